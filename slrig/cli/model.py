@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from slrig.combine.plan import StartingPoses, StatedAxis
 
 Vector = tuple[float, float, float]
+_OFF_DEG = 5.0
+"""Between what is said of a stage and what a scan's report says: more than stages err by, less than views are apart."""
 
 
 @grouped
@@ -109,6 +111,8 @@ def model(
     if shoot is None:
         files = _named_meshes(scans or ())
         start = _starts(list(files), angle, told, poses, found)
+        if angle is not None:
+            _require_order(files, angle)
     elif angle is not None or poses is not None:
         raise ConfigError("--shoot: it says itself where the views stand; leave --angle and --poses out")
     elif rig is not None:
@@ -250,6 +254,26 @@ def _starts(
         message = f"{file}: expected a pose of every scan, found none of {', '.join(missing)}; there are: "
         raise ConfigError(message + (", ".join(known) or "none"))
     return GivenPoses.of(known[name] for name in names)
+
+
+def _require_order(files: Mapping[str, Path], angle: float) -> None:
+    """Raises ConfigError: the scans' own reports say that the stage stood elsewhere, as where a shell has put view-10
+    before view-2.
+    """
+    from slrig.combine.plan import stage_told
+    from slrig.scan.artefacts import REPORT
+
+    reports = [mesh.with_name(REPORT) for mesh in files.values()]
+    told = [stage_told(report.read_bytes()) if report.is_file() else None for report in reports]
+    stood = [stage[0] for stage in told if stage is not None]
+    off = [math.remainder(each - stood[0] - angle * number, 360.0) for number, each in enumerate(stood)]
+    if len(stood) == len(files) and max(map(abs, off)) > _OFF_DEG:
+        where = ", ".join(f"{name} at {each:g}°" for name, each in zip(files, stood, strict=True))
+        message = (
+            f"--angle {angle:g}: expected scans in the order in which the stage turned, so far from one to the next, "
+            f"found by their own reports {where}. Name them in that order, or the folder that they lie in"
+        )
+        raise ConfigError(message)
 
 
 def _axis(file: Path | None, point: Vector | None, direction: Vector | None) -> StatedAxis | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ from slrig.combine.plan import (
     TurntablePoses,
     plan_from_json,
     plan_json,
+    stage_told,
 )
 from slrig.combine.stage import StageStore
 from slrig.combine.store import ModelStore, found_axis, summary
@@ -342,9 +342,8 @@ class ModelDesk:
     def _angle_told(self, scan_id: UUID) -> tuple[float, str | None] | None:
         """Where the stage stood, deg, and what that counts from, as a scan's report says; None where it does not."""
         try:
-            report = json.loads(self._folder.read(self._folder.scan(scan_id) / "report.json"))
-            return float(report["stage"]["angle_deg"]), report["stage"].get("count")
-        except (FileNotFoundError, ValueError, KeyError, TypeError):
+            return stage_told(self._folder.read(self._folder.scan(scan_id) / "report.json"))
+        except FileNotFoundError:
             return None
 
     def _remove_old(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -97,6 +98,15 @@ class MarkerPoses:
 
 
 StartingPoses = TurntablePoses | GivenPoses | UnknownPoses | MarkerPoses
+
+
+def stage_told(report: bytes) -> tuple[float, str | None] | None:
+    """Where the stage stood, deg, and what that counts from, as a scan's report says; None where it does not."""
+    try:
+        stage = json.loads(report)["stage"]
+        return float(stage["angle_deg"]), stage.get("count")
+    except (ValueError, KeyError, TypeError):
+        return None
 
 
 @dataclass(frozen=True, slots=True)

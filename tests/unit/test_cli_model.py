@@ -112,6 +112,23 @@ def test_a_vase_is_told_to_be_free(scans: Path, tmp_path: Path) -> None:
     assert (free["view"], free["motion"]) == ("vase-1", "turn")
 
 
+def test_scans_in_another_order_than_the_stage_turned_in_are_refused(scans: Path, tmp_path: Path) -> None:
+    named = [scans / "all" / f"scan-{number}" for number in (9, 10, 11)]
+    for number, folder in enumerate(named):
+        (folder / "report.json").write_text(json.dumps({"stage": {"angle_deg": 320 + ANGLE * number}}))
+    try:
+        # As a shell sorts them.
+        shuffled = [named[1], named[2], named[0]]
+        refused = model(*shuffled, "--output", tmp_path / "none", *STAGE)
+        assert (refused.exit_code, (tmp_path / "none").exists()) == (2, False)
+        assert "scan-10 at 360°, scan-11 at 400°, scan-9 at 320°" in " ".join(refused.output.split())
+        in_order = model(*named, "--output", tmp_path / "model", *STAGE)
+        assert in_order.exit_code == 0, in_order.output
+    finally:
+        for folder in named:
+            (folder / "report.json").unlink()
+
+
 def test_what_is_missing_is_said(scans: Path, tmp_path: Path) -> None:
     poses = tmp_path / "some.json"
     poses.write_bytes(encode_poses(Poses({"scan-9": np.eye(4)})))
