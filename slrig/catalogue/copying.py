@@ -91,6 +91,10 @@ class Copier:
         if self._fault is not None:
             message = f"{self._fault}. This rig scans on, and tries again by itself."
             raise CatalogueError(message)
+        with suppress(CatalogueError):
+            return self._catalogue.fleet()
+        # The connection may be older than the last start of the database, which says nothing of that.
+        self._catalogue.close()
         try:
             return self._catalogue.fleet()
         except CatalogueError as error:
