@@ -22,7 +22,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.exc import TimeoutError as NoConnectionError
 from sqlalchemy.orm import aliased
 
-from slrig.catalogue.fleet import SEEN_S, Fleet, LastScan, RigStanding
+from slrig.catalogue.fleet import SEEN_S, STOPPED, UNSEEN, Fleet, LastScan, RigStanding
 from slrig.catalogue.tables import CatalogueBase, FinishedJobRow, Moment, RigRow
 from slrig.config import ServiceSettings, is_loopback
 from slrig.errors import CatalogueError, ConfigError, ExtraMissingError
@@ -255,7 +255,7 @@ def _value(name: str, value: Any) -> Any:
 def _standing(row: Mapping[Any, Any], now: datetime, scans: int, failed: int) -> RigStanding:
     """A rig as it was when it was seen last, as far as that still says something."""
     seen_s = max((now - row["seen_at"]).total_seconds(), 0.0)
-    stopped, seen = row["state"] == "stopped", seen_s <= SEEN_S
+    stopped, seen = row["state"] == STOPPED, seen_s <= SEEN_S
     current = seen and not stopped
     last = None
     if row["job"] is not None:
@@ -267,7 +267,7 @@ def _standing(row: Mapping[Any, Any], now: datetime, scans: int, failed: int) ->
         started_at=row["started_at"],
         seen_at=row["seen_at"],
         seen_s=round(seen_s, 1),
-        state=row["state"] if current or stopped else "unseen",
+        state=row["state"] if current or stopped else UNSEEN,
         words=row["words"] if current else "",
         waiting=row["waiting"] if current else None,
         computing=row["computing"] if current else None,

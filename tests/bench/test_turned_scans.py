@@ -88,18 +88,11 @@ def command(*arguments: object) -> tuple[float, str]:
     return spent, done.stdout
 
 
-def true_pose(angle_deg: float) -> FloatArray:
-    """From a view's coordinates to those of the first: the turn of the table, undone."""
+def turned_back(angle_deg: float, axis: FloatArray, point_mm: FloatArray) -> FloatArray:
+    """From a view's coordinates to those of the first: the turn of the table about an axis, undone."""
     pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(-np.deg2rad(angle_deg) * AXIS).as_matrix()
-    pose[:3, 3] = POINT_MM - pose[:3, :3] @ POINT_MM
-    return pose
-
-
-def start_pose(angle_deg: float) -> FloatArray:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(-np.deg2rad(angle_deg) * OFF_AXIS).as_matrix()
-    pose[:3, 3] = OFF_POINT_MM - pose[:3, :3] @ OFF_POINT_MM
+    pose[:3, :3] = Rotation.from_rotvec(-np.deg2rad(angle_deg) * axis).as_matrix()
+    pose[:3, 3] = point_mm - pose[:3, :3] @ point_mm
     return pose
 
 
@@ -120,7 +113,7 @@ def test_a_turned_object(name: str, count: int, tmp_path: Path, capsys: pytest.C
     told = json.loads((tmp_path / "model" / "poses.json").read_text())
     report = json.loads((tmp_path / "model" / "report.json").read_text())
     poses = [np.array(each["pose"]) for each in told["views"]]
-    true = [true_pose(angle) for angle in angles]
+    true = [turned_back(angle, AXIS, POINT_MM) for angle in angles]
 
     def apart_um(found: list[FloatArray]) -> list[float]:
         return [1e3 * displacement_mm(*each) for each in zip(views, found, true, strict=True)][1:]
@@ -128,7 +121,7 @@ def test_a_turned_object(name: str, count: int, tmp_path: Path, capsys: pytest.C
     ours = apart_um(poses)
     rows = [f"slrig{'':<14}" + " ".join(f"{each:5.1f}" for each in ours)]
     if importlib.util.find_spec("small_gicp"):
-        starts = [start_pose(angle) for angle in angles]
+        starts = [turned_back(angle, OFF_AXIS, OFF_POINT_MM) for angle in angles]
         for spacing_mm in (0.7, 0.05):
             chain = apart_um(chained(small_gicp(), "GICP", views, starts, spacing_mm=spacing_mm))
             rows.append(f"GICP, {spacing_mm:<4} mm{'':<4}" + " ".join(f"{each:5.1f}" for each in chain))
