@@ -17,7 +17,6 @@ from slrig.calibration.boards.sightings import (
     UNMIRRORED,
     fitting_width,
     markers_in,
-    markers_seen,
     nothing_words,
     rest_px,
     side_px,
@@ -161,11 +160,5 @@ def _nothing(grey: Grey, board: Board) -> str:
         return (
             f"a mirrored print: {count} markers of {board.dictionary} can be read only with left and right changed "
             f"over: {UNMIRRORED}"
-        )
-    markers = markers_seen(grey, but=board.dictionary)
-    if markers is not None:
-        return (
-            f"another board: expected markers of {board.dictionary}, found {markers.count} of {markers.dictionary} or "
-            f"a smaller dictionary of its family: give that one as {setting('dictionary')}, or take the other board"
         )
     return nothing_words(grey, board)

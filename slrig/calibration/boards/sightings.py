@@ -11,7 +11,7 @@ import numpy as np
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.artwork import charuco_board, marker_dictionary
 from slrig.calibration.boards.blobs import circle_lattice
-from slrig.calibration.boards.chess_lattice import chessboard_lattice
+from slrig.calibration.boards.chess_lattice import chessboard_lattice, holds_markers
 from slrig.calibration.boards.grey import Grey
 from slrig.errors import setting
 from slrig.model import FloatArray, IntArray
@@ -85,14 +85,21 @@ def _family(dictionary: str) -> str:
 
 
 def other_words(grey: Grey, board: Board) -> str | None:
-    """That a board of another kind than the one asked for is in view, which, and what to do; None where none is."""
+    """That a board of another kind or other markers than asked for is in view, and what to do; None where none is."""
     found, kind = None, ""
-    markers = markers_seen(grey) if board.kind is not BoardKind.CHARUCO else None
+    chess = chessboard_lattice(grey) if board.kind is not BoardKind.CHESSBOARD else None
+    # Six dictionaries take longer than all else together, so a chessboard with nothing in its squares comes first.
+    plain = chess is not None and not holds_markers(grey.level, chess)
+    markers = None if plain else markers_seen(grey, but=board.dictionary)
+    if markers is not None and board.kind is BoardKind.CHARUCO:
+        return (
+            f"another board: expected markers of {board.dictionary}, found {markers.count} of {markers.dictionary} or "
+            f"a smaller dictionary of its family: give that one as {setting('dictionary')}, or take the other board"
+        )
     if markers is not None:
         kind = "charuco"
         found = f"the markers of a ChArUco board ({markers.dictionary}, number {markers.greatest} the greatest)"
-    chess = chessboard_lattice(grey) if found is None and board.kind is not BoardKind.CHESSBOARD else None
-    if chess is not None:
+    elif chess is not None:
         kind = "chessboard"
         found = f"a chessboard of {max(chess.columns, chess.rows)} x {min(chess.columns, chess.rows)} inner corners"
     # In a blurred image squares are round.
