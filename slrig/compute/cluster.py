@@ -11,6 +11,7 @@ from contextlib import suppress
 from typing import Any, Protocol
 from uuid import uuid4
 
+import dask
 import structlog
 from distributed import Client, Future, Security
 
@@ -122,6 +123,8 @@ class DaskCluster:
         # A rig computes by itself while it has no connection, and says so once.
         for name in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
+        # dask's client asks for the same that `_watch` asks for.
+        dask.config.set({"distributed.client.scheduler-info-interval": "1 day"})
         with suppress(asyncio.CancelledError):
             asyncio.run(self._keep_connected())
 

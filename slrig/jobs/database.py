@@ -1,4 +1,4 @@
-"""The service's SQLite database: write-ahead log, synchronous FULL, so that what was answered survives a power cut."""
+"""The service's SQLite database: write-ahead log, synchronous FULL, so that what was answered outlasts a power cut."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ PATIENCE_S = 10.0
 """How long a change waits for another program that has the file locked, as some backups do. A person who asked waits as
 long."""
 
-_PATIENCE = "slrig_patience_ms"
+PASSING_PATIENCE_S = 0.2
+"""How long a change waits that may be lost: the work waits meanwhile."""
+
+_PATIENCE, _SYNCHRONOUS = "slrig_patience_ms", "slrig_synchronous"
 
 
 class Database:
@@ -63,12 +66,14 @@ class Database:
             yield session
 
     @contextmanager
-    def changing(self, *, patience_s: float | None = None) -> Iterator[Session]:
+    def changing(self, *, passing: bool = False) -> Iterator[Session]:
         """A session whose changes are kept, all of them, when the block ends without an error.
 
-        patience_s : how long to wait for another program that has the file locked; None stands for `PATIENCE_S`.
+        passing : a change that a power cut may undo, as how far a job is: it reaches the disk with the next one that is
+        to last, and is refused where another program has the file locked. A slow disk takes 10 ms and more to sync.
         """
-        writer = writing(self._engine, PATIENCE_S if patience_s is None else patience_s)
+        patience_s, synchronous = (PASSING_PATIENCE_S, "NORMAL") if passing else (PATIENCE_S, "FULL")
+        writer = writing(self._engine, patience_s, synchronous)
         # SQLite has one writer; a lock here keeps a second thread from ever seeing "database is locked".
         with self._refusals(), self._writing, Session(writer, expire_on_commit=False) as session, session.begin():
             yield session
@@ -99,9 +104,12 @@ def sqlite_engine(path: Path) -> Engine:
     return engine
 
 
-def writing(engine: Engine, patience_s: float) -> Engine:
-    """The same file, whose transactions have its one write lock from their beginning; how long they wait for it."""
-    return engine.execution_options(**{_PATIENCE: int(1000 * patience_s)})
+def writing(engine: Engine, patience_s: float, synchronous: str = "FULL") -> Engine:
+    """The same file, whose transactions have its one write lock from their beginning; how long they wait for it.
+
+    synchronous : of SQLite's words, which is the least that lasts through a power cut.
+    """
+    return engine.execution_options(**{_PATIENCE: int(1000 * patience_s), _SYNCHRONOUS: synchronous})
 
 
 def _set_up(connection: DBAPIConnection, _record: object) -> None:
@@ -114,9 +122,11 @@ def _set_up(connection: DBAPIConnection, _record: object) -> None:
 
 
 def _begin(connection: Connection) -> None:
-    patience_ms = connection.get_execution_options().get(_PATIENCE)
+    options = connection.get_execution_options()
+    patience_ms = options.get(_PATIENCE)
     if patience_ms is not None:
         connection.exec_driver_sql(f"PRAGMA busy_timeout={patience_ms}")
+        connection.exec_driver_sql(f"PRAGMA synchronous={options[_SYNCHRONOUS]}")
     connection.exec_driver_sql("BEGIN" if patience_ms is None else "BEGIN IMMEDIATE")
 
 

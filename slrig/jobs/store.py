@@ -25,7 +25,6 @@ _LISTED = {
     JobKind.MODEL: "GET /model lists those that are.",
 }
 
-_PROGRESS_PATIENCE_S = 0.2  # the work waits meanwhile
 
 EVERY_JOB = UUID(int=0)
 """Stands for all jobs of a store where they are followed."""
@@ -203,7 +202,7 @@ class JobStore:
         self._tell(job_id, "captured", {"time": self._now()})
 
     def _tell(self, job_id: UUID, kind: str, data: dict[str, Any], at: JobProgress | None = None) -> None:
-        with self.database.changing(patience_s=_PROGRESS_PATIENCE_S) as session:
+        with self.database.changing(passing=True) as session:
             row = self._find(session, job_id)
             if at is not None:
                 row.stage, row.fraction, row.detail = at.stage, at.fraction, at.detail

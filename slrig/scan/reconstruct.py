@@ -55,6 +55,9 @@ from slrig.scan.report import (
 from slrig.scan.stream import CameraResult, LiveScan
 from slrig.scan.triangulated import Triangulated, steps, widest_gap_px
 
+_BETWEEN = frozenset({"read bundle", "check frames"})
+"""What is done with each frame between other stages."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Meshed:
@@ -140,7 +143,7 @@ def reconstruct_into(
     """
     watch = Stopwatch() if live is None else live.watch
 
-    at = ("", 0.0)
+    at = ("", 0.0, "")
 
     def entered(stage: str, fraction: float, detail: str) -> None:
         nonlocal at
@@ -148,12 +151,14 @@ def reconstruct_into(
             message = f"the scan was cancelled before '{stage}'"
             raise ScanCancelledError(message)
         watch.enter(stage)
-        at = (stage, fraction)
-        progress(stage, fraction, detail)
+        # Frames are read and checked one after another while those before them are decoded: that is no step back.
+        if (stage, fraction, detail) != at and not (at[0] and stage in _BETWEEN):
+            at = (stage, fraction, detail)
+            progress(stage, fraction, detail)
 
     def compiling(kernel: str) -> None:
         # What only some scans need is compiled when the first one comes.
-        progress(*at, f"preparing kernels, first time only: {kernel}")
+        progress(*at[:2], f"preparing kernels, first time only: {kernel}")
 
     def place(name: str, data: bytes) -> None:
         write_file(folder / name, data, durable=False)

@@ -30,6 +30,15 @@ def test_migrations_give_the_tables_that_the_code_uses(path: Path) -> None:
     engine.dispose()
 
 
+def test_what_a_power_cut_may_undo_is_not_brought_to_disk_by_itself(path: Path) -> None:
+    database, found = Database(path), []
+    for passing in (False, True, False):
+        with database.changing(passing=passing) as session:
+            found.append(session.scalar(text("PRAGMA synchronous")))
+    database.close()
+    assert found == [2, 1, 2]  # FULL, NORMAL
+
+
 def test_file_that_is_no_database_is_refused(path: Path) -> None:
     path.write_bytes(b"not a database, for certain" * 100)
     with pytest.raises(StorageError, match=r"slrig\.sqlite"):

@@ -349,11 +349,15 @@ def test_frames_taken_live_give_the_bytes_that_the_bundle_gives(recorded: Path, 
 
 def test_frames_that_were_judged_as_they_were_captured_are_not_judged_again(recorded: Path, tmp_path: Path) -> None:
     (tmp_path / "judged").mkdir()
+    told: list[str] = []
     judged = reconstruct_into(
-        recorded, tmp_path / "judged", plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False,
-        judged=seen_live(recorded).evidence,
+        recorded, tmp_path / "judged", plan=ReconstructionPlan(), progress=lambda stage, *_: told.append(stage),
+        cancelled=lambda: False, judged=seen_live(recorded).evidence,
     )  # fmt: skip
     read = run(recorded, tmp_path / "read")
+    # Each stage is entered once, though frames are read one by one between them.
+    assert told[0] == "read bundle"
+    assert sorted(set(told)) == sorted(told)
     assert "check frames" not in judged["stages_s"]  # type: ignore[operator]
     assert "check frames" in read["stages_s"]  # type: ignore[operator]
     assert reports_alike(judged, read)
