@@ -159,10 +159,12 @@ def _spread_of_one_pixel(blur_px: float) -> FloatArray:
 
 
 def _spread(light: FloatArray, blur_px: float) -> Float32Array:
-    # Half a second to import: whoever only lists drivers is spared it.
-    from scipy.signal import upfirdn
-
-    return np.asarray(upfirdn(_spread_of_one_pixel(blur_px), light, up=NODES_PER_PX), np.float32)
+    """The light of pixels in a row, at all nodes. scipy.signal has it too, and takes half a second to import."""
+    one = _spread_of_one_pixel(blur_px)
+    taps = -(-len(one) // NODES_PER_PX)
+    by_node = np.pad(one, (0, taps * NODES_PER_PX - len(one))).reshape(taps, NODES_PER_PX)
+    beside = np.lib.stride_tricks.sliding_window_view(np.pad(light, taps - 1), taps)
+    return np.asarray((beside @ by_node[::-1]).ravel()[: (len(light) - 1) * NODES_PER_PX + len(one)], np.float32)
 
 
 @kernel_part
