@@ -7,6 +7,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -134,8 +135,20 @@ class Host(WorkerPlugin):
             self._store.fetch_bundle(order.bundle, bundle, beat)
             given = (bundle, result, *order.task.given)
             task = replace(order.task, given=given, where={"where": "pool"}, remedy="Its rig computes by itself.")
-            answer = self._worker.run(task, progress=progress, cancelled=stopped)
-            return Answer(answer, self._store.put_result(order.job, result, beat))
+            # While the next file is made, the last one travels.
+            line, files = ThreadPoolExecutor(1, thread_name_prefix="slrig-store"), dict[str, Future[str]]()
+
+            def made(name: str) -> None:
+                files[name] = line.submit(self._store.put_result, order.job, result / name, beat)
+
+            try:
+                answer = self._worker.run(task, progress=progress, cancelled=stopped, made=made)
+                for path in result.iterdir():
+                    if path.name not in files:
+                        made(path.name)
+                return Answer(answer, {name: files[name].result() for name in sorted(files)})
+            finally:
+                line.shutdown(cancel_futures=True)
 
 
 def compute(order: Order) -> Answer:

@@ -93,16 +93,14 @@ class PoolStore:
             with tarfile.open(fileobj=packed) as archive:
                 archive.extractall(bundle, filter="data")
 
-    def put_result(self, job: str, folder: Path, check: Check) -> dict[str, str]:
-        """Bring the files of a folder to the store; return the hash of each by its name. Raises as `put_bundle`."""
-        found = {}
-        for path in sorted(folder.iterdir()):
-            with refusals_of(path), path.open("rb") as file:
-                found[path.name] = hashlib.file_digest(file, "sha256").hexdigest()
-                file.seek(0)
-                with self._faults():
-                    self._put(_result(job, path.name), file, check)
-        return found
+    def put_result(self, job: str, path: Path, check: Check) -> str:
+        """Bring a file of a result to the store; return its hash. Raises as `put_bundle`."""
+        with refusals_of(path), path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+            file.seek(0)
+            with self._faults():
+                self._put(_result(job, path.name), file, check)
+        return digest
 
     def fetch_result(self, job: str, hashes: Mapping[str, str], folder: Path, check: Check) -> Iterator[str]:
         """Fetch the files of a result into a folder one after another, each whole or not at all, and yield their names.

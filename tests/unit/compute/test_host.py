@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -85,6 +87,35 @@ def test_a_stage_is_told_now_and_then(pool: Pool, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(pool.remote, "run", run)
     assert pool.cluster.host.done(given, heard.append).fault is None
     assert [each["fraction"] for each in heard if "stage" in each] == [0.0, 0.4, 0.8, 1.0]
+
+
+def test_a_file_travels_while_the_next_one_is_made(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given, gone, put = order(pool, tmp_path), threading.Event(), pool.store.put_result
+
+    def put_result(job: str, path: Path, check: Callable[[], None]) -> str:
+        digest = put(job, path, check)
+        gone.set()
+        return digest
+
+    def run(task: Task, *, made: Callable[[str], None] = lambda _: None, **_: object) -> object:
+        if not task.movable:
+            return versions()
+        (task.given[1] / "mesh.ply").write_bytes(b"ply")
+        made("mesh.ply")
+        assert gone.wait(30)
+        (task.given[1] / "report.json").write_bytes(b"{}")
+        return "the report"
+
+    monkeypatch.setattr(pool.store, "put_result", put_result)
+    monkeypatch.setattr(pool.remote, "run", run)
+    answer = pool.cluster.host.done(given, lambda _: None)
+    assert answer.result == "the report"
+    assert dict(answer.files) == {
+        "mesh.ply": hashlib.sha256(b"ply").hexdigest(), "report.json": hashlib.sha256(b"{}").hexdigest()
+    }  # fmt: skip
+    assert {each["path"] for each in pool.objects.list("results").collect()} == {
+        "results/job/mesh.ply", "results/job/report.json"
+    }  # fmt: skip
 
 
 def test_a_job_that_its_rig_gave_up_is_stopped_in_the_middle(pool: Pool, tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def test_a_store_that_is_tidied_holds_nothing_and_may_be_tidied_again(tmp_path: 
     shared = tmp_path / "shared"
     store = open_store(shared.as_uri())
     key = store.put_bundle(bundle(tmp_path / "bundle"), lambda: None)
-    store.put_result("job", tmp_path / "bundle" / "frames", lambda: None)
+    store.put_result("job", tmp_path / "bundle" / "frames" / "0.png", lambda: None)
     for _ in range(2):
         store.clear(bundle=key, job="job")
         assert list(shared.iterdir()) == []
@@ -81,7 +81,7 @@ def test_a_slow_line_carries_one_part_at_a_time(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(obstore, "put", put)
     store = PoolStore("memory://", MemoryStore())
     store.put_bundle(bundle(tmp_path / "bundle"), lambda: None)
-    store.put_result("job", tmp_path / "bundle" / "frames", lambda: None)
+    store.put_result("job", tmp_path / "bundle" / "frames" / "0.png", lambda: None)
     assert asked == [1, 1]
 
 
