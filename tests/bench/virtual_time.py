@@ -18,6 +18,10 @@ from distributed import metrics
 from tornado.ioloop import PeriodicCallback
 from tornado.platform.asyncio import BaseAsyncIOLoop
 
+EARLY_S = 2e-9
+"""asyncio takes a timer for due up to a nanosecond before its time. Who then looks at the clock, and waits on, would wait
+for ever at a clock that stands still."""
+
 PERIODIC = ("WorkStealing.balance",)
 """What dask does again and again that matters here; signs of life and figures for its pages do not."""
 
@@ -33,7 +37,7 @@ class _Jumping(selectors.SelectSelector):
         found = super().select(0)
         if not found:
             assert timeout is not None, "everybody waits, and nobody for a time"
-            self.now_s += max(timeout, 0.0)
+            self.now_s += max(timeout, EARLY_S)
         return found
 
 
