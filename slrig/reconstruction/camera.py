@@ -15,6 +15,7 @@ from slrig.reconstruction.asked import AskedPixels, without_others
 from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.coded import Coded, cell_width_px, code_edge_points, line_image
 from slrig.reconstruction.correlation import edge_sum, phase_sum
+from slrig.reconstruction.curvature import freed_of_curvature
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode, lit_pixels
 from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_steps
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
@@ -261,11 +262,12 @@ def _placed(coded: Coded, found: list[LinePoints], scales: _Scales, tables: Code
     if has_phase(frames):
         resolution_px = 0.0
         near_shadow = coded.near_shadow
-        seen = at_pixel_centres(
+        seen, blur_variance = at_pixel_centres(
             seen, frames.contrast, coded.contrast_deviation, limits.camera_blur_px, clear=~near_shadow
         )  # fmt: skip
         near_step = near_steps(seen, resolution_px, limits.edges)
         usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
+        seen = freed_of_curvature(seen, usable, blur_variance, frames.line_patterns[0].period_px)
         refinement = refined(found, seen, usable, code, tables.position_of)
         disagreement_px = refinement.disagreement_px
         if np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px:

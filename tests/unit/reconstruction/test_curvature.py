@@ -1,0 +1,125 @@
+"""What blur makes of curved surfaces, against light that is blurred on a fine grid; the kernel against plain numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from slrig.model import FloatArray
+from slrig.reconstruction.curvature import freed_of_curvature
+from slrig.reconstruction.phase import PositionMap
+
+FINE = 8
+PIXELS = 36
+BLUR_PX = 0.65
+PERIOD_PX = 8.0
+INNER = (slice(6, -6),) * 2
+
+
+def fine_grid() -> tuple[FloatArray, FloatArray]:
+    at = (np.arange(PIXELS * FINE) - (FINE - 1) / 2) / FINE - PIXELS / 2
+    return tuple(np.meshgrid(at, at))  # type: ignore[return-value]
+
+
+def at_pixels(fine: FloatArray) -> FloatArray:
+    """Between the two middle rows and columns of each pixel's samples."""
+    middle = slice(FINE // 2 - 1, None, FINE), slice(FINE // 2, None, FINE)
+    return np.asarray(sum(fine[rows, columns] for rows in middle for columns in middle) / 4)
+
+
+def seen_through_blur(position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Phase position at each pixel, and the true one; no formula of the code under test is used."""
+    shifts = np.arange(8)
+    lights = (1 + np.cos(2 * np.pi / PERIOD_PX * (position - shift)) for shift in shifts)
+    lines = np.stack([at_pixels(gaussian_filter(light, BLUR_PX * FINE)) for light in lights])
+    turns = np.exp(2j * np.pi / PERIOD_PX * shifts)[:, None, None]
+    phase = np.angle((lines * turns).sum(axis=0)) * PERIOD_PX / (2 * np.pi)
+    true = at_pixels(position)
+    return phase + PERIOD_PX * np.rint((true - phase) / PERIOD_PX), true
+
+
+def freed(position: FloatArray, sigma_px: float = 0.001, usable: NDArray[np.bool_] | None = None) -> FloatArray:
+    everywhere = np.ones(position.shape, dtype=np.bool_) if usable is None else usable
+    seen = PositionMap(position.astype(np.float32), np.full(position.shape, sigma_px, dtype=np.float32))
+    return freed_of_curvature(seen, everywhere, BLUR_PX**2, PERIOD_PX).position.astype(np.float64)
+
+
+@pytest.mark.parametrize(("right", "down"), [(1.1, 0.2), (0.3, -0.9), (2.4, 0.5)])
+@pytest.mark.parametrize("bend", [(0.02, 0.0, 0.0), (0.0, 0.0, 0.02), (-0.015, 0.01, -0.01)])
+def test_a_curved_surface_lies_where_it_is(right: float, down: float, bend: tuple[float, float, float]) -> None:
+    x, y = fine_grid()
+    xx, xy, yy = bend
+    measured, true = seen_through_blur(40 + right * x + down * y + xx * x * x + xy * x * y + yy * y * y)
+    before = np.abs(measured - true)[INNER].max()
+    after = np.abs(freed(measured) - true)[INNER].max()
+    assert before > 0.004
+    assert after < 0.12 * before
+
+
+def test_noise_of_an_even_surface_stays_as_it_is() -> None:
+    y, x = np.indices((200, 200)).astype(np.float64)
+    noise = np.random.default_rng(3).normal(0, 0.02, x.shape)
+    plane = 300 + 1.1 * x + 0.3 * y
+    moved = freed(plane + noise, 0.02) - plane - noise
+    assert np.sqrt((moved**2).mean()) < 0.02 * 0.02
+    assert abs(moved.mean()) < 2e-5
+
+
+def test_a_surface_that_bends_within_the_wide_window_is_judged_by_the_narrow_one() -> None:
+    x, _ = fine_grid()
+    measured, true = seen_through_blur(40 + 1.1 * x + 0.8 * np.sqrt(x * x + 1.0))
+    after = np.abs(freed(measured) - true)[INNER]
+    before = np.abs(measured - true)[INNER]
+    assert before.max() > 0.09
+    assert after.max() < 0.45 * before.max()
+    # The wide window alone would move these by 0.007 and 0.015 px: it reaches the bend, and the surface is even.
+    assert after[:, [8, 16]].max() < 0.002
+
+
+def test_what_lies_beside_a_border_stays_as_it_is() -> None:
+    y, x = np.indices((30, 40)).astype(np.float64)
+    position = 40 + 1.1 * x + 0.02 * x * x + 0.01 * y * y
+    position[12, 20] = np.nan
+    usable = np.ones(position.shape, dtype=np.bool_)
+    usable[:, 33] = False
+    given = position.astype(np.float32).astype(np.float64)
+    moved = freed(given, usable=usable) != given
+    moved[12, 20] = False
+    expected = np.zeros_like(moved)
+    expected[2:-2, 2:31] = True
+    expected[2:-2, 36:-2] = True
+    expected[10:15, 18:23] = False
+    np.testing.assert_array_equal(moved, expected)
+
+
+def test_the_kernel_is_what_plain_least_squares_say() -> None:
+    random = np.random.default_rng(8)
+    y, x = np.indices((24, 26)).astype(np.float64)
+    # A step in slope, so that both windows are taken, and noise, so that some is in doubt.
+    position = 200 + 1.3 * x - 0.4 * y + 0.002 * x * y + 0.2 * np.abs(x - 13) + 0.004 * (y - 9) ** 2
+    position = (position + random.normal(0, 0.01, x.shape)).astype(np.float32).astype(np.float64)
+    found = freed(position, 0.01)
+    for row, column in ((2, 2), (3, 20), (9, 6), (12, 12), (12, 13), (12, 16), (14, 17), (19, 19), (21, 23)):
+        assert found[row, column] == pytest.approx(plainly_freed(position, row, column, 0.01), abs=4e-5)
+
+
+def plainly_freed(position: FloatArray, row: int, column: int, sigma_px: float) -> float:
+    variance, taken = BLUR_PX**2, (np.nan, np.nan)
+    for reach in (2, 4):
+        window = slice(row - reach, row + reach + 1), slice(column - reach, column + reach + 1)
+        if row < reach or column < reach or position[window].shape != (2 * reach + 1, 2 * reach + 1):
+            continue
+        dy, dx = (each.ravel() for each in np.indices((2 * reach + 1,) * 2) - reach)
+        terms = np.stack([np.ones(len(dx)), dx, dy, dx * dx, dx * dy, dy * dy], axis=1)
+        _, gx, gy, cxx, cxy, cyy = np.linalg.lstsq(terms, position[window].ravel())[0]
+        slope, bends = np.array([gx, gy]), np.array([[2 * cxx, cxy], [cxy, 2 * cyy]])
+        turn = (2 * np.pi / PERIOD_PX) ** 2 * variance
+        shift = 0.5 * variance * (np.trace(bends) - turn * slope @ bends @ slope)
+        spread = np.linalg.inv(terms.T @ terms)
+        noise = variance * sigma_px * np.sqrt(spread[3, 3] + spread[5, 5] + 2 * spread[3, 5])
+        if reach == 2 or abs(shift - taken[0]) <= 3 * taken[1]:
+            taken = float(shift), float(noise)
+    shift, noise = taken
+    return float(position[row, column] - shift * shift**4 / (shift**4 + 16 * noise**4))
