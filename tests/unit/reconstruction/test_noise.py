@@ -76,6 +76,25 @@ def test_a_textured_surface_does_not_look_noisy_when_inverses_are_there() -> Non
     assert variance_at(found, 100.0) == pytest.approx(3.5, rel=0.1)
 
 
+def test_whole_numbers_of_a_bright_surface_tell_the_noise_of_the_dark() -> None:
+    # Of eight bits and few frames; no level of the sums is dark.
+    rng, (x, y) = np.random.default_rng(5), grid(SHAPE)
+    white, black = 140 + 40 * np.sin(x / 40) * np.cos(y / 50), 2 + 0.002 * y
+
+    def seen(light: FloatArray | float) -> NDArray[np.float32]:
+        mean = black + (white - black) * light
+        noisy = mean + np.sqrt(0.1 + 0.025 * mean) * rng.standard_normal(SHAPE)
+        return np.asarray(np.rint(np.maximum(noisy, 0)), dtype=np.float32)
+
+    lights = [0.5 + 0.5 * np.sign(np.sin(np.pi * x / 320 * 2**bit + 0.3)) for bit in range(8)]
+    bits, inverses = (np.array([seen(one + sign * light) for light in lights]) for one, sign in ((0, 1), (1, -1)))
+    found = estimate_noise(
+        code_frames(bits=bits, inverses=inverses, white=seen(1.0), black=seen(0.0), full_scale=255.0)
+    )
+    assert variance_at(found, 10.0) == pytest.approx(0.1 + 0.025 * 10 + 1 / 12, rel=0.25)
+    assert variance_at(found, 100.0) == pytest.approx(0.1 + 0.025 * 100 + 1 / 12, rel=0.15)
+
+
 def test_clipped_pixels_do_not_look_quiet() -> None:
     frames = frames_with_noise(2.0, 0.04, paired=True)
     assert frames.inverses is not None
