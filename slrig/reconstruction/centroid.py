@@ -51,9 +51,8 @@ def at_pixel_centres(
     /,
     *,
     clear: NDArray[np.bool_] | None = None,
-) -> tuple[PositionMap, float]:
-    """The position map moved from the centroids of the pixels' light to their centres, to first order, and the variance
-    of the blur that was used, px².
+) -> PositionMap:
+    """The position map moved from the centroids of the pixels' light to their centres, to first order.
 
     contrast, deviation : (H, W) float32, white minus black and the standard deviation of its noise; blur_px : standard
     deviation of the camera's own blur, its pixel's area included, px. clear : (H, W) bool, pixels away from the borders
@@ -73,7 +72,7 @@ def at_pixel_centres(
         if clear is not None:
             variance = _told_variance(seen, shift, contrast, deviation, clear, blur_px**2)
         moved = seen.position - np.float32(variance) * shift
-    return PositionMap(moved, seen.sigma), variance
+    return PositionMap(moved, seen.sigma)
 
 
 def _told_variance(

@@ -106,7 +106,7 @@ def projector_positions(
     clear = asked & ~near_print(contrast, deviation, camera_blur_px, limits)
     if has_phase(frames):
         seen = position_map(frames, noise, code, tables.cell_position)
-        seen, _ = at_pixel_centres(seen, contrast, deviation, camera_blur_px)
+        seen = at_pixel_centres(seen, contrast, deviation, camera_blur_px)
         row, column = np.nonzero(clear & np.isfinite(seen.position) & (seen.sigma < limits.largest_sigma_px))
         pixels = np.column_stack([column, row]).astype(np.float64)
         position, sigma = seen.position[row, column].astype(np.float64), seen.sigma[row, column].astype(np.float64)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from slrig.model import FloatArray
-from slrig.reconstruction.centroid import at_pixel_centres as centres_and_blur
+from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.phase import PositionMap
 from tests.unit.reconstruction.builders import grid
 
@@ -43,10 +41,6 @@ def fine_x() -> FloatArray:
 
 def as_map(row: FloatArray) -> NDArray[np.float32]:
     return np.tile(row, (5, 1)).astype(np.float32)
-
-
-def at_pixel_centres(*given: Any, **known: Any) -> PositionMap:
-    return centres_and_blur(*given, **known)[0]
 
 
 NOISELESS = np.zeros((5, PIXELS), dtype=np.float32)
