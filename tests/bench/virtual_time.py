@@ -19,8 +19,8 @@ from tornado.ioloop import PeriodicCallback
 from tornado.platform.asyncio import BaseAsyncIOLoop
 
 EARLY_S = 2e-9
-"""asyncio takes a timer for due up to a nanosecond before its time. Who then looks at the clock, and waits on, would wait
-for ever at a clock that stands still."""
+"""asyncio takes a timer for due up to a nanosecond before its time. Who then looks at the clock, and waits on, would
+wait for ever at a clock that stands still."""
 
 PERIODIC = ("WorkStealing.balance",)
 """What dask does again and again that matters here; signs of life and figures for its pages do not."""
