@@ -47,8 +47,14 @@ def kernel(function: Callable[..., Any] | None = None, /, *, in_every_scan: bool
     return made if function is None else made(function)
 
 
-def kernel_part(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
-    """Compile a function that kernels call: it becomes part of theirs."""
+def kernel_part(function: Callable[..., Any] | None = None, /, *, borrows: bool = False, **options: Any) -> Any:
+    """Compile a function that kernels call: it becomes part of theirs.
+
+    borrows : it makes no array and returns none, so that references to those it is given need no counting. numba leaves
+    that out by itself where arrays are arguments, and not where they are fields of a tuple that is one (numba issue
+    2350): a count per field and call, which all cores share, may be more than half of the time.
+    """
+    options = {"_nrt": not borrows, **options}
     return (lambda each: _compiled(each, options)) if function is None else _compiled(function, options)
 
 

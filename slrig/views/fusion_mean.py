@@ -118,7 +118,7 @@ def mean_values(sheets: Sheets, points_mm: FloatArray, nearest: IntArray, rule: 
     return means
 
 
-@kernel_part
+@kernel_part(borrows=True)
 def _view_at(sheets: Any, face: int, x: float, y: float, z: float, rule: Any, rows: Any, row: int) -> bool:
     """What a view's nearest triangle says of a point, into a row; whether it counts there."""
     points, normals, insets, sigmas = sheets.points_mm, sheets.normals, sheets.inset_mm, sheets.sigma_mm
@@ -155,21 +155,28 @@ def _view_at(sheets: Any, face: int, x: float, y: float, z: float, rule: Any, ro
     return True
 
 
-@kernel_part
-def _pose_covariance(
-    poses: Any, j: int, k: int, x: float, y: float, z: float, nx: float, ny: float, nz: float
-) -> float:
-    """gᵀ C_jk g : of where two views' poses put the surface at a point, along its normal, mm²."""
+@kernel_part(borrows=True)
+def _lever(poses: Any, x: float, y: float, z: float, nx: float, ny: float, nz: float) -> Any:
+    """g of a point and a normal."""
     x, y, z = x - poses.middle_mm[0], y - poses.middle_mm[1], z - poses.middle_mm[2]
-    g = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx, nx, ny, nz)
-    total = 0.0
+    return y * nz - z * ny, z * nx - x * nz, x * ny - y * nx, nx, ny, nz
+
+
+@kernel_part(borrows=True)
+def _pose_covariance(poses: Any, j: int, k: int, lever: Any) -> float:
+    """gᵀ C_jk g : of where two views' poses put the surface at a point, along its normal, mm²."""
+    total, begin, covariance = 0.0, 6 * k, poses.covariance
+    d, e, f, u, v, w = lever
     for a in range(6):
-        for b in range(6):
-            total += g[a] * poses.covariance[6 * j + a, 6 * k + b] * g[b]
+        row = 6 * j + a
+        total += lever[a] * (
+            d * covariance[row, begin] + e * covariance[row, begin + 1] + f * covariance[row, begin + 2]
+            + u * covariance[row, begin + 3] + v * covariance[row, begin + 4] + w * covariance[row, begin + 5]
+        )  # fmt: skip
     return total
 
 
-@kernel_part
+@kernel_part(borrows=True)
 def _counting(sheets: Any, points: Any, nearest: Any, at: int, rule: Any, rows: Any, order: Any) -> int:
     """How many views count at a point; `order` begins with their rows, by their values."""
     count, near = 0, 0
@@ -230,18 +237,19 @@ def _means(first: int, last: int, sheets: Any, points: Any, nearest: Any, rule: 
             length = np.sqrt(nx * nx + ny * ny + nz * nz)
             nx, ny, nz = nx / length, ny / length, nz / length
             means.normals[at, 0], means.normals[at, 1], means.normals[at, 2] = nx, ny, nz
-            x, y, z = points[at, 0], points[at, 1], points[at, 2]
+            lever = _lever(rule.poses, points[at, 0], points[at, 1], points[at, 2], nx, ny, nz)
             for one in range(count):
                 j, w = int(rows[order[one], _VIEW]), rows[order[one], _WEIGHT]
-                for other in range(count):
+                variance += w * w * _pose_covariance(rule.poses, j, j, lever)
+                for other in range(one):
                     k, v = int(rows[order[other], _VIEW]), rows[order[other], _WEIGHT]
-                    variance += w * v * _pose_covariance(rule.poses, j, k, x, y, z, nx, ny, nz)
+                    variance += 2 * w * v * _pose_covariance(rule.poses, j, k, lever)
             means.sigma_mm[at] = np.sqrt(variance / (weight * weight) + rule.shared_mm**2)
             means.views[at] = max(inside, 1)
             _blend(sheets, rows, order, count, means.light[at], means.mark, at)
 
 
-@kernel_part
+@kernel_part(borrows=True)
 def _blend(sheets: Any, rows: Any, order: Any, count: int, light: Any, mark: Any, at: int) -> None:
     """Light by weight, of the vertices without a mark; where all have one, of those with a colour, else of all.
 
@@ -298,16 +306,9 @@ def _differences(
                 differences[count] = rows[0, _VALUE] - rows[1, _VALUE]
                 noise[count] = rows[0, _NOISE] + rows[1, _NOISE]
                 j, k = int(rows[0, _VIEW]), int(rows[1, _VIEW])
-                x, y, z, nx, ny, nz = (
-                    points[at, 0],
-                    points[at, 1],
-                    points[at, 2],
-                    rows[0, _NX],
-                    rows[0, _NY],
-                    rows[0, _NZ],
-                )
-                apart = _pose_covariance(rule.poses, j, j, x, y, z, nx, ny, nz)
-                apart += _pose_covariance(rule.poses, k, k, x, y, z, nx, ny, nz)
-                by_poses[count] = apart - 2 * _pose_covariance(rule.poses, j, k, x, y, z, nx, ny, nz)
+                x, y, z = points[at, 0], points[at, 1], points[at, 2]
+                lever = _lever(rule.poses, x, y, z, rows[0, _NX], rows[0, _NY], rows[0, _NZ])
+                apart = _pose_covariance(rule.poses, j, j, lever) + _pose_covariance(rule.poses, k, k, lever)
+                by_poses[count] = apart - 2 * _pose_covariance(rule.poses, j, k, lever)
                 count += 1
     return differences[:count], noise[:count], by_poses[:count]
