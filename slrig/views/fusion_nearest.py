@@ -50,17 +50,18 @@ class _Reach(NamedTuple):
 
 
 def _nearest(sheets: Sheets, grid: Grid, points: FloatArray, cells: IntArray, reach: _Reach) -> IntArray:
-    first_point = np.full(CELLS * len(grid.keys), -1, dtype=np.int32)
-    first_point[cells[::-1]] = np.arange(len(cells), dtype=np.int32)[::-1]
+    # Of each cell, and one more: points of a row of cells are those from its first to before the next row's first.
+    first_point = np.zeros(CELLS * len(grid.keys) + 1, dtype=np.int32)
+    np.cumsum(np.bincount(cells, minlength=len(first_point) - 1), out=first_point[1:])
     views = len(sheets.first_face) - 1
     nearest = np.full((views, len(points)), -1, dtype=np.int32)
-    in_bands(_nearest_faces, views, sheets, grid, points, cells, first_point, reach, nearest)
+    in_bands(_nearest_faces, views, sheets, grid, points, first_point, reach, nearest)
     return nearest
 
 
 @kernel(in_every_scan=False)
 def _nearest_faces(
-    first: int, last: int, sheets: Any, grid: Any, points: Any, cells: Any, first_point: Any, reach: Any,
+    first: int, last: int, sheets: Any, grid: Any, points: Any, first_point: Any, reach: Any,
     nearest: Any,
 ) -> None:  # fmt: skip
     corners, faces, origin, keys, voxel = sheets.points_mm, sheets.faces, grid.origin_mm, grid.keys, grid.voxel_mm
@@ -105,28 +106,23 @@ def _nearest_faces(
                             for x in range(max(x_low - 8 * bx, 0), min(x_high - 8 * bx, 7) + 1):
                                 for y in range(max(y_low - 8 * by, 0), min(y_high - 8 * by, 7) + 1):
                                     row = CELLS * brick + 64 * x + 8 * y
-                                    for cell in range(row + z_begin, row + z_end + 1):
-                                        at = first_point[cell]
-                                        while at >= 0:
-                                            gap = gaps[at]
-                                            px, py, pz = points[at, 0], points[at, 1], points[at, 2]
-                                            dx, dy, dz = px - ax, py - ay, pz - az
-                                            if corner < 3:
-                                                gap2 = dx * dx + dy * dy + dz * dz
-                                            else:
-                                                height = nx * dx + ny * dy + nz * dz
-                                                aside = max(sx * dx + sy * dy + sz * dz, tx * dx + ty * dy + tz * dz)
-                                                aside = max(aside, wx * dx + wy * dy + wz * dz - third, 0.0)
-                                                gap2 = height * height + aside * aside  # at least
+                                    for at in range(first_point[row + z_begin], first_point[row + z_end + 1]):
+                                        gap = gaps[at]
+                                        px, py, pz = points[at, 0], points[at, 1], points[at, 2]
+                                        dx, dy, dz = px - ax, py - ay, pz - az
+                                        if corner < 3:
+                                            gap2 = dx * dx + dy * dy + dz * dz
+                                        else:
+                                            height = nx * dx + ny * dy + nz * dz
+                                            aside = max(sx * dx + sy * dy + sz * dz, tx * dx + ty * dy + tz * dz)
+                                            aside = max(aside, wx * dx + wy * dy + wz * dz - third, 0.0)
+                                            gap2 = height * height + aside * aside  # at least
+                                        if gap2 < gap * gap:
+                                            if corner == 3:
+                                                gap2 = on_triangle(px, py, pz, corners, a, b, c)[0]
                                             if gap2 < gap * gap:
-                                                if corner == 3:
-                                                    gap2 = on_triangle(px, py, pz, corners, a, b, c)[0]
-                                                if gap2 < gap * gap:
-                                                    gaps[at] = np.sqrt(gap2)
-                                                    nearest[view, at] = face
-                                            at += 1
-                                            if at == len(cells) or cells[at] != cell:
-                                                break
+                                                gaps[at] = np.sqrt(gap2)
+                                                nearest[view, at] = face
 
 
 @kernel_part(inline="always")
