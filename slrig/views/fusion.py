@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import InvalidInputError, NothingToReconstructError
+from slrig.kernels import in_bands, kernel
 from slrig.meshing.boundary import smoothed
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.optimisation import optimised
@@ -51,6 +53,9 @@ _FINEST = 0.2  # of the views' sampling; work and memory rise with its square
 _FURTHEST = 0.75  # voxels from a cell's vertex to a sharp edge through the cell
 _BORDER = 4.0  # voxels over which a view's weight rises from its border: no step where it ends, and edges are worse
 _LONGEST_EDGE = 3.0  # voxels; a cell's vertex and those beside it are at most 2√2 apart
+_HALVES = np.array([[[0, 1, 3], [1, 2, 3]], [[0, 1, 2], [0, 2, 3]]])
+"""Corners of a quadrangle's two triangles, along its second diagonal and along its first."""
+_OUTWARD, _FOLDED = 1, 2  # how a triangle faces that was seen
 _FEWEST_TRIANGLES = 20  # of a piece: fewer are dust, and of a false layer: fewer are folds
 
 
@@ -149,17 +154,38 @@ def _sound(points: FloatArray, quads: IntArray, means: Means) -> IntArray:
 
     Those are beyond what was seen, or run through a place where the views' field jumps: they face the wrong way.
     """
-    a, b, c, d = quads.T
-    across = ((points[a] - points[c]) ** 2).sum(axis=1) <= ((points[b] - points[d]) ** 2).sum(axis=1)
-    halves = np.where(across[:, None, None], quads[:, [[0, 1, 2], [0, 2, 3]]], quads[:, [[0, 1, 3], [1, 2, 3]]])
-    faces = halves.reshape(-1, 3)
-    a, b, c = faces.T
-    facing = np.cross(points[b] - points[a], points[c] - points[a])
-    along = np.stack([np.einsum("ij,ij->i", facing, means.normals[each]) for each in (a, b, c)])
-    # NaN, where no view counts, makes the largest NaN. A few triangles folded over at a sharp edge are no false layer.
-    seen, facing_out = np.isfinite(along).all(axis=0), along.max(axis=0) > 0
-    folded = seen & ~facing_out
-    return np.ascontiguousarray(faces[facing_out | folded & (component_sizes(faces, folded) < _FEWEST_TRIANGLES)])
+    faces, facing = np.zeros((2 * len(quads), 3), dtype=np.int32), np.zeros(2 * len(quads), dtype=np.uint8)
+    in_bands(_halve, len(quads), quads, points, means.normals, faces, facing)
+    # A few triangles folded over at a sharp edge are no false layer.
+    folded = facing == _FOLDED
+    return np.ascontiguousarray(
+        faces[(facing == _OUTWARD) | folded & (component_sizes(faces, folded) < _FEWEST_TRIANGLES)]
+    )
+
+
+@kernel(in_every_scan=False)
+def _halve(first: int, last: int, quads: Any, points: Any, normals: Any, faces: Any, facing: Any) -> None:
+    """Both triangles of each quadrangle, and whether one faces as the normal of a corner does; neither with a NaN."""
+    for quad in range(first, last):
+        one, other = 0.0, 0.0
+        for axis in range(3):
+            one += (points[quads[quad, 0], axis] - points[quads[quad, 2], axis]) ** 2
+            other += (points[quads[quad, 1], axis] - points[quads[quad, 3], axis]) ** 2
+        for half in range(2):
+            face = 2 * quad + half
+            for corner in range(3):
+                faces[face, corner] = quads[quad, _HALVES[int(one <= other), half, corner]]
+            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+            ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+            vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            seen, outward = True, False
+            for corner in range(3):
+                normal = faces[face, corner]
+                along = nx * normals[normal, 0] + ny * normals[normal, 1] + nz * normals[normal, 2]
+                seen &= not np.isnan(along)
+                outward |= along > 0.0
+            facing[face] = 0 if not seen else _OUTWARD if outward else _FOLDED
 
 
 def _mended(points: FloatArray, faces: IntArray, voxel_mm: float) -> IntArray:

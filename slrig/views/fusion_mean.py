@@ -157,7 +157,7 @@ def _view_at(sheets: Any, face: int, x: float, y: float, z: float, rule: Any, ro
 
 @kernel_part(borrows=True)
 def _lever(poses: Any, x: float, y: float, z: float, nx: float, ny: float, nz: float) -> Any:
-    """g of a point and a normal."""
+    """What g is at a point, along a normal."""
     x, y, z = x - poses.middle_mm[0], y - poses.middle_mm[1], z - poses.middle_mm[2]
     return y * nz - z * ny, z * nx - x * nz, x * ny - y * nx, nx, ny, nz
 

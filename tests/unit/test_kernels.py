@@ -9,14 +9,14 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from numba import config
 
 from slrig import kernels
-from slrig.kernels import all_kept, compilations_told, in_bands, kernel
+from slrig.kernels import all_kept, compilations_told, in_bands, kernel, kernel_part
 
 _ADDS = """
 from slrig.kernels import kernel, kernel_part
@@ -224,3 +224,30 @@ def test_kernels_share_a_busy_machine() -> None:
             process.wait()
     # Half of each core would be 2. Where threads wait for one another by spinning it was 500.
     assert quiet / loaded < 10
+
+
+class _Held(NamedTuple):
+    values: Any
+    factors: Any
+
+
+@kernel_part(borrows=True)
+def _product(held: Any, at: int) -> float:
+    if held.values[at] < 0.0:
+        return 0.0
+    product: float = held.values[at] * held.factors[at]
+    return product
+
+
+@kernel(in_every_scan=False)
+def _products(held: Any, out: Any) -> None:
+    for at in range(len(out)):
+        out[at] = _product(held, at)
+
+
+@pytest.mark.skipif(bool(config.DISABLE_JIT), reason="nothing is compiled")
+def test_a_part_that_borrows_counts_no_references() -> None:
+    held, out = _Held(np.array([2.0, -1.0]), np.array([3.0, 4.0])), np.zeros(2)
+    _products(held, out)
+    np.testing.assert_array_equal(out, [6.0, 0.0])
+    assert not any("NRT_incref" in code for code in _product.inspect_llvm().values())

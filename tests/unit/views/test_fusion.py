@@ -13,7 +13,9 @@ from slrig.meshing.search_tree import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import AlbedoMark, FloatArray, Mesh
 from slrig.model.srgb import light_of, srgb_of
-from slrig.views.fusion import FusedModel, fused
+from slrig.views.fusion import _FOLDED, _OUTWARD, FusedModel, _halve, fused
+from slrig.views.fusion_mean import PoseErrors, Rule, mean_values
+from slrig.views.fusion_sheets import sheets
 from tests.unit.views.known_views import Noise, View, around, plate_on_box, star, views_of
 
 QUIET = Noise(sigma_mm=0.001, slow_mm=0.0)
@@ -199,3 +201,54 @@ def test_what_cannot_be_fused_is_refused() -> None:
         fused([crossed], [pose])
     with pytest.raises(NothingToReconstructError, match="1 views, and none has a triangle"):
         fused([replace(view, sigma_mm=np.full_like(view.sigma_mm, np.nan))], [pose])
+
+
+def test_the_poses_part_of_a_variance_is_that_of_all_pairs_by_matrices() -> None:
+    random = np.random.default_rng(4)
+    views = [sheet(0.001 * k) for k in range(4)]
+    root, middle = random.normal(size=(24, 24)) * 1e-3, np.array([1.0, -2.0, 0.5])
+    seen = sheets(views, [np.eye(4)] * 4, inset_mm=0.5)
+    points = np.array([[0.1, 0.2, 0.0], [1.3, -0.7, 0.01], [-2.1, 1.9, -0.01]])
+    nearest = np.array(
+        [
+            [
+                first + np.argmin(((view.vertices_mm[view.faces].mean(axis=1) - point) ** 2).sum(axis=1))
+                for point in points
+            ]
+            for first, view in zip(seen.first_face[:-1], views, strict=True)
+        ],
+        dtype=np.int32,
+    )
+
+    def variance(covariance: FloatArray) -> FloatArray:
+        rule = Rule(0.001, 0.001, 0.0, 1.0, 0.5, PoseErrors(covariance, middle))
+        return np.asarray(mean_values(seen, points, nearest, rule, values_only=False).sigma_mm ** 2)
+
+    normal = np.array([0.0, 0.0, 1.0])
+    g = np.hstack([np.cross(points - middle, normal), np.tile(normal, (3, 1))])
+    # All four views count alike.
+    levers = np.tile(g, (1, 4)) / 4
+    expected = np.einsum("ni,ij,nj->n", levers, root @ root.T, levers)
+    np.testing.assert_allclose(variance(root @ root.T) - variance(np.zeros((24, 24))), expected, rtol=1e-9)
+
+
+def test_quadrangles_are_halved_and_judged_as_by_arrays() -> None:
+    random = np.random.default_rng(5)
+    points, normals = random.normal(size=(2, 60, 3))
+    points[7], normals[11] = np.nan, np.nan
+    quads = np.stack([random.permutation(60)[:4] for _ in range(500)]).astype(np.int32)
+    faces, facing = np.zeros((1000, 3), np.int32), np.full(1000, 9, np.uint8)
+    _halve(0, 500, quads, points, normals, faces, facing)
+
+    a, b, c, d = quads.T
+    across = ((points[a] - points[c]) ** 2).sum(axis=1) <= ((points[b] - points[d]) ** 2).sum(axis=1)
+    halves = np.where(across[:, None, None], quads[:, [[0, 1, 2], [0, 2, 3]]], quads[:, [[0, 1, 3], [1, 2, 3]]])
+    np.testing.assert_array_equal(faces, halves.reshape(-1, 3))
+    a, b, c = faces.T
+    along = np.stack(
+        [(np.cross(points[b] - points[a], points[c] - points[a]) * normals[each]).sum(axis=1) for each in (a, b, c)]
+    )
+    unseen = np.isnan(along).any(axis=0)
+    expected = np.where(unseen, 0, np.where((along > 0).any(axis=0), _OUTWARD, _FOLDED))
+    np.testing.assert_array_equal(facing, expected)
+    assert set(expected) == {0, _OUTWARD, _FOLDED}
