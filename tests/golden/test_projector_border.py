@@ -52,7 +52,9 @@ def test_lines_near_the_border_are_no_worse_than_they_state(points: tuple[Points
     assert beside.sum() > 2000
     for at in np.unique(distance[beside]):
         here = distance == at
-        assert rms(found.error_px[here]) < rms(found.stated_px[here]), f"{at} columns from the border"
+        # Two standard deviations of a root mean square of so many.
+        most = 1 + 2 / np.sqrt(2 * here.sum())
+        assert rms(found.error_px[here]) < most * rms(found.stated_px[here]), f"{at} columns from the border"
 
 
 def test_only_the_lines_beside_the_border_are_left_out(points: tuple[Points, FloatArray]) -> None:
