@@ -78,6 +78,7 @@ def in_one_line(words: str) -> str:
 def test_the_login_is_told_to_nobody(postgres: Postgres, tmp_path: Path) -> None:
     login = tmp_path / "login"
     login.write_text(LOGIN + "\n")
+    login.chmod(0o644)
     settings = tmp_path / "settings.toml"
     settings.write_text(f'catalogue = "{postgres.address("cli")}"\ncatalogue_login_file = "login"\n')
     told = CliRunner().invoke(app, ["fleet", "--settings", str(settings)])
