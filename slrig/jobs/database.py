@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import random
+import sqlite3
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +15,7 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine, MetaData, create_engine, event
-from sqlalchemy.engine.interfaces import DBAPIConnection
+from sqlalchemy.engine.interfaces import DBAPIConnection, DBAPICursor
 from sqlalchemy.exc import DatabaseError, OperationalError
 from sqlalchemy.orm import Session
 
@@ -116,9 +119,28 @@ def _set_up(connection: DBAPIConnection, _record: object) -> None:
     # The driver begins no transactions of its own: `_begin` does.
     connection.isolation_level = None
     cursor = connection.cursor()
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"busy_timeout={int(1000 * PATIENCE_S)}"):
+    for pragma in (f"busy_timeout={int(1000 * PATIENCE_S)}", "synchronous=FULL", "foreign_keys=ON"):
         cursor.execute(f"PRAGMA {pragma}")
+    _begin_log(cursor)
     cursor.close()
+
+
+def _begin_log(cursor: DBAPICursor) -> None:
+    """Have the file keep a write-ahead log, as it does ever after.
+
+    Of programs that do so at the same moment SQLite refuses all but one at once, whatever its `busy_timeout`: those
+    hold locks that the one waits for. They let theirs go and ask again.
+    """
+    given_up = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            cursor.execute("PRAGMA journal_mode=WAL")
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > given_up:
+                raise
+        else:
+            return
+        time.sleep(random.uniform(0.001, 0.02))  # not all at the same moment again
 
 
 def _begin(connection: Connection) -> None:

@@ -11,7 +11,7 @@ from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, text
 
 from slrig.errors import StorageError
-from slrig.jobs.database import Database
+from slrig.jobs.database import Database, sqlite_engine
 from slrig.jobs.tables import Base
 
 
@@ -37,6 +37,27 @@ def test_what_a_power_cut_may_undo_is_not_brought_to_disk_by_itself(path: Path) 
             found.append(session.scalar(text("PRAGMA synchronous")))
     database.close()
     assert found == [2, 1, 2]  # FULL, NORMAL
+
+
+def test_programs_that_open_a_new_file_together_wait_for_one_another(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with sqlite3.connect(path) as other:
+        other.execute("CREATE TABLE other_program (number INTEGER)")
+    other.execute("BEGIN IMMEDIATE")
+    waits: list[float] = []
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        other.rollback()
+
+    monkeypatch.setattr("slrig.jobs.database.time.sleep", wait)
+    engine = sqlite_engine(path)
+    with engine.connect() as connection:
+        assert connection.execute(text("PRAGMA journal_mode")).scalar() == "wal"
+    engine.dispose()
+    other.close()
+    assert len(waits) == 1
 
 
 def test_file_that_is_no_database_is_refused(path: Path) -> None:
