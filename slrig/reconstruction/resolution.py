@@ -34,7 +34,6 @@ _LEAST_FOUND = 0.5
 _FEWEST_LINES = 200
 """Points to be found in a block and its neighbours; fewer tell nothing."""
 _WIDEST_STEP = 2.0  # cells from pixel to pixel; more is a step of depth
-_DRAWN = 4  # every so many rows and columns are counted
 
 
 def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np.uint8]:
@@ -79,9 +78,8 @@ def lost_lines(
     shape = code.refusal.shape
     cell = np.where(usable & (code.refusal == 0), code.lowest + code.highest, np.float32(np.nan)) / 2
     wanted = np.maximum(_passed(cell), _passed(cell.T).T) * lines_per_cell
-    columns, rows = (np.rint(points_px[::_DRAWN]).astype(np.intp) // BLOCK_PX).T
-    drawn = np.bincount(rows * wanted.shape[1] + columns, minlength=wanted.size)
-    found = _DRAWN * drawn.reshape(wanted.shape)
+    columns, rows = (np.rint(points_px).astype(np.intp) // BLOCK_PX).T
+    found = np.bincount(rows * wanted.shape[1] + columns, minlength=wanted.size).reshape(wanted.shape)
     wanted, found = _with_neighbours(wanted), _with_neighbours(found)
     lost = (found < _LEAST_FOUND * wanted) & (wanted >= _FEWEST_LINES)
     if not lost.any():
@@ -92,11 +90,10 @@ def lost_lines(
 
 def _passed(cell: FloatArray) -> FloatArray:
     """(block rows, block columns): cells of the code passed on the way along the rows of each block."""
-    drawn = cell[::_DRAWN]
-    steps = np.abs(np.diff(drawn, axis=1, prepend=np.nan))
+    steps = np.abs(np.diff(cell, axis=1, prepend=np.nan))
     steps[~(steps <= _WIDEST_STEP)] = 0
-    starts = [np.arange(0, extent, BLOCK_PX // each) for extent, each in zip(drawn.shape, (_DRAWN, 1), strict=True)]
-    return _DRAWN * np.add.reduceat(np.add.reduceat(steps, starts[0], axis=0), starts[1], axis=1).astype(np.float64)
+    rows, columns = (np.arange(0, extent, BLOCK_PX) for extent in cell.shape)
+    return np.add.reduceat(np.add.reduceat(steps, rows, axis=0), columns, axis=1).astype(np.float64)
 
 
 def _tally(word: NDArray[np.int32], lit: NDArray[np.bool_], finest: int) -> NDArray[np.int64]:
