@@ -29,6 +29,9 @@ _WIDE, _NARROW = 4, 2  # px either way
 # Of what is not usable round a window: at the projector's own border the last usable pixels still miss some of their
 # light, and that looks like a bend (points 3 columns from it erred by 12 % more).
 _CLEAR_PX = 1
+# Up to which a pixel without a whole window has that of a neighbour. Beside a straight border 3 are needed. Where the
+# neighbour's surface does not go on to the pixel, its bends say nothing there.
+_BESIDE_PX = 4
 _APART = 3.0  # standard deviations: the two windows see two surfaces, or one that bends within the wide one
 _DOUBT = 4.0  # squared: a shift of two standard deviations counts by half
 
@@ -43,7 +46,8 @@ def freed_of_curvature(
 
     Derivatives are those of a quadratic surface fitted to 9 x 9 pixels; where it does not explain the 5 x 5 in the
     middle, or where a window is not wholly usable, to those. A shift d counts d⁴/(d⁴ + 16 σ⁴), σ its standard
-    deviation by noise, so that an even surface keeps its noise. Beside borders positions stay as they are.
+    deviation by noise, so that an even surface keeps its noise. A pixel beside a border has the shift at the nearest
+    5 x 5 window that is whole, if that one's surface goes on to it.
     """
     mask = (usable & np.isfinite(seen.position)).view(np.uint8)
     wide, narrow = (
@@ -52,6 +56,7 @@ def freed_of_curvature(
     turn = (2 * np.pi / period_px) ** 2 * blur_variance
     freed = seen.position.copy()
     in_bands(_curvature_kernel, len(freed), *seen, wide, narrow, float(blur_variance), turn, freed)
+    in_bands(_border_kernel, len(freed), *seen, mask, narrow, float(blur_variance), turn, freed)
     return PositionMap(freed, seen.sigma)
 
 
@@ -78,9 +83,72 @@ def _curvature_kernel(
                 smooth = _shift(broad, x, variance, turn)
                 if abs(smooth - shift) <= _APART * noise:
                     shift, noise = smooth, broad_gain * sigma[y, x]
-            fourth, doubt = shift**4, (_DOUBT * noise * noise) ** 2
-            if fourth > 0:
-                out[y, x] -= shift * (fourth / (fourth + doubt))
+            out[y, x] -= _counted(shift, noise)
+
+
+@kernel
+def _border_kernel(
+    first: int, last: int, position: Any, sigma: Any, known: Any, narrow: Any, variance: float, turn: float, out: Any
+) -> None:
+    """Take from each position beside a border the shift at the nearest whole window."""
+    rows, columns = position.shape
+    derivatives = np.zeros((5, 1))
+    gain = variance * _gain(_NARROW)
+    for y in range(first, last):
+        for x in range(columns):
+            if narrow[y, x] or not known[y, x]:
+                continue
+            nearest, down, across = _BESIDE_PX**2 + 1, 0, 0
+            for dy in range(max(-_BESIDE_PX, -y), min(_BESIDE_PX, rows - 1 - y) + 1):
+                for dx in range(max(-_BESIDE_PX, -x), min(_BESIDE_PX, columns - 1 - x) + 1):
+                    if narrow[y + dy, x + dx] and dx * dx + dy * dy < nearest:
+                        nearest, down, across = dx * dx + dy * dy, dy, dx
+            if nearest > _BESIDE_PX**2:
+                continue
+            level = _derivatives_at(position, y + down, x + across, derivatives)
+            there, spread = _continued(level, derivatives, -across, -down)
+            if abs(position[y, x] - there) > _APART * spread * sigma[y, x]:
+                continue
+            out[y, x] -= _counted(_shift(derivatives, 0, variance, turn), gain * sigma[y, x])
+
+
+@kernel_part
+def _derivatives_at(position: Any, y: int, x: int, out: Any) -> float:
+    """Fill out, (5, 1), with the derivatives of one narrow window, as `_derivatives` has them. Returns the mean."""
+    count = 2 * _NARROW + 1
+    mean, second, bend = _squares(_NARROW)
+    out[:] = 0
+    level = 0.0
+    for dy in range(-_NARROW, _NARROW + 1):
+        for dx in range(-_NARROW, _NARROW + 1):
+            p = position[y + dy, x + dx]
+            level += p / count**2
+            out[0, 0] += p * dx / (count * second)
+            out[1, 0] += p * dy / (count * second)
+            out[2, 0] += p * 2 * (dx * dx - mean) / (count * bend)
+            out[3, 0] += p * dx * dy / (second * second)
+            out[4, 0] += p * 2 * (dy * dy - mean) / (count * bend)
+    return level
+
+
+@kernel_part
+def _continued(level: float, derivatives: Any, dx: int, dy: int) -> tuple[float, float]:
+    """Where the fitted surface is this far from its window's middle, and how far off a pixel there is by unit noise."""
+    count = 2 * _NARROW + 1
+    mean, second, bend = _squares(_NARROW)
+    gx, gy, xx, xy, yy = derivatives[:, 0]
+    across, down = dx * dx - mean, dy * dy - mean
+    there = level + gx * dx + gy * dy + xx * across / 2 + xy * dx * dy + yy * down / 2
+    variance = 1 + 1 / count**2 + (dx * dx + dy * dy) / (count * second)
+    variance += (across * across + down * down) / (count * bend) + (dx * dy / second) ** 2
+    return there, float(np.sqrt(variance))
+
+
+@kernel_part(inline="always")
+def _counted(shift: float, noise: float) -> float:
+    """How much of a shift counts whose standard deviation by noise is this."""
+    fourth, doubt = shift**4, (_DOUBT * noise * noise) ** 2
+    return shift * (fourth / (fourth + doubt)) if fourth > 0 else 0.0
 
 
 @kernel_part(inline="always")
