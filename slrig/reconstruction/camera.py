@@ -304,7 +304,10 @@ def _curves(
     lost = None
     if tables.edges_of is not None:
         per_cell = line_count * frames.gray.cell_px / frames.line_patterns[0].period_px
-        lost = lost_lines(numbered.stripes.points_px, coded.code, ~(near_shadow | near_step), per_cell)
+        clear = ~(near_shadow | near_step)
+        if coded.asked is not None:
+            clear &= coded.asked
+        lost = lost_lines(numbered.stripes.points_px, coded.code, clear, per_cell)
     if lost is not None and tables.edges_of is not None:
         del stripes, numbered
         entered("locate stripes")
