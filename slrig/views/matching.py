@@ -29,6 +29,11 @@ _NOISE_SIGMAS = 4.0
 _SPACINGS = 1.5
 """How far the nearest vertex may be along the surface where two views coincide, in edges of the mesh."""
 
+_BORDER_ROWS = 2
+"""Of vertices beside a border. What rims say, rounded by the camera's blur, errs alike in the views that see them:
+without these rows the worst view of a flange is 9 µm off, not 23, that of a box 7, not 18. Four rows of rendered scans
+leave 3 and 2 µm, but coarse ones, 0.7 mm apart, lose too much of a narrow overlap."""
+
 
 @dataclass(frozen=True, slots=True)
 class Side:
@@ -78,14 +83,14 @@ class Terms(NamedTuple):
 
 
 def side_of(view: Mesh) -> Side:
-    """A view prepared. Left out: the boundary, vertices without a normal or a deviation, clipped and grazing ones."""
+    """A view prepared. Left out: what lies beside borders, has no normal or deviation, is clipped or seen grazing."""
     points, normals = view.vertices_mm.astype(np.float64), view.normals.astype(np.float64)
     edges = points[view.faces[:, 0]] - points[view.faces[:, 1]]
     usable = (
         np.isfinite(normals[:, 0] + normals[:, 1] + normals[:, 2] + view.sigma_mm)  # one sum: an axis of three is slow
         & ~np.isin(view.mark, (AlbedoMark.SATURATED, AlbedoMark.GRAZING))
-        & ~boundary_vertices(view.faces, len(points))
     )
+    usable &= ~_beside_borders(view.faces, usable)
     return Side(
         points_mm=points,
         normals=normals,
@@ -97,6 +102,19 @@ def side_of(view: Mesh) -> Side:
         # Of 500 000 points: 0.3 of the time of the defaults, for faster answers.
         tree=cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False),
     )
+
+
+def _beside_borders(faces: IntArray, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(V,) bool: the border's vertices, and as many rows of them beside it as leave half of the usable ones."""
+    beside = boundary_vertices(faces, len(usable))
+    fewest = np.count_nonzero(usable & ~beside) / 2
+    for _ in range(_BORDER_ROWS):
+        wider = beside.copy()
+        wider[faces[beside[faces].any(axis=1)]] = True
+        if np.count_nonzero(usable & ~wider) < fewest:
+            break
+        beside = wider
+    return beside
 
 
 def moved(pose: FloatArray, points_mm: NDArray[np.floating[Any]]) -> FloatArray:
