@@ -82,7 +82,7 @@ class Terms(NamedTuple):
     gradient: FloatArray
 
 
-def side_of(view: Mesh) -> Side:
+def side_of(view: Mesh, *, border_rows: int = _BORDER_ROWS) -> Side:
     """A view prepared. Left out: what lies beside borders, has no normal or deviation, is clipped or seen grazing."""
     points, normals = view.vertices_mm.astype(np.float64), view.normals.astype(np.float64)
     edges = points[view.faces[:, 0]] - points[view.faces[:, 1]]
@@ -90,7 +90,7 @@ def side_of(view: Mesh) -> Side:
         np.isfinite(normals[:, 0] + normals[:, 1] + normals[:, 2] + view.sigma_mm)  # one sum: an axis of three is slow
         & ~np.isin(view.mark, (AlbedoMark.SATURATED, AlbedoMark.GRAZING))
     )
-    usable &= ~_beside_borders(view.faces, usable)
+    usable &= ~_beside_borders(view.faces, usable, border_rows)
     return Side(
         points_mm=points,
         normals=normals,
@@ -104,11 +104,11 @@ def side_of(view: Mesh) -> Side:
     )
 
 
-def _beside_borders(faces: IntArray, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _beside_borders(faces: IntArray, usable: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
     """(V,) bool: the border's vertices, and as many rows of them beside it as leave half of the usable ones."""
     beside = boundary_vertices(faces, len(usable))
     fewest = np.count_nonzero(usable & ~beside) / 2
-    for _ in range(_BORDER_ROWS):
+    for _ in range(rows):
         wider = beside.copy()
         wider[faces[beside[faces].any(axis=1)]] = True
         if np.count_nonzero(usable & ~wider) < fewest:
