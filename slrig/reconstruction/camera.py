@@ -304,9 +304,7 @@ def _curves(
     lost = None
     if tables.edges_of is not None:
         per_cell = line_count * frames.gray.cell_px / frames.line_patterns[0].period_px
-        clear = ~(near_shadow | near_step)
-        if coded.asked is not None:
-            clear &= coded.asked
+        clear = ~(near_shadow | near_step) & (True if coded.asked is None else coded.asked)
         lost = lost_lines(numbered.stripes.points_px, coded.code, clear, per_cell)
     if lost is not None and tables.edges_of is not None:
         del stripes, numbered
