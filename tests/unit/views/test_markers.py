@@ -123,5 +123,5 @@ def test_a_vase_is_held_where_markers_have_it_and_as_well_as_those_are_known() -
         off = [displacement_mm(*each) for each in zip(views, found.poses, turned.poses, strict=True)][1:]
         over.append(np.square(off / found.sigma_mm[1:]))
     # Along the free turn the error is the markers', and is stated: all but nothing of it is without their covariance.
-    assert (found.sigma_mm[1:] > 1.5 * registered(views, marked.poses).sigma_mm[1:]).all()
+    assert (found.sigma_mm[1:] > 2 * registered(views, marked.poses).sigma_mm[1:]).all()
     assert 0.2 < np.mean(over) < 2.5, over
