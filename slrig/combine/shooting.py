@@ -321,7 +321,8 @@ class ViewShooting:
         views = self._views(model_id, shoot)
         done = sum(view.good is not None for view in views)
         under_way = next((view for view in views if view.scans and not view.ended), None)
-        stage, detail = VIEW, f"view {1 if under_way is None else under_way.number} of {shoot.views}"
+        # Where none is under way the last has just ended, and the model comes next.
+        stage, detail = VIEW, f"view {(under_way or views[-1]).number} of {shoot.views}"
         if under_way is None and shoot.by_hand:
             stage, last = TURN, ([view for view in views if view.scans] or [views[0]])[-1]
             detail = (

@@ -29,7 +29,7 @@ from slrig.errors import (
 )
 from slrig.failure import failure_of
 from slrig.jobs.job import Holder, Job
-from slrig.jobs.records import JobRecord, JobState, utc_now
+from slrig.jobs.records import JobProgress, JobRecord, JobState, utc_now
 from slrig.jobs.rig_jobs import Recorded
 from slrig.rig.session import RigSession
 from slrig.scan.plan import ScanPlan
@@ -129,6 +129,18 @@ def test_all_views_are_shot_around_the_table_and_the_model_is_made_of_them(bench
     assert fractions == sorted(fractions)
     assert made.summary is not None
     assert "notes" not in made.summary
+
+
+def test_a_last_view_that_ends_before_it_is_told_is_no_first_one(
+    bench: ShootingBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model_id = started(bench)
+    shoot = plan_from_json(bench.over(model_id).plan).shoot
+    assert shoot is not None
+    told: list[JobProgress] = []
+    monkeypatch.setattr(bench.desk.jobs, "progress", lambda _, progress: told.append(progress))
+    bench.shooting._tell(model_id, shoot)
+    assert [each.detail for each in told] == ["view 4 of 4"]
 
 
 def test_a_view_that_fails_is_told_and_a_devices_fault_is_tried_twice_more(bench: ShootingBench) -> None:
