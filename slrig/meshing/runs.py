@@ -32,13 +32,14 @@ def parts_of_curves(
 
     Each step of a curve has the nearest curve beside it that is there at that place, at most `widest_step_px` away. So
     a curve that ends, where the camera does not resolve its bit any more, leaves its neighbours to one another, and
-    strips meet in the points that they share.
+    strips meet in the points that they share. Steps with nobody beside them go on in the strip next to them, as those
+    of whole curves do: a fan about the last point of the curve that ends.
 
     along_px : (n,) float64, rising along each curve; widest_gap_px : where its next point is further, a curve is not
     there in between.
     """
     pieces = [_pieces(along_px, begin, end, widest_gap_px) for begin, end in pairwise(offsets.tolist())]
-    found = _Runs(int(offsets[-1]))
+    found = _Runs(along_px, pieces)
     for curve, mine in enumerate(pieces):
         last = int(np.searchsorted(position_px, position_px[curve] + widest_step_px + 1e-9))
         for piece in mine:
@@ -61,11 +62,13 @@ def parts_of_curves(
 class _Runs:
     """The runs so far. Of each step the first strip on either side stands: sparse curves leave it to several."""
 
-    def __init__(self, point_count: int) -> None:
-        self._right, self._left = np.zeros((2, point_count), dtype=np.bool_)
+    def __init__(self, along_px: FloatArray, pieces: list[list[_Piece]]) -> None:
+        self._along_px = along_px
+        self._right, self._left = np.zeros((2, len(along_px)), dtype=np.bool_)
+        self._firsts, self._lasts = np.zeros((2, len(along_px)), dtype=np.bool_)
+        for piece in (piece for curve in pieces for piece in curve):
+            self._firsts[piece.first] = self._lasts[piece.last] = True
         self._runs: list[list[int]] = []
-        self._by_end: dict[tuple[int, int], list[int]] = {}
-        self._by_begin: dict[tuple[int, int], list[int]] = {}
 
     def add(self, i: int, last_i: int, j: int, last_j: int) -> None:
         """Add a run, but for the steps that have a strip already."""
@@ -75,21 +78,47 @@ class _Runs:
             return
         self._right[i:last_i] = True
         self._left[j:last_j] = True
-        # Two that share both ends are one strip.
-        before, after = self._by_end.pop((i, j), None), self._by_begin.pop((last_i, last_j), None)
-        run = [i, last_i, j, last_j]
-        if before is not None:
-            self._runs.remove(before)
-            run[0], run[2] = before[0], before[2]
-        if after is not None:
-            self._runs.remove(after)
-            run[1], run[3] = after[1], after[3]
-        self._runs.append(run)
-        self._by_begin[run[0], run[2]] = self._by_end[run[1], run[3]] = run
+        self._runs.append([i, last_i, j, last_j])
 
     def joined(self) -> IntArray:
-        """(s, 4) int32."""
-        return np.array(self._runs, dtype=np.int32).reshape(-1, 4)
+        """(s, 4) int32: with the free steps before and behind each; two that share both ends are one strip."""
+        runs = np.array(self._runs, dtype=np.int32).reshape(-1, 4)
+        first, second = runs[:, :2], runs[:, 2:]
+        runs = np.hstack([self._extended(first, second, self._right), self._extended(second, first, self._left)])
+        strips: list[list[int]] = []
+        by_end: dict[tuple[int, int], list[int]] = {}
+        for i, last_i, j, last_j in sorted(runs.tolist()):
+            strip = by_end.pop((i, j), None)
+            if strip is None:
+                strips.append(strip := [i, last_i, j, last_j])
+            else:
+                strip[1], strip[3] = last_i, last_j
+            by_end[last_i, last_j] = strip
+        return np.array(strips, dtype=np.int32).reshape(-1, 4)
+
+    def _extended(self, part: IntArray, other: IntArray, taken: NDArray[np.bool_]) -> IntArray:
+        """(s, 2) int32: parts with the free steps on to the end of the curve's piece, or half way to the next strip.
+
+        part, other : (s, 2), first and last points, and those on the curve beside; taken : (n,) bool, each step.
+        """
+        held = np.zeros(len(taken), dtype=np.bool_)
+        held[part] = True
+        points = np.arange(len(taken), dtype=np.int32)
+        stops = held | self._firsts | self._lasts
+        before = np.maximum.accumulate(np.where(stops, points, 0))
+        behind = np.minimum.accumulate(np.where(stops, points, len(taken))[::-1])[::-1]
+        longer = part.copy()
+        for side, sign, ends in ((0, -1, self._firsts), (1, 1, self._lasts)):
+            # Of several strips that end in one point, that which is furthest.
+            order = np.lexsort((sign * self._along_px[other[:, side]], part[:, side]))
+            at = part[order, side]
+            furthest = np.append(at[1:] != at[:-1], True)
+            mine, at = order[furthest], at[furthest]
+            free = ~taken[at - (sign < 0)] & ~ends[at]
+            mine, at = mine[free], at[free]
+            to = before[at - 1] if sign < 0 else behind[at + 1]
+            longer[mine, side] = np.where(held[to], (at + to) // 2, to)
+        return longer
 
 
 def _free(taken: NDArray[np.bool_], first: int, last: int) -> tuple[int, int]:
@@ -108,6 +137,11 @@ class _Piece:
 
     first: int
     along_px: FloatArray
+
+    @property
+    def last(self) -> int:
+        """The number of its last point."""
+        return self.first + len(self.along_px) - 1
 
     def beside(
         self, other: _Piece, after: float, before: float

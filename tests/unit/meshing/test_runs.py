@@ -33,8 +33,8 @@ def test_where_a_curve_ends_its_neighbours_are_joined() -> None:
     places = [float(k) for k in range(6)]
     # The one in the middle is there from 0 to 2: beyond, the others meet, from the points that its strips end in.
     assert parts(places, places[:3], places) == [[0, 2, 6, 8], [2, 5, 11, 14], [6, 8, 9, 11]]
-    # And not if they are too far apart.
-    assert parts(places, places[:3], places, widest_step_px=1.0) == [[0, 2, 6, 8], [6, 8, 9, 11]]
+    # And not if they are too far apart: the rest of each is a fan about its last point.
+    assert parts(places, places[:3], places, widest_step_px=1.0) == [[0, 5, 6, 8], [6, 8, 9, 14]]
 
 
 def test_a_gap_in_a_curve_is_closed_by_its_neighbours() -> None:
@@ -44,6 +44,22 @@ def test_a_gap_in_a_curve_is_closed_by_its_neighbours() -> None:
     assert [2, 7, 18, 23] in runs
     assert len(runs) == 5
     assert parts(places, torn, places, widest_gap_px=6.0) == [[0, 9, 10, 15], [10, 15, 16, 25]]
+
+
+def test_between_two_parts_beside_it_each_has_half_of_a_curve() -> None:
+    places = [float(k) for k in range(11)]
+    torn = [0.0, 1.0, 2.0, 8.0, 9.0, 10.0]
+    assert parts(places, torn, widest_step_px=1.0) == [[0, 5, 11, 13], [5, 10, 14, 16]]
+    assert parts(torn, places, widest_step_px=1.0) == [[0, 2, 6, 11], [3, 5, 11, 16]]
+
+
+def test_curves_without_gaps_are_joined_to_their_ends() -> None:
+    rng = np.random.default_rng(4)
+    first, last = rng.integers(0, 8, 30), rng.integers(12, 30, 30)
+    along = [np.arange(a, b, dtype=np.float64) for a, b in zip(first, last, strict=True)]
+    offsets = np.concatenate([[0], np.cumsum(last - first)]).astype(np.int32)
+    whole = whole_curves(neighbouring_curves(np.arange(30.0), offsets, widest_step_px=1.0), offsets)
+    assert parts(*(each.tolist() for each in along), widest_step_px=1.0) == whole.tolist()
 
 
 def torn_curves(seed: int) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
