@@ -87,6 +87,7 @@ def document(result: AcceptanceResult) -> dict[str, object]:
             }
             for each in result.verdicts
         ],
+        "scale": result.scale,
         "positions": [
             {
                 "name": step.name,

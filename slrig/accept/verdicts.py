@@ -10,6 +10,7 @@ import numpy as np
 
 from slrig.accept.evaluation import Reading
 from slrig.accept.plan import AcceptancePlan, Quantity
+from slrig.accept.scale import Scale, scale_by_bar
 from slrig.accept.uncertainty import ErrorUncertainty, error_uncertainty
 from slrig.calibration.artefacts import Decision, decision
 from slrig.model import Calibration
@@ -53,6 +54,11 @@ class AcceptanceResult:
             if worst in told:
                 return worst
         return Decision.PASSES
+
+    @property
+    def scale(self) -> Scale | None:
+        """Whether everything measures too long or too short; None where the bar was not measured, or in few places."""
+        return scale_by_bar(self.readings, self.plan.artefacts)
 
     @property
     def complete(self) -> bool:

@@ -37,6 +37,7 @@ from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
 from slrig.logs import set_up_logs_for_a_person
+from slrig.reports.page import begun
 
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 
@@ -162,6 +163,8 @@ def tell(result: AcceptanceResult, console: Console) -> None:
     console.print(table)
     figures = document(result)
     console.print(f"L0 {result.plan.diagonal_mm:.1f} mm. {figures['manner']}", markup=False, style="dim")
+    if result.scale is not None and result.scale.words is not None:
+        console.print(Text(f"{begun(result.scale.words)}.", style=_COLOURS[Decision.FAILS]))
     console.print(Text(f"The rig {result.decision.value}.", style=_COLOURS[result.decision]))
 
 

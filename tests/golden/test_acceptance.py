@@ -146,3 +146,6 @@ def test_the_whole_test_of_a_rendered_rig(tmp_path: Path) -> None:
     written = json.loads((tmp_path / "out" / "report.json").read_text())
     assert written["complete"]
     assert written["decision"] == result.decision
+    assert written["scale"]["places"] == 7
+    assert written["scale"]["words"] is None
+    assert abs(written["scale"]["share"]) < 1e-4

@@ -25,9 +25,10 @@ from slrig.calibration.solution import (
 from slrig.errors import setting
 from slrig.model import Calibration, FloatArray, Pinhole
 
-_LEAST_OFF = 0.001
+LEAST_OFF = 0.001
 """What a board in a box, a warm day and a rig that was touched may do to a distance, over itself."""
-_SURE = 5.0
+SURE = 5.0
+"""Standard deviations of a share from which it is told."""
 _TURNED_DEG = 1.0
 _POSE = PARAMETERS.index("turn_x")
 _EACH = len(PARAMETERS)
@@ -76,12 +77,12 @@ def check_scale(solution: Solution, earlier: Calibration, board: Board) -> Scale
         sigmas.append(float(np.sqrt(variance)) / old_mm)
         told.append(f"{device_title(first)} to {device_title(second)}: {new_mm:.2f} mm, before {old_mm:.2f} mm")
     share, sigma = float(np.mean(shares)), max(sigmas)
-    off = [abs(each) > max(_LEAST_OFF, _SURE * own_sigma) for each, own_sigma in zip(shares, sigmas, strict=True)]
+    off = [abs(each) > max(LEAST_OFF, SURE * own_sigma) for each, own_sigma in zip(shares, sigmas, strict=True)]
     if not any(off):
         return ScaleCheck(True, share, sigma, ())
     changed = "; ".join(words for words, wrong in zip(told, off, strict=True) if wrong)
     turned = any(_turned_deg(now, before, *pair) > _TURNED_DEG for pair in pairs)
-    alike = max(shares) - min(shares) <= max(_LEAST_OFF, _SURE * sigma)
+    alike = max(shares) - min(shares) <= max(LEAST_OFF, SURE * sigma)
     if all(off) and alike and not turned:
         words = (
             f"everything is {abs(share):.2%} {'larger' if share > 0 else 'smaller'} than in the earlier calibration "
@@ -100,7 +101,7 @@ def check_scale(solution: Solution, earlier: Calibration, board: Board) -> Scale
 def judged_size(solution: Solution, scale: ScaleCheck | None) -> Iterator[Judgement]:
     """What is to be said of a print's stretch, and of the scale where it was held against another one."""
     size = solution.size
-    if abs(size.stretch) > max(_LEAST_OFF, _SURE * size.stretch_sigma):
+    if abs(size.stretch) > max(LEAST_OFF, SURE * size.stretch_sigma):
         longer, shorter = ("wider", "high") if size.stretch > 0 else ("higher", "wide")
         words = (
             f"the print is {abs(size.stretch):.2%} ± {size.stretch_sigma:.2%} {longer} than it is {shorter}, against "
