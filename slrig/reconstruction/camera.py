@@ -268,7 +268,7 @@ def _placed(coded: Coded, found: list[LinePoints], scales: _Scales, tables: Code
         near_step = near_steps(seen, resolution_px, limits.edges)
         usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
         seen = freed_of_curvature(seen, usable, blur_px**2, frames.line_patterns[0].period_px)
-        refinement = refined(found, seen, usable, code, tables.position_of)
+        refinement = refined(found, seen, usable, code, tables.position_of, near_step=near_step)
         disagreement_px = refinement.disagreement_px
         if np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px:
             code = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)

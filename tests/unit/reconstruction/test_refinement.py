@@ -218,6 +218,24 @@ def test_mixed_light_and_pixels_of_two_lines_give_no_points() -> None:
     assert lost > 100
 
 
+def test_points_beside_a_step_stay_and_state_what_light_of_the_other_side_does() -> None:
+    here, code = mapped(tilted(1.0, 0.0), noise=0.01)
+    step = np.zeros(SHAPE, dtype=np.bool_)
+    step[:, 40] = True
+    usable = ~step
+    plain = refined([NONE] * 8, here, usable, code, POSITION_OF)
+    stated = refined([NONE] * 8, here, usable, code, POSITION_OF, near_step=step)
+    beside = 0
+    for one, other in zip(plain.points, stated.points, strict=True):
+        np.testing.assert_array_equal(one.points_px, other.points_px)
+        np.testing.assert_array_equal(one.strength, other.strength)
+        off = np.abs(np.rint(one.points_px[:, 0]) - 40)
+        more = np.sqrt(np.maximum(other.sigma_px**2 - one.sigma_px**2, 0))
+        np.testing.assert_allclose(more, np.select([off == 1, off == 2], [0.04, 0.015], 0.0), atol=1e-6)
+        beside += int((off == 1).sum())
+    assert beside > 10
+
+
 def test_points_too_coarse_to_use_are_left_out() -> None:
     here, code = mapped(tilted(0.9, 0.3), noise=0.3)
     frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)
