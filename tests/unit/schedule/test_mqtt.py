@@ -134,7 +134,8 @@ def test_certificate_counts_where_its_authority_is_known(tmp_path: Path, monkeyp
     bench.put("job.ended", "1")
     with structlog.testing.capture_logs() as log:
         assert bench.broker.step() == 1
-    assert [line["cause"] for line in log] == ["SSLCertVerificationError"]
+    # Threads of other tests may still log.
+    assert [line["cause"] for line in log if "cause" in line] == ["SSLCertVerificationError"]
     monkeypatch.setenv("SSL_CERT_FILE", str(pem))
     bench.broker = Broker(bench.outbox, broker.url, LOGIN)
     bench.empty()
