@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -62,12 +63,21 @@ def rig_options(seed: int) -> dict[str, Any]:
     return options
 
 
-def solved(options: dict[str, Any], folder: Path) -> tuple[Solution, Calibration, list[str]]:
+def solved(
+    options: dict[str, Any],
+    folder: Path,
+    *,
+    board: Board = BOARD,
+    more: str = "",
+    spoil: Callable[[Path], None] = lambda _bundle: None,
+) -> tuple[Solution, Calibration, list[str]]:
     """Shoot, read and solve all poses of a rig: the solution and the truth, both in the first camera's frame; and why
     poses were refused, as they are in a session, which goes on without them.
+
+    more : of the board's table in the scene; spoil : what is done to the frames of each pose before they are read.
     """
     seen, refused = [], []
-    head = board_head(folder, options, board_scene("chessboard"))
+    head = board_head(folder, options, board_scene(board.kind, more=more))
     plan = ScanPlan(patterns=PatternPlan(rows=True))
     with board_rig(head, options) as rig:
         assert rig.positioner is not None
@@ -76,14 +86,15 @@ def solved(options: dict[str, Any], folder: Path) -> tuple[Solution, Calibration
             bundle = folder / name
             try:
                 capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
-                seen.append(read_pose(bundle, BOARD, name).observation)
+                spoil(bundle)
+                seen.append(read_pose(bundle, board, name).observation)
             except (PoseRefusedError, ScanEvidenceError) as error:
                 refused.append(f"{name}: {type(error).__name__}: {error}")
             shutil.rmtree(bundle)
     made = HeadOptions.model_validate(options)
     (camera,) = made.camera
     truth = in_first_camera(Calibration({camera.name: camera.pinhole()}, made.projector.pinhole()))
-    return solve(Observations(BOARD, {camera.name: camera.size}, made.projector.size, tuple(seen))), truth, refused
+    return solve(Observations(board, {camera.name: camera.size}, made.projector.size, tuple(seen))), truth, refused
 
 
 def row(seed: int, folder: Path) -> dict[str, Any]:
