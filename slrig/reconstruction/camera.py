@@ -18,7 +18,7 @@ from slrig.reconstruction.coded import Coded, cell_width_px, code_edge_points, l
 from slrig.reconstruction.correlation import edge_sum, phase_sum
 from slrig.reconstruction.curvature import freed_of_curvature
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode, lit_pixels
-from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_steps
+from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_shadows_of, near_steps
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
 from slrig.reconstruction.identification import identify, with_refused_points
 from slrig.reconstruction.linking import StripeEnsemble, link
@@ -262,8 +262,8 @@ def _placed(coded: Coded, found: list[LinePoints], scales: _Scales, tables: Code
     resolution_px = cell_width_px(coded)
     if has_phase(frames):
         resolution_px = 0.0
-        near_shadow = coded.near_shadow
-        blur_px = told_blur_px(frames, seen, ~near_shadow, limits.camera_blur_px)
+        blur_px = told_blur_px(frames, seen, ~coded.near_shadow, limits.camera_blur_px)
+        near_shadow = near_shadows_of(blur_px, coded.near_shadow, coded.unlit, limits.edges)
         seen = at_pixel_centres(seen, frames.contrast, coded.contrast_deviation, blur_px, clear=~near_shadow)
         near_step = near_steps(seen, resolution_px, limits.edges)
         usable = np.isfinite(seen.position) & ~near_shadow & ~near_step

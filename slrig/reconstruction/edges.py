@@ -59,6 +59,19 @@ def near_shadows(unlit: NDArray[np.bool_], limits: EdgeLimits, /) -> NDArray[np.
     return _within(_without_specks(unlit, limits.smallest_shadow_px), limits.shadow_px)
 
 
+_SHADOW_BLURS = 3.0
+"""Standard deviations of the camera's blur within which light fades out at a border: 2 px of the usual 0.65 px."""
+
+
+def near_shadows_of(
+    blur_px: float, near_shadow: NDArray[np.bool_], unlit: NDArray[np.bool_], limits: EdgeLimits, /
+) -> NDArray[np.bool_]:
+    """(H, W) bool: pixels near the lit area's border by a camera of this blur; near_shadow : by a usual one."""
+    if _SHADOW_BLURS * blur_px <= limits.shadow_px:
+        return near_shadow
+    return near_shadows(unlit, replace(limits, shadow_px=_SHADOW_BLURS * blur_px))
+
+
 def near_steps(
     seen: PositionMap, resolution_px: float | NDArray[np.float32], limits: EdgeLimits, /
 ) -> NDArray[np.bool_]:

@@ -40,7 +40,7 @@ class Light:
     gamma : of the projector; signal_blur_px : see `simulated_rig.light.Response`. ambient : light of the room over the
     projector's white. texture_ratio : brightest over darkest albedo; texture : its kind, in grains of 5 mm.
     lobe : strength of a mirror lobe beside the diffuse albedo; lobe_exponent : how narrow it is.
-    bracket : exposures, each as a multiple of the one that white sets.
+    bracket : exposures, each as a multiple of the one that white sets. camera_blur_px : of a camera out of focus.
     """
 
     gamma: float = 1.0
@@ -51,6 +51,7 @@ class Light:
     lobe: float = 0.0
     lobe_exponent: float = 20.0
     bracket: tuple[float, ...] = (1.0,)
+    camera_blur_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +142,8 @@ def lit_scene(light: Light, *, share: float = 1.0) -> LitScene:
     del table["driver"]
     table["projector"] |= {"gamma": light.gamma, "signal_blur_px": light.signal_blur_px}
     table["camera"] = [_cut(table["camera"][0], share)]
+    if light.camera_blur_px is not None:
+        table["camera"][0]["blur_px"] = light.camera_blur_px
     options = HeadOptions.model_validate(table | {"ambient": light.ambient})
     eye, lamp = options.camera[0], options.projector
     surface = _surface(light)

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray
-from slrig.reconstruction.edges import EdgeLimits, near_edges
+from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_shadows_of
 from slrig.reconstruction.phase import PositionMap
 from tests.unit.reconstruction.builders import grid
 
@@ -166,3 +166,13 @@ def test_unlit_specks_are_dust_and_not_shadow() -> None:
     assert shadow[20, 20]
     assert shadow[22, 22]
     assert not shadow[5, 5]
+
+
+def test_shadows_reach_further_by_a_camera_out_of_focus() -> None:
+    unlit = np.zeros((40, 40), dtype=np.bool_)
+    unlit[:, :10] = True
+    usual = near_shadows(unlit, EdgeLimits())
+    assert near_shadows_of(0.65, usual, unlit, EdgeLimits()) is usual
+    wider = near_shadows_of(1.5, usual, unlit, EdgeLimits())
+    assert (usual.sum(axis=1) == 12).all()
+    assert (wider.sum(axis=1) == 14).all()
