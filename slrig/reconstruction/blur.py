@@ -4,7 +4,8 @@ The first harmonic of the lines' light, over white minus black, is what is left 
 projector's part is the same everywhere in its own columns, and a Gaussian blur of the camera of variance σ² leaves
 exp(-½ ω²σ²|g|²) where the position rises by g per pixel, ω the phase per position. A surface has slopes that differ, so
 that the logarithm falls by ½ ω²σ² along |g|²: of the albedo, the projector's focus and the noise nothing enters. On
-rendered scenes the variance is told to 3 %, from 0.08 px², that of the pixel's square alone, to 1.1.
+rendered scenes the variance is told to 3 %, from 0.08 px², that of the pixel's square alone, to 1.1; a relief of few
+slopes is told 1.1 for 1.5, since what is expected counts there.
 """
 
 from __future__ import annotations
