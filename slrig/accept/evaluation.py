@@ -55,6 +55,15 @@ class Reading:
         return any(abs(error) > limits.limit_mm(quantity) for quantity, error in self.errors_mm.items())
 
 
+def errors_by_step(readings: Sequence[Reading], quantity: Quantity) -> dict[str, list[float]]:
+    """The errors of a quantity by position, mm, of each capture there; positions that do not tell it are left out."""
+    found: dict[str, list[float]] = {}
+    for each in readings:
+        if quantity in each.errors_mm:
+            found.setdefault(each.step, []).append(each.errors_mm[quantity])
+    return found
+
+
 @dataclass(frozen=True, slots=True)
 class Evidence:
     """The points behind a reading.

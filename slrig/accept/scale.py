@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slrig.accept.evaluation import Reading
+from slrig.accept.evaluation import Reading, errors_by_step
 from slrig.accept.plan import Artefacts, Quantity
 from slrig.accept.uncertainty import error_uncertainty
 from slrig.calibration.judging.board_size import LEAST_OFF, SURE
@@ -36,10 +36,7 @@ def scale_by_bar(readings: Sequence[Reading], artefacts: Artefacts) -> Scale | N
 
     It is told from 0.1 % and from five of its standard deviations on, as the scale of a calibration is.
     """
-    by_place: dict[str, list[float]] = {}
-    for each in readings:
-        if Quantity.SPACING in each.errors_mm:
-            by_place.setdefault(each.step, []).append(each.errors_mm[Quantity.SPACING])
+    by_place = errors_by_step(readings, Quantity.SPACING)
     if len(by_place) < _FEWEST_PLACES:
         return None
     length_mm = artefacts.expanded_mm(artefacts.distance)

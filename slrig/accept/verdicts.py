@@ -8,7 +8,7 @@ from datetime import datetime
 
 import numpy as np
 
-from slrig.accept.evaluation import Reading
+from slrig.accept.evaluation import Reading, errors_by_step
 from slrig.accept.plan import AcceptancePlan, Quantity
 from slrig.accept.scale import Scale, scale_by_bar
 from slrig.accept.uncertainty import ErrorUncertainty, error_uncertainty
@@ -85,10 +85,7 @@ def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePl
 
 def _scatter(quantity: Quantity, readings: Sequence[Reading]) -> tuple[float, int]:
     """Standard deviation of repeated captures of one position, mm, and how many they were; NaN and 0 without any."""
-    by_step: dict[str, list[float]] = {}
-    for each in readings:
-        by_step.setdefault(each.step, []).append(each.errors_mm[quantity])
-    repeated = [np.array(errors) for errors in by_step.values() if len(errors) > 1]
+    repeated = [np.array(errors) for errors in errors_by_step(readings, quantity).values() if len(errors) > 1]
     if not repeated:
         return float("nan"), 0
     count = sum(len(errors) for errors in repeated)

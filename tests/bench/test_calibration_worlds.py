@@ -21,12 +21,12 @@ import numpy as np
 import pytest
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.solution import Solution, scale_mode
+from slrig.calibration.solution import Solution
 from slrig.calibration.solving.parameters import difference
 from slrig.model import Calibration
 from tests.bench.test_calibration_seeds import BOARD, rig_options, solved
 from tests.golden.test_image_processing import processed
-from tests.unit.calibration.solving.test_projection import row_of
+from tests.unit.calibration.solving.against_truth import exact_covariance, rows_of
 
 SEEDS = int(os.environ.get("SLRIG_SEEDS") or 3)
 WITHIN = (0.6, 1.4)
@@ -72,13 +72,8 @@ WORLDS = {
 
 def chi_square(solution: Solution, truth: Calibration) -> tuple[float, int]:
     """χ² of all numbers that are free, and how many."""
-    rows = [
-        np.array([row_of(one) for one in (*rig.cameras.values(), *([rig.projector] if rig.projector else []))])
-        for rig in (solution.calibration, truth)
-    ]
-    off = difference(*rows).ravel()
-    mode = solution.size.scale_sigma * scale_mode(solution.calibration)
-    covariance = solution.covariance - np.outer(mode, mode)
+    off = difference(rows_of(solution.calibration), rows_of(truth)).ravel()
+    covariance = exact_covariance(solution)
     free = np.diagonal(covariance) > 0
     sigma = np.sqrt(np.diagonal(covariance)[free])
     correlation = covariance[np.ix_(free, free)] / np.outer(sigma, sigma)

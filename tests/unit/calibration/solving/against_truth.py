@@ -8,7 +8,7 @@ import numpy as np
 
 from slrig.calibration.solution import PARAMETERS, PROJECTOR, Solution, scale_mode
 from slrig.calibration.solving.parameters import difference
-from slrig.model import Calibration, Pinhole
+from slrig.model import Calibration, FloatArray, Pinhole
 from tests.unit.calibration.solving.test_projection import row_of
 
 
@@ -25,18 +25,25 @@ def in_first_camera(calibration: Calibration) -> Calibration:
     return Calibration({name: moved(each) for name, each in calibration.cameras.items()}, moved(calibration.projector))
 
 
+def rows_of(calibration: Calibration) -> FloatArray:
+    """(d, 21): its cameras and its projector as kernels take them."""
+    return np.array([row_of(one) for one in (*calibration.cameras.values(), calibration.projector) if one is not None])
+
+
+def exact_covariance(solution: Solution) -> FloatArray:
+    """What the solve states, but for the board's size, as if that were exact."""
+    mode = solution.size.scale_sigma * scale_mode(solution.calibration)
+    return np.asarray(solution.covariance - np.outer(mode, mode))
+
+
 def in_deviations(solution: Solution, truth: Calibration, *, exact_board: bool = True) -> dict[str, float]:
     """Focal lengths, principal points, turns and baselines of all devices: error over its own stated deviation.
 
     exact_board : the board was as large as it was said to be, so that no deviation of its size explains anything.
     """
-    mode = solution.size.scale_sigma * scale_mode(solution.calibration)
-    stated = solution.covariance - np.outer(mode, mode) if exact_board else solution.covariance
+    stated = exact_covariance(solution) if exact_board else solution.covariance
     names = [*truth.cameras, *([PROJECTOR] if truth.projector else [])]
-    rows = [
-        np.array([row_of(one) for one in (*rig.cameras.values(), *([rig.projector] if rig.projector else []))])
-        for rig in (solution.calibration, truth)
-    ]
+    rows = [rows_of(solution.calibration), rows_of(truth)]
     off = difference(*rows)
     found = {}
     for device, name in enumerate(names):
