@@ -44,11 +44,12 @@ def test_worse_light_costs_at_most_half_more_error(
 
 
 def test_a_camera_out_of_focus_states_what_it_errs_by(references: dict[Light, Figures], tmp_path: Path) -> None:
-    found = scanned(Light(camera_blur_px=1.2), tmp_path)
-    # Light fades out over more than the usual 2 px at borders: with these 22 µm over the whole scene, and 9 stated.
+    # The whole scene: its borders are what matters. Light fades out there over more than the usual 2 px: with these
+    # 22 µm, and 9 stated.
+    found = lit_scene(Light(camera_blur_px=1.2)).scanned(tmp_path, seed=1)
     assert found.rms_mm <= 1.2 * found.sigma_rms_mm
     assert found.rms_mm <= 3 * references[Light()].rms_mm
-    assert found.complete_03 >= references[Light()].complete_03 - 0.005
+    assert found.complete_03 >= 0.985
 
 
 def test_gamma_does_nothing_to_native_pixels_of_black_and_white() -> None:
