@@ -48,7 +48,7 @@ def scale_by_bar(readings: Sequence[Reading], artefacts: Artefacts) -> Scale | N
         return Scale(share, sigma, len(shares), None)
     longer, smaller = ("longer", "smaller") if share > 0 else ("shorter", "larger")
     words = (
-        f"the bar measures {abs(share):.2%} ± {sigma:.2%} {longer} than its certificate says, in all of "
+        f"the bar measures {abs(share):.2%} ± {100 * sigma:.1g}% {longer} than its certificate says, in all of "
         f"{len(shares)} places: everything does. The squares of the board that the rig was calibrated with are so much "
         f"{smaller} than they were said to be, or a device was moved since; measure both rulers of the board, give "
         f"{setting('measured_mm')}, and calibrate again"
