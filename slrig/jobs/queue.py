@@ -78,10 +78,12 @@ class JobQueue:
 
     def start(self) -> None:
         """Start the owner thread, which opens the rig."""
-        self._owner.start()
+        # With the lock held, so that the owner has what it captures computed itself, and nobody twice.
+        with self._changed:
+            self._owner.start()
+            for job in self._computing:
+                self._begin_computing(job)
         self._watchdog.start()
-        for job in list(self._computing):
-            self._begin_computing(job)
 
     def submit(self, make: Callable[[], Sequence[Job]], *, wait: bool) -> None:
         """Put the jobs that `make` returns in line; `wait` lets the first stand behind others.
@@ -119,9 +121,9 @@ class JobQueue:
             self._waiting += tuple(job for job in jobs if job.work is not None)
             self._computing.extend(computing)
             self._changed.notify_all()
-        if self._owner.is_alive():
-            for job in computing:
-                self._begin_computing(job)
+            if self._owner.is_alive():
+                for job in computing:
+                    self._begin_computing(job)
 
     def cancel(self, job_id: UUID) -> bool:
         """Have a job end early. Returns whether it is under way and was told; one that waited has ended."""

@@ -22,9 +22,10 @@ from slrig.errors import (
     ScanInterruptedError,
 )
 from slrig.jobs.job import Holder, Job
+from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobState, utc_now
 from slrig.rig.session import ActiveCalibration, RigSession, driver_errors
-from slrig.rig.watchdog import MOVE_LIMIT_S, Calls, GuardedPositioner
+from slrig.rig.watchdog import MOVE_LIMIT_S, Calls, GuardedPositioner, Watchdog
 from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S
@@ -281,6 +282,36 @@ def test_calibration_that_turns_out_to_be_for_others_leaves_the_rig_to_be_calibr
     assert work.over.wait(WAIT_S)
     assert (work.told, work.rigs[0].calibration) == ([None], None)
     bench.close()
+
+
+def test_what_is_captured_while_the_queue_starts_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine the owner thread may be done with its first job before `start` goes on."""
+    computing, go_on, over = threading.Event(), threading.Event(), threading.Event()
+    computed: list[Job] = []
+    told: list[Exception | None] = []
+
+    def compute(job: Job) -> None:
+        computed.append(job)
+        computing.set()
+        go_on.wait(WAIT_S)
+
+    def ended(error: Exception | None) -> None:
+        told.append(error)
+        over.set()
+
+    def no_rig() -> Rig:
+        message = "not plugged in"
+        raise DeviceGoneError(message)
+
+    monkeypatch.setattr(Watchdog, "start", lambda _: computing.wait(WAIT_S))
+    queue = JobQueue(RigSession("bench", no_rig), queue_length=1, backlog_length=1, give_up=lambda _: None)
+    queue.add([Job(uuid4(), HOLDER, utc_now(), lambda _rig, _job: None, ended, compute)])
+    queue.start()
+    go_on.set()
+    assert over.wait(WAIT_S)
+    queue.end()
+    queue.join(WAIT_S)
+    assert (len(computed), told) == (1, [None])
 
 
 def test_positioner_is_watched_like_the_other_devices() -> None:
