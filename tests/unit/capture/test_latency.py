@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from slrig.capture.latency import LatencyMeasurement, measure_latency, shutter_skew_s, stable_from_ns
+from slrig.capture.latency_fit import Flash, FlashRows, RowLevels, rows_of
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig, Shown, Synchronisation, SystemClock, Trigger
 from slrig.discovery import open_rig
@@ -49,6 +50,26 @@ def test_frames_that_are_lost_do_no_harm(tmp_path: Path, trigger: Trigger) -> No
     found = measure_latency(lossy, trigger=trigger).cameras["eye"]
     assert found.latency_s == pytest.approx(0.012, abs=5e-4)
     assert found.line_time_s == pytest.approx(1e-4, rel=0.02)
+
+
+def test_a_camera_in_step_with_the_display_is_started_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One at 120 frames a second before 240 refreshes saw 6 of 160 flashes, in the phase in which it had begun."""
+    usual = rig(tmp_path, faults={"light_delay_s": 0.012})
+    eye = usual.cameras["eye"]
+    arm, armed = eye.arm, list[int]()
+
+    def counted(count: int, trigger: Trigger) -> None:
+        armed.append(0)
+        arm(count, trigger)
+
+    def rows(flash: Flash, levels: RowLevels) -> FlashRows | None:
+        return rows_of(flash, levels) if len(armed) == 2 else None
+
+    monkeypatch.setattr(eye, "arm", counted)
+    monkeypatch.setattr("slrig.capture.latency.rows_of", rows)
+    found = measure_latency(usual, trials=12).cameras["eye"]
+    assert len(armed) == 2
+    assert found.latency_s == pytest.approx(0.012, abs=5e-4)
 
 
 def test_the_rig_is_dark_and_usable_after_the_test(tmp_path: Path) -> None:
