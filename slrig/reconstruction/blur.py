@@ -5,10 +5,12 @@ projector's part is the same everywhere in its own columns, and a Gaussian blur 
 exp(-½ ω²σ²|g|²) where the position rises by g per pixel, ω the phase per position. A surface has slopes that differ, so
 that the logarithm falls by ½ ω²σ² along |g|²: of the albedo, the projector's focus and the noise nothing enters. On
 rendered scenes the variance is told to 3 %, from 0.08 px², that of the pixel's square alone, to 1.1; a relief of few
-slopes is told 1.1 for 1.5, since what is expected counts there.
+slopes is told 1.45 for 1.5.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +24,29 @@ _FLAT_PX = 1.0  # of second difference over that: more is two surfaces, whose li
 _FEWEST = 500
 _TURNS = 4
 _FARTHEST = 3.0  # standard deviations from the line: glints, and light of two surfaces
-# Chosen, both. Of the logarithm, which a projector's focus that changes with depth may tie to the slope; and of what is
-# expected, of lenses more or less in focus.
+# Chosen, both. Of the logarithm, which a projector's focus that changes with depth may tie to the slope; and of that of
+# the variance over what is expected: lenses more or less in focus, twice and half of it.
 _UNEVEN = 0.02
-_PRIOR_SHARE = 0.5
-_LEAST = 1 / 12  # px², of the pixel's own square
+_PRIOR = np.log(2)
+_LEAST, _MOST = 1 / 12, 16.0
+"""px²: of the pixel's own square, and of a blur in which lines of 8 px are lost."""
+_STEPS = 2000  # of 0.3 % of the variance
 
 
-def told_blur_px(frames: AxisFrames, seen: PositionMap, clear: NDArray[np.bool_], expected_px: float, /) -> float:
-    """Standard deviation of the camera's own blur, its pixel's area included, px.
+class ToldBlur(NamedTuple):
+    """The camera's own blur. sigma_px : its standard deviation, the pixel's area included. by_lines : whether lines
+    tell it, and not what is expected.
+    """
+
+    sigma_px: float
+    by_lines: bool
+
+
+def told_blur(frames: AxisFrames, seen: PositionMap, clear: NDArray[np.bool_], expected_px: float, /) -> ToldBlur:
+    """The most likely blur, by the lines and by what is expected.
 
     seen : by the phase of all line frames; clear : (H, W) bool, pixels away from the borders of shadows; expected_px :
-    what stands where slopes are too even, or pixels too few, to tell; it is one more observation elsewhere.
+    what stands where slopes are too even, or pixels too few, to tell; 0 is taken as known.
     """
     patterns = frames.line_patterns
     turn = 2 * np.pi / patterns[0].period_px
@@ -54,8 +67,8 @@ def told_blur_px(frames: AxisFrames, seen: PositionMap, clear: NDArray[np.bool_]
         bend = np.maximum(bend, np.abs(before - 2 * seen.position[inner] + after))
     contrast = frames.white[inner] - frames.black[inner]
     known = clear[inner] & (bend < _FLAT_PX) & (contrast > 0) & (left > 0)
-    if np.count_nonzero(known) < _FEWEST:
-        return expected_px
+    if expected_px <= 0 or np.count_nonzero(known) < _FEWEST:
+        return ToldBlur(expected_px, by_lines=False)
     across, fallen = -0.5 * turn**2 * squared[known], np.log(left[known] / contrast[known])
     kept = np.ones(len(across), dtype=np.bool_)
     told = expected_px**2
@@ -65,7 +78,8 @@ def told_blur_px(frames: AxisFrames, seen: PositionMap, clear: NDArray[np.bool_]
         told = float(away[kept] @ (fallen[kept] - mean)) / max(float(away[kept] @ away[kept]), 1e-12)
         residual = np.abs(fallen - mean - told * away)
         kept = residual <= _FARTHEST * 1.4826 * np.median(residual[kept])
-    # Two observations: that of the lines by the share of its weight in what is expected.
-    expected = expected_px**2
-    share = (float(across[kept].std()) / _UNEVEN * _PRIOR_SHARE * expected) ** 2
-    return float(np.sqrt(max((share * told + expected) / (share + 1), min(_LEAST, expected))))
+    expected, deviation = expected_px**2, _UNEVEN / max(float(across[kept].std()), 1e-12)
+    tried = np.geomspace(min(_LEAST, expected), max(_MOST, expected), _STEPS)
+    unlikely = ((tried - told) / deviation) ** 2 + (np.log(tried / expected) / _PRIOR) ** 2
+    likely = float(tried[np.argmin(unlikely)])
+    return ToldBlur(likely**0.5, by_lines=deviation < _PRIOR * likely)

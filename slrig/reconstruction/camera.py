@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, Pattern, Refusal
 from slrig.reconstruction.asked import AskedPixels, without_others
-from slrig.reconstruction.blur import told_blur_px
+from slrig.reconstruction.blur import told_blur
 from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.coded import Coded, cell_width_px, code_edge_points, line_image
 from slrig.reconstruction.correlation import edge_sum, phase_sum
@@ -60,8 +60,7 @@ class Limits:
 
     largest_disagreement_px : where the stripes of one frame lie further than this from where all frames together put
     them, the light changed from frame to frame, and each stripe stands as its own frame shows it.
-    camera_blur_px : standard deviation of the camera's own blur, where neither lines nor edges of a print tell it: a
-    lens in focus, 0.58 px, and the pixel's own square, 1/12 px² of variance.
+    camera_blur_px : its own, where neither lines nor a print tell it: a lens in focus, 0.58 px, and its pixel, 1/12 px²
     """
 
     decoding: DecodingLimits = field(default_factory=DecodingLimits)
@@ -262,9 +261,10 @@ def _placed(coded: Coded, found: list[LinePoints], scales: _Scales, tables: Code
     resolution_px = cell_width_px(coded)
     if has_phase(frames):
         resolution_px = 0.0
-        blur_px = told_blur_px(frames, seen, ~coded.near_shadow, limits.camera_blur_px)
+        blur_px, by_lines = told_blur(frames, seen, ~coded.near_shadow, limits.camera_blur_px)
         near_shadow = near_shadows_of(blur_px, coded.near_shadow, coded.unlit, limits.edges)
-        seen = at_pixel_centres(seen, frames.contrast, coded.contrast_deviation, blur_px, clear=~near_shadow)
+        prints = None if by_lines else ~near_shadow
+        seen = at_pixel_centres(seen, frames.contrast, coded.contrast_deviation, blur_px, clear=prints)
         near_step = near_steps(seen, resolution_px, limits.edges)
         usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
         seen = freed_of_curvature(seen, usable, blur_px**2, frames.line_patterns[0].period_px)
