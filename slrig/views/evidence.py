@@ -74,7 +74,7 @@ class Seen:
 
 def seen_by(view: Mesh) -> Seen:
     """A view prepared."""
-    side = side_of(view, border_rows=0)  # that tells most of a box; how well it fits is asked afterwards
+    side = side_of(view, whole=True)  # that tells most of a box; how well it fits is asked afterwards
     points = side.points_mm
     a, b, c = (points[view.faces[:, corner]] for corner in range(3))
     facing = (np.cross(b - a, c - a) * a).sum(axis=1) < 0
