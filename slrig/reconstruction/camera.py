@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import FloatArray, IntArray, Pattern, Refusal
+from slrig.model import FloatArray, Pattern, Refusal
 from slrig.reconstruction.asked import AskedPixels, without_others
-from slrig.reconstruction.blur import told_blur
-from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.coded import Coded, cell_width_px, code_edge_points, line_image
 from slrig.reconstruction.correlation import edge_sum, phase_sum
-from slrig.reconstruction.curvature import freed_of_curvature
-from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode, lit_pixels
-from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_shadows_of, near_steps
+from slrig.reconstruction.decoding import CodeMap, decode, lit_pixels
+from slrig.reconstruction.edges import near_edges, near_shadows
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
-from slrig.reconstruction.identification import identify, with_refused_points
+from slrig.reconstruction.identification import identify
+from slrig.reconstruction.limits import CodeTables, Limits
 from slrig.reconstruction.linking import StripeEnsemble, link
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.phase import has_phase, position_map
-from slrig.reconstruction.refinement import refined
+from slrig.reconstruction.phase import position_map
+from slrig.reconstruction.placing import placed
 from slrig.reconstruction.resolution import lost_lines, unresolved_bits
 from slrig.reconstruction.response import in_light
 from slrig.reconstruction.stripes import (
@@ -39,35 +37,6 @@ _FINEST_SCALE_PX = 1.0  # at 0.7 px, stripes of 0.7 px are found to 0.027 px rms
 _COARSEST_SCALE_PX = 2.5  # chosen; half and double give the same figures of a rendered vase, refined by phase
 _REACH_PX = 16  # of the widest filter, 9 px, and of what a point may lie beside its pixel
 _LEAST_SMOOTHED_PX = 1.4  # stripe and filter together: see `_matched_scale_px`
-
-
-@dataclass(frozen=True, slots=True)
-class CodeTables:
-    """What the patterns mean. index_of_word : (2^bits,) int32; cell_position : (cells,) float64, px;
-    position_of : (frames, cells) float64, px, of lines or of code edges; edges_of : (bits, cells) float64, px, of the
-    code edges that stand for lines where those are not resolved, None where nothing does.
-    """
-
-    index_of_word: IntArray
-    cell_position: FloatArray
-    position_of: FloatArray
-    edges_of: FloatArray | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """All thresholds of a camera's reconstruction.
-
-    largest_disagreement_px : where the stripes of one frame lie further than this from where all frames together put
-    them, the light changed from frame to frame, and each stripe stands as its own frame shows it.
-    camera_blur_px : its own, where neither lines nor a print tell it: a lens in focus, 0.58 px, and its pixel, 1/12 px²
-    """
-
-    decoding: DecodingLimits = field(default_factory=DecodingLimits)
-    stripes: StripeLimits = field(default_factory=StripeLimits)
-    edges: EdgeLimits = field(default_factory=EdgeLimits)
-    largest_disagreement_px: float = 0.03
-    camera_blur_px: float = 0.65
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,45 +208,6 @@ class _Scales:
     blur_px: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Placed:
-    """Points of each line frame, or of each bit, at their best places, and the code with the causes of those left out.
-
-    near_shadow, near_step : (H, W) bool, where no point counts; refined, disagreement_px : as of `CameraCurves`.
-    """
-
-    points: list[LinePoints]
-    code: CodeMap
-    near_shadow: NDArray[np.bool_]
-    near_step: NDArray[np.bool_]
-    refined: bool
-    disagreement_px: FloatArray
-
-
-def _placed(coded: Coded, found: list[LinePoints], scales: _Scales, tables: CodeTables, limits: Limits) -> _Placed:
-    """Put the points that were found where the light of all frames puts them, if it was the same in all."""
-    frames, code, disagreement_px = coded.frames, coded.code, np.zeros(0)
-    seen = position_map(frames, coded.position_noise, code, tables.cell_position)
-    resolution_px = cell_width_px(coded)
-    if has_phase(frames):
-        resolution_px = 0.0
-        blur_px, by_lines = told_blur(frames, seen, ~coded.near_shadow, limits.camera_blur_px)
-        near_shadow = near_shadows_of(blur_px, coded.near_shadow, coded.unlit, limits.edges)
-        prints = None if by_lines else ~near_shadow
-        seen = at_pixel_centres(seen, frames.contrast, coded.contrast_deviation, blur_px, clear=prints)
-        near_step = near_steps(seen, resolution_px, limits.edges)
-        usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
-        seen = freed_of_curvature(seen, usable, blur_px**2, frames.line_patterns[0].period_px)
-        refinement = refined(found, seen, usable, code, tables.position_of, near_step=near_step)
-        disagreement_px = refinement.disagreement_px
-        if np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px:
-            code = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
-            return _Placed(refinement.points, code, near_shadow, near_step, True, disagreement_px)
-    # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
-    near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(scales.blur_px))
-    return _Placed(list(found), code, near_shadow, near_step, False, disagreement_px)
-
-
 def _curves(
     coded: Coded,
     found: list[LinePoints],
@@ -293,10 +223,10 @@ def _curves(
     """
     frames = coded.frames
     entered("refine stripes")
-    placed = _placed(coded, found, scales, tables, limits)
+    best = placed(coded, found, scales.blur_px, tables, limits)
     line_count = len(found)
     found.clear()
-    points, code, near_shadow, near_step = placed.points, placed.code, placed.near_shadow, placed.near_step
+    points, code, near_shadow, near_step = best.points, best.code, best.near_shadow, best.near_step
     entered("identify stripes")
     shortest = limits.stripes.shortest_points
     stripes = chained(points, code.refusal.shape)
@@ -336,8 +266,8 @@ def _curves(
         decoded_pixels=int(decoded.sum()),
         stripe_points=len(stripes.points_px),
         stripe_count=len(numbered.stripes),
-        refined=placed.refined,
-        disagreement_px=placed.disagreement_px,
+        refined=best.refined,
+        disagreement_px=best.disagreement_px,
         unresolved=coded.unresolved,
         lost_lines=lost,
         compression_dn=float(np.sqrt(coded.loss_variance)),

@@ -27,6 +27,7 @@ from slrig.kernels import in_bands, kernel
 from slrig.model import FloatArray
 from slrig.reconstruction.phase import PositionMap
 
+_FITTED_PX = 5  # by as many pixels a point is fitted
 _FLAT_PX = 1.0  # projector px of second difference over six pixels: more is two surfaces with a step between
 _APART_PX = 4.0  # projector px of second difference over two pixels: more than an edge of a print displaces them
 _SIXTH_GAIN = 2 * (45**2 + 9**2 + 1) / 60**2  # variance of the sixth-order difference of unit noise
@@ -75,6 +76,22 @@ def at_pixel_centres(
             variance = _told_variance(seen, shift, contrast, deviation, clear, blur_px**2)
         moved = seen.position - np.float32(variance) * shift
     return PositionMap(moved, seen.sigma)
+
+
+def third_order_px(
+    measured: PositionMap, centred: PositionMap, usable: NDArray[np.bool_], blur_px: float, period_px: float, /
+) -> NDArray[np.float32]:
+    """(H, W): standard deviation, camera px, of what the first order leaves in points that are fitted to 5 x 5 pixels.
+
+    It is the third order where brightness changes as sharply as the blur lets it, ∂³ ln L = ∂ ln L / σ²: the share
+    σ²ω²s²/6 of what the first order displaced them by. It has either sign.
+    """
+    down, across = np.gradient(measured.position)
+    share = (blur_px * 2 * np.pi / period_px) ** 2 / 6  # over s², and in projector px over s
+    squared = share**2 * (down * down + across * across) * (centred.position - measured.position) ** 2
+    squared[~(usable & np.isfinite(squared))] = 0
+    mean = cv2.blur(squared, (_FITTED_PX, _FITTED_PX))
+    return np.asarray(np.sqrt(np.maximum(mean, 0)), dtype=np.float32)  # running sums go a rounding below 0
 
 
 def _told_variance(

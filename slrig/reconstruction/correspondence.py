@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import Axis, FloatArray, Refusal
-from slrig.reconstruction.camera import CodeTables
 from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.code_edges import EdgeCrossings, edge_crossings
 from slrig.reconstruction.compression import compression_loss
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
+from slrig.reconstruction.limits import CodeTables
 from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.response import gain, in_light

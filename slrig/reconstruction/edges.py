@@ -16,6 +16,11 @@ from numpy.typing import NDArray
 from slrig.kernels import in_bands, kernel
 from slrig.reconstruction.phase import PositionMap
 
+_BESIDE_STEPS_PX = (0.04, 0.015)
+"""What the light of the other surface displaces a point by in the first and the second pixel beside a step of depth.
+Beside edges of terraces and boxes, rendered by others and by us, errors were 1.7 to 2.3 and 1.3 to 1.9 times what noise
+alone states, 95 % of them below 4.8 and 3.7."""
+
 
 @dataclass(frozen=True, slots=True)
 class EdgeLimits:
@@ -90,6 +95,16 @@ def _without_specks(unlit: NDArray[np.bool_], smallest: int) -> NDArray[np.bool_
     large = figures[:, cv2.CC_STAT_AREA] >= smallest
     large[0] = False
     return np.asarray(large[labels])
+
+
+def beside_steps_px(near_step: NDArray[np.bool_], /) -> NDArray[np.float32]:
+    """(H, W): a standard deviation of points, beside steps; see `_BESIDE_STEPS_PX`."""
+    sigma_px, inside = np.zeros(near_step.shape, dtype=np.float32), near_step.view(np.uint8)
+    for displaced_px in _BESIDE_STEPS_PX:
+        wider = cv2.dilate(inside, np.ones((3, 3), np.uint8))
+        sigma_px[wider > inside] = displaced_px
+        inside = wider
+    return sigma_px
 
 
 def _within(mask: NDArray[np.bool_], radius_px: float) -> NDArray[np.bool_]:

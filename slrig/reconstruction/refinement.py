@@ -30,10 +30,6 @@ _POINTS_TIED = 5  # by a filter along the stripe: 2√π of its scale, 4.3 point
 _CLEAR_PX = 0.12  # so near to the border of a pixel, a fit of its own might end beyond it
 _LINES_KEPT = 2  # of the lines that begin at one pixel, which are neighbours, these many are remembered
 _MOST_FOR_MEDIAN = 20_000  # tied, their median is known to a fiftieth of their scatter
-_BESIDE_STEPS_PX = (0.04, 0.015)
-"""What the light of the other surface displaces a point by in the first and the second pixel beside a step of depth.
-Beside edges of terraces and boxes, rendered by others and by us, errors were 1.7 to 2.3 and 1.3 to 1.9 times what noise
-alone states, 95 % of them below 4.8 and 3.7."""
 _CROSSING_PX = 0.62  # more than half a pixel: two neighbours' noisy slopes must not both miss a line between them
 
 
@@ -158,14 +154,14 @@ def refined(
     position_of: FloatArray,
     /,
     *,
-    near_step: NDArray[np.bool_] | None = None,
+    displaced_px: NDArray[np.float32] | None = None,
     coarsest_px: float = 0.5,
 ) -> Refinement:
     """Refine the points of all line frames of one axis.
 
     Points of mixed light (not `usable`) or of no single line are left out, as are those whose standard deviation
-    exceeds coarsest_px pixels. position_of : (frames, cells) float64, as for `identify`. near_step : (H, W) bool, the
-    part of what is not usable that is so for a step of depth; points beside it state what that does to them.
+    exceeds coarsest_px pixels. position_of : (frames, cells) float64, as for `identify`. displaced_px : (H, W), what
+    points err by and no pixels' scatter shows, standard deviation; they state it.
     """
     borders = np.concatenate([[0], np.cumsum([len(each.points_px) for each in found], dtype=np.int64)])
     parts = [slice(a, b) for a, b in pairwise(borders)]
@@ -194,25 +190,14 @@ def refined(
     del started, landed, targets, away, crossings
     new_borders = np.searchsorted(frame, np.arange(len(found) + 1))
     new_parts = [slice(a, b) for a, b in pairwise(new_borders)]
-    displaced_px = _displaced_px(np.zeros_like(usable) if near_step is None else near_step)
     pairs = zip(found, parts, new_parts, strict=True)
     joined = [_joined(points, old, part, missed, more, displaced_px) for points, part, more in pairs]
     return Refinement(joined, disagreement)
 
 
-def _displaced_px(near_step: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """(H, W): a standard deviation of points, beside steps; see `_BESIDE_STEPS_PX`."""
-    sigma_px, inside = np.zeros(near_step.shape, dtype=np.float32), near_step.view(np.uint8)
-    for displaced_px in _BESIDE_STEPS_PX:
-        wider = cv2.dilate(inside, np.ones((3, 3), np.uint8))
-        sigma_px[wider > inside] = displaced_px
-        inside = wider
-    return sigma_px
-
-
 def _joined(
     points: LinePoints, old: FittedPoints, part: slice, missed: FittedPoints, more: slice,
-    displaced_px: NDArray[np.float32],
+    displaced_px: NDArray[np.float32] | None,
 ) -> LinePoints:  # fmt: skip
     """The good points of one frame: those that the filter found, and those that it missed."""
     kept, added = old.found[part], missed.found[more]
@@ -227,8 +212,10 @@ def _joined(
     # Chains begin at what the filter found; what it missed comes after, the surest first.
     strength[first:] = _FAINT / out[2][first:]
     strong[first:] = out[2][first:] < _SURE_PX
-    columns, rows = np.rint(out[0]).astype(np.intp).T
-    sigma_px = np.hypot(out[2], displaced_px[rows, columns])
+    sigma_px = out[2]
+    if displaced_px is not None:
+        columns, rows = np.rint(out[0]).astype(np.intp).T
+        sigma_px = np.hypot(sigma_px, displaced_px[rows, columns])
     return LinePoints(points_px=out[0], normals=out[1], strength=strength, strong=strong, sigma_px=sigma_px)
 
 

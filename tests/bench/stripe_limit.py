@@ -24,8 +24,9 @@ from simulated_rig.scene import Scene, surface_of
 from slrig.model import Axis, CameraFormat, Capture, FloatArray, Gray, LineShift, PatternSequence, Shot
 from slrig.patterns.positions import cell_positions, index_of_word, line_positions
 from slrig.patterns.sequence import encode, scan_patterns
-from slrig.reconstruction.camera import CameraCurves, CodeTables, Limits, camera_curves
+from slrig.reconstruction.camera import CameraCurves, camera_curves
 from slrig.reconstruction.frames import axis_frames
+from slrig.reconstruction.limits import CodeTables, Limits
 from tests.light_bound import ExposedView, pixel_bound, stripe_bound
 
 PLANE: Mapping[str, object] = {"shape": "plane", "size_mm": [240.0, 240.0], "rotation_deg": [8.0, -12.0, 0.0]}

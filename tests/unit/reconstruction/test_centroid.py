@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from slrig.model import FloatArray
-from slrig.reconstruction.centroid import at_pixel_centres
+from slrig.reconstruction.centroid import at_pixel_centres, third_order_px
 from slrig.reconstruction.phase import PositionMap
 from tests.unit.reconstruction.builders import grid
 
@@ -138,6 +138,23 @@ def test_noise_of_white_and_black_hardly_enters() -> None:
     inner = slice(5, -5)
     moved = (position - found.position)[:, inner]
     assert np.sqrt(np.mean((moved - wanted[inner]) ** 2)) < 0.3 * np.sqrt(np.mean(wanted[inner] ** 2))
+
+
+@pytest.mark.parametrize("blur_px", [1.2, 1.5])
+@pytest.mark.parametrize("slope", [0.7, 1.2])
+def test_what_the_first_order_leaves_at_an_edge_out_of_focus_is_stated(blur_px: float, slope: float) -> None:
+    x = fine_x()
+    position = 40 + slope * x
+    measured, white = seen_through_blur(np.where(x < 30.3, 1.0, 7.0), position, blur_px)
+    seen = PositionMap(as_map(measured), as_map(0 * measured))
+    centred = at_pixel_centres(seen, as_map(20 * white), NOISELESS, blur_px)
+    usable = np.ones(seen.position.shape, dtype=np.bool_)
+    stated = third_order_px(seen, centred, usable, blur_px, PERIOD_PX)[2]
+    left = (centred.position[2] - position[FINE // 2 :: FINE]) / slope
+    at_edge = slice(24, 37)
+    assert 0.5 < np.sqrt(np.mean(stated[at_edge] ** 2) / np.mean(left[at_edge] ** 2)) < 1.2
+    assert stated[45:].max() < 1e-3
+    assert not third_order_px(seen, centred, ~usable, blur_px, PERIOD_PX).any()
 
 
 @pytest.mark.parametrize("blur_px", [0.4, 0.65, 0.9])

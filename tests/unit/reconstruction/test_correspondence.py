@@ -13,7 +13,6 @@ from scipy.special import ndtr
 from slrig.model import Axis, FloatArray, Gray, LineShift, Pattern, Size
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.patterns.sequence import profile
-from slrig.reconstruction.camera import CodeTables
 from slrig.reconstruction.code_edges import edge_crossings
 from slrig.reconstruction.correspondence import (
     CorrespondenceLimits,
@@ -23,6 +22,7 @@ from slrig.reconstruction.correspondence import (
 )
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.limits import CodeTables
 from slrig.reconstruction.noise import NoiseModel
 from tests.unit.reconstruction.builders import code_frames
 

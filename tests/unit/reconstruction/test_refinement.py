@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from slrig.model import Axis, Capture, FloatArray, LineShift, Pattern, Shot, Size
 from slrig.patterns.positions import cell_positions, index_of_word, line_positions
 from slrig.patterns.sequence import scan_patterns
-from slrig.reconstruction.camera import CameraCurves, CodeTables, Limits, camera_curves
+from slrig.reconstruction.camera import CameraCurves, camera_curves
 from slrig.reconstruction.decoding import CodeMap
+from slrig.reconstruction.edges import beside_steps_px
 from slrig.reconstruction.frames import axis_frames
+from slrig.reconstruction.limits import CodeTables, Limits
 from slrig.reconstruction.phase import PositionMap
 from slrig.reconstruction.refinement import Refinement, refined
 from slrig.reconstruction.stripes import LinePoints, chained
@@ -224,7 +226,7 @@ def test_points_beside_a_step_stay_and_state_what_light_of_the_other_side_does()
     step[:, 40] = True
     usable = ~step
     plain = refined([NONE] * 8, here, usable, code, POSITION_OF)
-    stated = refined([NONE] * 8, here, usable, code, POSITION_OF, near_step=step)
+    stated = refined([NONE] * 8, here, usable, code, POSITION_OF, displaced_px=beside_steps_px(step))
     beside = 0
     for one, other in zip(plain.points, stated.points, strict=True):
         np.testing.assert_array_equal(one.points_px, other.points_px)

@@ -1,0 +1,69 @@
+"""Points of stripes at their best places: where the light of all line frames puts them, if it was the same in all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray
+from slrig.reconstruction.blur import told_blur
+from slrig.reconstruction.centroid import at_pixel_centres, third_order_px
+from slrig.reconstruction.coded import Coded, cell_width_px
+from slrig.reconstruction.curvature import freed_of_curvature
+from slrig.reconstruction.decoding import CodeMap
+from slrig.reconstruction.edges import beside_steps_px, near_edges, near_shadows_of, near_steps
+from slrig.reconstruction.identification import with_refused_points
+from slrig.reconstruction.limits import CodeTables, Limits
+from slrig.reconstruction.phase import has_phase, position_map
+from slrig.reconstruction.refinement import refined
+from slrig.reconstruction.stripes import LinePoints
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Points of each line frame, or of each bit, at their best places, and the code with the causes of those left out.
+
+    near_shadow, near_step : (H, W) bool, where no point counts; refined, disagreement_px : as of `camera.CameraCurves`.
+    """
+
+    points: list[LinePoints]
+    code: CodeMap
+    near_shadow: NDArray[np.bool_]
+    near_step: NDArray[np.bool_]
+    refined: bool
+    disagreement_px: FloatArray
+
+
+def placed(
+    coded: Coded, found: Sequence[LinePoints], stripe_blur_px: float, tables: CodeTables, limits: Limits
+) -> Placed:
+    """Put the points that were found where the light of all frames puts them, if it was the same in all.
+
+    stripe_blur_px : the blur that the stripes' width tells, the projector's included.
+    """
+    frames, code, disagreement_px = coded.frames, coded.code, np.zeros(0)
+    seen = position_map(frames, coded.position_noise, code, tables.cell_position)
+    resolution_px = cell_width_px(coded)
+    if has_phase(frames):
+        resolution_px = 0.0
+        period_px = frames.line_patterns[0].period_px
+        blur_px, by_lines = told_blur(frames, seen, ~coded.near_shadow, limits.camera_blur_px)
+        near_shadow = near_shadows_of(blur_px, coded.near_shadow, coded.unlit, limits.edges)
+        prints = None if by_lines else ~near_shadow
+        centred = at_pixel_centres(seen, frames.contrast, coded.contrast_deviation, blur_px, clear=prints)
+        near_step = near_steps(centred, resolution_px, limits.edges)
+        usable = np.isfinite(centred.position) & ~near_shadow & ~near_step
+        beyond_px = third_order_px(seen, centred, usable, blur_px, period_px)
+        seen = freed_of_curvature(centred, usable, blur_px**2, period_px)
+        displaced_px = np.hypot(beside_steps_px(near_step), beyond_px)
+        refinement = refined(found, seen, usable, code, tables.position_of, displaced_px=displaced_px)
+        disagreement_px = refinement.disagreement_px
+        if np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px:
+            code = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
+            return Placed(refinement.points, code, near_shadow, near_step, True, disagreement_px)
+    # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
+    near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(stripe_blur_px))
+    return Placed(list(found), code, near_shadow, near_step, False, disagreement_px)
