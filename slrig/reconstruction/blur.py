@@ -21,6 +21,7 @@ from slrig.reconstruction.phase import PositionMap
 _EVERY = 4  # of rows and columns: neighbours know the same
 _REACH = 2  # px either way, of the slope
 _FLAT_PX = 1.0  # of second difference over that: more is two surfaces, whose light mixes
+_EVEN = 0.2  # of the brightness, over that: at an edge of a print of 7:1, lines tell a sixth of the variance too little
 _FEWEST = 500
 _TURNS = 4
 _FARTHEST = 3.0  # standard deviations from the line: glints, and light of two surfaces
@@ -60,13 +61,18 @@ def told_blur(frames: AxisFrames, seen: PositionMap, clear: NDArray[np.bool_], e
     inner = beside(0, 0)
     lines = np.array([image[inner] for image in frames.lines], dtype=np.float64)
     left = np.hypot(np.tensordot(np.cos(angle), lines, 1), np.tensordot(np.sin(angle), lines, 1))
-    squared, bend = np.zeros(left.shape), np.zeros(left.shape)
+    light = frames.contrast
+    contrast = light[inner]
+    squared, bend, edge = np.zeros((3, *left.shape))
     for rows, columns in ((0, _REACH), (_REACH, 0)):
         before, after = seen.position[beside(-rows, -columns)], seen.position[beside(rows, columns)]
         squared += ((after - before) / (2 * _REACH)) ** 2
         bend = np.maximum(bend, np.abs(before - 2 * seen.position[inner] + after))
-    contrast = frames.white[inner] - frames.black[inner]
+        edge = np.maximum(edge, np.abs(light[beside(rows, columns)] - light[beside(-rows, -columns)]))
     known = clear[inner] & (bend < _FLAT_PX) & (contrast > 0) & (left > 0)
+    even = known & (edge < _EVEN * contrast)
+    if np.count_nonzero(even) >= _FEWEST:
+        known = even
     if expected_px <= 0 or np.count_nonzero(known) < _FEWEST:
         return ToldBlur(expected_px, by_lines=False)
     across, fallen = -0.5 * turn**2 * squared[known], np.log(left[known] / contrast[known])

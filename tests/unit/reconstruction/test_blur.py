@@ -19,13 +19,19 @@ EXPECTED_PX = 0.65
 
 
 def told(
-    blur_px: float, slopes: FloatArray, focus_px: float = 0.9, noise_dn: float = 1.0, expected_px: float = EXPECTED_PX
+    blur_px: float,
+    slopes: FloatArray,
+    focus_px: float = 0.9,
+    noise_dn: float = 1.0,
+    expected_px: float = EXPECTED_PX,
+    print_ratio: float = 1.0,
 ) -> ToldBlur:
     """Of a surface that rises by `slopes` from its left to its right, behind a projector's blur of focus_px."""
     rng = np.random.default_rng(4)
     slope = np.interp(np.arange(SHAPE[1] * FINE) / FINE, np.linspace(0, SHAPE[1], len(slopes)), slopes)
     position = np.tile(100 + np.cumsum(slope) / FINE, (SHAPE[0] * FINE, 1))
-    albedo = np.tile(1 + 0.3 * np.sin(np.arange(SHAPE[0] * FINE) / FINE / 9)[:, None], (1, SHAPE[1] * FINE))
+    albedo: FloatArray = np.tile(1 + 0.3 * np.sin(np.arange(SHAPE[0] * FINE) / FINE / 9)[:, None], (1, SHAPE[1] * FINE))
+    albedo *= np.where(np.arange(SHAPE[1] * FINE) // FINE // 16 % 2, 1.0, 1.0 / print_ratio)
     swing = np.exp(-0.5 * (2 * np.pi / PERIOD_PX * focus_px) ** 2)
 
     def seen(light: FloatArray | float) -> NDArray[np.float32]:
@@ -55,6 +61,12 @@ def test_few_slopes_tell_of_a_camera_out_of_focus_all_the_same() -> None:
     blur = told(1.25, np.array([0.7, 1.3]))
     assert blur.by_lines
     assert blur.sigma_px**2 == pytest.approx(1.25**2, rel=0.1)
+
+
+def test_edges_of_a_print_say_nothing_else() -> None:
+    """With them 17 % less of the variance is told."""
+    blur = told(1.25, np.array([0.5, 1.9, 0.8, 1.5]), print_ratio=7.0)
+    assert blur.sigma_px**2 == pytest.approx(1.25**2, rel=0.05)
 
 
 def test_an_even_slope_tells_nothing() -> None:
