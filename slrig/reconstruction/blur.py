@@ -47,7 +47,7 @@ def told_blur(frames: AxisFrames, seen: PositionMap, clear: NDArray[np.bool_], e
     """The most likely blur, by the lines and by what is expected.
 
     seen : by the phase of all line frames; clear : (H, W) bool, pixels away from the borders of shadows; expected_px :
-    what stands where slopes are too even, or pixels too few, to tell; 0 is taken as known.
+    what stands where slopes are too even, or pixels too few, to tell more; 0 is taken as known.
     """
     patterns = frames.line_patterns
     turn = 2 * np.pi / patterns[0].period_px
@@ -88,4 +88,6 @@ def told_blur(frames: AxisFrames, seen: PositionMap, clear: NDArray[np.bool_], e
     tried = np.geomspace(min(_LEAST, expected), max(_MOST, expected), _STEPS)
     unlikely = ((tried - told) / deviation) ** 2 + (np.log(tried / expected) / _PRIOR) ** 2
     likely = float(tried[np.argmin(unlikely)])
-    return ToldBlur(likely**0.5, by_lines=deviation < _PRIOR * likely)
+    # Lines that tell less than is known beforehand are as likely to be misled, by a projector's focus for example.
+    by_lines = deviation < _PRIOR * likely
+    return ToldBlur(likely**0.5 if by_lines else expected_px, by_lines=bool(by_lines))

@@ -48,8 +48,8 @@ LIGHTS = {
     # Sharp at the ball; on the wall behind it the projector's spread is 1.5 px more, and the camera's 1.0 px. The rms,
     # 40.2 and 57.3 µm, is that of the shadow's border, where the projector's spread is wider than what is refused; the
     # median error is 10 µm. 1.10 and 1.39 times what is stated.
-    # The projector's focus, which changes with the slope here, has the lines tell 0.56 px of blur for 0.67: 43.9 µm
-    # instead of the 42.1 by the 0.65 px that other scans expect.
+    # The projector's focus changes with the slope here, and lines would tell 0.56 px of blur for 0.67; but slopes are
+    # so even that what is expected stands.
     "focus over depth": Light(
         {"focus_mm": 540.0, "defocus_px": 9.5}, {"focus_mm": 570.0, "defocus_px": 15.0}, rms=4.9, sigma=1.5
     ),
