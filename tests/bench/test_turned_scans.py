@@ -164,3 +164,7 @@ def test_a_turned_object(name: str, count: int, tmp_path: Path, capsys: pytest.C
     else:
         assert max(ours) <= 10
     assert crossed == 0
+    for folder in folders:
+        # Poses are as good as the scans: one that errs by twice what it states bends all that it is joined to.
+        truth = json.loads((folder / "report.json").read_text())["truth"]
+        assert 0.75 < truth["error_over_sigma_p68"] < 1.25, folder
