@@ -187,7 +187,7 @@ def _shift_kernel(
             out[y, x] = shift
 
 
-@kernel
+@kernel(in_every_scan=False)
 def _edges_kernel(
     first: int, last: int, position: Any, sigma: Any, shift: Any, contrast: Any, deviation: Any, whole: Any,
     stencil: Any, expected: float, sums: Any,
