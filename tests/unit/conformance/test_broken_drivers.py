@@ -11,10 +11,19 @@ import pytest
 from slrig.conformance import CHECKS, Check, Examination, Outcome, Result, run
 from slrig.devices import Rig, Synchronisation, Trigger
 from slrig.errors import DeviceBusyError
-from slrig.model import Calibration, Pinhole, Size
+from slrig.model import Calibration, Frame, Pinhole, Size
 from tests.unit.conformance import broken_cameras as cameras
 from tests.unit.conformance import broken_projectors as projectors
-from tests.unit.conformance.model_rig import ALL, CAMERA, PROJECTOR, Maker, ModelCamera, ModelProjector, sequence
+from tests.unit.conformance.model_rig import (
+    ALL,
+    CAMERA,
+    PROJECTOR,
+    Exposure,
+    Maker,
+    ModelCamera,
+    ModelProjector,
+    sequence,
+)
 
 HOUR_NS = 3600 * 10**9
 
@@ -246,6 +255,25 @@ def test_a_display_whose_latency_was_measured_is_waited_for() -> None:
     projector = type("Projector", (projectors.LightsLate,), {"plays": False})
     report = run(Measured(camera, projector), sequence())
     assert [str(result.failure) for result in report.results if result.outcome is Outcome.FAILED] == []
+
+
+def test_a_frame_that_a_busy_host_gets_late_was_not_passed_over() -> None:
+    class ArrivesLate(ModelCamera):
+        """Its frames are 0.22 s on their way: more than ten exposures."""
+
+        triggers = frozenset({Trigger.SOFTWARE})
+        late_ns = 220_000_000
+
+        def next_exposure(self, deadline_ns: int) -> Exposure | None:
+            return super().next_exposure(deadline_ns - self.late_ns)
+
+        def read(self, after_ns: int, timeout_s: float) -> Frame:
+            frame = super().read(after_ns, timeout_s)
+            self.world.at_ns = max(self.world.at_ns, frame.t_end_ns + self.late_ns)
+            return frame
+
+    result = examined(Maker(ArrivesLate), named("stale_frames_never_come_back"))
+    assert (result.outcome, str(result.failure)) == (Outcome.PASSED, "None")
 
 
 def test_a_frame_that_has_to_be_shot_again_is_told() -> None:
