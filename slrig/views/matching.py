@@ -120,10 +120,11 @@ def _away(
 ) -> NDArray[np.bool_]:
     """(V,) bool: what is usable less an edge's vertices and as many rows of those beside it as leave enough."""
     left, fewest = usable, max(fewest, np.count_nonzero(usable) / 2)
+    first, second, third = np.ascontiguousarray(faces.T)
     for row in range(rows + 1):
         if row:
             edge = edge.copy()
-            edge[faces[edge[faces].any(axis=1)]] = True
+            edge[faces[edge[first] | edge[second] | edge[third]]] = True
         if np.count_nonzero(usable & ~edge) < fewest:
             break
         left = usable & ~edge
