@@ -77,7 +77,7 @@ class Tallied:
         )
 
 
-def play_session(seed: int, engine: Engine, scene: Scene, tallied: Tallied, *, reply_s: float = 0.02) -> None:
+def play_session(seed: int, engine: Engine, scene: Scene, tallied: Tallied, *, reply_s: float) -> None:
     """Open, load, show every pattern, close, over a bad line, with a box that restarts once; judge what was lit."""
     rng = random.Random(seed)
     # At any of the 37 commands that a session has at least, obeyed or not before its answer could leave.
@@ -152,11 +152,12 @@ def test_500_sessions_over_a_bad_line_are_exact(capsys: pytest.CaptureFixture[st
     def played(seed: int) -> Tallied:
         tallied, scene = Tallied(), Scene()
         engine = CoreEngine(scene, description(CRC32), drift=random.Random(seed).uniform(-1e-4, 1e-4))
-        play_session(seed, engine, scene, tallied)
+        # Beside other work, answers of this process to itself were 20 ms late twelve times in a row.
+        play_session(seed, engine, scene, tallied, reply_s=0.06)
         return tallied
 
     # Most of a session is waiting for what was lost.
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(12) as pool:
         tallied = sum(pool.map(played, range(1_000, 1_500)), Tallied())
     with capsys.disabled():
         sys.stdout.write(f"\n{tallied}\n")
