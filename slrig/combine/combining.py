@@ -27,7 +27,7 @@ from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import Progress
 from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
 from slrig.views.fusion import FusedModel, fused
-from slrig.views.fusion_mean import PoseErrors
+from slrig.views.fusion_mean import registered_poses
 from slrig.views.markers import MarkerFit, MarkersSeen, marker_poses
 from slrig.views.placing import put_together
 from slrig.views.registration import Registration, registered
@@ -113,7 +113,8 @@ def combine_into(
 
         found, axis = _registered(views, poses, marked, names, start_error_mm, again)
         entered("fusing", 0.4)
-        whole = fused(views, found.poses, voxel_mm=voxel_mm, pose_errors=_pose_errors(found))
+        errors = registered_poses(found.covariance, found.middle_mm)
+        whole = fused(views, found.poses, voxel_mm=voxel_mm, pose_errors=errors)
         entered("writing", 0.9, f"{len(whole.mesh.faces)} triangles")
         known = Poses(
             dict(zip(names, found.poses, strict=True)), None if axis is None else (axis.point_mm, axis.direction)
@@ -139,11 +140,6 @@ def combine_into(
         for name, encoded in files.items():
             write_file(folder / name, encoded(), durable=False)
     progress("done", 1.0, f"{len(whole.mesh.faces)} triangles")
-
-
-def _pose_errors(found: Registration) -> PoseErrors:
-    """Of all views; the first stands still."""
-    return PoseErrors(np.pad(found.covariance, ((6, 0), (6, 0))), found.middle_mm)
 
 
 def read_mesh(file: Path) -> Mesh:

@@ -55,6 +55,11 @@ def exact_poses(views: int) -> PoseErrors:
     return PoseErrors(np.zeros((6 * views, 6 * views)), np.zeros(3))
 
 
+def registered_poses(covariance: FloatArray, middle_mm: FloatArray) -> PoseErrors:
+    """Of views of which the first stands still. covariance : (6 (V - 1), 6 (V - 1)) float64, of the others."""
+    return PoseErrors(np.pad(covariance, ((6, 0), (6, 0))), middle_mm)
+
+
 class Rule(NamedTuple):
     """correlated_mm : c above; own_mm : d; shared_mm : f. beyond_mm : how far beyond a border a view still counts;
     inset_mm : how far from its border a view has its full weight.

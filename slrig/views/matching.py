@@ -33,8 +33,8 @@ _BORDER_ROWS, _BLURRED_ROWS = 2, 4
 """Of vertices left out beside borders, and beside sharp bends and borders where enough remain. What scans say there,
 rounded by the camera's blur, errs alike in all the views that see it, and in opposite senses in those that see an edge
 from its two sides. Worst views of a coin on its rim, a box and a flange, rendered and scanned from 12 sides: 14, 23 and
-8 µm off with two rows beside borders, 10, 2 and 4 with four; five are no better. They cost views that no lens has
-blurred (rows of 0.5 mm, errors alike over 3 mm): 13 µm for 11, the mean of ten draws."""
+8 µm off with two rows beside borders, 10, 2 and 4 with four; five help the coin and harm the flange. They cost views
+that no lens has blurred (rows of 0.5 mm, errors alike over 3 mm): 13 µm for 11, the mean of ten draws."""
 _FEWEST = 3000
 """Vertices away from bends, and twice as many from borders as well: fewer, as of a coarse scan of a small thing, are
 needed for what all of them tell."""

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray, Mesh
 from slrig.views.fusion import fused
-from slrig.views.fusion_mean import PoseErrors
+from slrig.views.fusion_mean import registered_poses
 from slrig.views.matching import side_of
 from slrig.views.registration import registered
 from slrig.views.turntable import turntable
@@ -121,7 +121,7 @@ def test_one_model_of_eight_views_of_half_a_million_points(capsys: pytest.Captur
     began = time.process_time()
     found = registered(views, starts)
     placed = time.process_time()
-    errors = PoseErrors(np.pad(found.covariance, ((6, 0), (6, 0))), found.middle_mm)
+    errors = registered_poses(found.covariance, found.middle_mm)
     whole = fused(views, found.poses, pose_errors=errors)
     ended = time.process_time()
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

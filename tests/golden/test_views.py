@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray
 from slrig.views.fusion import fused
-from slrig.views.fusion_mean import PoseErrors
+from slrig.views.fusion_mean import registered_poses
 from slrig.views.matching import moved
 from slrig.views.matching import turned as turned_by
 from slrig.views.registration import Registration, registered
@@ -42,7 +42,7 @@ def test_eight_views_come_to_where_they_belong_and_are_fused_to_less_error_than_
         assert axis is not None
         assert np.linalg.norm(np.cross(axis.direction, AXIS)) < np.deg2rad(0.01)
         # As a model has it: its deviations hold how well the poses are known.
-        errors = PoseErrors(np.pad(found.covariance, ((6, 0), (6, 0))), found.middle_mm)
+        errors = registered_poses(found.covariance, found.middle_mm)
         whole = fused(views, found.poses, pose_errors=errors)
         assert topology_counts(whole.mesh.faces).nonmanifold_edges == 0
         ones.append(off_surface_mm(bumpy, views[0]))
