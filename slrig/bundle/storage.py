@@ -12,7 +12,7 @@ from slrig.disk import refusals_of, staging_name
 _WINDOWS = os.name == "nt"
 
 
-def write_durably(path: Path, data: bytes) -> None:
+def write_durably(path: Path, data: bytes | bytearray) -> None:
     """Write a new file and bring it to disk; for a folder that is itself renamed into place later.
     Raises OSError: the disk refused.
     """
@@ -57,7 +57,7 @@ def sync_tree(folder: Path, *, but: str = "") -> None:
         sync_folder(Path(place))
 
 
-def write_file(path: Path, data: bytes, *, durable: bool = True) -> None:
+def write_file(path: Path, data: bytes | bytearray, *, durable: bool = True) -> None:
     """Replace the file `path` by `data`, whole or not at all.
     Raises StorageError: the disk refused; what was there before is still there.
 

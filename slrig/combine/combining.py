@@ -127,7 +127,7 @@ def combine_into(
         report["markers"] = None if marked is None else _of_markers(marked, seen, names)
         report["notes"] = list(notes)
         # One at a time: each is as large as all meshes.
-        files: dict[str, Callable[[], bytes]] = {
+        files: dict[str, Callable[[], bytes | bytearray]] = {
             MODEL: lambda: encode_mesh_ply(whole.mesh, views=whole.views),
             MODEL_GLB: lambda: encode_mesh_glb(whole.mesh),
             PLACED: lambda: encode_mesh_ply(put_together(views, found.poses)),

@@ -76,6 +76,7 @@ def finished_mesh(
 ) -> FinishedMesh:
     """Mesh the curves: strips and what is dropped of them, global optimisation, boundary.
 
+    No mesh of an earlier step is kept: of millions of triangles each takes as much memory as the points.
     Arrays as for `initial_mesh`. `entered` is told the name of each stage as it begins; `Stage.name` repeats it.
     """
     stages: list[Stage] = []
@@ -105,7 +106,8 @@ def finished_mesh(
     if limits.smooth_boundary and len(faces):
         entered("shrinking boundary")
         less = shrunk(points_mm, faces, longest_boundary_edge_mm(points_mm, faces), adjacency=adjacency)
-        faces, adjacency = less.faces, less.adjacency
+        faces, adjacency, shrunk_triangles = less.faces, less.adjacency, less.removed_triangles
+        del less
         done("shrinking boundary", faces, adjacency)
         entered("smoothing boundary")
         allowed_mm = limits.depth_edge_ratio * sampling_mm
@@ -115,19 +117,23 @@ def finished_mesh(
             allowed_mm[np.concatenate([ends, ends + 1])] = -np.inf
         smooth = smoothed(points_mm, faces, allowed_mm, adjacency=adjacency)
         faces, adjacency = smooth.faces, smooth.adjacency
+        added, removed_triangles, rounds = smooth.added, smooth.removed_triangles, smooth.rounds
+        del smooth
         done("smoothing boundary", faces, adjacency)
         entered("optimising boundary")
         # Nothing is flipped unless triangles were added, and then the arrays are the smoothing's own.
-        mended = optimised(points_mm, faces, rule=limits.flip_rule, among=smooth.added, adjacency=adjacency)
+        mended = optimised(points_mm, faces, rule=limits.flip_rule, among=added, adjacency=adjacency)
         faces = mended.faces
         done("optimising boundary", faces, None)
         steps["boundary"] = {
-            "shrunk_triangles": less.removed_triangles,
-            "added_triangles": int(np.count_nonzero(smooth.added)),
-            "removed_triangles": smooth.removed_triangles,
-            "rounds": smooth.rounds,
+            "shrunk_triangles": shrunk_triangles,
+            "added_triangles": int(np.count_nonzero(added)),
+            "removed_triangles": removed_triangles,
+            "rounds": rounds,
             "optimisation": _of_flips(mended),
         }
+        del mended
+    del adjacency
     entered("vertex normals")
     return FinishedMesh(faces, vertex_normals(points_mm, faces), tuple(stages), steps)
 

@@ -131,7 +131,7 @@ class CameraStream:
             if self._scales is not None and not self._stacks.missing:
                 self._curves = _curves(
                     self._coded, self._points, self._scales, self._tables, self._limits, self._entered,
-                    self._stacks.let_go,
+                    self._stacks,
                 )  # fmt: skip
         return self._coded
 
@@ -215,44 +215,51 @@ def _curves(
     tables: CodeTables,
     limits: Limits,
     entered: Callable[[str], None],
-    let_go: Callable[[], None],
+    stacks: FrameStacks,
 ) -> CameraCurves:
     """What is left when all points are found: refine, number and link them.
 
-    What takes memory goes as soon as it is not needed: `found` is emptied, and `let_go` drops the frames.
+    What takes memory goes as soon as it is not needed: `found` and the refined points are emptied, and `stacks`, whose
+    frames these are.
     """
     frames = coded.frames
     entered("refine stripes")
-    best = placed(coded, found, scales.blur_px, tables, limits)
-    line_count = len(found)
-    found.clear()
+    best = placed(coded, found, scales.blur_px, tables, limits, stacks.let_lines_go)
     points, code, near_shadow, near_step = best.points, best.code, best.near_shadow, best.near_step
     entered("identify stripes")
     shortest = limits.stripes.shortest_points
     stripes = chained(points, code.refusal.shape)
     numbered, refusal = identify(stripes, code, tables.position_of, near_shadow, near_step, shortest_points=shortest)
-    lost = None
+    chained_points, lost = len(stripes.points_px), None
+    del stripes
     if tables.edges_of is not None:
-        per_cell = line_count * frames.gray.cell_px / frames.line_patterns[0].period_px
+        per_cell = len(points) * frames.gray.cell_px / frames.line_patterns[0].period_px
         clear = ~(near_shadow | near_step) & (True if coded.asked is None else coded.asked)
         lost = lost_lines(numbered.stripes.points_px, coded.code, clear, per_cell)
     if lost is not None and tables.edges_of is not None:
-        del stripes, numbered
+        del numbered
         entered("locate stripes")
         coded, code = _with_fewer_bits(coded, code, lost, tables, limits)
-        edges = _edges_within(coded, lost, limits.stripes, scales.filter_px)
         beside = limits.edges.for_filters(scales.blur_px)
         middles = position_map(frames, coded.position_noise, code, tables.cell_position, by_phase=False)
         shadow, step = near_edges(middles, coded.unlit, cell_width_px(coded), beside)
         near_shadow, near_step = np.where(lost, shadow, near_shadow), np.where(lost, step, near_step)
-        let_go()
+        del middles, shadow, step
+        edges = _edges_within(coded, lost, limits.stripes, scales.filter_px)
+        stacks.let_go()
         entered("identify stripes")
-        stripes = chained([*(_outside(each, lost) for each in points), *edges], code.refusal.shape)
+        points[:] = [_outside(points.pop(0), lost) for _ in range(len(points))] + edges
+        del edges
+        stripes = chained(points, code.refusal.shape)
+        points.clear()
+        chained_points = len(stripes.points_px)
         numbered, refusal = identify(
             stripes, code, np.vstack([tables.position_of, tables.edges_of]), near_shadow, near_step,
             shortest_points=shortest,
         )  # fmt: skip
-    let_go()
+        del stripes
+    points.clear()
+    stacks.let_go()
     decoded = coded.code.refusal == Refusal.NONE
     if coded.asked is not None:
         decoded &= coded.asked
@@ -264,7 +271,7 @@ def _curves(
         noise=coded.noise,
         scale_px=scales.filter_px,
         decoded_pixels=int(decoded.sum()),
-        stripe_points=len(stripes.points_px),
+        stripe_points=chained_points,
         stripe_count=len(numbered.stripes),
         refined=best.refined,
         disagreement_px=best.disagreement_px,
@@ -289,14 +296,15 @@ def _with_fewer_bits(
         frames.rows(rows), noise.rows(rows), tables.index_of_word, cells, limits.decoding, unresolved=bits[rows]
     )
 
+    # Elsewhere all bits are read, as before. Both maps name the same cells, and differ in the causes alone.
+    lowest, highest = code.lowest.copy(), code.highest.copy()
+    lowest[rows][inside], highest[rows][inside] = fewer.lowest[inside], fewer.highest[inside]
+
     def changed(before: CodeMap) -> CodeMap:
-        lowest, highest, refusal = before.lowest.copy(), before.highest.copy(), before.refusal.copy()
-        lowest[rows][inside] = fewer.lowest[inside]
-        highest[rows][inside] = fewer.highest[inside]
+        refusal = before.refusal.copy()
         refusal[rows][inside] = fewer.refusal[inside]
         return CodeMap(lowest, highest, refusal)
 
-    # Elsewhere all bits are read, as before.
     return replace(coded, code=changed(coded.code), unresolved=bits), changed(code)
 
 

@@ -259,6 +259,10 @@ class FrameStacks:
             self._ends[pattern] = image.astype(np.float32)
         self._missing.discard(pattern)
 
+    def let_lines_go(self) -> None:
+        """Drop the images of lines, of the frames that were given out, too."""
+        self._lines.clear()
+
     def let_go(self) -> None:
         """Drop the images of code and lines, of the frames that were given out, too."""
         for images in (self._bits, self._inverses, self._lines):

@@ -36,6 +36,11 @@ class StripeEnsemble(NamedTuple):
     stripe: IntArray
     bridge_after: NDArray[np.bool_]
 
+    def without_points(self) -> StripeEnsemble:
+        """Which curves there are and where they are joined, for when their points are triangulated."""
+        none = np.zeros((0, 2))
+        return self._replace(points_px=none, normals=none, sigma_px=np.zeros(0), stripe=np.zeros(0, dtype=np.int32))
+
 
 def link(coded: CodedStripes, /) -> StripeEnsemble:
     """Link the stripes of each code into one curve, top end first."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,11 +38,13 @@ class Placed:
 
 
 def placed(
-    coded: Coded, found: Sequence[LinePoints], stripe_blur_px: float, tables: CodeTables, limits: Limits
-) -> Placed:
+    coded: Coded, found: list[LinePoints], stripe_blur_px: float, tables: CodeTables, limits: Limits,
+    lines_used: Callable[[], None],
+) -> Placed:  # fmt: skip
     """Put the points that were found where the light of all frames puts them, if it was the same in all.
 
-    stripe_blur_px : the blur that the stripes' width tells, the projector's included.
+    found : is emptied. stripe_blur_px : the blur that the stripes' width tells, the projector's included. lines_used :
+    is called when the images of lines are needed no more, before what takes most memory begins.
     """
     frames, code, disagreement_px = coded.frames, coded.code, np.zeros(0)
     seen = position_map(frames, coded.position_noise, code, tables.cell_position)
@@ -59,11 +61,19 @@ def placed(
         beyond_px = third_order_px(seen, centred, usable, blur_px, period_px)
         seen = freed_of_curvature(centred, usable, blur_px**2, period_px)
         displaced_px = np.hypot(beside_steps_px(near_step), beyond_px)
-        refinement = refined(found, seen, usable, code, tables.position_of, displaced_px=displaced_px)
+        del centred, beyond_px
+        known = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
+        lines_used()
+        refinement = refined(
+            found, seen, usable, code, tables.position_of, displaced_px=displaced_px,
+            largest_disagreement_px=limits.largest_disagreement_px,
+        )  # fmt: skip
         disagreement_px = refinement.disagreement_px
-        if np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px:
-            code = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
-            return Placed(refinement.points, code, near_shadow, near_step, True, disagreement_px)
+        if refinement.moved:
+            return Placed(refinement.points, known, near_shadow, near_step, True, disagreement_px)
+        found[:] = refinement.points
     # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
     near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(stripe_blur_px))
-    return Placed(list(found), code, near_shadow, near_step, False, disagreement_px)
+    points = found.copy()
+    found.clear()
+    return Placed(points, code, near_shadow, near_step, False, disagreement_px)

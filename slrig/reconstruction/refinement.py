@@ -8,7 +8,6 @@ own stripes must lie where all frames together put them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -111,7 +110,7 @@ def _crossing_kernel(
                     end_x, end_y = x + dx + away * normals[i, 0], y + dy + away * normals[i, 1]
                     at_x, at_y = int(np.rint(end_x)), int(np.rint(end_y))
                     clear = max(abs(end_x - at_x), abs(end_y - at_y)) < 0.5 - _CLEAR_PX
-                    if clear and landed[k, at_y, at_x]:
+                    if clear and _has_landed(landed, k, at_y, at_x):
                         continue
                 if fill:
                     at = place[y, k]
@@ -139,15 +138,16 @@ class Refinement:
 
     disagreement_px : (frames,) float64, median distance from each frame's own stripes to the refined ones, along the
     normals, less three standard deviations of that median; NaN for a frame without any. Where the light was the same
-    in all frames it is next to nothing.
+    in all frames it is next to nothing. moved : False where it is not, and the filter's points stand as they were.
     """
 
     points: list[LinePoints]
     disagreement_px: FloatArray
+    moved: bool
 
 
 def refined(
-    found: Sequence[LinePoints],
+    found: list[LinePoints],
     seen: PositionMap,
     usable: NDArray[np.bool_],
     code: CodeMap,
@@ -156,8 +156,9 @@ def refined(
     *,
     displaced_px: NDArray[np.float32] | None = None,
     coarsest_px: float = 0.5,
+    largest_disagreement_px: float = np.inf,
 ) -> Refinement:
-    """Refine the points of all line frames of one axis.
+    """Refine the points of all line frames of one axis, which `found` gives away.
 
     Points of mixed light (not `usable`) or of no single line are left out, as are those whose standard deviation
     exceeds coarsest_px pixels. position_of : (frames, cells) float64, as for `identify`. displaced_px : (H, W), what
@@ -168,31 +169,37 @@ def refined(
     count = int(borders[-1])
     given = windows(seen, usable)
     clear = cv2.erode(usable.view(np.uint8), np.ones((7, 7), dtype=np.uint8), borderValue=0)
-    old = no_points(count)
-    targets, away = np.zeros(count), np.zeros(count)
+    old, targets, disagreement = no_points(count), np.zeros(count), np.zeros(len(found))
     started, landed = _nothing_taken(len(found), usable.shape)
     for index, (points, part) in enumerate(zip(found, parts, strict=True)):
         starts = np.ascontiguousarray(points.points_px)
         in_bands(_target_kernel, len(starts), starts, code, position_of[index], targets[part])
-        fitted = FittedPoints(
-            old.points[part], old.normals[part], old.sigma_px[part], old.found[part], old.noise_px[part]
-        )  # fmt: skip
+        # Of one frame at a time: what only its own points need.
+        noise_px, away = np.zeros(len(starts)), np.zeros(len(starts))
+        fitted = FittedPoints(old.points[part], old.normals[part], old.sigma_px[part], old.found[part], noise_px)
         in_bands(fit_kernel, len(starts), *given, starts, targets[part], fitted, rows_at_least=POINTS)
         own = np.ascontiguousarray(points.sigma_px)
-        in_bands(_settle_kernel, len(starts), starts, own, clear, coarsest_px, fitted, away[part])
-        _taken_kernel(starts, fitted.points, fitted.found, part.start, index % _LINES_KEPT, started, landed[index])
-    disagreement = np.array([_sure_median(_drawn(away[p], old.found[p])) for p in parts])
+        in_bands(_settle_kernel, len(starts), starts, own, clear, coarsest_px, fitted, away)
+        disagreement[index] = _sure_median(_drawn(away, fitted.found))
+        _taken_kernel(starts, fitted.points, fitted.found, part.start, index, started, landed)
+    if np.nanmax(np.abs(disagreement), initial=0.0) > largest_disagreement_px:
+        unmoved = found.copy()
+        found.clear()
+        return Refinement(unmoved, disagreement, moved=False)
     frame, *crossings = _crossings(seen, usable, code, position_of, started, landed, old, targets)
+    # Each step from here on takes as much again.
+    del started, targets
     missed = no_points(len(frame))
     in_bands(fit_kernel, len(frame), *given, *crossings, missed, rows_at_least=POINTS)
     in_bands(_new_kernel, len(frame), frame, coarsest_px, landed, missed)
-    # What follows takes as much again.
-    del started, landed, targets, away, crossings
+    del landed, crossings
     new_borders = np.searchsorted(frame, np.arange(len(found) + 1))
     new_parts = [slice(a, b) for a, b in pairwise(new_borders)]
-    pairs = zip(found, parts, new_parts, strict=True)
-    joined = [_joined(points, old, part, missed, more, displaced_px) for points, part, more in pairs]
-    return Refinement(joined, disagreement)
+    joined = [
+        _joined(found.pop(0), old, part, missed, more, displaced_px)
+        for part, more in zip(parts, new_parts, strict=True)
+    ]
+    return Refinement(joined, disagreement, moved=True)
 
 
 def _joined(
@@ -276,17 +283,23 @@ def _target_kernel(first: int, last: int, points: Any, code: Any, position_of: A
 
 
 def _nothing_taken(frames: int, shape: tuple[int, int]) -> tuple[IntArray, NDArray[np.uint8]]:
-    """What `_taken_kernel` fills in: (H, W, 2) int32 and (frames, H, W) uint8."""
-    return np.zeros((*shape, _LINES_KEPT), dtype=np.int32), np.zeros((frames, *shape), dtype=np.uint8)
+    """What `_taken_kernel` fills in: (H, W, 2) int32, and (frames / 8, H, W) uint8, a bit for each frame."""
+    return np.zeros((*shape, _LINES_KEPT), dtype=np.int32), np.zeros((-(-frames // 8), *shape), dtype=np.uint8)
 
 
 @kernel
-def _taken_kernel(starts: Any, moved: Any, good: Any, first: int, slot: int, started: Any, landed: Any) -> None:
+def _taken_kernel(starts: Any, moved: Any, good: Any, first: int, frame: int, started: Any, landed: Any) -> None:
     """Note which good point of a frame began at each pixel (one more than its index), and whether one landed there."""
+    slot, word, bit = frame % _LINES_KEPT, frame >> 3, np.uint8(1 << (frame & 7))
     for i in range(len(starts)):
         if good[i]:
             started[int(np.rint(starts[i, 1])), int(np.rint(starts[i, 0])), slot] = first + i + 1
-            landed[int(np.rint(moved[i, 1])), int(np.rint(moved[i, 0]))] = 1
+            landed[word, int(np.rint(moved[i, 1])), int(np.rint(moved[i, 0]))] |= bit
+
+
+@kernel_part(inline="always")
+def _has_landed(landed: Any, frame: int, y: int, x: int) -> bool:
+    return bool(landed[frame >> 3, y, x] >> (frame & 7) & 1)
 
 
 @kernel
@@ -295,4 +308,4 @@ def _new_kernel(first: int, last: int, frame: Any, coarsest: float, landed: Any,
     points, _, sigma, good, _ = fitted
     for i in range(first, last):
         x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
-        good[i] = good[i] and sigma[i] < coarsest and not landed[frame[i], y, x]
+        good[i] = good[i] and sigma[i] < coarsest and not _has_landed(landed, frame[i], y, x)

@@ -33,6 +33,7 @@ _LEAST_FOUND = 0.5
 0.02 to 0.15, and where the one passes into the other 0.6."""
 _FEWEST_LINES = 200
 """Points to be found in a block and its neighbours; fewer tell nothing."""
+_BLOCKS_AT_ONCE = 4  # rows of blocks, of which a band holds some numbers for every pixel
 _WIDEST_STEP = 2.0  # cells from pixel to pixel; more is a step of depth
 
 
@@ -75,24 +76,44 @@ def lost_lines(
     surfaces does not mix; lines_per_cell : frames' lines whose centres lie in one code cell. On the way along a row of
     pixels each line makes one point, or along a column where stripes run rather across the image.
     """
-    shape = code.refusal.shape
-    cell = np.where(usable & (code.refusal == 0), code.lowest + code.highest, np.float32(np.nan)) / 2
-    wanted = np.maximum(_passed(cell), _passed(cell.T).T) * lines_per_cell
+    wanted = _passed(code, usable) * lines_per_cell
     columns, rows = (np.rint(points_px).astype(np.intp) // BLOCK_PX).T
     found = np.bincount(rows * wanted.shape[1] + columns, minlength=wanted.size).reshape(wanted.shape)
     wanted, found = _with_neighbours(wanted), _with_neighbours(found)
     lost = (found < _LEAST_FOUND * wanted) & (wanted >= _FEWEST_LINES)
     if not lost.any():
         return None
-    rows, columns = (np.arange(extent) // BLOCK_PX for extent in shape)
+    rows, columns = (np.arange(extent) // BLOCK_PX for extent in usable.shape)
     return lost[np.ix_(rows, columns)]
 
 
-def _passed(cell: FloatArray) -> FloatArray:
-    """(block rows, block columns): cells of the code passed on the way along the rows of each block."""
-    steps = np.abs(np.diff(cell, axis=1, prepend=np.nan))
+def _passed(code: CodeMap, usable: NDArray[np.bool_]) -> FloatArray:
+    """(block rows, block columns): cells of the code passed on the way along the rows of pixels in each block, or along
+    the columns if those are more.
+    """
+    shape = code.refusal.shape
+    blocks = tuple(-(-extent // BLOCK_PX) for extent in shape)
+    across, down = np.zeros(blocks), np.zeros(blocks)
+
+    def band(first: int, last: int) -> None:
+        # And the row above, from which the way leads into the band.
+        above, begin = max(first * BLOCK_PX - 1, 0), first * BLOCK_PX
+        rows = slice(above, min(last * BLOCK_PX, shape[0]))
+        known = usable[rows] & (code.refusal[rows] == 0)
+        cell = np.where(known, (code.lowest[rows] + code.highest[rows]).astype(np.float32) / 2, np.float32(np.nan))
+        own = cell[begin - above :]
+        across[first:last] = _in_blocks(np.diff(own, axis=1, prepend=np.float32(np.nan)))
+        down[first:last] = _in_blocks(np.diff(cell, axis=0) if begin else np.diff(cell, axis=0, prepend=cell[:1]))
+
+    in_bands(band, blocks[0], rows_at_most=_BLOCKS_AT_ONCE)
+    return np.maximum(across, down)
+
+
+def _in_blocks(steps: NDArray[np.float32]) -> FloatArray:
+    """(block rows, block columns): cells of the code that steps from pixel to pixel pass in each block."""
+    steps = np.abs(steps, out=steps)
     steps[~(steps <= _WIDEST_STEP)] = 0
-    rows, columns = (np.arange(0, extent, BLOCK_PX) for extent in cell.shape)
+    rows, columns = (np.arange(0, extent, BLOCK_PX) for extent in steps.shape)
     return np.add.reduceat(np.add.reduceat(steps, rows, axis=0), columns, axis=1).astype(np.float64)
 
 

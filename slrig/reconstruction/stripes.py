@@ -8,7 +8,7 @@ minus its inverse, found along its gradient by the same two steps. Both give poi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -78,21 +78,27 @@ def chained(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
     shape : (rows, columns) of the image.
     """
 
-    def chain(first: int, last: int) -> list[Stripes]:
-        # Frame by frame: what chaining makes on the way is large.
-        found = []
-        for index in range(first, last):
-            points, normals, strength, strong, sigma_px = frames[index]
-            order, offsets = chain_points(points, normals, strength, strong, shape)
-            frame = np.full(len(offsets) - 1, index, dtype=np.int32)
-            found.append(Stripes(offsets, frame, *gathered(order, points, normals, sigma_px)))
-        return found
+    def chain(first: int, last: int) -> list[tuple[IntArray, IntArray]]:
+        return [chain_points(*each[:4], shape) for each in frames[first:last]]
 
-    none = Stripes(np.zeros(1, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-    parts = [none, *(each for band in in_bands(chain, len(frames)) for each in band)]
-    lengths = np.concatenate([np.diff(each.offsets) for each in parts])
-    joined = (np.concatenate([getattr(each, field.name) for each in parts]) for field in fields(Stripes)[1:])
-    return Stripes(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32), *joined)
+    # What chaining makes on the way is large, and so are the points: these are moved once, when all places are known.
+    chains = [each for band in in_bands(chain, len(frames)) for each in band]
+    ends = np.cumsum([0, *(len(order) for order, _ in chains)])
+    count = int(ends[-1])
+    points_px, normals, sigma_px = np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count)
+
+    def gather(first: int, last: int) -> None:
+        for index in range(first, last):
+            given, order, part = frames[index], chains[index][0], slice(ends[index], ends[index + 1])
+            np.take(given.points_px, order, axis=0, out=points_px[part], mode="clip")
+            np.take(given.normals, order, axis=0, out=normals[part], mode="clip")
+            np.take(given.sigma_px, order, out=sigma_px[part], mode="clip")
+
+    in_bands(gather, len(frames))
+    lengths = [np.diff(offsets) for _, offsets in chains]
+    frame = np.repeat(np.arange(len(frames), dtype=np.int32), [len(each) for each in lengths])
+    offsets = np.cumsum(np.concatenate([[0], *lengths]), dtype=np.int32)
+    return Stripes(offsets, frame, points_px, normals, sigma_px)
 
 
 def gathered(

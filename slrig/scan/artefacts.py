@@ -97,7 +97,7 @@ def encode_report(report: Mapping[str, object]) -> bytes:
 
 def encode_mesh_ply(
     mesh: Mesh, *, sigma_calibration_mm: FloatArray | None = None, views: IntArray | None = None
-) -> bytes:
+) -> bytearray:
     """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe` per vertex;
     triangles.
 
@@ -105,15 +105,17 @@ def encode_mesh_ply(
     sigma_calibration_mm : (V,), the part of `sigma_mm` that the calibration's own error makes, one property more; None
     where the calibration does not state it. views : (V,), of how many views each vertex is the mean, one property more.
     """
-    further = _further(sigma_calibration_mm, views)
-    vertices = _records(len(mesh.vertices_mm), {**_vertex_properties(mesh), **further})
-    faces = np.zeros(len(mesh.faces), dtype=_FACE)
+    properties = {**_vertex_properties(mesh), **_further(sigma_calibration_mm, views)}
+    kind = _record(properties)
+    header = _ply_header(_mesh_elements(kind, len(mesh.vertices_mm), len(mesh.faces)))
+    data, (vertices, faces) = _room(header, (kind, len(mesh.vertices_mm)), (_FACE, len(mesh.faces)))
+    _fill(vertices, properties)
     faces["count"] = 3
     faces["vertices"] = mesh.faces
-    return _ply(_mesh_elements(vertices, len(faces)), vertices, faces)
+    return data
 
 
-def decode_mesh_ply(data: bytes) -> Mesh:
+def decode_mesh_ply(data: bytes | bytearray) -> Mesh:
     """The mesh in a PLY that `encode_mesh_ply` made, without what that writes of its vertices besides.
 
     Raises
@@ -124,18 +126,18 @@ def decode_mesh_ply(data: bytes) -> Mesh:
     head, mark, body = data.partition(_END_OF_HEADER)
     counts = [int(count) for count in re.findall(rb"^element \w+ (\d{1,12})$", head, re.MULTILINE)]
     stated, views = (_NONE if f" {name}\n".encode() in head else None for name in (_CALIBRATION_PART, _VIEWS))
-    none = _records(0, {**_vertex_properties(_NO_MESH), **_further(stated, views)})
+    kind = _record({**_vertex_properties(_NO_MESH), **_further(stated, views)})
     vertex_count, face_count = counts if len(counts) == 2 else (0, 0)
-    vertex_bytes = vertex_count * none.dtype.itemsize
+    vertex_bytes = vertex_count * kind.itemsize
     length = vertex_bytes + face_count * _FACE.itemsize
-    wanted = _ply_header(_mesh_elements(none, face_count, vertex_count=vertex_count))
+    wanted = _ply_header(_mesh_elements(kind, vertex_count, face_count))
     if head + mark != wanted or len(body) != length:
         message = (
             f"mesh.ply: expected the header that slrig writes and {length} bytes after it, found "
             f"{'another header' if head + mark != wanted else f'{len(body)} bytes'}; reconstruct the bundle again"
         )
         raise InvalidInputError(message)
-    vertices = np.frombuffer(body, dtype=none.dtype, count=vertex_count)
+    vertices = np.frombuffer(body, dtype=kind, count=vertex_count)
     faces = np.frombuffer(body, dtype=_FACE, count=face_count, offset=vertex_bytes)["vertices"]
     if len(faces) and not 0 <= faces.min() <= faces.max() < vertex_count:
         message = "mesh.ply: a triangle names a vertex that is not there; reconstruct the bundle again"
@@ -174,14 +176,14 @@ def _further(
     return part
 
 
-def _mesh_elements(vertices: NDArray[np.void], face_count: int, *, vertex_count: int | None = None) -> list[str]:
+def _mesh_elements(vertex: np.dtype[np.void], vertex_count: int, face_count: int) -> list[str]:
     faces = [f"element face {face_count}", "property list uchar int vertex_indices"]
-    return [*_vertex_element(vertices, count=vertex_count), *faces]
+    return [*_vertex_element(vertex, vertex_count), *faces]
 
 
 def encode_points_ply(
     curves: PointCurves, normals: NDArray[np.float32], *, sigma_calibration_mm: FloatArray | None = None
-) -> bytes:
+) -> bytearray:
     """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe`, `source`,
     `bridge_after` per point.
 
@@ -190,45 +192,55 @@ def encode_points_ply(
     sigma_calibration_mm : (n,), as for `encode_mesh_ply`.
     """
     columns = np.floor(curves.column_px).astype(np.int32)
-    points = _records(
-        len(curves.points_mm),
-        {
-            **_columns(("x", "y", "z"), "f4", curves.points_mm),
-            **_columns(("nx", "ny", "nz"), "f4", normals),
-            **_columns(("red", "green", "blue"), "u1", curves.colour),
-            _MARK: ("u1", curves.mark),
-            "sigma_mm": ("f4", curves.sigma_mm),
-            "stripe": ("i4", np.repeat(columns, np.diff(curves.offsets))),
-            "source": ("u1", curves.source),
-            "bridge_after": ("u1", curves.bridge_after),
-            **_further(sigma_calibration_mm),
-        },
-    )
-    return _ply(_vertex_element(points), points)
+    properties = {
+        **_columns(("x", "y", "z"), "f4", curves.points_mm),
+        **_columns(("nx", "ny", "nz"), "f4", normals),
+        **_columns(("red", "green", "blue"), "u1", curves.colour),
+        _MARK: ("u1", curves.mark),
+        "sigma_mm": ("f4", curves.sigma_mm),
+        "stripe": ("i4", np.repeat(columns, np.diff(curves.offsets))),
+        "source": ("u1", curves.source),
+        "bridge_after": ("u1", curves.bridge_after),
+        **_further(sigma_calibration_mm),
+    }
+    kind, count = _record(properties), len(curves.points_mm)
+    data, (points,) = _room(_ply_header(_vertex_element(kind, count)), (kind, count))
+    _fill(points, properties)
+    return data
 
 
 def _columns(names: tuple[str, ...], kind: str, array: NDArray[Any]) -> dict[str, tuple[str, NDArray[Any]]]:
     return {name: (kind, array[:, index]) for index, name in enumerate(names)}
 
 
-def _records(count: int, properties: Mapping[str, tuple[str, NDArray[Any]]]) -> NDArray[np.void]:
-    """(count,) structured, packed, little endian."""
-    records = np.zeros(count, dtype=[(name, f"<{kind}") for name, (kind, _) in properties.items()])
+def _record(properties: Mapping[str, tuple[str, NDArray[Any]]]) -> np.dtype[np.void]:
+    """Packed, little endian."""
+    return np.dtype([(name, f"<{kind}") for name, (kind, _) in properties.items()])
+
+
+def _room(header: bytes, *bodies: tuple[np.dtype[np.void], int]) -> tuple[bytearray, list[NDArray[np.void]]]:
+    """A file that begins with the header, and its bodies of records in place, to be filled in: a file put together of
+    finished parts would take their memory twice.
+    """
+    data = bytearray(len(header) + sum(kind.itemsize * count for kind, count in bodies))
+    data[: len(header)] = header
+    places, at = [], len(header)
+    for kind, count in bodies:
+        places.append(np.frombuffer(data, dtype=kind, count=count, offset=at))
+        at += kind.itemsize * count
+    return data, places
+
+
+def _fill(records: NDArray[np.void], properties: Mapping[str, tuple[str, NDArray[Any]]]) -> None:
     for name, (_, values) in properties.items():
         records[name] = values
-    return records
 
 
-def _vertex_element(vertices: NDArray[np.void], *, count: int | None = None) -> list[str]:
-    names = vertices.dtype.names or ()
-    kinds = [_PLY_TYPES[vertices.dtype[name].str[1:]] for name in names]
+def _vertex_element(vertex: np.dtype[np.void], count: int) -> list[str]:
+    names = vertex.names or ()
+    kinds = [_PLY_TYPES[vertex[name].str[1:]] for name in names]
     properties = [f"property {kind} {name}" for kind, name in zip(kinds, names, strict=True)]
-    return [f"element vertex {len(vertices) if count is None else count}", *properties]
-
-
-def _ply(elements: list[str], *bodies: NDArray[np.void]) -> bytes:
-    # A view is not copied before it is joined.
-    return b"".join([_ply_header(elements), *(body.view(np.uint8).data for body in bodies)])
+    return [f"element vertex {count}", *properties]
 
 
 def _ply_header(elements: list[str]) -> bytes:

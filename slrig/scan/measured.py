@@ -95,7 +95,7 @@ def measured(
             message = f"{folder}: {words}"
             raise NothingToReconstructError(message)
         best.notes.append(words)
-    return best, found
+    return replace(best, seen=found.cameras), found
 
 
 def _tried(

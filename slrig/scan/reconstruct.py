@@ -24,6 +24,7 @@ from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
 from slrig.kernels import Prepared, compilations_told
+from slrig.memory import give_back
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
 from slrig.meshing.vertices import compact_mesh
@@ -151,6 +152,7 @@ def reconstruct_into(
             message = f"the scan was cancelled before '{stage}'"
             raise ScanCancelledError(message)
         watch.enter(stage)
+        give_back()
         # Frames are read and checked one after another while those before them are decoded: that is no step back.
         if (stage, fraction, detail) != at and not (at[0] and stage in _BETWEEN):
             at = (stage, fraction, detail)
@@ -160,7 +162,7 @@ def reconstruct_into(
         # What only some scans need is compiled when the first one comes.
         progress(*at[:2], f"preparing kernels, first time only: {kernel}")
 
-    def place(name: str, data: bytes) -> None:
+    def place(name: str, data: bytes | bytearray) -> None:
         write_file(folder / name, data, durable=False)
         made(name)
 

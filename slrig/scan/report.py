@@ -84,7 +84,7 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
         "gamma": round(curves.gamma, 2),
         "stripe_scale_px": curves.scale_px,
         "stripe_points_found": curves.stripe_points,
-        "stripe_points_coded": len(curves.ensemble.points_px),
+        "stripe_points_coded": len(curves.ensemble.bridge_after),
         "stripes": curves.stripe_count,
         "curves": len(curves.ensemble.position_px),
         "bridges": int(curves.ensemble.bridge_after.sum()),

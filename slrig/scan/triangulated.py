@@ -31,7 +31,7 @@ _STEEP_ENOUGH = 0.5  # of the pair whose stripes cross its epipolar lines most s
 @dataclass(frozen=True, slots=True)
 class Triangulated:
     """The curves of all cameras, what they say of one another, and the cameras with the points that were left out
-    among their refusals.
+    among their refusals, and no points in their own curves.
 
     share_across : 0 to 1, the sine of the angle between the stripes and the baseline: by the calibration, or without a
     projector as the median over the image. second : index of the camera that the first is paired with, without one.
@@ -72,7 +72,7 @@ def triangulated(
         gap = widest_gap_px(projector, axis)
         spare = redundancy(parts, devices, axis, widest_gap_px=gap)
         joined = merged(parts, projector.centre_mm, widest_gap_px=gap)
-        return Triangulated(joined, spare, told, share_across(axis, list(devices.values()), projector))
+        return Triangulated(joined, spare, _without_points(told), share_across(axis, list(devices.values()), projector))
     first, *others = cameras
     mine = first.curves.ensemble
     crossing = [stripe_crossing(mine, first.device, seen.device) for seen in others]
@@ -86,7 +86,13 @@ def triangulated(
     gap = widest_gap_px(None, axis)
     spare = redundancy([best], devices, axis, widest_gap_px=gap)
     joined = merged([best], first.device.centre_mm, widest_gap_px=gap)
-    return Triangulated(joined, spare, cameras, crossing[second], 1 + second)
+    return Triangulated(joined, spare, _without_points(cameras), crossing[second], 1 + second)
+
+
+def _without_points(cameras: Sequence[CameraResult]) -> list[CameraResult]:
+    return [
+        replace(seen, curves=replace(seen.curves, ensemble=seen.curves.ensemble.without_points())) for seen in cameras
+    ]
 
 
 def widest_gap_px(projector: Pinhole | None, axis: Axis) -> float:

@@ -43,7 +43,7 @@ def _least_cpu_s(work: Callable[[], object]) -> float:
 
 @pytest.fixture(scope="module")
 def ply() -> bytes:
-    return encode_mesh_ply(sheet(917, 918))
+    return bytes(encode_mesh_ply(sheet(917, 918)))
 
 
 def test_files_for_pages(ply: bytes) -> None:

@@ -169,7 +169,7 @@ def test_an_array_of_objects_is_not_unpickled(kind: Kind) -> None:
 @both
 def test_the_mesh_is_in_millimetres_with_what_its_vertices_say(kind: Kind) -> None:
     mesh = half_ball()
-    walk = Walk(mesh_ply=encode_mesh_ply(mesh))
+    walk = Walk(mesh_ply=bytes(encode_mesh_ply(mesh)))
 
     async def case() -> Any:
         result = await settled(client_of(kind, walk).result("5f"))

@@ -140,7 +140,7 @@ def test_points_of_the_filter_move_onto_their_lines_and_say_how_far(slope: float
         mine = exact[(frame == k) & inside]
         found.append(points_at(mine + (shift + rng.normal(0, 0.02, len(mine)))[:, None] * across))
     found[5] = NONE
-    refinement = refined(found, here, EVERYWHERE, code, POSITION_OF)
+    refinement = refined([*found], here, EVERYWHERE, code, POSITION_OF)
     for k, misses in enumerate(on_lines(refinement, surface, slope)):
         assert len(misses) >= len(found[k].points_px)
         # Lines of other pixels that the code calls by the same cell are refused before; the rest is on its line.
@@ -167,7 +167,7 @@ def test_no_pixel_holds_two_points_of_one_line(slope: float, angle_rad: float, s
     _, first = np.unique(pixels, return_index=True)
     first = first[rng.random(len(first)) < share]
     found = [points_at(starts[first][frame[first] == k]) for k in range(8)]
-    stripes = chained(refined(found, here, EVERYWHERE, code, POSITION_OF).points, SHAPE)
+    stripes = chained(refined([*found], here, EVERYWHERE, code, POSITION_OF).points, SHAPE)
     frame = np.repeat(stripes.frame, np.diff(stripes.offsets))
     at = np.column_stack([np.rint(stripes.points_px).astype(int), frame])
     assert len(at) > 1400
@@ -199,6 +199,20 @@ def test_squeezed_stripes_that_no_filter_tells_apart_are_added(slope: float, ang
     assert np.isnan(refinement.disagreement_px).all()
 
 
+@pytest.mark.parametrize("moved", [True, False])
+def test_points_are_held_once(*, moved: bool) -> None:
+    here, code = mapped(tilted(0.9, 0.3))
+    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)
+    given = [points_at(starts[frame == k]) for k in range(8)]
+    found = given.copy()
+    limit_px = math.inf if moved else -1.0
+    refinement = refined(found, here, EVERYWHERE, code, POSITION_OF, largest_disagreement_px=limit_px)
+    assert found == []
+    assert refinement.moved == moved
+    assert len(refinement.points) == 8
+    assert all(one is other for one, other in zip(refinement.points, given, strict=True)) != moved
+
+
 def test_mixed_light_and_pixels_of_two_lines_give_no_points() -> None:
     here, code = mapped(tilted(0.9, 0.3))
     x, y = grid(SHAPE)
@@ -207,7 +221,7 @@ def test_mixed_light_and_pixels_of_two_lines_give_no_points() -> None:
     code = CodeMap(np.where(two, code.lowest - 2, code.lowest).astype(np.int32), code.highest, code.refusal)
     frame, starts, _ = line_crossings(here, EVERYWHERE, cells_of(here.position.astype(np.float64), 4), POSITION_OF)
     found = [points_at(starts[frame == k]) for k in range(8)]
-    refinement = refined(found, here, usable, code, POSITION_OF)
+    refinement = refined([*found], here, usable, code, POSITION_OF)
     lost = 0
     for k, points in enumerate(refinement.points):
         columns, rows = np.rint(points.points_px).astype(int).T
@@ -242,8 +256,8 @@ def test_points_too_coarse_to_use_are_left_out() -> None:
     here, code = mapped(tilted(0.9, 0.3), noise=0.3)
     frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)
     found = [points_at(starts[frame == k]) for k in range(8)]
-    every = refined(found, here, EVERYWHERE, code, POSITION_OF)
-    fewer = refined(found, here, EVERYWHERE, code, POSITION_OF, coarsest_px=0.15)
+    every = refined([*found], here, EVERYWHERE, code, POSITION_OF)
+    fewer = refined([*found], here, EVERYWHERE, code, POSITION_OF, coarsest_px=0.15)
     assert 0 < sum(len(each.points_px) for each in fewer.points) < sum(len(each.points_px) for each in every.points)
     assert max(each.sigma_px.max() for each in fewer.points) < 0.15
     assert max(each.sigma_px.max() for each in every.points) < 0.5
@@ -257,7 +271,7 @@ def test_what_is_skipped_as_already_there_is_there() -> None:
     frame, starts, targets = line_crossings(here, usable, code, POSITION_OF)
     drawn = np.random.default_rng(9).random(len(frame)) < 0.6
     found = [points_at(starts[drawn & (frame == k)]) for k in range(8)]
-    refinement = refined(found, here, usable, code, POSITION_OF)
+    refinement = refined([*found], here, usable, code, POSITION_OF)
     for k, points in enumerate(refinement.points):
         mine = frame == k
         ended, _, sigma_px, good, _ = fitted_points(here, usable, starts[mine], targets[mine])

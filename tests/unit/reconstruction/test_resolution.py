@@ -140,13 +140,20 @@ def test_lines_are_lost_where_less_than_half_of_their_points_are_found(down: boo
     assert lost_lines(points[kept], code, ~every, 4.0) is None
 
 
-def test_cells_passed_are_counted_in_each_block() -> None:
+@pytest.mark.parametrize("down", [False, True])
+def test_cells_passed_are_counted_in_each_block(*, down: bool) -> None:
     rng = np.random.default_rng(2)
-    cell = np.cumsum(rng.choice([0.0, 0.5, 1.0, 9.0, np.nan], (70, 100), p=[0.5, 0.2, 0.2, 0.05, 0.05]), axis=1)
-    cell[np.isnan(cell)] = 0
-    expected = np.zeros((3, 4))
-    for y in range(70):
-        for x in range(1, 100):
-            step = abs(cell[y, x] - cell[y, x - 1])
-            expected[y // BLOCK_PX, x // BLOCK_PX] += step if step <= 2 else 0
-    np.testing.assert_allclose(_passed(cell), expected)
+    shape = 310, 100  # more rows of blocks than are worked on at once
+    steps = rng.choice([0, 1, 2, 18], shape, p=[0.5, 0.2, 0.2, 0.1])
+    twice = np.cumsum(steps, axis=0 if down else 1).astype(np.int32)
+    refusal = rng.choice([0, 3], shape, p=[0.9, 0.1]).astype(np.uint8)
+    usable = rng.random(shape) < 0.95
+    known = usable & (refusal == 0)
+    expected = np.zeros((2, 10, 4))
+    for y, x in np.argwhere(known):
+        for way, (above, left) in enumerate(((y, x - 1), (y - 1, x))):
+            if min(above, left) >= 0 and known[above, left]:
+                step = abs(int(twice[y, x]) - int(twice[above, left])) / 2
+                expected[way, y // BLOCK_PX, x // BLOCK_PX] += step if step <= 2 else 0
+    passed = _passed(CodeMap(twice // 2, twice - twice // 2, refusal), usable)
+    np.testing.assert_array_equal(passed, expected.max(axis=0))

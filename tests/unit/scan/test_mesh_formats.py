@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import Any
 
@@ -18,7 +19,12 @@ from slrig.scan.artefacts import encode_mesh_ply
 from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
 from tests.unit.scan.test_artefacts import example_mesh
 
-ENCODERS = {"ply": encode_mesh_ply, "glb": encode_mesh_glb, "stl": encode_mesh_stl, "obj": encode_mesh_obj}
+ENCODERS: Mapping[str, Callable[[Mesh], bytes | bytearray]] = {
+    "ply": encode_mesh_ply,
+    "glb": encode_mesh_glb,
+    "stl": encode_mesh_stl,
+    "obj": encode_mesh_obj,
+}
 
 
 def half_ball(rows: int = 12, columns: int = 20) -> Mesh:
@@ -42,11 +48,11 @@ def half_ball(rows: int = 12, columns: int = 20) -> Mesh:
     )
 
 
-def load(data: bytes, kind: str) -> Any:
+def load(data: bytes | bytearray, kind: str) -> Any:
     return trimesh.load(io.BytesIO(data), file_type=kind, process=False)
 
 
-def in_mm(data: bytes, kind: str) -> trimesh.Trimesh:
+def in_mm(data: bytes | bytearray, kind: str) -> trimesh.Trimesh:
     """One mesh as a reader places it in its scene, brought back from glTF's axes (y up, front to +z) and metres."""
     found = load(data, kind)
     if isinstance(found, trimesh.Scene):
@@ -196,7 +202,7 @@ def test_a_mesh_without_triangles_can_be_written(kind: str) -> None:
     if kind == "stl":
         assert len(data) == 84
     elif kind == "glb":
-        (primitive,) = glb_tree(data)["meshes"][0]["primitives"]
+        (primitive,) = glb_tree(bytes(data))["meshes"][0]["primitives"]
         assert primitive["mode"] == 0
         (stored,) = load(data, kind).geometry.values()
         np.testing.assert_array_equal(stored.vertices, points.vertices_mm)

@@ -1,0 +1,35 @@
+"""Free memory goes back where a process holds much, and nowhere else."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from slrig import memory
+
+
+@pytest.mark.parametrize(("much", "calls"), [(0, [0]), (2**60, [])])
+def test_memory_goes_back_where_much_is_held(monkeypatch: pytest.MonkeyPatch, much: int, calls: list[int]) -> None:
+    if sys.platform != "linux":
+        pytest.skip("resident memory is read from Linux's /proc")
+    called: list[int] = []
+    monkeypatch.setattr(memory, "_MUCH_BYTES", much)
+    monkeypatch.setattr(memory, "_trim", lambda: called.append)
+    memory.give_back()
+    assert called == calls
+
+
+def test_what_is_resident_is_told() -> None:
+    if sys.platform != "linux":
+        pytest.skip("resident memory is read from Linux's /proc")
+    before = memory._resident_bytes()
+    held = np.ones(2**26, dtype=np.uint8)
+    assert memory._resident_bytes() - before == pytest.approx(held.nbytes, rel=0.1)
+
+
+def test_a_library_without_the_call_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "_MUCH_BYTES", 0)
+    monkeypatch.setattr(memory, "_trim", lambda: None)
+    memory.give_back()
