@@ -8,7 +8,7 @@ from ctypes import Structure
 from pathlib import Path
 
 from drivers.v4l2 import kernel
-from drivers.v4l2.controls import controls_of, without
+from drivers.v4l2.controls import AUTOGAIN, controls_of, put, without
 from drivers.v4l2.finding import identity_of
 from drivers.v4l2.processing import switch_off_processing
 from slrig.errors import DeviceGoneError, SlrigError
@@ -35,7 +35,7 @@ def require_present(path: str, otherwise: DeviceGoneError) -> None:
 
 
 def plain_pictures(path: str, skipped: Sequence[str]) -> tuple[frozenset[int], tuple[str, ...]]:
-    """Switch a camera's own image processing off, which OpenCV has no names for.
+    """Switch a camera's automatic gain and its own image processing off, which OpenCV has no names for.
 
     Return the numbers of the controls that are left alone, by the names that `skipped` has, and notes for a person.
 
@@ -44,7 +44,7 @@ def plain_pictures(path: str, skipped: Sequence[str]) -> tuple[frozenset[int], t
     DeviceGoneError, DeviceError
         It is not there, or fails.
     UnsupportedByDeviceError
-        It has no control of such a name.
+        It has no control of such a name, or its automatic gain cannot be switched off.
     """
     node = Path(path)
     try:
@@ -52,6 +52,8 @@ def plain_pictures(path: str, skipped: Sequence[str]) -> tuple[frozenset[int], t
         try:
             everything = controls_of(handle)
             mine = without(everything, skipped, node)
+            if AUTOGAIN in mine:
+                put(handle, node, mine[AUTOGAIN], 0)
             notes = switch_off_processing(handle, node, mine, named=(), is_uvc=identity_of(handle).is_uvc)
         finally:
             os.close(handle)

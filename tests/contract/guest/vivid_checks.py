@@ -20,10 +20,11 @@ import numpy as np
 import pytest
 
 from drivers import v4l2
+from drivers.v4l2.controls import AUTOGAIN
 from slrig.capture.sequencer import capture
 from slrig.conformance import run
 from slrig.conformance.bench import usual_settings
-from slrig.devices import Camera, Trigger
+from slrig.devices import Camera, CameraSettings, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from tests.contract import vivid_bench
 from tests.contract.guest.outcome import Notes, outcome
@@ -215,6 +216,22 @@ def an_unplugged_camera_is_gone(driver: str, notes: Notes) -> None:
         open_camera(UNPLUGGED[driver], driver)
 
 
+def its_automatic_gain_is_off(driver: str, notes: Notes) -> None:
+    """The gain of vivid, as long as it is automatic, counts seconds and takes no value."""
+    vivid_bench.camera_node(BUSY).set(AUTOGAIN)
+    with armed(open_camera(BUSY, driver)) as camera:
+        least, most = camera.info.gain_range
+        notes["gain"] = f"{least:g} to {most:g}"
+        assert most > least
+        camera.disarm()
+        asked = (least + most) / 2
+        applied = camera.configure(CameraSettings(camera.info.exposure_range_s[0], asked))
+        assert applied.gain == pytest.approx(asked, 0.02)
+        threading.Event().wait(1.1)
+        camera.arm(1, Trigger.FREE)
+        assert camera.read(time.monotonic_ns(), PATIENCE_S).image.size
+
+
 def an_unplugged_camera_is_not_found(_: Notes) -> None:
     """Its node stays for as long as somebody has it open; it is no camera any more."""
     before = {device.device for device in v4l2.find_devices()}
@@ -282,6 +299,7 @@ _OF_EACH = (
     a_camera_that_another_program_streams_from_is_busy,
     a_stream_that_dies_is_gone_and_can_be_reopened,
     an_unplugged_camera_is_gone,
+    its_automatic_gain_is_off,
 )
 ALL: dict[str, Callable[[Notes], None]] = {
     **{f"v4l2: {check.__name__}": check for check in _OF_V4L2},
