@@ -5,7 +5,6 @@ Nothing of a bundle is kept but its rows of the table that is printed at the end
 
 from __future__ import annotations
 
-import re
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ import typer
 from rich.table import Column
 
 from slrig.bundle.description import DESCRIPTION, read_description
+from slrig.bundle.natural_order import natural
 from slrig.cli.display import ProgressDisplay, print_table, progress_shown
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError
@@ -120,12 +120,6 @@ def _bundles_inside(folder: Path) -> list[Path]:
     if found and skipped:
         typer.echo(f"{'skipped':<10}no {DESCRIPTION} in {_listed(skipped)} of {folder}", err=True)
     return found
-
-
-def natural(path: Path) -> list[str | int]:
-    """A key that sorts scan-2 before scan-10."""
-    parts = re.split(r"([0-9]+)", str(path))
-    return [int(part) if place % 2 else part.casefold() for place, part in enumerate(parts)]
 
 
 def _name(bundle: Path) -> str:

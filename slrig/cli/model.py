@@ -303,7 +303,8 @@ def _named_meshes(asked: Sequence[Path]) -> dict[str, Path]:
 
     Raises ConfigError: there is none, fewer than two, or two of one name.
     """
-    from slrig.cli.bundles import matching, natural
+    from slrig.bundle.natural_order import natural
+    from slrig.cli.bundles import matching
     from slrig.scan.artefacts import MESH
 
     found: list[tuple[str, Path]] = []

@@ -14,6 +14,7 @@ from slrig.bundle.calibration_file import check_calibration
 from slrig.bundle.description import MOST_CAMERA_PX
 from slrig.bundle.faults import read_text
 from slrig.bundle.images import frame_format, read_with_colour
+from slrig.bundle.natural_order import natural
 from slrig.bundle.writing import BundleWriter
 from slrig.disk import refusals_of
 from slrig.errors import BundleError
@@ -137,7 +138,7 @@ def _by_camera(folder: Path) -> dict[str, list[Path]]:
     """Images in natural order, by subfolder, or by what their names have before the last number."""
     images = _images(folder)
     if not images:
-        inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=_natural)
+        inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural)
         found = {each.name: files for each in inside if (files := _images(each))}
         if not found:
             raise BundleError(f"{folder}: expected images ({', '.join(sorted(IMAGES))}), found none in it or below it")
@@ -152,11 +153,7 @@ def _by_camera(folder: Path) -> dict[str, list[Path]]:
 
 def _images(folder: Path) -> list[Path]:
     found = (each for each in folder.iterdir() if each.suffix.lower() in IMAGES and each.name[0] != ".")
-    return sorted(found, key=_natural)
-
-
-def _natural(path: Path) -> list[str | int]:
-    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"([0-9]+)", path.name))]
+    return sorted(found, key=natural)
 
 
 def _by_names(folder: Path, code: Code, naming: Naming) -> Imported:
