@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidatorFunctionWrapHandler, WrapValidator, field_validator
+from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator, field_validator
 
 from slrig.bundle.faults import MOST_FAULTS, Strict, read_description_of
 from slrig.bundle.moments import AwareMoment
@@ -19,10 +19,21 @@ MOST_CAMERA_PX = 2**26
 MOST_CAPTURE_BYTES = 2**32
 CAMERA_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 """Names of cameras become names of files."""
+PROJECTOR = "projector"
+"""The projector's name beside those of the cameras, wherever devices are told apart; no camera has it."""
 
 Side = Annotated[int, Field(ge=1, le=MOST_SIDE_PX)]
 Extent = Annotated[list[Side], Field(min_length=2, max_length=2)]
-CameraName = Annotated[str, Field(pattern=CAMERA_NAME)]
+
+
+def _of_a_camera(name: str) -> str:
+    if name == PROJECTOR:
+        message = f"expected a camera's own name, found '{name}', which is the projector's; rename the camera"
+        raise ValueError(message)
+    return name
+
+
+CameraName = Annotated[str, Field(pattern=CAMERA_NAME), AfterValidator(_of_a_camera)]
 
 
 class ProjectorEntry(Strict):

@@ -34,7 +34,7 @@ from typing import Any, NoReturn, TypeGuard
 import cv2
 import numpy as np
 
-from slrig.bundle.description import CAMERA_NAME, MOST_SIDE_PX
+from slrig.bundle.description import CAMERA_NAME, MOST_SIDE_PX, PROJECTOR
 from slrig.bundle.faults import MOST_FAULTS, read_text, shorten
 from slrig.bundle.file_storage import Value, read_file_storage
 from slrig.bundle.storage import write_file
@@ -42,7 +42,6 @@ from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
 
 MOST_FILE_BYTES = 4 * 2**20
-PROJECTOR = "projector"
 SOLVED = "solved"
 MOST_ID_LENGTH = 64
 NODE_NAME = re.compile(r"^[A-Za-z_][A-Za-z0-9_-]*$")

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from slrig.bundle.calibration_file import write_calibration
-from slrig.bundle.description import CAMERA_NAME, DESCRIPTION
+from slrig.bundle.description import CAMERA_NAME, DESCRIPTION, PROJECTOR
 from slrig.bundle.png import encode_frame
 from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.refused import FOLDER, LIST, Refused, RefusedEntry, RefusedList
@@ -53,10 +53,10 @@ class BundleWriter:
         *,
         captured_at: datetime | None = None,
     ) -> None:
-        wrong = [name for name in cameras if not re.fullmatch(CAMERA_NAME, name)]
+        wrong = [name for name in cameras if not re.fullmatch(CAMERA_NAME, name) or name == PROJECTOR]
         if wrong:
             raise BundleError(
-                f"{folder}: expected camera names of letters, digits, '_' and '-', "
+                f"{folder}: expected camera names of letters, digits, '_' and '-', none of them '{PROJECTOR}', "
                 f"found {', '.join(map(repr, wrong))}; "
                 "rename the camera: its name becomes the name of a folder"
             )

@@ -154,7 +154,7 @@ def test_samples_beyond_full_scale_are_refused(tmp_path: Path) -> None:
         writer.add(Shot(0, "left", np.full(CAMERA.shape, 1024, np.uint16)))
 
 
-@pytest.mark.parametrize("name", ["", "../left", "a/b", "left\n", ".left", "é", "x" * 65])
+@pytest.mark.parametrize("name", ["", "../left", "a/b", "left\n", ".left", "é", "x" * 65, "projector"])
 def test_a_camera_must_have_a_name_fit_for_files(tmp_path: Path, name: str) -> None:
     capture = sample_capture()
     with pytest.raises(BundleError, match="rename the camera"):

@@ -271,6 +271,10 @@ BAD_DESCRIPTIONS: dict[str, tuple[Edit, tuple[str, ...]]] = {
         lambda data: data["cameras"].update({"../left": data["cameras"]["left"]}),
         ("cameras", "../left"),
     ),
+    "camera named as the projector": (
+        lambda data: data["cameras"].update(projector=data["cameras"]["left"]),
+        ("cameras", "expected a camera's own name, found 'projector'", "rename the camera"),
+    ),
     "a file above the folder": (
         lambda data: data["frames"][0].update(file="frames/../../secret.png"),
         ("frames[0].file", "inside the bundle", "secret.png"),

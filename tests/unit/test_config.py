@@ -106,6 +106,7 @@ def test_scan_defaults_are_the_fields_of_a_plan() -> None:
         ('driver = "serial_projector"', "", "projector.driver: missing"),
         ('name = "right"', 'name = "left"', "found left twice"),
         ('name = "right"', 'name = "../right"', "camera[1].name"),
+        ('name = "right"', 'name = "projector"', "camera[1].name: expected a camera's own name, found 'projector'"),
         ("exposure_s = 0.0167", "exposure_s = 0", "camera[0].exposure_s"),
         ("exposure_s = 0.0167", 'exposure_s = "0.0167"', "camera[0].exposure_s"),
         ("exposure_s = 0.0167", "exposure_s = nan", "camera[0].exposure_s"),
