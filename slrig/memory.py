@@ -5,12 +5,14 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 _MUCH_BYTES = 2**30
 """A scan of 1.3 megapixels holds two thirds of it, and to take memory anew costs more than is saved there."""
+_STATM = Path("/proc/self/statm")
 
 
 def give_back() -> None:
@@ -29,4 +31,7 @@ def _trim() -> Any:
 
 
 def _resident_bytes() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    """0 where the system does not tell."""
+    with suppress(OSError):
+        return int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0

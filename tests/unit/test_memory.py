@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +28,14 @@ def test_what_is_resident_is_told() -> None:
     before = memory._resident_bytes()
     held = np.ones(2**26, dtype=np.uint8)
     assert memory._resident_bytes() - before == pytest.approx(held.nbytes, rel=0.1)
+
+
+def test_nothing_is_given_back_where_nothing_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    called: list[int] = []
+    monkeypatch.setattr(memory, "_STATM", tmp_path / "statm")
+    monkeypatch.setattr(memory, "_trim", lambda: called.append)
+    memory.give_back()
+    assert called == []
 
 
 def test_a_library_without_the_call_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
