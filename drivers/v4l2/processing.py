@@ -2,7 +2,9 @@
 
 Sharpening makes halos at edges, and a stripe beside a printed edge moves; a curve that is not straight, or one that
 follows the picture (backlight compensation, high dynamic range), makes greys of one light differ; noise reduction mixes
-neighbours and frames. A frame rate that follows the light makes the time of a frame unknown.
+neighbours and frames. A frame rate that follows the light makes the time of a frame unknown. Stabilisation moves the
+picture. Zoom, pan and tilt stay as the last program left them, which may have been a video call, and a calibration
+holds for one value of each: they are set to their defaults, unless a person sets them.
 
 Gamma: the USB Video Class counts it in hundredths, 1 to 500, so 100 is a gamma of 1 (USB Device Class Definition for
 Video Devices 1.5, Processing Unit, "Gamma Control"; the same in Windows' KSPROPERTY_VIDEOPROCAMP_GAMMA). Many cameras
@@ -58,7 +60,7 @@ def _wanted(control: Control, *, is_uvc: bool) -> int | str | None:
     match control.number:
         case ctl.SHARPNESS:
             return control.minimum
-        case ctl.CONTRAST:
+        case ctl.CONTRAST | ctl.ZOOM_ABSOLUTE | ctl.PAN_ABSOLUTE | ctl.TILT_ABSOLUTE:
             return control.default
         case ctl.BACKLIGHT_COMPENSATION:
             return 0 if control.takes(0) else control.minimum
@@ -69,7 +71,10 @@ def _wanted(control: Control, *, is_uvc: bool) -> int | str | None:
                 f"which value of its control {control.name} ({control.minimum} to {control.maximum}) makes its values "
                 "grow with the light is not known, and slrig doctor measures whether they do"
             )
-        case ctl.WIDE_DYNAMIC_RANGE | ctl.HDR_SENSOR_MODE | ctl.EXPOSURE_AUTO_PRIORITY:
+        case (
+            ctl.AUTOBRIGHTNESS | ctl.EXPOSURE_AUTO_PRIORITY | ctl.HDR_SENSOR_MODE | ctl.IMAGE_STABILIZATION
+            | ctl.ISO_SENSITIVITY_AUTO | ctl.PRESET_WHITE_BALANCE | ctl.SCENE_MODE | ctl.WIDE_DYNAMIC_RANGE
+        ):  # fmt: skip
             return 0
     if not _NAMED.search(control.name):
         return None

@@ -36,6 +36,11 @@ def test_what_bends_the_picture_is_off_when_it_is_open(plugged: Plug) -> None:
         control(0x009A0915, "Wide Dynamic Range", 0, 1, 1, kind=2),
         control(0x009A0924, "HDR Sensor Mode", 0, 1, 1, kind=3),
         control(0x0A046D01, "3D Noise Reduction", 0, 10, 5),
+        control(0x00980920, "Brightness, Automatic", 0, 1, 1, kind=2),
+        control(0x009A0914, "White Balance, Auto & Preset", 0, 9, 1, kind=3),
+        control(0x009A0916, "Image Stabilization", 0, 1, 1, kind=2),
+        control(0x009A0918, "ISO Sensitivity, Auto", 0, 1, 1, kind=3),
+        control(0x009A091A, "Scene Mode", 0, 13, 2, kind=3),
     )
     device = plugged(Faked(controls=(*CONTROLS, *more)))
     camera = device.open_camera(**FAST)
@@ -44,9 +49,27 @@ def test_what_bends_the_picture_is_off_when_it_is_open(plugged: Plug) -> None:
     wanted = {
         **{"Sharpness": 0, "Gamma": 100, "Contrast": 32, "Backlight Compensation": 0, "Wide Dynamic Range": 0},
         **{"HDR Sensor Mode": 0, "3D Noise Reduction": 0, "Exposure, Dynamic Framerate": 0, "Auto Exposure": 1},
+        **{"Brightness, Automatic": 0, "White Balance, Auto & Preset": 0, "Image Stabilization": 0},
+        **{"ISO Sensitivity, Auto": 0, "Scene Mode": 0},
     }
     assert {name: known.get(name) for name in wanted} == wanted
     assert "Brightness" not in known
+    camera.close()
+
+
+def test_what_another_program_left_of_zoom_and_pan_is_undone(plugged: Plug) -> None:
+    moved = (
+        control(0x009A0908, "Pan, Absolute", -36000, 36000, 0),
+        control(0x009A0909, "Tilt, Absolute", -36000, 36000, 0),
+        control(0x009A090D, "Zoom, Absolute", 100, 500, 100),
+    )
+    device = plugged(Faked(controls=(*CONTROLS, *moved)))
+    device.open_camera(**FAST, controls={"zoom_absolute": 200}).close()
+    assert device.controls_set()["Zoom, Absolute"] == 200
+    camera = device.open_camera(**FAST)
+    known = device.controls_set()
+    assert (known["Pan, Absolute"], known["Tilt, Absolute"], known["Zoom, Absolute"]) == (0, 0, 100)
+    assert camera.info.notes == ()
     camera.close()
 
 
