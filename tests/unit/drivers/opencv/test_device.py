@@ -20,7 +20,7 @@ from tests.contract.opencv_bench import DeviceHost
 from tests.contract.pairing import FRAMES, wrong_pairings
 from tests.contract.stage import StagedProjector
 from tests.contract.suite import rig_of
-from tests.contract.v4l2_bench import CONTROLS, Faked, FakeDevice, sequence, staged, why_not
+from tests.contract.v4l2_bench import CONTROLS, Faked, FakeDevice, control, sequence, staged, why_not
 
 pytestmark = pytest.mark.slow
 
@@ -207,13 +207,13 @@ def test_no_wrong_pairing_in_many_frames_by_stamps(plugged: Plug, stamp: str) ->
 
 def test_its_own_image_processing_is_off_and_what_refuses_is_told(plugged: Plug) -> None:
     stuck = tuple({**each, "stalls": ["set"], "errno": 5} if each["name"] == "Contrast" else each for each in CONTROLS)
-    device = plugged(controls=stuck)
+    device = plugged(controls=(*stuck, control(0x00980912, "Gain, Automatic", 0, 1, 1)))
     camera = device.open_camera(**GREY, skip_controls=["backlight_compensation", "gain"])
     [note] = camera.info.notes
     assert "asked contrast = 32, the driver refuses it" in note
     assert camera.info.gain_range == (1.0, 1.0)
     known = device.controls_set()
-    assert (known["Sharpness"], known["Gamma"]) == (0, 100)
+    assert (known["Sharpness"], known["Gamma"], known["Gain, Automatic"]) == (0, 100, 0)
     assert not known.keys() & {"Backlight Compensation", "Gain", "Contrast"}
     assert camera.configure(CameraSettings(0.01)).least_period_s == pytest.approx(1 / 50)
     camera.close()
