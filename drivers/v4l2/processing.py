@@ -18,9 +18,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 
 from drivers.v4l2 import controls as ctl
+from drivers.v4l2 import kernel
 from drivers.v4l2.controls import Control, Controls
 from slrig.errors import UnsupportedByDeviceError
 
@@ -41,6 +43,8 @@ def switch_off_processing(
         The device is gone. What it refuses is told, not raised: a camera without these controls does no better.
     """
     notes: list[str] = []
+    if _is_covered(handle):
+        notes.append("its privacy shutter is closed, and its pictures are black: open it")
     for control in controls.values():
         wanted = _wanted(control, is_uvc=is_uvc)
         if wanted is None or control.name in named:
@@ -53,6 +57,14 @@ def switch_off_processing(
         except UnsupportedByDeviceError as refusal:
             notes.append(f"its own image processing cannot be switched off: {refusal}")
     return tuple(notes)
+
+
+def _is_covered(handle: int) -> bool:
+    """Whether a camera says so that can; mostly a shutter that a person moves, and no program."""
+    answer = kernel.ControlValue(id=ctl.PRIVACY)
+    with suppress(OSError):
+        kernel.ask(handle, kernel.G_CTRL, answer)
+    return bool(answer.value)
 
 
 def _wanted(control: Control, *, is_uvc: bool) -> int | str | None:

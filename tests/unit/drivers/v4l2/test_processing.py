@@ -73,6 +73,14 @@ def test_what_another_program_left_of_zoom_and_pan_is_undone(plugged: Plug) -> N
     camera.close()
 
 
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_closed_privacy_shutter_is_told(plugged: Plug, *, closed: bool) -> None:
+    device = plugged(Faked(controls=(*CONTROLS, control(0x009A0910, "Privacy", 0, 1, int(closed), flags=4))))
+    camera = device.open_camera(**FAST)
+    assert ["privacy shutter is closed" in note for note in camera.info.notes] == [True] * closed
+    camera.close()
+
+
 def test_a_person_has_the_last_word(plugged: Plug) -> None:
     device = plugged()
     left = ["backlight_compensation", "gain"]
