@@ -43,10 +43,10 @@ def placed(
 ) -> Placed:  # fmt: skip
     """Put the points that were found where the light of all frames puts them, if it was the same in all.
 
-    found : is emptied. stripe_blur_px : the blur that the stripes' width tells, the projector's included. lines_used :
-    is called when the images of lines are needed no more, before what takes most memory begins.
+    found : is given away. stripe_blur_px : the blur that the stripes' width tells, the projector's included.
+    lines_used : is called when the images of lines are needed no more, before what takes most memory begins.
     """
-    frames, code, disagreement_px = coded.frames, coded.code, np.zeros(0)
+    frames, code, disagreement_px, points = coded.frames, coded.code, np.zeros(0), found
     seen = position_map(frames, coded.position_noise, code, tables.cell_position)
     resolution_px = cell_width_px(coded)
     if has_phase(frames):
@@ -68,12 +68,9 @@ def placed(
             found, seen, usable, code, tables.position_of, displaced_px=displaced_px,
             largest_disagreement_px=limits.largest_disagreement_px,
         )  # fmt: skip
-        disagreement_px = refinement.disagreement_px
+        points, disagreement_px = refinement.points, refinement.disagreement_px
         if refinement.moved:
-            return Placed(refinement.points, known, near_shadow, near_step, True, disagreement_px)
-        found[:] = refinement.points
+            return Placed(points, known, near_shadow, near_step, True, disagreement_px)
     # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
     near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(stripe_blur_px))
-    points = found.copy()
-    found.clear()
     return Placed(points, code, near_shadow, near_step, False, disagreement_px)

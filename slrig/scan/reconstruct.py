@@ -152,10 +152,10 @@ def reconstruct_into(
             message = f"the scan was cancelled before '{stage}'"
             raise ScanCancelledError(message)
         watch.enter(stage)
-        give_back()
         # Frames are read and checked one after another while those before them are decoded: that is no step back.
         if (stage, fraction, detail) != at and not (at[0] and stage in _BETWEEN):
             at = (stage, fraction, detail)
+            give_back()
             progress(stage, fraction, detail)
 
     def compiling(kernel: str) -> None:

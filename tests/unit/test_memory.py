@@ -10,11 +10,12 @@ import pytest
 
 from slrig import memory
 
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read from Linux's /proc")
 
+
+@LINUX
 @pytest.mark.parametrize(("much", "calls"), [(0, [0]), (2**60, [])])
 def test_memory_goes_back_where_much_is_held(monkeypatch: pytest.MonkeyPatch, much: int, calls: list[int]) -> None:
-    if sys.platform != "linux":
-        pytest.skip("resident memory is read from Linux's /proc")
     called: list[int] = []
     monkeypatch.setattr(memory, "_MUCH_BYTES", much)
     monkeypatch.setattr(memory, "_trim", lambda: called.append)
@@ -22,9 +23,8 @@ def test_memory_goes_back_where_much_is_held(monkeypatch: pytest.MonkeyPatch, mu
     assert called == calls
 
 
+@LINUX
 def test_what_is_resident_is_told() -> None:
-    if sys.platform != "linux":
-        pytest.skip("resident memory is read from Linux's /proc")
     before = memory._resident_bytes()
     held = np.ones(2**26, dtype=np.uint8)
     assert memory._resident_bytes() - before == pytest.approx(held.nbytes, rel=0.1)
