@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.kernels import kernel
+from slrig.kernels import in_bands, kernel
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.boundary_rules import (
     add,
@@ -73,7 +73,7 @@ def longest_boundary_edge_mm(points_mm: FloatArray, faces: IntArray, /) -> Float
     points, faces = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(faces)
     longest = np.full(len(points), LONGEST_MM)
     near = np.zeros(len(points), dtype=np.bool_)
-    if not _mark_long_edges(points, faces, LONGEST_MM, near):
+    if not any(in_bands(_mark_long_edges, len(faces), points, faces, LONGEST_MM, near)):
         return longest
     # The spacing of all that an edge too long touches, and of their neighbours, from all edges of both.
     ring = np.zeros(len(points), dtype=np.bool_)
@@ -182,10 +182,10 @@ def smoothed(
 
 
 @kernel
-def _mark_long_edges(points: Any, faces: Any, longest_mm: float, near: Any) -> bool:
+def _mark_long_edges(begin: int, end: int, points: Any, faces: Any, longest_mm: float, near: Any) -> bool:
     """Mark both ends of every edge longer than longest_mm; whether there is one."""
     found = False
-    for face in range(len(faces)):
+    for face in range(begin, end):
         for corner in range(3):
             a, b = faces[face, corner], faces[face, corner + 1 if corner < 2 else 0]
             if length_mm(points, a, b) > longest_mm:

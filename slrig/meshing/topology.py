@@ -120,20 +120,22 @@ def kept_faces(faces: IntArray, adjacency: IntArray, kept: NDArray[np.bool_]) ->
     numbers = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
     rest = np.zeros((int(np.count_nonzero(kept)), 3), dtype=np.int32)
     across = np.zeros_like(rest)
-    _keep(np.ascontiguousarray(faces), np.ascontiguousarray(adjacency), kept, numbers, rest, across)
+    given = np.ascontiguousarray(faces), np.ascontiguousarray(adjacency)
+    in_bands(_keep, len(faces), *given, numbers, rest, across)
     return rest, across
 
 
 @kernel
-def _keep(faces: IntArray, adjacency: IntArray, kept: Any, numbers: IntArray, rest: Any, across: Any) -> None:
-    count = 0
-    for face in range(len(faces)):
-        if kept[face]:
+def _keep(
+    first: int, last: int, faces: IntArray, adjacency: IntArray, numbers: IntArray, rest: Any, across: Any
+) -> None:
+    for face in range(first, last):
+        number = numbers[face]
+        if number >= 0:
             for corner in range(3):
                 other = adjacency[face, corner]
-                rest[count, corner] = faces[face, corner]
-                across[count, corner] = numbers[other] if other >= 0 else -1
-            count += 1
+                rest[number, corner] = faces[face, corner]
+                across[number, corner] = numbers[other] if other >= 0 else -1
 
 
 def _vertex_bound(faces: IntArray) -> int:

@@ -85,8 +85,12 @@ def with_refused_points(
     """
     refusal = code.refusal.copy()
     clipped = np.zeros(refusal.shape, dtype=np.bool_)
-    for image in frames.lines:
-        clipped |= image >= frames.clipped_at
+
+    def clip(first: int, last: int) -> None:
+        for image in frames.lines:
+            clipped[first:last] |= image[first:last] >= frames.clipped_at
+
+    in_bands(clip, len(clipped))
     for index, points in enumerate(found):
         cause = np.zeros(len(points.points_px), dtype=np.uint8)
         in_bands(

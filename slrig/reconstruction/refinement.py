@@ -195,10 +195,15 @@ def refined(
     del landed, crossings
     new_borders = np.searchsorted(frame, np.arange(len(found) + 1))
     new_parts = [slice(a, b) for a, b in pairwise(new_borders)]
-    joined = [
-        _joined(found.pop(0), old, part, missed, more, displaced_px)
-        for part, more in zip(parts, new_parts, strict=True)
-    ]
+
+    def join(first: int, last: int) -> None:
+        # Each in place of what it is made of, whose memory is needed.
+        for at in range(first, last):
+            found[at] = _joined(found[at], old, parts[at], missed, new_parts[at], displaced_px)
+
+    in_bands(join, len(found))
+    joined = found.copy()
+    found.clear()
     return Refinement(joined, disagreement, moved=True)
 
 
