@@ -23,13 +23,16 @@ _LIMITS = MeshingLimits(
 
 
 def mesh_sample() -> None:
-    """Mesh a wavy sheet with a ragged border, by the types of array that a scan has."""
-    ragged = np.random.default_rng(0).integers(0, 8, (_CURVES, 2))
+    """Mesh a wavy, noisy sheet with a ragged border, by the types of array that a scan has."""
+    random = np.random.default_rng(0)
+    ragged = random.integers(0, 8, (_CURVES, 2))
     lengths = _POINTS - ragged.sum(axis=1)
     offsets = np.concatenate(([0], np.cumsum(lengths))).astype(np.int32)
     curve = np.repeat(np.arange(_CURVES), lengths)
     along = np.arange(offsets[-1]) - offsets[curve] + ragged[curve, 0]
-    points = np.column_stack((curve, 0.5 * along, 400 + np.sin(curve / 3) * np.cos(along / 7)))
+    # So noisy that a turn of flips is taken back, as in some scans.
+    depth = 400 + np.sin(curve / 3) * np.cos(along / 7) + 0.3 * random.standard_normal(len(curve))
+    points = np.column_stack((curve, 0.5 * along, depth))
     bridge = np.zeros(len(points), dtype=np.bool_)
     surface = finished_mesh(
         points, offsets, curve.astype(np.float64), bridge, np.ones(len(points)), np.zeros(3), _LIMITS,
