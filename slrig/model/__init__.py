@@ -17,7 +17,17 @@ from slrig.model.frames import (
 )
 from slrig.model.light_axis import LEAST_SHARE, share_across, told_depth, triangulated_axis
 from slrig.model.missing_bits import without_missing_bits
-from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
+from slrig.model.patterns import (
+    Black,
+    Gray,
+    LineShift,
+    Pattern,
+    PatternSequence,
+    Primary,
+    White,
+    coarse_bits,
+    telling_bits,
+)
 from slrig.model.region import Region
 from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, LightMap, Pinhole, Size, Solved
 from slrig.model.stage import MeasuredAxis, PlaneKind, StageAxis, StagePlane
@@ -73,8 +83,10 @@ __all__ = [
     "Truth",
     "White",
     "bracket_fault",
+    "coarse_bits",
     "exposure_groups",
     "share_across",
+    "telling_bits",
     "told_depth",
     "triangulated_axis",
     "without_missing_bits",

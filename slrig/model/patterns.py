@@ -59,6 +59,21 @@ class Gray:
             )
 
 
+def coarse_bits(bits: int) -> int:
+    """How many bits of a code, the first of them, are coarse: few pixels lie at their edges, and the rest tell noise.
+
+    Half of them; three at least, as many as tell a variance.
+    """
+    return max(3, bits // 2)
+
+
+def telling_bits(bits: int) -> tuple[int, ...]:
+    """Which bits of a code tell what a camera makes of light, all bits together no more: the coarse ones, which are
+    even and tell noise, and the two finest, whose edges tell compression and a bent response.
+    """
+    return tuple(sorted({*range(min(coarse_bits(bits), bits)), *range(max(bits - 2, 0), bits)}))
+
+
 @dataclass(frozen=True, slots=True)
 class LineShift:
     """One frame of shifted lines: lights position c when (c - shift) mod period < line width."""

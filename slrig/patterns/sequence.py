@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Black, Gray, LineShift, Pattern, PatternSequence, Primary, Size, White
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, PatternSequence, Primary, Size, White, telling_bits
 from slrig.patterns.gray import gray_bits, gray_profile
 from slrig.patterns.line_shift import line_profile
 
@@ -32,15 +33,16 @@ def scan_patterns(
 ) -> tuple[Pattern, ...]:
     """List the patterns of one scan in the order of play.
 
-    White, black; for columns, then for rows, as far as they are asked for: the Gray bits, most significant first, each
-    followed by its inverse, and the n line frames; white, black again. The two pairs of white and black bracket
-    everything that can drift.
+    White, black; for columns, then for rows, as far as they are asked for: the Gray bits, each followed by its inverse,
+    first `telling_bits`, most significant first, and after the n line frames the rest; white, black again. The two
+    pairs of white and black bracket everything that can drift. What tells how a camera sees comes first, so that
+    stripes are found while the bits come that only number them.
 
     size : the projector. line_shift : False leaves the line frames out: a Gray-only scan. period_px, line_width_px : n
     and the width of a line. gray_cell_px : None stands for ⌊n/2⌋, or `GRAY_ONLY_CELL_PX` without line shift.
     gray_offset_px : added to a position before it is cut into cells: moves the cell edges. rows, columns : the axes to
-    play. coloured_light : white in red, green and blue as well, each before one of the last three frames of code: so
-    an old frame in the place of any of them, or of the one after it, does not pass for it.
+    play. coloured_light : white in red, green and blue as well, each between two of the last frames of code: so an
+    old frame in the place of any of them, or of the one after it, does not pass for it.
 
     Raises PatternError: a code that cannot tell the lines of one frame apart, or a pattern that does not fit the
     projector.
@@ -59,21 +61,22 @@ def scan_patterns(
     bracket: tuple[Pattern, ...] = (White(), Black())
     middle: list[Pattern] = []
     for axis in [each for each, played in ((Axis.COLUMN, columns), (Axis.ROW, rows)) if played]:
-        middle.extend(_gray_patterns(axis, size.along(axis), cell_px, gray_offset_px))
-        if line_shift:
-            middle.extend(LineShift(axis, shift, period_px, line_width_px) for shift in range(period_px))
+        code = _gray_patterns(axis, size.along(axis), cell_px, gray_offset_px)
+        shifts = range(period_px) if line_shift else ()
+        telling = telling_bits(code[0].bits)
+        middle += [each for each in code if each.bit in telling]
+        middle += [LineShift(axis, shift, period_px, line_width_px) for shift in shifts]
+        middle += [each for each in code if each.bit not in telling]
     if coloured_light:
-        codes = [at for at, pattern in enumerate(middle) if isinstance(pattern, Gray)]
-        for light, at in zip((Primary("blue"), Primary("green"), Primary("red")), codes[:-4:-1], strict=False):
+        between = [at for at, pair in enumerate(pairwise(middle), 1) if all(isinstance(each, Gray) for each in pair)]
+        for light, at in zip((Primary("blue"), Primary("green"), Primary("red")), reversed(between), strict=False):
             middle.insert(at, light)
     return (*bracket, *middle, *bracket)
 
 
-def _gray_patterns(axis: Axis, extent_px: int, cell_px: int, offset_px: int) -> Iterator[Gray]:
+def _gray_patterns(axis: Axis, extent_px: int, cell_px: int, offset_px: int) -> list[Gray]:
     bits = gray_bits(extent_px, cell_px, offset_px)
-    for bit in range(bits):
-        for inverted in (False, True):
-            yield Gray(axis, bit, bits, cell_px, offset_px, inverted)
+    return [Gray(axis, bit, bits, cell_px, offset_px, inverted) for bit in range(bits) for inverted in (False, True)]
 
 
 def united(sequences: Sequence[PatternSequence]) -> PatternSequence:

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from slrig.errors import PatternError
 from slrig.model import FloatArray, Pattern, Refusal
 from slrig.reconstruction.asked import AskedPixels, without_others
-from slrig.reconstruction.coded import Coded, cell_width_px, code_edge_points, line_image
+from slrig.reconstruction.coded import Coded, cell_width_px, code_edge_points, line_image, not_yet_coded
 from slrig.reconstruction.correlation import edge_sum, phase_sum
 from slrig.reconstruction.decoding import CodeMap, decode, lit_pixels
-from slrig.reconstruction.edges import near_edges, near_shadows
+from slrig.reconstruction.edges import near_edges
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
 from slrig.reconstruction.identification import identify
 from slrig.reconstruction.limits import CodeTables, Limits
@@ -70,9 +70,9 @@ class CameraCurves:
 class CameraStream:
     """The reconstruction of one camera and axis, fed frame by frame.
 
-    What a frame allows is done when it comes: the code is read once its last frame is in, stripes are located in each
-    line frame once the code is known, and the rest is done once all are in. Frames may come in any order, with the same
-    result to the bit.
+    What a frame allows is done when it comes: stripes are located in each line frame once it is known what the camera
+    makes of light, the code is read once its last frame is in, and the rest is done once all are in. Frames may come in
+    any order, with the same result to the bit.
 
     noise : where it is known already; it is estimated otherwise. entered : told the name of each stage as it begins.
     asked : the pixels that count.
@@ -96,6 +96,7 @@ class CameraStream:
         self._limits = limits
         self._entered = entered
         self._coded: Coded | None = None
+        self._decoded = False
         self._ends: tuple[NDArray[np.float32], NDArray[np.float32]]
         self._scales: _Scales | None = None
         self._points: list[LinePoints] = []
@@ -124,42 +125,53 @@ class CameraStream:
 
     def _go_on(self) -> Coded | None:
         """Do what the frames so far allow."""
-        if self._coded is None and self._stacks.coded:
-            self._coded = self._decoded()
-        if self._coded is not None and self._curves is None:
-            self._coded = self._locate(self._coded)
-            if self._scales is not None and not self._stacks.missing:
-                self._curves = _curves(
-                    self._coded, self._points, self._scales, self._tables, self._limits, self._entered,
-                    self._stacks,
-                )  # fmt: skip
-        return self._coded
+        coded = self._coded
+        if coded is None and self._stacks.telling:
+            coded = self._told()
+        if coded is None or self._curves is not None:
+            return coded
+        if not self._decoded and self._stacks.coded:
+            coded = self._with_code(coded)
+        # Where some pixels are asked for, the code tells which.
+        if self._decoded or self._asked is None:
+            coded = self._locate(coded)
+        self._coded = coded
+        if self._scales is not None and not self._stacks.missing:
+            self._curves = _curves(
+                coded, self._points, self._scales, self._tables, self._limits, self._entered, self._stacks
+            )  # fmt: skip
+        return coded
 
-    def _decoded(self) -> Coded:
-        self._entered("decode")
+    def _told(self) -> Coded:
+        """What the camera makes of light, and which pixels are lit."""
+        self._entered("measure noise")
         frames = self._stacks.frames()
-        tables, limits = self._tables, self._limits.decoding
         self._ends = frames.white, frames.black
         gamma, noise = 1.0, self._noise
         if noise is None:
-            frames, noise, gamma = in_light(self._stacks, limits)
+            frames, noise, gamma = in_light(self._stacks, self._limits.decoding)
+        return not_yet_coded(frames, noise, gamma, self._limits)
+
+    def _with_code(self, coded: Coded) -> Coded:
+        self._entered("decode")
+        self._decoded = True
+        frames, noise, tables, limits = coded.frames, coded.noise, self._tables, self._limits.decoding
         unresolved = None
         if not self._stacks.patterns.lines:
             unresolved = unresolved_bits(frames, lit_pixels(frames, noise, limits))
         code = decode(
             frames, noise, tables.index_of_word, len(tables.cell_position), limits, unresolved=unresolved
         )  # fmt: skip
-        near_shadow = near_shadows(np.asarray(code.refusal == Refusal.NOT_LIT), self._limits.edges)
-        ends = noise.variance(frames.white) + noise.variance(frames.black)
-        deviation = np.sqrt(ends / np.float32(frames.ends_repeats))
         asked = None
         if self._asked is not None:
             asked = self._asked.told(frames, code, tables.cell_position)
             code = without_others(code, asked)
-        return Coded(frames, noise, code, near_shadow, deviation, unresolved, gamma=gamma, asked=asked)
+        return replace(coded, code=code, unresolved=unresolved, asked=asked)
 
     def _locate(self, coded: Coded) -> Coded:
         if self._scales is None and not self._stacks.patterns.lines:
+            if not self._decoded:
+                return coded
             self._entered("locate stripes")
             scale_px = self._limits.stripes.sigma_px or _FINEST_SCALE_PX
             self._scales = _Scales(scale_px, _FINEST_SCALE_PX)
@@ -172,9 +184,7 @@ class CameraStream:
             self._entered("locate stripes")
             if self._scales is None:
                 # The first frame tells for all.
-                coded = coded.summed(
-                    coded.frames.lines[:1], phase_sum(coded.frames, coded.code, self._tables.cell_position)
-                )
+                coded = coded.summed(coded.frames.lines[:1], phase_sum(coded.frames, coded.searched))
             image, deviation = line_image(coded, len(self._points))
             lit = coded.searched
             if self._scales is None:

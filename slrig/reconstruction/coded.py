@@ -11,8 +11,10 @@ from slrig.kernels import in_bands
 from slrig.model import Refusal
 from slrig.reconstruction.compression import loss_variance
 from slrig.reconstruction.correlation import PixelSum, shared_noise
-from slrig.reconstruction.decoding import CodeMap
+from slrig.reconstruction.decoding import CodeMap, lit_pixels
+from slrig.reconstruction.edges import near_shadows
 from slrig.reconstruction.frames import AxisFrames, Images, at_rows, band_rows, rows_of
+from slrig.reconstruction.limits import Limits
 from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.response import gain
 from slrig.reconstruction.stripes import (
@@ -82,6 +84,21 @@ class Coded:
     def searched(self) -> NDArray[np.bool_]:
         """(H, W) bool: the lit pixels in which points are looked for."""
         return ~self.unlit if self.asked is None else ~self.unlit & (self.code.refusal != Refusal.OUTSIDE_REGION)
+
+
+def not_yet_coded(frames: AxisFrames, noise: NoiseModel, gamma: float, limits: Limits) -> Coded:
+    """What is known before the code is read: which pixels are lit, and no cell of any."""
+    lit = lit_pixels(frames, noise, limits.decoding)
+    ends = noise.variance(frames.white) + noise.variance(frames.black)
+    nowhere = np.broadcast_to(np.int32(-1), lit.shape)
+    return Coded(
+        frames, noise,
+        CodeMap(nowhere, nowhere, np.where(lit, np.uint8(Refusal.NONE), np.uint8(Refusal.NOT_LIT))),
+        near_shadow=near_shadows(~lit, limits.edges),
+        contrast_deviation=np.sqrt(ends / np.float32(frames.ends_repeats)),
+        unresolved=None,
+        gamma=gamma,
+    )  # fmt: skip
 
 
 def cell_width_px(coded: Coded) -> float | NDArray[np.float32]:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import FloatArray, IntArray, Refusal
+from slrig.model import FloatArray, IntArray, Refusal, telling_bits
 from slrig.reconstruction.correlation import PixelSum
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames, Images
@@ -96,8 +96,10 @@ def loss_variance(frames: AxisFrames, noise: NoiseModel, code: CodeMap, images: 
 
 def frames_loss(frames: AxisFrames, lit: NDArray[np.bool_], images: Images | None = None) -> FloatArray:
     """`compression_loss` of these images, of one camera and axis; by default of its code. lit : (H, W) bool."""
-    told_by = (*frames.bits, *(() if frames.inverses is None else frames.inverses))
-    return compression_loss(frames.bits if images is None else images, told_by, lit, frames.full_scale)
+    telling = telling_bits(len(frames.bits))
+    direct = [frames.bits[bit] for bit in telling]
+    told_by = direct + ([] if frames.inverses is None else [frames.inverses[bit] for bit in telling])
+    return compression_loss(direct if images is None else images, told_by, lit, frames.full_scale)
 
 
 @cache

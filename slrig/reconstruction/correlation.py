@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import FloatArray, Refusal
-from slrig.reconstruction.decoding import CodeMap
+from slrig.model import FloatArray, coarse_bits
 from slrig.reconstruction.frames import AxisFrames, Images
 from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.surface_fit import stencils
@@ -27,8 +26,7 @@ _LEAST_WINDOWS = 200
 _CLEAR_SHARE = 0.8  # of the contrast: less is an edge of the code, where a camera that bends its values breaks the sum
 _LEAST_RATIO = 1.1  # the model is no better than that; of independent noise the windows tell 0.98 to 1.08
 _FEWEST_BITS = 3  # as for `noise.estimate_noise`
-_MOST_RISES = 200_000  # whose median is known to a few thousandths
-_STEP_PX = 8  # over which stripes are counted: cells of the code are steps
+_MOST_COUNTED = 200_000  # whose mean is known to a hundredth
 
 
 class PixelSum(NamedTuple):
@@ -51,19 +49,31 @@ class PixelSum(NamedTuple):
         return np.asarray(self.weights * np.exp(-2j * np.pi * (across * x + down * y)))
 
 
-def phase_sum(frames: AxisFrames, code: CodeMap, cell_position: FloatArray) -> PixelSum:
-    """As the fit to the phase of line frames sums pixels. cell_position : (cells,) float64, px."""
-    rows, columns = code.refusal.shape
-    every = max(1, rows * columns // _MOST_RISES)
+def phase_sum(frames: AxisFrames, lit: NDArray[np.bool_]) -> PixelSum:
+    """As the fit to the phase of line frames sums pixels. lit : (H, W) bool.
 
-    def position(first: int) -> FloatArray:
-        drawn = code.rows(slice(first, None if first else -_STEP_PX, every))
-        return np.where(drawn.refusal == Refusal.NONE, cell_position[drawn.lowest], np.nan)
+    How close lines lie is told by a fine bit of the code, which changes its sign every so many projector pixels. The
+    finest may not resolve.
+    """
+    index = max(len(frames.bits) - 2, 0)
+    changes_px = (2 << (len(frames.bits) - 1 - index)) * frames.gray.cell_px
+    every = max(1, lit.size // _MOST_COUNTED)
 
-    here = position(0)
-    rises = here[:, _STEP_PX:] - here[:, :-_STEP_PX], position(_STEP_PX) - here
-    per_cycle = _STEP_PX * frames.line_patterns[0].period_px
-    across, down = (float(np.nanmedian(np.abs(rise))) / per_cycle if np.isfinite(rise).any() else 0.0 for rise in rises)
+    def above(first: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        rows = slice(first, None if first else -1, every)
+        if frames.inverses is not None:
+            against = frames.inverses[index][rows]
+        else:
+            against = (frames.white[rows] + frames.black[rows]) / 2
+        return frames.bits[index][rows] > against, lit[rows]
+
+    def cycles_per_px(here: NDArray[np.bool_], there: NDArray[np.bool_], both: NDArray[np.bool_]) -> float:
+        changes = int(np.count_nonzero((here != there) & both)) / max(int(np.count_nonzero(both)), 1)
+        return changes * changes_px / frames.line_patterns[0].period_px
+
+    (here, known), (below, known_below) = above(0), above(1)
+    across = cycles_per_px(here[:, 1:], here[:, :-1], known[:, 1:] & known[:, :-1])
+    down = cycles_per_px(here, below, known & known_below)
     return PixelSum(stencils()[0][0, :25].reshape(5, 5).astype(np.float64), (across, down))
 
 
@@ -82,7 +92,7 @@ def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_]
     """
     if frames.inverses is None or len(frames.bits) < _FEWEST_BITS:
         return 1.0
-    count = max(_FEWEST_BITS, len(frames.bits) // 2)
+    count = coarse_bits(len(frames.bits))
     bits, inverses = frames.bits[:count], frames.inverses[:count]
     corner = _windows(where, len(summed.weights))
     if len(corner[0]) < _LEAST_WINDOWS:

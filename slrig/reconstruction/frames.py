@@ -18,7 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Shot, White, exposure_groups
+from slrig.model import (
+    Axis,
+    Black,
+    Capture,
+    Gray,
+    LineShift,
+    Pattern,
+    Shot,
+    White,
+    exposure_groups,
+    telling_bits,
+)
 
 Image = NDArray[np.float32]
 Images = Sequence[NDArray[Any]] | NDArray[np.float32]
@@ -291,12 +302,26 @@ class FrameStacks:
         return frozenset(self._missing)
 
     @property
+    def telling(self) -> bool:
+        """Whether all is in that tells what the camera makes of light: of white, black and inverses that are shown,
+        those of `telling_bits`; otherwise all of the code.
+        """
+        patterns = self.patterns
+        if not patterns.paired or len(patterns.ends) < 2:
+            return self.coded
+        bits = telling_bits(patterns.gray.bits)
+        return not any(
+            not isinstance(pattern, LineShift) and (not isinstance(pattern, Gray) or pattern.bit in bits)
+            for pattern in self._missing
+        )
+
+    @property
     def coded(self) -> bool:
         """Whether all that decoding needs is in: everything but line frames."""
         return all(isinstance(pattern, LineShift) for pattern in self._missing)
 
     def frames(self) -> AxisFrames:
-        """The frames, once `coded`; line frames that are not in are black until they are."""
+        """The frames, once `telling`; those that are not in are black until they are."""
         patterns = self.patterns
         pairs = sorted(patterns.direct & patterns.inverted)
         white, black = self._ends.get(White()), self._ends.get(Black())

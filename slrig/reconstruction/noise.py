@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import FloatArray
+from slrig.model import FloatArray, coarse_bits
 from slrig.reconstruction.frames import AxisFrames, Images, at_rows, sampled
 
 _QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
@@ -99,7 +99,7 @@ def noise_samples(
     """
     if frames.inverses is None or len(frames.bits) < 3:
         return _scatter_between_neighbours(frames, where, frames.white, frames.black)
-    coarse = max(3, len(frames.bits) // 2)
+    coarse = coarse_bits(len(frames.bits))
     level, variance = _scatter_of_sums(frames.bits[:coarse], frames.inverses[:coarse], frames.clipped_at, where)
     if len(level) and not _tells_slope(level, variance):
         dark, dark_variance = _scatter_between_neighbours(frames, where, frames.black)

@@ -15,14 +15,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands
+from slrig.model import telling_bits
 from slrig.reconstruction.compression import frames_loss
 from slrig.reconstruction.decoding import DecodingLimits, lit_pixels
-from slrig.reconstruction.frames import AxisFrames, FrameStacks, sampled
+from slrig.reconstruction.frames import AxisFrames, FrameStacks, Images, rows_of
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
 
 _LEAST = 1.2  # chosen: cameras bend by 1.8 and more if at all, and edges of eight scenes by straight ones told 1.00
@@ -41,14 +44,9 @@ def found_gamma(frames: AxisFrames) -> float:
     full = frames.full_scale
     # Rows enough: an edge of the code crosses most of them.
     step = max(1, frames.white.size // _MOST_PIXELS)
-    bits, inverses = sampled(frames.bits, step, 1), sampled(frames.inverses, step, 1)
-    # At most bits a pixel is clear of edges. White does not tell: projectors may dim a picture that is all white.
-    white, black = (_middle(each(bits, inverses)) for each in (np.maximum, np.minimum))
-    clear = (white - black > _CLEAR_LEVELS / 255 * full) & (white < frames.clipped_at)
-    found = []
-    for bit, inverse in zip(bits, inverses, strict=True):
-        alike = clear & (np.abs(bit - inverse) < _ALIKE * (white - black))
-        found.append(np.stack([(bit[alike] + inverse[alike]) / 2, white[alike], black[alike]]))
+    telling = telling_bits(len(frames.bits))
+    bits, inverses = ([images[bit][::step] for bit in telling] for images in (frames.bits, frames.inverses))
+    found = in_bands(partial(_edges, bits, inverses, full, frames.clipped_at), len(bits[0]))
     middle, bright, dark = np.maximum(np.concatenate(found, axis=1), 0).astype(np.float64) / full
     if len(middle) < _LEAST_EDGES:
         return 1.0
@@ -67,6 +65,21 @@ def found_gamma(frames: AxisFrames) -> float:
         else:
             high = gamma
     return low
+
+
+def _edges(
+    bits: Images, inverses: Images, full: float, clipped_at: float, first: int, last: int
+) -> NDArray[np.float32]:
+    """(3, n): at edges of the code in some rows, the mean of a bit and its inverse, white and black."""
+    direct, inverted = rows_of(bits, slice(first, last)), rows_of(inverses, slice(first, last))
+    # At most bits a pixel is clear of edges. White does not tell: projectors may dim a picture that is all white.
+    white, black = (_middle(each(direct, inverted)) for each in (np.maximum, np.minimum))
+    clear = (white - black > _CLEAR_LEVELS / 255 * full) & (white < clipped_at)
+    found = []
+    for bit, inverse in zip(direct, inverted, strict=True):
+        alike = clear & (np.abs(bit - inverse) < _ALIKE * (white - black))
+        found.append(np.stack([(bit[alike] + inverse[alike]) / 2, white[alike], black[alike]]))
+    return np.concatenate(found, axis=1)
 
 
 def _middle(images: NDArray[np.float32]) -> NDArray[np.float32]:

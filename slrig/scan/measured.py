@@ -31,7 +31,7 @@ from slrig.scan.report import capture_notes, capture_report, lit_pixels
 from slrig.scan.stream import CameraResult, LiveScan, ScanStream, cell_px, step_px
 from slrig.scan.triangulated import Triangulated, camera_notes, triangulated, unresolved_notes
 
-_STAGES = ("decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
+_STAGES = ("measure noise", "decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
 
 Entered = Callable[[str, float, str], None]
 """Told the name of a stage, how far the whole is, and a detail."""
@@ -86,7 +86,7 @@ def measured(
     sound = [each for each in tries if not isinstance(each, NothingToReconstructError)]
     if not sound:
         raise next(each for each in tries if isinstance(each, NothingToReconstructError))
-    best, found = max(sound, key=lambda each: _depth_known(*each))
+    best, found = max(sound, key=lambda each: _depth_known(*each)) if len(sound) > 1 else sound[0]
     best.notes.extend(_chosen_notes(walked, best, found))
     best.notes.extend(left_out_notes(best.axis, {seen.name: seen.device for seen in best.seen}, best.devices.projector))
     words = weakness(best.axis, best.shown, found.share_across)
@@ -186,7 +186,8 @@ def _walked(
         if last != stage + name:
             last = stage + name
             if stage in _STAGES:
-                share = (names.index(name) + _STAGES.index(stage) / len(_STAGES)) / len(names)
+                # Stripes may be located before the code is read.
+                share = max(share, (names.index(name) + _STAGES.index(stage) / len(_STAGES)) / len(names))
             entered(stage, 0.1 + 0.5 * share, f"camera '{name}'")
 
     if (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -47,6 +49,17 @@ def test_each_bit_is_followed_by_its_inverse_most_significant_first() -> None:
 def test_every_shift_is_played_once() -> None:
     lines = [pattern for pattern in patterns_of(Size(64, 48), period_px=5) if isinstance(pattern, LineShift)]
     assert lines == [LineShift(Axis.COLUMN, shift, 5) for shift in range(5)]
+
+
+def test_what_tells_how_a_camera_sees_comes_before_the_lines_of_its_axis_and_the_other_bits_after() -> None:
+    patterns = [pattern for pattern in patterns_of(Size(1024, 192), rows=True) if isinstance(pattern, Gray | LineShift)]
+    played = [f"{pattern.axis} {pattern.bit if isinstance(pattern, Gray) else 'lines'}" for pattern in patterns]
+    assert [each for each, _ in groupby(played)] == [
+        *(f"column {each}" for each in (0, 1, 2, 3, 6, 7, "lines", 4, 5)),
+        *(f"row {each}" for each in (0, 1, 2, 4, 5, "lines", 3)),
+    ]
+    for bit in (pattern for pattern in patterns if isinstance(pattern, Gray) and not pattern.inverted):
+        assert patterns[patterns.index(bit) + 1] == replace(bit, inverted=True)
 
 
 def test_gray_only_has_cells_of_two_pixels_and_no_lines() -> None:

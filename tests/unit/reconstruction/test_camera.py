@@ -102,7 +102,7 @@ def errors_px(curves: CameraCurves, scene: Scene) -> FloatArray:
 def test_a_slanted_plate_gives_every_column_once_to_a_fraction_of_a_pixel() -> None:
     curves, stages = walk(rendered(slope, patterns()))
     assert list(dict.fromkeys(stages)) == [
-        "decode", "locate stripes", "refine stripes", "identify stripes", "link stripes"
+        "measure noise", "decode", "locate stripes", "refine stripes", "identify stripes", "link stripes"
     ]  # fmt: skip
     position = curves.ensemble.position_px
     # 8 … 121 columns are in view; those whose stripe leaves by a corner are there in part.
@@ -327,6 +327,47 @@ def test_nothing_waits_once_every_frame_is_in() -> None:
     last = told.index(f"frame {count - 1}")
     assert told[last + 1 :] == ["locate stripes", "refine stripes", "identify stripes", "link stripes", "finish"]
     assert "refine stripes" not in told[:last]
+
+
+def bent(image: NDArray[np.uint8], _: np.random.Generator) -> NDArray[np.uint8]:
+    """As a camera made for displays gives it."""
+    return np.rint(255 * (image / 255) ** (1 / 2.2)).astype(np.uint8)
+
+
+def compressed(image: NDArray[np.uint8], _: np.random.Generator) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 70])[1], 0), dtype=np.uint8)
+
+
+def with_noise_of_rows(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    return np.clip(np.rint(image + rng.normal(0, 2, (len(image), 1))), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("seen", [lambda image, _: image, bent, compressed, with_noise_of_rows])
+def test_stripes_are_located_before_the_bits_come_that_only_number_them(
+    seen: Callable[[NDArray[np.uint8], np.random.Generator], NDArray[np.uint8]],
+) -> None:
+    capture, rng = rendered(slope, patterns(cell_px=1)), np.random.default_rng(1)
+    capture = replace(capture, shots=tuple(replace(shot, image=seen(shot.image, rng)) for shot in capture.shots))
+    bits = [pattern.bit for pattern in capture.patterns if isinstance(pattern, Gray)]
+    assert bits == [0, 0, 1, 1, 2, 2, 5, 5, 6, 6, 3, 3, 4, 4]
+    count = len(telling_shots(capture, "eye"))
+    told: list[str] = []
+    got, wanted = streamed(capture, range(count), told.append), walk(capture)[0]
+    stages = ["measure noise", *["locate stripes"] * 8, "decode", "refine stripes", "identify stripes", "link stripes"]
+    assert [each for each in told if not each.startswith("frame")] == [*stages, "finish"]
+    first_number = capture.patterns.index(Gray(Axis.COLUMN, 3, 7, cell_px=1))
+    assert told.index(f"frame {first_number}") > len(told) - 1 - told[::-1].index("locate stripes")
+    for order in ([*range(12), *range(20, 24), *range(12, 20)], range(count - 1, -1, -1)):
+        other = streamed(capture, order)
+        for each in (other, wanted):
+            assert each.ensemble.points_px.tobytes() == got.ensemble.points_px.tobytes()
+            assert each.ensemble.sigma_px.tobytes() == got.ensemble.sigma_px.tobytes()
+            assert (each.gamma, each.compression_dn, each.shared_noise) == (
+                got.gamma, got.compression_dn, got.shared_noise
+            )  # fmt: skip
+    assert (got.gamma > 2) == (seen is bent)
+    assert (got.compression_dn > 1) == (seen is compressed)
+    assert (got.shared_noise > 2) == (seen in {compressed, with_noise_of_rows})
 
 
 def test_a_stream_that_lacks_a_frame_says_which() -> None:

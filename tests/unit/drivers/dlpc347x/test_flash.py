@@ -8,7 +8,7 @@ import pytest
 
 from drivers.dlpc347x.flash import Lines, block_of, places_in, places_of, size_of
 from drivers.dlpc347x.projector import MIRRORS
-from slrig.model import PatternSequence, Size
+from slrig.model import Axis, Gray, LineShift, Pattern, PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns, united
 
 
@@ -19,6 +19,13 @@ def scanned(size: Size, *, period_px: int = 16) -> PatternSequence:
     return united([encode(patterns, size)])
 
 
+def as_compiled(pattern: Pattern) -> tuple[bool, bool, int]:
+    """Sorts patterns by axis, then code before lines, then bits; white and black stay first."""
+    if not isinstance(pattern, Gray | LineShift):
+        return False, False, -1
+    return pattern.axis is Axis.ROW, isinstance(pattern, LineShift), pattern.bit if isinstance(pattern, Gray) else 0
+
+
 @pytest.mark.parametrize(
     ("controller", "length", "digest"),
     [
@@ -27,9 +34,13 @@ def scanned(size: Size, *, period_px: int = 16) -> PatternSequence:
     ],
 )
 def test_a_block_is_what_tis_own_source_makes_of_the_same_patterns(controller: int, length: int, digest: str) -> None:
-    # dlpc347x_internal_patterns.c as `drivers.dlpc347x.flash` cites it, compiled and run once.
+    # dlpc347x_internal_patterns.c as `drivers.dlpc347x.flash` cites it, compiled and run once: of each axis all bits,
+    # and then the lines.
     _, mirrors = MIRRORS[controller]
-    block = block_of(scanned(mirrors.size), Lines(mirrors, (False, False)))
+    found = scanned(mirrors.size)
+    ordered = sorted(zip(found.patterns, found.profiles, strict=True), key=lambda each: as_compiled(each[0]))
+    patterns, profiles = zip(*ordered, strict=True)
+    block = block_of(PatternSequence(found.projector, patterns, profiles), Lines(mirrors, (False, False)))
     assert (len(block), hashlib.sha256(block).hexdigest()) == (length, digest)
     assert size_of(block[:20]) == length
 

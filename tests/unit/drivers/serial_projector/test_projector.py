@@ -184,7 +184,7 @@ def test_patterns_that_are_not_flashed_are_refused_dark_and_nothing_is_written(b
     projector.load(SEQUENCE)
     projector.show(0)
     wider = whole_sequence(SIZE, line_width_px=2)
-    with pytest.raises(UnsupportedByDeviceError, match=r"it lacks 8 of them, pattern 16 the first\..*slrig patterns"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"it lacks 8 of them, pattern 12 the first\..*slrig patterns"):
         projector.load(wider)
     assert bench.scene.lit is None
     with pytest.raises(DeviceStateError, match="no sequence is loaded"):
