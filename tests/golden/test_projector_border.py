@@ -41,7 +41,7 @@ def points() -> tuple[Points, FloatArray]:
     bench = narrow_rig()
     column = bench.view.truth().projector_px[..., 0]
     assert np.isnan(column[45, [0, -1]]).all()
-    found = measured(bench, exposed_at_snr(bench, SNR), captures=4)
+    found = measured(bench, exposed_at_snr(bench, SNR), captures=20)
     line = found.cell // bench.camera.size.height_px
     return found, np.minimum(line, COLUMNS - 1 - line).astype(np.float64)
 
