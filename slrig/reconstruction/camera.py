@@ -126,14 +126,14 @@ class CameraStream:
     def _go_on(self) -> Coded | None:
         """Do what the frames so far allow."""
         coded = self._coded
-        if coded is None and self._stacks.telling:
-            coded = self._told()
+        if coded is None and self._stacks.noise_shown:
+            coded = self._with_noise()
         if coded is None or self._curves is not None:
             return coded
         if not self._decoded and self._stacks.coded:
             coded = self._with_code(coded)
-        # Where some pixels are asked for, the code tells which.
-        if self._decoded or self._asked is None:
+        # Where some pixels are asked for the code tells which, and without lines its edges stand for them.
+        if self._decoded or (self._stacks.patterns.lines and self._asked is None):
             coded = self._locate(coded)
         self._coded = coded
         if self._scales is not None and not self._stacks.missing:
@@ -142,8 +142,8 @@ class CameraStream:
             )  # fmt: skip
         return coded
 
-    def _told(self) -> Coded:
-        """What the camera makes of light, and which pixels are lit."""
+    def _with_noise(self) -> Coded:
+        """What is known of the camera's noise and response, and which pixels are lit, but no code yet."""
         self._entered("measure noise")
         frames = self._stacks.frames()
         self._ends = frames.white, frames.black
@@ -153,12 +153,13 @@ class CameraStream:
         return not_yet_coded(frames, noise, gamma, self._limits)
 
     def _with_code(self, coded: Coded) -> Coded:
+        """The same with the code read, of the pixels that are asked for."""
         self._entered("decode")
         self._decoded = True
         frames, noise, tables, limits = coded.frames, coded.noise, self._tables, self._limits.decoding
         unresolved = None
         if not self._stacks.patterns.lines:
-            unresolved = unresolved_bits(frames, lit_pixels(frames, noise, limits))
+            unresolved = unresolved_bits(frames, ~coded.unlit)
         code = decode(
             frames, noise, tables.index_of_word, len(tables.cell_position), limits, unresolved=unresolved
         )  # fmt: skip
@@ -170,8 +171,6 @@ class CameraStream:
 
     def _locate(self, coded: Coded) -> Coded:
         if self._scales is None and not self._stacks.patterns.lines:
-            if not self._decoded:
-                return coded
             self._entered("locate stripes")
             scale_px = self._limits.stripes.sigma_px or _FINEST_SCALE_PX
             self._scales = _Scales(scale_px, _FINEST_SCALE_PX)

@@ -302,16 +302,16 @@ class FrameStacks:
         return frozenset(self._missing)
 
     @property
-    def telling(self) -> bool:
-        """Whether all is in that tells what the camera makes of light: of white, black and inverses that are shown,
-        those of `telling_bits`; otherwise all of the code.
+    def noise_shown(self) -> bool:
+        """Whether all is in that tells the camera's noise and response: white, black and `telling_bits`, if all bits
+        come with their inverses; otherwise all of the code.
         """
         patterns = self.patterns
         if not patterns.paired or len(patterns.ends) < 2:
             return self.coded
         bits = telling_bits(patterns.gray.bits)
-        return not any(
-            not isinstance(pattern, LineShift) and (not isinstance(pattern, Gray) or pattern.bit in bits)
+        return all(
+            isinstance(pattern, LineShift) or (isinstance(pattern, Gray) and pattern.bit not in bits)
             for pattern in self._missing
         )
 
@@ -321,7 +321,7 @@ class FrameStacks:
         return all(isinstance(pattern, LineShift) for pattern in self._missing)
 
     def frames(self) -> AxisFrames:
-        """The frames, once `telling`; those that are not in are black until they are."""
+        """The frames, once `noise_shown`; those that are not in are black until they are."""
         patterns = self.patterns
         pairs = sorted(patterns.direct & patterns.inverted)
         white, black = self._ends.get(White()), self._ends.get(Black())
