@@ -366,6 +366,9 @@ app.command()(fleet)
 
 def main() -> None:
     """Run the command that the arguments name."""
+    # Before numpy is loaded, here and in what commands start. OpenBLAS's threads wait for work by spinning, for 2**26
+    # ticks after each product (its THREAD_TIMEOUT), beside kernels, captures and other programs.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # A reader that has seen enough (slrig devices | head) closes the pipe: that is no error.
     try:
         app(prog_name="slrig")

@@ -92,6 +92,8 @@ class ServiceProcess:
             "SLRIG_MIN_FREE_BYTES": "0",
             "PYTHONUNBUFFERED": "1",
         }
+        # What a command does by itself about OpenBLAS's threads: the tests' own setting would hide it.
+        environment.pop("OPENBLAS_NUM_THREADS", None)
         self.process: subprocess.Popen[bytes] | ForkedCommand
         # What is to be preloaded is read as a program begins.
         if fresh or "LD_PRELOAD" in environment:

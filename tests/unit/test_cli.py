@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -503,3 +504,26 @@ def test_refusal_of_a_service_does_nothing_to_the_terminal() -> None:
     with client_of(lambda _: httpx2.Response(422, json=problem)) as client, pytest.raises(ServiceError) as refused:
         client.get("/scan")
     assert str(refused.value) == "no \\u001b[2J\n  label: found \\u009b"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in Linux's /proc")
+@pytest.mark.parametrize(("asked", "kept"), [(None, "1"), ("2", "2")])
+def test_a_command_has_no_threads_that_spin_beside_it(asked: str | None, kept: str) -> None:
+    # numpy and scipy bring an OpenBLAS each, with a thread per core beside the first, all started when it is loaded.
+    command = (
+        "import os, sys; sys.argv = ['slrig', '--version']\n"
+        "from slrig.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "import numpy, scipy.linalg\n"
+        "print(os.environ['OPENBLAS_NUM_THREADS'], len(os.listdir('/proc/self/task')))"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    if asked is not None:
+        environment["OPENBLAS_NUM_THREADS"] = asked
+    ran = subprocess.run(  # noqa: S603 - our own
+        [sys.executable, "-c", command], capture_output=True, text=True, check=True, env=environment
+    )
+    setting, threads = ran.stdout.split()[-2:]
+    assert setting == kept
+    assert threads == "1" or asked is not None
