@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
+from queue import Empty, SimpleQueue
 from typing import Any
 from unittest import mock
 
@@ -105,9 +106,10 @@ class FakeOak:
         self.unplugged.set()
 
     def pulse(self) -> None:
-        """An edge on FSIN."""
+        """An edge on FSIN: at the same time for all, however late their threads come to it."""
+        edge_ns = time.monotonic_ns()
         for sensor in self.sensors.values():
-            sensor.pulse()
+            sensor.edges_ns.put(edge_ns)
 
     @contextmanager
     def connected(self) -> Iterator[None]:
@@ -241,7 +243,9 @@ class FakeSensor(Node):  # type: ignore[misc]
         self.output = self.createOutput()
         self.inputControl = self.createInput()
         self.initialControl = dai.CameraControl()
-        self._pulses = threading.Semaphore(0)
+        self.told = threading.Event()
+        """Set when a setting has come in since the start: the library hands them over in a thread of its own."""
+        self.edges_ns: SimpleQueue[int] = SimpleQueue()
         self._settings: list[tuple[int, Any]] = []
 
     def build(self, socket: Any, *, sensorFps: float) -> FakeSensor:
@@ -266,9 +270,6 @@ class FakeSensor(Node):  # type: ignore[misc]
         self._kind = kind
         return self.output
 
-    def pulse(self) -> None:
-        self._pulses.release()
-
     def run(self) -> None:
         command = dai.CameraControl.Command
         control = self.initialControl
@@ -280,14 +281,16 @@ class FakeSensor(Node):  # type: ignore[misc]
         while self.isRunning() and not self.oak.unplugged.is_set():
             for fresh in iter(self.inputControl.tryGet, None):
                 self._settings.append((number + self.oak.fault.settling_frames, fresh))
+                self.told.set()
             while self._settings and self._settings[0][0] <= number:
                 _, fresh = self._settings.pop(0)
                 exposure_us, iso = _exposure_us(fresh), fresh.getSensitivity()
             used_us = self.oak.fault.stuck_exposure_us or exposure_us
             if snapshot:
-                if not self._pulses.acquire(timeout=0.02):
+                try:
+                    end_ns = self.edges_ns.get(timeout=0.02) + used_us * 1_000
+                except Empty:
                     continue
-                end_ns = time.monotonic_ns() + used_us * 1_000
             else:
                 assert self.oak.ticks is not None
                 end_ns = self.oak.ticks.end_ns(number, round(1e9 / self._fps))

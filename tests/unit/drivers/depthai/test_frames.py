@@ -172,6 +172,7 @@ def test_an_edge_on_the_wire_is_one_frame(head: Opens) -> None:
         assert camera.configure(CameraSettings(0.004)).exposure_s == 0.004
         with pytest.raises(UnsupportedByDeviceError, match="free trigger"):
             camera.arm(1, Trigger.FREE)
+    assert all(sensor.told.wait(PATIENCE_S) for sensor in pair.oak.sensors.values())
     # The first frames after a setting are still taken otherwise; those edges belong to nobody.
     for camera in cameras:
         camera.arm(8, Trigger.HARDWARE)
