@@ -270,7 +270,7 @@ def test_the_exposure_is_where_the_frame_says(
     peer: FakeGigE, relay: Relay, opened: Opened, trigger: Trigger, time_stamp: str, most_err_s: float
 ) -> None:
     camera = opened(device=relay.address, time_stamp=time_stamp)
-    errors_ns = []
+    errors_ns: list[float] = []
     # The clock is tied anew by each arming. A machine that is held meanwhile ties it loosely, and says so.
     while len(errors_ns) < 5 and min(errors_ns, default=math.inf) > most_err_s * 1e9:
         camera.arm(10, trigger)
@@ -284,7 +284,7 @@ def test_the_exposure_is_where_the_frame_says(
             frames.append(camera.read(0, LONG_S))
         assert all(within(frame, peer.exposures) for frame in frames)
         # Half of them at least: a busy machine may be slow with one.
-        errors_ns.append(np.median([frame.t_err_ns for frame in frames]))
+        errors_ns.append(float(np.median([frame.t_err_ns for frame in frames])))
         camera.disarm()
     assert min(errors_ns) <= most_err_s * 1e9
 
