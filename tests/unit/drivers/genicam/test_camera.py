@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.genicam import GenicamCamera, find_devices, open_camera
+from drivers.genicam.aravis import AravisConnection
 from slrig.devices import CameraSettings, Trigger
 from slrig.errors import (
     DeviceBusyError,
@@ -262,31 +262,55 @@ def relay(peer: FakeGigE) -> Iterator[Relay]:
         yield found
 
 
+@pytest.fixture
+def looks_ns(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How long each look at the camera's clock takes from now on."""
+    took_ns: list[int] = []
+    latch = AravisConnection.latch
+
+    def timed(connection: AravisConnection) -> tuple[int, int, int] | None:
+        look = latch(connection)
+        if look is not None:
+            took_ns.append(look[2] - look[0])
+        return look
+
+    monkeypatch.setattr(AravisConnection, "latch", timed)
+    return took_ns
+
+
 @pytest.mark.parametrize(
     ("time_stamp", "most_err_s"), [("exposure_start", 0.001), ("exposure", 0.0035), ("none", 0.051)]
 )
 @pytest.mark.parametrize("trigger", Trigger)
 def test_the_exposure_is_where_the_frame_says(
-    peer: FakeGigE, relay: Relay, opened: Opened, trigger: Trigger, time_stamp: str, most_err_s: float
+    peer: FakeGigE,
+    relay: Relay,
+    opened: Opened,
+    looks_ns: list[int],
+    trigger: Trigger,
+    time_stamp: str,
+    most_err_s: float,
 ) -> None:
     camera = opened(device=relay.address, time_stamp=time_stamp)
-    errors_ns: list[float] = []
-    # The clock is tied anew by each arming. A machine that is held meanwhile ties it loosely, and says so.
-    while len(errors_ns) < 5 and min(errors_ns, default=math.inf) > most_err_s * 1e9:
-        camera.arm(10, trigger)
-        assert bool(relay.latches) == (time_stamp != "none")
-        frames = []
-        for _ in range(10):
-            if trigger is Trigger.SOFTWARE:
-                camera.trigger()
-            elif trigger is Trigger.HARDWARE:
-                peer.pulse()
-            frames.append(camera.read(0, LONG_S))
-        assert all(within(frame, peer.exposures) for frame in frames)
-        # Half of them at least: a busy machine may be slow with one.
-        errors_ns.append(float(np.median([frame.t_err_ns for frame in frames])))
+    camera.arm(10, trigger)
+    for _ in range(20):
+        if min(looks_ns, default=0) < 1_000_000:
+            break
+        # The machine was held during every look at the clock, which an arming ties anew.
         camera.disarm()
-    assert min(errors_ns) <= most_err_s * 1e9
+        looks_ns.clear()
+        camera.arm(10, trigger)
+    assert bool(relay.latches) == (time_stamp != "none")
+    frames = []
+    for _ in range(10):
+        if trigger is Trigger.SOFTWARE:
+            camera.trigger()
+        elif trigger is Trigger.HARDWARE:
+            peer.pulse()
+        frames.append(camera.read(0, LONG_S))
+    assert all(within(frame, peer.exposures) for frame in frames)
+    # Half of them at least: a busy machine may be slow with one.
+    assert np.median([frame.t_err_ns for frame in frames]) <= most_err_s * 1e9
 
 
 def test_a_clock_that_stands_is_not_believed(peer: FakeGigE, opened: Opened) -> None:
