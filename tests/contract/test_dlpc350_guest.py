@@ -14,7 +14,7 @@ from tests.contract.dlpc350_bench import CHECKS as ON_A_NODE
 from tests.contract.guest.machine import FILES, Module, require_guest, run_in_guest
 from tests.contract.suite import COLOUR
 
-pytestmark = [pytest.mark.slow, pytest.mark.one_core]
+pytestmark = pytest.mark.realtime
 
 TIMEOUT_S = 420.0
 

@@ -15,7 +15,7 @@ from tests.contract.guest.machine import FILES, Module, require_guest, run_in_gu
 from tests.contract.kms_bench import CHECKS, DEVICES
 from tests.contract.suite import COLOUR
 
-pytestmark = [pytest.mark.slow, pytest.mark.one_core]
+pytestmark = pytest.mark.realtime
 
 TIMEOUT_S = 540.0
 LACKING = {Need.FREE, Need.HARDWARE, Need.PLAYS, Need.POSITIONER}

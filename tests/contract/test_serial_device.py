@@ -146,8 +146,7 @@ def test_sessions_of_micropython_over_a_bad_line_are_exact() -> None:
     assert tallied.damaged > 0
 
 
-@pytest.mark.slow
-@pytest.mark.one_core
+@pytest.mark.realtime
 def test_500_sessions_over_a_bad_line_are_exact(capsys: pytest.CaptureFixture[str]) -> None:
     def played(seed: int) -> Tallied:
         tallied, scene = Tallied(), Scene()

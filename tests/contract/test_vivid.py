@@ -16,7 +16,7 @@ from tests.contract.guest.vivid_checks import ALL
 from tests.contract.suite import COLOUR
 from tests.contract.vivid_bench import DRIVERS
 
-pytestmark = [pytest.mark.slow, pytest.mark.one_core]
+pytestmark = pytest.mark.realtime
 
 TIMEOUT_S = 540.0
 LACKING = {Need.SOFTWARE, Need.HARDWARE, Need.PLAYS, Need.POSITIONER}

@@ -17,7 +17,7 @@ from tests.e2e.faulty_rig.following import Follower
 from tests.e2e.faulty_rig.scenery import CAMERA_NAME
 from tests.e2e.faulty_rig.service import ended, gone, half_written, installed, scanned, write_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = pytest.mark.realtime
 
 READ = Step(CAMERA_NAME, "read", 7)
 

@@ -207,8 +207,7 @@ print(count)
 """
 
 
-@pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.realtime
 def test_kernels_share_a_busy_machine() -> None:
     def meshes() -> int:
         call = [sys.executable, "-c", _MESHES_IN_3_S]

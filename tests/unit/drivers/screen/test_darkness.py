@@ -25,7 +25,7 @@ from tests.unit.drivers.screen.conftest import LEFT, OPEN, RIGHT, SIZE
 FAR_S = 20.0
 WHITE, BLACK = 0, 1
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = pytest.mark.realtime
 
 PROGRAM = """
 import sys
