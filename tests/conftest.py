@@ -24,9 +24,9 @@ _OF_A_SHELL = ("NUMBA_", "SLRIG_", "XDG_")
 _KEPT = {"SLRIG_SHARED"}
 
 NEED_KERNELS = (
-    "tests/golden/", "tests/properties/", "tests/contract/", "tests/e2e/", "tests/unit/accept/", "tests/unit/calibration/",
-    "tests/unit/doctor/", "tests/unit/meshing/", "tests/unit/reconstruction/", "tests/unit/scan/", "tests/unit/simulated_rig/",
-    "tests/unit/views/",
+    "tests/golden/", "tests/properties/", "tests/contract/", "tests/e2e/", "tests/unit/accept/",
+    "tests/unit/calibration/", "tests/unit/doctor/", "tests/unit/meshing/", "tests/unit/reconstruction/",
+    "tests/unit/scan/", "tests/unit/simulated_rig/", "tests/unit/views/",
 )  # fmt: skip
 """Tests that call compiled kernels. They run last, so that the kernels compile beside all others."""
 
@@ -69,6 +69,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if not several or config.option.collectonly or next(kept.rglob("*.nbc"), None) is not None:
         return
     folder = tempfile.TemporaryDirectory(prefix="kernels-")
+    config.add_cleanup(folder.cleanup)
     lock = FileLock(Path(folder.name) / "compiling.lock", thread_local=False)
     lock.acquire()
     config.stash[_KERNELS_LOCK] = lock.lock_file
@@ -78,7 +79,6 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     def release() -> None:
         process.wait()
         lock.release()
-        folder.cleanup()
 
     threading.Thread(target=release, name="kernels").start()
     config.add_cleanup(process.terminate)
