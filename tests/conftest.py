@@ -74,7 +74,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     lock.acquire()
     config.stash[_KERNELS_LOCK] = lock.lock_file
     # Tests of the command say why kernels cannot be compiled.
-    process = subprocess.Popen([sys.executable, "-m", "slrig.cli", "warm"], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "slrig.cli", "warm"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
 
     def release() -> None:
         process.wait()
