@@ -152,7 +152,7 @@ def views_there(client: Client, request: Mapping[str, Any], output: Path, *, ask
         with suppress(ServiceError):
             client.models.cancel(here)
         raise
-    model = client.models.look(here)
+    model = client.models.get(here)
     if model["state"] != "succeeded":
         raise ServiceError(f"Model {here} {model['state']}: {model['error']['detail']}")
     output.mkdir(parents=True, exist_ok=True)

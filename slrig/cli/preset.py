@@ -39,7 +39,7 @@ def export(name: Name, service: Service) -> None:
     from slrig.cli.display import print_json
 
     with service.client() as client:
-        print_json(client.presets.look(name))
+        print_json(client.presets.get(name))
 
 
 @app.command(name="import")

@@ -13,7 +13,6 @@ from rich.table import Column
 from slrig.cli.display import print_table, progress_shown
 from slrig.cli.quality import quality_lines
 from slrig.client import Client, ScanJob
-from slrig.client.wire import Blocking
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
 from slrig.scan.offered import PREFIXES, installed_by, offered
@@ -118,14 +117,14 @@ def assisted(client: Client, request: Mapping[str, Any], *, budget_s: float | No
     return {**request, **found["scan"]}
 
 
-def _started(client: Client, request: Mapping[str, Any]) -> ScanJob[Blocking]:
+def _started(client: Client, request: Mapping[str, Any]) -> ScanJob:
     # Whether it waits for the rig is as the request says, or the service.
     return client.start_scan(**{"if_busy": None, **request})
 
 
 def _completed(
     client: Client,
-    job: ScanJob[Blocking],
+    job: ScanJob,
     cancel: str,
     output: Path,
     files: Sequence[str],

@@ -1,7 +1,6 @@
-"""The service's client for other people's Python: light to load, typed, blocking or awaited."""
+"""The service's client for other people's Python: light to load, and typed."""
 
-from slrig.client.clients import AsyncClient, Client
-from slrig.client.cloud import Cloud
-from slrig.client.scans import ScanJob, ScanResult
+from slrig.client.client import Client
+from slrig.client.results import Cloud, ScanJob, ScanResult
 
-__all__ = ["AsyncClient", "Client", "Cloud", "ScanJob", "ScanResult"]
+__all__ = ["Client", "Cloud", "ScanJob", "ScanResult"]

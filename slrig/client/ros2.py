@@ -11,7 +11,7 @@ import importlib
 import json
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,6 @@ from numpy.typing import NDArray
 from slrig.client import Client, ScanResult
 from slrig.errors import SlrigError
 from slrig.ros_messages import PROJECTOR, TF_STATIC, WORLD, Device, Messages, topic
-
-if TYPE_CHECKING:
-    from slrig.client.wire import Blocking
 
 NODE = "slrig"
 
@@ -48,7 +45,7 @@ class ScanNode:
             response.success, response.message = True, result.id
         return response
 
-    def publish(self, result: ScanResult[Blocking]) -> None:
+    def publish(self, result: ScanResult) -> None:
         """Publish where the devices stand, how each sees, and the points of each camera, stamped with the time at which
         the scan began. Raises ServiceError.
         """

@@ -36,7 +36,7 @@ def followed_to(client: Client, model: str, words: str) -> None:
     for event in client.models.follow(model):
         if isinstance(event, Progress) and event.detail.startswith(words):
             return
-    message = f"the model ended without {words}: {client.models.look(model)}"
+    message = f"the model ended without {words}: {client.models.get(model)}"
     raise AssertionError(message)
 
 
@@ -62,7 +62,7 @@ def test_after_kills_between_views_and_within_one_the_missing_views_are_shot(sta
         first.kill()
     second = start(RIG)
     with second.client() as client:
-        waiting = client.models.look(by_hand)
+        waiting = client.models.get(by_hand)
         assert (waiting["state"], waiting["progress"]["stage"]) == ("capturing", "turn")
         assert views(client, by_hand) == [(1, "succeeded")]
         client.models.cancel(by_hand)
@@ -103,5 +103,5 @@ def test_a_view_that_a_device_fails_is_tried_three_times_and_told(start: Start, 
             client.models.combine(model)
             for _ in client.models.follow(model):
                 pass
-            assert client.models.look(model)["plan"]["notes"] == ["view 3 of 3, at 240°, is not in it: it was not shot"]
+            assert client.models.get(model)["plan"]["notes"] == ["view 3 of 3, at 240°, is not in it: it was not shot"]
         assert service.stop() == 0

@@ -78,7 +78,7 @@ def test_scans_become_a_model_over_http_and_a_kill_while_it_is_made_costs_nothin
         waiting = client.models.start(scans[:2], axis=STAGE)["id"]
         with pytest.raises(ConflictError, match="needed by model"):
             client.scans.delete(scans[0])
-        assert client.models.look(cut_off)["state"] == "computing"
+        assert client.models.get(cut_off)["state"] == "computing"
         first.kill()
         os.kill(worker, signal.SIGKILL)
     assert [each.name for each in (data / "models").iterdir()] == [made["id"]]

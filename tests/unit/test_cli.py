@@ -122,7 +122,7 @@ def test_devices_lists_the_rendered_rig_for_people_and_programs() -> None:
 def test_key_comes_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def sent(key_file: Path | None) -> str | None:
         with Service(key_file=key_file).client() as client:
-            return client.core.wire.http.headers.get("Authorization")
+            return client.connection.http.headers.get("Authorization")
 
     monkeypatch.setenv("SLRIG_API_KEY", "from the environment")
     assert sent(None) == "Bearer from the environment"

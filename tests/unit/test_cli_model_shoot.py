@@ -142,7 +142,7 @@ class Models:
     def combine(self, _: str) -> None:
         self.asked.append("combine")
 
-    def look(self, _: str) -> dict[str, Any]:
+    def get(self, _: str) -> dict[str, Any]:
         error = {"detail": "too few views"}
         return {"state": self.state, "error": error, "links": {"files": {"model.ply": "/model/m/model.ply"}}}
 

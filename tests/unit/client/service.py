@@ -1,16 +1,14 @@
-"""A service that answers from a table, and both clients before it, by the same words."""
+"""A service that answers from a table, and a client of it."""
 
 from __future__ import annotations
 
-import asyncio
-import inspect
 import json
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import httpx2
 
-from slrig.client import AsyncClient, Client
+from slrig.client import Client
 
 URL = "http://127.0.0.1:1"
 HERE = "/scan/5f"
@@ -26,29 +24,10 @@ SCAN: dict[str, Any] = {
 Handler = Callable[[httpx2.Request], httpx2.Response]
 
 
-def client_of(kind: type[Client] | type[AsyncClient], handler: Handler) -> Any:
-    """One of the clients, before what answers; typed as neither, since a case is written for both."""
-    return kind(URL, "key", transport=httpx2.MockTransport(handler))
-
-
-async def settled(found: Any) -> Any:
-    """What an operation gives, of whichever client."""
-    return await found if inspect.isawaitable(found) else found
-
-
-async def each(found: Any) -> AsyncIterator[Any]:
-    """What a stream gives, of whichever client."""
-    if hasattr(found, "__anext__"):
-        async for one in found:
-            yield one
-    else:
-        for one in found:
-            yield one
-
-
-def run(case: Coroutine[Any, Any, Any]) -> Any:
-    """Run a case to its end."""
-    return asyncio.run(case)
+def client_of(handler: Handler, *, pauses: list[float] | None = None) -> Client:
+    """A client of a service. pauses : gets the seconds that the client waits, which takes no time."""
+    pause = (lambda _: None) if pauses is None else pauses.append
+    return Client(URL, "key", pause=pause, transport=httpx2.MockTransport(handler))
 
 
 def stream(*events: dict[str, Any]) -> bytes:
@@ -66,7 +45,7 @@ def event_answer(content: bytes | Broken) -> httpx2.Response:
     return httpx2.Response(200, headers={"Content-Type": "text/event-stream"}, **body)
 
 
-class Broken(httpx2.SyncByteStream, httpx2.AsyncByteStream):
+class Broken(httpx2.SyncByteStream):
     """A body that breaks off after its first piece."""
 
     def __init__(self, piece: bytes) -> None:
@@ -76,10 +55,6 @@ class Broken(httpx2.SyncByteStream, httpx2.AsyncByteStream):
         yield self._piece
         message = "the connection broke"
         raise httpx2.ReadError(message)
-
-    async def __aiter__(self) -> AsyncIterator[bytes]:
-        for piece in self:
-            yield piece
 
 
 class Walk:

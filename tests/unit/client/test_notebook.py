@@ -7,9 +7,8 @@ from base64 import b64encode
 from html import unescape
 from typing import Any
 
-from slrig.client import AsyncClient, Client
 from slrig.client.notebook import shown
-from tests.unit.client.service import SCAN, Walk, client_of, run, settled
+from tests.unit.client.service import SCAN, Walk, client_of
 
 GLB = b"glTF of a scan"
 SUMMARY = {
@@ -59,17 +58,6 @@ def test_the_view_is_whole_and_asks_for_nothing() -> None:
     assert "sandbox='allow-scripts'" in found
 
 
-def test_a_result_fetches_its_view_where_that_can_be_waited_for() -> None:
-    walk = Walk(coarse_glb=GLB)
-    assert "<iframe" in client_of(Client, walk).result("5f")._repr_html_()
-
-    async def case() -> tuple[str, str]:
-        result = await settled(client_of(AsyncClient, walk).result("5f"))
-        before = result._repr_html_()
-        await result.view
-        return before, result._repr_html_()
-
-    before, after = run(case())
-    assert "<iframe" not in before
-    assert "<table>" in before
-    assert "<iframe" in after
+def test_a_result_is_shown_with_its_mesh() -> None:
+    assert "<iframe" in client_of(Walk(coarse_glb=GLB)).result("5f")._repr_html_()
+    assert "<iframe" not in client_of(Walk()).result("5f")._repr_html_()

@@ -132,7 +132,7 @@ def arrays() -> dict[str, Any]:
 
 @pytest.fixture
 def client() -> Iterator[Client]:
-    with client_of(Client, answer) as made:
+    with client_of(answer) as made:
         yield made
 
 
@@ -179,7 +179,7 @@ def _plain(message: Any) -> Any:
 
 def test_a_scan_that_cannot_be_is_answered_and_published_nowhere(node: FakeNode) -> None:
     problem = {"type": "/problems/rig-busy", "status": 409, "detail": "The rig is held."}
-    with client_of(Client, lambda _: httpx2.Response(409, json=problem)) as refused:
+    with client_of(lambda _: httpx2.Response(409, json=problem)) as refused:
         ScanNode(node, refused)
         answered = node.services["~/scan"](None, SimpleNamespace())
     assert (answered.success, answered.message) == (False, "The rig is held.")

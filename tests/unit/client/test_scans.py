@@ -1,27 +1,22 @@
-"""Scans through both clients: started, followed, and what comes of them."""
+"""Scans through the client: started, followed, and their results."""
 
 from __future__ import annotations
 
-import asyncio
 import io
 from pathlib import Path
 from typing import Any
 
-import httpx2
 import numpy as np
 import pytest
 
-from slrig.client import AsyncClient, Client, Cloud
+from slrig.client import Cloud
 from slrig.client.errors import ScanFailedError
 from slrig.client.events import Captured, Event, FileReady, Progress, StateChange
 from slrig.errors import ScanCancelledError, ServiceError
 from slrig.model.srgb import light_of
 from slrig.scan.artefacts import encode_mesh_ply
-from tests.unit.client.service import HERE, URL, Walk, client_of, each, run, settled
+from tests.unit.client.service import HERE, Walk, client_of
 from tests.unit.scan.test_mesh_formats import half_ball
-
-Kind = type[Client] | type[AsyncClient]
-both = pytest.mark.parametrize("kind", [Client, AsyncClient])
 
 
 def npz(camera: str, level: int, **others: Any) -> bytes:
@@ -46,34 +41,20 @@ def npz(camera: str, level: int, **others: Any) -> bytes:
     return file.getvalue()
 
 
-@both
-def test_a_scan_is_started_followed_and_returned(kind: Kind) -> None:
+def test_a_scan_is_started_followed_and_returned() -> None:
     walk = Walk(report_json=b'{"cameras": {}}')
-    told: list[tuple[str, float, str]] = []
-
-    async def case() -> Any:
-        client = client_of(kind, walk)
-        result = await settled(client.scan(label="cup", exposure_s=0.01, progress=lambda *step: told.append(step)))
-        assert (result.id, result.files, await settled(result.report)) == ("5f", ("report.json",), {"cameras": {}})
-        assert await settled(result.report) is await settled(result.report)
-
-    run(case())
+    steps: list[tuple[str, float, str]] = []
+    result = client_of(walk).scan(label="cup", exposure_s=0.01, progress=lambda *step: steps.append(step))
+    assert (result.id, result.files, result.report) == ("5f", ("report.json",), {"cameras": {}})
+    assert result.report is result.report
     assert walk.asked[0] == ("POST", "/scan", {"if_busy": "queue", "label": "cup", "exposure_s": 0.01})
     assert [path for _, path, _ in walk.asked].count(f"{HERE}/report.json") == 1
-    assert told == [("waiting for the rig", 0.0, ""), ("capture", 0.25, "frame 1 of 4")]
+    assert steps == [("waiting for the rig", 0.0, ""), ("capture", 0.25, "frame 1 of 4")]
 
 
-@both
-def test_a_job_tells_its_events_and_its_result(kind: Kind) -> None:
-    async def case() -> list[Any]:
-        client = client_of(kind, Walk())
-        job = await settled(client.start_scan())
-        found = [event async for event in each(aiter(job) if kind is AsyncClient else iter(job))]
-        assert (await settled(job.result())).id == job.id == "5f"
-        assert [each.id for each in await settled(job.series())] == ["5f"]
-        return found
-
-    assert run(case()) == [
+def test_a_job_yields_its_events_and_its_result() -> None:
+    job = client_of(Walk()).start_scan()
+    assert [*job] == [
         StateChange(number=1, state="queued"),
         Progress(number=2, stage="capture", fraction=0.25, detail="frame 1 of 4"),
         Captured(number=3),
@@ -81,122 +62,80 @@ def test_a_job_tells_its_events_and_its_result(kind: Kind) -> None:
         Event(number=5),
         StateChange(number=6, state="succeeded"),
     ]
+    assert job.result().id == job.id == "5f"
+    assert [each.id for each in job.series()] == ["5f"]
 
 
-@both
-def test_a_scan_without_a_mesh_raises_its_cause(kind: Kind) -> None:
+def test_a_scan_without_a_mesh_raises_its_cause() -> None:
     fault = {"type": "/problems/scan-evidence", "status": 502, "detail": "No stripe was found."}
     with pytest.raises(ScanFailedError, match=r"Scan 5f failed: No stripe was found\.") as failed:
-        run(settled(client_of(kind, Walk("failed", fault)).scan()))
+        client_of(Walk("failed", fault)).scan()
     assert (failed.value.code, failed.value.scan["state"]) == ("scan-evidence", "failed")
     with pytest.raises(ScanCancelledError):
-        run(settled(client_of(kind, Walk("cancelled")).scan()))
+        client_of(Walk("cancelled")).scan()
 
 
-def test_a_scan_that_is_interrupted_is_cancelled() -> None:
+def test_ctrl_c_cancels_the_scan() -> None:
     walk = Walk()
 
-    def interrupted(*_: object) -> None:
+    def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        client_of(Client, walk).scan(progress=interrupted)
+        client_of(walk).scan(progress=interrupt)
     assert walk.asked[-1][:2] == ("POST", f"{HERE}/cancel")
 
 
-def test_a_task_that_is_cancelled_cancels_its_scan() -> None:
-    walk = Walk()
-
-    async def answer(request: httpx2.Request) -> httpx2.Response:
-        await asyncio.sleep(0)
-        return walk(request)
-
-    async def case() -> None:
-        current = asyncio.current_task()
-        assert current is not None
-        async with AsyncClient(URL, transport=httpx2.MockTransport(answer)) as client:
-            # It ends where it next waits.
-            await client.scan(progress=lambda *_: current.cancel())
-
-    with pytest.raises(asyncio.CancelledError):
-        run(case())
-    assert walk.asked[-1][:2] == ("POST", f"{HERE}/cancel")
-
-
-@both
-def test_arrays_are_those_of_the_first_camera_of_the_rig(kind: Kind) -> None:
+def test_arrays_are_those_of_the_first_camera_of_the_rig() -> None:
     files: dict[str, bytes] = {
         "points__right_npz": npz("right", 188),
         "points__left_npz": npz("left", 255),
         "report_json": b'{"cameras": {"right": {}, "left": {}}}',
     }
     walk = Walk(**files)  # type: ignore[arg-type]
-
-    async def case() -> None:
-        result = await settled(client_of(kind, walk).result("5f"))
-        points, sigma = await settled(result.points_mm), await settled(result.sigma_mm)
-        assert (points.shape, points.dtype, sigma.shape) == ((2, 3, 3), np.float32, (2, 3))
-        cause, causes = await settled(result.cause), await settled(result.causes)
-        np.testing.assert_array_equal(np.isfinite(points).all(axis=-1), cause == 0)
-        assert causes[cause[0, 0]] == "not lit"
-        albedo = await settled(result.albedo)
-        assert albedo.dtype == np.float32
-        assert np.isnan(albedo[0, 0]).all()
-        assert albedo[1, 1, 0] == pytest.approx(light_of(np.array([188], np.uint8))[0] / 65535, abs=1e-5)
-        left = await settled(result.cloud("left"))
-        assert isinstance(left, Cloud)
-        assert (left.camera, left.albedo[1, 1, 0]) == ("left", 1.0)
-        with pytest.raises(ServiceError, match=r"has no points-top\.npz\. It has: points-right\.npz, "):
-            await settled(result.cloud("top"))
-
-    run(case())
+    result = client_of(walk).result("5f")
+    points, sigma = result.points_mm, result.sigma_mm
+    assert (points.shape, sigma.shape) == ((2, 3, 3), (2, 3))
+    assert points.dtype == np.float32
+    np.testing.assert_array_equal(np.isfinite(points).all(axis=-1), result.cause == 0)
+    assert result.causes[result.cause[0, 0]] == "not lit"
+    assert result.albedo.dtype == np.float32
+    assert np.isnan(result.albedo[0, 0]).all()
+    assert result.albedo[1, 1, 0] == pytest.approx(light_of(np.array([188], np.uint8))[0] / 65535, abs=1e-5)
+    left = result.cloud("left")
+    assert isinstance(left, Cloud)
+    assert (left.camera, left.albedo[1, 1, 0]) == ("left", 1.0)
+    with pytest.raises(ServiceError, match=r"has no points-top\.npz\. It has: points-right\.npz, "):
+        result.cloud("top")
     # What was fetched is kept.
     assert len([path for _, path, _ in walk.asked if path.endswith(".npz")]) == 2
 
 
-@both
-def test_an_array_of_objects_is_not_unpickled(kind: Kind) -> None:
+def test_an_array_of_objects_is_not_unpickled() -> None:
     walk = Walk(points__left_npz=npz("left", 0, points_mm=np.array([{}], dtype=object)))
-
-    async def case() -> None:
-        result = await settled(client_of(kind, walk).result("5f"))
-        await settled(result.points_mm)
-
     with pytest.raises(ValueError, match="allow_pickle"):
-        run(case())
+        _ = client_of(walk).result("5f").points_mm
 
 
-@both
-def test_the_mesh_is_in_millimetres_with_what_its_vertices_say(kind: Kind) -> None:
+def test_the_mesh_is_in_millimetres_with_values_of_its_vertices() -> None:
     mesh = half_ball()
-    walk = Walk(mesh_ply=bytes(encode_mesh_ply(mesh)))
-
-    async def case() -> Any:
-        result = await settled(client_of(kind, walk).result("5f"))
-        return await settled(result.mesh)
-
-    found = run(case())
+    found = client_of(Walk(mesh_ply=bytes(encode_mesh_ply(mesh)))).result("5f").mesh
     np.testing.assert_array_equal(found.vertices, mesh.vertices_mm)
     np.testing.assert_array_equal(found.faces, mesh.faces)
     np.testing.assert_array_equal(found.vertex_attributes["sigma_mm"], mesh.sigma_mm)
     assert found.units == "mm"
 
 
-@both
-def test_files_are_saved_kept_and_deleted(kind: Kind, tmp_path: Path) -> None:
+def test_files_are_saved_and_a_scan_is_pinned_and_deleted(tmp_path: Path) -> None:
     walk = Walk(mesh_ply=b"ply")
-
-    async def case() -> None:
-        result = await settled(client_of(kind, walk).result("5f"))
-        assert await settled(result.save("mesh.ply", tmp_path)) == tmp_path / "mesh.ply"
-        await settled(result.fetch("mesh.ply", tmp_path / "other.ply"))
-        with pytest.raises(ServiceError, match=r"has no mesh\.obj\. It has: mesh\.ply"):
-            await settled(result.save("mesh.obj", tmp_path))
-        await settled(result.pin())
-        await settled(result.pin(pinned=False))
-        await settled(result.delete())
-
-    run(case())
+    result = client_of(walk).result("5f")
+    assert result.save("mesh.ply", tmp_path) == tmp_path / "mesh.ply"
+    result.fetch("mesh.ply", tmp_path / "other.ply")
+    with pytest.raises(ServiceError, match=r"has no mesh\.obj\. It has: mesh\.ply"):
+        result.save("mesh.obj", tmp_path)
+    result.pin()
+    result.pin(pinned=False)
+    result.delete()
     assert [path.read_bytes() for path in sorted(tmp_path.iterdir())] == [b"ply", b"ply"]
     assert [asked[:2] for asked in walk.asked[-3:]] == [
         ("PUT", f"{HERE}/pin"),
@@ -205,9 +144,9 @@ def test_files_are_saved_kept_and_deleted(kind: Kind, tmp_path: Path) -> None:
     ]
 
 
-def test_a_name_of_the_service_leads_out_of_no_folder(tmp_path: Path) -> None:
+def test_the_name_of_a_file_leads_out_of_no_folder(tmp_path: Path) -> None:
     walk = Walk(mesh_ply=b"ply")
     walk.scan["links"]["files"]["../../mesh.ply"] = f"{HERE}/mesh.ply"
     folder = tmp_path / "deep" / "folder"
     folder.mkdir(parents=True)
-    assert client_of(Client, walk).result("5f").save("../../mesh.ply", folder) == folder / "mesh.ply"
+    assert client_of(walk).result("5f").save("../../mesh.ply", folder) == folder / "mesh.ply"
