@@ -1,4 +1,4 @@
-"""What a disk's refusals mean, and the names that files have until they are whole. Loads nothing."""
+"""Errors of a disk in words, and names of files that are not yet whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Why a job failed, as a value that crosses processes and survives in the store."""
+"""The cause of a failed job, as a value that crosses processes and is stored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where log lines go, and in what form: text for people, JSON for the programs that collect a service's log.
+"""Logs: text for people, JSON for programs.
 
 Every line has one form, whoever wrote it: our own loggers, those of libraries, Python's warnings, and the errors that
 end a thread or the process. They all go through the root logger of the standard library.

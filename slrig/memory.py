@@ -1,4 +1,4 @@
-"""Memory that is free, back to the system: what its threads have freed glibc keeps, of a large scan a third."""
+"""Returns freed memory to the system: glibc keeps a third of a large scan's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What drivers say of their options: the pydantic model that a package declares for a driver's name.
+"""The options that a driver declares by a pydantic model.
 
 The group is slrig.options. Nothing but writing rig files needs it, so a driver may do without, and neither the driver
 nor the library of its vendor is loaded.

@@ -1,1 +1,1 @@
-"""Calibration sessions: poses shot, read and judged, solves, and what is kept of them."""
+"""Calibration sessions: capturing and judging poses, solving, storing calibrations."""

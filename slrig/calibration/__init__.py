@@ -1,1 +1,1 @@
-"""Calibration: boards, what a pose of one tells, the solve, and how far the result may be trusted. Mathematics only."""
+"""The mathematics of calibration: boards, poses, the solve, its accuracy, drift."""

@@ -1,1 +1,1 @@
-"""A catalogue that many rigs share: what became of their jobs, and how each of them is."""
+"""A catalogue in Postgres that many rigs share: their jobs, and the state of each rig."""

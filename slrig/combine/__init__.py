@@ -1,1 +1,1 @@
-"""Models: scans from several sides, shot or at hand, made one mesh; their jobs, their report."""
+"""Models: scans of one object from several sides, combined into one mesh; their jobs and their report."""

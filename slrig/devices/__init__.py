@@ -1,4 +1,4 @@
-"""What slrig asks of a camera, a projector and a rig: protocols and the values they exchange."""
+"""Protocols of camera, projector, positioner and rig, and the values that they exchange."""
 
 from slrig.devices.camera import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.devices.clock import Clock, KeepsTime, SystemClock

@@ -1,1 +1,1 @@
-"""The examination of a rig: what is wrong with it, and the values for a better rig file."""
+"""The examination of a rig: its faults, and the values for a better rig file."""

@@ -1,1 +1,1 @@
-"""From curves to a triangle mesh, and what the mesh is worth."""
+"""From curves to a triangle mesh: strips, flips, boundary, quality."""

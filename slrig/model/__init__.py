@@ -1,4 +1,4 @@
-"""Frozen values that travel between the rooms of slrig, shape-checked once, on construction.
+"""Frozen values that the rooms exchange, checked once, on construction.
 
 Conventions: arrays are (row, column); extents only as `Size`; pixel centres at integer coordinates (OpenCV);
 world to device `X_dev = R @ X_world + t_mm`; millimetres; unmeasured is NaN.

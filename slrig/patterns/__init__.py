@@ -1,1 +1,1 @@
-"""Patterns as described data: each module holds an encoding beside its inverse."""
+"""Pattern sequences: each encoding with its inverse."""

@@ -1,1 +1,1 @@
-"""What the HTML reports share."""
+"""What the HTML reports have in common."""

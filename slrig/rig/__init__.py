@@ -1,1 +1,1 @@
-"""The rig as the service holds it."""
+"""The rig of the service: one owner thread, a watchdog, live pictures."""

@@ -1,1 +1,1 @@
-"""One scan: plan, pipeline, runner, store."""
+"""Scans: plan, acquisition, the steps from frames to files, report, formats."""

@@ -1,1 +1,1 @@
-"""Work for the rig at times that a person set: which runs are due, which were done, and what became of the others."""
+"""Work for the rig at set times: recurrence, due runs, retries and notices."""

@@ -1,1 +1,1 @@
-"""Meshes of one object from several sides: where each belongs in one frame, and one model of them all."""
+"""Several meshes of one object: registration, markers, turntable, fusion."""

@@ -1,0 +1,36 @@
+"""Reconstruct Gray-code images that another program took, with its OpenCV calibration; no service is needed.
+
+    python config/examples/import_folder.py images/ 1024x768 calibration.yml mesh/
+
+`images/` holds numbered images of one camera in the order of OpenCV's GrayCodePattern; `slrig import --help` lists
+other orders, and options for images that are named by their patterns.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+
+def main(images: str, projector: str, calibration: str, output: str) -> None:
+    """Write mesh.ply and report.json into `output`, and print the figures that matter."""
+    with tempfile.TemporaryDirectory() as scratch:
+        bundle = str(Path(scratch) / "bundle")
+        slrig = [sys.executable, "-m", "slrig.cli"]
+        subprocess.run(
+            [*slrig, "import", images, "--projector", projector, "--calibration", calibration, "--output", bundle],
+            check=True,
+        )
+        subprocess.run([*slrig, "reconstruct", bundle, "--output", output], check=True)
+    report = json.loads((Path(output) / "report.json").read_text())
+    figures = report["mesh"]["figures"]
+    print(f"{figures['vertices']:,} vertices, {figures['area_mm2'] / 100:.1f} cm²")
+    for camera, found in report["cameras"].items():
+        print(f"camera {camera}: {found['decoded_pixels']:,} pixels decoded")
+    for note in report["notes"]:
+        print(f"note: {note}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:5])

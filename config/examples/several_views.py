@@ -1,0 +1,26 @@
+"""Scan an object from all sides on the rig's turntable, combine the views, and fetch the model.
+
+slrig serve config/rigs/turntable.toml
+SLRIG_API_KEY=... python config/examples/several_views.py 8 model.ply
+"""
+
+import sys
+
+from slrig.client import Client
+from slrig.client.events import Progress
+
+
+def main(views: int, output: str) -> None:
+    """Scan `views` views at equal angles, and write their model to `output`."""
+    with Client() as client:
+        model = client.models.shoot(views=views, label=f"{views} views", if_busy="queue")
+        for event in client.models.follow(model["id"]):
+            if isinstance(event, Progress):
+                print(f"{event.fraction:4.0%} {event.stage} {event.detail}")
+        model = client.models.wait(model["id"])
+        client.fetch(model["links"]["files"]["model.ply"], output)
+        print(f"{output}: {model['summary']}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), sys.argv[2])
