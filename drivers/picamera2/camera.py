@@ -17,7 +17,16 @@ from drivers.picamera2.library import cameras, library, told
 from drivers.picamera2.options import PiCameraOptions
 from drivers.picamera2.stream import Stream, configured
 from slrig.bundle.faults import checked
-from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
+from slrig.devices import (
+    AppliedSettings,
+    Camera,
+    CameraInfo,
+    CameraSettings,
+    CameraState,
+    Clock,
+    SystemClock,
+    Trigger,
+)
 from slrig.errors import DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame
 
@@ -58,6 +67,8 @@ class PiCamera:
         As the rig file calls it.
     options
         Checked already.
+    clock
+        CLOCK_MONOTONIC; in tests that of the stand-in for the library.
 
     Raises
     ------
@@ -71,8 +82,9 @@ class PiCamera:
         It cannot do what an option asks.
     """
 
-    def __init__(self, name: str, options: PiCameraOptions) -> None:
+    def __init__(self, name: str, options: PiCameraOptions, *, clock: Clock | None = None) -> None:
         self._name, self._options = name, options
+        self._clock = clock or SystemClock()
         self._state = CameraState(name)
         known = cameras()
         numbers = [number for number, each in enumerate(known) if each["Id"] == options.device]
@@ -133,10 +145,10 @@ class PiCamera:
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `Camera`. A frame may have begun earlier than it says by the error of its stamp: that is allowed for."""
         self._state.require_armed()
-        until_s = time.monotonic() + timeout_s
+        until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         passed = 0
         while True:
-            left_s = until_s - time.monotonic()
+            left_s = (until_ns - self._clock.now_ns()) / 1e9
             with told(self._name, "waiting for a frame"):
                 request = self._next(max(min(left_s, _SLICE_S), 0.0))
             if request is not None:
@@ -216,7 +228,7 @@ class PiCamera:
     def _frame(self, request: Any, after_ns: int) -> Frame | None:
         """The frame of a request; None if it began before."""
         metadata = request.get_metadata()
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock.now_ns()
         exposure_ns = round(metadata["ExposureTime"] * 1e3)
         stamp_ns = _monotonic(metadata["SensorTimestamp"], now_ns)
         if self._last_ns:

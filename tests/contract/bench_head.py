@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from slrig.devices import Camera, Projector
+from slrig.devices import Camera, Clock, Projector, SystemClock
 from slrig.model import Calibration, Truth
 
 
@@ -15,6 +15,7 @@ class BenchHead:
 
     cameras: Mapping[str, Camera]
     projector: Projector
+    clock: Clock = field(default_factory=SystemClock, kw_only=True)
 
     @property
     def calibration(self) -> Calibration | None:

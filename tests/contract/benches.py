@@ -23,6 +23,7 @@ from tests.contract import (
     picamera2_bench,
     serial_bench,
     v4l2_bench,
+    v4l2_virtual,
 )
 from tests.contract.suite import Bench, rig_of
 
@@ -108,6 +109,7 @@ BENCHES: dict[str, Callable[[Path], Bench]] = {
     "simulated in real time": partial(simulated, realtime=True),
     "replay": replayed,
     "replay in real time, 50 times as fast": partial(replayed, speed=50),
+    "v4l2 (fake kernel)": v4l2_virtual.bench,
     "v4l2 (umockdev)": v4l2_bench.bench,
     "opencv (stream)": opencv_bench.stream_bench,
     "opencv (file)": opencv_bench.file_bench,

@@ -7,12 +7,11 @@ mixture of both, as a real one does: a driver that pairs frames with patterns wr
 from __future__ import annotations
 
 import threading
-import time
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.model import CameraFormat, PatternSequence, Pixels
 from tests.unit.capture.fake_rig import Scene
 
@@ -25,12 +24,22 @@ _REMEMBERED = 500
 
 
 class Stage:
-    """What a projector showed when (CLOCK_MONOTONIC, ns), and what a camera sees of it. Safe between threads.
+    """What a projector showed when (ns, by the clock), and what a camera sees of it. Safe between threads.
 
-    latency_s, jitter_s : from `show` to light: the latency, and up to so much more, at random.
+    latency_s, jitter_s : from `show` to light: the latency, and up to so much more, at random. clock : of all devices
+    on this stage.
     """
 
-    def __init__(self, scene: Scene, *, latency_s: float = 0.0, jitter_s: float = 0.0, seed: int = 0) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        latency_s: float = 0.0,
+        jitter_s: float = 0.0,
+        seed: int = 0,
+        clock: Clock | None = None,
+    ) -> None:
+        self.clock = clock or SystemClock()
         self.scene = scene
         self.latency_s = latency_s
         self.jitter_s = jitter_s
@@ -49,7 +58,7 @@ class Stage:
         """Change the light to a pattern, or to the dark, now or at an instant to come; return when it will change."""
         with self._lock:
             late_s = self.latency_s + self.jitter_s * float(self._rng.random())
-            asked_ns = time.monotonic_ns() if asked_ns is None else asked_ns
+            asked_ns = self.clock.now_ns() if asked_ns is None else asked_ns
             at_ns = max(asked_ns + round(late_s * 1e9), self._changes[-1][0])
             # No camera looks back so far.
             del self._changes[:-_REMEMBERED]
@@ -120,7 +129,7 @@ class StagedProjector:
     def show(self, index: int) -> Shown:
         """See `Projector`."""
         at_ns = self._stage.show(self._state.require_pattern(index).profiles[index])
-        SystemClock().wait_until(at_ns + self._err_ns, self._state.closed)
+        self._stage.clock.wait_until(at_ns + self._err_ns, self._state.closed)
         return Shown(index, at_ns, self._err_ns)
 
     def play(self, exposure_s: float, period_s: float) -> None:

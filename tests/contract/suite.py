@@ -19,10 +19,13 @@ COLOUR = "frames_come_in_colour_where_it_is_declared"
 
 @dataclass(frozen=True)
 class Bench:
-    """A driver under test. `open_head` opens the instrument afresh; `sequence` begins with white, then black."""
+    """A driver under test. `open_head` opens the instrument afresh; `sequence` begins with white, then black; `end`
+    lets go of what stands below the driver.
+    """
 
     open_head: Callable[[], Head]
     sequence: PatternSequence
+    end: Callable[[], object] = lambda: None
 
     @contextmanager
     def head(self) -> Iterator[Head]:

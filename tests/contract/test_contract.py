@@ -12,7 +12,7 @@ from slrig.devices import Camera, Head, Positioner, Projector, Turntable
 from tests.contract.benches import BENCHES
 from tests.contract.suite import Bench
 
-QUICK = ("simulated", "replay")
+QUICK = ("simulated", "replay", "v4l2 (fake kernel)", "picamera2 (a stand-in for the library)")
 """Benches on virtual time. The others take as long as their devices would, ten seconds and more."""
 
 ABOUT = {
@@ -69,8 +69,10 @@ ABOUT = {
     scope="session", params=[pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in BENCHES]
 )
 def examination(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Examination]:
-    with BENCHES[request.param](tmp_path_factory.mktemp("bench")).examination() as examination:
+    bench = BENCHES[request.param](tmp_path_factory.mktemp("bench"))
+    with bench.examination() as examination:
         yield examination
+    bench.end()
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)

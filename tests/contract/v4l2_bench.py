@@ -23,7 +23,7 @@ from typing import Any, Self, cast
 
 import pytest
 
-from slrig.devices import Camera, FoundDevice
+from slrig.devices import Camera, Clock, FoundDevice
 from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract.bench_head import BenchHead
@@ -228,10 +228,10 @@ class FakeDevice:
         self.close()
 
 
-def staged(code: str = "GREY", *, camera: Size = CAMERA, noise_dn: float = 0.0, latency_s: float = 0.002) -> Stage:
+def staged(code: str = "GREY", *, noise_dn: float = 0.0, clock: Clock | None = None) -> Stage:
     """The light before a fake camera of this pixel format."""
     scene = Scene(
-        camera=camera,
+        camera=CAMERA,
         bit_depth=BIT_DEPTHS[code],
         projector=PROJECTOR,
         first_column_px=1.0,
@@ -240,7 +240,7 @@ def staged(code: str = "GREY", *, camera: Size = CAMERA, noise_dn: float = 0.0, 
         blur_px=0.7,
         noise_dn=noise_dn,
     )
-    return Stage(scene, latency_s=latency_s)
+    return Stage(scene, latency_s=0.002, clock=clock)
 
 
 def sequence() -> PatternSequence:

@@ -16,7 +16,7 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,7 @@ class Sensor:
 
     config: dict[str, Any]
     rng: random.Random
+    now_ns: Callable[[], int]
     begun_ns: int = 0
     period_ns: int = 0
     exposure_ns: int = 0
@@ -79,7 +80,7 @@ class Sensor:
 
     def start(self, period_ns: int, exposure_ns: int) -> None:
         self.period_ns = max(period_ns, exposure_ns) if self.config["stretches"] else period_ns
-        self.begun_ns = time.monotonic_ns()
+        self.begun_ns = self.now_ns()
         # The settings of the stream before are in use for a few frames yet.
         self.before_ns, self.exposure_ns = self.exposure_ns or exposure_ns, exposure_ns
         self.coming = self.drawn(0, 0)
@@ -122,6 +123,8 @@ class Device:
     """The kernel's side of one video node. `owner` is the open file that holds the buffers."""
 
     config: dict[str, Any]
+    light: Any
+    now_ns: Callable[[], int] = time.monotonic_ns
     memory: Any = None
     owner: object = None
     buffers: int = 0
@@ -131,8 +134,7 @@ class Device:
     filled: deque[tuple[int, Shot]] = field(default_factory=deque)
 
     def __post_init__(self) -> None:
-        self.sensor = Sensor(self.config, random.Random(self.config["seed"]))
-        self.light = Light(self.config["light"])
+        self.sensor = Sensor(self.config, random.Random(self.config["seed"]), self.now_ns)
         self.controls = {control["id"]: control for control in self.config["controls"]}
         self.values = {number: control["default"] for number, control in self.controls.items()}
         self.code, (self.size, *_) = next(iter(self.config["formats"].items()))
@@ -147,6 +149,11 @@ class Device:
     def told(self, fault: str) -> bool:
         """Whether the test asks for this fault now."""
         return (Path(self.config["faults"]) / fault).exists()
+
+    def was_set(self, control: str, value: int) -> None:
+        """Tell the test of a control that was set."""
+        with (Path(self.config["faults"]) / "controls.txt").open("a") as told:
+            told.write(f"{control} = {value}\n")
 
     def answer(self, request: int, data: bytearray, file: object) -> int | None:
         """Answer into `data`; return when to ask again (ns) if there is nothing to tell yet. Raises Refused."""
@@ -278,7 +285,7 @@ class Device:
 
     def queue(self, data: bytearray) -> None:
         (index,) = struct.unpack_from("I", data, 0)
-        now_ns = time.monotonic_ns()
+        now_ns = self.now_ns()
         self.fill_until(now_ns)
         self.queued.append((now_ns, index))
 
@@ -313,7 +320,7 @@ class Device:
             raise Refused(errno.EIO)
         if not self.streaming:
             raise Refused(errno.EINVAL)
-        now_ns = time.monotonic_ns()
+        now_ns = self.now_ns()
         self.fill_until(now_ns)
         if not self.filled:
             due_ns = self.sensor.coming.done_ns if self.sensor.coming is not None else now_ns
@@ -397,5 +404,4 @@ class Device:
             return
         value = control.get("insists_on", value)
         self.values[number] = min(max(value, control["minimum"]), control["maximum"])
-        with (Path(self.config["faults"]) / "controls.txt").open("a") as told:
-            told.write(f"{control['name']} = {self.values[number]}\n")
+        self.was_set(control["name"], self.values[number])

@@ -1,4 +1,4 @@
-"""What the fake video device's sensor sees, as the bytes that a camera would send: answers over a socket."""
+"""What the fake video device's sensor sees, as the bytes that a camera would send."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def _packed(row: Pixels) -> list[int]:
     return packed
 
 
-class SensorService:
-    """Answers the fake device on a socket: each question is one exposure, each answer the bytes of one frame.
+class Sensor:
+    """What a fake camera sees: each question is one exposure, each answer the bytes of one frame.
 
     bands : a rolling shutter is so many bands of rows, exposed one after another within the read-out.
     noise_when_corrupt : whether a corrupt frame holds random bytes; otherwise its second half is missing.
@@ -59,7 +59,7 @@ class SensorService:
     """
 
     def __init__(
-        self, path: Path, stage: Stage, *, readout_s: float = 0.0, bands: int = 1, noise_when_corrupt: bool = True
+        self, stage: Stage, *, readout_s: float = 0.0, bands: int = 1, noise_when_corrupt: bool = True
     ) -> None:
         self.stage = stage
         self.readout_ns = round(readout_s * 1e9)
@@ -67,36 +67,13 @@ class SensorService:
         self.noise_when_corrupt = noise_when_corrupt
         self.rng = np.random.default_rng(1)
         self.asked: list[dict[str, Any]] = []
-        self._more = threading.Condition()
-        service = self
 
-        class Handler(socketserver.StreamRequestHandler):
-            def handle(self) -> None:
-                for line in self.rfile:
-                    data = service.answer(json.loads(line))
-                    self.wfile.write(b"%d\n" % len(data) + data)
-
-        class Server(socketserver.ThreadingUnixStreamServer):
-            daemon_threads = True
-            block_on_close = False
-
-        self._server = Server(str(path), Handler)
-        self._thread = threading.Thread(target=self._server.serve_forever, name="sensor", daemon=True)
-        self._thread.start()
-
-    def answer(self, asked: dict[str, Any]) -> bytes:
-        with self._more:
-            self.asked.append(asked)
-            self._more.notify_all()
+    def seen(self, asked: dict[str, Any]) -> bytes:
+        self.asked.append(asked)
         data = encoded(self.image(asked), asked["code"], asked["row_bytes"])
         if not asked["corrupt"]:
             return data
         return self.rng.bytes(len(data)) if self.noise_when_corrupt else data[: len(data) // 2]
-
-    def wait_for_more(self, than: int) -> None:
-        """Return once more than so many frames have been taken: somebody reads."""
-        with self._more:
-            assert self._more.wait_for(lambda: len(self.asked) > than, timeout=10)
 
     def image(self, asked: dict[str, Any]) -> Pixels:
         start_ns, exposure_ns = asked["start_ns"], asked["exposure_ns"]
@@ -108,6 +85,28 @@ class SensorService:
             seen = self.stage.exposed(start_ns + late_ns, start_ns + late_ns + exposure_ns, gain=gain)
             whole[part] = seen[part]
         return whole.astype(np.uint8) if self.stage.format.bit_depth <= 8 else whole
+
+
+class SensorService(Sensor):
+    """The same for a camera in another process, which asks over a socket."""
+
+    def __init__(self, path: Path, stage: Stage, **more: Any) -> None:
+        super().__init__(stage, **more)
+        service = self
+
+        class Handler(socketserver.StreamRequestHandler):
+            def handle(self) -> None:
+                for line in self.rfile:
+                    data = service.seen(json.loads(line))
+                    self.wfile.write(b"%d\n" % len(data) + data)
+
+        class Server(socketserver.ThreadingUnixStreamServer):
+            daemon_threads = True
+            block_on_close = False
+
+        self._server = Server(str(path), Handler)
+        self._thread = threading.Thread(target=self._server.serve_forever, name="sensor", daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
         self._server.shutdown()

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tests.contract.v4l2_kernel import G_EXT_CTRLS, MOST_BUFFERS, SIZES, Device, Refused
+from tests.contract.v4l2_kernel import G_EXT_CTRLS, MOST_BUFFERS, SIZES, Device, Light, Refused
 
 
 def serve(config: dict[str, Any]) -> None:
@@ -32,7 +32,7 @@ def serve(config: dict[str, Any]) -> None:
         path.symlink_to(target)
     bases = []
     for name, own in config["nodes"].items():
-        device = Device({**config, **own})
+        device = Device({**config, **own}, Light(config["light"]))
         room = (root / "dev" / name).open("r+b")
         room.truncate(MOST_BUFFERS * own["most_bytes"])
         device.memory = mmap.mmap(room.fileno(), 0)

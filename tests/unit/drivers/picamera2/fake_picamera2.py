@@ -2,17 +2,16 @@
 
 A sensor exposes back to back. Of the requests that are complete one is kept for who asks; a job that asks waits for the
 next one. Requests that are not released are missing to the camera, and `stop` waits for the jobs that came before it.
+Time is the stage's; frames come about when the driver waits for them.
 """
 
 from __future__ import annotations
 
 import sys
 import threading
-import time
 import types
 from collections import deque
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,9 +20,11 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.picamera2 import PiCamera, PiCameraOptions
 from tests.contract.stage import Stage
 
 BUFFERS = 6
+_NEVER = threading.Event()
 LINE_US = 20
 LEAST_LINES = 4
 BLANK_US = 600
@@ -66,6 +67,12 @@ class Pi:
         with mock.patch.dict(sys.modules, {"picamera2": library}):
             yield
 
+    def opened(self, **options: object) -> PiCamera:
+        """The driver's camera, on the stage's time."""
+        with self.connected():
+            table = PiCameraOptions.model_validate({"device": self.identity, **options})
+            return PiCamera("left", table, clock=self.stage.clock)
+
     def _library(self) -> type:
         pi = self
 
@@ -83,8 +90,7 @@ class Pi:
 class Job:
     """What `capture_request` gives that does not wait."""
 
-    def __init__(self) -> None:
-        self.future: Future[FakeRequest] = Future()
+    request: FakeRequest | None = None
 
 
 class FakeRequest:
@@ -119,13 +125,12 @@ class FakePicamera2:
             message = "Camera __init__ sequence did not complete."
             raise RuntimeError(message) from RuntimeError("Failed to acquire camera: Device or resource busy")
         self.pi = pi
-        self._lock = threading.Condition()
+        self._clock = pi.stage.clock
         self._config: dict[str, Any] = {}
         self._pending: dict[str, Any] = {}
-        self._jobs: deque[Job] = deque()
-        self._completed: deque[FakeRequest] = deque()
-        self._running = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._job: Job | None = None
+        self._kept: FakeRequest | None = None
+        self._running = False
         self._rng = np.random.default_rng(5)
         self.read_stream = ""
         self.is_open = True
@@ -153,7 +158,7 @@ class FakePicamera2:
         }
 
     def configure(self, config: dict[str, Any]) -> None:
-        assert self._thread is None
+        assert not self._running
         self._config = config
         self.read_stream = "main" if config["main"]["format"] == "YUV420" else "raw"
         stream = config[self.read_stream]
@@ -174,22 +179,20 @@ class FakePicamera2:
         self._pending |= controls
 
     def start(self) -> None:
-        assert self._thread is None
+        assert not self._running
         self.pi.asked |= self._pending
-        self._running.set()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
+        asked = self.pi.asked
+        self._exposure_us = max(round(asked["ExposureTime"] / LINE_US), LEAST_LINES) * LINE_US
+        self._gain = round(asked["AnalogueGain"] * 16) / 16
+        least_us, most_us = asked["FrameDurationLimits"]
+        self._duration_us = min(max(least_us, self._exposure_us + BLANK_US), most_us)
+        self._next_ns = self._clock.now_ns()
+        self._running = True
 
     def stop(self) -> None:
-        if self._thread is None:
-            return
-        assert not self._jobs, "stop waits for the jobs before it"
-        self._running.clear()
-        self._thread.join()
-        self._thread = None
-        with self._lock:
-            while self._completed:
-                self._completed.popleft().release()
+        assert self._job is None, "stop waits for the jobs before it"
+        self._running = False
+        self._keep(None)
 
     def close(self) -> None:
         self.stop()
@@ -197,59 +200,45 @@ class FakePicamera2:
 
     def capture_request(self, wait: bool | None = None) -> Job:
         assert wait is False
-        job = Job()
-        with self._lock:
-            self._jobs.append(job)
-            self._serve()
+        self._job = job = Job()
+        self._run()
         return job
 
-    def wait(self, job: Job, timeout: float | None = None) -> FakeRequest:
-        return job.future.result(timeout)
+    def wait(self, job: Job, timeout: float) -> FakeRequest:
+        until_ns = self._clock.now_ns() + round(timeout * 1e9)
+        while job.request is None and self._clock.now_ns() < until_ns:
+            end_ns = until_ns if self.pi.frozen else self._next_ns + self._exposure_us * 1000
+            self._clock.wait_until(min(end_ns, until_ns), _NEVER)
+            self._run()
+        if job.request is None:
+            raise TimeoutError
+        return job.request
 
     def cancel_all_and_flush(self) -> None:
-        with self._lock:
-            self._jobs.clear()
+        self._job = None
 
-    def _serve(self) -> None:
-        while self._jobs and self._completed:
-            self._jobs.popleft().future.set_result(self._completed.popleft())
+    def _keep(self, request: FakeRequest | None) -> None:
+        if self._kept is not None:
+            self._kept.release()
+        self._kept = request
 
     def _run(self) -> None:
-        never = threading.Event()
-        asked = self.pi.asked
-        exposure_us = max(round(asked["ExposureTime"] / LINE_US), LEAST_LINES) * LINE_US
-        gain = round(asked["AnalogueGain"] * 16) / 16
-        least_us, most_us = asked["FrameDurationLimits"]
-        duration_us = min(max(least_us, exposure_us + BLANK_US), most_us)
-        due_ns = time.monotonic_ns()
-        while self._running.is_set():
-            if self.pi.frozen:
-                never.wait(0.01)
-                continue
-            start_ns = max(due_ns, time.monotonic_ns())
-            due_ns = start_ns + duration_us * 1000
-            end_ns = start_ns + exposure_us * 1000
-            while (left_ns := end_ns - time.monotonic_ns()) > 0:
-                never.wait(left_ns / 1e9)
+        """Make the frames that have ended by now, and hand the last one to who asks."""
+        while not self.pi.frozen and (end_ns := self._next_ns + self._exposure_us * 1000) <= self._clock.now_ns():
+            start_ns, self._next_ns = self._next_ns, self._next_ns + self._duration_us * 1000
             self.pi.exposures.append((start_ns, end_ns))
-            luck = self._rng.random()
-            if luck >= self.pi.lost + self.pi.damaged and self.pi.held < BUFFERS:
-                stamp_ns = start_ns if self.pi.stamps_start else end_ns
-                metadata = {
-                    "SensorTimestamp": stamp_ns + self.pi.stamp_offset_ns,
-                    "ExposureTime": exposure_us,
-                    "AnalogueGain": gain,
-                    "FrameDuration": duration_us,
-                }
-                request = FakeRequest(self, self._seen(start_ns, end_ns, gain), metadata)
-                with self._lock:
-                    self.pi.held += 1
-                    self._completed.append(request)
-                    self._serve()
-                    while len(self._completed) > 1:
-                        self._completed.popleft().release()
-            while self._running.is_set() and (left_ns := due_ns - time.monotonic_ns()) > 0:
-                never.wait(min(left_ns / 1e9, 0.02))
+            if self._rng.random() < self.pi.lost + self.pi.damaged or self.pi.held >= BUFFERS:
+                continue
+            metadata = {
+                "SensorTimestamp": (start_ns if self.pi.stamps_start else end_ns) + self.pi.stamp_offset_ns,
+                "ExposureTime": self._exposure_us,
+                "AnalogueGain": self._gain,
+                "FrameDuration": self._duration_us,
+            }
+            self.pi.held += 1
+            self._keep(FakeRequest(self, self._seen(start_ns, end_ns, self._gain), metadata))
+        if self._job is not None and self._kept is not None:
+            self._job.request, self._job, self._kept = self._kept, None, None
 
     def _seen(self, start_ns: int, end_ns: int, gain: float) -> NDArray[np.uint8]:
         stream = self._config[self.read_stream]

@@ -1,25 +1,26 @@
-"""A fake video device below the driver."""
+"""A fake kernel below the driver, on virtual time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 
 from tests.contract.stage import Stage
-from tests.contract.v4l2_bench import Faked, FakeDevice, staged, why_not
+from tests.contract.v4l2_bench import Faked
+from tests.contract.v4l2_virtual import VirtualDevice, virtually
+
+Plug = Callable[..., VirtualDevice]
 
 
 @pytest.fixture
-def plugged(tmp_path: Path) -> Iterator[Callable[..., FakeDevice]]:
-    """Plug a fake camera in: `plugged(Faked(…), stage)`. Skips where umockdev is not installed."""
-    if why_not():
-        pytest.skip(why_not())
+def plugged() -> Iterator[Plug]:
+    """Plug a fake camera in: `plugged(Faked(…), stage)`; the one before is gone."""
     with ExitStack() as leaving:
 
-        def plug(faked: Faked | None = None, stage: Stage | None = None) -> FakeDevice:
-            return leaving.enter_context(FakeDevice(tmp_path, stage or staged(), faked or Faked()))
+        def plug(faked: Faked | None = None, stage: Stage | None = None) -> VirtualDevice:
+            leaving.close()
+            return leaving.enter_context(VirtualDevice(stage or virtually(), faked or Faked()))
 
         yield plug
