@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import fcntl
 import importlib
 import os
 import socket
@@ -12,15 +11,15 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO
+from typing import Self
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
+from filelock import FileLock
 
-from drivers.genicam import open_camera
+from drivers.genicam import GenicamCamera, open_camera
+from slrig.devices import Camera, CameraInfo, Trigger
 from slrig.model import PatternSequence, Pixels, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract.bench_head import BenchHead
@@ -64,7 +63,10 @@ class Fate:
 
 
 class FakeGigE:
-    """A fake GigE Vision camera in a process of its own, that sees a stage. Only one runs at a time: it has one port.
+    """A fake GigE Vision camera in a process of its own, that sees a stage. A context manager.
+
+    GigE Vision has one port: one camera runs at a time, on this machine. Another one of this process ends it, one of
+    another process waits for its end.
 
     Parameters
     ----------
@@ -95,7 +97,7 @@ class FakeGigE:
         self._kind = kind
         self._packed = packed or {}
         self._process: subprocess.Popen[str] | None = None
-        self._lock: IO[str] | None = None
+        self._lock = FileLock(Path(tempfile.gettempdir()) / "slrig-test-gige.lock")
         self._never = threading.Event()
 
     def start(self) -> None:
@@ -104,9 +106,7 @@ class FakeGigE:
             return
         if FakeGigE._running is not None:
             FakeGigE._running.stop()
-        # Other test runs on this machine wait for the port here.
-        self._lock = (Path(tempfile.gettempdir()) / "slrig-test-gige.lock").open("w", encoding="ascii")
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        self._lock.acquire()
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", "tests.contract.genicam_peer", str(theirs.fileno()), self._kind]
         self._process = subprocess.Popen(  # noqa: S603 - our own module
@@ -138,10 +138,16 @@ class FakeGigE:
         if process.stdin is not None:
             process.stdin.close()
         self._thread.join(_LONG_S)
-        if self._lock is not None:
-            self._lock.close()
+        self._lock.release()
         FakeGigE._running = None
         atexit.unregister(self.stop)
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
     def _serve(self, peer: socket.socket) -> None:
         fate = Fate()
@@ -158,17 +164,13 @@ class FakeGigE:
                     if fate.held_s:
                         self._never.wait(fate.held_s)
                     seen = self.stage.exposed(start_ns, end_ns, gain=float(gain))[:height_px, :width_px]
-                    packed = self._packed.get(names[pixel_format], _as_it_is)
-                    data = packed(seen)
+                    packed = self._packed.get(names[pixel_format])
+                    data = seen.tobytes() if packed is None else packed(seen)
                     answer = ANSWERED.pack(fate.lost, len(data)) + data
                 try:
                     peer.sendall(answer)
                 except OSError:
                     return
-
-
-def _as_it_is(image: NDArray[np.unsignedinteger]) -> bytes:
-    return image.tobytes()
 
 
 def table(**options: object) -> dict[str, object]:
@@ -189,6 +191,26 @@ def sequence() -> PatternSequence:
     return encode(patterns, PROJECTOR)
 
 
+def opened(**options: object) -> GenicamCamera:
+    """The driver's camera."""
+    camera = open_camera("left", table(**options), Path())
+    assert isinstance(camera, GenicamCamera)
+    return camera
+
+
+class FreeOnly:
+    """A camera that hides its other triggers, so that it is let run free."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self.configure, self.arm, self.disarm = camera.configure, camera.arm, camera.disarm
+        self.trigger, self.read, self.close = camera.trigger, camera.read, camera.close
+
+    @property
+    def info(self) -> CameraInfo:
+        return replace(self._camera.info, triggers=frozenset({Trigger.FREE}))
+
+
 def bench(folder: Path) -> Bench:
     """The driver on Aravis' fake GigE Vision camera, as it comes."""
     del folder
@@ -197,6 +219,6 @@ def bench(folder: Path) -> Bench:
 
     def open_head() -> BenchHead:
         peer.start()
-        return BenchHead({"left": open_camera("left", table(), Path())}, StagedProjector(peer.stage))
+        return BenchHead({"left": opened()}, StagedProjector(peer.stage))
 
-    return Bench(open_head, sequence())
+    return Bench(open_head, sequence(), peer.stop)

@@ -7,12 +7,14 @@ import importlib.util
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
 import pytest
 
-from drivers.genicam import open_gentl_camera
+from drivers.genicam import GenicamCamera, open_gentl_camera
 from tests.contract.bench_head import BenchHead
 from tests.contract.genicam_bench import CAMERA, scene, sequence
 from tests.contract.gentl_camera import MemoryCamera
@@ -41,28 +43,33 @@ def _producer() -> FakeProducer:
     return FakeProducer(build(folder), MemoryCamera(Stage(scene())))
 
 
-def serving(camera: MemoryCamera) -> FakeProducer:
+@contextmanager
+def serving(camera: MemoryCamera) -> Iterator[FakeProducer]:
     """The producer, with this camera plugged in."""
     require_harvesters()
     producer = _producer()
     producer.serve(camera)
-    return producer
+    yield producer
+    camera.stop()
 
 
-def table(served: FakeProducer, **options: object) -> dict[str, object]:
-    """The `[[camera]]` table of the camera."""
+def opened(served: FakeProducer, **options: object) -> GenicamCamera:
+    """The driver's camera."""
     region = {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px}
     device = f"slrig-memory-{served.camera.serial}"
-    return {"device": device, "producer": str(served.file), "region": region, **options}
+    table = {"device": device, "producer": str(served.file), "region": region, **options}
+    camera = open_gentl_camera("left", table, Path())
+    assert isinstance(camera, GenicamCamera)
+    return camera
 
 
 def bench(folder: Path) -> Bench:
     """The driver before a stage, with a software trigger, a wire and a clock that can be latched."""
     del folder
-    producer = serving(MemoryCamera(Stage(scene(noise_dn=0.5), latency_s=0.002, jitter_s=0.002)))
+    serves = serving(MemoryCamera(Stage(scene(noise_dn=0.5), latency_s=0.002, jitter_s=0.002)))
+    producer = serves.__enter__()
 
     def open_head() -> BenchHead:
-        camera = open_gentl_camera("left", table(producer), Path())
-        return BenchHead({"left": camera}, StagedProjector(producer.camera.stage))
+        return BenchHead({"left": opened(producer)}, StagedProjector(producer.camera.stage))
 
-    return Bench(open_head, sequence())
+    return Bench(open_head, sequence(), lambda: serves.__exit__(None, None, None))

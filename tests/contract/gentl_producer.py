@@ -116,7 +116,7 @@ class FakeProducer:
 
     def __init__(self, file: Path, camera: MemoryCamera) -> None:
         self.file = file
-        self.opened = self.loaded = False
+        self.loaded = False
         self._library = ctypes.CDLL(str(file))
         self._called = []
         for index, (name, types) in enumerate(_CALLS.items()):
@@ -130,6 +130,7 @@ class FakeProducer:
     def serve(self, camera: MemoryCamera) -> None:
         """Be there for a camera from now on."""
         self.camera = camera
+        self.opened = False
         self.longest_wait_ms = 0
         camera.deliver = self._deliver
         self._memory: dict[int, tuple[int, int, int]] = {}

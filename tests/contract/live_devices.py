@@ -6,17 +6,15 @@ runs by itself, stamps a frame when its first packet comes, delivers it later, a
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drivers.display.options import UNMEASURED_S
 from drivers.display.timing import flipped, whole_light
 from drivers.v4l2.timing import Durations, Exposure, Stamp, StampSource, exposure_of
-from slrig.capture.latency import measure_latency
 from slrig.devices import (
     AppliedSettings,
     CameraInfo,
@@ -26,7 +24,6 @@ from slrig.devices import (
     ProjectorState,
     Rig,
     Shown,
-    SystemClock,
     Trigger,
 )
 from slrig.errors import FrameTimeoutError
@@ -45,19 +42,17 @@ class LiveDisplay:
     def __init__(self, stage: Stage, *, refresh_hz: float = 60.0) -> None:
         self.refresh_ns = round(1e9 / refresh_hz)
         self._stage = stage
-        self._begun_ns = time.monotonic_ns()
+        self._begun_ns = self._stage.clock.now_ns()
         self._state = ProjectorState("the live display")
 
     @property
     def info(self) -> ProjectorInfo:
-        """See `Projector`."""
         refresh_s = self.refresh_ns / 1e9
         latency_s = 2 * UNMEASURED_S + 2 * refresh_s
         size = self._stage.scene.projector
         return ProjectorInfo("display", "live display", "0", size, False, latency_s, refresh_s)
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`."""
         self._state.require_size(sequence, self._stage.scene.projector)
         self.blank()
         self._state.loaded = sequence
@@ -75,30 +70,26 @@ class LiveDisplay:
         return Shown(index, t_visible_ns, t_err_ns)
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`."""
         self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
-        """See `Projector`."""
         self.blank()
 
     def blank(self) -> None:
-        """See `Projector`."""
         if not self._state.closed.is_set():
             self._flip(None)
 
     def close(self) -> None:
-        """See `Projector`."""
         self.blank()
         self._state.loaded = None
         self._state.closed.set()
 
     def _flip(self, profile: Pixels | None) -> int:
         """Hand a picture over, and return at the refresh that takes it, however late this thread wakes up for that."""
-        since_ns = time.monotonic_ns() - self._begun_ns
+        since_ns = self._stage.clock.now_ns() - self._begun_ns
         flip_ns = self._begun_ns + -(-since_ns // self.refresh_ns) * self.refresh_ns
         self._stage.show(profile, asked_ns=flip_ns)
-        SystemClock().wait_until(flip_ns, self._state.closed)
+        self._stage.clock.wait_until(flip_ns, self._state.closed)
         return flip_ns
 
 
@@ -112,13 +103,12 @@ class LivePlayer(LiveDisplay):
 
     @property
     def info(self) -> ProjectorInfo:
-        """See `Projector`."""
         return replace(super().info, plays=True, refresh_s=None)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. All of it is written down at once, and comes about by itself."""
         sequence = self._state.require_loaded("play")
-        begun_ns = time.monotonic_ns() + 5_000_000
+        begun_ns = self._stage.clock.now_ns() + 5_000_000
         self.played_s = len(sequence) * period_s
         for index, profile in enumerate(sequence.profiles):
             t_ns = begun_ns + round(index * period_s * 1e9)
@@ -128,10 +118,9 @@ class LivePlayer(LiveDisplay):
                 camera.pulse(t_ns)
 
     def stop(self) -> None:
-        """See `Projector`."""
+        """Nothing is left to be stopped."""
 
     def blank(self) -> None:
-        """See `Projector`. At once."""
         self._stage.show(None)
 
 
@@ -172,7 +161,6 @@ class LiveCamera:
         self._kept: deque[_Kept] = deque()
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`."""
         self._state.check_settings(settings, self.info)
         self._exposure_ns = round(settings.exposure_s * 1e9)
         return AppliedSettings(settings.exposure_s, settings.gain, self._period_ns / 1e9)
@@ -181,17 +169,15 @@ class LiveCamera:
         """See `Camera`. Where in its period it begins is chance."""
         self._state.check_arming(count, trigger, self.info)
         self._state.armed = trigger
-        self._begun_ns = time.monotonic_ns() + round(self._period_ns * float(self._rng.random()))
+        self._begun_ns = self._stage.clock.now_ns() + round(self._period_ns * float(self._rng.random()))
         self._next, self._number, self._dropped = 0, -1, 0
         self._kept.clear()
 
     def trigger(self) -> None:
-        """See `Camera`."""
         self._state.require_armed(Trigger.SOFTWARE)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`."""
-        give_up_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        give_up_ns = self._stage.clock.now_ns() + round(timeout_s * 1e9)
         while True:
             self._state.require_armed()
             self._fill()
@@ -207,17 +193,15 @@ class LiveCamera:
                     return Frame(
                         self.info.name, image, start_ns, end_ns, error_ns, self._number, self._dropped, exposure_s, 1.0
                     )
-            if time.monotonic_ns() >= give_up_ns:
+            if self._stage.clock.now_ns() >= give_up_ns:
                 message = f"no frame in {timeout_s} s"
                 raise FrameTimeoutError(message)
-            SystemClock().wait_until(min(self._delivered_ns(self._next), give_up_ns), self._state.closed)
+            self._stage.clock.wait_until(min(self._delivered_ns(self._next), give_up_ns), self._state.closed)
 
     def disarm(self) -> None:
-        """See `Camera`."""
         self._state.armed = None
 
     def close(self) -> None:
-        """See `Camera`."""
         self._state.close()
 
     def _delivered_ns(self, number: int) -> int:
@@ -226,7 +210,7 @@ class LiveCamera:
 
     def _fill(self) -> None:
         """Take what was delivered until now into the buffers; what finds none is lost."""
-        while self._delivered_ns(self._next) <= time.monotonic_ns():
+        while self._delivered_ns(self._next) <= self._stage.clock.now_ns():
             number, self._next = self._next, self._next + 1
             if self._rng.random() < self._webcam.lost or len(self._kept) == BUFFERS:
                 continue
@@ -236,7 +220,7 @@ class LiveCamera:
             self._kept.append(_Kept(number, start_ns, end_ns, stamp_ns))
 
     def _claimed(self, kept: _Kept) -> Exposure:
-        stamp = Stamp(StampSource.EXPOSURE_START, kept.stamp_ns, kept.start_ns, time.monotonic_ns())
+        stamp = Stamp(StampSource.EXPOSURE_START, kept.stamp_ns, kept.start_ns, self._stage.clock.now_ns())
         return exposure_of(stamp, Durations(self._exposure_ns, self._period_ns))
 
     def _image(self, kept: _Kept) -> Pixels:
@@ -247,26 +231,9 @@ class LiveCamera:
         return image
 
 
-@dataclass
-class LiveRig:
-    """The devices as a rig, its latency measured on these very devices, by flashes, as `slrig latency` does."""
-
-    stage: Stage
-    webcams: dict[str, Webcam]
-    refresh_hz: float = 60.0
-    exposure_s: float = 1 / 60
-    seed: int = 0
-    rig: Rig = field(init=False)
-
-    def __post_init__(self) -> None:
-        cameras = {
-            name: LiveCamera(name, self.stage, webcam, seed=self.seed + number)
-            for number, (name, webcam) in enumerate(self.webcams.items())
-        }
-        settings = {name: CameraSettings(self.exposure_s) for name in cameras}
-        rig = Rig("live", cameras, LiveDisplay(self.stage, refresh_hz=self.refresh_hz), settings)
-        self.rig = rig
-
-    def measured(self) -> Rig:
-        """The rig with what flashes tell of its latency."""
-        return replace(self.rig, synchronisation=measure_latency(self.rig).synchronisation)
+def live_rig(stage: Stage, webcam: Webcam, *, refresh_hz: float) -> Rig:
+    """A display and one webcam, which exposes for a refresh."""
+    camera = LiveCamera("eye", stage, webcam)
+    return Rig(
+        "live", {"eye": camera}, LiveDisplay(stage, refresh_hz=refresh_hz), {"eye": CameraSettings(1 / refresh_hz)}
+    )

@@ -31,6 +31,8 @@ from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench
 from tests.contract.v4l2_bench import CAMERA, Faked, FakeDevice, sequence, staged, why_not
 
+GREY: dict[str, object] = {"fourcc": "GREY", "size_px": [CAMERA.width_px, CAMERA.height_px], "frame_rate_hz": 50}
+
 
 @dataclass
 class NetworkCamera:
@@ -182,41 +184,39 @@ class DeviceHost(FakeDevice):
         return super()._start(own, environment)
 
 
-def stream_bench(_folder: Path) -> Bench:
-    """A network camera."""
-    light = staged(noise_dn=1.0)
-    served = Served(NetworkCamera(light))
-
-    def open_head() -> BenchHead:
-        camera = opencv.open_camera("eye", served.camera.options(served.url), Path())
-        return BenchHead({"eye": camera}, StagedProjector(light))
-
-    return Bench(open_head, sequence())
-
-
-def file_bench(folder: Path) -> Bench:
-    """A file that another program writes as it goes: a named pipe."""
-    light = staged(noise_dn=1.0)
-    Piped(NetworkCamera(light), folder / "video.mjpeg")
-
-    def open_head() -> BenchHead:
-        camera = opencv.open_camera("eye", NetworkCamera(light).options("video.mjpeg"), folder)
-        return BenchHead({"eye": camera}, StagedProjector(light))
-
-    return Bench(open_head, sequence())
-
-
-def device_bench(folder: Path, faked: Faked | None = None, **options: object) -> Bench:
-    """A camera of the kernel's, by its stamps. Skips the test where umockdev is missing."""
+def plugged(folder: Path, faked: Faked | None = None, code: str = "GREY") -> DeviceHost:
+    """A fake video device of this pixel format. Skips the test where umockdev is missing."""
     if why_not():
         pytest.skip(why_not())
-    device = DeviceHost(folder, staged(noise_dn=1.0), faked or Faked())
+    return DeviceHost(folder, staged(code, noise_dn=1.0), faked or Faked())
+
+
+def served_bench(folder: Path, *, through: str = "stream") -> Bench:
+    """A network camera, or one that another program writes into a file as it goes: a named pipe."""
+    light = staged(noise_dn=1.0)
+    source: Served | Piped
+    if through == "stream":
+        source = Served(NetworkCamera(light))
+        device = source.url
+    else:
+        source = Piped(NetworkCamera(light), folder / "video.mjpeg")
+        device = "video.mjpeg"
 
     def open_head() -> BenchHead:
-        usual = {"fourcc": "GREY", "size_px": [CAMERA.width_px, CAMERA.height_px], "frame_rate_hz": 50}
-        return BenchHead({"left": device.open_camera(**usual, **options)}, StagedProjector(device.stage))
+        camera = opencv.open_camera("eye", source.camera.options(device), folder)
+        return BenchHead({"eye": camera}, StagedProjector(light))
 
-    return Bench(open_head, sequence())
+    return Bench(open_head, sequence(), source.close)
+
+
+def device_bench(folder: Path) -> Bench:
+    """A camera of the kernel's, by its stamps."""
+    device = plugged(folder)
+
+    def open_head() -> BenchHead:
+        return BenchHead({"left": device.open_camera(**GREY)}, StagedProjector(device.stage))
+
+    return Bench(open_head, sequence(), device.close)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench
 from tests.contract.v4l2_host import AUTHKEY, Host
+from tests.contract.v4l2_kernel import STAMP_FLAGS
 from tests.contract.v4l2_sensor import BIT_DEPTHS, GAIN_UNITS, SensorService
 from tests.unit.capture.fake_rig import Scene
 
@@ -37,6 +38,8 @@ ROOT = Path(__file__).resolve().parents[2]
 DEBIAN_PYTHON = Path("/usr/bin/python3")
 CAMERA = Size(80, 60)
 PROJECTOR = Size(32, 24)
+STAMPS = tuple(STAMP_FLAGS)
+"""What a fake camera may stamp a frame with."""
 
 
 @cache
@@ -251,14 +254,14 @@ def sequence() -> PatternSequence:
     return encode(patterns, PROJECTOR)
 
 
-def bench(folder: Path, faked: Faked | None = None, *, frame_rate_hz: float = 50, **options: object) -> Bench:
+def bench(folder: Path) -> Bench:
     """The driver on a fake webcam that stamps the start of exposure. Skips the test where umockdev is missing."""
     if why_not():
         pytest.skip(why_not())
-    device = FakeDevice(folder, staged(noise_dn=1.0), faked or Faked())
+    device = FakeDevice(folder, staged(noise_dn=1.0), Faked())
 
     def open_head() -> BenchHead:
-        camera = device.open_camera(frame_rate_hz=frame_rate_hz, gain_unity=GAIN_UNITS, **options)
+        camera = device.open_camera(frame_rate_hz=50, gain_unity=GAIN_UNITS)
         return BenchHead({"left": camera}, StagedProjector(device.stage))
 
-    return Bench(open_head, sequence())
+    return Bench(open_head, sequence(), device.close)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from dataclasses import dataclass
 
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Clock, SystemClock, Trigger
 from slrig.errors import FrameTimeoutError
 from slrig.model import Frame
 from tests.contract.stage import Stage
@@ -40,73 +39,67 @@ class WiredCamera:
         gains: tuple[float, float] = (1.0, 4.0),
         readout_s: float = 0.0,
         tells: bool = True,
+        clock: Clock | None = None,
     ) -> None:
-        self._stage, self._readout_s, self._tells = stage, readout_s, tells
+        self._stage, self._readout_s, self._tells, self._clock = stage, readout_s, tells, clock or SystemClock()
         triggers = frozenset({Trigger.SOFTWARE, Trigger.HARDWARE})
         self.info = CameraInfo(name, "wired", "0", stage.format, triggers, exposures_s, gains)
-        self._changed = threading.Condition()
+        self._lock, self._changed = threading.RLock(), threading.Event()
         self._settings = CameraSettings(usual_s)
         self._state = CameraState(name)
         self._room = self._number = self._missed = self._busy_until_ns = 0
         self._exposures: deque[_Exposure] = deque()
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`."""
-        with self._changed:
+        with self._lock:
             self._state.check_settings(settings, self.info)
             self._settings = settings
             least_period_s = max(settings.exposure_s, self._readout_s) + WIRE_NS / 1e9
             return AppliedSettings(settings.exposure_s, settings.gain, least_period_s if self._tells else None)
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`."""
-        with self._changed:
+        with self._lock:
             self._state.check_arming(count, trigger, self.info)
             self._state.armed, self._room, self._missed = trigger, count, 0
 
     def trigger(self) -> None:
-        """See `Camera`."""
-        with self._changed:
+        with self._lock:
             self._state.require_armed(Trigger.SOFTWARE)
             # As many are under way as were triggered: each begins when the one before it has ended.
-            self._expose(max(time.monotonic_ns(), self._busy_until_ns))
+            self._expose(max(self._clock.now_ns(), self._busy_until_ns))
 
     def pulse(self, t_ns: int) -> None:
         """Take an edge on the wire. A sensor that is at work takes no notice."""
-        with self._changed:
+        with self._lock:
             if self._state.armed is Trigger.HARDWARE:
                 self._expose(t_ns + WIRE_NS)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`."""
-        until_s = time.monotonic() + timeout_s
-        with self._changed:
-            while True:
+        until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while True:
+            with self._lock:
+                self._changed.clear()
                 self._state.require_armed()
                 while self._exposures and self._exposures[0].t_start_ns < after_ns:
                     self._exposures.popleft()
-                left_s = until_s - time.monotonic()
-                under_way_s = 0.0
-                if self._exposures:
-                    under_way_s = (self._exposures[0].t_end_ns - time.monotonic_ns()) / 1e9
-                    if under_way_s <= 0:
-                        return self._frame(self._exposures.popleft())
-                if left_s <= 0:
+                now_ns = self._clock.now_ns()
+                next_ns = self._exposures[0].t_end_ns if self._exposures else until_ns
+                if self._exposures and next_ns <= now_ns:
+                    return self._frame(self._exposures.popleft())
+                if now_ns >= until_ns:
                     message = f"no frame began after {after_ns} ns within {timeout_s} s; see what triggers the camera"
                     raise FrameTimeoutError(message)
-                self._changed.wait(min(left_s, under_way_s) if under_way_s > 0 else left_s)
+            self._clock.wait_until(min(next_ns, until_ns), self._changed)
 
     def disarm(self) -> None:
-        """See `Camera`."""
-        with self._changed:
+        with self._lock:
             self._state.armed = None
             # An exposure under way ends here: the next trigger must not be lost to it.
             self._busy_until_ns = 0
             self._exposures.clear()
-            self._changed.notify_all()
+            self._changed.set()
 
     def close(self) -> None:
-        """See `Camera`."""
         self._state.close()
         self.disarm()
 
@@ -119,7 +112,7 @@ class WiredCamera:
         self._busy_until_ns = max(end_ns, begun_ns + round(self._readout_s * 1e9))
         self._exposures.append(_Exposure(self._number, begun_ns, end_ns))
         self._number += 1
-        self._changed.notify_all()
+        self._changed.set()
 
     def _frame(self, exposure: _Exposure) -> Frame:
         settings = self._settings

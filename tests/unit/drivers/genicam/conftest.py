@@ -1,54 +1,70 @@
-"""A fake GigE Vision camera for the tests of this folder; skipped with a reason where Aravis is not installed."""
+"""Fake GenICam cameras behind either library: GigE Vision through Aravis, a GenTL producer through harvesters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
 import pytest
 
-from drivers.genicam import GenicamCamera, open_camera
+from drivers.genicam import GenicamCamera
 from slrig.devices import CameraSettings
-from tests.contract.genicam_bench import FakeGigE, Fate, require_aravis, scene, table
+from tests.contract import genicam_bench, gentl_bench
+from tests.contract.genicam_bench import FakeGigE, Fate, require_aravis, scene
 from tests.contract.genicam_peer import PIXEL_FORMATS
+from tests.contract.gentl_camera import MemoryCamera
 from tests.contract.stage import Stage
 from tests.unit.drivers.genicam.encoding import encoded
 
 EXPOSURE_S = 0.005
+NO_LATCH = ("TimestampLatch", "TimestampLatchValue")
 
 
-@pytest.fixture(scope="session")
-def _peer() -> Iterator[FakeGigE]:
+@dataclass
+class Device:
+    """A camera before a dark stage, and the driver that opens it."""
+
+    camera: FakeGigE | MemoryCamera
+    opened: Callable[..., GenicamCamera]
+    unplug: Callable[[], object]
+    plug: Callable[[], object]
+    closing: ExitStack = field(default_factory=ExitStack)
+
+    def open(self, **options: object) -> GenicamCamera:
+        """The driver's camera, set to 5 ms; closed after the test."""
+        camera = self.opened(**options)
+        self.closing.callback(camera.close)
+        camera.configure(CameraSettings(EXPOSURE_S))
+        return camera
+
+
+@pytest.fixture(scope="module")
+def gige() -> Iterator[FakeGigE]:
+    """One for a whole file. Skips where Aravis is not installed."""
     require_aravis()
     packed = {name: partial(encoded, name=name) for name in PIXEL_FORMATS}
-    peer = FakeGigE(Stage(scene()), kind="sfnc", packed=packed)
-    yield peer
-    peer.stop()
+    with FakeGigE(Stage(scene()), kind="sfnc", packed=packed) as peer:
+        yield peer
 
 
-@pytest.fixture
-def peer(_peer: FakeGigE) -> FakeGigE:
-    """The camera, running and faultless, before a dark stage."""
-    _peer.stage = Stage(scene())
-    _peer.fate = Fate
-    _peer.exposures.clear()
-    _peer.start()
-    return _peer
-
-
-@pytest.fixture
-def opened(peer: FakeGigE) -> Iterator[Callable[..., GenicamCamera]]:
-    """Opens the driver's camera with options, set to 5 ms; closes it after the test."""
-    with ExitStack() as closing:
-
-        def call(**options: object) -> GenicamCamera:
+@pytest.fixture(params=["genicam", "gentl"])
+def device(request: pytest.FixtureRequest) -> Iterator[Device]:
+    """A camera of each kind; "gentl, no latch" has a clock that cannot be looked at."""
+    with ExitStack() as leaving:
+        if request.param == "genicam":
+            peer: FakeGigE = request.getfixturevalue("gige")
+            peer.stage, peer.fate = Stage(scene()), Fate
+            peer.exposures.clear()
             peer.start()
-            camera = open_camera("left", table(**options), Path())
-            assert isinstance(camera, GenicamCamera)
-            closing.callback(camera.close)
-            camera.configure(CameraSettings(EXPOSURE_S))
-            return camera
-
-        yield call
+            found = Device(peer, genicam_bench.opened, peer.stop, peer.start)
+        else:
+            memory = MemoryCamera(Stage(scene()), without=NO_LATCH if "no latch" in request.param else ())
+            producer = leaving.enter_context(gentl_bench.serving(memory))
+            plugged = partial(setattr, memory, "plugged")
+            found = Device(
+                memory, partial(gentl_bench.opened, producer), partial(plugged, False), partial(plugged, True)
+            )
+        leaving.enter_context(found.closing)
+        yield found
