@@ -10,8 +10,7 @@ from drivers import replay
 from simulated_rig import device
 from slrig.bundle import write_bundle
 from slrig.capture.sequencer import capture
-from slrig.model import Capture, PatternSequence, Size
-from slrig.patterns.sequence import encode, scan_patterns
+from slrig.model import Capture, Size
 from tests.contract import (
     depthai_bench,
     dlpc347x_bench,
@@ -25,7 +24,7 @@ from tests.contract import (
     v4l2_bench,
     v4l2_virtual,
 )
-from tests.contract.suite import Bench, rig_of
+from tests.contract.suite import Bench, rig_of, sequence_for
 
 PROJECTOR = Size(96, 72)
 
@@ -39,13 +38,6 @@ size_mm = [400.0, 400.0]
 rotation_deg = [6.0, -10.0, 0.0]
 albedo = 0.8
 """
-
-
-def sequence() -> PatternSequence:
-    patterns = scan_patterns(
-        PROJECTOR, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
-    )
-    return encode(patterns, PROJECTOR)
 
 
 def _eye(name: str, x_mm: float, **options: object) -> dict[str, object]:
@@ -90,7 +82,7 @@ def simulated(folder: Path, *, realtime: bool = False, **head: object) -> Bench:
         "camera": eyes(),
         **head,
     }
-    return Bench(partial(device.open_head, options, folder), sequence())
+    return Bench(partial(device.open_head, options, folder), sequence_for(PROJECTOR))
 
 
 def replayed(folder: Path, **options: object) -> Bench:

@@ -13,11 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from drivers.depthai import open_camera
-from slrig.model import PatternSequence, Size
-from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, sequence_for
 from tests.unit.capture.fake_rig import PROJECTOR, Scene
 
 FPS = 60.0
@@ -35,13 +33,6 @@ class OakHead(BenchHead):
         self.projector.close()
         for camera in self.cameras.values():
             camera.close()
-
-
-def sequence(projector: Size = PROJECTOR) -> PatternSequence:
-    patterns = scan_patterns(
-        projector, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
-    )
-    return encode(patterns, projector)
 
 
 def oak_head(stage: Stage, *, fps: float = FPS, options: Mapping[str, object] | None = None, **oak: Any) -> OakHead:
@@ -66,4 +57,4 @@ def bench(folder: Path, **oak: Any) -> Bench:  # noqa: ARG001 - every bench take
         scene = Scene(noise_dn=0.8, seed=next(seeds))
         return oak_head(Stage(scene, latency_s=0.002, jitter_s=0.003), **oak)
 
-    return Bench(open_head, sequence())
+    return Bench(open_head, sequence_for(PROJECTOR))

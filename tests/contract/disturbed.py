@@ -19,7 +19,6 @@ import pytest
 from drivers.opencv import open_camera as open_opencv_camera
 from slrig.devices import Camera, CameraSettings, Head, Rig
 from slrig.model import PatternSequence, Pixels, Size
-from slrig.patterns.sequence import encode
 from tests.contract import depthai_bench, genicam_bench, gentl_bench, opencv_bench, v4l2_bench, v4l2_virtual
 from tests.contract.bench_head import BenchHead
 from tests.contract.genicam_bench import Fate
@@ -27,10 +26,10 @@ from tests.contract.genicam_relay import Relay
 from tests.contract.gentl_camera import MemoryCamera
 from tests.contract.pairing import PairingResult, wrong_pairings
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import rig_of
+from tests.contract.suite import rig_of, sequence_for
 from tests.contract.v4l2_bench import Faked
 from tests.contract.v4l2_sensor import GAIN_UNITS
-from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for
+from tests.unit.capture.fake_rig import PROJECTOR, Scene
 from tests.unit.drivers.picamera2.fake_picamera2 import Pi
 from tests.virtual_clock import VirtualClock
 
@@ -87,7 +86,7 @@ def v4l2(leaving: ExitStack, _: Path, *, stamp: str) -> Disturbed:
         camera = device.open_camera(frame_rate_hz=400, gain_unity=GAIN_UNITS)
         return BenchHead({"left": camera}, StagedProjector(device.stage), clock=device.clock)
 
-    return Disturbed(open_head, device.stage, v4l2_bench.sequence(), 0.0008, 8.0)
+    return Disturbed(open_head, device.stage, sequence_for(v4l2_bench.PROJECTOR), 0.0008, 8.0)
 
 
 def picamera2(_: ExitStack, __: Path) -> Disturbed:
@@ -97,7 +96,7 @@ def picamera2(_: ExitStack, __: Path) -> Disturbed:
     def open_head() -> BenchHead:
         return BenchHead({"left": pi.opened()}, StagedProjector(pi.stage), clock=pi.stage.clock)
 
-    return Disturbed(open_head, pi.stage, encode(patterns_for(), PROJECTOR), 0.005)
+    return Disturbed(open_head, pi.stage, sequence_for(PROJECTOR), 0.005)
 
 
 def opencv_device(leaving: ExitStack, folder: Path, *, stamp: str) -> Disturbed:
@@ -109,7 +108,7 @@ def opencv_device(leaving: ExitStack, folder: Path, *, stamp: str) -> Disturbed:
         camera = device.open_camera(**{**opencv_bench.GREY, "frame_rate_hz": 200})
         return BenchHead({"left": camera}, StagedProjector(device.stage))
 
-    return Disturbed(open_head, device.stage, v4l2_bench.sequence(), 0.002)
+    return Disturbed(open_head, device.stage, sequence_for(v4l2_bench.PROJECTOR), 0.002)
 
 
 def opencv_network(
@@ -139,7 +138,9 @@ def opencv_network(
         cameras: dict[str, Camera] = {name: open_opencv_camera(name, table, folder) for name, table in tables.items()}
         return BenchHead(cameras, StagedProjector(network.stage))
 
-    return Disturbed(open_head, network.stage, v4l2_bench.sequence(), network.exposure_s, longest_idle_s=0.1)
+    return Disturbed(
+        open_head, network.stage, sequence_for(v4l2_bench.PROJECTOR), network.exposure_s, longest_idle_s=0.1
+    )
 
 
 def oak(_: ExitStack, __: Path) -> Disturbed:
@@ -149,9 +150,7 @@ def oak(_: ExitStack, __: Path) -> Disturbed:
     scene = Scene(camera=small, projector=small, columns_per_px=0.8, noise_dn=0.3)
     stage = Stage(scene, latency_s=0.001, jitter_s=0.002)
     fault = library.Fault(dropped=0.1, damaged=0.05, repeated=0.02, late_s=0.006)
-    return Disturbed(
-        partial(depthai_bench.oak_head, stage, fps=200.0, fault=fault), stage, depthai_bench.sequence(small), 0.003
-    )
+    return Disturbed(partial(depthai_bench.oak_head, stage, fps=200.0, fault=fault), stage, sequence_for(small), 0.003)
 
 
 @dataclass
@@ -181,7 +180,13 @@ def _by_genicam(stage: Stage, open_camera: Callable[..., Camera], *, free: bool,
         return BenchHead({"left": genicam_bench.FreeOnly(camera) if free else camera}, StagedProjector(stage))
 
     return Disturbed(
-        open_head, stage, genicam_bench.sequence(), 0.001, 10.0, timeout_s=1.0 if free else 0.026, longest_idle_s=0.03
+        open_head,
+        stage,
+        sequence_for(genicam_bench.PROJECTOR),
+        0.001,
+        10.0,
+        timeout_s=1.0 if free else 0.026,
+        longest_idle_s=0.03,
     )
 
 

@@ -20,12 +20,11 @@ from filelock import FileLock
 
 from drivers.genicam import GenicamCamera, open_camera
 from slrig.devices import Camera, CameraInfo, Trigger
-from slrig.model import PatternSequence, Pixels, Size
-from slrig.patterns.sequence import encode, scan_patterns
+from slrig.model import Pixels, Size
 from tests.contract.bench_head import BenchHead
 from tests.contract.genicam_peer import ANSWERED, ASKED, BEGIN, DELAY, END, INTERFACE, PIXEL_FORMATS, read_exactly
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, sequence_for
 from tests.unit.capture.fake_rig import Scene
 
 CAMERA, PROJECTOR = Size(120, 90), Size(64, 48)
@@ -184,13 +183,6 @@ def scene(**options: int | float) -> Scene:
     return Scene(camera=CAMERA, projector=PROJECTOR, columns_per_px=0.5, rows_per_px=0.5, white=0.4, **options)  # type: ignore[arg-type]
 
 
-def sequence() -> PatternSequence:
-    patterns = scan_patterns(
-        PROJECTOR, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
-    )
-    return encode(patterns, PROJECTOR)
-
-
 def opened(**options: object) -> GenicamCamera:
     """The driver's camera."""
     camera = open_camera("left", table(**options), Path())
@@ -221,4 +213,4 @@ def bench(folder: Path) -> Bench:
         peer.start()
         return BenchHead({"left": opened()}, StagedProjector(peer.stage))
 
-    return Bench(open_head, sequence(), peer.stop)
+    return Bench(open_head, sequence_for(PROJECTOR), peer.stop)

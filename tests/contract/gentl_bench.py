@@ -16,11 +16,11 @@ import pytest
 
 from drivers.genicam import GenicamCamera, open_gentl_camera
 from tests.contract.bench_head import BenchHead
-from tests.contract.genicam_bench import CAMERA, scene, sequence
+from tests.contract.genicam_bench import CAMERA, PROJECTOR, scene
 from tests.contract.gentl_camera import MemoryCamera
 from tests.contract.gentl_producer import FakeProducer, build
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, sequence_for
 
 
 def require_harvesters() -> None:
@@ -72,4 +72,4 @@ def bench(folder: Path) -> Bench:
     def open_head() -> BenchHead:
         return BenchHead({"left": opened(producer)}, StagedProjector(producer.camera.stage))
 
-    return Bench(open_head, sequence(), lambda: serves.__exit__(None, None, None))
+    return Bench(open_head, sequence_for(PROJECTOR), lambda: serves.__exit__(None, None, None))

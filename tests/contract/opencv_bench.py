@@ -28,8 +28,8 @@ from drivers import opencv
 from tests.contract import v4l2_host
 from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench
-from tests.contract.v4l2_bench import CAMERA, Faked, FakeDevice, sequence, staged, why_not
+from tests.contract.suite import Bench, sequence_for
+from tests.contract.v4l2_bench import CAMERA, PROJECTOR, Faked, FakeDevice, staged, why_not
 
 GREY: dict[str, object] = {"fourcc": "GREY", "size_px": [CAMERA.width_px, CAMERA.height_px], "frame_rate_hz": 50}
 
@@ -206,7 +206,7 @@ def served_bench(folder: Path, *, through: str = "stream") -> Bench:
         camera = opencv.open_camera("eye", source.camera.options(device), folder)
         return BenchHead({"eye": camera}, StagedProjector(light))
 
-    return Bench(open_head, sequence(), source.close)
+    return Bench(open_head, sequence_for(PROJECTOR), source.close)
 
 
 def device_bench(folder: Path) -> Bench:
@@ -216,7 +216,7 @@ def device_bench(folder: Path) -> Bench:
     def open_head() -> BenchHead:
         return BenchHead({"left": device.open_camera(**GREY)}, StagedProjector(device.stage))
 
-    return Bench(open_head, sequence(), device.close)
+    return Bench(open_head, sequence_for(PROJECTOR), device.close)
 
 
 if __name__ == "__main__":

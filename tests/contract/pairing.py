@@ -72,38 +72,17 @@ class IdlingProjector:
     """A projector before which a program dawdles, now and then, before it shows the next pattern."""
 
     def __init__(self, projector: Projector, gaps: Gaps) -> None:
-        self._projector = projector
-        self._gaps = gaps
+        self._projector, self._gaps = projector, gaps
+        self.load, self.play, self.stop = projector.load, projector.play, projector.stop
+        self.blank, self.close = projector.blank, projector.close
 
     @property
     def info(self) -> ProjectorInfo:
-        """See `Projector`."""
         return self._projector.info
 
-    def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`."""
-        self._projector.load(sequence)
-
     def show(self, index: int) -> Shown:
-        """See `Projector`."""
         self._gaps.idle()
         return self._projector.show(index)
-
-    def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`."""
-        self._projector.play(exposure_s, period_s)
-
-    def stop(self) -> None:
-        """See `Projector`."""
-        self._projector.stop()
-
-    def blank(self) -> None:
-        """See `Projector`."""
-        self._projector.blank()
-
-    def close(self) -> None:
-        """See `Projector`."""
-        self._projector.close()
 
 
 class Unproven(Evidence):

@@ -11,7 +11,9 @@ from slrig.conformance import CHECKS as CONTRACT
 from slrig.conformance import Check, Examination, Outcome
 from slrig.conformance.bench import usual_settings
 from slrig.devices import Camera, CameraSettings, Head, KeepsTime, Rig, SystemClock
-from slrig.model import PatternSequence
+from slrig.model import PatternSequence, Size
+from slrig.patterns.sequence import encode
+from tests.unit.capture.fake_rig import patterns_for
 
 COLOUR = "frames_come_in_colour_where_it_is_declared"
 """The check that a mono camera has nothing to show for."""
@@ -40,6 +42,11 @@ class Bench:
 
     def examination(self, *, limit_s: float | None = None) -> Examination:
         return Examination(self.open_rig, self.sequence, limit_s=limit_s)
+
+
+def sequence_for(projector: Size) -> PatternSequence:
+    """White, black, Gray code of columns with inverses, shifted lines, and white and black again."""
+    return encode(patterns_for(projector), projector)
 
 
 def close(head: Head) -> None:

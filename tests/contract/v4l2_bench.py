@@ -24,11 +24,10 @@ from typing import Any, Self, cast
 import pytest
 
 from slrig.devices import Camera, Clock, FoundDevice
-from slrig.model import PatternSequence, Size
-from slrig.patterns.sequence import encode, scan_patterns
+from slrig.model import Size
 from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, sequence_for
 from tests.contract.v4l2_host import AUTHKEY, Host
 from tests.contract.v4l2_kernel import STAMP_FLAGS
 from tests.contract.v4l2_sensor import BIT_DEPTHS, GAIN_UNITS, SensorService
@@ -246,14 +245,6 @@ def staged(code: str = "GREY", *, noise_dn: float = 0.0, clock: Clock | None = N
     return Stage(scene, latency_s=0.002, clock=clock)
 
 
-def sequence() -> PatternSequence:
-    """What the staged projector shows."""
-    patterns = scan_patterns(
-        PROJECTOR, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
-    )
-    return encode(patterns, PROJECTOR)
-
-
 def bench(folder: Path) -> Bench:
     """The driver on a fake webcam that stamps the start of exposure. Skips the test where umockdev is missing."""
     if why_not():
@@ -264,4 +255,4 @@ def bench(folder: Path) -> Bench:
         camera = device.open_camera(frame_rate_hz=50, gain_unity=GAIN_UNITS)
         return BenchHead({"left": camera}, StagedProjector(device.stage))
 
-    return Bench(open_head, sequence(), device.close)
+    return Bench(open_head, sequence_for(PROJECTOR), device.close)

@@ -21,8 +21,8 @@ from drivers.v4l2.camera import V4L2Camera
 from drivers.v4l2.finding import Node
 from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench
-from tests.contract.v4l2_bench import Faked, sequence, staged
+from tests.contract.suite import Bench, sequence_for
+from tests.contract.v4l2_bench import PROJECTOR, Faked, staged
 from tests.contract.v4l2_kernel import MOST_BUFFERS, Device, Refused
 from tests.contract.v4l2_sensor import GAIN_UNITS, Sensor
 from tests.virtual_clock import VirtualClock
@@ -166,4 +166,4 @@ def bench(folder: Path) -> Bench:
         camera = device.open_camera(frame_rate_hz=50, gain_unity=GAIN_UNITS)
         return BenchHead({"left": camera}, StagedProjector(device.stage), clock=device.clock)
 
-    return Bench(open_head, sequence(), device.__exit__)
+    return Bench(open_head, sequence_for(PROJECTOR), device.__exit__)

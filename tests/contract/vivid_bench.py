@@ -14,11 +14,10 @@ from pathlib import Path
 from drivers import opencv, v4l2
 from slrig.devices import Camera, ProjectorInfo, ProjectorState, Shown
 from slrig.model import PatternSequence, Pixels, Size
-from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract.bench_head import BenchHead
 from tests.contract.guest.vivid import Control, Node, Output, nodes
 from tests.contract.stage import Stage
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, sequence_for
 from tests.unit.capture.fake_rig import Scene
 
 SIGNAL = (640, 480)
@@ -27,14 +26,6 @@ CAMERA = Size(160, 120)
 PROJECTOR = Size(96, 72)
 _CUT_NS = 1_000
 """Flip times are cut to whole microseconds."""
-
-
-def sequence() -> PatternSequence:
-    """White, black, Gray code with inverses, shifted lines, and white and black again."""
-    patterns = scan_patterns(
-        PROJECTOR, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
-    )
-    return encode(patterns, PROJECTOR)
 
 
 @cache
@@ -86,35 +77,29 @@ class LoopedProjector:
         return ProjectorInfo("projector", "vivid output", str(self._output.path), PROJECTOR, False, 1 / 60)
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`."""
         self._state.require_open()
         self._state.require_size(sequence, PROJECTOR)
         self.blank()
         self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
-        """See `Projector`."""
         sequence = self._state.require_pattern(index)
         with self._lock:
             at_ns = self._output.show(expected(sequence.profiles[index]).tobytes())
         return Shown(index, at_ns, _CUT_NS)
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`."""
         self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
-        """See `Projector`."""
         self.blank()
 
     def blank(self) -> None:
-        """See `Projector`."""
         if not self._state.closed.is_set():
             with self._lock:
                 self._output.show(expected(None).tobytes())
 
     def close(self) -> None:
-        """See `Projector`."""
         self.blank()
         self._state.loaded = None
         self._state.closed.set()
@@ -138,7 +123,7 @@ def head(folder: Path, driver: str = "v4l2") -> BenchHead:
 
 def bench(folder: Path, driver: str = "v4l2") -> Bench:
     """The contract suite's bench; only in the guest."""
-    return Bench(lambda: head(folder, driver), sequence())
+    return Bench(lambda: head(folder, driver), sequence_for(PROJECTOR))
 
 
 DRIVERS: Mapping[str, Callable[[str, Mapping[str, object], Path], Camera]] = {

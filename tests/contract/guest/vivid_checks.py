@@ -29,7 +29,7 @@ from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, Un
 from tests.contract import vivid_bench
 from tests.contract.guest.outcome import Notes, outcome
 from tests.contract.guest.vivid import BARE, LOOPED, Control, Output, nodes
-from tests.contract.suite import rig_of
+from tests.contract.suite import rig_of, sequence_for
 from tests.contract.vivid_bench import DRIVERS
 
 FRAMES = {"v4l2": 500, "opencv": 300}
@@ -74,7 +74,7 @@ def pairing(driver: str, source: int, notes: Notes) -> None:
     """
     node = vivid_bench.camera_node(0)
     node.set(Control.TIMESTAMP_SOURCE, source)
-    sequence, frames = vivid_bench.sequence(), FRAMES[driver]
+    sequence, frames = sequence_for(vivid_bench.PROJECTOR), FRAMES[driver]
     rng = np.random.default_rng(source)
     head = vivid_bench.head(Path(), driver)
     wrong, late, injected, previous, frame = 0, 0, 0, -1, None
@@ -119,7 +119,7 @@ def pairing(driver: str, source: int, notes: Notes) -> None:
 
 def a_reader_without_the_rule_gets_wrong_frames(notes: Notes) -> None:
     """Read without asking for the light's time: wrong frames come, so `pairing` would have seen them."""
-    sequence = vivid_bench.sequence()
+    sequence = sequence_for(vivid_bench.PROJECTOR)
     head = vivid_bench.head(Path())
     wrong, count = 0, 20
     with armed(head.cameras["left"]) as camera:

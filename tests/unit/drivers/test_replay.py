@@ -79,19 +79,25 @@ def values(head: Head, patterns: Sequence[Pattern], *, exposure_s: float = 0.02)
 BASIC = [shot(0, 200), shot(1, 10), shot(2, 90)]
 
 
-def test_frames_follow_the_pattern_that_is_shown_and_not_the_order_of_the_recording(tmp_path: Path) -> None:
-    assert values(head_of(tmp_path, BASIC), [BIT, Black(), White()]) == [90, 10, 200]
+FIVE: list[Pattern] = [White(), Black(), BIT, White(), Black()]
 
 
-def test_a_pattern_that_was_recorded_once_looks_the_same_every_time(tmp_path: Path) -> None:
-    head = head_of(tmp_path, BASIC)
-    assert values(head, [White(), Black(), BIT, White(), Black()]) == [200, 10, 90, 200, 10]
-    assert values(head, [White()]) == [200]
-
-
-def test_the_second_showing_gives_the_second_recording(tmp_path: Path) -> None:
-    head = head_of(tmp_path, [*BASIC, shot(3, 190), shot(4, 12)], [White(), Black(), BIT, White(), Black()])
-    assert values(head, [White(), Black(), BIT, White(), Black()]) == [200, 10, 90, 190, 12]
+@pytest.mark.parametrize(
+    ("recorded", "patterns", "shown", "expected"),
+    [
+        # By the pattern, not in the order of the recording.
+        (BASIC, FIVE[:3], [BIT, Black(), White()], [90, 10, 200]),
+        # What was recorded once looks the same every time; the second showing gives the second recording.
+        (BASIC, FIVE[:3], FIVE, [200, 10, 90, 200, 10]),
+        ([*BASIC, shot(3, 190), shot(4, 12)], FIVE, FIVE, [200, 10, 90, 190, 12]),
+    ],
+)
+def test_showing_a_pattern_gives_its_frame(
+    tmp_path: Path, recorded: list[Shot], patterns: list[Pattern], shown: list[Pattern], expected: list[int]
+) -> None:
+    head = head_of(tmp_path, recorded, patterns)
+    assert values(head, shown) == expected
+    assert values(head, shown[:1]) == expected[:1]
 
 
 def test_the_exposure_chooses_among_a_bracket(tmp_path: Path) -> None:
@@ -121,43 +127,15 @@ def test_an_exposure_that_was_not_recorded_is_refused_with_those_that_were(tmp_p
         head.cameras["eye"].configure(CameraSettings(0.03))
     with pytest.raises(UnsupportedByDeviceError, match="gain 2"):
         head.cameras["eye"].configure(CameraSettings(0.02, gain=2))
-
-
-def test_a_recording_without_exposures_takes_any(tmp_path: Path) -> None:
-    head = head_of(tmp_path, [shot(0, 200, exposure_s=None)])
+    # One that does not tell its exposure takes any.
+    (tmp_path / "any").mkdir()
+    head = head_of(tmp_path / "any", [shot(0, 200, exposure_s=None)])
     assert head.cameras["eye"].configure(CameraSettings(0.123)).exposure_s == 0.123
-
-
-def test_recorded_times_are_kept(tmp_path: Path) -> None:
-    head = head_of(tmp_path, [shot(0, 200, time_s=0.0), shot(1, 10, time_s=0.5), shot(2, 90, time_s=1.25)])
-    camera = head.cameras["eye"]
-    head.projector.load(encode([White(), Black(), BIT], PROJECTOR))
-    camera.arm(3, Trigger.SOFTWARE)
-    starts = []
-    for index in range(3):
-        after_ns = head.projector.show(index).t_visible_ns
-        camera.trigger()
-        starts.append(camera.read(after_ns, 1.0).t_start_ns)
-    assert np.diff(starts) / 1e9 == pytest.approx([0.5, 0.75], abs=1e-4)
 
 
 def test_time_goes_on_when_the_recording_is_played_in_another_order(tmp_path: Path) -> None:
     head = head_of(tmp_path, [shot(0, 200, time_s=0.0), shot(1, 10, time_s=0.5), shot(2, 90, time_s=1.25)])
     assert values(head, [BIT, White(), Black()]) == [90, 200, 10]
-
-
-def test_two_cameras_are_exposed_together(tmp_path: Path) -> None:
-    shots = [shot(0, 200, time_s=0.1), shot(0, 150, camera="other", time_s=0.1)]
-    head = head_of(tmp_path, shots, cameras=["eye", "other"])
-    head.projector.load(encode([White()], PROJECTOR))
-    for camera in head.cameras.values():
-        camera.arm(1, Trigger.SOFTWARE)
-    after_ns = head.projector.show(0).t_visible_ns
-    for camera in head.cameras.values():
-        camera.trigger()
-    frames = [camera.read(after_ns, 1.0) for camera in head.cameras.values()]
-    assert [int(frame.image[0, 0]) for frame in frames] == [200, 150]
-    assert frames[0].t_start_ns == frames[1].t_start_ns
 
 
 def test_a_pattern_that_was_not_recorded_is_named_with_those_that_were(tmp_path: Path) -> None:
@@ -257,10 +235,11 @@ def test_every_scan_has_the_times_of_the_recording_at_any_speed(tmp_path: Path, 
         assert took_s == pytest.approx(1.27 / speed if speed else 0.0, abs=0.01)
 
 
-def test_a_camera_that_began_before_the_first_one_keeps_its_lead(tmp_path: Path) -> None:
-    shots = [shot(0, 200, time_s=0.0), shot(0, 150, camera="other", time_s=-0.25)]
-    head = head_of(tmp_path, shots, [White()], ["eye", "other"])
-    assert [(s.camera, s.time_s) for s in scanned(head, [White()])] == [("eye", 0.0), ("other", -0.25)]
+@pytest.mark.parametrize("lead_s", [0.0, 0.25])
+def test_two_cameras_keep_their_times(tmp_path: Path, lead_s: float) -> None:
+    shots = [shot(0, 200, time_s=0.0), shot(0, 150, camera="other", time_s=-lead_s)]
+    scan = scanned(head_of(tmp_path, shots, [White()], ["eye", "other"]), [White()])
+    assert [(s.camera, s.time_s, s.image[0, 0]) for s in scan] == [("eye", 0.0, 200), ("other", -lead_s, 150)]
 
 
 def test_at_speed_one_the_times_are_those_of_the_monotonic_clock(tmp_path: Path) -> None:
@@ -291,55 +270,33 @@ def test_a_scan_that_is_slower_than_the_recording_is_not_held_up_and_keeps_its_t
     assert real.waited_s == []
 
 
-def test_a_bracket_of_one_sequence_per_exposure_keeps_its_times(tmp_path: Path) -> None:
-    patterns: list[Pattern] = [White(), Black(), BIT, White(), Black()]
+@pytest.mark.parametrize("per_pattern", [False, True], ids=["one sequence per exposure", "exposures per pattern"])
+def test_a_bracket_keeps_its_times(tmp_path: Path, per_pattern: bool) -> None:
+    steps = list(enumerate((0.01, 0.03)))
+    order = [(index, *step) for step in steps for index in range(len(FIVE))]
+    if per_pattern:
+        order.sort()
     bracket = [
-        shot(index, 10 * index + step, exposure_s=exposure_s, time_s=10.0 * step + 0.1 * index)
-        for step, exposure_s in enumerate((0.01, 0.03))
-        for index in range(len(patterns))
+        shot(index, 10 * index + step, exposure_s=exposure_s, time_s=0.2 * number)
+        for number, (index, step, exposure_s) in enumerate(order)
     ]
-    head = head_of(tmp_path, bracket, patterns)
+    head = head_of(tmp_path, bracket, FIVE)
     camera = head.cameras["eye"]
-    for _ in range(2):
-        seen, starts_ns = [], []
-        for exposure_s in (0.01, 0.03):
-            camera.configure(CameraSettings(exposure_s))
-            head.projector.load(encode(patterns, PROJECTOR))
-            camera.arm(len(patterns), Trigger.SOFTWARE)
-            for index in range(len(patterns)):
-                after_ns = head.projector.show(index).t_visible_ns
-                camera.trigger()
-                frame = camera.read(after_ns, 1.0)
-                seen.append((int(frame.image[0, 0]), frame.exposure_s))
-                starts_ns.append(frame.t_start_ns)
-            camera.disarm()
-        assert seen == [(int(s.image[0, 0]), s.exposure_s) for s in bracket]
-        assert [ns - starts_ns[0] for ns in starts_ns] == [round((s.time_s or 0) * 1e9) for s in bracket]
-
-
-def test_a_bracket_of_several_exposures_per_pattern_keeps_its_times(tmp_path: Path) -> None:
-    patterns: list[Pattern] = [White(), Black(), BIT, White(), Black()]
-    bracket = [
-        shot(index, 10 * index + step, exposure_s=exposure_s, time_s=index + 0.2 * step)
-        for index in range(len(patterns))
-        for step, exposure_s in enumerate((0.01, 0.03))
-    ]
-    head = head_of(tmp_path, bracket, patterns)
-    camera = head.cameras["eye"]
-    head.projector.load(encode(patterns, PROJECTOR))
-    seen, starts_ns = [], []
-    for index in range(len(patterns)):
-        for exposure_s in (0.01, 0.03):
+    for _ in range(1 if per_pattern else 2):
+        frames = []
+        for number, (index, _step, exposure_s) in enumerate(order):
+            if number == 0 or not (index or per_pattern):
+                head.projector.load(encode(FIVE, PROJECTOR))
             camera.configure(CameraSettings(exposure_s))
             camera.arm(1, Trigger.SOFTWARE)
             after_ns = head.projector.show(index).t_visible_ns
             camera.trigger()
-            frame = camera.read(after_ns, 1.0)
-            seen.append((int(frame.image[0, 0]), frame.exposure_s))
-            starts_ns.append(frame.t_start_ns)
+            frames.append(camera.read(after_ns, 1.0))
             camera.disarm()
-    assert seen == [(int(s.image[0, 0]), s.exposure_s) for s in bracket]
-    assert [ns - starts_ns[0] for ns in starts_ns] == [round((s.time_s or 0) * 1e9) for s in bracket]
+        seen = [(int(frame.image[0, 0]), frame.exposure_s) for frame in frames]
+        assert seen == [(int(s.image[0, 0]), s.exposure_s) for s in bracket]
+        starts_ns = [frame.t_start_ns - frames[0].t_start_ns for frame in frames]
+        assert starts_ns == [round((s.time_s or 0) * 1e9) for s in bracket]
 
 
 def test_a_paced_read_waits_for_the_end_of_the_exposure_and_no_longer_than_it_may(tmp_path: Path) -> None:

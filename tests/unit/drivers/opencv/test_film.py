@@ -19,7 +19,8 @@ from slrig.devices import AppliedSettings, CameraSettings, Rig, Shown, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Pixels
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.v4l2_bench import sequence, staged
+from tests.contract.suite import sequence_for
+from tests.contract.v4l2_bench import PROJECTOR, staged
 
 RATE_HZ = 100.0
 EXPOSURE_S = 0.008
@@ -138,7 +139,7 @@ class FollowingProjector(StagedProjector):
 
 @pytest.mark.slow
 def test_a_film_of_a_sequence_pairs_with_a_projector_that_follows_it(tmp_path: Path) -> None:
-    light, shown, per_slot = staged(noise_dn=1.0), sequence(), 12
+    light, shown, per_slot = staged(noise_dn=1.0), sequence_for(PROJECTOR), 12
     # Each slot begins with a frame in which the pattern before is still seen: a scan must not take it.
     images: list[Pixels] = []
     for index in range(len(shown)):

@@ -20,10 +20,11 @@ from slrig.devices import AppliedSettings, Camera, CameraSettings, Trigger
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from tests.contract.opencv_bench import NetworkCamera, Served
 from tests.contract.stage import Stage
-from tests.contract.v4l2_bench import sequence, staged
+from tests.contract.suite import sequence_for
+from tests.contract.v4l2_bench import PROJECTOR, staged
 
 LONG_S = 20.0
-WHITE, BLACK = sequence().profiles[:2]
+WHITE, BLACK = sequence_for(PROJECTOR).profiles[:2]
 
 
 @contextmanager
