@@ -4,7 +4,7 @@ GenTL is an interface in C. The functions of the shared library, which the C com
 they do is done in Python, in this process. Names, numbers and meanings: EMVA's GenICam GenTL Standard, version 1.5.
 """
 
-# ruff: noqa: N802 - methods have GenTL's names
+# ruff: noqa: ARG002, N802 - methods have GenTL's names and arguments
 
 from __future__ import annotations
 
@@ -27,64 +27,20 @@ TL, INTERFACE, DEVICE, PORT, STREAM, NEW_BUFFER = 1, 2, 3, 4, 5, 6
 _TEXT, _I32, _U32, _U64, _POINTER, _BOOL, _SIZE = 1, 5, 6, 8, 10, 11, 12
 _PACKED = {_U32: "<I", _U64: "<Q", _SIZE: "<Q", _BOOL: "<B", _I32: "<i", _POINTER: "<Q"}
 
-_INFO = (c_int32, c_void_p, c_void_p, c_void_p)
-_CALLS: dict[str, tuple[Any, ...]] = {
-    "GCInitLib": (),
-    "GCCloseLib": (),
-    "GCGetInfo": _INFO,
-    "GCGetLastError": (c_void_p, c_void_p, c_void_p),
-    "GCReadPort": (c_void_p, c_uint64, c_void_p, c_void_p),
-    "GCWritePort": (c_void_p, c_uint64, c_void_p, c_void_p),
-    "GCGetPortURL": (c_void_p, c_void_p, c_void_p),
-    "GCGetPortInfo": (c_void_p, *_INFO),
-    "GCGetNumPortURLs": (c_void_p, c_void_p),
-    "GCGetPortURLInfo": (c_void_p, c_uint32, *_INFO),
-    "GCReadPortStacked": (c_void_p, c_void_p, c_void_p),
-    "GCWritePortStacked": (c_void_p, c_void_p, c_void_p),
-    "GCRegisterEvent": (c_void_p, c_int32, c_void_p),
-    "GCUnregisterEvent": (c_void_p, c_int32),
-    "EventGetData": (c_void_p, c_void_p, c_void_p, c_uint64),
-    "EventGetDataInfo": (c_void_p, c_void_p, c_size_t, *_INFO),
-    "EventGetInfo": (c_void_p, *_INFO),
-    "EventFlush": (c_void_p,),
-    "EventKill": (c_void_p,),
-    "TLOpen": (c_void_p,),
-    "TLClose": (c_void_p,),
-    "TLGetInfo": (c_void_p, *_INFO),
-    "TLGetNumInterfaces": (c_void_p, c_void_p),
-    "TLGetInterfaceID": (c_void_p, c_uint32, c_void_p, c_void_p),
-    "TLGetInterfaceInfo": (c_void_p, c_char_p, *_INFO),
-    "TLOpenInterface": (c_void_p, c_char_p, c_void_p),
-    "TLUpdateInterfaceList": (c_void_p, c_void_p, c_uint64),
-    "IFClose": (c_void_p,),
-    "IFGetInfo": (c_void_p, *_INFO),
-    "IFGetNumDevices": (c_void_p, c_void_p),
-    "IFGetDeviceID": (c_void_p, c_uint32, c_void_p, c_void_p),
-    "IFUpdateDeviceList": (c_void_p, c_void_p, c_uint64),
-    "IFGetDeviceInfo": (c_void_p, c_char_p, *_INFO),
-    "IFOpenDevice": (c_void_p, c_char_p, c_int32, c_void_p),
-    "DevGetPort": (c_void_p, c_void_p),
-    "DevGetNumDataStreams": (c_void_p, c_void_p),
-    "DevGetDataStreamID": (c_void_p, c_uint32, c_void_p, c_void_p),
-    "DevOpenDataStream": (c_void_p, c_char_p, c_void_p),
-    "DevGetInfo": (c_void_p, *_INFO),
-    "DevClose": (c_void_p,),
-    "DSAnnounceBuffer": (c_void_p, c_void_p, c_size_t, c_void_p, c_void_p),
-    "DSAllocAndAnnounceBuffer": (c_void_p, c_size_t, c_void_p, c_void_p),
-    "DSFlushQueue": (c_void_p, c_int32),
-    "DSStartAcquisition": (c_void_p, c_int32, c_uint64),
-    "DSStopAcquisition": (c_void_p, c_int32),
-    "DSGetInfo": (c_void_p, *_INFO),
-    "DSGetBufferID": (c_void_p, c_uint32, c_void_p),
-    "DSClose": (c_void_p,),
-    "DSRevokeBuffer": (c_void_p, c_void_p, c_void_p, c_void_p),
-    "DSQueueBuffer": (c_void_p, c_void_p),
-    "DSGetBufferInfo": (c_void_p, c_void_p, *_INFO),
-    "DSGetBufferChunkData": (c_void_p, c_void_p, c_void_p, c_void_p),
-    "IFGetParentTL": (c_void_p, c_void_p),
-    "DevGetParentIF": (c_void_p, c_void_p),
-    "DSGetParentDev": (c_void_p, c_void_p),
-}
+_TYPES = {"p": c_void_p, "i": c_int32, "I": c_uint32, "Q": c_uint64, "z": c_size_t, "s": c_char_p}
+_TABLE = """
+GCInitLib: GCCloseLib: GCGetInfo:ippp GCGetLastError:ppp GCReadPort:pQpp GCWritePort:pQpp GCGetPortURL:ppp
+GCGetPortInfo:pippp GCGetNumPortURLs:pp GCGetPortURLInfo:pIippp GCReadPortStacked:ppp GCWritePortStacked:ppp
+GCRegisterEvent:pip GCUnregisterEvent:pi EventGetData:pppQ EventGetDataInfo:ppzippp EventGetInfo:pippp
+EventFlush:p EventKill:p TLOpen:p TLClose:p TLGetInfo:pippp TLGetNumInterfaces:pp TLGetInterfaceID:pIpp
+TLGetInterfaceInfo:psippp TLOpenInterface:psp TLUpdateInterfaceList:ppQ IFClose:p IFGetInfo:pippp
+IFGetNumDevices:pp IFGetDeviceID:pIpp IFUpdateDeviceList:ppQ IFGetDeviceInfo:psippp IFOpenDevice:psip
+DevGetPort:pp DevGetNumDataStreams:pp DevGetDataStreamID:pIpp DevOpenDataStream:psp DevGetInfo:pippp
+DevClose:p DSAnnounceBuffer:ppzpp DSAllocAndAnnounceBuffer:pzpp DSFlushQueue:pi DSStartAcquisition:piQ
+DSStopAcquisition:pi DSGetInfo:pippp DSGetBufferID:pIp DSClose:p DSRevokeBuffer:pppp DSQueueBuffer:pp
+DSGetBufferInfo:ppippp DSGetBufferChunkData:pppp IFGetParentTL:pp DevGetParentIF:pp DSGetParentDev:pp
+"""
+_CALLS = _TABLE.split()
 """The functions of GenTL 1.5 that harvesters' wheel asks for, and the types of their arguments."""
 
 _SEVEN = ", ".join(f"void *{name}" for name in "abcdefg")
@@ -95,7 +51,8 @@ def build(folder: Path) -> Path:
     source, library = folder / "producer.c", folder / "producer.cti"
     lines = [f"typedef int (*call)({_SEVEN}); static call calls[{len(_CALLS)}];"]
     lines.append("void call_on(int index, call to) { calls[index] = to; }")
-    lines += [f"int {name}({_SEVEN}) {{ return calls[{at}](a, b, c, d, e, f, g); }}" for at, name in enumerate(_CALLS)]
+    for at, call in enumerate(_CALLS):
+        lines.append(f"int {call.split(':')[0]}({_SEVEN}) {{ return calls[{at}](a, b, c, d, e, f, g); }}")
     source.write_text("\n".join(lines), encoding="ascii")
     compiler = shutil.which("gcc")
     assert compiler is not None
@@ -119,8 +76,9 @@ class FakeProducer:
         self.loaded = False
         self._library = ctypes.CDLL(str(file))
         self._called = []
-        for index, (name, types) in enumerate(_CALLS.items()):
-            prototype = ctypes.CFUNCTYPE(c_int32, *types)
+        for index, call in enumerate(_CALLS):
+            name, types = call.split(":")
+            prototype = ctypes.CFUNCTYPE(c_int32, *(_TYPES[each] for each in types))
             called = prototype(self._answering(getattr(self, f"_{name}", None)))
             self._called.append(called)
             self._library.call_on(c_int32(index), called)
@@ -215,13 +173,17 @@ class FakeProducer:
         _put(count, "<I", 1)
 
     def _GCGetPortURLInfo(self, port: int, index: int, what: int, *into: int) -> None:
-        del port, index
         size = len(self.camera.xml)
         text = {0: f"Local:memory.xml;{XML_ADDRESS:x};{size:x}", 10: "memory.xml"}
         numbers = {1: 1, 2: 1, 3: 1, 4: 0, 5: 0, 9: 0}
         known: dict[int, tuple[int, Any]] = {each: (_TEXT, told) for each, told in text.items()}
         known |= {each: (_I32, number) for each, number in numbers.items()}
         _tell(known | {7: (_U64, XML_ADDRESS), 8: (_U64, size)}, what, into)
+
+    def _nothing(self, *_: int) -> None:
+        """What needs to be done: nothing."""
+
+    _GCUnregisterEvent = _EventKill = _TLClose = _IFClose = _DSClose = _nothing
 
     # ---- events
 
@@ -230,11 +192,7 @@ class FakeProducer:
             raise GentlFaultError(UNKNOWN)
         _put(event, "<Q", NEW_BUFFER)
 
-    def _GCUnregisterEvent(self, module: int, kind: int) -> None:
-        pass
-
     def _EventGetData(self, event: int, data: int, size: int, timeout_ms: int) -> None:
-        del event
         self.longest_wait_ms = max(self.longest_wait_ms, timeout_ms)
         with self._came:
             if not self._filled and timeout_ms and self.camera.plugged:
@@ -249,85 +207,54 @@ class FakeProducer:
         _put(size, "<Q", 16)
 
     def _EventGetInfo(self, event: int, what: int, *into: int) -> None:
-        del event
         _tell({0: (_I32, 1), 1: (_SIZE, len(self._filled)), 2: (_U64, 0), 3: (_SIZE, 16), 4: (_SIZE, 16)}, what, into)
 
     def _EventFlush(self, event: int) -> None:
-        del event
         with self._came:
             self._filled.clear()
-
-    def _EventKill(self, event: int) -> None:
-        pass
 
     # ---- what is there
 
     def _TLOpen(self, handle: int) -> None:
         _put(handle, "<Q", TL)
 
-    def _TLClose(self, handle: int) -> None:
-        pass
-
     def _TLGetInfo(self, handle: int, what: int, *into: int) -> None:
-        del handle
-        text = {
-            0: "SlrigTL",
-            1: "Slrig",
-            2: "Memory",
-            3: "1.0",
-            4: "Custom",
-            5: self.file.name,
-            6: str(self.file),
-            7: "TL",
-        }
+        text = dict(enumerate(("SlrigTL", "Slrig", "Memory", "1.0", "Custom", self.file.name, str(self.file), "TL")))
         known: dict[int, tuple[int, Any]] = {each: (_TEXT, told) for each, told in text.items()}
         _tell(known | {8: (_I32, 0), 9: (_U32, 1), 10: (_U32, 5)}, what, into)
 
     def _TLUpdateInterfaceList(self, handle: int, changed: int, timeout_ms: int) -> None:
-        del handle, timeout_ms
         if changed:
             _put(changed, "<B", 1)
 
     def _TLGetNumInterfaces(self, handle: int, count: int) -> None:
-        del handle
         _put(count, "<I", 1)
 
     def _TLGetInterfaceID(self, handle: int, index: int, *into: int) -> None:
-        del handle, index
         _give(_TEXT, "interface", 0, *into)
 
     def _TLGetInterfaceInfo(self, handle: int, name: bytes, what: int, *into: int) -> None:
-        del handle, name
         self._IFGetInfo(INTERFACE, what, *into)
 
     def _TLOpenInterface(self, handle: int, name: bytes, opened: int) -> None:
-        del handle, name
         _put(opened, "<Q", INTERFACE)
 
-    def _IFClose(self, handle: int) -> None:
-        pass
-
     def _IFGetInfo(self, handle: int, what: int, *into: int) -> None:
-        del handle
         _tell({0: (_TEXT, "interface"), 1: (_TEXT, "interface"), 2: (_TEXT, "Custom")}, what, into)
 
     def _IFUpdateDeviceList(self, handle: int, changed: int, timeout_ms: int) -> None:
         self._TLUpdateInterfaceList(handle, changed, timeout_ms)
 
     def _IFGetNumDevices(self, handle: int, count: int) -> None:
-        del handle
         _put(count, "<I", int(self.camera.plugged))
 
     def _IFGetDeviceID(self, handle: int, index: int, *into: int) -> None:
-        del handle, index
         _give(_TEXT, self._identity, 0, *into)
 
     def _IFGetDeviceInfo(self, handle: int, name: bytes, what: int, *into: int) -> None:
-        del handle, name
         self._DevGetInfo(DEVICE, what, *into)
 
     def _IFOpenDevice(self, handle: int, name: bytes, access: int, opened: int) -> None:
-        del handle, name, access
         if self.opened:
             raise GentlFaultError(DENIED)
         self.opened = True
@@ -340,45 +267,36 @@ class FakeProducer:
         return f"slrig-memory-{self.camera.serial}"
 
     def _DevGetPort(self, handle: int, port: int) -> None:
-        del handle
         _put(port, "<Q", PORT)
 
     def _DevGetInfo(self, handle: int, what: int, *into: int) -> None:
-        del handle
         text = {0: self._identity, 1: "Slrig", 2: "Memory", 3: "Custom", 4: "Memory camera", 7: self.camera.serial}
         _tell({each: (_TEXT, told) for each, told in text.items()} | {5: (_I32, 1)}, what, into)
 
     def _DevGetNumDataStreams(self, handle: int, count: int) -> None:
-        del handle
         _put(count, "<I", 1)
 
     def _DevGetDataStreamID(self, handle: int, index: int, *into: int) -> None:
-        del handle, index
         _give(_TEXT, "stream", 0, *into)
 
     def _DevOpenDataStream(self, handle: int, name: bytes, opened: int) -> None:
-        del handle, name
         _put(opened, "<Q", STREAM)
 
     def _DevClose(self, handle: int) -> None:
-        del handle
         self.camera.stop()
         self.opened = False
 
     def _DSAnnounceBuffer(self, stream: int, memory: int, size: int, user: int | None, buffer: int) -> None:
-        del stream
         with self._came:
             number = max(self._memory, default=100) + 1
             self._memory[number] = (memory, size, user or 0)
         _put(buffer, "<Q", number)
 
     def _DSQueueBuffer(self, stream: int, buffer: int) -> None:
-        del stream
         with self._came:
             self._free.append(buffer)
 
     def _DSRevokeBuffer(self, stream: int, buffer: int, memory: int | None, user: int | None) -> None:
-        del stream
         with self._came:
             address, _, private = self._memory.pop(buffer)
         for into, value in ((memory, address), (user, private)):
@@ -386,29 +304,21 @@ class FakeProducer:
                 _put(into, "<Q", value)
 
     def _DSFlushQueue(self, stream: int, operation: int) -> None:
-        del stream, operation
         with self._came:
             self._free.clear()
             self._filled.clear()
 
     def _DSStartAcquisition(self, stream: int, flags: int, count: int) -> None:
-        del stream, flags, count
         self._grabbing = True
 
     def _DSStopAcquisition(self, stream: int, flags: int) -> None:
-        del stream, flags
         self._grabbing = False
 
-    def _DSClose(self, stream: int) -> None:
-        pass
-
     def _DSGetInfo(self, stream: int, what: int, *into: int) -> None:
-        del stream
         known: dict[int, tuple[int, Any]] = {0: (_TEXT, "stream"), 8: (_BOOL, int(self._grabbing)), 9: (_BOOL, 0)}
         _tell(known | {10: (_TEXT, "Custom"), 12: (_SIZE, 2)}, what, into)
 
     def _DSGetBufferInfo(self, stream: int, buffer: int, what: int, *into: int) -> None:
-        del stream
         memory, size, user = self._memory[buffer]
         known: dict[int, tuple[int, Any]] = {0: (_POINTER, memory), 1: (_SIZE, size), 2: (_POINTER, user)}
         known |= {5: (_BOOL, int(buffer in self._free)), 8: (_TEXT, "Custom")}

@@ -21,46 +21,36 @@ from slrig.devices import (
     CameraSettings,
     CameraState,
     ProjectorInfo,
-    ProjectorState,
     Rig,
     Shown,
     Trigger,
 )
 from slrig.errors import FrameTimeoutError
-from slrig.model import Frame, PatternSequence, Pixels
-from tests.contract.stage import Stage
+from slrig.model import Frame, Pixels
+from tests.contract.stage import Stage, StagedProjector
 from tests.contract.wired_camera import WiredCamera
 
 BUFFERS = 4
 
 
-class LiveDisplay:
-    """Implements `Projector`: a display of this refresh rate, whose delay is the stage's latency. It states what the
-    driver `screen` states of a display that nobody measured.
+class LiveDisplay(StagedProjector):
+    """A display of this refresh rate, whose delay is the stage's latency. It states what the driver `screen` does of a
+    display that nobody measured.
     """
 
     def __init__(self, stage: Stage, *, refresh_hz: float = 60.0) -> None:
+        super().__init__(stage)
         self.refresh_ns = round(1e9 / refresh_hz)
-        self._stage = stage
         self._begun_ns = self._stage.clock.now_ns()
-        self._state = ProjectorState("the live display")
 
     @property
     def info(self) -> ProjectorInfo:
         refresh_s = self.refresh_ns / 1e9
-        latency_s = 2 * UNMEASURED_S + 2 * refresh_s
-        size = self._stage.scene.projector
-        return ProjectorInfo("display", "live display", "0", size, False, latency_s, refresh_s)
-
-    def load(self, sequence: PatternSequence) -> None:
-        self._state.require_size(sequence, self._stage.scene.projector)
-        self.blank()
-        self._state.loaded = sequence
+        return replace(super().info, latency_s=2 * UNMEASURED_S + 2 * refresh_s, refresh_s=refresh_s)
 
     def show(self, index: int) -> Shown:
         """See `Projector`. Waits for the next refresh."""
-        profile = self._state.require_pattern(index).profiles[index]
-        flip_ns = self._flip(profile)
+        flip_ns = self._flip(self._state.require_pattern(index).profiles[index])
         t_visible_ns, t_err_ns = whole_light(
             flipped(flip_ns),
             refresh_s=self.refresh_ns / 1e9,
@@ -69,20 +59,9 @@ class LiveDisplay:
         )
         return Shown(index, t_visible_ns, t_err_ns)
 
-    def play(self, exposure_s: float, period_s: float) -> None:
-        self._state.refuse_to_play(exposure_s, period_s)
-
-    def stop(self) -> None:
-        self.blank()
-
     def blank(self) -> None:
         if not self._state.closed.is_set():
             self._flip(None)
-
-    def close(self) -> None:
-        self.blank()
-        self._state.loaded = None
-        self._state.closed.set()
 
     def _flip(self, profile: Pixels | None) -> int:
         """Hand a picture over, and return at the refresh that takes it, however late this thread wakes up for that."""

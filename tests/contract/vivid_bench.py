@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from drivers import opencv, v4l2
-from slrig.devices import Camera, ProjectorInfo, ProjectorState, Shown
-from slrig.model import PatternSequence, Pixels, Size
+from slrig.devices import Camera, ProjectorInfo, Shown
+from slrig.model import Pixels, Size
 from tests.contract.bench_head import BenchHead
 from tests.contract.guest.vivid import Control, Node, Output, nodes
-from tests.contract.stage import Stage
+from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench, sequence_for
 from tests.unit.capture.fake_rig import Scene
 
@@ -62,47 +63,30 @@ def expected(profile: Pixels | None) -> Pixels:
     return stage().expected(profile)
 
 
-class LoopedProjector:
-    """Implements `slrig.devices.Projector` on vivid's output node."""
+class LoopedProjector(StagedProjector):
+    """A projector on vivid's output node."""
 
     def __init__(self, output: Output) -> None:
+        super().__init__(stage())
         self._output = output
-        self._state = ProjectorState("the video output")
         self._lock = threading.Lock()
         self.blank()
 
     @property
     def info(self) -> ProjectorInfo:
         """See `Projector`. It changes at the next frame of its signal."""
-        return ProjectorInfo("projector", "vivid output", str(self._output.path), PROJECTOR, False, 1 / 60)
-
-    def load(self, sequence: PatternSequence) -> None:
-        self._state.require_open()
-        self._state.require_size(sequence, PROJECTOR)
-        self.blank()
-        self._state.loaded = sequence
+        return replace(super().info, latency_s=1 / 60)
 
     def show(self, index: int) -> Shown:
-        sequence = self._state.require_pattern(index)
+        profile = self._state.require_pattern(index).profiles[index]
         with self._lock:
-            at_ns = self._output.show(expected(sequence.profiles[index]).tobytes())
+            at_ns = self._output.show(expected(profile).tobytes())
         return Shown(index, at_ns, _CUT_NS)
-
-    def play(self, exposure_s: float, period_s: float) -> None:
-        self._state.refuse_to_play(exposure_s, period_s)
-
-    def stop(self) -> None:
-        self.blank()
 
     def blank(self) -> None:
         if not self._state.closed.is_set():
             with self._lock:
                 self._output.show(expected(None).tobytes())
-
-    def close(self) -> None:
-        self.blank()
-        self._state.loaded = None
-        self._state.closed.set()
 
 
 def options(instance: int, driver: str = "v4l2", /, **more: object) -> dict[str, object]:

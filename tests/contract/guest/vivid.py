@@ -20,6 +20,7 @@ from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
 
+from drivers.v4l2 import kernel
 from tests.contract.guest.machine import Module
 
 LOOPED, BARE = 6, 3
@@ -61,24 +62,6 @@ def nodes() -> Mapping[str, Path]:
     return {(folder / "name").read_text().strip(): Path("/dev") / folder.name for folder in folders}
 
 
-class _Control(ctypes.Structure):
-    _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
-
-
-class _Query(ctypes.Structure):
-    _fields_ = (
-        ("id", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("name", ctypes.c_char * 32),
-        ("minimum", ctypes.c_int32),
-        ("maximum", ctypes.c_int32),
-        ("step", ctypes.c_int32),
-        ("default_value", ctypes.c_int32),
-        ("flags", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32 * 2),
-    )
-
-
 class _Timings(ctypes.Structure):
     """struct v4l2_dv_timings, of which extent and speed are looked at."""
 
@@ -99,69 +82,11 @@ class _ListedTimings(ctypes.Structure):
     _fields_ = (("index", ctypes.c_uint32), ("reserved", ctypes.c_uint32 * 3), ("timings", _Timings))
 
 
-class _Format(ctypes.Structure):
-    """struct v4l2_format with its struct v4l2_pix_format, on a 64-bit machine."""
-
-    _fields_ = (
-        ("type", ctypes.c_uint64),
-        ("width", ctypes.c_uint32),
-        ("height", ctypes.c_uint32),
-        ("pixel_format", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
-        ("bytes_per_line", ctypes.c_uint32),
-        ("image_bytes", ctypes.c_uint32),
-        ("rest", ctypes.c_uint8 * 176),
-    )
-
-
-class _Request(ctypes.Structure):
-    _fields_ = (
-        ("count", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("memory", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
-    )
-
-
-class _Buffer(ctypes.Structure):
-    """struct v4l2_buffer on a 64-bit machine."""
-
-    _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("bytes_used", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
-        ("seconds", ctypes.c_int64),
-        ("microseconds", ctypes.c_int64),
-        ("timecode", ctypes.c_uint8 * 16),
-        ("sequence", ctypes.c_uint32),
-        ("memory", ctypes.c_uint32),
-        ("offset", ctypes.c_uint64),
-        ("length", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32 * 2),
-    )
-
-
-_READ, _WRITE = 2, 1
-_OUTPUT, _MMAP, _NO_FIELD = 2, 1, 1
-
-
-def _request(direction: int, number: int, argument: type[ctypes._SimpleCData[int]] | type[ctypes.Structure]) -> int:
-    return (direction << 30) | (ctypes.sizeof(argument) << 16) | (ord("V") << 8) | number
-
-
-_S_FMT = _request(_READ | _WRITE, 5, _Format)
-_REQBUFS = _request(_READ | _WRITE, 8, _Request)
-_QUERYBUF = _request(_READ | _WRITE, 9, _Buffer)
-_QBUF = _request(_READ | _WRITE, 15, _Buffer)
-_DQBUF = _request(_READ | _WRITE, 17, _Buffer)
-_STREAMON = _request(_WRITE, 18, ctypes.c_int)
-_S_CTRL = _request(_READ | _WRITE, 28, _Control)
-_QUERYCTRL = _request(_READ | _WRITE, 36, _Query)
-_S_DV_TIMINGS = _request(_READ | _WRITE, 87, _Timings)
-_ENUM_DV_TIMINGS = _request(_READ | _WRITE, 98, _ListedTimings)
+_OUTPUT = 2
+_S_DV_TIMINGS, _ENUM_DV_TIMINGS = (
+    3 << 30 | ctypes.sizeof(kind) << 16 | ord("V") << 8 | number
+    for kind, number in ((_Timings, 87), (_ListedTimings, 98))
+)
 
 
 class Node:
@@ -179,21 +104,21 @@ class Node:
 
     def set(self, control: int, value: int = 1) -> None:
         """Set a control; a button is pressed by any value."""
-        self._ask(_S_CTRL, _Control(control, value))
+        self._ask(kernel.S_CTRL, kernel.ControlValue(control, value))
 
     def set_named(self, name: str, value: int) -> None:
         """Set a control that is known by name only. Raises LookupError if there is none."""
-        query = _Query(id=0x80000000)
+        query = kernel.ControlDescription(id=kernel.CONTROL_NEXT)
         while True:
             try:
-                self._ask(_QUERYCTRL, query)
+                self._ask(kernel.QUERYCTRL, query)
             except OSError as error:
                 message = f"{self.path} has no control '{name}'"
                 raise LookupError(message) from error
             if query.name.decode() == name:
                 self.set(query.id, value)
                 return
-            query.id |= 0x80000000
+            query.id |= kernel.CONTROL_NEXT
 
     def set_timing(self, width_px: int, height_px: int) -> None:
         """Choose the signal's timing: of the progressive ones of this extent the fastest. Raises LookupError."""
@@ -212,7 +137,7 @@ class Node:
             raise LookupError(message)
         self._ask(_S_DV_TIMINGS, max(fits, key=lambda timings: timings.pixel_clock_hz))
 
-    def _ask(self, request: int, argument: ctypes._SimpleCData[int] | ctypes.Structure) -> None:
+    def _ask(self, request: int, argument: ctypes.c_int | ctypes.Structure) -> None:
         fcntl.ioctl(self._file, request, argument)
 
 
@@ -221,27 +146,25 @@ class Output(Node):
 
     def __init__(self, path: Path, pixel_format: str, width_px: int, height_px: int, *, dark: bytes) -> None:
         super().__init__(path)
-        form = _Format(
-            type=_OUTPUT,
-            width=width_px,
-            height=height_px,
-            pixel_format=int.from_bytes(pixel_format.encode(), "little"),
-            field=_NO_FIELD,
-        )
-        self._ask(_S_FMT, form)
-        self.format = (form.pixel_format.to_bytes(4, "little").decode(), form.width, form.height, form.bytes_per_line)
-        request = _Request(count=2, type=_OUTPUT, memory=_MMAP)
-        self._ask(_REQBUFS, request)
-        if request.count != 2 or len(dark) != form.image_bytes:
-            message = f"{path}: {request.count} buffers of {form.image_bytes} bytes, format {self.format}"
+        form = kernel.Format(type=_OUTPUT)
+        pix = form.fmt.pix
+        pix.width, pix.height, pix.pixelformat = width_px, height_px, kernel.code_of(pixel_format)
+        pix.field = kernel.FIELD_NONE
+        self._ask(kernel.S_FMT, form)
+        request = kernel.BufferRequest(count=2, type=_OUTPUT, memory=kernel.MMAP)
+        self._ask(kernel.REQBUFS, request)
+        if request.count != 2 or len(dark) != pix.sizeimage:
+            message = (
+                f"{path}: {request.count} buffers of {pix.sizeimage} bytes, format {kernel.text_of(pix.pixelformat)}"
+            )
             raise RuntimeError(message)
         self._memory: list[mmap.mmap] = []
         for index in range(request.count):
-            buffer = _Buffer(index=index, type=_OUTPUT, memory=_MMAP)
-            self._ask(_QUERYBUF, buffer)
-            self._memory.append(mmap.mmap(self._file, buffer.length, offset=buffer.offset))
+            buffer = kernel.Buffer(index=index, type=_OUTPUT, memory=kernel.MMAP)
+            self._ask(kernel.QUERYBUF, buffer)
+            self._memory.append(mmap.mmap(self._file, buffer.length, offset=buffer.m.offset))
             self._queue(index, dark)
-        self._ask(_STREAMON, ctypes.c_int(_OUTPUT))
+        self._ask(kernel.STREAMON, ctypes.c_int(_OUTPUT))
         self._free, _ = self._flipped()
 
     def close(self) -> None:
@@ -258,7 +181,9 @@ class Output(Node):
 
     def _queue(self, index: int, picture: bytes) -> None:
         self._memory[index][: len(picture)] = picture
-        self._ask(_QBUF, _Buffer(index=index, type=_OUTPUT, memory=_MMAP, bytes_used=len(picture), field=_NO_FIELD))
+        buffer = kernel.Buffer(index=index, type=_OUTPUT, memory=kernel.MMAP)
+        buffer.bytesused, buffer.field = len(picture), kernel.FIELD_NONE
+        self._ask(kernel.QBUF, buffer)
 
     def _flipped(self) -> tuple[int, int]:
         """Wait for the picture before to come back: vivid keeps the last one for as long as there is no other."""
@@ -267,6 +192,6 @@ class Output(Node):
         if not waiting.poll(5000):
             message = f"{self.path} did not change its picture in 5 s"
             raise TimeoutError(message)
-        buffer = _Buffer(type=_OUTPUT, memory=_MMAP)
-        self._ask(_DQBUF, buffer)
-        return buffer.index, (buffer.seconds * 1_000_000 + buffer.microseconds) * 1_000
+        buffer = kernel.Buffer(type=_OUTPUT, memory=kernel.MMAP)
+        self._ask(kernel.DQBUF, buffer)
+        return buffer.index, (buffer.timestamp.tv_sec * 1_000_000 + buffer.timestamp.tv_usec) * 1_000

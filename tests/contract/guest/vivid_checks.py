@@ -21,15 +21,14 @@ import pytest
 
 from drivers import v4l2
 from drivers.v4l2.controls import AUTOGAIN
-from slrig.capture.sequencer import capture
 from slrig.conformance import run
 from slrig.conformance.bench import usual_settings
 from slrig.devices import Camera, CameraSettings, Trigger
-from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError
 from tests.contract import vivid_bench
 from tests.contract.guest.outcome import Notes, outcome
 from tests.contract.guest.vivid import BARE, LOOPED, Control, Output, nodes
-from tests.contract.suite import rig_of, sequence_for
+from tests.contract.suite import sequence_for
 from tests.contract.vivid_bench import DRIVERS
 
 FRAMES = {"v4l2": 500, "opencv": 300}
@@ -133,30 +132,6 @@ def a_reader_without_the_rule_gets_wrong_frames(notes: Notes) -> None:
     assert wrong >= 5
 
 
-def corrupt_buffers_are_passed_over_and_counted(notes: Notes) -> None:
-    node, count = vivid_bench.camera_node(0), 10
-    with armed(open_camera(0)) as camera:
-        first = last = camera.read(time.monotonic_ns(), PATIENCE_S)
-        for _ in range(count):
-            node.set(Control.BUFFER_ERROR)
-            last = camera.read(time.monotonic_ns(), PATIENCE_S)
-        counted = last.dropped_count - first.dropped_count
-    notes |= {"injected": count, "counted": counted}
-    assert counted >= count
-
-
-def a_sequence_is_captured(driver: str, notes: Notes) -> None:
-    """The sequencer and its evidence over the driver: every pattern proven, every frame exact."""
-    bench = vivid_bench.bench(Path(), driver)
-    with bench.head() as head:
-        begun = time.monotonic()
-        shots = list(capture(rig_of(head), bench.sequence))
-        notes |= {"patterns": len(shots), "ms per pattern": round((time.monotonic() - begun) / len(shots) * 1e3, 1)}
-        assert len(shots) == len(bench.sequence)
-        for shot in shots:
-            assert np.array_equal(shot.image, vivid_bench.expected(bench.sequence.profiles[shot.pattern]))
-
-
 def found_cameras_have_names_of_their_own(notes: Notes) -> None:
     """Nine cameras on one parent, six with an output beside them: nine names, each opening its own camera."""
     found = v4l2.find_devices()
@@ -253,14 +228,6 @@ def a_stream_that_dies_is_gone_and_can_be_reopened(driver: str, _: Notes) -> Non
         assert camera.read(time.monotonic_ns(), PATIENCE_S).image.size
 
 
-def what_the_device_cannot_do_is_refused(driver: str, notes: Notes) -> None:
-    """The kernel takes another format in silence."""
-    key = "pixel_format" if driver == "v4l2" else "fourcc"
-    with pytest.raises(UnsupportedByDeviceError, match=r"MJPG.* driver gives ") as refused:
-        open_camera(BUSY, driver, **{key: "MJPG"})
-    notes["says"] = str(refused.value)
-
-
 def samples_come_as_they_were_sent(notes: Notes) -> None:
     """Write random samples to the output in each format, and read them through the kernel's camera."""
     rng = np.random.default_rng(0)
@@ -289,13 +256,10 @@ def samples_come_as_they_were_sent(notes: Notes) -> None:
 _OF_V4L2 = (
     found_cameras_have_names_of_their_own,
     a_reader_without_the_rule_gets_wrong_frames,
-    corrupt_buffers_are_passed_over_and_counted,
     samples_come_as_they_were_sent,
     an_unplugged_camera_is_not_found,
 )
 _OF_EACH = (
-    a_sequence_is_captured,
-    what_the_device_cannot_do_is_refused,
     a_camera_that_another_program_streams_from_is_busy,
     a_stream_that_dies_is_gone_and_can_be_reopened,
     an_unplugged_camera_is_gone,
