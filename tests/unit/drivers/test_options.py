@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from slrig.bundle.faults import checked
+from slrig.errors import ConfigError
 from slrig.option_models import described_drivers, kinds_of, option_model
 
 SHIPPED = {
@@ -38,6 +40,36 @@ def test_every_option_has_a_meaning_in_a_sentence(driver: str) -> None:
     for name, part in told.items():
         assert len(part.get("description", "")) > 5, name
         assert part["description"].endswith((".", ")")), name
+
+
+@pytest.mark.parametrize(
+    ("driver", "table", "words"),
+    [
+        (
+            "v4l2",
+            {"pixel_format": "H264", "size_px": [640], "fokus": 3, "frame_rate_hz": -1},
+            ("device: missing", "'H264'", "size_px", "did you mean 'focus'?", "frame_rate_hz"),
+        ),
+        (
+            "genicam",
+            {"devise": "GV01", "region": {"width_px": 0, "height_px": 10}, "time_stamp": "sometimes", "transfer_s": -1},
+            ("device: missing", "did you mean 'device'", "region.width_px", "time_stamp", "transfer_s"),
+        ),
+        (
+            "depthai",
+            {"socket": "left", "fsp": 3, "fps": 0, "focus": 300},
+            ("device: missing", "'CAM_A'", "fsp: unknown key; did you mean 'fps'", "fps: ", "focus: "),
+        ),
+    ],
+)
+def test_every_fault_of_a_cameras_table_is_in_one_message(
+    driver: str, table: dict[str, object], words: tuple[str, ...]
+) -> None:
+    model = option_model(driver)
+    assert model is not None
+    with pytest.raises(ConfigError) as refused:
+        checked(model, table, "the table")
+    assert [each for each in words if each not in str(refused.value)] == []
 
 
 def test_a_finders_id_is_taken_by_device_or_by_what_a_model_marks() -> None:

@@ -214,22 +214,6 @@ def test_a_pipeline_that_the_device_refuses_is_refused_for_good(head: Opens, mon
         pair.cameras["right"].configure(CameraSettings(0.005))
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({}, r"device: missing.*\n.*socket: missing"),
-        (
-            {"device": DEVICE, "socket": "left", "fsp": 3},
-            r"socket: .*'CAM_A'.*\n.*fsp: unknown key; did you mean 'fps'",
-        ),
-        ({"device": DEVICE, "socket": "CAM_B", "fps": 0, "focus": 300}, r"fps: .*\n.*focus: "),
-    ],
-)
-def test_options_are_checked_with_all_their_faults(options: dict[str, object], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        open_camera("left", options, Path())
-
-
 def test_a_frame_larger_than_the_sensor_is_refused(head: Opens) -> None:
     with pytest.raises(UnsupportedByDeviceError, match="asked for 128 x 96, its sensor OV9282 has 64 x 48"):
         head(options={"size_px": [128, 96]})

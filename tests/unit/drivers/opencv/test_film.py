@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from pathlib import Path
 
@@ -12,15 +11,9 @@ import pytest
 
 from drivers.opencv import open_camera
 from drivers.opencv.camera import OpenCvCamera
-from drivers.opencv.feeds import FilmFeed
-from slrig.capture.evidence import Evidence
-from slrig.capture.sequencer import capture
-from slrig.devices import AppliedSettings, CameraSettings, Rig, Shown, Trigger
+from slrig.devices import AppliedSettings, CameraSettings, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Pixels
-from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import sequence_for
-from tests.contract.v4l2_bench import PROJECTOR, staged
 
 RATE_HZ = 100.0
 EXPOSURE_S = 0.008
@@ -117,43 +110,3 @@ def test_a_film_takes_the_exposure_it_was_made_with(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedByDeviceError, match="no control"):
         camera.configure(CameraSettings(1 / 60))
     camera.close()
-
-
-class FollowingProjector(StagedProjector):
-    """Shows each pattern when the film does: `slot_s` each, from the film's beginning."""
-
-    def __init__(self, light: Stage, camera: OpenCvCamera, slot_s: float) -> None:
-        super().__init__(light)
-        self._camera = camera
-        self._slot_s = slot_s
-
-    def show(self, index: int) -> Shown:
-        feed = self._camera._feed
-        assert isinstance(feed, FilmFeed)
-        # The light changes while a slot's first frame is exposed.
-        at_ns = feed.begun_ns + round((index * self._slot_s + 0.5 / RATE_HZ) * 1e9)
-        while (left_ns := at_ns - time.monotonic_ns()) > 0:
-            threading.Event().wait(left_ns / 1e9)
-        return Shown(index, at_ns, 0)
-
-
-@pytest.mark.slow
-def test_a_film_of_a_sequence_pairs_with_a_projector_that_follows_it(tmp_path: Path) -> None:
-    light, shown, per_slot = staged(noise_dn=1.0), sequence_for(PROJECTOR), 12
-    # Each slot begins with a frame in which the pattern before is still seen: a scan must not take it.
-    images: list[Pixels] = []
-    for index in range(len(shown)):
-        begun_ns = light.show(shown.profiles[index])
-        late_ns = begun_ns - 4_000_000
-        images.append(light.exposed(late_ns, late_ns + 8_000_000))
-        images += [light.exposed(begun_ns, begun_ns + 8_000_000) for _ in range(per_slot - 1)]
-    write_film(tmp_path / "film.avi", images)
-    camera = opened(tmp_path)
-    projector = FollowingProjector(light, camera, per_slot / RATE_HZ)
-    settings = {"eye": CameraSettings(EXPOSURE_S)}
-    rig = Rig("film", {"eye": camera}, projector, settings)
-    evidence = Evidence(shown.patterns, {"eye": camera.info.format})
-    with rig:
-        shots = list(capture(rig, shown, evidence=evidence))
-    assert [shot.pattern for shot in shots] == list(range(len(shown)))
-    assert evidence.summary().verified == len(shown)

@@ -10,8 +10,7 @@ from drivers.v4l2 import controls as ctl
 from drivers.v4l2.controls import Control
 from drivers.v4l2.options import V4L2Options
 from drivers.v4l2.scales import ExposureScale, GainScale
-from slrig.bundle.faults import checked
-from slrig.errors import ConfigError, UnsupportedByDeviceError
+from slrig.errors import UnsupportedByDeviceError
 
 NODE = Path("/dev/video7")
 GAIN = Control(ctl.GAIN, "gain", 16, 255, 1, 0)
@@ -108,12 +107,3 @@ def test_gain_with_unity_is_a_ratio() -> None:
 def test_a_device_without_gain_has_gain_1() -> None:
     scale = GainScale(None, 16)
     assert (scale.range, scale.units(1.0), scale.gain(77)) == ((1.0, 1.0), None, 1.0)
-
-
-def test_all_faults_of_a_table_come_in_one_message() -> None:
-    with pytest.raises(ConfigError) as caught:
-        checked(V4L2Options, {"pixel_format": "H264", "size_px": [640], "fokus": 3, "frame_rate_hz": -1}, "the table")
-    message = str(caught.value)
-    assert message.startswith("the table is wrong:\n")
-    for words in ("device: missing", "'H264'", "size_px", "did you mean 'focus'?", "frame_rate_hz"):
-        assert words in message
