@@ -19,9 +19,9 @@ from tests.contract import (
     genicam_bench,
     gentl_bench,
     opencv_bench,
+    opencv_umockdev,
     picamera2_bench,
     serial_bench,
-    v4l2_bench,
     v4l2_virtual,
 )
 from tests.contract.suite import Bench, rig_of, sequence_for
@@ -102,10 +102,9 @@ BENCHES: dict[str, Callable[[Path], Bench]] = {
     "replay": replayed,
     "replay in real time, 50 times as fast": partial(replayed, speed=50),
     "v4l2 (fake kernel)": v4l2_virtual.bench,
-    "v4l2 (umockdev)": v4l2_bench.bench,
     "opencv (stream)": opencv_bench.served_bench,
     "opencv (file)": partial(opencv_bench.served_bench, through="file"),
-    "opencv (umockdev)": opencv_bench.device_bench,
+    "opencv (umockdev)": opencv_umockdev.bench,
     "genicam (GigE Vision on loopback)": genicam_bench.bench,
     "gentl (a producer of our own)": gentl_bench.bench,
     "depthai (host-only)": depthai_bench.bench,

@@ -19,9 +19,18 @@ import pytest
 from drivers.opencv import open_camera as open_opencv_camera
 from slrig.devices import Camera, CameraSettings, Head, Rig
 from slrig.model import PatternSequence, Pixels, Size
-from tests.contract import depthai_bench, genicam_bench, gentl_bench, opencv_bench, v4l2_bench, v4l2_virtual
+from tests.contract import (
+    depthai_bench,
+    genicam_bench,
+    gentl_bench,
+    opencv_bench,
+    opencv_umockdev,
+    v4l2_bench,
+    v4l2_virtual,
+)
 from tests.contract.bench_head import BenchHead
 from tests.contract.genicam_bench import Fate
+from tests.contract.genicam_peer import INTERFACE
 from tests.contract.genicam_relay import Relay
 from tests.contract.gentl_camera import MemoryCamera
 from tests.contract.pairing import PairingResult, wrong_pairings
@@ -102,10 +111,10 @@ def picamera2(_: ExitStack, __: Path) -> Disturbed:
 def opencv_device(leaving: ExitStack, folder: Path, *, stamp: str) -> Disturbed:
     """By the kernel's stamps. Damaged buffers are not among the disturbances: OpenCV does not say which they are."""
     faked = Faked(stamp=stamp, jitter_s=0.001, readout_s=0.001, bands=4, lost=0.1)
-    device = leaving.enter_context(opencv_bench.plugged(folder, faked))
+    device = leaving.enter_context(opencv_umockdev.UmockdevDevice(folder, faked))
 
     def open_head() -> BenchHead:
-        camera = device.open_camera(**{**opencv_bench.GREY, "frame_rate_hz": 200})
+        camera = device.open_camera(frame_rate_hz=200)
         return BenchHead({"left": camera}, StagedProjector(device.stage))
 
     return Disturbed(open_head, device.stage, sequence_for(v4l2_bench.PROJECTOR), 0.002)
@@ -196,7 +205,7 @@ def _noisy() -> Stage:
 
 def genicam(leaving: ExitStack, _: Path, *, free: bool, latched: bool = True) -> Disturbed:
     peer = leaving.enter_context(genicam_bench.FakeGigE(_noisy(), kind="sfnc", fate=Fates()))
-    device = genicam_bench.INTERFACE
+    device = INTERFACE
     if latched:
         device = leaving.enter_context(Relay()).address
     more = {"features": {"AcquisitionFrameRate": 125.0}, "transfer_s": 0.05} if free else {"answer_s": 0.02}

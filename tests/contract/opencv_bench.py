@@ -10,10 +10,9 @@ from __future__ import annotations
 import os
 import random
 import select
-import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,16 +21,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import pytest
 
 from drivers import opencv
-from tests.contract import v4l2_host
 from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench, sequence_for
-from tests.contract.v4l2_bench import CAMERA, PROJECTOR, Faked, FakeDevice, staged, why_not
-
-GREY: dict[str, object] = {"fourcc": "GREY", "size_px": [CAMERA.width_px, CAMERA.height_px], "frame_rate_hz": 50}
+from tests.contract.v4l2_bench import PROJECTOR, staged
 
 
 @dataclass
@@ -176,21 +171,6 @@ class Piped:
         self.close()
 
 
-class DeviceHost(FakeDevice):
-    """The kernel's fake video device, and the OpenCV driver hosted beside it."""
-
-    def _start(self, command: list[str], environment: Mapping[str, str]) -> str:
-        own = [__spec__.name if part == v4l2_host.__name__ else part for part in command]
-        return super()._start(own, environment)
-
-
-def plugged(folder: Path, faked: Faked | None = None, code: str = "GREY") -> DeviceHost:
-    """A fake video device of this pixel format. Skips the test where umockdev is missing."""
-    if why_not():
-        pytest.skip(why_not())
-    return DeviceHost(folder, staged(code, noise_dn=1.0), faked or Faked())
-
-
 def served_bench(folder: Path, *, through: str = "stream") -> Bench:
     """A network camera, or one that another program writes into a file as it goes: a named pipe."""
     light = staged(noise_dn=1.0)
@@ -207,23 +187,3 @@ def served_bench(folder: Path, *, through: str = "stream") -> Bench:
         return BenchHead({"eye": camera}, StagedProjector(light))
 
     return Bench(open_head, sequence_for(PROJECTOR), source.close)
-
-
-def device_bench(folder: Path) -> Bench:
-    """A camera of the kernel's, by its stamps."""
-    device = plugged(folder)
-
-    def open_head() -> BenchHead:
-        return BenchHead({"left": device.open_camera(**GREY)}, StagedProjector(device.stage))
-
-    return Bench(open_head, sequence_for(PROJECTOR), device.close)
-
-
-if __name__ == "__main__":
-    threading.Thread(target=v4l2_host._end_with_input, daemon=True).start()
-    # The host opens cameras with the driver that it finds under this name.
-    v4l2_host.__dict__["v4l2"] = opencv
-    server = v4l2_host.Host(address=sys.argv[1], authkey=v4l2_host.AUTHKEY).get_server()
-    sys.stdout.write("ready\n")
-    sys.stdout.flush()
-    server.serve_forever()

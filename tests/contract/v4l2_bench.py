@@ -1,36 +1,20 @@
-"""The V4L2 driver over a fake video device (umockdev), as a bench.
-
-Three processes: Debian's Python serves the device's requests (`v4l2_server`), another hosts the unmodified driver in
-the test bed (`v4l2_host`), and this one holds the light, the projector and the test. Needs the Debian packages
-umockdev, gir1.2-umockdev-1.0 and python3-gi.
-"""
+"""Fake video devices, described for the fake kernel (`v4l2_kernel`), and the light before them."""
 
 from __future__ import annotations
 
-import atexit
-import json
-import os
 import shutil
 import subprocess
-import sys
-import tempfile
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any
 
-import pytest
-
-from slrig.devices import Camera, Clock, FoundDevice
+from slrig.devices import Clock
 from slrig.model import Size
-from tests.contract.bench_head import BenchHead
-from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench, sequence_for
-from tests.contract.v4l2_host import AUTHKEY, Host
+from tests.contract.stage import Stage
 from tests.contract.v4l2_kernel import STAMP_FLAGS
-from tests.contract.v4l2_sensor import BIT_DEPTHS, GAIN_UNITS, SensorService
+from tests.contract.v4l2_sensor import BIT_DEPTHS, GAIN_UNITS
 from tests.unit.capture.fake_rig import Scene
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -142,94 +126,6 @@ class Faked:
         }
 
 
-class FakeDevice:
-    """A fake camera that is plugged in, and the driver's host beside it. A context manager."""
-
-    def __init__(self, folder: Path, stage: Stage, faked: Faked) -> None:
-        self.stage = stage
-        self.faults = folder / "faults"
-        self.faults.mkdir(exist_ok=True)
-        # Socket paths may have 107 characters, and those of test folders have more.
-        self._short = tempfile.TemporaryDirectory(prefix="slrig-v4l2-")
-        short = Path(self._short.name)
-        self.sensor = SensorService(
-            short / "light",
-            stage,
-            readout_s=faked.readout_s,
-            bands=faked.bands,
-            noise_when_corrupt=faked.noise_when_corrupt,
-        )
-        config = folder / "device.json"
-        config.write_text(json.dumps(faked.config(short / "light", self.faults)))
-        self._processes: list[subprocess.Popen[str]] = []
-        try:
-            server = self._start([str(DEBIAN_PYTHON), "-m", "tests.contract.v4l2_server", str(config)], {})
-            address = str(short / "host")
-            self._start([sys.executable, "-m", "tests.contract.v4l2_host", address], {"UMOCKDEV_DIR": server})
-            host = cast("Any", Host(address=address, authkey=AUTHKEY))
-            host.connect()
-            self._driver = host.driver()
-        except BaseException:
-            self.close()
-            raise
-        atexit.register(self.close)
-
-    def open_camera(self, **options: object) -> Camera:
-        """Open a camera through the driver, in its host."""
-        camera: Camera = self._driver.open_camera("left", {"device": "/dev/video0", **options})
-        return camera
-
-    def found(self) -> tuple[FoundDevice, ...]:
-        """What the driver's finder finds."""
-        devices: tuple[FoundDevice, ...] = self._driver.find_devices()
-        return devices
-
-    def fault(self, name: str, on: bool = True) -> None:
-        """Begin or end a fault: unplugged, dead, busy, silent, no bandwidth."""
-        if on:
-            (self.faults / name).touch()
-        else:
-            (self.faults / name).unlink(missing_ok=True)
-
-    def controls_set(self) -> dict[str, int]:
-        """Every control that was set since the camera was plugged in, and to what last."""
-        lines = (self.faults / "controls.txt").read_text().splitlines()
-        return {name: int(value) for name, value in (line.split(" = ") for line in lines)}
-
-    def close(self) -> None:
-        """Unplug, and end both processes. Idempotent."""
-        atexit.unregister(self.close)
-        for process in self._processes:
-            with suppress(OSError):
-                process.communicate(timeout=10)
-        if self._processes:
-            self._processes.clear()
-            self.sensor.close()
-            self._short.cleanup()
-
-    def _start(self, command: list[str], environment: Mapping[str, str]) -> str:
-        process = subprocess.Popen(  # noqa: S603 - our own programs
-            ["umockdev-wrapper", *command],  # noqa: S607 - found by why_not
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=ROOT,
-            env={**os.environ, **environment},
-        )
-        self._processes.append(process)
-        assert process.stdout is not None
-        words = process.stdout.readline().split(maxsplit=1)
-        assert words, f"{command} ended early"
-        assert words[0] == "ready"
-        return words[1].strip() if len(words) > 1 else ""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
 def staged(code: str = "GREY", *, noise_dn: float = 0.0, clock: Clock | None = None) -> Stage:
     """The light before a fake camera of this pixel format."""
     scene = Scene(
@@ -243,16 +139,3 @@ def staged(code: str = "GREY", *, noise_dn: float = 0.0, clock: Clock | None = N
         noise_dn=noise_dn,
     )
     return Stage(scene, latency_s=0.002, clock=clock)
-
-
-def bench(folder: Path) -> Bench:
-    """The driver on a fake webcam that stamps the start of exposure. Skips the test where umockdev is missing."""
-    if why_not():
-        pytest.skip(why_not())
-    device = FakeDevice(folder, staged(noise_dn=1.0), Faked())
-
-    def open_head() -> BenchHead:
-        camera = device.open_camera(frame_rate_hz=50, gain_unity=GAIN_UNITS)
-        return BenchHead({"left": camera}, StagedProjector(device.stage))
-
-    return Bench(open_head, sequence_for(PROJECTOR), device.close)
