@@ -67,17 +67,9 @@ class FakeGigE:
     GigE Vision has one port: one camera runs at a time, on this machine. Another one of this process ends it, one of
     another process waits for its end.
 
-    Parameters
-    ----------
-    stage
-        What it sees.
-    kind
-        "stock": as Aravis makes it; "sfnc": in the names of SFNC 2, with a trigger line and more pixel formats;
-        "exposure start": the same, its trigger selector named as IDS' cameras name it.
-    fate
-        Asked once per frame.
-    packed
-        Makes the bytes of an image, by the name of the pixel format; as they are in memory where absent.
+    kind : "stock", as Aravis makes it; "sfnc", in the names of SFNC 2, with a trigger line and more pixel formats;
+    "exposure start", the same, its trigger selector named as IDS' cameras name it. fate : asked once per frame.
+    packed : makes the bytes of an image, by the name of the pixel format; as they are in memory where absent.
     """
 
     _running: FakeGigE | None = None

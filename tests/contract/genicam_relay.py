@@ -23,15 +23,7 @@ ACK = struct.Struct(">HHHH")
 
 
 class Relay:
-    """A GigE Vision camera at an address of its own.
-
-    Parameters
-    ----------
-    address, camera
-        Where it listens, and where the camera is.
-    clock_ns
-        The camera's clock, latched on request.
-    """
+    """A GigE Vision camera at an address of its own. clock_ns : its clock, latched on request."""
 
     def __init__(
         self, address: str = "127.0.0.2", camera: str = "127.0.0.1", *, clock_ns: Callable[[], int] = time.time_ns

@@ -108,21 +108,10 @@ def wrong_pairings(
 ) -> PairingResult:
     """Scan until `frames` frames were accepted in complete scans, and count those that should not have been.
 
-    Parameters
-    ----------
-    open_rig
-        Opens the instrument once; it stays open for all scans.
-    sequence
-        What is shown; white and black at both ends, as a scan has them.
-    expected
-        The truth to compare with.
-    longest_idle_s
-        Of a gap between two patterns, two frames or two scans.
-    timeout_s
-        As `capture` has it.
-    proven
-        Whether frames are held against one another, as a scan does. False leaves it to the driver alone, which has
-        nothing but time stamps and marks of damage: what it lets pass then is its own doing.
+    open_rig : opens the instrument once, for all scans. sequence : white and black at both ends, as a scan has them.
+    expected : the truth to compare with. longest_idle_s : of a gap between two patterns, two frames or two scans.
+    timeout_s : as `capture` has it. proven : whether frames are held against one another, as a scan does; else the
+    driver has nothing but time stamps and marks of damage, and what it lets pass is its own doing.
     """
     opened = open_rig()
     rig = opened if isinstance(opened, Rig) else rig_of(opened)

@@ -52,11 +52,7 @@ class Module:
 
 def initrd(kernel: Kernel, modules: Sequence[Module]) -> bytes:
     """The archive to boot with: loads the modules in order, mounts the host, runs SHARE/command, powers off.
-
-    Raises
-    ------
-    LookupError
-        The kernel has no such module.
+    Raises LookupError: the kernel has no such module.
     """
     parameters = {module.name.replace("-", "_"): module.parameters for module in modules}
     files = kernel.module_files([*_TRANSPORT, *(module.name for module in modules)])
@@ -75,11 +71,7 @@ def initrd(kernel: Kernel, modules: Sequence[Module]) -> bytes:
 
 def archive(entries: Mapping[str, tuple[int, bytes]]) -> bytes:
     """A cpio archive in the kernel's format "newc" (kernel documentation, "initramfs buffer format").
-
-    Parameters
-    ----------
-    entries
-        Mode (type and permissions) and content by path, folders before what lies in them.
+    entries : mode (type and permissions) and content by path, folders before what lies in them.
     """
     parts: list[bytes] = []
     for number, (name, (mode, content)) in enumerate([*entries.items(), ("TRAILER!!!", (0, b""))], start=1):

@@ -36,12 +36,7 @@ class Kernel:
     def module_files(self, names: Sequence[str]) -> tuple[Path, ...]:
         """The files of these modules and of all that they depend on, in the order in which they can be loaded.
 
-        Modules that are built into the kernel have no file and are left out.
-
-        Raises
-        ------
-        LookupError
-            The kernel has no such module.
+        Modules that are built into the kernel have no file. Raises LookupError: the kernel has no such module.
         """
         files = {_plain(path.name.split(".", 1)[0]): path for path in self.modules.rglob("*.ko*")}
         listed = (self.modules / "modules.builtin").read_text().split()
@@ -88,11 +83,7 @@ def _plain(module: str) -> str:
 
 def fetch_kernel() -> Kernel:
     """Debian's kernel and busybox, from the cache or by `apt-get download`.
-
-    Raises
-    ------
-    GuestUnavailableError
-        This is no amd64 Debian, or apt cannot fetch.
+    Raises GuestUnavailableError: this is no amd64 Debian, or apt cannot fetch.
     """
     if platform.system() != "Linux" or platform.machine() != "x86_64" or shutil.which("apt-get") is None:
         message = "the guest runs Debian's amd64 kernel on the interpreter of this machine, which is no amd64 Debian"

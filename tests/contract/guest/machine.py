@@ -63,30 +63,13 @@ def run_in_guest(
 ) -> Finished:
     """Boot, run one command in the checkout, power off.
 
-    Parameters
-    ----------
-    command
-        Program and arguments, as they would be run here. It runs as root, sees /dev and /sys of the guest, has a
-        loopback interface only, and may write anywhere: all but the files in `FILES` is forgotten.
-    folder
-        An empty folder for this run.
-    modules
-        Kernel modules to load before; what they depend on is found.
-    devices
-        QEMU's `-device` arguments ("virtio-gpu-pci").
-    environment
-        Added to PATH and to the few variables that the guest is given.
-    timeout_s
-        The whole run's. The machine is killed then, and with this process in any case.
-    monitor
-        Whether the guest's second serial port is QEMU's own monitor (QMP), by which it sees what its displays show.
+    command : runs as root, sees /dev and /sys of the guest, has a loopback interface only, and may write anywhere: all
+    but the files in `FILES` is forgotten. folder : an empty one. modules : loaded before, with what they depend on.
+    devices : QEMU's `-device` arguments. environment : added to the few variables that the guest is given. timeout_s :
+    the machine is killed then, and with this process in any case. monitor : whether the guest's second serial port is
+    QEMU's own monitor (QMP), by which it sees what its displays show.
 
-    Raises
-    ------
-    GuestUnavailableError
-        QEMU or Debian's kernel cannot be had here.
-    GuestError
-        The guest did not come up, or did not finish in time.
+    Raises GuestUnavailableError: QEMU or Debian's kernel cannot be had here; GuestError: it did not come up or finish.
     """
     qemu, kernel = _qemu(), fetch_kernel()
     archive, console, share = folder / "initrd", folder / "console", folder / "share"

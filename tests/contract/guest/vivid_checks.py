@@ -20,10 +20,9 @@ import numpy as np
 import pytest
 
 from drivers import v4l2
-from drivers.v4l2.controls import AUTOGAIN
 from slrig.conformance import run
 from slrig.conformance.bench import usual_settings
-from slrig.devices import Camera, CameraSettings, Trigger
+from slrig.devices import Camera, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError
 from tests.contract import vivid_bench
 from tests.contract.guest.outcome import Notes, outcome
@@ -164,47 +163,21 @@ def a_camera_that_another_program_streams_from_is_busy(driver: str, notes: Notes
         assert camera.read(time.monotonic_ns(), PATIENCE_S).image.size
 
 
-def an_unplugged_camera_is_gone(driver: str, notes: Notes) -> None:
-    """Pulled while a frame is waited for: told at once, closed without an error, not opened again."""
+def an_unplugged_camera_is_gone(driver: str, _: Notes) -> None:
+    """Pulled while a frame is waited for: closed without an error, not opened again."""
     node = vivid_bench.camera_node(UNPLUGGED[driver])
-    pulled: list[float] = []
-
-    def pull() -> None:
-        threading.Event().wait(0.2)
-        pulled.append(time.monotonic())
-        node.set(Control.DISCONNECT)
-
     with armed(open_camera(UNPLUGGED[driver], driver)) as camera:
-        thread = threading.Thread(target=pull)
+        thread = threading.Timer(0.2, node.set, (Control.DISCONNECT,))
         thread.start()
         with pytest.raises(DeviceGoneError):
             camera.read(time.monotonic_ns() + 60 * 10**9, 30.0)
-        told_s = time.monotonic() - pulled[0]
         thread.join()
         with pytest.raises(DeviceGoneError):
             camera.read(0, PATIENCE_S)
         camera.disarm()
     camera.close()
-    notes |= {"told after ms": round(told_s * 1e3, 1)}
-    assert told_s < 1.0
     with pytest.raises(DeviceGoneError):
         open_camera(UNPLUGGED[driver], driver)
-
-
-def its_automatic_gain_is_off(driver: str, notes: Notes) -> None:
-    """The gain of vivid, as long as it is automatic, counts seconds and takes no value."""
-    vivid_bench.camera_node(BUSY).set(AUTOGAIN)
-    with armed(open_camera(BUSY, driver)) as camera:
-        least, most = camera.info.gain_range
-        notes["gain"] = f"{least:g} to {most:g}"
-        assert most > least
-        camera.disarm()
-        asked = (least + most) / 2
-        applied = camera.configure(CameraSettings(camera.info.exposure_range_s[0], asked))
-        assert applied.gain == pytest.approx(asked, 0.02)
-        threading.Event().wait(1.1)
-        camera.arm(1, Trigger.FREE)
-        assert camera.read(time.monotonic_ns(), PATIENCE_S).image.size
 
 
 def an_unplugged_camera_is_not_found(_: Notes) -> None:
@@ -263,7 +236,6 @@ _OF_EACH = (
     a_camera_that_another_program_streams_from_is_busy,
     a_stream_that_dies_is_gone_and_can_be_reopened,
     an_unplugged_camera_is_gone,
-    its_automatic_gain_is_off,
 )
 ALL: dict[str, Callable[[Notes], None]] = {
     **{f"v4l2: {check.__name__}": check for check in _OF_V4L2},
