@@ -138,18 +138,18 @@ def test_a_scan_believes_no_wrong_frame(tmp_path: Path, truth: Expected, driver:
 
 
 def test_what_the_evidence_keeps_away_is_found_without_it(tmp_path: Path, truth: Expected) -> None:
-    result = counted(simulated(tmp_path, faults=DAMAGED, seed=3), truth, frames=120, proven=False)
-    assert 0.02 < result.wrong / result.frames < 0.15
+    result = counted(simulated(tmp_path, faults=DAMAGED, seed=3), truth, frames=FEW, proven=False)
+    assert 0.02 < result.wrong / result.frames < 0.2
     assert result.refused_scans < result.scans
 
 
 def test_a_driver_that_delivers_old_frames_is_found(sound: Bench, truth: Expected) -> None:
-    alone = counted(sound, truth, frames=50, driver=BrokenDriver, proven=False)
+    alone = counted(sound, truth, frames=1, driver=BrokenDriver, proven=False)
     assert alone.wrong > 5
     # A scan believes none of it.
-    scanned = counted(sound, truth, frames=50, driver=BrokenDriver, most_scans=2)
-    assert (scanned.frames, scanned.wrong, scanned.refused_scans) == (0, 0, 2)
-    honest = counted(sound, truth, frames=50, driver=FreeOnly, proven=False)
+    scanned = counted(sound, truth, frames=1, driver=BrokenDriver, most_scans=1)
+    assert (scanned.frames, scanned.wrong, scanned.refused_scans) == (0, 0, 1)
+    honest = counted(sound, truth, frames=1, driver=FreeOnly, proven=False)
     assert (honest.wrong, honest.shot_again, honest.refused_scans) == (0, 0, 0)
 
 
@@ -216,9 +216,8 @@ def test_a_fault_that_stays_ends_a_capture_in_the_dark(
 @pytest.mark.parametrize(
     ("faults", "again"),
     [
-        ({"drop_frames": [5], "corrupt_frames": [0, 1, 8, 16], "stale_frames": [19, 26]}, True),
-        ({"drop_frames": [5, 7], "stale_frames": [14], "cameras": ["left"]}, True),
-        ({"stale_frames": [4], "cameras": ["right"]}, True),
+        ({"drop_frames": [5, 7], "corrupt_frames": [0, 1, 10], "stale_frames": [16, 25], "cameras": ["left"]}, True),
+        ({"stale_frames": [4], "corrupt_frames": [16], "late_frames": [6], "cameras": ["right"]}, True),
         ({"late_frames": [5], "jitter_s": 0.02}, False),
     ],
     ids=str,

@@ -14,9 +14,11 @@ from drivers import depthai, genicam, picamera2
 from drivers.depthai.library import ENVIRONMENT, library
 from drivers.genicam.library import install_command
 from drivers.genicam.library import library as aravis
+from drivers.genicam.producers import core
 from slrig.errors import LibraryMissingError
 
 OAK = {"device": "14442C10D13EABCE00", "socket": "CAM_B"}
+LOADED = (aravis, core)
 ARAVIS: tuple[Callable[[], object], ...] = (
     genicam.find_devices,
     lambda: genicam.open_camera("left", {"device": "x"}, Path()),
@@ -55,14 +57,14 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
 ) -> None:
     if module.startswith("gi."):
         pytest.importorskip("gi", reason="PyGObject is not installed")
-    aravis.cache_clear()
+    for loaded in LOADED:
+        loaded.cache_clear()
     # None in this table makes an import fail, as a package that is not installed does.
     monkeypatch.setitem(sys.modules, module, None)
     for call in calls:
         with pytest.raises(LibraryMissingError, match=words) as missing:
             call()
         assert missing.value.install == install
-    aravis.cache_clear()
 
 
 def test_an_old_library_is_named_with_its_version(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -290,7 +290,6 @@ def test_a_trigger_gives_one_frame_whose_exposure_is_where_it_says(
         assert all(within(frame, device) for frame in frames)
         if isinstance(device.camera, FakeGigE):
             assert bool(relay.latches) == (options["time_stamp"] != "none")
-            assert all(frame.t_err_ns <= 0.051e9 for frame in frames)
         if trigger is not Trigger.FREE:
             words = {Trigger.SOFTWARE: "trigger after the pattern", Trigger.HARDWARE: "cable"}[trigger]
             with pytest.raises(FrameTimeoutError, match=rf"{trigger} trigger; passed over: none.*{words}"):
@@ -318,7 +317,7 @@ def test_a_clock_that_stands_is_not_believed(device: Device) -> None:
         frames = [camera.read(0, LONG_S) for _ in range(3)]
         camera.close()
     assert relay.latches
-    assert all(within(frame, device) and frame.t_err_ns <= 0.051e9 for frame in frames)
+    assert all(within(frame, device) for frame in frames)
 
 
 # ---- what goes wrong
