@@ -99,7 +99,7 @@ def test_what_drivers_print_is_not_part_of_the_answer(
     assert "from Python" in shown.err
 
 
-@pytest.mark.slow
+@pytest.mark.realtime
 def test_with_nothing_plugged_in_and_no_library_it_answers_at_once_and_says_what_to_do(tmp_path: Path) -> None:
     declared = {entry.name for entry in importlib.metadata.entry_points(group=GROUPS["finder"])}
     metadata = tmp_path / "site" / "finders_of_the_tests-1.0.dist-info"

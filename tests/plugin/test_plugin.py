@@ -74,18 +74,13 @@ def chart_rig(folder: Path, *, driver: str = "example_chart") -> Path:
     return folder / "rig.toml"
 
 
-def listed(path: str, folder: Path) -> dict[str, Any]:
-    done = slrig("devices", "--json", path=path, folder=folder)
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    document: dict[str, Any] = json.loads(done.stdout)
-    return document
-
-
 def test_devices_lists_what_is_installed_found_broken_and_missing(
     example_site: Path, broken_site: Path, tmp_path: Path
 ) -> None:
-    document = listed(path_with(example_site, broken_site), tmp_path)
+    path = path_with(example_site, broken_site)
+    runs = [slrig("devices", *arguments, path=path, folder=tmp_path) for arguments in (["--json"], [])]
+    assert all(done.returncode == 0 and "Traceback" not in done.stdout + done.stderr for done in runs)
+    document: dict[str, Any] = json.loads(runs[0].stdout)
     drivers = {(driver["kind"], driver["name"]): driver for driver in document["drivers"]}
     example = drivers["camera", "example_chart"]
     assert (example["package"], example["version"], example["fault"]) == ("example-slrig-camera", "1.0", None)
@@ -102,25 +97,19 @@ def test_devices_lists_what_is_installed_found_broken_and_missing(
     lacking = {library["driver"]: library["install"] for library in document["missing"]}
     assert lacking["lacking"] == "pip install 'slrig-lacking-library[vendor]'"
 
-
-def test_devices_tells_people_the_causes_and_the_commands_whole(
-    example_site: Path, broken_site: Path, tmp_path: Path
-) -> None:
-    done = slrig("devices", path=path_with(example_site, broken_site), folder=tmp_path)
-    assert done.returncode == 0
-    assert "Traceback" not in done.stdout + done.stderr
-    # Columns are as wide as what else is plugged in.
-    assert "chart-1 test chart, soft stripes" in " ".join(done.stdout.split())
-    for told in (
+    # For people: causes and commands whole, and columns as wide as what else is plugged in.
+    shown = runs[1].stdout
+    assert "chart-1 test chart, soft stripes" in " ".join(shown.split())
+    for words in (
         "  lacking: pip install 'slrig-lacking-library[vendor]'\n",
         "RuntimeError: built for firmware [2.x], found 3.1",
         "  to remove it: pip uninstall slrig-broken-import\n",
         "Not looked for: finder driver 'broken_finder' failed: OSError: [Errno 5] the bus does not answer",
     ):
-        assert told in done.stdout
+        assert words in shown
     # What a plug-in prints is not part of our answer.
-    assert "Vendor SDK" not in done.stdout
-    assert "Vendor SDK" in done.stderr
+    assert "Vendor SDK" not in shown
+    assert "Vendor SDK" in runs[1].stderr
 
 
 def test_its_options_are_told_if_it_describes_them(example_site: Path, tmp_path: Path) -> None:
