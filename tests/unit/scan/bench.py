@@ -8,29 +8,30 @@ from pathlib import Path
 from uuid import UUID
 
 from slrig.errors import InvalidInputError
+from slrig.jobs.compute import Compute
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.jobs.store import JobStore
-from slrig.jobs.worker import Worker
 from slrig.rig.session import RigSession
 from slrig.scan.plan import ScanPlan
 from slrig.scan.runner import Runner
+from tests.unit.jobs.tame_compute import TameCompute
 from tests.unit.scan.fakes import WAIT_S, TameBench
 
 PIPELINE = "tests.unit.scan.fake_pipeline"
 
 
 class Bench(TameBench):
-    """A runner over a tame bench."""
+    """A runner over a tame bench. worker : what computes, for one that needs no process."""
 
-    def __init__(self, tmp_path: Path) -> None:
+    def __init__(self, tmp_path: Path, *, worker: Compute | None = None) -> None:
         super().__init__()
         self.free_bytes = 10**9
         self.given_up: list[InvalidInputError] = []
         self.folder = DataFolder(tmp_path / "data", free=lambda _: self.free_bytes)
         self.store = JobStore(Database(self.folder.database), JobKind.SCAN)
-        self.worker = Worker(PIPELINE)
+        self.worker = TameCompute(PIPELINE) if worker is None else worker
         self.runner = Runner(
             self.store,
             self.folder,
@@ -53,33 +54,36 @@ class Bench(TameBench):
         assert self.began.wait(WAIT_S)
         return scan
 
-    def until(self, scan_id: UUID, state: JobState | None = None) -> JobRecord:
-        """The scan once it has reached `state`, or any final state."""
+    def until(self, job_id: UUID, state: JobState | None = None, *, jobs: JobStore | None = None) -> JobRecord:
+        """The job once it has reached `state`, or any final state. jobs : of its kind, for the scans."""
         states = {state} if state is not None else {state for state in JobState if state.final}
-        self._wait(scan_id, lambda: self.store.get(scan_id).state in states)
-        return self.store.get(scan_id)
+        store = self.store if jobs is None else jobs
+        wait_for(store, job_id, lambda: store.get(job_id).state in states)
+        return store.get(job_id)
 
     def until_event(self, scan_id: UUID, kind: str) -> None:
         """Wait until an event of this kind happened to a scan."""
-        self._wait(scan_id, lambda: any(event.kind == kind for event in self.store.events(scan_id, after=0)))
-
-    def _wait(self, scan_id: UUID, reached: Callable[[], bool]) -> None:
-        found = threading.Event()
-
-        def look() -> None:
-            if reached():
-                found.set()
-
-        unwatch = self.store.watch(scan_id, look)
-        look()
-        assert found.wait(WAIT_S)
-        unwatch()
+        wait_for(self.store, scan_id, lambda: any(each.kind == kind for each in self.store.events(scan_id, after=0)))
 
     def close(self) -> None:
         self.gate.set()
         self.runner.close()
         self.store.database.close()
         self.folder.release()
+
+
+def wait_for(jobs: JobStore, job_id: UUID, reached: Callable[[], bool]) -> None:
+    """Wait until `reached` says so of a job."""
+    found = threading.Event()
+
+    def look() -> None:
+        if reached():
+            found.set()
+
+    unwatch = jobs.watch(job_id, look)
+    look()
+    assert found.wait(WAIT_S)
+    unwatch()
 
 
 def failure_code(record: JobRecord) -> str | None:

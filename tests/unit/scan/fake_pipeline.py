@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import resource
 import signal
@@ -46,7 +47,7 @@ class LiveScan:
         """Count it."""
         match shot.image[0, 0]:
             case 1:
-                os.kill(os.getpid(), signal.SIGKILL)
+                _die()
             case 2:
                 message = "a frame that cannot be used"
                 raise ValueError(message)
@@ -57,6 +58,11 @@ class LiveScan:
     def end(self, _evidence: EvidenceSummary) -> None:
         """Remember that it was the end."""
         self.ended = True
+
+
+def _die() -> None:
+    assert multiprocessing.parent_process() is not None, "this needs a worker with a process of its own"
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def frame_receiver() -> FedFrames:
@@ -121,7 +127,7 @@ def reconstruct_into(
         message = "an index error, say"
         raise RuntimeError(message)
     if order == "die":
-        os.kill(os.getpid(), signal.SIGKILL)
+        _die()
     if order in {"hang", "hang-deaf"}:
         while order == "hang-deaf" or not cancelled():
             progress("mesh", 0.5, "")

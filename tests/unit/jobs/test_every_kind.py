@@ -1,0 +1,414 @@
+"""Every kind of job: however it is cancelled or fails, it has one end with its cause, the rig is dark and free
+afterwards, nothing half done stays on the disk, and the next job is none the worse.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar, cast
+from uuid import UUID
+
+import pytest
+
+from slrig.accept import running as acceptance
+from slrig.accept.desk import AcceptanceDesk
+from slrig.accept.evaluation import Reading
+from slrig.accept.plan import AcceptancePlan, Step
+from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.pose_shooting import PoseRequest
+from slrig.calibration.board import Board
+from slrig.calibration.observations import PoseObservation
+from slrig.combine.desk import ModelDesk
+from slrig.combine.plan import ModelPlan, StatedAxis, TurntablePoses
+from slrig.combine.stage import StageStore
+from slrig.errors import DeviceGoneError, OutOfMemoryError, ScanCancelledError, ScanInterruptedError
+from slrig.jobs.records import JobKind, JobRecord, JobState
+from slrig.jobs.store import JobStore
+from slrig.rig.session import ActiveCalibration
+from slrig.verify.job import VerificationDesk
+from slrig.verify.store import HealthStore
+from slrig.verify.verification import VerificationTools
+from tests.unit.accept.test_plan import plan_of
+from tests.unit.calibrate.calibration_bench import BOARD, TameCalibrating, tame_calibration
+from tests.unit.combine.model_bench import TameCombining, kept_scan
+from tests.unit.jobs.tame_compute import TameCompute
+from tests.unit.scan.bench import PIPELINE, Bench, failure_code
+from tests.unit.scan.fakes import WAIT_S
+from tests.unit.verify.health_bench import a_verification
+
+Cancelled = Callable[[], bool]
+
+
+class Computing:
+    """The mathematics of every kind of job: `began` is set by it; it goes on while `gate` is clear; `error` is raised
+    in place of its end.
+    """
+
+    def __init__(self) -> None:
+        self.began, self.gate = threading.Event(), threading.Event()
+        self.gate.set()
+        self.error: Exception | None = None
+
+    def __call__(self, cancelled: Cancelled = lambda: False) -> None:
+        self.began.set()
+        while not self.gate.wait(0.01):
+            if cancelled():
+                message = "It was cancelled."
+                raise ScanCancelledError(message)
+        if self.error is not None:
+            error, self.error = self.error, None
+            raise error
+
+
+class Service(Bench):
+    """Everything that begins jobs, over one tame rig that is calibrated."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.computing = computing = Computing()
+        super().__init__(root, worker=TameCompute(PIPELINE, before=computing))
+        self.tame = TameCalibrating(self)
+        tools = self.tame.tools()
+
+        def read(folder: Path, board: Board, name: str) -> Any:
+            computing()
+            return tools.read(folder, board, name)
+
+        def solve(*given: Any, **options: Any) -> Any:
+            computing()
+            return tools.solve(*given, **options)
+
+        def judge(poses: Sequence[Any], *_: object) -> Any:
+            assert isinstance(poses[0], PoseObservation)
+            return a_verification()
+
+        def combine(*given: Any, **options: Any) -> None:
+            computing(options["cancelled"])
+            TameCombining()(*given, **options)
+
+        def evaluate(
+            _work: Path,
+            _folder: Path,
+            _plan: AcceptancePlan,
+            step: Step,
+            take: int,
+            /,
+            *,
+            cancelled: Cancelled,
+            **_: Any,
+        ) -> Reading:
+            computing(cancelled)
+            return Reading(step.name, take, {}, 0.01, 0.01, 0.04, 900, 0, 0.0)
+
+        monkeypatch.setattr(acceptance, "capture_frames", tools.capture)
+        database, queue = self.store.database, self.runner.queue
+        self.of_calibrations = JobStore(database, JobKind.POSE, JobKind.SOLVE)
+        self.calibrations = Calibrations(
+            self.folder, self.runner, self.of_calibrations, rig_name="bench",
+            tools=replace(tools, read=read, solve=solve),
+        )  # fmt: skip
+        self.verifications = VerificationDesk(
+            self.folder, queue, HealthStore(database), JobStore(database, JobKind.VERIFICATION),
+            tools=VerificationTools(tools.capture, read, judge),
+        )  # fmt: skip
+        self.models = ModelDesk(
+            self.folder, queue, JobStore(database, JobKind.MODEL), scans=self.store, combine=combine,
+            stage=StageStore(root / "stage"), keep=100,
+        )  # fmt: skip
+        self.acceptance = AcceptanceDesk(
+            self.folder, queue, JobStore(database, JobKind.POSITION), evaluate=evaluate,
+            report=lambda *_: None,
+        )  # fmt: skip
+        self.runner.use_calibration(ActiveCalibration("spring", tame_calibration()))
+        self.runner.start()
+
+    def files(self) -> set[Path]:
+        """All that lies in the data folder, but for the records' own files."""
+        return {path for path in self.folder.root.rglob("*") if path.parent != self.folder.root or path.is_dir()}
+
+    def close(self) -> None:
+        self.computing.gate.set()
+        super().close()
+
+
+class Kind:
+    """How jobs of a kind are begun and cancelled. Each object stands for one.
+
+    captures : its first part holds the rig and takes frames. hears : its second part can be cancelled; else it is so
+    short that it comes to its end. holds : it has the rig while it computes, too. keeps : the frames stay where the
+    second part failed.
+    """
+
+    captures, hears, holds, keeps = True, False, False, False
+    name: ClassVar[str]
+    jobs: JobStore
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Do what comes before its first job."""
+
+    def begin(self, *, wait: bool = False) -> UUID:
+        """Begin a job; return its id."""
+        raise NotImplementedError
+
+    def cancel(self, job_id: UUID) -> None:
+        """Ask it to end early."""
+        raise NotImplementedError
+
+    def capturing(self) -> UUID:
+        """A job that captures until the bench's gate is set."""
+        self.service.gate.clear()
+        job_id = self.begin()
+        assert self.service.began.wait(WAIT_S)
+        return job_id
+
+    def computing(self) -> UUID:
+        """A job that computes until the gate of the mathematics is set."""
+        self.service.computing.gate.clear()
+        job_id = self.begin()
+        assert self.service.computing.began.wait(WAIT_S)
+        return job_id
+
+    def over(self, job_id: UUID) -> JobRecord:
+        """The job when it has ended."""
+        return self.service.until(job_id, jobs=self.jobs)
+
+
+class Scan(Kind):
+    """A scan."""
+
+    name = "scan"
+    hears = keeps = True
+
+    def prepare(self) -> None:
+        self.jobs = self.service.store
+
+    def begin(self, *, wait: bool = False) -> UUID:
+        return self.service.scan(wait=wait).id
+
+    def cancel(self, job_id: UUID) -> None:
+        self.service.runner.cancel(job_id)
+
+
+class Pose(Kind):
+    """A pose of a calibration."""
+
+    name = "pose"
+
+    def prepare(self) -> None:
+        self.jobs = self.service.of_calibrations
+        self.session = self.service.calibrations.open(BOARD).id
+
+    def begin(self, *, wait: bool = False) -> UUID:
+        return self.service.calibrations.poses.shoot(self.session, PoseRequest(), wait=wait).id
+
+    def cancel(self, job_id: UUID) -> None:
+        poses = self.service.calibrations.register.get(self.session).poses
+        number = next(pose.number for pose in poses if pose.id == job_id)
+        self.service.calibrations.poses.cancel(self.session, number)
+
+
+class Solve(Pose):
+    """A solve of a calibration that has one pose."""
+
+    name = "solve"
+    captures = False
+
+    def prepare(self) -> None:
+        super().prepare()
+        assert self.over(super().begin()).state is JobState.SUCCEEDED
+        self.service.began.clear()
+        self.service.computing.began.clear()
+
+    def begin(self, *, wait: bool = False) -> UUID:
+        del wait
+        self.service.calibrations.solves.solve(self.session)
+        return self.jobs.of(self.session)[self.session][-1].id
+
+    def cancel(self, job_id: UUID) -> None:
+        self.service.calibrations.solves.work.cancel(job_id)
+
+
+class Verification(Kind):
+    """A verification."""
+
+    name = "verification"
+
+    def prepare(self) -> None:
+        self.jobs = self.service.verifications.jobs
+
+    def begin(self, *, wait: bool = False) -> UUID:
+        return self.service.verifications.shoot(BOARD, wait=wait).id
+
+    def cancel(self, job_id: UUID) -> None:
+        self.service.verifications.cancel(job_id)
+
+
+class Model(Kind):
+    """A model of two scans."""
+
+    name = "model"
+    captures, hears = False, True
+
+    def prepare(self) -> None:
+        self.jobs = self.service.models.jobs
+        self.scans = tuple(kept_scan(self.service.store, self.service.folder, angle_deg=each) for each in (0.0, 40.0))
+
+    def begin(self, *, wait: bool = False) -> UUID:
+        del wait
+        plan = ModelPlan(self.scans, TurntablePoses(StatedAxis((4.0, 45.0, 12.0), (0.0, -1.0, 0.0))))
+        return self.service.models.combine(plan).id
+
+    def cancel(self, job_id: UUID) -> None:
+        self.service.models.cancel(job_id)
+
+
+class Position(Kind):
+    """One of an acceptance test, which is cancelled with it."""
+
+    name = "position"
+    hears = holds = True
+
+    def prepare(self) -> None:
+        self.jobs = self.service.acceptance.jobs
+        # A test is opened on a rig that is open.
+        self.service.until(self.service.scan().id)
+        self.service.began.clear()
+        self.service.computing.began.clear()
+        self.test = self.service.acceptance.open(lambda *_: plan_of()).id
+
+    def begin(self, *, wait: bool = False) -> UUID:
+        if not self.service.acceptance.get(self.test).state.waiting:
+            # It was over with its position that was cancelled.
+            self.test = self.service.acceptance.open(lambda *_: plan_of()).id
+        return self.service.acceptance.measure(self.test, wait=wait, scripted=False).id
+
+    def cancel(self, job_id: UUID) -> None:
+        assert job_id in {job.id for job in self.jobs.of(self.test)[self.test]}
+        self.service.acceptance.cancel(self.test)
+
+
+KINDS = (Scan, Pose, Solve, Verification, Model, Position)
+
+
+@pytest.fixture
+def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
+    service = Service(tmp_path, monkeypatch)
+    yield service
+    service.close()
+
+
+@pytest.fixture
+def kind(request: pytest.FixtureRequest, service: Service) -> Kind:
+    """One of KINDS, by `every` or `capturing` below."""
+    return cast("type[Kind]", request.param)(service)
+
+
+def parametrised(kinds: Sequence[type[Kind]]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("kind", kinds, indirect=True, ids=[kind.name for kind in kinds])
+
+
+every = parametrised(KINDS)
+capturing = parametrised([kind for kind in KINDS if kind.captures])
+
+
+def assert_well(service: Service, kind: Kind, *, opened: int = 1) -> None:
+    """The rig is dark, free and open, and the next job of this kind succeeds."""
+    assert service.runner.status().holder is None
+    assert all(projector.dark for _, projector in service.opened)
+    for each in (service.computing, service):
+        each.gate.set()
+    assert kind.over(kind.begin()).state is JobState.SUCCEEDED
+    assert len(service.opened) <= opened
+    assert list(service.folder.incoming.iterdir()) == []
+
+
+@capturing
+def test_a_job_that_is_cancelled_while_it_waits_never_begins(service: Service, kind: Kind) -> None:
+    holder = service.held()
+    before = service.files()
+    waiting = kind.begin(wait=True)
+    service.began.clear()
+    kind.cancel(waiting)
+    record = kind.over(waiting)
+    assert (record.state, failure_code(record)) == (JobState.CANCELLED, "scan-cancelled")
+    assert record.started_at is None
+    assert service.files() == before
+    service.gate.set()
+    assert service.until(holder.id).state is JobState.SUCCEEDED
+    assert not service.began.is_set()
+    assert_well(service, kind)
+
+
+@capturing
+def test_a_job_that_is_cancelled_while_it_captures_leaves_nothing(service: Service, kind: Kind) -> None:
+    before = service.files()
+    job_id = kind.capturing()
+    assert service.runner.status().holder is not None
+    assert not service.opened[0][1].dark
+    kind.cancel(job_id)
+    record = kind.over(job_id)
+    assert (record.state, failure_code(record)) == (JobState.CANCELLED, "scan-cancelled")
+    assert service.files() == before
+    assert not service.computing.began.is_set()
+    assert_well(service, kind)
+
+
+@every
+def test_a_job_that_is_cancelled_while_it_computes_ends_or_comes_to_its_end(service: Service, kind: Kind) -> None:
+    before = service.files()
+    job_id = kind.computing()
+    assert (service.runner.status().holder is not None) is kind.holds
+    kind.cancel(job_id)
+    if not kind.hears:
+        service.computing.gate.set()
+    record = kind.over(job_id)
+    assert record.state is (JobState.CANCELLED if kind.hears else JobState.SUCCEEDED)
+    assert list(service.folder.incoming.iterdir()) == []
+    if kind.hears:
+        assert service.files() == before
+    kind.cancel(job_id)
+    assert kind.over(job_id) == record
+    assert_well(service, kind)
+
+
+@capturing
+def test_a_device_that_is_lost_fails_the_job_and_is_opened_again(service: Service, kind: Kind) -> None:
+    service.error = DeviceGoneError("Camera 'cam0' was unplugged.")
+    record = kind.over(kind.begin())
+    assert (record.state, failure_code(record)) == (JobState.FAILED, "device-gone")
+    assert service.opened[0][1].dark
+    assert service.opened[0][0].closed
+    assert service.opened_again.wait(WAIT_S)
+    assert list(service.folder.incoming.iterdir()) == []
+    assert_well(service, kind, opened=2)
+
+
+@every
+def test_mathematics_that_fails_fails_the_job_alone(service: Service, kind: Kind) -> None:
+    service.computing.error = OutOfMemoryError("No room.")
+    record = kind.over(kind.begin())
+    assert (record.state, failure_code(record)) == (JobState.FAILED, "out-of-memory")
+    assert list(service.folder.incoming.iterdir()) == []
+    if kind.keeps:
+        assert [path.name for path in service.folder.scan(record.id).iterdir()] == ["bundle"]
+    assert_well(service, kind)
+
+
+@capturing
+def test_the_end_of_the_service_interrupts_what_captures_and_leaves_what_waits(service: Service, kind: Kind) -> None:
+    job_id = kind.capturing()
+    waiting = service.scan(wait=True)
+    service.runner.close()
+    record = kind.over(job_id)
+    assert (record.state, failure_code(record)) == (JobState.INTERRUPTED, "scan-interrupted")
+    assert service.store.get(waiting.id).state is JobState.QUEUED
+    camera, projector = service.opened[0]
+    assert (projector.dark, projector.closed, camera.closed) == (True, True, True)
+    with pytest.raises(ScanInterruptedError):
+        service.scan()
