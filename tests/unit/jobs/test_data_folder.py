@@ -138,11 +138,17 @@ def test_other_errors_pass_through(tmp_path: Path) -> None:
         (tmp_path / "absent").read_bytes()
 
 
+@pytest.mark.parametrize("state", [JobState.CAPTURING, JobState.COMPUTING])
 def test_sweep_records_a_cut_off_capture_as_interrupted_and_clears_its_files(
-    store: JobStore, folder: DataFolder
+    store: JobStore, folder: DataFolder, state: JobState
 ) -> None:
-    scan_id = running(store, JobState.CAPTURING)
-    staged_bundle(folder, scan_id)
+    scan_id = running(store, state)
+    if state is JobState.CAPTURING:
+        staged_bundle(folder, scan_id)
+    else:
+        # Killed between the light and the end of the recording: its frames are not all on the disk.
+        folder.stage(scan_id)
+        folder.recording(scan_id).mkdir()
     swept = sweep(store, folder)
     assert swept.interrupted == (scan_id,)
     record = store.get(scan_id)

@@ -24,7 +24,7 @@ from slrig.calibration.observations import PoseObservation
 from slrig.combine.desk import ModelDesk
 from slrig.combine.plan import ModelPlan, StatedAxis, TurntablePoses
 from slrig.combine.stage import StageStore
-from slrig.errors import DeviceGoneError, OutOfMemoryError, ScanCancelledError, ScanInterruptedError
+from slrig.errors import DeviceGoneError, OutOfMemoryError, RigBusyError, ScanCancelledError, ScanInterruptedError
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.jobs.store import JobStore
 from slrig.rig.session import ActiveCalibration
@@ -319,7 +319,8 @@ capturing = parametrised([kind for kind in KINDS if kind.captures])
 
 def assert_well(service: Service, kind: Kind, *, opened: int = 1) -> None:
     """The rig is dark, free and open, and the next job of this kind succeeds."""
-    assert service.runner.status().holder is None
+    status = service.runner.status()
+    assert (status.holder, status.fault) == (None, None)
     assert all(projector.dark for _, projector in service.opened)
     for each in (service.computing, service):
         each.gate.set()
@@ -338,6 +339,8 @@ def test_a_job_that_is_cancelled_while_it_waits_never_begins(service: Service, k
     record = kind.over(waiting)
     assert (record.state, failure_code(record)) == (JobState.CANCELLED, "scan-cancelled")
     assert record.started_at is None
+    assert record.fault is not None
+    assert record.fault.message.endswith("was cancelled while it waited for the rig.")
     assert service.files() == before
     service.gate.set()
     assert service.until(holder.id).state is JobState.SUCCEEDED
@@ -349,7 +352,14 @@ def test_a_job_that_is_cancelled_while_it_waits_never_begins(service: Service, k
 def test_a_job_that_is_cancelled_while_it_captures_leaves_nothing(service: Service, kind: Kind) -> None:
     before = service.files()
     job_id = kind.capturing()
-    assert service.runner.status().holder is not None
+    with pytest.raises(RigBusyError) as busy:
+        service.scan()
+    started = kind.jobs.get(job_id).started_at
+    assert started is not None
+    assert (busy.value.holder, busy.value.since) == (
+        service.runner.status().holder, started.isoformat(timespec="seconds"),
+    )  # fmt: skip
+    assert "cancel it with POST /" in str(busy.value)
     assert not service.opened[0][1].dark
     kind.cancel(job_id)
     record = kind.over(job_id)

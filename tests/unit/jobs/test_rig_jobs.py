@@ -178,6 +178,7 @@ def test_whatever_happens_the_job_has_one_end_with_its_cause(
 ) -> None:
     record = bench.done(work)
     assert (record.state, code(record)) == (state, fault)
+    assert "secret" not in str(record.fault)
     assert work.done[-1].startswith(done)
     assert len([each for each in work.done if each.startswith("failed")]) == (fault != "pose-refused")
     assert bench.projector.dark
