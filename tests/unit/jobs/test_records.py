@@ -1,21 +1,28 @@
-"""The record of scans."""
+"""What is on record of jobs: their states and events, progress, the keys of requests, what took how long."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 from uuid import uuid4
 
 import pytest
 
-from slrig.errors import JobNotFoundError
+from slrig.errors import IdempotencyError, JobNotFoundError, KeyInFlightError
 from slrig.failure import JobFailure
+from slrig.jobs import versions as module
 from slrig.jobs.database import Database
-from slrig.jobs.records import JobKind, JobProgress, JobState
+from slrig.jobs.keys import RequestKeys
+from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
 from slrig.jobs.store import JobStore
+from slrig.jobs.timeline import Stage, stages_of
 from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.scan.records import plan_from_json, plan_json
 from tests.unit.scan.fakes import SetClock
+
+NOON = SetClock().now
 
 
 @pytest.fixture
@@ -28,6 +35,11 @@ def store(tmp_path: Path, clock: SetClock) -> Iterator[JobStore]:
     store = JobStore(Database(tmp_path / "slrig.sqlite"), JobKind.SCAN, clock=clock)
     yield store
     store.database.close()
+
+
+@pytest.fixture
+def keys(store: JobStore, clock: SetClock) -> RequestKeys:
+    return RequestKeys(store.database, clock=clock)
 
 
 def test_scan_comes_back_as_it_was_recorded(store: JobStore, clock: SetClock) -> None:
@@ -125,3 +137,117 @@ def test_jobs_of_one_parent_are_listed_and_followed_together(tmp_path: Path, clo
     assert jobs.get(alone.id).parent == other
     unwatch()
     jobs.database.close()
+
+
+def test_progress_is_recorded_by_stage_by_hundredths_and_while_a_stage_goes_on(store: JobStore) -> None:
+    scan = store.create({}, rig="bench", label=None)
+    now_s = [0.0]
+    record = ProgressRecorder(store, scan.id, hidden="secret/", now_s=lambda: now_s[0])
+    for at_s, stage, fraction, detail in (
+        (0.0, "preparing kernels", 0.0, "0 of 56"),
+        (0.5, "preparing kernels", 0.0, "1 of 56"),  # too soon to be told
+        (2.5, "preparing kernels", 0.0, "9 of 56"),
+        (9.0, "preparing kernels", 0.0, "9 of 56"),  # nothing new
+        (9.1, "decode", 0.001, "secret/a"),
+        (9.15, "decode", 0.2, "too soon after the last"),
+        (9.3, "decode", 0.5, ""),
+        (9.31, "decode", 1.0, "the end"),
+    ):
+        now_s[0] = at_s
+        record(stage, fraction, detail)
+    events = [event.data for event in store.events(scan.id, after=0) if event.kind == "progress"]
+    assert [(each["stage"], each["detail"]) for each in events] == [
+        ("preparing kernels", "0 of 56"),
+        ("preparing kernels", "9 of 56"),
+        ("decode", "a"),
+        ("decode", ""),
+        ("decode", "the end"),
+    ]
+
+
+def spans(stages: Iterator[Stage]) -> list[tuple[str, float, float, str | None]]:
+    return [(stage.name, (stage.begin - NOON).total_seconds(), stage.seconds, stage.inside) for stage in stages]
+
+
+def test_job_that_ends_is_told_with_its_stages(store: JobStore, clock: SetClock) -> None:
+    told: list[JobRecord] = []
+    store.after_end = told.append
+    job = store.create({}, rig="bench", label=None).id
+    clock.move(seconds=2)
+    store.advance(job, JobState.CAPTURING)
+    clock.move(seconds=5)
+    store.progress(job, JobProgress("capture", 0.5, ""))
+    store.advance(job, JobState.COMPUTING)
+    clock.move(seconds=10)
+    assert told == []
+    assert store.finish(job, JobState.SUCCEEDED, summary={"stages_s": {"decode": 3.0, "mesh": 6.5}})
+    assert not store.finish(job, JobState.FAILED)
+    (record,) = told
+    assert record == store.get(job)
+    assert spans(stages_of(record, store.events(job, after=0))) == [
+        ("queued", 0, 2, None),
+        ("capturing", 2, 5, None),
+        ("computing", 7, 10, None),
+        ("decode", 7, 3, "computing"),
+        ("mesh", 10, 6.5, "computing"),
+    ]
+
+
+def test_job_that_never_began_only_waited(store: JobStore, clock: SetClock) -> None:
+    job = store.create({}, rig="bench", label=None).id
+    clock.move(seconds=4)
+    store.finish(job, JobState.CANCELLED)
+    assert spans(stages_of(store.get(job), store.events(job, after=0))) == [("queued", 0, 4, None)]
+
+
+def test_idempotency_key_leads_back_to_its_scan(store: JobStore, keys: RequestKeys) -> None:
+    assert keys.reserve("k", "body") is None
+    with pytest.raises(KeyInFlightError):
+        keys.reserve("k", "body")
+    scan = store.create({}, rig="bench", label=None, key="k")
+    assert keys.reserve("k", "body") == scan.id
+    with pytest.raises(IdempotencyError, match="another request body"):
+        keys.reserve("k", "other body")
+
+
+def test_key_of_a_refused_request_is_free_again(keys: RequestKeys) -> None:
+    keys.reserve("k", "body")
+    keys.release("k")
+    assert keys.reserve("k", "other body") is None
+
+
+def test_key_of_a_scan_is_not_released(store: JobStore, keys: RequestKeys) -> None:
+    keys.reserve("k", "body")
+    scan = store.create({}, rig="bench", label=None, key="k")
+    keys.release("k")
+    keys.release_all()
+    assert keys.reserve("k", "body") == scan.id
+
+
+def test_key_is_forgotten_after_a_day(store: JobStore, keys: RequestKeys, clock: SetClock) -> None:
+    keys.reserve("k", "body")
+    store.create({}, rig="bench", label=None, key="k")
+    clock.move(hours=23, minutes=59)
+    with pytest.raises(IdempotencyError):
+        keys.reserve("k", "other body")
+    clock.move(minutes=2)
+    assert keys.reserve("k", "other body") is None
+
+
+def test_key_leads_back_to_what_is_no_job(keys: RequestKeys) -> None:
+    keys.reserve("k", "body")
+    keys.tie("k", made := uuid4())
+    keys.release("k")
+    assert keys.reserve("k", "body") == made
+
+
+def test_two_states_of_one_version_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for code in ("", "", "one = 1"):
+        (tmp_path / "kernel.py").write_text(code)
+        monkeypatch.setattr(module, "_PACKAGE", tmp_path)
+        module.versions.cache_clear()
+        found.append(dict(module.versions()))
+    module.versions.cache_clear()
+    assert found[0] == found[1] != found[2]
+    assert found[0]["numba"] == version("numba")
