@@ -14,29 +14,20 @@ from numpy.typing import NDArray
 
 from slrig.bundle import BundleWriter, read_bundle, read_calibration, write_calibration
 from slrig.bundle.description import read_description
-from slrig.config import read_rig
-from slrig.discovery import open_rig
 from slrig.errors import BundleError
 from slrig.model import Calibration, Solved
-from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import write_converted
-from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from slrig.scan.report import calibration_report
+from tests.prepared_bundles import prepared_bundle
 
-RIG = Path(__file__).parents[3] / "config" / "rigs" / "sphere.toml"
 BOX = np.array([[-40.0, -40, -40], [40, 40, 40]])
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recorded") / "bundle"
-    with open_rig(read_rig(RIG)) as rig:
-        capture_frames(rig, ScanPlan(), folder, progress=lambda *_: None, cancelled=lambda: False).finish()
-    # To compare with the truth takes longer than all the rest.
-    for path in (*folder.glob("truth*"), folder / "visible_points.npy"):
-        path.unlink()
-    return folder
+    return prepared_bundle(tmp_path_factory, "ball")
 
 
 def stating(calibration: Calibration, scale: float = 1.0, solved_at: str = "2026-01-02T03:04:05+00:00") -> Calibration:

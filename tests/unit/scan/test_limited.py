@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-import shutil
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,40 +16,29 @@ from numpy.typing import NDArray
 
 from slrig.bundle import read_bundle, write_bundle
 from slrig.capture.evidence import check_capture
-from slrig.config import read_rig
-from slrig.discovery import open_rig
 from slrig.errors import ConfigError, NothingToReconstructError
 from slrig.model import Mesh, Pinhole, Refusal, Region
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import decode_mesh_ply
-from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from slrig.scan.stream import LiveScan
+from tests.prepared_bundles import prepared_bundle
 
-RIGS = Path(__file__).parents[3] / "config" / "rigs"
 BOX = ((-45.0, -45.0, -400.0), (20.0, 35.0, 400.0))
-SCAN = ScanPlan()
 
 
 class Scanned:
-    """A recorded scan, and meshes of it."""
+    """A recorded scan, and meshes of it in `folder`."""
 
-    def __init__(self, folder: Path, rig_file: str = "sphere.toml", plan: ScanPlan = SCAN) -> None:
-        self.folder = folder
-        self.bundle = folder / "bundle"
-        with open_rig(read_rig(RIGS / rig_file)) as rig:
-            capture_frames(rig, plan, self.bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
-        self.truthful = folder / "truthful"
-        shutil.copytree(self.bundle, self.truthful)
-        for truth in (*self.bundle.glob("truth*"), self.bundle / "visible_points.npy"):
-            truth.unlink(missing_ok=True)
+    def __init__(self, bundle: Path, folder: Path) -> None:
+        self.bundle, self.folder = bundle, folder
         self.made: dict[str, tuple[Mesh, Mapping[str, Any], Path]] = {}
 
     def __call__(self, region: Region | None = None, *, live: LiveScan | None = None) -> tuple[Mesh, Any, Path]:
         key = f"{region}{live is None}"
         if key not in self.made:
-            output = self.folder / f"out{len(self.made)}"
+            output = self.folder / f"out{len(list(self.folder.iterdir()))}"
             reconstruct_bundle(
                 self.bundle, output, plan=ReconstructionPlan(region=region), progress=lambda *_: None,
                 cancelled=lambda: False, live=live,
@@ -78,7 +65,7 @@ class Scanned:
 
 @pytest.fixture(scope="module")
 def scanned(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
-    return Scanned(tmp_path_factory.mktemp("limited"))
+    return Scanned(prepared_bundle(tmp_path_factory, "ball"), tmp_path_factory.mktemp("limited"))
 
 
 def same_points(part: Mesh, whole: Mesh, kept: Any) -> None:
@@ -112,9 +99,10 @@ def test_a_box_gives_the_points_of_the_whole_scan_in_it_and_no_others(scanned: S
 
 
 @pytest.mark.slow
-def test_what_nobody_asked_for_is_neither_missing_nor_wrong(scanned: Scanned) -> None:
-    told = copy(scanned)
-    told.bundle, told.made = scanned.truthful, {}
+def test_what_is_outside_of_the_region_is_neither_missing_nor_wrong(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    told = Scanned(prepared_bundle(tmp_path_factory, "ball with its truth"), tmp_path)
     whole, part = (told(region)[1]["truth"] for region in (None, Region(box_mm=BOX)))
     assert part["complete_0.3mm"] == pytest.approx(whole["complete_0.3mm"], abs=0.03)
     assert part["rms_mm"] < 1.2 * whole["rms_mm"]
@@ -172,6 +160,7 @@ def test_weak_contrast_and_large_deviations_are_left_out(scanned: Scanned) -> No
     assert len(bright.vertices_mm) == pytest.approx(np.count_nonzero(~dark), rel=0.02)
 
 
+@pytest.mark.slow
 def test_two_halves_make_the_whole(scanned: Scanned) -> None:
     """Where a region ends nothing is lost and nothing found twice."""
     whole, _, _ = scanned()
@@ -184,25 +173,23 @@ def test_two_halves_make_the_whole(scanned: Scanned) -> None:
     assert parts[0].vertices_mm[:, 0].max() <= 0 <= parts[1].vertices_mm[:, 0].min()
 
 
-def test_frames_that_came_live_give_the_same_bytes(scanned: Scanned) -> None:
+@pytest.mark.parametrize(
+    "announced",
+    [Region(box_mm=BOX), pytest.param(Region(box_mm=BOX, depth_mm=(1.0, 2.0)), marks=pytest.mark.slow)],
+    ids=["this region", "another region, so that the bundle is read"],
+)
+def test_frames_that_came_live_give_the_same_bytes(scanned: Scanned, announced: Region) -> None:
     region = Region(box_mm=BOX)
     _, _, recorded = scanned(region)
     bundle = read_bundle(scanned.bundle)
     assert bundle.calibration is not None
-    live = LiveScan(CaptureHeader.of(bundle.capture), bundle.calibration, region)
+    live = LiveScan(CaptureHeader.of(bundle.capture), bundle.calibration, announced)
     for shot in bundle.capture.shots:
         live.take(shot)
     live.end(check_capture(bundle.capture, ()))
+    scanned.made.pop(f"{region}{False}", None)
     _, _, streamed = scanned(region, live=live)
     assert (streamed / "mesh.ply").read_bytes() == (recorded / "mesh.ply").read_bytes()
-    # Another region than the one that was announced: the bundle is read.
-    other = LiveScan(CaptureHeader.of(bundle.capture), bundle.calibration, replace(region, depth_mm=(1.0, 2.0)))
-    for shot in bundle.capture.shots:
-        other.take(shot)
-    other.end(check_capture(bundle.capture, ()))
-    scanned.made.pop(f"{region}{False}")
-    _, _, again = scanned(region, live=other)
-    assert (again / "mesh.ply").read_bytes() == (recorded / "mesh.ply").read_bytes()
 
 
 def test_a_camera_that_is_not_there_is_no_region(scanned: Scanned) -> None:
@@ -230,8 +217,7 @@ def test_two_cameras_are_limited_each_in_its_own_image(pair: Scanned, tmp_path: 
     assert bundle.calibration is not None
     calibration = bundle.calibration if projector else replace(bundle.calibration, projector=None)
     write_bundle(tmp_path / "bundle", bundle.capture, calibration)
-    pair = copy(pair)
-    pair.bundle, pair.folder, pair.made = tmp_path / "bundle", tmp_path, {}
+    pair = Scanned(tmp_path / "bundle", tmp_path)
     whole, _, _ = pair()
     part, report, _ = pair(Region(box_mm=BOX))
     inside = ((whole.vertices_mm >= BOX[0]) & (whole.vertices_mm <= BOX[1])).all(axis=1)
@@ -243,12 +229,12 @@ def test_two_cameras_are_limited_each_in_its_own_image(pair: Scanned, tmp_path: 
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
-    return Scanned(tmp_path_factory.mktemp("pair"), "two_cameras.toml")
+    return Scanned(prepared_bundle(tmp_path_factory, "ball by two cameras"), tmp_path_factory.mktemp("pair"))
 
 
 @pytest.mark.slow
-def test_a_bracket_is_limited_as_one_exposure_is(tmp_path: Path) -> None:
-    scanned = Scanned(tmp_path, plan=ScanPlan(exposures_s=(0.005, 0.015)))
+def test_a_bracket_is_limited_as_one_exposure_is(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    scanned = Scanned(prepared_bundle(tmp_path_factory, "ball by a bracket"), tmp_path)
     whole, _, _ = scanned()
     part, _, _ = scanned(Region(box_mm=BOX))
     inside = ((whole.vertices_mm >= BOX[0]) & (whole.vertices_mm <= BOX[1])).all(axis=1)
