@@ -144,6 +144,19 @@ class World:
 
 
 @dataclass
+class WorldClock:
+    """Implements `slrig.devices.Clock`: the time of a world."""
+
+    world: World
+
+    def now_ns(self) -> int:
+        return self.world.now_ns
+
+    def wait_until(self, t_ns: int, _stop: object) -> None:
+        self.world.now_ns = max(self.world.now_ns, t_ns)
+
+
+@dataclass
 class FakeProjector:
     """Implements `Projector`. `swaps` shows another pattern than was asked for, and says nothing.
 
@@ -432,4 +445,4 @@ def fake_rig(
         for index, name in enumerate(cameras)
     }
     settings = {name: CameraSettings(EXPOSURE_NS / 1e9) for name in cameras}
-    return FakeRig(world, shown_by, fakes, Rig("fake", fakes, shown_by, settings))
+    return FakeRig(world, shown_by, fakes, Rig("fake", fakes, shown_by, settings, clock=WorldClock(world)))

@@ -1,4 +1,4 @@
-"""Pictures while the rig is idle: on the rendered rig, and on one that fails."""
+"""Pictures while the rig is idle, of a rig in memory."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulated_rig.device import SimulatedHead
 from slrig.devices import Rig
 from slrig.errors import CameraNotFoundError, DeviceBusyError, DeviceError, DeviceGoneError, RigBusyError
 from slrig.rig.preview import Light, Picture, Previews, Watch
 from slrig.rig.session import RigSession
-from tests.contract.benches import simulated
-from tests.contract.suite import rig_of
+from tests.unit.capture.fake_rig import CameraFaults, Scene, fake_rig
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S, TameProjector
 
@@ -52,57 +50,53 @@ def next_of(watch: Watch, after: int = 0) -> Picture:
     return picture
 
 
-def test_pictures_follow_one_another_and_the_light_that_is_asked_for(tmp_path: Path) -> None:
-    with simulated(tmp_path).head() as head:
-        assert isinstance(head, SimulatedHead)
-        room = Room(rig_of(head))
-        with room.previews.watch("left", Light.OFF) as dark, room.previews.watch("right", Light.OFF) as other:
-            room.run()
-            first = next_of(dark)
-            assert (first.image.shape, first.image.dtype) == ((120, 160), np.dtype(np.uint8))
-            assert next_of(dark, first.number).number > first.number
-            # A camera of 12 bits is shown in eight.
-            assert next_of(other).image.dtype == np.uint8
-            with room.previews.watch("left", Light.WHITE) as lit:
-                now = next_of(dark).number
-                # One picture may have been under way when the light was asked for.
-                bright = next_of(lit, now + 1)
-                assert bright.image.mean() > 4 * first.image.mean()
-                assert head.projector.lit
+def test_pictures_follow_one_another_and_the_light_that_is_asked_for() -> None:
+    fake = fake_rig()
+    # A camera of 12 bits is shown in eight.
+    fake.cameras["right"].scene = Scene(bit_depth=12)
+    room = Room(fake.rig)
+    with room.previews.watch("left", Light.OFF) as dark, room.previews.watch("right", Light.OFF) as other:
+        room.run()
+        first = next_of(dark)
+        assert (first.image.shape, first.image.dtype) == ((150, 200), np.dtype(np.uint8))
+        assert next_of(dark, first.number).number > first.number
+        assert next_of(other).image.dtype == np.uint8
+        with room.previews.watch("left", Light.WHITE) as lit:
             now = next_of(dark).number
-            assert next_of(dark, now + 1).image.mean() < 1.5 * first.image.mean()
-        # Nobody looks any more: it ends by itself.
+            # One picture may have been under way when the light was asked for.
+            assert next_of(lit, now + 1).image.mean() > 4 * first.image.mean()
+            assert fake.projector.lit
+        now = next_of(dark).number
+        assert next_of(dark, now + 1).image.mean() < 1.5 * first.image.mean()
+    # When the last has left, it ends by itself.
+    room.join()
+    assert room.error is None
+    assert fake.at_rest
+
+
+def test_a_job_that_wants_the_rig_gets_it_dark_and_disarmed() -> None:
+    fake = fake_rig()
+    room = Room(fake.rig)
+    with room.previews.watch("left", Light.WHITE) as watch:
+        room.run()
+        next_of(watch)
+        room.stopped.set()
+        room.previews.interrupt()
         room.join()
-        assert room.error is None
-        assert not head.projector.lit
+        assert fake.at_rest
+        assert room.previews.wanted
 
 
-def test_whoever_wants_the_rig_gets_it_dark_and_disarmed(tmp_path: Path) -> None:
-    with simulated(tmp_path).head() as head:
-        assert isinstance(head, SimulatedHead)
-        room = Room(rig_of(head))
-        with room.previews.watch("left", Light.WHITE) as watch:
-            room.run()
-            next_of(watch)
-            room.stopped.set()
-            room.previews.interrupt()
-            room.join()
-            assert not head.projector.lit
-            head.cameras["left"].arm(1, next(iter(head.cameras["left"].info.triggers)))
-            assert room.previews.wanted
-
-
-def test_a_device_that_goes_away_ends_the_looking_and_says_why(tmp_path: Path) -> None:
-    with simulated(tmp_path, faults={"unplug_camera_at_frame": 2}).head() as head:
-        room = Room(rig_of(head))
-        with room.previews.watch("left", Light.OFF) as watch:
-            room.run()
-            room.join()
-            assert isinstance(room.error, DeviceGoneError)
-            room.previews.fail(room.error)
-            with pytest.raises(DeviceGoneError):
-                watch.picture(99, WAIT_S)
-        assert not room.previews.wanted
+def test_a_device_that_goes_away_ends_the_looking_and_says_why() -> None:
+    room = Room(fake_rig(faults={"left": CameraFaults(unplug_at=2)}).rig)
+    with room.previews.watch("left", Light.OFF) as watch:
+        room.run()
+        room.join()
+        assert isinstance(room.error, DeviceGoneError)
+        room.previews.fail(room.error)
+        with pytest.raises(DeviceGoneError):
+            watch.picture(99, WAIT_S)
+    assert not room.previews.wanted
 
 
 def test_no_picture_comes_while_nobody_takes_any() -> None:
@@ -114,27 +108,26 @@ def test_no_picture_comes_while_nobody_takes_any() -> None:
 def test_a_scan_goes_first_and_pictures_go_on_after_it(tmp_path: Path) -> None:
     """On the runner: looking is refused while a scan holds the rig, and yields to one that comes."""
     bench = Bench(tmp_path)
-    with simulated(tmp_path).head() as head:
-        # The cameras of the rendered rig; the tame capture asks nothing of them, and lights the tame projector.
-        bench.runner.queue.rig = RigSession("bench", lambda: replace(rig_of(head), projector=TameProjector()))
-        bench.runner.start()
-        try:
-            scan = bench.scan()
-            bench.until(scan.id)
-            with pytest.raises(CameraNotFoundError, match="left, right"):
-                bench.runner.queue.watch("middle", Light.OFF)
-            with bench.runner.queue.watch("left", Light.OFF) as watch:
-                seen = next_of(watch).number
-                held = bench.held()
-                with pytest.raises(RigBusyError, match=str(held.id)):
-                    bench.runner.queue.watch("left", Light.OFF)
-                stood = next_of(watch).number
-                assert watch.picture(stood, 0.2) is None
-                bench.gate.set()
-                bench.until(held.id)
-                assert next_of(watch, max(seen, stood)).number > stood
-        finally:
-            bench.close()
+    # The tame capture asks nothing of these cameras, and lights the tame projector.
+    rig = replace(fake_rig().rig, projector=TameProjector())
+    bench.runner.queue.rig = RigSession("bench", lambda: rig)
+    bench.runner.start()
+    try:
+        bench.until(bench.scan().id)
+        with pytest.raises(CameraNotFoundError, match="left, right"):
+            bench.runner.queue.watch("middle", Light.OFF)
+        with bench.runner.queue.watch("left", Light.OFF) as watch:
+            seen = next_of(watch).number
+            held = bench.held()
+            with pytest.raises(RigBusyError, match=str(held.id)):
+                bench.runner.queue.watch("left", Light.OFF)
+            stood = next_of(watch).number
+            assert watch.picture(stood, 0.0) is None
+            bench.gate.set()
+            bench.until(held.id)
+            assert next_of(watch, max(seen, stood)).number > stood
+    finally:
+        bench.close()
 
 
 def test_before_the_rig_is_open_there_is_nothing_to_see(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from slrig.scan.report import capture_notes, capture_report
 from tests.samples import sample_calibration
-from tests.unit.capture.fake_rig import FakeCamera, FakeProjector, Scene, World
+from tests.unit.capture.fake_rig import FakeCamera, FakeProjector, Scene, World, WorldClock
 from tests.unit.scan.fakes import WAIT_S
 from tests.unit.scan.test_acquisition import Sink
 
@@ -97,20 +97,7 @@ def fake(
         for index, (name, white) in enumerate((whites or {"right": 0.6}).items())
     }  # fmt: skip
     settings = {name: CameraSettings(USUAL_S) for name in cameras}
-    return Fake(world, projector, cameras, Rig("fake", cameras, projector, settings, clock=Ticking(world)))
-
-
-@dataclass
-class Ticking:
-    """The clock of the fakes."""
-
-    world: World
-
-    def now_ns(self) -> int:
-        return self.world.now_ns
-
-    def wait_until(self, t_ns: int, _stop: object) -> None:
-        self.world.now_ns = max(self.world.now_ns, t_ns)
+    return Fake(world, projector, cameras, Rig("fake", cameras, projector, settings, clock=WorldClock(world)))
 
 
 def captured(
