@@ -1,4 +1,4 @@
-"""Reconstruction in another process: answers, progress, cancellation, death."""
+"""Reconstruction in another process: answers, progress, cancelling, death; and frames on their way to it."""
 
 from __future__ import annotations
 
@@ -8,33 +8,44 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from ctypes import c_double
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
+from slrig.capture.evidence import EvidenceSummary
 from slrig.errors import (
     NothingToReconstructError,
     OutOfMemoryError,
     ScanCancelledError,
     ScanInterruptedError,
-    StorageError,
     WorkerBusyError,
     WorkerLostError,
 )
 from slrig.failure import failure_of, interruption
 from slrig.jobs import worker as worker_module
 from slrig.jobs import worker_wait
+from slrig.jobs.frame_feed import (
+    LEAST_WAITING_BYTES,
+    MOST_WAITING_BYTES,
+    Abandon,
+    Begin,
+    FrameFeed,
+    most_waiting_bytes,
+)
+from slrig.jobs.records import JobState
 from slrig.jobs.worker import LOADING, READY, WAITING, UnexpectedWorkerError, Worker, prepare_kernel_cache
-from slrig.jobs.worker_process import Done, Failed, FileMade, Progressed, Task, serve
+from slrig.jobs.worker_process import Done, Failed, FileMade, Progressed, Task, Unloadable, serve
 from slrig.jobs.worker_wait import JobWait
+from slrig.model import Shot
 from slrig.scan.job import reconstruction
 from slrig.scan.plan import ReconstructionPlan
-from tests.unit.scan.fakes import WAIT_S
-
-PIPELINE = "tests.unit.scan.fake_pipeline"
+from tests.unit.scan.bench import PIPELINE, Bench, failure_code
+from tests.unit.scan.fakes import CALIBRATION, EVIDENCE, OUTLINE, SHOTS, WAIT_S
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +72,18 @@ def job(tmp_path: Path, order: str) -> Task:
     (bundle / "order").write_text(order)
     (tmp_path / "result").mkdir(exist_ok=True)
     return reconstruction(PIPELINE, bundle, tmp_path / "result", ReconstructionPlan(keep_holes=True))
+
+
+def gone(worker: Worker) -> None:
+    """Wait for the end of the worker's process, and leave its remains to the worker."""
+    assert worker.process_id is not None
+    os.waitid(os.P_PID, worker.process_id, os.WEXITED | os.WNOWAIT)
+
+
+def killed(worker: Worker) -> None:
+    assert worker.process_id is not None
+    os.kill(worker.process_id, signal.SIGKILL)
+    gone(worker)
 
 
 def never() -> bool:
@@ -103,9 +126,7 @@ def test_killed_process_is_named_and_replaced(worker: Worker, tmp_path: Path) ->
 
 
 def test_process_killed_while_idle_costs_nothing_but_a_new_one(worker: Worker, tmp_path: Path) -> None:
-    assert worker.process_id is not None
-    os.kill(worker.process_id, signal.SIGKILL)
-    os.waitid(os.P_PID, worker.process_id, os.WEXITED | os.WNOWAIT)
+    killed(worker)
     assert worker.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)["seconds"] == 1.5
 
 
@@ -128,15 +149,14 @@ def test_any_named_task_is_done_with_what_it_takes(worker: Worker) -> None:
     assert worker.run(replace(task("told_where"), where={"where": "pool"})) == {"where": "pool"}
 
 
-@pytest.mark.parametrize("refused", [StorageError("The disk is full."), KeyboardInterrupt()])
-def test_an_answer_that_came_too_late_is_nobodys(worker: Worker, tmp_path: Path, refused: BaseException) -> None:
-    """Whoever was told of progress refused it: the wait is over, the job is not."""
+def test_an_answer_that_came_too_late_is_dropped(worker: Worker, tmp_path: Path) -> None:
+    """What was told of progress refused it: the wait is over, the job is not."""
 
     def refuse(*_: object) -> None:
-        raise refused
+        raise KeyboardInterrupt
 
     left = worker.process_id
-    with pytest.raises(type(refused)):
+    with pytest.raises(KeyboardInterrupt):
         worker.run(job(tmp_path, "finish"), progress=refuse)
     assert worker.run(task("process_id")) == worker.process_id != left
     assert worker.run(job(tmp_path / "again", "finish"))["seconds"] == 1.5
@@ -200,10 +220,10 @@ def test_jobs_have_their_turn_in_the_order_in_which_they_came(worker: Worker, tm
     first, second = (threading.Thread(target=do, args=(name,)) for name in ("first", "second"))
     first.start()
     while not worker.jobs:
-        pass
+        threading.Event().wait(0.01)
     second.start()
     while (WAITING, 0.0) not in told.stages:
-        pass
+        threading.Event().wait(0.01)
     with pytest.raises(ScanCancelledError):
         worker.run(task("process_id"), cancelled=lambda: True)
     (tmp_path / "second").touch()
@@ -213,40 +233,48 @@ def test_jobs_have_their_turn_in_the_order_in_which_they_came(worker: Worker, tm
     assert ended == ["first", "second"]
 
 
-def gone(worker: Worker) -> None:
-    """Wait for the end of the worker's process, and leave its remains to the worker."""
-    assert worker.process_id is not None
-    os.waitid(os.P_PID, worker.process_id, os.WEXITED | os.WNOWAIT)
-
-
-def test_condition_is_loading_and_then_ok(tmp_path: Path) -> None:
-    fresh = Worker(PIPELINE)
+def test_how_far_the_kernels_are_is_told_before_and_during_a_job(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fresh, gate = Worker("tests.unit.jobs.preparing_pipeline"), tmp_path / "go"
     assert fresh.condition == LOADING
-    fresh.start()
-    fresh.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)
-    assert fresh.condition == READY
-    fresh.close()
-
-
-def test_how_far_the_kernels_are_is_told_before_and_during_a_job(tmp_path: Path) -> None:
-    fresh = Worker("tests.unit.jobs.preparing_pipeline")
-    gate = tmp_path / "go"
-    os.environ["PREPARING_GATE"] = str(gate)
-    try:
-        fresh.start()
-    finally:
-        del os.environ["PREPARING_GATE"]
+    monkeypatch.setenv("PREPARING_GATE", str(gate))
+    with pytest.raises(WorkerBusyError, match="not ready yet for the report"):
+        fresh.run(Task(f"{PIPELINE}:process_id", what="report"), within_s=0.0)
+    before = fresh.process_id
     deadline = time.monotonic() + WAIT_S
     while fresh.condition == LOADING and time.monotonic() < deadline:
-        pass
+        threading.Event().wait(0.01)
     assert fresh.condition == "preparing kernels, first time only: 41 of 118"
     assert fresh.loading
-    told = Told()
-    gate.touch()
-    fresh.run(job(tmp_path, "finish"), progress=told, cancelled=never)
-    assert ("preparing kernels", 0.0) in told.stages
-    assert (fresh.condition, fresh.loading) == (READY, False)
+    feed, told = fresh.feed(), list[str]()
+    # More than the pipe holds, so that the feed waits for a process that prepares.
+    fed(feed, SHOTS[0], replace(SHOTS[1], image=np.zeros((4000, 4000), dtype=np.uint8)))
+
+    def go_on() -> bool:
+        gate.touch()
+        return False
+
+    report = fresh.run(
+        job(tmp_path, "finish"), progress=lambda stage, _, detail: told.append(f"{stage} {detail}".strip()),
+        cancelled=go_on, feed=feed,
+    )  # fmt: skip
+    assert report["live"] == [2, 2, True]
+    assert told[:2] == ["preparing kernels first time only: 42 of 118", "decode"]
+    assert (fresh.condition, fresh.loading, fresh.process_id) == (READY, False, before)
     fresh.close()
+
+
+def test_process_that_ends_while_it_loads_is_told(tmp_path: Path) -> None:
+    broken = Worker("tests.unit.jobs.dying_pipeline")
+    broken.start()
+    gone(broken)
+    cause = "the reconstruction cannot be loaded: its process ended"
+    assert cause in broken.condition
+    with pytest.raises(WorkerLostError, match=cause):
+        broken.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)
+    assert cause in broken.condition
+    broken.close()
 
 
 @pytest.mark.parametrize(
@@ -254,18 +282,18 @@ def test_how_far_the_kernels_are_is_told_before_and_during_a_job(tmp_path: Path)
     [
         ("tests.unit.scan.no_such_module", "ModuleNotFoundError: No module named"),
         ("tests.unit.scan.fakes", "AttributeError: "),
-        ("tests.unit.jobs.dying_pipeline", "its process ended"),
     ],
 )
-def test_pipeline_that_cannot_be_loaded_is_told(tmp_path: Path, module: str, cause: str) -> None:
-    broken = Worker(module)
-    broken.start()
-    gone(broken)
-    assert f"the reconstruction cannot be loaded: {cause}" in broken.condition
-    with pytest.raises(WorkerLostError, match=cause):
-        broken.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)
-    assert f"the reconstruction cannot be loaded: {cause}" in broken.condition
-    broken.close()
+def test_pipeline_that_cannot_be_loaded_is_told(monkeypatch: pytest.MonkeyPatch, module: str, cause: str) -> None:
+    # Signals belong to the tests here.
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    near, far = multiprocessing.Pipe()
+    stops, _ = multiprocessing.Pipe(duplex=False)
+    with capture_logs(), pytest.raises(SystemExit):
+        serve(far, stops, c_double(), module)
+    told = near.recv()
+    assert isinstance(told, Unloadable)
+    assert told.cause.startswith(cause)
 
 
 @pytest.mark.parametrize("read", [True, False])
@@ -352,14 +380,235 @@ def test_a_task_that_cannot_begin_in_time_is_refused_and_the_worker_goes_on(work
     assert worker.jobs == 0
 
 
-def test_a_process_that_is_not_ready_in_time_goes_on_with_its_kernels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+# ---- frames that reach the process while they are taken: all of them or none count, and nothing waits for it
+
+
+RAISE, HANG = 2, 3
+"""What the first pixel of a frame has the fake reconstruction do."""
+
+
+class Far:
+    """The other end of a feed: keeps what it is sent; while `open` is clear a message is stuck on its way."""
+
+    def __init__(self) -> None:
+        self.messages: list[object] = []
+        self.open = threading.Event()
+        self.open.set()
+        self.reached = threading.Event()
+        self.arrived = threading.Semaphore(0)
+        self.alive = True
+
+    def __call__(self, message: object) -> bool:
+        self.reached.set()
+        assert self.open.wait(WAIT_S)
+        self.messages.append(message)
+        self.arrived.release()
+        return self.alive
+
+    def kinds(self) -> list[type]:
+        return [type(message) for message in self.messages]
+
+
+def fed(feed: FrameFeed, *shots: Shot) -> None:
+    feed.begin(OUTLINE, CALIBRATION)
+    for shot in shots:
+        feed.take(shot)
+    feed.end(EVIDENCE)
+
+
+def telling(order: int) -> Shot:
+    """A frame that makes the fake reconstruction die, raise or hang."""
+    return replace(SHOTS[0], image=np.full((48, 64), order, dtype=np.uint8))
+
+
+def test_frames_are_sent_in_order() -> None:
+    far = Far()
+    feed = FrameFeed(far)
+    fed(feed, *SHOTS)
+    assert feed.settled(WAIT_S)
+    assert feed.whole
+    assert far.kinds() == [Begin, Shot, Shot, EvidenceSummary]
+    assert far.messages[1:3] == list(SHOTS)
+    # After the end there is nothing left to be abandoned.
+    feed.abandon()
+    assert feed.whole
+    assert far.kinds()[-1] is EvidenceSummary
+
+
+def test_capture_is_not_held_up_by_a_reconstruction_that_falls_behind() -> None:
+    far = Far()
+    far.open.clear()
+    feed = FrameFeed(far, most_bytes=2 * SHOTS[0].image.nbytes)
+    # Were it to wait for the other end, this would never return.
+    fed(feed, SHOTS[0], SHOTS[1], SHOTS[0])
+    far.open.set()
+    assert feed.settled(WAIT_S)
+    assert not feed.whole
+    assert far.kinds() in ([Begin, Abandon], [Abandon])
+
+
+@pytest.mark.parametrize(("memory_gib", "share"), [(1, None), (4, 1 / 16), (64, None)])
+def test_frames_that_wait_take_a_share_of_the_memory(
+    memory_gib: int, share: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fresh, gate = Worker("tests.unit.jobs.preparing_pipeline"), tmp_path / "go"
-    monkeypatch.setenv("PREPARING_GATE", str(gate))
-    with pytest.raises(WorkerBusyError, match="not ready yet for the report"):
-        fresh.run(Task(f"{PIPELINE}:process_id", what="report"), within_s=0.0)
-    before = fresh.process_id
-    gate.touch()
-    assert fresh.run(Task(f"{PIPELINE}:process_id", what="report"), within_s=WAIT_S) == before
-    fresh.close()
+    page = 4096
+    asked = {"SC_PAGE_SIZE": page, "SC_PHYS_PAGES": memory_gib * 2**30 // page}
+    monkeypatch.setattr(os, "sysconf", asked.__getitem__)
+    bounds = LEAST_WAITING_BYTES if memory_gib == 1 else MOST_WAITING_BYTES
+    assert most_waiting_bytes() == (bounds if share is None else memory_gib * 2**30 * share)
+
+
+def test_frames_that_have_been_sent_wait_no_more() -> None:
+    far = Far()
+    feed = FrameFeed(far, most_bytes=2 * SHOTS[0].image.nbytes)
+    feed.begin(OUTLINE, CALIBRATION)
+    assert far.arrived.acquire(timeout=WAIT_S)
+    for index in range(5):
+        feed.take(replace(SHOTS[0], pattern=index))
+        # Once this one is there, the one before it is counted no more.
+        assert far.arrived.acquire(timeout=WAIT_S)
+    feed.end(EVIDENCE)
+    assert feed.settled(WAIT_S)
+    assert feed.whole
+
+
+def test_a_frame_that_takes_anothers_place_costs_the_head_start_only() -> None:
+    far = Far()
+    feed = FrameFeed(far)
+    # The same pattern at another exposure is a frame of its own.
+    bracket = [replace(SHOTS[0], exposure_s=exposure_s) for exposure_s in (0.01, 0.02)]
+    fed(feed, *bracket, SHOTS[1])
+    assert feed.settled(WAIT_S)
+    assert feed.whole
+    again = FrameFeed(far)
+    fed(again, *bracket, SHOTS[1], bracket[0])
+    assert again.settled(WAIT_S)
+    assert not again.whole
+    assert far.kinds()[-1] is Abandon
+
+
+def test_abandoned_frames_are_forgotten() -> None:
+    far = Far()
+    far.open.clear()
+    feed = FrameFeed(far)
+    feed.begin(OUTLINE, CALIBRATION)
+    feed.take(SHOTS[0])
+    assert far.reached.wait(WAIT_S)
+    feed.abandon()
+    feed.take(SHOTS[1])
+    assert not feed.settled(0.0)
+    far.open.set()
+    assert feed.settled(WAIT_S)
+    assert far.kinds() == [Begin, Abandon]
+    assert not feed.whole
+
+
+def test_nothing_more_is_sent_to_nobody() -> None:
+    far = Far()
+    far.alive = False
+    feed = FrameFeed(far)
+    fed(feed, *SHOTS)
+    assert feed.settled(WAIT_S)
+    assert far.kinds() == [Begin]
+    assert not feed.whole
+
+
+def test_without_a_calibration_nothing_is_sent() -> None:
+    far = Far()
+    feed = FrameFeed(far)
+    feed.begin(OUTLINE, None)
+    feed.take(SHOTS[0])
+    feed.end(EVIDENCE)
+    assert feed.settled(0.0)
+    assert (far.messages, feed.whole) == ([], False)
+
+
+Ran = Callable[..., object]
+
+
+@pytest.fixture
+def run(worker: Worker, tmp_path: Path) -> Ran:
+    """Run a job after a capture; return what the reconstruction says of the frames that it was sent."""
+
+    def ran(feed: FrameFeed, cancelled: Callable[[], bool] = never) -> object:
+        return worker.run(job(tmp_path, "finish"), cancelled=cancelled, feed=feed).get("live")
+
+    return ran
+
+
+def test_frames_are_there_when_the_job_comes(worker: Worker, run: Ran) -> None:
+    for _ in range(2):
+        feed = worker.feed()
+        fed(feed, *SHOTS)
+        assert run(feed) == [2, 2, True]
+
+
+def test_frames_of_a_capture_that_failed_reach_no_other_scan(worker: Worker, run: Ran) -> None:
+    failed = worker.feed()
+    failed.begin(OUTLINE, CALIBRATION)
+    failed.take(SHOTS[0])
+    failed.abandon()
+    assert run(failed) is None
+    feed = worker.feed()
+    fed(feed, *SHOTS)
+    assert run(feed) == [2, 2, True]
+
+
+def test_process_that_is_killed_during_the_capture_costs_the_head_start_only(worker: Worker, run: Ran) -> None:
+    feed = worker.feed()
+    feed.begin(OUTLINE, CALIBRATION)
+    feed.take(SHOTS[0])
+    killed(worker)
+    feed.take(SHOTS[1])
+    feed.end(EVIDENCE)
+    assert run(feed) is None
+
+
+def test_frame_that_cannot_be_used_costs_the_head_start_only(worker: Worker, run: Ran) -> None:
+    before = worker.process_id
+    feed = worker.feed()
+    fed(feed, telling(RAISE), SHOTS[1])
+    assert run(feed) is None
+    assert worker.process_id == before
+
+
+def test_cancel_ends_a_process_that_is_stuck_in_a_frame(
+    worker: Worker, run: Ran, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_wait, "CANCEL_LIMIT_S", 0.0)
+    feed = worker.feed()
+    # More than the pipe holds, so that the feed is stuck as well.
+    large = replace(SHOTS[1], image=np.zeros((4000, 4000), dtype=np.uint8))
+    fed(feed, telling(HANG), large)
+    before = worker.process_id
+    with pytest.raises(ScanCancelledError):
+        run(feed, cancelled=lambda: True)
+    again = worker.feed()
+    fed(again, *SHOTS)
+    assert run(again) == [2, 2, True]
+    assert worker.process_id != before
+
+
+def test_scans_outlive_their_worker(tmp_path: Path) -> None:
+    """Killed while a scan captures, it costs the head start; while one is reconstructed, that scan."""
+    worker = Worker(PIPELINE)
+    bench = Bench(tmp_path, worker=worker)
+    bench.runner.start()
+    scan = bench.held()
+    killed(worker)
+    bench.gate.set()
+    assert bench.until(scan.id).state is JobState.SUCCEEDED
+    assert '"live"' not in (bench.folder.scan(scan.id) / "report.json").read_text()
+    bench.order = "die"
+    record = bench.until(bench.scan().id)
+    assert (record.state, failure_code(record)) == (JobState.FAILED, "worker-lost")
+    assert [path.name for path in bench.folder.scan(record.id).iterdir()] == ["bundle"]
+    bench.order = "finish"
+    cancelled = bench.held()
+    bench.runner.cancel(cancelled.id)
+    assert bench.until(cancelled.id).state is JobState.CANCELLED
+    bench.gate.set()
+    # It sees its own frames only.
+    record = bench.until(bench.scan().id)
+    assert '"live": [2, 2, true]' in (bench.folder.scan(record.id) / "report.json").read_text()
+    bench.close()
