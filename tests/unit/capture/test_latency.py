@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -72,34 +73,30 @@ def test_a_camera_in_step_with_the_display_is_started_anew(tmp_path: Path, monke
     assert found.latency_s == pytest.approx(0.012, abs=5e-4)
 
 
-def test_the_rig_is_dark_and_usable_after_the_test(tmp_path: Path) -> None:
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_the_rig_is_dark_and_usable_after_the_test(tmp_path: Path, interrupted: bool) -> None:
     usual = rig(tmp_path)
-    told: list[tuple[str, float, str]] = []
-    measure_latency(usual, trials=8, told=lambda *step: told.append(step))
-    usual.cameras["eye"].arm(1, Trigger.FREE)
-    assert told[0][1] == 0
-    assert told[-1][1] == 1
-    assert usual.head is not None
-    assert not usual.head.projector.lit  # type: ignore[attr-defined]
+    fractions: list[float] = []
 
-
-def test_an_interrupted_test_leaves_the_rig_dark_and_usable(tmp_path: Path) -> None:
-    usual = rig(tmp_path)
-
-    def interrupt(_stage: str, fraction: float, _detail: str) -> None:
-        if fraction > 0:
+    def told(_stage: str, fraction: float, _detail: str) -> None:
+        fractions.append(fraction)
+        if interrupted and fraction > 0:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        measure_latency(usual, told=interrupt)
+    with pytest.raises(KeyboardInterrupt) if interrupted else nullcontext():
+        measure_latency(usual, trials=8, told=told)
+    usual.cameras["eye"].arm(1, Trigger.FREE)
+    assert fractions[0] == 0
+    assert interrupted or fractions[-1] == 1
     assert usual.head is not None
     assert not usual.head.projector.lit  # type: ignore[attr-defined]
-    usual.cameras["eye"].arm(1, Trigger.FREE)
 
 
-def test_a_lamp_that_is_off_ends_the_test(tmp_path: Path) -> None:
+def test_a_lamp_that_is_off_and_a_way_of_triggering_that_a_camera_has_not_end_the_test(tmp_path: Path) -> None:
     with pytest.raises(ScanEvidenceError, match="'eye' sees no flash"):
         measure_latency(rig(tmp_path, faults={"lamp_off": True}))
+    with pytest.raises(UnsupportedByDeviceError, match="free, software"):
+        measure_latency(rig(tmp_path), trigger=Trigger.HARDWARE)
 
 
 def test_light_before_the_first_trigger_is_explained(tmp_path: Path) -> None:
@@ -110,11 +107,6 @@ def test_light_before_the_first_trigger_is_explained(tmp_path: Path) -> None:
     prompt = rig(tmp_path, still, projector={"latency_s": 0.006})
     found = measure_latency(prompt, trigger=Trigger.SOFTWARE, exposure_s=0.015, trials=10)
     assert found.cameras["eye"].latency_s == pytest.approx(0.0, abs=5e-4)
-
-
-def test_a_way_of_triggering_that_a_camera_has_not_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UnsupportedByDeviceError, match="free, software"):
-        measure_latency(rig(tmp_path), trigger=Trigger.HARDWARE)
 
 
 # ---- what is done with it

@@ -99,8 +99,7 @@ def both_ways(light: Light) -> Callable[[bool, np.random.Generator], Light]:
 # ---- the fit
 
 
-@pytest.mark.parametrize("line_s", [0.0, 1.5e-5, 6e-5, 3e-4])
-@pytest.mark.parametrize("latency_s", [-0.004, 0.012])
+@pytest.mark.parametrize(("latency_s", "line_s"), [(0.012, 0.0), (-0.004, 1.5e-5), (0.012, 6e-5), (-0.004, 3e-4)])
 def test_latency_and_line_time_come_out_of_the_rows(latency_s: float, line_s: float) -> None:
     found = World(both_ways(step(latency_s)), line_s=line_s, period_s=0.032).measured()
     assert found.latency_s == pytest.approx(latency_s, abs=1e-4)
@@ -113,19 +112,15 @@ def test_latency_and_line_time_come_out_of_the_rows(latency_s: float, line_s: fl
 
 
 @pytest.mark.slow
-def test_a_global_shutter_is_not_taken_for_a_rolling_one() -> None:
-    for seed in range(40):
-        found = World(both_ways(step(0.012)), noise_dn=2.0).measured(count=30, seed=seed)
-        assert not found.rolling
-        assert not found.scanned
-
-
-@pytest.mark.slow
-def test_the_stated_error_of_the_line_time_is_its_scatter() -> None:
+def test_the_stated_error_of_the_line_time_is_its_scatter_and_no_shutter_is_taken_for_another() -> None:
     found = [World(both_ways(step(0.003)), line_s=3e-5, noise_dn=3.0).measured(count=30, seed=s) for s in range(30)]
     scatter = np.std([each.line_time_s for each in found], ddof=1)
     stated = np.median([each.line_time_error_s for each in found])
     assert 0.6 < stated / scatter < 1.6
+    for seed in range(40):
+        still = World(both_ways(step(0.012)), noise_dn=2.0).measured(count=30, seed=seed)
+        assert not still.rolling
+        assert not still.scanned
 
 
 def test_a_constant_error_of_the_time_stamps_is_part_of_the_latency() -> None:
@@ -157,12 +152,8 @@ def test_a_ramp_is_timed_at_its_middle_and_waited_for_to_its_end() -> None:
 
 
 def test_darkening_more_slowly_than_brightening_is_told_and_waited_for() -> None:
-    def light(to_white: bool, rng: np.random.Generator) -> Light:
-        return both_ways(step(0.005 if to_white else 0.015))(to_white, rng)
-
-    found = World(light).measured()
-    assert found.rise_s == pytest.approx(0.005, abs=1e-4)
-    assert found.fall_s == pytest.approx(0.015, abs=1e-4)
+    found = World(lambda to_white, rng: both_ways(step(0.005 if to_white else 0.015))(to_white, rng)).measured()
+    assert (found.rise_s, found.fall_s) == pytest.approx((0.005, 0.015), abs=1e-4)
     assert found.latest_s == pytest.approx(0.015, abs=3e-4)
 
 
@@ -178,12 +169,13 @@ def test_a_colour_wheel_is_told_as_flicker_and_hardly_moves_the_latency() -> Non
         change = both_ways(step(0.012))(to_white, rng)
         return lambda t: change(t) * wheel(t + 1.0 + off_s)
 
-    found = World(light, exposure_s=0.0125, period_s=0.0141, steady=lambda t: wheel(t + 1.0)).measured(count=120)
+    found = World(light, exposure_s=0.0125, period_s=0.0141, steady=lambda t: wheel(t + 1.0)).measured()
     assert found.flicker > 0.02
     assert found.latency_s == pytest.approx(0.012, abs=turn_s / 8)
     assert found.jitter_s < turn_s / 4
     assert not found.rolling
-    whole = World(light, exposure_s=2 * turn_s, period_s=0.0181, steady=lambda t: wheel(t + 1.0)).measured(count=120)
+    # Exposures of whole turns see none of it.
+    whole = World(light, exposure_s=2 * turn_s, period_s=0.0181, steady=lambda t: wheel(t + 1.0)).measured()
     assert whole.flicker < 0.005
     assert whole.latency_s == pytest.approx(0.012, abs=turn_s / 8)
 
@@ -217,30 +209,17 @@ def test_levels_leave_out_rows_that_tell_nothing() -> None:
 # ---- what cannot be measured
 
 
-def levels_of(**world: Any) -> RowLevels:
-    return World(both_ways(step(0.0)), **world).levels(np.random.default_rng(0))
-
-
-def test_a_lamp_that_is_off_is_said_to_be() -> None:
-    with pytest.raises(ScanEvidenceError, match=r"sees no flash.*lamp is on"):
-        levels_of(white_dn=0.0)
-
-
-def test_too_much_light_is_said_to_be() -> None:
-    with pytest.raises(ScanEvidenceError, match=r"saturated.*expose shorter"):
-        levels_of(white_dn=3000.0)
-
-
-def test_too_noisy_a_picture_is_said_to_be() -> None:
-    with pytest.raises(ScanEvidenceError, match="rows tell white from black"):
-        levels_of(white_dn=60.0, noise_dn=15.0)
-
-
-def test_flashes_between_two_exposures_are_said_to_be() -> None:
-    with pytest.raises(ScanEvidenceError, match=r"between two exposures .* raise its frame rate"):
-        World(both_ways(step(0.012)), exposure_s=5e-4, period_s=0.1).measured(count=20)
-
-
-def test_light_that_comes_too_late_is_said_to() -> None:
-    with pytest.raises(ScanEvidenceError, match="did not change while it was watched"):
-        World(both_ways(step(0.35))).measured(count=20)
+@pytest.mark.parametrize(
+    ("world", "words"),
+    [
+        ({"white_dn": 0.0}, r"sees no flash.*lamp is on"),
+        ({"white_dn": 3000.0}, r"saturated.*expose shorter"),
+        ({"white_dn": 60.0, "noise_dn": 15.0}, "rows tell white from black"),
+        ({"exposure_s": 5e-4, "period_s": 0.1}, r"between two exposures .* raise its frame rate"),
+        ({"light": both_ways(step(0.35))}, "did not change while it was watched"),
+    ],
+    ids=["lamp off", "too much light", "too noisy", "flashes between exposures", "light too late"],
+)
+def test_what_cannot_be_measured_is_said(world: dict[str, Any], words: str) -> None:
+    with pytest.raises(ScanEvidenceError, match=words):
+        World(**{"light": both_ways(step(0.012)), **world}).measured(count=20)

@@ -1,10 +1,154 @@
-"""How much earlier than its light a pattern may be asked for."""
+"""Cameras that run by themselves: what is foretold of their next frame, and of a pattern's light, and their readers."""
 
 from __future__ import annotations
 
-import numpy as np
+import threading
+from dataclasses import replace
 
+import numpy as np
+import pytest
+
+from slrig.capture.cadence import Cadence
+from slrig.capture.frame_reader import FrameReader
+from slrig.capture.sequencer import capture
 from slrig.capture.streaming import _Lead
+from slrig.devices import Camera, Synchronisation, Trigger
+from slrig.errors import DeviceGoneError
+from slrig.model import Frame
+from tests.contract.live_devices import Webcam
+from tests.contract.test_streaming import SEQUENCE, live
+from tests.unit.capture.fake_rig import CameraFaults, fake_rig
+
+PERIOD_NS = 33_333_333
+
+
+def frame(number: int, start_ns: int) -> Frame:
+    return Frame("eye", np.zeros((1, 1), np.uint8), start_ns, start_ns + 10_000_000, 0, number, 0, 0.01, 1.0)
+
+
+def after(numbers: list[int], t_ns: int, *, jitter_ns: float = 0.0) -> tuple[int, int] | None:
+    rng = np.random.default_rng(4)
+    cadence = Cadence()
+    for number in numbers:
+        cadence.note(frame(number, 10**12 + number * PERIOD_NS + round(jitter_ns * float(rng.standard_normal()))))
+    return cadence.start_after(10**12 + t_ns)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "after_periods", "foretold_period"),
+    [
+        (list(range(10)), 20, 20),
+        # Lost frames do not mislead it.
+        ([0, 1, 4, 5, 9, 10, 17], 20, 20),
+        # Frames that are past are not foretold.
+        (list(range(10)), 2, 10),
+    ],
+)
+def test_the_first_frame_after_an_instant_is_foretold(
+    numbers: list[int], after_periods: int, foretold_period: int
+) -> None:
+    foretold = after(numbers, after_periods * PERIOD_NS - 1_000)
+    assert foretold is not None
+    assert abs(foretold[0] - (10**12 + foretold_period * PERIOD_NS)) < 100
+    assert foretold[1] < 100 or foretold_period < 20
+
+
+def test_a_frame_that_may_begin_too_early_is_not_counted_on() -> None:
+    numbers = list(range(24))
+    foretold = after(numbers, 30 * PERIOD_NS, jitter_ns=1e6)
+    assert foretold is not None
+    start_ns, spare_ns = foretold
+    assert 1_000_000 < spare_ns < 4_000_000
+    assert abs(start_ns - (10**12 + 31 * PERIOD_NS)) < 2_000_000
+
+
+def test_nothing_is_foretold_of_too_few_or_too_uneven_frames() -> None:
+    assert after([0, 1], 0) is None
+    assert after(list(range(24)), 0, jitter_ns=PERIOD_NS) is None
+
+
+def test_a_camera_that_counts_anew_is_learnt_anew() -> None:
+    cadence = Cadence()
+    for number in range(5):
+        cadence.note(frame(number, number * PERIOD_NS))
+    cadence.note(frame(0, 10**12))
+    assert cadence.start_after(0) is None
+
+
+def test_one_frame_is_enough_where_a_camera_states_its_period() -> None:
+    cadence = Cadence(PERIOD_NS / 1e9)
+    assert cadence.start_after(0) is None
+    cadence.note(frame(0, 10**12))
+    foretold = cadence.start_after(10**12 + 2 * PERIOD_NS)
+    assert foretold is not None
+    start_ns, spare_ns = foretold
+    assert abs(start_ns - (10**12 + 3 * PERIOD_NS)) < 100  # the second may begin too early
+    assert abs(spare_ns - PERIOD_NS / 10) < 100
+
+
+def test_a_period_that_is_stated_wrongly_is_corrected_by_the_frames() -> None:
+    cadence = Cadence(PERIOD_NS / 2e9)
+    for number in range(3):
+        cadence.note(frame(number, 10**12 + number * PERIOD_NS))
+    foretold = cadence.start_after(10**12 + 20 * PERIOD_NS - 1_000)
+    assert foretold is not None
+    assert abs(foretold[0] - (10**12 + 20 * PERIOD_NS)) < 100
+
+
+FREE = frozenset({Trigger.FREE})
+PATIENCE_S = 10.0
+
+
+def armed(**faults: object) -> Camera:
+    camera = fake_rig(
+        cameras=["eye"],
+        triggers={"eye": FREE},
+        faults={"eye": CameraFaults(**faults)},  # type: ignore[arg-type]
+    ).cameras["eye"]
+    camera.arm(10, Trigger.FREE)
+    return camera
+
+
+def test_every_frame_comes_in_order_and_reading_ends() -> None:
+    reader = FrameReader({"top": armed()})
+    reader.start()
+    numbers = []
+    for _ in range(5):
+        arrival = reader.next(PATIENCE_S)
+        assert arrival is not None
+        name, came = arrival
+        assert name == "top"
+        assert isinstance(came, Frame)
+        numbers.append(came.sequence_number)
+    assert numbers == [0, 1, 2, 3, 4]
+    reader.stop()
+    reader.stop()
+    assert not [thread for thread in threading.enumerate() if thread.name == "slrig-frames of top"]
+
+
+def test_what_a_driver_raises_comes_as_it_is() -> None:
+    reader = FrameReader({"eye": armed(unplug_at=1)})
+    reader.start()
+    came = [arrival for arrival in (reader.next(PATIENCE_S) for _ in range(3)) if arrival is not None]
+    reader.stop()
+    assert isinstance(came[0][1], Frame)
+    assert isinstance(came[-1][1], DeviceGoneError)
+
+
+def test_nothing_comes_from_nobody() -> None:
+    assert FrameReader({}).next(0.0) is None
+
+
+def test_a_camera_that_goes_ends_the_capture_and_its_thread() -> None:
+    one = live(Webcam())
+    rig = replace(one.rig, synchronisation=Synchronisation(0.0, 0.0, earliest_s=0.0))
+    frames = capture(rig, SEQUENCE)
+    next(frames)
+    rig.cameras["eye"].close()
+    with pytest.raises(Exception, match="closed"):
+        list(frames)
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("slrig-frames")]
+
 
 REFRESH_NS = 16_666_667
 DELAY_NS = 46_800_000
