@@ -25,7 +25,7 @@ from slrig.jobs.job import Holder, Job
 from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobState, utc_now
 from slrig.rig.session import ActiveCalibration, RigSession, driver_errors
-from slrig.rig.watchdog import MOVE_LIMIT_S, Calls, GuardedPositioner, Watchdog
+from slrig.rig.watchdog import Watchdog
 from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S
@@ -274,28 +274,3 @@ def test_what_is_captured_while_the_queue_starts_is_computed_once(monkeypatch: p
     queue.end()
     queue.join(WAIT_S)
     assert (len(computed), told) == (1, [None])
-
-
-def test_positioner_is_watched_like_the_other_devices() -> None:
-    seen: list[tuple[str, str, float]] = []
-
-    class Stage:
-        poses = ("home",)
-
-        def move(self, index: int) -> None:
-            (call,) = calls._current.values()
-            seen.append((call.device, call.step, call.limit_s))
-            if index:
-                raise OSError(19, "No such device")
-
-        def close(self) -> None:
-            return
-
-    calls = Calls()
-    stage = GuardedPositioner(Stage(), calls)
-    stage.move(0)
-    with pytest.raises(DeviceGoneError, match="the positioner is gone"):
-        stage.move(1)
-    stage.close()
-    assert seen[0] == ("the positioner", "move", MOVE_LIMIT_S)
-    assert tuple(stage.poses) == ("home",)

@@ -46,62 +46,53 @@ def failing(error: Exception) -> Callable[[], None]:
 
 
 @pytest.mark.parametrize(
-    ("raised", "kind", "text"),
+    ("raised", "kind", "text", "in_doubt"),
     [
-        (DeviceGoneError("no answer"), DeviceGoneError, r"^no answer \(camera 'left', in read\)$"),
-        (UnsupportedByDeviceError("too long"), UnsupportedByDeviceError, r"^too long \(camera 'left', in read\)$"),
-        (FrameTimeoutError("no frame"), FrameTimeoutError, r"^no frame$"),
-        (ConfigError("no key"), ConfigError, r"^no key$"),
-        (OSError(errno.EBUSY, "busy"), DeviceBusyError, r"^camera 'left' is held .*in read: \[Errno 16\].*end that"),
-        (OSError(errno.ENODEV, "gone"), DeviceGoneError, r"^camera 'left' is gone \(in read: .*plug it in, then scan"),
-        (OSError(errno.EIO, "bad"), DeviceError, r"^camera 'left' failed in read: \[Errno 5\] bad; check cable"),
+        (DeviceGoneError("no answer"), DeviceGoneError, r"^no answer \(camera 'left', in read\)$", True),
+        (DeviceStateError("armed"), DeviceStateError, r"^armed \(camera 'left', in read\)$", True),
+        (UnsupportedByDeviceError("long"), UnsupportedByDeviceError, r"^long \(camera 'left', in read\)$", False),
+        (FrameTimeoutError("no frame"), FrameTimeoutError, r"^no frame$", False),
+        (ConfigError("no key"), ConfigError, r"^no key$", False),
+        (
+            OSError(errno.EBUSY, "busy"),
+            DeviceBusyError,
+            r"^camera 'left' is held .*in read: \[Errno 16\].*end that",
+            True,
+        ),
+        (
+            OSError(errno.ENODEV, "gone"),
+            DeviceGoneError,
+            r"^camera 'left' is gone \(in read: .*plug it in, then scan",
+            True,
+        ),
+        (OSError(errno.EIO, "bad"), DeviceError, r"^camera 'left' failed in read: \[Errno 5\] bad; check cable", True),
         (
             IndexError("5"),
             DriverBrokenError,
             r"^camera 'left': its driver failed in read \(IndexError: 5\).*maintainer",
+            True,
         ),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
 )
-def test_error_says_which_device_which_call_and_what_to_do(
-    raised: Exception, kind: type[SlrigError], text: str
+def test_error_says_which_device_which_call_and_what_to_do_and_is_noted_if_the_device_is_in_doubt(
+    raised: Exception, kind: type[SlrigError], text: str, in_doubt: bool
 ) -> None:
+    calls = Calls()
     with capture_logs(), pytest.raises(SlrigError, match=text) as caught:
-        Calls().make("camera 'left'", "read", 1.0, failing(raised))
+        calls.make("camera 'left'", "read", 1.0, failing(raised))
     assert type(caught.value) is kind
+    assert (calls.failure is not None) == in_doubt
 
 
-def test_error_that_is_raised_again_is_placed_once() -> None:
+def test_error_is_placed_once_and_not_where_the_call_that_opens_names_the_device() -> None:
     error, calls = DeviceGoneError("no answer"), Calls()
     for _ in range(2):
         with pytest.raises(DeviceGoneError):
             calls.make("projector 'p'", "blank", 1.0, failing(error))
     assert str(error) == "no answer (projector 'p', in blank)"
-
-
-def test_whoever_opens_a_device_names_it() -> None:
     with pytest.raises(DeviceGoneError, match=r"^no camera on usb-3$"):
-        Calls().make("rig 'bench'", OPEN, 1.0, failing(DeviceGoneError("no camera on usb-3")))
-
-
-@pytest.mark.parametrize(
-    ("raised", "noted"),
-    [
-        (DeviceGoneError("gone"), True),
-        (DeviceStateError("armed already"), True),
-        (OSError(errno.EIO, "bad"), True),
-        (ZeroDivisionError(), True),
-        (FrameTimeoutError("late"), False),
-        (UnsupportedByDeviceError("too long"), False),
-        (ConfigError("no key"), False),
-    ],
-    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
-)
-def test_failure_that_leaves_a_device_in_doubt_is_noted(raised: Exception, noted: bool) -> None:
-    calls = Calls()
-    with capture_logs(), pytest.raises(SlrigError):
-        calls.make("camera 'left'", "disarm", 1.0, failing(raised))
-    assert (calls.failure is not None) == noted
+        calls.make("rig 'bench'", OPEN, 1.0, failing(DeviceGoneError("no camera on usb-3")))
 
 
 def test_call_is_given_up_at_the_second_look_and_raises_when_it_returns() -> None:
@@ -373,17 +364,27 @@ def test_a_turn_that_hangs_is_told_as_a_move_that_hangs() -> None:
     table.close()
 
 
-def test_a_positioner_that_turns_nothing_is_guarded_as_one() -> None:
+def test_positioner_is_watched_like_the_other_devices() -> None:
+    seen: list[tuple[str, str, float]] = []
+    calls = Calls()
+
     class Stage:
         poses = ("home",)
 
         def move(self, index: int) -> None:
-            raise OSError(errno.ENODEV, f"no such device {index}")
+            (call,) = calls._current.values()
+            seen.append((call.device, call.step, call.limit_s))
+            if index:
+                raise OSError(errno.ENODEV, "No such device")
 
         def close(self) -> None:
             return
 
-    stage = guarded(Rig("bench", {}, TameProjector(), {}, positioner=Stage()), Calls(), {}).positioner
+    stage = guarded(Rig("bench", {}, TameProjector(), {}, positioner=Stage()), calls, {}).positioner
     assert type(stage) is GuardedPositioner
+    assert tuple(stage.poses) == ("home",)
+    stage.move(0)
     with pytest.raises(DeviceGoneError, match="the positioner is gone"):
-        stage.move(0)
+        stage.move(1)
+    stage.close()
+    assert seen[0] == ("the positioner", "move", MOVE_LIMIT_S)
