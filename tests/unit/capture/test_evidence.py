@@ -190,17 +190,22 @@ def cut(shots: list[Shot], index: int) -> Pixels:
     return image
 
 
-# The first pair and a later one, the finest bit, the first line and another.
-EACH_KIND = {2, 7, 10, FIRST_LINE, FIRST_LINE + 5}
+SPOILS: tuple[Spoil, ...] = (stale, stale_and_exposed_again, dark, garbled, cut)
+# Of the frames of a pair, of the finest bit and of lines one each by every kind of damage.
+EACH_KIND = {3: SPOILS, 10: (stale, garbled), FIRST_LINE: (stale, cut), FIRST_LINE + 5: SPOILS}
 
 
 @pytest.mark.parametrize(
-    "index",
-    [each if each in EACH_KIND else pytest.param(each, marks=pytest.mark.slow) for each in range(2, len(PATTERNS) - 2)],
-)
-@pytest.mark.parametrize(
-    "spoil", [stale, stale_and_exposed_again, dark, garbled, cut], ids=lambda spoil: spoil.__name__
-)
+    ("spoil", "index"),
+    [
+        pytest.param(
+            spoil, index, marks=[] if spoil in EACH_KIND.get(index, ()) else pytest.mark.slow,
+            id=f"{spoil.__name__} {index}",  # type: ignore[attr-defined]
+        )
+        for index in range(2, len(PATTERNS) - 2)
+        for spoil in SPOILS
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("scaler_px", [0.0, pytest.param(0.7, marks=pytest.mark.slow)])
 def test_a_frame_that_is_not_what_it_claims_is_refused(spoil: Spoil, index: int, scaler_px: float) -> None:
     scene = Scene(noise_dn=1.0, scaler_px=scaler_px)
@@ -498,7 +503,8 @@ def bright_rows(shots: list[Shot], index: int) -> Pixels:
 
 @pytest.mark.parametrize("index", [0, 1, COUNT - 2, COUNT - 1])
 @pytest.mark.parametrize("damage", [garbled, black_rows, bright_rows], ids=lambda damage: damage.__name__)
-@pytest.mark.parametrize("white", [0.6, *(pytest.param(each, marks=pytest.mark.slow) for each in (0.3, 0.9))])
+@pytest.mark.parametrize("white", [0.3, 0.6, 0.9])
+@pytest.mark.slow
 def test_damage_to_white_or_black_shows_by_the_end(index: int, damage: Spoil, white: float) -> None:
     scene = Scene(noise_dn=1.0, white=white, ambient=0.08)
     shots = scene.shots(PATTERNS)
@@ -507,6 +513,18 @@ def test_damage_to_white_or_black_shows_by_the_end(index: int, damage: Spoil, wh
     black = index in {1, COUNT - 1}
     # Black that is darker still shows nothing: it is as dark as the room in truth.
     assert (check_capture(capture).faults == ()) == (black and damage is black_rows)
+
+
+@pytest.mark.parametrize(
+    ("index", "damage", "shows"),
+    # Black that is darker still shows nothing: it is as dark as the room in truth.
+    [(0, garbled, True), (1, bright_rows, True), (1, black_rows, False), (COUNT - 2, black_rows, True)],
+)
+def test_damage_to_white_or_black_shows(index: int, damage: Spoil, shows: bool) -> None:
+    spoilt = replace(SHOTS[index], image=damage(SHOTS, index))
+    shots = (*SHOTS[:index], spoilt, *SHOTS[index + 1 :])
+    found = check_capture(Capture(PROJECTOR, PATTERNS, {"left": SCENE.format}, shots))
+    assert (found.faults != ()) is shows
 
 
 def test_an_opening_frame_that_shows_half_of_white_is_found_by_the_closing_one() -> None:

@@ -332,9 +332,14 @@ EACH_KIND: dict[str, dict[str, object]] = {
 }
 
 
-@pytest.mark.parametrize("faults", EACH_KIND.values(), ids=EACH_KIND.keys())
-def test_a_frame_that_fails_is_shot_again_and_all_frames_are_right(faults: dict[str, object]) -> None:
-    taken = Taken(faulty(**faults)).run()
+QUICK = {"stale", "too early", "garbled line frame", "garbled white", "exposed otherwise", "lost", "several"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in EACH_KIND]
+)
+def test_a_frame_that_fails_is_shot_again_and_all_frames_are_right(name: str) -> None:
+    taken = Taken(faulty(**EACH_KIND[name])).run()
     taken.assert_right()
     assert {refused.camera for refused in taken.refused} == {"right"}
     assert taken.summary is not None
