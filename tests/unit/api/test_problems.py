@@ -1,10 +1,10 @@
-"""Every refusal is a problem that says what to do."""
+"""Every path of the description: its methods, HEAD, its key; and every refusal as a problem that says what to do."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from uuid import uuid4
 
 import pytest
 from fastapi.testclient import TestClient
@@ -18,9 +18,16 @@ from slrig.api.server import _keys
 from slrig.config import ServiceSettings
 from slrig.errors import ConfigError
 from slrig.failure import errors_by_code
-from tests.unit.api.conftest import KEY, ServedBench
+from tests.unit.api.conftest import KEY, ServedBench, ended
 
 OPENAPI = Path(__file__).resolve().parents[3] / "config" / "openapi.json"
+PATHS = json.loads(OPENAPI.read_text(encoding="utf-8"))["paths"]
+STREAMS = ("/events", "/preview/{camera}")
+
+
+def filled(path: str) -> str:
+    """A path of the description with something in its braces."""
+    return "/".join(str(uuid4()) if part.startswith("{") else part for part in path.split("/")).replace("{camera}", "a")
 
 
 def test_table_of_statuses_is_the_whole_error_tree() -> None:
@@ -47,91 +54,13 @@ def test_openapi_document_in_config_is_up_to_date() -> None:
 
 
 def test_every_refusal_is_documented_as_a_problem() -> None:
-    document = json.loads(OPENAPI.read_text(encoding="utf-8"))
-    for path, operations in document["paths"].items():
+    for path, operations in PATHS.items():
         for method, operation in operations.items():
             for status, found in operation["responses"].items():
                 if int(status) >= 400:
                     assert list(found["content"]) == ["application/problem+json"], (path, method, status)
             if path not in {"/livez", "/readyz"}:
                 assert "401" in operation["responses"], (path, method)
-
-
-@pytest.mark.parametrize(
-    ("request_body", "fields"),
-    [
-        ({"exposure_s": -1}, ["exposure_s"]),
-        ({"exposure_s": 1e9}, ["exposure_s"]),
-        ({"exposure_s": "0.1"}, ["exposure_s"]),
-        ({"patterns": {"line_shift_period_px": 3}}, ["patterns.line_shift_period_px"]),
-        ({"patterns": {"line_shift_period_px": 8.5}}, ["patterns.line_shift_period_px"]),
-        ({"patterns": {"rows": 1}}, ["patterns.rows"]),
-        ({"patterns": {"gray_cells": 4}}, ["patterns.gray_cells"]),
-        ({"reconstruction": {"max_code_gap": 0}}, ["reconstruction.max_code_gap"]),
-        ({"reconstruction": {"keep_holes": "yes"}}, ["reconstruction.keep_holes"]),
-        ({"reconstruction": {"flip_rule": "dyer"}}, ["reconstruction.flip_rule"]),
-        ({"reconstruction": {"smooth_boundary": 1}}, ["reconstruction.smooth_boundary"]),
-        ({"if_busy": "wait"}, ["if_busy"]),
-        ({"label": ""}, ["label"]),
-        ({"label": "x" * 201}, ["label"]),
-        ({"label": "a\x1b[2J"}, ["label"]),
-        ({"exposure_s": 0, "if_busy": 1, "paint": "red"}, ["exposure_s", "if_busy", "paint"]),
-        ({"colour": "red"}, ["colour"]),
-        ([], ["body"]),
-    ],
-)
-def test_absurd_request_is_refused_with_every_fault_named(
-    client: TestClient, request_body: Any, fields: list[str]
-) -> None:
-    response = client.post("/scan", json=request_body)
-    assert response.status_code == 422
-    assert response.headers["content-type"] == "application/problem+json"
-    problem = response.json()
-    assert problem["type"] == "/problems/invalid-request"
-    assert [fault["field"] for fault in problem["errors"]] == fields
-    assert all(fault["message"] for fault in problem["errors"])
-    assert client.get("/scan").json()["scans"] == []
-
-
-def test_numbers_beyond_json_are_refused(client: TestClient) -> None:
-    headers = {"Content-Type": "application/json"}
-    for number in ("NaN", "Infinity", "1e999"):
-        response = client.post("/scan", content=f'{{"exposure_s": {number}}}', headers=headers)
-        assert response.status_code == 422, number
-        assert response.json()["errors"][0]["field"] == "exposure_s"
-
-
-@pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""])
-@pytest.mark.parametrize("content", ['{"label": "a"}', "", iter([b"{}"])])
-def test_body_that_is_not_called_json_is_refused(client: TestClient, content: Any, kind: str) -> None:
-    if not kind and content == "":
-        pytest.skip("nothing is sent: no page can send that, either, without its Origin")
-    response = client.post("/scan", content=content, headers={"Content-Type": kind} if kind else {})
-    assert (response.status_code, response.headers["content-type"]) == (415, "application/problem+json")
-    assert "expected application/json, found" in response.json()["detail"]
-
-
-def test_broken_json_is_told_where_it_breaks(client: TestClient) -> None:
-    response = client.post("/scan", content='{"label": }', headers={"Content-Type": "application/json"})
-    assert response.json()["errors"] == [{"field": "body", "message": "is no JSON: Expecting value at character 10"}]
-    assert "1 fault: body" in response.json()["detail"]
-
-
-@pytest.mark.parametrize(
-    ("content", "field", "found"),
-    [(r'{"label": "\ud800"}', "label", r"\ud800"), (r'{"\udfff": "a"}', "body", r"\udfff")],
-)
-def test_half_a_surrogate_pair_is_refused_in_print(client: TestClient, content: str, field: str, found: str) -> None:
-    response = client.post("/scan", content=content, headers={"Content-Type": "application/json"})
-    assert (response.status_code, response.headers["content-type"]) == (422, "application/problem+json")
-    (fault,) = response.json()["errors"]
-    assert (fault["field"], fault["found"]) == (field, found)
-
-
-def test_pattern_that_the_projector_cannot_show_is_refused(client: TestClient) -> None:
-    client.get(f"{client.post('/scan').json()['links']['events']}")
-    response = client.post("/scan", json={"patterns": {"gray_cell_px": 64}})
-    assert (response.status_code, response.json()["type"]) == (422, "/problems/pattern")
 
 
 @pytest.mark.parametrize(
@@ -190,12 +119,41 @@ def test_key_is_needed_for_all_but_the_probes(client: TestClient, served: Served
     ):
         assert stranger.get("/scan", headers=headers).status_code == 401, headers
     assert stranger.get("/scan", headers={"X-API-Key": KEY}).status_code == 200
-    assert client.get("/scan").status_code == 200
+    # No page of another site may read an answer.
+    assert "access-control-allow-origin" not in client.get("/scan", headers={"Origin": "https://evil.example"}).headers
 
 
-def test_no_foreign_page_may_read_the_answers(client: TestClient) -> None:
-    response = client.get("/scan", headers={"Origin": "https://evil.example"})
-    assert "access-control-allow-origin" not in response.headers
+def test_path_names_all_its_methods_where_another_is_refused(client: TestClient) -> None:
+    for path, operations in PATHS.items():
+        methods = {method.upper() for method in operations}
+        if "GET" in methods and not path.endswith(STREAMS):
+            methods.add("HEAD")
+        for method in {"PATCH", "OPTIONS", "PUT", "GET", "HEAD", "DELETE", "POST"} - methods:
+            refused = client.request(method, filled(path))
+            assert refused.status_code == 405, (method, path)
+            assert refused.headers["Allow"] == ", ".join(sorted(methods))
+            if method != "HEAD":
+                assert refused.headers["content-type"] == "application/problem+json"
+                assert refused.headers["Allow"] in refused.json()["detail"]
+    for method in ("GET", "HEAD", "PATCH"):
+        answer = client.request(method, "/nothing")
+        assert (answer.status_code, answer.headers.get("Allow")) == (404, None)
+
+
+def test_head_answers_as_get_without_the_body(client: TestClient, served: ServedBench) -> None:
+    scan = client.post("/scan").json()["id"]
+    done = ended(client, scan)
+    paths = [*done["links"]["files"].values(), "/livez", "/readyz", "/rig", "/scan", f"/scan/{scan}", "/openapi.json"]
+    paths += [f"/scan/{uuid4()}", "/scan/none", "/scan?limit=0", "/problems/storage", "/calibration", "/schedule"]
+    for path in paths:
+        whole, head = client.get(path), client.head(path)
+        assert head.content == b""
+        assert head.status_code == whole.status_code, path
+        assert dict(head.headers) == dict(whole.headers), path
+    tag = client.head(f"/scan/{scan}/mesh.ply").headers["ETag"]
+    assert client.head(f"/scan/{scan}/mesh.ply", headers={"If-None-Match": tag}).status_code == 304
+    assert client.head("/scan", headers={"Authorization": "Bearer none"}).status_code == 401
+    assert served.app.state.streams.count == 0
 
 
 def test_every_kind_of_problem_is_explained(client: TestClient) -> None:

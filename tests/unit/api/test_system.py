@@ -1,0 +1,177 @@
+"""What a service says of itself: the rig, its devices, its probes, its metrics; and a data folder that is gone."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from prometheus_client.parser import text_string_to_metric_families
+from starlette.types import Message, Receive, Scope, Send
+
+from slrig.api import latency
+from slrig.api.latency import Durations, Latency
+from slrig.devices import AppliedSettings, CameraSettings
+from slrig.jobs.examinations import keep
+from slrig.jobs.worker import Worker
+from slrig.rig.settings import SettingsInUse
+from tests.unit.api.conftest import ServedBench, client_of, ended
+from tests.unit.api.test_problems import PATHS, filled
+
+ANSWERS, JOBS, STAGES = (
+    "slrig_http_response_start_seconds",
+    "slrig_job_duration_seconds",
+    "slrig_job_stage_duration_seconds",
+)
+
+
+def test_rig_says_what_it_is_and_how_its_cameras_are_set(client: TestClient, served: ServedBench) -> None:
+    ended(client, client.post("/scan").json()["id"])
+    rig = client.get("/rig").json()
+    assert (rig["name"], rig["open"], rig["error"], rig["holder"]) == ("bench", True, None, None)
+    assert rig["projector"]["size_px"] == [64, 40]
+    assert rig["scan_defaults"] == {"line_shift_period_px": 6, "exposure_s": 0.5}
+    (camera,) = rig["cameras"]
+    assert (camera["size_px"], camera["exposure_s"], camera["gain"], camera["notes"]) == ([64, 48], None, None, [])
+    settings = served.service.runner.queue.rig.settings
+    settings[camera["name"]] = SettingsInUse(CameraSettings(0.02), AppliedSettings(0.01, 1.0))
+    (camera,) = client.get("/rig").json()["cameras"]
+    settings.clear()
+    assert (camera["exposure_s"], camera["gain"]) == (0.01, 1.0)
+    assert "asked for an exposure of 20 ms, and uses 10 ms" in camera["notes"][0]
+
+
+def test_drivers_and_devices_are_listed(client: TestClient) -> None:
+    found = client.get("/device").json()
+    assert ("head", "simulated", None) in [(each["kind"], each["name"], each["fault"]) for each in found["drivers"]]
+
+
+def test_last_examinations_of_the_rig_are_shown_with_what_to_run(client: TestClient, served: ServedBench) -> None:
+    root = served.service.folder.root
+    found = client.get("/rig/examinations").json()
+    assert (found["doctor"], found["conform"]) == (None, None)
+    assert found["commands"]["doctor"] == f"slrig doctor RIG.toml --data {root}"
+    for rig in ("bench", "another"):
+        keep(root, "doctor" if rig == "bench" else "conform", {"rig": rig, "findings": []})
+    found = client.get("/rig/examinations").json()
+    assert found["doctor"]["found"] == {"rig": "bench", "findings": []}
+    assert found["conform"] is None
+
+
+def test_probes_say_what_is_missing(client: TestClient, served: ServedBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended(client, client.post("/scan").json()["id"])
+    assert client.get("/livez").json()["checks"] == {"process": "ok"}
+    assert client.get("/readyz").json() == {
+        "checks": {"records": "ok", "disk": "ok", "rig": "ok", "reconstruction": "ok"},
+        "pending": [],
+    }
+    served.free_bytes = 10
+    refused, ready = client.post("/scan"), client.get("/readyz")
+    served.free_bytes = 10**12
+    assert (refused.status_code, refused.json()["type"]) == (507, "/problems/storage")
+    assert (ready.status_code, ready.json()["type"]) == (503, "/problems/not-ready")
+    assert ready.json()["checks"]["rig"] == "ok"
+    assert "are free" in ready.json()["checks"]["disk"]
+    for condition, pending in (
+        ("loading", ["reconstruction"]),
+        ("preparing kernels, first time only: 41 of 118", ["reconstruction"]),
+        ("the reconstruction cannot be loaded: its process ended", []),
+    ):
+        monkeypatch.setattr(Worker, "condition", condition)
+        monkeypatch.setattr(Worker, "loading", bool(pending))
+        ready = client.get("/readyz")
+        assert (ready.status_code, ready.json()["checks"]["reconstruction"]) == (503, condition)
+        assert ready.json()["pending"] == pending
+        assert f"reconstruction: {condition}" in ready.json()["detail"]
+
+
+def test_service_whose_data_folder_is_gone_says_so(tmp_path: Path) -> None:
+    # It is not started: nothing but requests uses its folder.
+    idle = ServedBench(tmp_path / "data")
+    client = client_of(idle)
+    root = idle.service.folder.root
+    away = root.with_name("away")
+    root.rename(away)
+    without = {"/livez", "/device", "/problems/{name}", "/calibration/board.pdf"}
+    for path, operations in PATHS.items():
+        for method in operations:
+            if path in without or path.startswith("/session"):
+                continue
+            answer = client.request(method, filled(path))
+            assert answer.status_code in ({422, 503} if method in {"post", "get"} else {503}), (method, path)
+            if path == "/readyz":
+                assert "is gone, or empty" in answer.json()["checks"]["disk"]
+            elif answer.status_code == 503:
+                assert answer.json()["type"] == "/problems/data-folder-gone"
+    assert client.get("/livez").status_code == 200
+    away.rename(root)
+    assert client.get("/scan").status_code == 200
+    idle.service.close()
+
+
+def counted(text: str, name: str) -> dict[tuple[str, ...], float]:
+    """The number of observations of a histogram by its labels."""
+    (family,) = [each for each in text_string_to_metric_families(text) if each.name == name]
+    assert family.type == "histogram"
+    return {tuple(sample.labels.values()): sample.value for sample in family.samples if sample.name == f"{name}_count"}
+
+
+def test_answers_and_jobs_are_counted_by_names_that_no_client_can_choose(client: TestClient) -> None:
+    before = client.get("/metrics").text
+    scan = client.post("/scan").json()["id"]
+    ended(client, scan)
+    client.head(f"/scan/{scan}/mesh.ply")
+    client.get("/scan/none")
+    client.get(f"/nothing/{scan}")
+    client.request(scan[:8].upper(), "/scan")
+    assert client.get("/metrics", headers={"Authorization": "Bearer another key"}).status_code == 401
+    after = client.get("/metrics").text
+    assert scan not in after
+    known = counted(before, ANSWERS)
+    more = {labels: count - known.get(labels, 0) for labels, count in counted(after, ANSWERS).items()}
+    assert {labels: count for labels, count in more.items() if count} == {
+        ("GET", "/metrics", "2xx"): 1,
+        ("POST", "/scan", "2xx"): 1,
+        ("GET", "/scan/{scan_id}/events", "2xx"): 1,
+        ("GET", "/scan/{scan_id}", "2xx"): 1,
+        ("HEAD", "/scan/{scan_id}/mesh.ply", "2xx"): 1,
+        ("GET", "/scan/{scan_id}", "4xx"): 1,
+        ("GET", "other", "4xx"): 2,
+        ("other", "other", "4xx"): 1,
+    }
+    ended_before = counted(before, JOBS).get(("scan", "succeeded"), 0)
+    assert counted(after, JOBS)["scan", "succeeded"] == ended_before + 1
+    stages = counted(after, STAGES)
+    assert {stage for kind, stage in stages if kind == "scan"} >= {"queued", "capturing", "computing"}
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_answer_is_measured_until_it_begins(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    durations, now_s = Durations(), 100.0
+    monkeypatch.setattr(latency, "time", type("Clock", (), {"perf_counter": staticmethod(lambda: now_s)}))
+
+    async def app(_scope: Scope, _receive: Receive, send: Send) -> None:
+        nonlocal now_s
+        now_s += 0.25
+        if fails:
+            message = "no"
+            raise ValueError(message)
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        now_s += 60
+        await send({"type": "http.response.body", "body": b""})
+
+    async def nothing(*_: Any) -> Message:
+        return {}
+
+    scope = {"type": "http", "method": "GET", "path": "/x", "route": None}
+    served: Any = Latency(app, durations=durations)(scope, nothing, nothing)  # type: ignore[arg-type] # nobody reads it
+    if fails:
+        with pytest.raises(ValueError, match="no"):
+            asyncio.run(served)
+    else:
+        asyncio.run(served)
+    labels = {"method": "GET", "path": "other", "status": "5xx" if fails else "2xx"}
+    assert durations.registry.get_sample_value(f"{ANSWERS}_count", labels) == 1
+    assert durations.registry.get_sample_value(f"{ANSWERS}_sum", labels) == pytest.approx(0.25)
