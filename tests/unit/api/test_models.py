@@ -1,4 +1,4 @@
-"""/model: asked for, followed, fetched, deleted; and every refusal in words."""
+"""/model over HTTP: made of scans or of views that are shot for it, followed, fetched, deleted, and refused."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from fastapi.testclient import TestClient
 from slrig.combine.offered import MEDIA_TYPES
 from slrig.combine.plan import GivenPoses, MarkerPoses, StatedAxis, TurntablePoses, UnknownPoses
 from slrig.errors import RegistrationRefusedError
-from tests.unit.api.conftest import ServedBench
-from tests.unit.combine.model_bench import kept_scan
+from tests.unit.api.conftest import ServedBench, ended
+from tests.unit.combine.model_bench import kept_scan, until_told
+from tests.unit.scan.fakes import WAIT_S
 
 AXIS = {"point_mm": [4.0, 45.0, 12.0], "direction": [0.0, -1.0, 0.0]}
 STILL = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+MIRROR = [[-1.0, 0.0, 0.0, 0.0], *STILL[1:]]
+BY_HAND = {"by_hand": True, "axis": AXIS, "views": 3, "label": "cup", "if_busy": "queue"}
 
 
 @pytest.fixture
@@ -31,9 +34,7 @@ def over(client: TestClient, model: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def test_a_model_is_asked_for_once_followed_and_fetched(
-    client: TestClient, served: ServedBench, scans: list[str]
-) -> None:
+def test_model_is_made_once_followed_and_fetched(client: TestClient, served: ServedBench, scans: list[str]) -> None:
     request = {"scans": scans, "axis": AXIS, "voxel_mm": 0.4, "label": "cup"}
     key = {"Idempotency-Key": str(uuid4())}
     answer = client.post("/model", json=request, headers=key)
@@ -55,18 +56,19 @@ def test_a_model_is_asked_for_once_followed_and_fetched(
         assert found.content == (served.service.models.store.place(UUID(model["id"])) / name).read_bytes()
         assert found.headers["content-type"].startswith(MEDIA_TYPES[name])
         assert client.get(path, headers={"If-None-Match": found.headers["ETag"]}).status_code == 304
-    second = over(client, client.post("/model", json={"scans": scans, "poses": [STILL, STILL]}).json())
-    asked = served.combining.asked
-    assert isinstance(asked[-1][1], GivenPoses)
-    found = client.post("/model", json={"scans": scans, "poses": "unknown"}).json()
-    assert over(client, found)["plan"]["poses"] == {"kind": "unknown"}
-    assert isinstance(asked[2][1], UnknownPoses)
     for scan in scans:
         (served.service.folder.scan(UUID(scan)) / "bundle").mkdir()
-    request = {"scans": scans, "poses": "markers", "dictionary": "DICT_4X4_50"}
-    marked = over(client, client.post("/model", json=request).json())
+    others = []
+    for poses, kind in (
+        ({"poses": [STILL, STILL]}, GivenPoses),
+        ({"poses": "unknown"}, UnknownPoses),
+        ({"poses": "markers", "dictionary": "DICT_4X4_50"}, MarkerPoses),
+    ):
+        others.append(over(client, client.post("/model", json={"scans": scans, **poses}).json()))
+        assert isinstance(served.combining.asked[-1][1], kind)
+    second, found, marked = others
+    assert found["plan"]["poses"] == {"kind": "unknown"}
     assert marked["plan"]["poses"] == {"kind": "markers", "dictionary": "DICT_4X4_50"}
-    assert asked[3][1] == MarkerPoses("DICT_4X4_50")
     assert client.delete(marked["links"]["self"]).status_code == 204
     assert client.delete(found["links"]["self"]).status_code == 204
     page = client.get("/model", params={"limit": 1}).json()
@@ -77,9 +79,7 @@ def test_a_model_is_asked_for_once_followed_and_fetched(
     assert client.delete(f"/scan/{scans[0]}").status_code == 204
 
 
-def test_scans_stay_while_a_model_needs_them_and_it_can_be_cancelled(
-    client: TestClient, served: ServedBench, scans: list[str]
-) -> None:
+def test_scans_stay_while_a_model_needs_them(client: TestClient, served: ServedBench, scans: list[str]) -> None:
     served.combining.gate.clear()
     model = client.post("/model", json={"scans": scans, "axis": AXIS}).json()
     for method, path, words in (
@@ -100,22 +100,94 @@ def test_scans_stay_while_a_model_needs_them_and_it_can_be_cancelled(
     assert "will never be made (one overlaps no other). Make it again." in never.json()["detail"]
 
 
-def test_what_cannot_be_made_is_refused_and_not_on_record(client: TestClient, scans: list[str]) -> None:
-    known = {each["id"] for each in client.get("/model").json()["models"]}
-    mirror = [[-1.0, 0.0, 0.0, 0.0], *STILL[1:]]
-    for status, words, request in (
-        (422, "scans", {"scans": scans[:1]}),
-        (422, "twice", {"scans": [*scans, scans[0]], "axis": AXIS}),
-        (404, "No scan", {"scans": [scans[0], str(uuid4())], "axis": AXIS}),
-        (422, "axis: expected that of the stage", {"scans": scans}),
-        (422, "one for each of 2", {"scans": scans, "axis": AXIS, "angles_deg": [1.0]}),
-        (422, "expected a rotation", {"scans": scans, "poses": [STILL, mirror]}),
-        (422, "leave one of them out", {"scans": scans, "poses": [STILL, STILL], "axis": AXIS}),
-        (422, "leave one of them out", {"scans": scans, "poses": "unknown", "angles_deg": [0.0, 1.0]}),
-        (422, "poses", {"scans": scans, "poses": "somewhere"}),
-        (422, "expected the frames of each scan", {"scans": scans, "poses": "markers"}),
-        (422, "dictionary", {"scans": scans, "poses": "unknown", "dictionary": "DICT_4X4_50"}),
-    ):
-        refused = client.post("/model", json=request)
-        assert (refused.status_code, words in refused.text) == (status, True), (request, refused.text)
-    assert {each["id"] for each in client.get("/model").json()["models"]} == known
+def views(client: TestClient, model: dict[str, Any]) -> list[dict[str, Any]]:
+    """The scans of a model, all of them over."""
+    scans = client.get(f"/scan/series/{model['id']}").json()["scans"]
+    return [ended(client, each["id"]) for each in scans]
+
+
+def test_model_is_shot_while_a_person_turns_the_object(client: TestClient, served: ServedBench) -> None:
+    request = {**BY_HAND, "scan": {"preset": "shiny", "reconstruction": {"region": {"depth_mm": [1, 900]}}}}
+    key = {"Idempotency-Key": str(uuid4())}
+    answer = client.post("/model/shoot", json=request, headers=key)
+    assert answer.status_code == 202, answer.text
+    model = answer.json()
+    assert answer.headers["Location"] == f"/model/{model['id']}"
+    assert client.post("/model/shoot", json=request, headers=key).json()["id"] == model["id"]
+    (first,) = views(client, model)
+    place = first["plan"]["series"]
+    assert (place["number"], place["count"], first["label"], first["plan"]["preset"]["name"]) == (1, 3, "cup", "shiny")
+    assert (first["plan"]["turn_deg"], first["plan"]["turned_by"]) == (0.0, "hand")
+    assert first["plan"]["reconstruction"]["region"]["depth_mm"] == [1, 900]
+    until_told(served.service.models.jobs, UUID(model["id"]), "turn the object")
+    here = client.get(f"/model/{model['id']}").json()
+    assert (here["state"], here["progress"]["stage"]) == ("capturing", "turn")
+    assert here["progress"]["detail"] == "turn the object by 120° for view 2 of 3"
+    assert here["plan"]["shoot"]["views"] == 3
+    early = client.post(f"/model/{model['id']}/combine")
+    assert (early.status_code, "it takes two" in early.json()["detail"]) == (409, True)
+    for _ in range(2):
+        # Sent twice, it is shot once.
+        assert client.post(f"/model/{model['id']}/view", headers=key).status_code == 202
+    assert [each["plan"]["turn_deg"] for each in views(client, model)] == [0.0, 120.0]
+    assert client.post(f"/model/{model['id']}/view", json={"again": True}).status_code == 202
+    assert [each["plan"]["turn_deg"] for each in views(client, model)] == [0.0, 120.0, 120.0]
+    assert client.post(f"/model/{model['id']}/combine").status_code == 202
+    client.get(model["links"]["events"])
+    done = client.get(f"/model/{model['id']}").json()
+    assert done["state"] == "succeeded", done["error"]
+    assert done["summary"]["notes"] == ["view 3 of 3, at 240°, is not in it: it was not shot"]
+    assert len(served.combining.asked[-1][0]) == 2
+    late = client.post(f"/model/{model['id']}/view")
+    assert (late.status_code, "is succeeded" in late.json()["detail"]) == (409, True)
+
+
+def test_cancelled_model_ends_its_views(client: TestClient, served: ServedBench) -> None:
+    served.began.clear()
+    served.gate.clear()
+    model = client.post("/model/shoot", json=BY_HAND).json()
+    assert served.began.wait(WAIT_S)
+    busy = client.post("/model/shoot", json={**BY_HAND, "if_busy": "reject"})
+    assert (busy.status_code, busy.json()["type"]) == (409, "/problems/rig-busy")
+    shooting = client.post(f"/model/{model['id']}/view")
+    assert "View 1 of model" in shooting.json()["detail"]
+    assert client.post(model["links"]["cancel"]).json()["state"] == "cancelled"
+    assert [each["state"] for each in views(client, model)] == ["cancelled"]
+
+
+@pytest.mark.parametrize(
+    ("status", "words", "request_body"),
+    [
+        (422, "twice", {"scans": [0, 1, 0], "axis": AXIS}),
+        (404, "No scan", {"scans": [0, str(uuid4())], "axis": AXIS}),
+        (422, "scans", {"scans": [0]}),
+        (422, "axis: expected that of the stage", {"scans": [0, 1]}),
+        (422, "one for each of 2", {"scans": [0, 1], "axis": AXIS, "angles_deg": [1.0]}),
+        (422, "expected a rotation", {"scans": [0, 1], "poses": [STILL, MIRROR]}),
+        (422, "leave one of them out", {"scans": [0, 1], "poses": [STILL, STILL], "axis": AXIS}),
+        (422, "leave one of them out", {"scans": [0, 1], "poses": "unknown", "angles_deg": [0.0, 1.0]}),
+        (422, "poses", {"scans": [0, 1], "poses": "somewhere"}),
+        (422, "expected the frames of each scan", {"scans": [0, 1], "poses": "markers"}),
+        (422, "dictionary", {"scans": [0, 1], "poses": "unknown", "dictionary": "DICT_4X4_50"}),
+        (422, "has no turntable. Turn it by hand", {"axis": AXIS}),
+        (422, "axis: expected that of the stage", {"by_hand": True}),
+        (422, "views", {**BY_HAND, "views": 1}),
+        (422, "views", {**BY_HAND, "views": 73}),
+        (422, "one for each of 3 scans", {"by_hand": True, "views": 3, "poses": [STILL, STILL]}),
+        (422, "leave one of them out", {"by_hand": True, "views": 2, "poses": [STILL, STILL], "axis": AXIS}),
+        (422, "repeat", {**BY_HAND, "scan": {"repeat": 2}}),
+        (422, "turn_deg", {**BY_HAND, "scan": {"turn_deg": 2}}),
+        (422, "one of", {**BY_HAND, "scan": {"exposure_s": 0.1, "exposures_s": [0.1, 0.2]}}),
+        (404, "none", {**BY_HAND, "scan": {"preset": "none"}}),
+    ],
+)
+def test_bad_request_for_a_model_is_refused_and_not_on_record(
+    client: TestClient, scans: list[str], status: int, words: str, request_body: dict[str, Any]
+) -> None:
+    """`scans` of a request: numbers stand for scans on record. Without them its views are shot."""
+    known = client.get("/model").json()["models"], len(client.get("/scan").json()["scans"])
+    given = [scans[each] if isinstance(each, int) else each for each in request_body.get("scans", ())]
+    path, body = ("/model", {**request_body, "scans": given}) if given else ("/model/shoot", request_body)
+    refused = client.post(path, json=body)
+    assert (refused.status_code, words in refused.text) == (status, True), refused.text
+    assert (client.get("/model").json()["models"], len(client.get("/scan").json()["scans"])) == known
