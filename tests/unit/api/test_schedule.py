@@ -14,15 +14,15 @@ from uuid import UUID
 import httpx2
 import pytest
 from fastapi.testclient import TestClient
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from slrig.bundle.calibration_file import write_calibration
-from slrig.cli.commands import app
 from slrig.cli.options import Service
 from slrig.client import Client
 from slrig.schedule.records import RunState
+from tests.unit import command
 from tests.unit.api.conftest import KEY, ServedBench
-from tests.unit.calibrate_command import refused
+from tests.unit.command import refused, slrig
 from tests.unit.scan.fakes import WAIT_S
 
 BOARD = {"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}
@@ -76,13 +76,11 @@ def opened(client: TestClient) -> None:
 
 
 def run(*arguments: str) -> Result:
-    return CliRunner().invoke(app, ["schedule", *arguments])
+    return slrig("schedule", *arguments)
 
 
 def done(*arguments: str) -> str:
-    result = run(*arguments)
-    assert result.exit_code == 0, result.output
-    return result.stdout
+    return command.done("schedule", *arguments)
 
 
 def test_schedule_is_added_and_listed_with_its_next_five_times(client: TestClient) -> None:
