@@ -1,7 +1,8 @@
-"""The command line: its exit codes, what it says, and how its client bears a bad connection."""
+"""The command line as a whole: help, exit codes, `slrig scan`, `slrig demo`, and what is shown on a terminal."""
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import os
@@ -9,15 +10,18 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import httpx2
+import numpy as np
 import pytest
-from typer.testing import CliRunner
+import typer
 
 from slrig.api.schemas import ScanRequest
+from slrig.bundle.region_file import read_region
 from slrig.cli.commands import INTERRUPTED, app
 from slrig.cli.demo import remove_earlier, still_missing
 from slrig.cli.display import ProgressDisplay, print_json, print_table
@@ -26,79 +30,131 @@ from slrig.cli.quality import quality_lines
 from slrig.cli.scan import scan_with, series_with, tell_result
 from slrig.client import Client, ScanJob
 from slrig.errors import ScanCancelledError, ServiceError, SlrigError
+from slrig.model import Region
 from slrig.scan.offered import MEDIA_TYPES
+from slrig.scan.records import report_summary
+from tests.unit.capture.fake_rig import fake_rig
+from tests.unit.client.service import SCAN, Handler, Walk
+from tests.unit.command import done, refused, slrig
 
-SCAN = {
-    "id": "5f",
-    "state": "succeeded",
-    "summary": {
-        "mesh": {"figures": {"vertices": 1200, "triangles": 2301}, "sigma_mm": {"p50": 0.0079}},
-        "truth": {"rms_mm": 0.0123, "complete_0.3mm": 0.97},
-    },
-    "error": None,
-    "links": {
-        "self": "/scan/5f",
-        "events": "/scan/5f/events",
-        "cancel": "/scan/5f/cancel",
-        "files": {"mesh.ply": "/scan/5f/mesh.ply"},
-    },
+COLUMNS = 80
+DEMO = Path(__file__).parents[2] / "config" / "rigs" / "demo.toml"
+SUMMARY = {
+    "identity": "28/28 patterns verified, 2 frames shot again",
+    "mesh": {"figures": {"vertices": 1200, "triangles": 2301}, "sigma_mm": {"p50": 0.0079}},
+    "truth": {"rms_mm": 0.0123, "complete_0.3mm": 0.97},
 }
-Handler = Callable[[httpx2.Request], httpx2.Response]
+SERIES = "/scan/series/9"
 
 
-def client_of(handler: Handler, pauses: list[float] | None = None) -> Client:
-    pause = (lambda _s: None) if pauses is None else pauses.append
-    return Client("http://127.0.0.1:1", "key", pause=pause, transport=httpx2.MockTransport(handler))
+def client_of(handler: Handler) -> Client:
+    return Client("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(handler))
 
 
-def stream(*events: dict[str, Any]) -> bytes:
-    """Server-sent events as they travel."""
-    blocks = []
-    for event in events:
-        data = {name: value for name, value in event.items() if name not in {"id", "kind"}}
-        blocks.append(f"id: {event['id']}\nevent: {event['kind']}\ndata: {json.dumps(data)}\n\n")
-    return "".join(blocks).encode()
-
-
-def event_answer(content: bytes | Iterator[bytes]) -> httpx2.Response:
-    return httpx2.Response(200, headers={"Content-Type": "text/event-stream"}, content=content)
+def printed(code: str, **env: str) -> str:
+    """The last line that a process of its own prints."""
+    found = subprocess.run(  # noqa: S603 - our own interpreter
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, **env}
+    )
+    return found.stdout.strip().splitlines()[-1]
 
 
 def ignore(_stage: str, _fraction: float, _detail: str) -> None:
     return
 
 
-def test_help_loads_nothing_heavy() -> None:
+def commands() -> list[tuple[str, ...]]:
+    """Every command and group of commands, as it is typed."""
+    found: list[tuple[str, ...]] = [()]
+
+    def walk(group: object, words: tuple[str, ...]) -> None:
+        for name, command in getattr(group, "commands", {}).items():
+            found.append((*words, name))
+            walk(command, (*words, name))
+
+    walk(typer.main.get_command(app), ())
+    return found
+
+
+def test_help_of_each_command_fits_a_terminal_of_80_columns() -> None:
+    for words in commands():
+        lines = done(*words, "--help", COLUMNS=str(COLUMNS)).splitlines()
+        assert max(map(len, lines)) <= COLUMNS, words
+        # Nothing is cut, neither an option's name nor the sentence beside a command's.
+        assert [line for line in lines if ("..." in line or "…" in line) and not line.startswith("Usage:")] == [], words
+        # And no text stands in a strip of a few words.
+        indents = [len(line) - len(line.lstrip()) for line in lines if line.startswith("   ")]
+        assert max(indents, default=0) <= COLUMNS // 2, words
+
+
+def test_help_and_version_load_nothing_heavy() -> None:
+    assert done("--version") == f"slrig {version('slrig')}\n"
+    heavy = {"numba", "numpy", "cv2", "fastapi", "sqlalchemy", "scipy", "trimesh", "pydantic", "httpx2", "rich"}
     code = (
-        "import sys, slrig.cli\n"
-        "heavy = {'numba', 'numpy', 'cv2', 'fastapi', 'sqlalchemy', 'scipy', 'trimesh', 'pydantic', 'httpx2', 'rich'}\n"
-        "print(sorted(heavy & set(sys.modules)))"
+        "import sys, slrig.cli, slrig.cli.calibrate\nsys.argv = ['slrig', '--version']\n"
+        f"try: slrig.cli.main()\nexcept SystemExit: print(sorted({heavy} & set(sys.modules)))"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
-    assert found.stdout.strip() == "[]"
+    assert printed(code) == "[]"
+
+
+@pytest.mark.parametrize(
+    ("typed", "completed"),
+    [
+        ("slrig sc", {"scan", "schedule"}),
+        pytest.param("slrig calibrate so", {"solve"}, marks=pytest.mark.slow),
+        pytest.param("slrig scan --exp", {"--exposure-s"}, marks=pytest.mark.slow),
+    ],
+)
+def test_a_shell_completes_commands_and_options(typed: str, completed: set[str]) -> None:
+    words = {"_SLRIG_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+    found = subprocess.run(
+        [sys.executable, "-m", "slrig.cli"], capture_output=True, text=True, check=False, env={**os.environ, **words}
+    )
+    assert set(found.stdout.split()) == completed
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in Linux's /proc")
+@pytest.mark.parametrize(("asked", "kept"), [("", "1"), pytest.param("2", "2", marks=pytest.mark.slow)])
+def test_command_has_no_threads_that_spin_beside_it(asked: str, kept: str) -> None:
+    # numpy and scipy bring an OpenBLAS each, with a thread per core beside the first, all started when it is loaded.
+    code = (
+        f"import os, sys; sys.argv = ['slrig', '--version']; os.environ.pop('OPENBLAS_NUM_THREADS', None)\n"
+        f"os.environ |= {{'OPENBLAS_NUM_THREADS': '{asked}'}} if '{asked}' else {{}}\n"
+        "from slrig.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "import numpy, scipy.linalg\n"
+        "print(os.environ['OPENBLAS_NUM_THREADS'], len(os.listdir('/proc/self/task')))"
+    )
+    setting, threads = printed(code).split()
+    assert setting == kept
+    assert threads == "1" or asked
 
 
 def test_error_of_ours_is_one_screen_and_exit_code_2(tmp_path: Path) -> None:
-    for arguments in (
-        ["serve", str(tmp_path / "absent.toml")],
-        ["reconstruct", str(tmp_path / "absent"), "--output", str(tmp_path / "out")],
-        ["scan", "--url", "http://127.0.0.1:9", "--output", str(tmp_path / "out")],
-        ["scan", "--url", "http://127.0.0.1:9", "--key-file", str(tmp_path / "absent.key")],
-        ["demo", str(tmp_path / "absent.toml"), "--output", str(tmp_path / "out")],
-        ["conform", str(tmp_path / "absent.toml")],
+    absent, out = tmp_path / "absent.toml", ("--output", tmp_path / "out")
+    nowhere = ("scan", "--url", "http://127.0.0.1:9", *out)
+    for words in (
+        ("serve", absent),
+        ("reconstruct", tmp_path / "absent", *out),
+        nowhere,
+        (*nowhere, "--key-file", tmp_path / "absent.key"),
+        ("demo", absent, *out),
+        ("conform", absent),
     ):
-        result = CliRunner().invoke(app, arguments)
-        assert result.exit_code == 2, arguments
-        assert result.stderr.count("error: ") == 1, arguments
-        assert "Traceback" not in result.stderr, arguments
-        assert len(result.stderr.splitlines()) < 20, arguments
         # Nothing is compiled for a mistake.
-        assert "preparing" not in result.stderr, arguments
+        assert "preparing" not in refused(slrig(*words)), words
+    unknown = refused(slrig(*nowhere, "--file", "mesh.e57"))
+    assert all(f" {name}," in unknown for name in MEDIA_TYPES)
     assert not (tmp_path / "out").exists()
-
-
-def test_unknown_option_is_exit_code_2() -> None:
-    assert CliRunner().invoke(app, ["scan", "--colour", "red"]).exit_code == 2
+    assert slrig("scan", "--colour", "red").exit_code == 2
+    for option, value, words_ in (
+        ("--depth-edge-ratio", "1", "depth_edge_ratio: expected a finite number above 1, found 1;"),
+        ("--max-code-gap", "0", "max_code_gap: expected 1 or more, found 0;"),
+        ("--flip-rule", "dyer", "flip_rule: expected constrained or delaunay, found 'dyer';"),
+    ):
+        result = slrig("reconstruct", tmp_path, *out, option, value)
+        assert (result.exit_code, words_ in result.stderr) == (2, True), result.stderr
 
 
 def test_interruption_is_exit_code_130(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,17 +162,21 @@ def test_interruption_is_exit_code_130(monkeypatch: pytest.MonkeyPatch) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("slrig.cli.devices.list_devices", interrupted)
-    assert CliRunner().invoke(app, ["devices"]).exit_code == INTERRUPTED
+    assert slrig("devices").exit_code == INTERRUPTED
 
 
 def test_devices_lists_the_rendered_rig_for_people_and_programs() -> None:
-    shown = CliRunner().invoke(app, ["devices"])
-    assert shown.exit_code == 0
-    assert "simulated" in shown.stdout
-    document = json.loads(CliRunner().invoke(app, ["devices", "--json"]).stdout)
+    assert "simulated" in done("devices")
+    document = json.loads(done("devices", "--json"))
     assert ("head", "simulated", None) in [
         (driver["kind"], driver["name"], driver["fault"]) for driver in document["drivers"]
     ]
+
+
+def test_patterns_are_not_written_for_a_projector_that_shows_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("slrig.discovery.open_rig", lambda _: fake_rig().rig)
+    words = " ".join(refused(slrig("patterns", DEMO)).split())
+    assert "shows any pattern: nothing to flash" in words
 
 
 def test_key_comes_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,139 +244,136 @@ def scan_of(name: str, *, rig: str = "sphere", label: str = "demo") -> dict[str,
     return {"id": name, "rig": rig, "label": label, "links": {"self": f"/scan/{name}"}}
 
 
-def test_reconstruction_option_out_of_range_is_told_by_the_plan(tmp_path: Path) -> None:
-    for option, value, words in (
-        ("--depth-edge-ratio", "1", "depth_edge_ratio: expected a finite number above 1, found 1;"),
-        ("--max-code-gap", "0", "max_code_gap: expected 1 or more, found 0;"),
-        ("--flip-rule", "dyer", "flip_rule: expected constrained or delaunay, found 'dyer';"),
-    ):
-        result = CliRunner().invoke(
-            app, ["reconstruct", str(tmp_path), "--output", str(tmp_path / "out"), option, value]
-        )
-        assert (result.exit_code, words in result.stderr) == (2, True), result.stderr
+@pytest.fixture
+def requests(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """What `slrig scan` asks the service for."""
+    sent: list[dict[str, Any]] = []
+
+    def scanned(_client: Client, request: dict[str, Any], _output: Path, **_: object) -> dict[str, Any]:
+        sent.append(request)
+        return SCAN
+
+    monkeypatch.setattr("slrig.cli.scan.scan_with", scanned)
+    return sent
 
 
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
         ([], {}),
-        (["--keep-holes"], {"keep_holes": True}),
-        (["--close-holes", "--raw-boundary"], {"keep_holes": False, "smooth_boundary": False}),
-        (["--smooth-boundary", "--flip-rule", "delaunay"], {"smooth_boundary": True, "flip_rule": "delaunay"}),
-        (["--depth-edge-ratio", "9", "--max-code-gap", "2"], {"depth_edge_ratio": 9.0, "max_code_gap": 2}),
-        (["--axis", "row"], {"axis": "row"}),
+        (["--keep-holes"], {"reconstruction": {"keep_holes": True}}),
+        (
+            ["--close-holes", "--raw-boundary"],
+            {"reconstruction": {"keep_holes": False, "smooth_boundary": False}},
+        ),
+        (
+            ["--smooth-boundary", "--flip-rule", "delaunay"],
+            {"reconstruction": {"smooth_boundary": True, "flip_rule": "delaunay"}},
+        ),
+        (
+            ["--depth-edge-ratio", "9", "--max-code-gap", "2"],
+            {"reconstruction": {"depth_edge_ratio": 9.0, "max_code_gap": 2}},
+        ),
+        (["--axis", "row"], {"reconstruction": {"axis": "row"}}),
+        (["--exposure-s", "0.02"], {"exposure_s": 0.02}),
+        (["--exposure-s", "0.02", "--exposure-s", "0.08"], {"exposures_s": [0.02, 0.08]}),
     ],
 )
-def test_a_scan_asks_the_service_for_the_options_that_were_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], wanted: dict[str, Any]
+def test_scan_asks_the_service_for_the_options_that_were_given(
+    tmp_path: Path, requests: list[dict[str, Any]], arguments: list[str], wanted: dict[str, Any]
 ) -> None:
-    asked: list[dict[str, Any]] = []
-
-    def scanned(_client: Client, request: dict[str, Any], _output: Path, **_: object) -> dict[str, Any]:
-        asked.append(request)
-        return SCAN
-
-    monkeypatch.setattr("slrig.cli.scan.scan_with", scanned)
-    result = CliRunner().invoke(app, ["scan", "--output", str(tmp_path), *arguments])
-    assert result.exit_code == 0, result.output
-    assert asked[0]["reconstruction"] == wanted
+    done("scan", "--output", tmp_path, *arguments)
+    (request,) = requests
+    of_interest = {name: request[name] for name in request if name.startswith(("exposure", "recon"))}
+    assert of_interest == {"reconstruction": {}, **wanted}
     # The service understands what it is asked.
-    assert ScanRequest.model_validate_json(json.dumps(asked[0])).reconstruction.model_dump(exclude_none=True) == wanted
+    understood = ScanRequest.model_validate_json(json.dumps(request)).model_dump(mode="json", exclude_none=True)
+    assert understood.items() >= of_interest.items()
 
 
-class Walk:
-    """A service that takes one scan to the given end."""
-
-    def __init__(self, state: str, error: dict[str, Any] | None = None) -> None:
-        self.scan = {**SCAN, "state": state, "error": error}
-        self.cancelled = False
-
-    def __call__(self, request: httpx2.Request) -> httpx2.Response:
-        path = request.url.path
-        if path == "/scan":
-            return httpx2.Response(202, json=SCAN)
-        if path.endswith("/events"):
-            if request.headers["Last-Event-ID"] != "0":
-                return httpx2.Response(204)
-            return event_answer(
-                stream(
-                    {"id": 1, "kind": "state", "state": "queued"},
-                    {"id": 2, "kind": "progress", "stage": "capture", "fraction": 0.25, "detail": "frame 1 of 4"},
-                    {"id": 3, "kind": "state", "state": self.scan["state"]},
-                )
-            )
-        if path.endswith("/cancel"):
-            self.cancelled = True
-            return httpx2.Response(202, json=self.scan)
-        if path.endswith("/mesh.ply"):
-            return httpx2.Response(200, content=b"ply")
-        return httpx2.Response(200, json=self.scan)
+def test_region_is_read_from_a_file(tmp_path: Path, requests: list[dict[str, Any]]) -> None:
+    path, out = tmp_path / "part.toml", ("--output", tmp_path / "out")
+    path.write_text('depth_mm = [100, 200]\n[masks]\nleft = "left.png"\n')
+    mask = cv2.imencode(".png", np.full((10, 20), 255, dtype=np.uint8))[1].tobytes()
+    (tmp_path / "left.png").write_bytes(mask)
+    done("scan", *out, "--region", path)
+    masks = {"left": base64.b64encode(mask).decode()}
+    assert requests[0]["reconstruction"] == {"region": {"depth_mm": [100, 200], "masks": masks}}
+    assert read_region(path).region() == Region(depth_mm=(100, 200), masks=masks)
+    (tmp_path / "left.png").unlink()
+    words = " ".join(refused(slrig("scan", *out, "--region", path)).split())
+    assert "left.png: expected a mask as PNG, found: No such file or directory" in words
+    path.write_text("depth = [100, 200]\n")
+    assert "did you mean 'depth_mm'?" in refused(slrig("reconstruct", tmp_path, *out, "--region", path))
 
 
 def test_scan_is_followed_and_fetched(tmp_path: Path) -> None:
-    told: list[tuple[str, float]] = []
-    with client_of(Walk("succeeded")) as client:
-        scan = scan_with(
+    shown: list[tuple[str, float]] = []
+    with client_of(Walk(mesh_ply=b"ply")) as client:
+        scan_with(
             client,
             {},
             tmp_path / "out",
             files=("mesh.ply",),
-            display=lambda stage, fraction, _detail: told.append((stage, fraction)),
+            display=lambda stage, fraction, _detail: shown.append((stage, fraction)),
         )
     assert (tmp_path / "out" / "mesh.ply").read_bytes() == b"ply"
-    assert told == [
-        ("waiting for the rig", 0.0),
-        ("capture", 0.25),
-        ("fetching mesh.ply", 1.0),
-        ("done", 1.0),
-    ]
-    assert quality_lines(scan["summary"]) == [
-        "size      1,200 vertices, 2,301 triangles",
-        "stated    standard deviation of a point 0.0079 mm (median)",
-        "error     rms 0.0123 mm against the known truth, 97.0% of the visible surface within 0.3 mm",
-    ]
+    assert shown == [("waiting for the rig", 0.0), ("capture", 0.25), ("fetching mesh.ply", 1.0), ("done", 1.0)]
 
 
-def test_every_file_that_was_fetched_is_told_with_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_result_is_shown_with_its_files_and_its_quality(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = ("mesh.ply", "mesh.obj", "rejected-left.png")
     for name in (*files, "report.json"):
         (tmp_path / name).write_bytes(b"of this scan or of an earlier one")
     tell_result({}, tmp_path, files=files)
-    told = capsys.readouterr().out.splitlines()
-    assert [line.split() for line in told] == [
+    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
         ["mesh", str(tmp_path / "mesh.ply")],
         ["mesh.obj", str(tmp_path / "mesh.obj")],
         ["rejected-left.png", str(tmp_path / "rejected-left.png")],
     ]
+    assert quality_lines(report_summary({"method": "Gray-only", **SUMMARY})) == [
+        "frames    28/28 patterns verified, 2 frames shot again",
+        "size      1,200 vertices, 2,301 triangles",
+        "stated    standard deviation of a point 0.0079 mm (median)",
+        "error     rms 0.0123 mm against the known truth, 97.0% of the visible surface within 0.3 mm",
+    ]
+    # A summary of an earlier version.
+    assert quality_lines({"method": "Gray-only"}) == []
 
 
-def test_failed_scan_tells_the_cause(tmp_path: Path) -> None:
-    walk = Walk("failed", {"detail": "No stripe was found."})
-    with client_of(walk) as client, pytest.raises(ServiceError, match=r"Scan 5f failed: No stripe was found\."):
-        scan_with(client, {}, tmp_path / "out", display=ignore)
+@pytest.mark.parametrize(
+    ("walk", "error", "words"),
+    [
+        (Walk("failed", {"detail": "No stripe was found."}), ServiceError, r"Scan 5f failed: No stripe was found\."),
+        (Walk("cancelled"), ScanCancelledError, "cancelled"),
+        (Walk(mesh_ply=b"ply"), ServiceError, r"no mesh\.obj\. It has: mesh\.ply"),
+    ],
+)
+def test_scan_without_its_files_raises_the_cause_and_fetches_nothing(
+    tmp_path: Path, walk: Walk, error: type[Exception], words: str
+) -> None:
+    with client_of(walk) as client, pytest.raises(error, match=words):
+        scan_with(client, {}, tmp_path / "out", files=("mesh.ply", "mesh.obj"), display=ignore)
     assert not (tmp_path / "out").exists()
 
 
-def test_scan_cancelled_elsewhere_is_told_as_such(tmp_path: Path) -> None:
-    with client_of(Walk("cancelled")) as client, pytest.raises(ScanCancelledError):
-        scan_with(client, {}, tmp_path / "out", display=ignore)
-
-
-def test_a_series_goes_on_after_a_failure_and_tells_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    ends = {"1": Walk("succeeded"), "2": Walk("failed", {"detail": "No stripe was found."}), "3": Walk("succeeded")}
-    asked: list[dict[str, Any]] = []
+def test_series_goes_on_after_a_failure_and_names_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ends = {"1": Walk(mesh_ply=b"ply"), "2": Walk("failed", {"detail": "No stripe was found."})}
+    ends["3"] = ends["1"]
+    sent: list[dict[str, Any]] = []
 
     def numbered(scan: dict[str, Any], number: str) -> dict[str, Any]:
         here = f"/scan/{number}"
-        links = {**scan["links"], "self": here, "events": f"{here}/events", "series": "/scan/series/9"}
-        return {**scan, "id": number, "links": {**links, "files": {"mesh.ply": f"{here}/mesh.ply"}}}
+        links = {**scan["links"], "self": here, "events": f"{here}/events", "series": SERIES}
+        files = {"mesh.ply": f"{here}/mesh.ply"}
+        return {**scan, "id": number, "summary": SUMMARY, "links": {**links, "files": files}}
 
     def answer(request: httpx2.Request) -> httpx2.Response:
         path = request.url.path
         if path == "/scan":
-            asked.append(json.loads(request.content))
+            sent.append(json.loads(request.content))
             return httpx2.Response(202, json=numbered(SCAN, "1"))
-        if path == "/scan/series/9":
+        if path == SERIES:
             return httpx2.Response(200, json={"scans": [numbered(SCAN, number) for number in ends]})
         number = path.split("/")[2]
         found = ends[number](request)
@@ -327,7 +384,7 @@ def test_a_series_goes_on_after_a_failure_and_tells_of_it(tmp_path: Path, capsys
     assert ScanRequest.model_validate(request).repeat == 3
     with client_of(answer) as client, pytest.raises(ServiceError, match=r"^1 of 3 scans did not succeed: 002\.$"):
         series_with(client, request, tmp_path, files=("mesh.ply",), display=ignore)
-    assert asked == [request]
+    assert sent == [request]
     assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.ply")) == [
         "001/mesh.ply",
         "003/mesh.ply",
@@ -338,27 +395,25 @@ def test_a_series_goes_on_after_a_failure_and_tells_of_it(tmp_path: Path, capsys
     assert "No stripe was found." in " ".join(rows[2])
 
 
-def test_a_series_that_is_broken_off_is_cancelled_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("series", [False, True])
+def test_ctrl_c_cancels_the_scan_or_the_whole_series(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, series: bool
+) -> None:
     posted: list[str] = []
 
     def answer(request: httpx2.Request) -> httpx2.Response:
-        started = {**SCAN, "links": {**SCAN["links"], "series": "/scan/series/9"}}  # type: ignore[dict-item]
+        started = {**SCAN, "links": {**SCAN["links"], "series": SERIES}}
         posted.extend([request.url.path] if request.method == "POST" else [])
         return httpx2.Response(202, json={**started, "scans": [started, started]})
 
-    def interrupted(_job: object, _told: object) -> None:
+    def interrupted(_job: object, _display: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ScanJob, "result", interrupted)
+    scan = series_with if series else scan_with
     with client_of(answer) as client, pytest.raises(KeyboardInterrupt):
-        series_with(client, {"repeat": 2}, tmp_path, display=ignore)
-    assert posted == ["/scan", "/scan/series/9/cancel"]
-
-
-def test_file_that_this_scan_has_not_is_told_before_anything_is_fetched(tmp_path: Path) -> None:
-    with client_of(Walk("succeeded")) as client, pytest.raises(ServiceError, match=r"no mesh\.obj\. It has: mesh\.ply"):
-        scan_with(client, {}, tmp_path / "out", files=("mesh.ply", "mesh.obj"), display=ignore)
-    assert not (tmp_path / "out").exists()
+        scan(client, {"repeat": 2 if series else 1}, tmp_path, display=ignore)
+    assert posted == ["/scan", f"{SERIES if series else SCAN['links']['self']}/cancel"]
 
 
 @pytest.mark.parametrize(
@@ -395,47 +450,6 @@ def test_name_that_no_scan_has_is_refused_before_one_is_shot(
     with client_of(handler) as client, pytest.raises(SlrigError, match=told or "the rig is held"):
         scan_with(client, {}, tmp_path / "out", files=("mesh.ply", name), display=ignore)
     assert (len(started) == 0) == (told is not None)
-
-
-def test_name_that_no_scan_has_is_exit_code_2_without_a_service(tmp_path: Path) -> None:
-    arguments = ["scan", "--url", "http://127.0.0.1:9", "--output", str(tmp_path), "--file", "mesh.e57"]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 2
-    assert all(f" {name}," in result.stderr for name in MEDIA_TYPES)
-
-
-@pytest.mark.parametrize(("busy", "fetched"), [(2, True), (1000, False)])
-def test_a_file_that_has_to_wait_is_asked_for_again(tmp_path: Path, busy: int, fetched: bool) -> None:
-    asked, pauses = [], list[float]()
-
-    def handler(request: httpx2.Request) -> httpx2.Response:
-        asked.append(request.url.path)
-        if len(asked) <= busy:
-            return httpx2.Response(503, headers={"Retry-After": "5"}, json={"detail": "Another job is computed."})
-        return httpx2.Response(200, content=b"npz")
-
-    target = tmp_path / "points-left.npz"
-    with client_of(handler, pauses) as client:
-        if fetched:
-            client.fetch("/scan/1/points-left.npz", target)
-        else:
-            with pytest.raises(ServiceError, match="Another job is computed"):
-                client.fetch("/scan/1/points-left.npz", target)
-    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"npz"] * fetched
-    assert pauses == [5.0] * (len(asked) - 1)
-    assert 2 < len(asked) < 50
-
-
-def test_ctrl_c_cancels_the_scan_on_the_service(tmp_path: Path) -> None:
-    walk = Walk("succeeded")
-
-    def interrupt(stage: str, _fraction: float, _detail: str) -> None:
-        if stage == "capture":
-            raise KeyboardInterrupt
-
-    with client_of(walk) as client, pytest.raises(KeyboardInterrupt):
-        scan_with(client, {}, tmp_path / "out", display=interrupt)
-    assert walk.cancelled
 
 
 def test_progress_off_a_terminal_is_one_line_per_stage() -> None:
@@ -497,33 +511,3 @@ def test_label_of_an_older_record_does_nothing_to_the_terminal(capsys: pytest.Ca
     for shown in (table, document):
         assert all(character == "\n" or character.isprintable() for character in shown)
     assert json.loads("{" + document) == {"label": label}
-
-
-def test_refusal_of_a_service_does_nothing_to_the_terminal() -> None:
-    problem = {"detail": "no \x1b[2J", "errors": [{"field": "label", "message": "found \x9b"}]}
-    with client_of(lambda _: httpx2.Response(422, json=problem)) as client, pytest.raises(ServiceError) as refused:
-        client.get("/scan")
-    assert str(refused.value) == "no \\u001b[2J\n  label: found \\u009b"
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in Linux's /proc")
-@pytest.mark.parametrize(("asked", "kept"), [(None, "1"), ("2", "2")])
-def test_a_command_has_no_threads_that_spin_beside_it(asked: str | None, kept: str) -> None:
-    # numpy and scipy bring an OpenBLAS each, with a thread per core beside the first, all started when it is loaded.
-    command = (
-        "import os, sys; sys.argv = ['slrig', '--version']\n"
-        "from slrig.cli import main\n"
-        "try: main()\n"
-        "except SystemExit: pass\n"
-        "import numpy, scipy.linalg\n"
-        "print(os.environ['OPENBLAS_NUM_THREADS'], len(os.listdir('/proc/self/task')))"
-    )
-    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
-    if asked is not None:
-        environment["OPENBLAS_NUM_THREADS"] = asked
-    ran = subprocess.run(  # noqa: S603 - our own
-        [sys.executable, "-c", command], capture_output=True, text=True, check=True, env=environment
-    )
-    setting, threads = ran.stdout.split()[-2:]
-    assert setting == kept
-    assert threads == "1" or asked is not None
