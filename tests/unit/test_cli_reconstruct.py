@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from slrig.bundle import write_bundle
-from slrig.cli.commands import INTERRUPTED, app
+from slrig.cli.commands import INTERRUPTED
 from slrig.errors import NothingToReconstructError
 from slrig.scan.artefacts import staged_folder
 from slrig.scan.preparation import sample_scan
+from tests.unit.command import slrig
 
 
 class Report(dict[str, object]):
@@ -31,6 +32,7 @@ class Reconstruction:
     def __init__(self) -> None:
         self.prepared = 0
         self.seen: list[str] = []
+        self.counts_kept = False
         self.kept: list[int] = []
         self.wanted: dict[str, Callable[[], None]] = {}
         self._reports: list[weakref.ref[Report]] = []
@@ -40,8 +42,9 @@ class Reconstruction:
         return 0
 
     def __call__(self, bundle: Path, output: Path, *, progress: Callable[..., None], **_: object) -> Report:
-        gc.collect()
-        self.kept.append(sum(each() is not None for each in self._reports))
+        if self.counts_kept:
+            gc.collect()
+            self.kept.append(sum(each() is not None for each in self._reports))
         self.seen.append(bundle.name)
         with staged_folder(output) as staging:
             (staging / "mesh.ply").write_text(bundle.name)
@@ -85,7 +88,7 @@ def scans(tmp_path: Path, recorded: Path) -> Path:
 
 
 def run(*words: object) -> Result:
-    return CliRunner().invoke(app, ["reconstruct", *map(str, words)])
+    return slrig("reconstruct", *words)
 
 
 def rows(result: Result) -> list[list[str]]:
@@ -97,51 +100,28 @@ def within(folder: Path) -> list[str]:
     return sorted(each.name for each in folder.iterdir())
 
 
-def test_several_bundles_are_reconstructed_as_each_alone(
+def test_bundles_are_reconstructed_with_the_files_and_the_calibration_that_were_given(
     scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("slrig.cli.reconstruct.prepare_kernels", lambda _: 0)
-    alone, out = tmp_path / "alone", tmp_path / "out"
-    assert run(scans / "scan-1", "--output", alone).exit_code == 0
-    result = run(scans / "scan-1", scans / "scan-2", "--output", out, "--file", "mesh.stl")
-    assert result.exit_code == 0, result.output
-    triangles = json.loads((alone / "report.json").read_text())["mesh"]["figures"]["triangles"]
+    out = tmp_path / "out"
     for name in ("scan-1", "scan-2"):
-        assert (out / name / "mesh.ply").read_bytes() == (alone / "mesh.ply").read_bytes()
-        assert within(out / name) == sorted([*within(alone), "mesh.stl"])
-    assert [row[:2] for row in rows(result)] == [["scan-1", f"{triangles:,}"], ["scan-2", f"{triangles:,}"]]
-
-
-def test_files_of_a_camera_are_written_by_name_and_with_the_calibration_that_was_given(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("slrig.cli.reconstruct.prepare_kernels", lambda _: 0)
-    bundle, out = tmp_path / "bundle", tmp_path / "out"
-    shutil.copytree(recorded, bundle)
-    calibration = (bundle / "calibration.json").rename(tmp_path / "elsewhere.json")
-    names = ["points-sample.npz", "mesh.stl", "mesh.ply"]
-    chosen = [word for name in names for word in ("--file", name)]
-    result = run(bundle, "--output", out, "--calibration", calibration, *chosen)
+        calibration = (scans / name / "calibration.json").rename(tmp_path / "elsewhere.json")
+    chosen = [word for name in ("points-sample.npz", "mesh.stl", "mesh.ply") for word in ("--file", name)]
+    result = run(scans / "scan-1", scans / "scan-2", "--output", out, "--calibration", calibration, *chosen)
     assert result.exit_code == 0, result.output
-    assert f"npz       {out / 'points-sample.npz'}" in result.stdout
+    triangles = json.loads((out / "scan-1" / "report.json").read_text())["mesh"]["figures"]["triangles"]
+    assert [row[:2] for row in rows(result)] == [["scan-1", f"{triangles:,}"], ["scan-2", f"{triangles:,}"]]
+    assert (out / "scan-1" / "mesh.ply").read_bytes() == (out / "scan-2" / "mesh.ply").read_bytes()
+    assert within(out / "scan-1") == within(out / "scan-2")
+    assert f"npz       {out / '*' / 'points-sample.npz'}" in result.stdout
     assert result.stdout.count("mesh.ply") == 1
-    with np.load(out / "points-sample.npz") as cloud:
+    assert (out / "scan-1" / "mesh.stl").is_file()
+    with np.load(out / "scan-1" / "points-sample.npz") as cloud:
         assert np.isfinite(cloud["points_mm"]).all(axis=2).mean() > 0.5
-    assert (out / "mesh.stl").is_file()
 
 
-@pytest.mark.parametrize("name", ["points-left.npz", "bundle.zip", "../mesh.stl"])
-def test_a_file_that_no_reconstruction_gives_is_refused_at_once(
-    recorded: Path, tmp_path: Path, work: Reconstruction, name: str
-) -> None:
-    result = run(recorded, "--output", tmp_path / "out", "--file", name)
-    assert result.exit_code == 2
-    assert f"it gives no {name}. There are: mesh.ply, " in result.stderr
-    assert "points-sample.npz" in result.stderr
-    assert (work.seen, work.prepared) == ([], 0)
-
-
-def test_a_folder_of_bundles_is_worked_through_in_natural_order(
+def test_folder_of_bundles_is_worked_through_in_natural_order(
     scans: Path, tmp_path: Path, work: Reconstruction
 ) -> None:
     out = tmp_path / "out"
@@ -159,38 +139,27 @@ def test_a_folder_of_bundles_is_worked_through_in_natural_order(
     assert result.stdout.splitlines()[4:] == words
 
 
-@pytest.mark.parametrize("named", ["folder", "bundles"])
-def test_bundles_of_a_service_go_by_their_scans(scans: Path, tmp_path: Path, work: Reconstruction, named: str) -> None:
+@pytest.mark.usefixtures("work")
+def test_bundles_are_named_by_folder_pattern_scan_or_place(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for scan in ("scan-1", "scan-2"):
         shutil.copytree(scans / scan, tmp_path / "data" / f"id-{scan}" / "bundle")
-    asked = [tmp_path / "data"] if named == "folder" else sorted((tmp_path / "data").glob("*/bundle"))
-    result = run(*asked, "--output", tmp_path / "out")
-    assert (result.exit_code, work.prepared) == (0, 1), result.output
-    assert within(tmp_path / "out") == ["id-scan-1", "id-scan-2"]
-
-
-def test_a_pattern_that_no_shell_expanded_is_expanded(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
-    assert run(scans / "scan-1*", scans / "scan-1", "--output", tmp_path / "out").exit_code == 0
-    assert work.seen == ["scan-1", "scan-10"]
-    # One bundle is one, however it was named.
+    monkeypatch.chdir(scans / "scan-1")
+    for number, (words, names) in enumerate(
+        (
+            ((tmp_path / "data",), ["id-scan-1", "id-scan-2"]),
+            (sorted((tmp_path / "data").glob("*/bundle")), ["id-scan-1", "id-scan-2"]),
+            # A pattern that no shell expanded; one bundle is one, however it was named.
+            ((scans / "scan-1*", scans / "scan-1"), ["scan-1", "scan-10"]),
+            ((".", "../scan-2"), ["scan-1", "scan-2"]),
+        )
+    ):
+        out = tmp_path / f"out-{number}"
+        result = run(*words, "--output", out)
+        assert (result.exit_code, within(out)) == (0, names), result.output
     assert run(scans / "*-2", "--output", tmp_path / "one").exit_code == 0
     assert (tmp_path / "one" / "mesh.ply").read_text() == "scan-2"
-
-
-def test_the_current_folder_has_a_name(
-    scans: Path, tmp_path: Path, work: Reconstruction, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(scans / "scan-1")
-    assert run(".", "../scan-2", "--output", tmp_path / "out").exit_code == 0
-    assert within(tmp_path / "out") == ["scan-1", "scan-2"]
-    assert work.seen[1] == "scan-2"
-
-
-def test_a_folder_without_bundles_is_refused_as_a_bundle_is(tmp_path: Path, work: Reconstruction) -> None:
-    (tmp_path / "empty" / "inner").mkdir(parents=True)
-    result = run(tmp_path / "empty", "--output", tmp_path / "out")
-    assert (result.exit_code, work.prepared) == (2, 0)
-    assert "found a folder without it; give the folder that holds it" in result.stderr
 
 
 def test_broken_bundles_do_not_stop_the_others(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
@@ -222,7 +191,7 @@ def test_broken_bundles_do_not_stop_the_others(scans: Path, tmp_path: Path, work
     assert result.stderr.count("decode ") == 3
 
 
-def test_a_defect_is_told_with_its_place_and_is_the_worst(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+def test_defect_is_shown_with_its_place_and_is_the_worst(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
     (scans / "scan-1" / "bundle.json").write_text("{}")
 
     def defect() -> None:
@@ -236,38 +205,34 @@ def test_a_defect_is_told_with_its_place_and_is_the_worst(scans: Path, tmp_path:
     assert "ZeroDivisionError: of nobody's doing" in result.stderr
 
 
-def test_nothing_is_prepared_for_bundles_that_are_all_broken(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+def test_nothing_is_computed_that_could_only_be_refused(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+    out, one, file = tmp_path / "out", tmp_path / "one", tmp_path / "file"
+    file.write_text("")
+    assert run(scans / "scan-1", "--output", one).exit_code == 0
+    work.prepared, work.seen = 0, []
+    shutil.copytree(scans / "scan-1", tmp_path / "other" / "Scan-1")
+    (tmp_path / "empty" / "inner").mkdir(parents=True)
+    names = f"the same name: {scans / 'scan-1'}, {tmp_path / 'other' / 'Scan-1'}. Rename"
+    for words, expected in (
+        *(
+            ((scans / "scan-1", "--output", out, "--file", name), f"it gives no {name}. There are: mesh.ply, ")
+            for name in ("points-left.npz", "bundle.zip", "../mesh.stl")
+        ),
+        ((tmp_path / "empty", "--output", out), "found a folder without it; give the folder that holds it"),
+        ((scans, tmp_path / "other" / "Scan-1", "--output", out), names),
+        ((scans, "--output", file), "name a new folder"),
+        ((scans, "--output", one), "name a new folder"),
+    ):
+        result = run(*words)
+        assert (result.exit_code, expected in result.stderr) == (2, True), result.stderr
     for each in scans.glob("scan-*"):
         (each / "bundle.json").write_text("{}")
-    result = run(scans, "--output", tmp_path / "out")
-    assert (result.exit_code, work.prepared, work.seen) == (2, 0, [])
-    assert result.stdout.splitlines()[-1] == "bundles   3 failed"
-
-
-def test_equal_names_are_refused_before_anything_is_computed(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
-    shutil.copytree(scans / "scan-1", tmp_path / "other" / "Scan-1")
-    result = run(scans, tmp_path / "other" / "Scan-1", "--output", tmp_path / "out")
-    assert (result.exit_code, work.prepared, work.seen) == (2, 0, [])
-    assert f"the same name: {scans / 'scan-1'}, {tmp_path / 'other' / 'Scan-1'}. Rename" in result.stderr
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("kind", ["file", "result"])
-def test_results_of_several_do_not_go_into_the_result_of_one(
-    scans: Path, tmp_path: Path, work: Reconstruction, kind: str
-) -> None:
-    out = tmp_path / "out"
-    if kind == "file":
-        out.write_text("")
-    else:
-        assert run(scans / "scan-1", "--output", out).exit_code == 0
-    work.seen.clear()
     result = run(scans, "--output", out)
-    assert (result.exit_code, work.seen) == (2, [])
-    assert "name a new folder" in result.stderr
+    assert (result.exit_code, result.stdout.splitlines()[-1]) == (2, "bundles   3 failed")
+    assert (work.prepared, work.seen) == (0, [])
 
 
-def test_ctrl_c_ends_all_and_tells_what_is_done(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+def test_ctrl_c_ends_all_and_shows_what_is_done(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
     def interrupted() -> None:
         raise KeyboardInterrupt
 
@@ -293,7 +258,7 @@ def test_nothing_of_a_bundle_is_kept_while_the_next_is_worked_on(
         large.append(weakref.ref(held))
         raise NothingToReconstructError(str(held))
 
-    work.wanted["scan-2"] = fails
+    work.wanted["scan-2"], work.counts_kept = fails, True
     assert run(scans, "--output", tmp_path / "out").exit_code == 2
     assert work.kept == [0, 0, 0]
     assert [each() for each in large] == [None]
