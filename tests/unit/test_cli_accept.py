@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,30 +35,36 @@ app.command()(accept)
 
 
 @pytest.fixture(scope="module")
-def plan() -> AcceptancePlan:
+def rig() -> Iterator[Rig]:
     with open_rig(read_rig(BALL_BAR)) as rig:
-        return plan_for(AcceptanceOptions(), rig)
+        yield rig
 
 
-def test_a_rendered_rig_needs_no_artefacts_and_states_exact_ones(plan: AcceptancePlan) -> None:
+@pytest.fixture(scope="module")
+def plan(rig: Rig) -> AcceptancePlan:
+    return plan_for(AcceptanceOptions(), rig)
+
+
+def test_rendered_rig_needs_no_artefacts_and_states_exact_ones(rig: Rig, plan: AcceptancePlan) -> None:
     assert plan.rendered
     assert plan.artefacts.diameter.uncertainty_mm == 0
     assert plan.limits.spacing_mm == pytest.approx(plan.diagonal_mm / 5000)
     assert len(plan.steps) == 23
+    given = plan_for(AcceptanceOptions(volume_mm=(-50, -40, -25, 50, 40, 25)), rig)
+    assert given.volume_mm.tolist() == [[-50, -40, -25], [50, 40, 25]]
 
 
-def test_metal_needs_the_certificates() -> None:
-    with open_rig(read_rig(BALL_BAR)) as rig:
-        metal = replace(rig, head=None)
-        with pytest.raises(InvalidInputError, match="needs --sphere DIAMETER U"):
-            plan_for(AcceptanceOptions(), metal)
-        given = AcceptanceOptions(sphere_mm=(17.5, 0.001), bar_mm=(64.0, 0.002), plane_mm=(95.0, 67.0))
-        with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not told"):
-            plan_for(given, metal)
-        certain = replace(given, sphere_form_mm=0.001, plane_form_mm=0.002, spacing_limit_mm=0.05)
-        wanted = plan_for(replace(certain, wanted_mm=0.03), metal).limits
-        assert wanted == Limits(form_mm=0.06, size_mm=0.03, spacing_mm=0.05, flatness_mm=0.06)
-        assert not plan_for(certain, metal).rendered
+def test_metal_needs_the_certificates(rig: Rig) -> None:
+    metal = replace(rig, head=None)
+    with pytest.raises(InvalidInputError, match="needs --sphere DIAMETER U"):
+        plan_for(AcceptanceOptions(), metal)
+    given = AcceptanceOptions(sphere_mm=(17.5, 0.001), bar_mm=(64.0, 0.002), plane_mm=(95.0, 67.0))
+    with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not told"):
+        plan_for(given, metal)
+    certain = replace(given, sphere_form_mm=0.001, plane_form_mm=0.002, spacing_limit_mm=0.05)
+    wanted = plan_for(replace(certain, wanted_mm=0.03), metal).limits
+    assert wanted == Limits(form_mm=0.06, size_mm=0.03, spacing_mm=0.05, flatness_mm=0.06)
+    assert not plan_for(certain, metal).rendered
 
 
 @pytest.mark.slow
@@ -78,12 +85,6 @@ def test_limits_follow_the_rig_file_unless_asked_for(monkeypatch: pytest.MonkeyP
     assert [limits.spacing_mm for limits in planned] == [0.04, 0.01]
 
 
-def test_a_given_volume_is_used() -> None:
-    with open_rig(read_rig(BALL_BAR)) as rig:
-        plan = plan_for(AcceptanceOptions(volume_mm=(-50, -40, -25, 50, 40, 25)), rig)
-    assert plan.volume_mm.tolist() == [[-50, -40, -25], [50, 40, 25]]
-
-
 @pytest.mark.slow
 def test_a_rig_whose_script_has_the_positions_moves_its_own_artefacts(tmp_path: Path) -> None:
     config = read_rig(RIGS / "rendered-acceptance.toml")
@@ -100,25 +101,23 @@ def test_a_rig_that_is_not_rendered_cannot_be_scripted(tmp_path: Path, plan: Acc
         scripted_config(replace(config, head=None), plan, tmp_path)
 
 
-def test_a_person_is_told_each_position_and_may_leave(plan: AcceptancePlan) -> None:
+def test_person_reads_each_position_and_may_leave(plan: AcceptancePlan) -> None:
     shown = io.StringIO()
     answers = iter(["", "q"])
-    place = placed_by_hand(plan, Console(file=shown, width=120), ask=lambda _: next(answers))
+
+    def ask(_: str) -> str:
+        if (answer := next(answers, None)) is None:
+            raise EOFError
+        return answer
+
+    place = placed_by_hand(plan, Console(file=shown, width=120), ask=ask)
     rig = Rig("tame", {}, None, {})  # type: ignore[arg-type]
     place(rig, plan.steps[0])
     assert "1 of 23" in shown.getvalue()
     assert "Put the sphere in the middle of the volume." in shown.getvalue()
-    with pytest.raises(ScanCancelledError, match="left before sphere-2"):
-        place(rig, plan.steps[1])
-
-
-def test_the_end_of_input_leaves_too(plan: AcceptancePlan) -> None:
-    def ended(_: str) -> str:
-        raise EOFError
-
-    place = placed_by_hand(plan, Console(file=io.StringIO()), ask=ended)
-    with pytest.raises(ScanCancelledError):
-        place(Rig("tame", {}, None, {}), plan.steps[0])  # type: ignore[arg-type]
+    for _ in ("q", "end of input"):
+        with pytest.raises(ScanCancelledError, match="left before sphere-2"):
+            place(rig, plan.steps[1])
 
 
 @pytest.mark.slow

@@ -9,11 +9,10 @@ from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import BaseModel, Field
-from typer.testing import CliRunner
 
-from slrig.cli.commands import app
 from slrig.cli.driver_options import Option, sections
 from slrig.cli.rig_schema import rig_schema
+from tests.unit.command import slrig
 
 RIGS = sorted((Path(__file__).resolve().parents[2] / "config" / "rigs").glob("*.toml"))
 HERE = __name__
@@ -59,9 +58,15 @@ class Sample(BaseModel):
     rows: list[Row] = []
 
 
-def run(*arguments: str, columns: int = 80) -> tuple[int, str]:
-    result = CliRunner().invoke(app, ["devices", *arguments], env={"COLUMNS": str(columns)})
+def run(*arguments: str) -> tuple[int, str]:
+    result = slrig("devices", *arguments, COLUMNS="80")
     return result.exit_code, result.output
+
+
+@pytest.fixture(scope="module")
+def schema() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(rig_schema())
+    return found
 
 
 @pytest.fixture
@@ -73,9 +78,10 @@ def _fake_drivers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path / "site")
 
 
-@pytest.mark.parametrize(
-    "expected",
-    [
+def test_options_are_shown_by_type_unit_default_and_limits() -> None:
+    own, row, rows = sections(Sample.model_json_schema(), "head")
+    assert [section.heading for section in (own, row, rows)] == ["[head]", "[head.row]", "[[head.rows]]"]
+    assert own.options == (
         Option("choice", "text", "–", "a", "one of a, b", "Which."),
         Option("share", "number", "–", "0.5", "above 0 to below 1", ""),
         Option("turn_deg", "number", "°", "–", "at most 90", ""),
@@ -87,19 +93,9 @@ def _fake_drivers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         Option("many", "list of numbers", "–", "[1, 2.5]", "", ""),
         Option("row", "table", "–", "–", "", ""),
         Option("rows", "list of tables", "–", "none", "", ""),
-    ],
-    ids=lambda each: each.name,
-)
-def test_an_option_is_told_by_type_unit_default_and_limits(expected: Option) -> None:
-    own = sections(Sample.model_json_schema(), "camera")[0]
-    assert own.heading == "[[camera]]"
-    assert expected in own.options
-
-
-def test_tables_in_the_table_have_sections_of_their_own() -> None:
-    told = sections(Sample.model_json_schema(), "head")
-    assert [section.heading for section in told] == ["[head]", "[head.row]", "[[head.rows]]"]
-    assert told[1].options == (Option("width_px", "integer", "px", "required", "", "How wide."),)
+    )
+    assert row.options == (Option("width_px", "integer", "px", "required", "", "How wide."),)
+    assert sections(Sample.model_json_schema(), "camera")[0].heading == "[[camera]]"
 
 
 def test_people_are_told_in_80_columns() -> None:
@@ -126,36 +122,21 @@ def test_programs_get_json_schema() -> None:
 
 
 @pytest.mark.usefixtures("_fake_drivers")
-def test_a_driver_that_says_nothing_of_its_options_is_no_fault() -> None:
+def test_drivers_of_others_are_shown_or_refused() -> None:
     code, shown = run("--options", "undescribed")
-    assert code == 0
-    assert "'undescribed' does not describe its options" in shown
+    assert (code, "'undescribed' does not describe its options" in shown) == (0, True)
     assert json.loads(run("--options", "undescribed", "--json")[1]) == {}
-
-
-@pytest.mark.usefixtures("_fake_drivers")
-def test_a_driver_of_two_kinds_is_told_for_both() -> None:
     shown = run("--options", "two_sided")[1]
     assert "projector driver two_sided" in shown
     assert "head driver two_sided" in shown
-
-
-@pytest.mark.usefixtures("_fake_drivers")
-def test_what_is_no_model_and_who_is_no_driver_are_refused() -> None:
-    code, shown = run("--options", "strange")
-    assert code == 2
-    assert "driver 'strange' of fake_drivers are no pydantic model" in shown
-    code, shown = run("--options", "unloadable")
-    assert code == 2
-    assert "'unloadable' of fake_drivers cannot be loaded (no_such_module:Options): ModuleNotFoundError" in shown
-    code, shown = run("--options", "v4l")
-    assert code == 2
-    assert "no installed package provides a driver 'v4l'; installed: " in shown
-    assert "two_sided" in shown
-
-
-@pytest.mark.usefixtures("_fake_drivers")
-def test_the_schema_for_editors_holds_the_drivers_of_slrig_alone() -> None:
+    for driver, words in (
+        ("strange", "driver 'strange' of fake_drivers are no pydantic model"),
+        ("unloadable", "'unloadable' of fake_drivers cannot be loaded (no_such_module:Options): ModuleNotFoundError"),
+        ("v4l", "no installed package provides a driver 'v4l'; installed: "),
+    ):
+        code, shown = run("--options", driver)
+        assert (code, words in shown) == (2, True), shown
+    # The schema for editors holds the drivers of slrig alone.
     assert "two_sided" not in rig_schema()
 
 
@@ -176,17 +157,15 @@ def checked(rig: dict[str, Any], kind: str, table: dict[str, Any]) -> tuple[set[
 
 
 @pytest.mark.parametrize("path", RIGS, ids=lambda path: path.stem)
-def test_the_schema_for_editors_knows_every_key_of_the_rigs_we_ship(path: Path) -> None:
-    rig = json.loads(rig_schema())
+def test_schema_for_editors_knows_every_key_of_the_rigs_we_ship(schema: dict[str, Any], path: Path) -> None:
     data = tomllib.loads(path.read_text(encoding="utf-8"))
     tables = [(kind, data[kind]) for kind in ("head", "projector") if kind in data]
     for kind, table in [*tables, *(("camera", each) for each in data.get("camera", []))]:
-        known, required = checked(rig, kind, table)
+        known, required = checked(schema, kind, table)
         assert required <= set(table) <= known
 
 
-def test_every_reference_of_the_schema_leads_somewhere() -> None:
-    rig = json.loads(rig_schema())
+def test_every_reference_of_the_schema_leads_somewhere(schema: dict[str, Any]) -> None:
     found: list[str] = []
 
     def look(part: object) -> None:
@@ -198,5 +177,5 @@ def test_every_reference_of_the_schema_leads_somewhere() -> None:
             for each in part:
                 look(each)
 
-    look(rig)
-    assert {each.removeprefix("#/$defs/") for each in found} == set(rig["$defs"])
+    look(schema)
+    assert {each.removeprefix("#/$defs/") for each in found} == set(schema["$defs"])

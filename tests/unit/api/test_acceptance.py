@@ -16,7 +16,6 @@ from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
 from slrig.jobs.keys import RequestKeys
 from tests.unit.accept.test_desk import PLAN, desk, desks, queue
-from tests.unit.accept.test_running import RIG
 from tests.unit.jobs.tame_queue import TameQueue
 
 __all__ = ["desk", "desks", "queue"]
@@ -42,33 +41,34 @@ def client(desk: AcceptanceDesk) -> TestClient:
     return TestClient(app)
 
 
-def test_a_test_is_opened_and_says_what_to_do_first(client: TestClient) -> None:
-    answer = client.post("/acceptance", json={"artefacts": EXACT, "volume_mm": VOLUME, "repeats": 2})
-    assert answer.status_code == 201
-    body = answer.json()
-    assert client.get(answer.headers["location"]).json() == body
-    assert (body["captures"], body["captures_done"], body["state"]) == (26, 0, "open")
-    assert body["next"]["words"] == "Put the sphere in the middle of the volume."
-    assert len(body["positions"]) == 23
-
-
 def test_positions_are_measured_to_the_end_and_the_report_is_fetched(
     client: TestClient, desk: AcceptanceDesk, tmp_path: Path
 ) -> None:
+    answer = client.post("/acceptance", json={"artefacts": EXACT, "volume_mm": VOLUME, "repeats": 2})
+    body = answer.json()
+    assert (answer.status_code, client.get(answer.headers["location"]).json()) == (201, body)
+    assert (body["captures"], body["captures_done"], body["state"]) == (26, 0, "open")
+    assert body["next"]["words"] == "Put the sphere in the middle of the volume."
+    assert len(body["positions"]) == 23
     test = desk.open(lambda *_: PLAN)
     path = f"/acceptance/{test.id}"
     early = client.get(f"{path}/report.json")
     assert (early.status_code, early.json()["type"]) == (409, "/problems/artefact-not-ready")
-    first = client.post(f"{path}/position").json()
-    assert first["captures_done"] == PLAN.repeats
-    assert set(first["readings"][0]["errors_mm"]) == {"PF", "PS"}
+    measured = client.post(f"{path}/position").json()
+    assert measured["captures_done"] == PLAN.repeats
+    assert set(measured["readings"][0]["errors_mm"]) == {"PF", "PS"}
     client.post(f"{path}/position", json={"scripted": True})
     body = client.get(path).json()
     assert (body["state"], body["decision"], body["next"]) == ("finished", "passes", None)
     assert client.get(body["files"]["report.json"]).json()["decision"] == "passes"
     assert "No conformity" in client.get(body["files"]["report.html"]).text
     assert client.post(f"{path}/position").status_code == 409
+    first, second = client.get("/acceptance").json()["tests"]
+    assert (first["id"], first["decision"], second["decision"]) == (str(test.id), "passes", None)
+    assert client.get("/acceptance?limit=1").json()["tests"] == [first]
     assert (tmp_path / "acceptance" / str(test.id) / "points").is_dir()
+    assert client.delete(path).status_code == 204
+    assert client.get(path).status_code == 404
 
 
 @pytest.mark.parametrize(
@@ -81,13 +81,13 @@ def test_positions_are_measured_to_the_end_and_the_report_is_fetched(
         ({"colour": "red"}, "colour"),
     ],
 )
-def test_what_cannot_be_tested_is_refused(client: TestClient, body: dict[str, object], words: str) -> None:
+def test_bad_request_for_a_test_is_refused(client: TestClient, body: dict[str, object], words: str) -> None:
     answer = client.post("/acceptance", json={"volume_mm": VOLUME, **body})
     assert answer.status_code == 422
     assert words in answer.text
 
 
-def test_a_held_rig_answers_409_and_an_unknown_test_404(
+def test_held_rig_answers_409_and_an_unknown_test_404(
     client: TestClient, desk: AcceptanceDesk, queue: TameQueue
 ) -> None:
     test = desk.open(lambda *_: PLAN)
@@ -98,16 +98,7 @@ def test_a_held_rig_answers_409_and_an_unknown_test_404(
     assert client.post(f"/acceptance/{test.id}/cancel").json()["state"] == "cancelled"
 
 
-def test_exact_artefacts_are_refused_on_metal(client: TestClient) -> None:
-    assert RIG.solved is None
-    opened = client.post("/acceptance", json={"volume_mm": VOLUME}).json()
-    client.post(f"/acceptance/{opened['id']}/position", json={"scripted": True})
-    error = client.get(f"/acceptance/{opened['id']}").json()["error"]
-    assert error["status"] == 422
-    assert "exact artefacts are those of a rendered rig" in error["detail"]
-
-
-def test_a_repeated_request_opens_and_measures_nothing_anew(
+def test_repeated_request_opens_and_measures_nothing_new(
     client: TestClient, desk: AcceptanceDesk, queue: TameQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
@@ -124,15 +115,3 @@ def test_a_repeated_request_opens_and_measures_nothing_anew(
         other = {"repeats": 2} if where == "/acceptance" else {"scripted": True}
         answer = client.post(where, headers=key, json=other)
         assert (answer.status_code, answer.json()["type"]) == (422, "/problems/idempotency"), where
-
-
-def test_tests_are_listed_and_deleted(client: TestClient, desk: AcceptanceDesk) -> None:
-    first, second = desk.open(lambda *_: PLAN), desk.open(lambda *_: PLAN)
-    desk.measure(second.id, wait=False, scripted=True)
-    listed = client.get("/acceptance").json()["tests"]
-    assert [each["id"] for each in listed] == [str(second.id), str(first.id)]
-    assert (listed[0]["decision"], listed[1]["decision"]) == ("passes", None)
-    assert client.get(listed[0]["files"]["report.html"]).status_code == 200
-    assert client.get("/acceptance?limit=1").json()["tests"] == listed[:1]
-    assert client.delete(f"/acceptance/{second.id}").status_code == 204
-    assert client.get(f"/acceptance/{second.id}").status_code == 404

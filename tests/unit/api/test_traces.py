@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fastapi.testclient import TestClient
 
 from slrig.api.traces import traces_by_environment
 from slrig.errors import ConfigError
@@ -20,7 +19,7 @@ from slrig.failure import JobFailure
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobState
 from slrig.jobs.store import JobStore
-from tests.unit.api.conftest import KEY, ServedBench, ended
+from tests.unit.api.conftest import ServedBench, client_of, ended
 
 WHY = "needs OpenTelemetry: pip install 'slrig[telemetry]'"
 EXPORTER = "opentelemetry.exporter.otlp.proto.http.trace_exporter"
@@ -122,8 +121,7 @@ def test_job_is_a_trace_with_a_span_for_each_stage(collector: Collector, tmp_pat
 def test_service_sends_each_of_its_jobs(collector: Collector, tmp_path: Path) -> None:
     served = ServedBench(tmp_path)
     served.gate.set()
-    headers = {"Authorization": f"Bearer {KEY}"}
-    with TestClient(served.app, base_url="http://127.0.0.1", headers=headers) as client:
+    with client_of(served) as client:
         scans = [client.post("/scan").json()["id"]]
         ended(client, scans[0])
     _, spans = collector.spans()
@@ -146,6 +144,7 @@ def test_library_that_is_missing_is_told_with_its_command(monkeypatch: pytest.Mo
         traces_by_environment()
 
 
+@pytest.mark.slow
 def test_nothing_is_loaded_unless_it_is_asked_for() -> None:
     code = "import sys, slrig.api.service as s; s.traces_by_environment(); print('opentelemetry.sdk' in sys.modules)"
     found = subprocess.run(  # noqa: S603 - our own interpreter and code
