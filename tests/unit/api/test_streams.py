@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterator, MutableMapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator, MutableMapping, Sequence
 from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
@@ -22,6 +22,7 @@ from slrig.jobs.feed import JobFeed
 from slrig.jobs.records import JobEvent, JobKind, JobProgress, JobState
 from slrig.jobs.store import EVERY_JOB, JobStore
 from tests.unit.api.conftest import KEY, ServedBench
+from tests.unit.looped import on_loop
 from tests.unit.scan.fakes import WAIT_S
 
 
@@ -101,7 +102,8 @@ async def rest(stream: AsyncIterator[ServerSentEvent]) -> list[str | None]:
         return [event.id async for event in stream]
 
 
-def test_client_ahead_of_its_scan_gets_what_comes_next(jobs: Jobs) -> None:
+@on_loop
+async def test_client_ahead_of_its_scan_gets_what_comes_next(jobs: Jobs) -> None:
     scan = jobs.scan()
 
     def go_on() -> None:
@@ -109,148 +111,133 @@ def test_client_ahead_of_its_scan_gets_what_comes_next(jobs: Jobs) -> None:
         jobs.scans.finish(scan, JobState.SUCCEEDED)
 
     jobs.scans.act = go_on
-    assert asyncio.run(rest(jobs.follow_scan(scan, 1000))) == ["2", "3"]
+    assert await rest(jobs.follow_scan(scan, 1000)) == ["2", "3"]
     assert jobs.streams.followed == {}
 
 
 @pytest.mark.parametrize("final", [True, False])
-def test_stream_of_a_deleted_scan_ends(jobs: Jobs, final: bool) -> None:
+@on_loop
+async def test_stream_of_a_deleted_scan_ends(jobs: Jobs, final: bool) -> None:
     scan = jobs.scan()
     woken: list[bool] = []
     unwatch = jobs.scans.watch(scan, lambda: woken.append(True))
-
-    async def follow() -> list[str | None]:
-        stream = jobs.follow_scan(scan, 0)
-        assert (await anext(stream)).id == "1"
-        if final:
-            # The last event wakes the stream, which then finds the scan gone.
-            jobs.scans.act = lambda: jobs.scans.delete(scan)
-            jobs.scans.finish(scan, JobState.SUCCEEDED)
-        else:
-            jobs.scans.delete(scan)
-        return await rest(stream)
-
-    assert asyncio.run(follow()) == []
+    stream = jobs.follow_scan(scan, 0)
+    assert (await anext(stream)).id == "1"
+    if final:
+        # The last event wakes the stream, which then finds the scan gone.
+        jobs.scans.act = lambda: jobs.scans.delete(scan)
+        jobs.scans.finish(scan, JobState.SUCCEEDED)
+    else:
+        jobs.scans.delete(scan)
+    assert await rest(stream) == []
     unwatch()
     assert woken[0]
 
 
-def test_event_of_any_job_wakes_the_streams_of_all_jobs(jobs: Jobs) -> None:
-    async def follow() -> None:
-        stream, calibration = jobs.follow(), uuid4()
-        waiting = asyncio.ensure_future(some(stream, 1))
-        await jobs.looked(1)
-        scan = await asyncio.to_thread(jobs.scan)
-        (first,) = await waiting
-        assert (first["number"], first["job"]["id"], first["state"]) == (1, str(scan), "queued")
-        waiting = asyncio.ensure_future(some(stream, 2))
-        await asyncio.sleep(0)
-        pose = await asyncio.to_thread(jobs.poses.create, {"number": 4}, rig="bench", label=None, parent=calibration)
-        fault = JobFailure("pose-refused", "no board")
-        await asyncio.to_thread(jobs.poses.finish, pose.id, JobState.FAILED, fault=fault)
-        queued, failed = await waiting
-        assert (queued["number"], queued["event"], failed["number"]) == (2, "state", 3)
-        assert failed["job"] == {
-            "id": str(pose.id),
-            "kind": "pose",
-            "label": None,
-            "calibration": str(calibration),
-            "links": {
-                "self": f"/calibration/{calibration}/pose/4",
-                "events": f"/calibration/{calibration}/events",
-                "calibration": f"/calibration/{calibration}",
-            },
-        }
-        # As everywhere, a fault is the problem that it is.
-        assert (failed["error"]["type"], failed["error"]["detail"]) == ("/problems/pose-refused", "no board")
-
-    asyncio.run(follow())
+@on_loop
+async def test_event_of_any_job_wakes_the_streams_of_all_jobs(jobs: Jobs) -> None:
+    stream, calibration = jobs.follow(), uuid4()
+    waiting = asyncio.ensure_future(some(stream, 1))
+    await jobs.looked(1)
+    scan = await asyncio.to_thread(jobs.scan)
+    (first,) = await waiting
+    assert (first["number"], first["job"]["id"], first["state"]) == (1, str(scan), "queued")
+    waiting = asyncio.ensure_future(some(stream, 2))
+    await asyncio.sleep(0)
+    pose = await asyncio.to_thread(jobs.poses.create, {"number": 4}, rig="bench", label=None, parent=calibration)
+    fault = JobFailure("pose-refused", "no board")
+    await asyncio.to_thread(jobs.poses.finish, pose.id, JobState.FAILED, fault=fault)
+    queued, failed = await waiting
+    assert (queued["number"], queued["event"], failed["number"]) == (2, "state", 3)
+    assert failed["job"] == {
+        "id": str(pose.id),
+        "kind": "pose",
+        "label": None,
+        "calibration": str(calibration),
+        "links": {
+            "self": f"/calibration/{calibration}/pose/4",
+            "events": f"/calibration/{calibration}/events",
+            "calibration": f"/calibration/{calibration}",
+        },
+    }
+    # As everywhere, a fault is the problem that it is.
+    assert (failed["error"]["type"], failed["error"]["detail"]) == ("/problems/pose-refused", "no board")
 
 
-def test_many_events_come_in_pieces_and_then_the_stream_waits(jobs: Jobs) -> None:
+@on_loop
+async def test_many_events_come_in_pieces_and_then_the_stream_waits(jobs: Jobs) -> None:
     jobs.scan(steps=41)
 
-    async def follow() -> None:
-        stream = jobs.follow(most=7)
-        assert [each["number"] for each in await some(stream, 42)] == list(range(1, 43))
-        waiting = asyncio.ensure_future(some(stream, 1))
-        await jobs.looked(7)
-        # Looks run on these threads: were there further ones, they would have begun.
-        for _ in range(20):
-            await asyncio.to_thread(int)
-        assert (jobs.looks, waiting.done()) == ([0, 7, 14, 21, 28, 35, 42], False), "it looks again and again"
-        await asyncio.to_thread(jobs.scan)
-        assert (await waiting)[0]["number"] == 43
-
-    asyncio.run(follow())
+    stream = jobs.follow(most=7)
+    assert [each["number"] for each in await some(stream, 42)] == list(range(1, 43))
+    waiting = asyncio.ensure_future(some(stream, 1))
+    await jobs.looked(7)
+    # Looks run on these threads: were there further ones, they would have begun.
+    for _ in range(20):
+        await asyncio.to_thread(int)
+    assert (jobs.looks, waiting.done()) == ([0, 7, 14, 21, 28, 35, 42], False), "it looks again and again"
+    await asyncio.to_thread(jobs.scan)
+    assert (await waiting)[0]["number"] == 43
 
 
-def test_twenty_clients_cost_little_more_than_one(jobs: Jobs) -> None:
+@on_loop
+async def test_twenty_clients_cost_little_more_than_one(jobs: Jobs) -> None:
     jobs.scan(steps=59)
 
-    async def follow() -> None:
-        # Each begins somewhere else: no look serves two of them.
-        late = [jobs.follow(start, most=2) for start in range(20)]
-        await asyncio.gather(*(some(stream, 60 - start) for start, stream in enumerate(late)))
-        assert len(jobs.streams.followed[EVERY_JOB]._looks) <= 16
-        for stream in late:
-            await stream.aclose()
-        jobs.looks.clear()
-        everyone = [asyncio.ensure_future(some(jobs.follow(60), 10)) for _ in range(20)]
-        await jobs.looked(1)
-        await asyncio.to_thread(jobs.scan, steps=9)
-        found = await asyncio.gather(*everyone)
-        assert all([each["number"] for each in one] == list(range(61, 71)) for one in found)
-
-    asyncio.run(follow())
+    # Each begins somewhere else: no look serves two of them.
+    late = [jobs.follow(start, most=2) for start in range(20)]
+    await asyncio.gather(*(some(stream, 60 - start) for start, stream in enumerate(late)))
+    assert len(jobs.streams.followed[EVERY_JOB]._looks) <= 16
+    for stream in late:
+        await stream.aclose()
+    jobs.looks.clear()
+    everyone = [asyncio.ensure_future(some(jobs.follow(60), 10)) for _ in range(20)]
+    await jobs.looked(1)
+    await asyncio.to_thread(jobs.scan, steps=9)
+    found = await asyncio.gather(*everyone)
+    assert all([each["number"] for each in one] == list(range(61, 71)) for one in found)
     # Each alone would look for each event, 200 times in all.
     assert len(jobs.looks) <= 44
 
 
-def test_end_of_the_service_ends_the_stream_after_the_last_event(jobs: Jobs) -> None:
+@on_loop
+async def test_end_of_the_service_ends_the_stream_after_the_last_event(jobs: Jobs) -> None:
     scan = jobs.scan()
 
-    async def follow() -> None:
-        stream = jobs.follow(1)
-        waiting = asyncio.ensure_future(some(stream, 1))
-        await jobs.looked(1)
-        await asyncio.to_thread(jobs.scans.finish, scan, JobState.INTERRUPTED)
-        jobs.feed.end()
-        assert (await waiting)[0]["state"] == "interrupted"
-        assert await rest(stream) == []
-
-    asyncio.run(follow())
+    stream = jobs.follow(1)
+    waiting = asyncio.ensure_future(some(stream, 1))
+    await jobs.looked(1)
+    await asyncio.to_thread(jobs.scans.finish, scan, JobState.INTERRUPTED)
+    jobs.feed.end()
+    assert (await waiting)[0]["state"] == "interrupted"
+    assert await rest(stream) == []
     assert jobs.streams.followed == {}
 
 
-def test_events_of_a_deleted_job_are_gone_and_others_go_on(jobs: Jobs) -> None:
+@on_loop
+async def test_events_of_a_deleted_job_are_gone_and_others_go_on(jobs: Jobs) -> None:
     first, second = jobs.scan(steps=2), jobs.scan()
     jobs.scans.delete(first)
 
-    async def follow() -> None:
-        stream = jobs.follow()
-        assert [each["number"] for each in await some(stream, 1)] == [4]
-        waiting = asyncio.ensure_future(some(stream, 1))
-        await asyncio.sleep(0)
-        await asyncio.to_thread(jobs.scans.delete, second)
-        await asyncio.to_thread(jobs.scan)
-        # A number that was used is never used again.
-        assert (await waiting)[0]["number"] == 5
-
-    asyncio.run(follow())
+    stream = jobs.follow()
+    assert [each["number"] for each in await some(stream, 1)] == [4]
+    waiting = asyncio.ensure_future(some(stream, 1))
+    await asyncio.sleep(0)
+    await asyncio.to_thread(jobs.scans.delete, second)
+    await asyncio.to_thread(jobs.scan)
+    # A number that was used is never used again.
+    assert (await waiting)[0]["number"] == 5
 
 
-def test_client_that_names_no_event_gets_the_number_where_it_begins(jobs: Jobs) -> None:
+@on_loop
+async def test_client_that_names_no_event_gets_the_number_where_it_begins(jobs: Jobs) -> None:
     jobs.scan(steps=4)
 
-    async def follow() -> None:
-        stream = stream_of(jobs.streams, EVERY_JOB, jobs.followed(), 5, begins=5)
-        async with asyncio.timeout(WAIT_S):
-            assert (await anext(stream)).encode() == b"id: 5\n\n"
-        await asyncio.to_thread(jobs.scan)
-        assert [each["number"] for each in await some(stream, 1)] == [6]
-
-    asyncio.run(follow())
+    stream = stream_of(jobs.streams, EVERY_JOB, jobs.followed(), 5, begins=5)
+    async with asyncio.timeout(WAIT_S):
+        assert (await anext(stream)).encode() == b"id: 5\n\n"
+    await asyncio.to_thread(jobs.scan)
+    assert [each["number"] for each in await some(stream, 1)] == [6]
 
 
 def test_bad_number_of_an_event_is_refused(client: TestClient) -> None:
@@ -258,7 +245,7 @@ def test_bad_number_of_an_event_is_refused(client: TestClient) -> None:
         assert client.get(path, headers=headers).status_code == 422
 
 
-def asked(app: FastAPI, path: str, gone: asyncio.Event) -> Awaitable[int]:
+def asked(app: FastAPI, path: str, gone: asyncio.Event) -> asyncio.Future[int]:
     """The status of an answer to a client that stays until `gone` is set."""
     status: asyncio.Future[int] = asyncio.get_running_loop().create_future()
     scope = {
@@ -283,35 +270,29 @@ def asked(app: FastAPI, path: str, gone: asyncio.Event) -> Awaitable[int]:
 
 
 @pytest.mark.parametrize("path", ["of a scan", "/events"])
-def test_only_so_many_streams_are_open_at_once(client: TestClient, served: ServedBench, path: str) -> None:
+@on_loop
+async def test_only_so_many_streams_are_open_at_once(client: TestClient, served: ServedBench, path: str) -> None:
     path = served.held(client)["links"]["events"] if path == "of a scan" else path
     gone = asyncio.Event()
-
-    async def burst(count: int) -> list[int]:
-        answers = [asyncio.ensure_future(asked(served.app, path, gone)) for _ in range(count)]
-        # All but those that stay open are answered; these end when their clients go.
-        refused, waiting = [], answers
-        while len(waiting) > 1:
-            done, pending = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED, timeout=WAIT_S)
-            assert done, "more streams are open than may"
-            refused += [answer.result() for answer in done]
-            waiting = list(pending)
-        assert served.app.state.streams.count == 1
-        gone.set()
-        return [*refused, *await asyncio.gather(*waiting)]
-
-    assert sorted(asyncio.run(burst(6))) == [200, *[429] * 5]
+    waiting = [asyncio.ensure_future(asked(served.app, path, gone)) for _ in range(6)]
+    # All but those that stay open are answered; these end when their clients go.
+    refused: list[int] = []
+    while len(waiting) > 1:
+        done, pending = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED, timeout=WAIT_S)
+        assert done, "more streams are open than may"
+        refused += [answer.result() for answer in done]
+        waiting = list(pending)
+    assert served.app.state.streams.count == 1
+    gone.set()
+    assert (refused, await waiting[0]) == ([429] * 5, 200)
     assert served.app.state.streams.count == 0
 
 
-def test_client_that_is_gone_before_its_stream_begins_keeps_no_place(client: TestClient, served: ServedBench) -> None:
-    path = served.held(client)["links"]["events"]
-
-    async def leave_at_once() -> None:
-        gone = asyncio.Event()
-        gone.set()
-        async with asyncio.timeout(WAIT_S):
-            await asked(served.app, path, gone)
-
-    asyncio.run(leave_at_once())
+@on_loop
+async def test_client_that_is_gone_before_its_stream_begins_keeps_no_place(
+    client: TestClient, served: ServedBench
+) -> None:
+    gone = asyncio.Event()
+    gone.set()
+    await asked(served.app, served.held(client)["links"]["events"], gone)
     assert served.app.state.streams.count == 0
