@@ -14,6 +14,7 @@ from tests.unit.calibrate.solved import BOARD, solved_result
 
 ID = "3f6c1f6e-9f0e-4c57-8a39-5f8a4f0c2b11"
 NOW = "2026-11-22T09:30:00+00:00"
+UNKNOWN_OF_A_POSE = ("position", "position_name", "exposure_s", "accepted", "answer", "error", "seconds")
 
 
 class Desk:
@@ -83,14 +84,8 @@ class Desk:
             "name": f"pose {self.latest}",
             "state": "queued",
             "created_at": NOW,
-            "position": None,
-            "position_name": None,
-            "exposure_s": None,
-            "accepted": None,
-            "answer": None,
-            "error": None,
-            "seconds": None,
             "links": {"self": here, "events": f"/calibration/{ID}/events", "cancel": f"{here}/cancel", "pictures": {}},
+            **dict.fromkeys(UNKNOWN_OF_A_POSE),
         }
         PoseBody.model_validate(pose)
         self.shot.append(pose)
@@ -104,14 +99,10 @@ class Desk:
         if not pose["accepted"]:
             problem = {"type": "about:blank", "title": "t", "status": 422, "detail": "the board moved: hold it still"}
             pose["error"] = problem
+        figures = {"corners_found": 80, "tilt_deg": 31.2, "distance_mm": None, "sharpness_px": 1.1, "moved_px": 0.02}
         pose["answer"] = {
-            "corners_found": {"left": 80},
+            **{name: {"left": figure} for name, figure in {**figures, "saturated": 0.013}.items()},
             "corners_expected": 88,
-            "tilt_deg": {"left": 31.2},
-            "distance_mm": {"left": None},
-            "sharpness_px": {"left": 1.1},
-            "moved_px": {"left": 0.02},
-            "saturated": {"left": 0.013},
             "warnings": ["camera 'left' sees the board small: bring it nearer"],
         }
 
@@ -128,15 +119,13 @@ class Desk:
         here = f"/calibration/{ID}"
         accepted = sum(pose["accepted"] is True for pose in self.shot)
         cells = [[accepted * (row < 2 and column < 3) for column in range(6)] for row in range(6)]
-        device = {
-            "cells": cells,
-            "reachable": [[row != 5 for _ in range(6)] for row in range(6)],
-            "share": 6 / 36,
-            "depths": 1,
-            "tilted": [1, 0],
-            "turns": 2,
-            "distance_mm": [None, None],
-        }
+        reachable = [[row != 5 for _ in range(6)] for row in range(6)]
+        seen = {"cells": cells, "reachable": reachable, "share": 6 / 36, "depths": 1, "tilted": [1, 0], "turns": 2}
+        coverage = {"poses": [], "devices": {"left": {**seen, "distance_mm": [None, None]}}}
+        board = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0, "marker_mm": None, "dictionary": None}
+        links = {what: f"{here}/{what}" for what in ("events", "pose", "solve", "activate")}
+        plan = {"line_shift_period_px": 8, "line_width_px": 1, "gray_cell_px": None, "gray_offset_px": 0}
+        corner = [[900, 600], [1270, 600], [1270, 1000], [900, 1000]]
         solved = self.state == "solved"
         problem = {"type": "about:blank", "title": "t", "status": 422, "detail": self.solve_error}
         session = {
@@ -152,42 +141,20 @@ class Desk:
             "verdict": "good" if solved else None,
             "links": {
                 "self": here,
-                "events": f"{here}/events",
-                "pose": f"{here}/pose",
-                "solve": f"{here}/solve",
-                "activate": f"{here}/activate",
+                **links,
                 "coverage": {},
                 "files": {"calibration.json": f"{here}/calibration.json"} if solved else {},
             },
-            "board": {
-                "kind": "chessboard",
-                "corners": [11, 8],
-                "square_mm": 12.0,
-                "marker_mm": None,
-                "dictionary": None,
-                "square_sigma": 0.001,
-                "aspect": 1.0,
-                "title": BOARD.title,
-            },
-            "patterns": {
-                "line_shift_period_px": 8,
-                "line_width_px": 1,
-                "gray_cell_px": None,
-                "gray_offset_px": 0,
-                "line_shift": True,
-                "rows": True,
-                "codes": True,
-            },
+            "board": {**board, "square_sigma": 0.001, "aspect": 1.0, "title": BOARD.title},
+            "patterns": {**plan, "line_shift": True, "rows": True, "codes": True},
             "shot": self.shot,
             "script": list(range(max(self.script - 1, 0))),
-            "coverage": {"poses": [], "devices": {"left": device}, "missing": ["3 of at least 10 poses"]}
-            if accepted
-            else None,
+            "coverage": {**coverage, "missing": ["3 of at least 10 poses"]} if accepted else None,
             "next_move": {
                 "words": "move it to the lower right corner",
                 "enough": False,
                 "camera": "left",
-                "outline_px": [[900, 600], [1270, 600], [1270, 1000], [900, 1000]],
+                "outline_px": corner,
                 "worst_px": {},
                 "expected_px": {},
             },

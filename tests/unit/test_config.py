@@ -13,8 +13,6 @@ from slrig.errors import ConfigError
 from slrig.model import FlipRule
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 
-RIGS = sorted((Path(__file__).resolve().parents[2] / "config" / "rigs").glob("*.toml"))
-
 BENCH = """
 name = "bench"
 calibration = "bench.json"
@@ -80,15 +78,6 @@ def test_the_rules_of_the_mesh_are_read(tmp_path: Path) -> None:
     assert (scan.flip_rule, scan.smooth_boundary) == (FlipRule.DELAUNAY, False)
 
 
-def test_there_are_rigs_to_read() -> None:
-    assert RIGS
-
-
-@pytest.mark.parametrize("path", RIGS, ids=lambda path: path.stem)
-def test_every_rig_of_the_repository_is_read(path: Path) -> None:
-    assert read_rig(path).name
-
-
 def test_scan_defaults_are_the_fields_of_a_plan() -> None:
     plan = {field.name for part in (PatternPlan, ReconstructionPlan, ScanPlan) for field in fields(part)}
     # A pose may be shot without codes, a scan may not; a request makes a series, names a preset and turns a stage, no
@@ -116,9 +105,13 @@ def test_scan_defaults_are_the_fields_of_a_plan() -> None:
         ("depth_edge_ratio = 6", 'flip_rule = "dyer"', "scan.flip_rule"),
         ("depth_edge_ratio = 6", "smooth_boundary = 1", "scan.smooth_boundary"),
         ("[scan]", '[head]\ndriver = "x"\n[scan]', "expected [head] alone"),
+        (BENCH, 'name = "x"', "found no [projector]"),
+        (BENCH, 'name = "x"\n[projector]\ndriver = "y"', "found no [[camera]]"),
+        (BENCH, 'name = "x"\nname = "y"', "expected TOML, found a fault: Cannot overwrite"),
+        (BENCH, "name = ", "expected TOML, found a fault"),
     ],
 )
-def test_a_bad_rig_is_told_with_its_key(tmp_path: Path, old: str, new: str, part: str) -> None:
+def test_fault_of_a_rig_file_is_named_with_its_key(tmp_path: Path, old: str, new: str, part: str) -> None:
     assert old in BENCH
     path = _rig(tmp_path, BENCH.replace(old, new, 1))
     with pytest.raises(ConfigError) as caught:
@@ -127,30 +120,13 @@ def test_a_bad_rig_is_told_with_its_key(tmp_path: Path, old: str, new: str, part
     assert part in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "part"),
-    [
-        ('name = "x"', r"found no \[projector\]"),
-        ('name = "x"\n[projector]\ndriver = "y"', r"found no \[\[camera\]\]"),
-        ('name = "x"\nname = "y"', "expected TOML, found a fault: Cannot overwrite"),
-        ("name = ", "expected TOML, found a fault"),
-    ],
-)
-def test_what_is_no_rig_is_told(tmp_path: Path, text: str, part: str) -> None:
-    with pytest.raises(ConfigError, match=part):
-        read_rig(_rig(tmp_path, text))
-
-
-def test_a_missing_rig_file_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.toml: expected a readable file, found: No such file"):
-        read_rig(tmp_path / "none.toml")
-
-
 def test_every_fault_of_a_rig_is_in_one_message(tmp_path: Path) -> None:
     text = BENCH.replace('name = "left"', "").replace("gain = 2", 'gain = "2"').replace("depth_edge_ratio", "ratio")
     with pytest.raises(ConfigError) as caught:
         read_rig(_rig(tmp_path, text))
     assert len(str(caught.value).splitlines()) == 4
+    with pytest.raises(ConfigError, match=r"none\.toml: expected a readable file, found: No such file"):
+        read_rig(tmp_path / "none.toml")
 
 
 def test_settings_are_closed_by_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

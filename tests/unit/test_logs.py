@@ -13,11 +13,10 @@ from pathlib import Path
 
 import pytest
 import structlog
-from typer.testing import CliRunner
 
 from slrig import logs
-from slrig.cli.commands import app
 from slrig.logs import LogFormat, set_up_logs, set_up_logs_for_a_person
+from tests.unit.command import slrig
 
 
 @pytest.fixture(autouse=True)
@@ -52,16 +51,13 @@ def line(monkeypatch: pytest.MonkeyPatch, form: LogFormat, *, terminal: bool) ->
     return stream.getvalue()
 
 
-def test_a_terminal_shows_text_and_a_pipe_carries_json(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_terminal_shows_text_and_pipe_carries_json_unless_a_form_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = line(monkeypatch, "auto", terminal=True)
     assert "{" not in shown
     assert shown.index("the rig cannot be opened") < shown.index("bench") < shown.index("no light")
     carried = json.loads(line(monkeypatch, "auto", terminal=False))
     assert (carried["event"], carried["cause"]) == ("the rig cannot be opened", "no light")
     assert carried["timestamp"].endswith("Z")
-
-
-def test_either_form_can_be_had_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     written = line(monkeypatch, "text", terminal=False)
     assert written.partition(" ")[2] == "[warning] the rig cannot be opened rig=bench cause='no light'\n"
     assert json.loads(line(monkeypatch, "json", terminal=True))["rig"] == "bench"
@@ -80,21 +76,11 @@ def test_an_error_is_told_with_its_trace_in_either_form(monkeypatch: pytest.Monk
         assert "IndexError" in stream.getvalue()
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["conform", "{}"],
-        ["latency", "{}"],
-        ["doctor", "{}"],
-        ["verify", "{}"],
-        ["accept", "{}", "--output", "{}"],
-        ["reconstruct", "{}", "--output", "{}"],
-        ["calibrate", "solve", "{}", "--output", "{}.json"],
-    ],
-    ids=lambda arguments: str(arguments[0]),
-)
-def test_a_command_that_works_by_itself_logs_beside_its_output(tmp_path: Path, arguments: list[str]) -> None:
-    result = CliRunner().invoke(app, [word.format(tmp_path / "absent") for word in arguments])
+@pytest.mark.parametrize("command", ["conform", "latency", "doctor", "verify", "accept", "reconstruct", "calibrate"])
+def test_command_that_works_by_itself_logs_beside_its_output(tmp_path: Path, command: str) -> None:
+    solve = ["solve"] if command == "calibrate" else []
+    output = [] if command in {"conform", "latency", "doctor", "verify"} else ["--output", tmp_path / "absent.json"]
+    result = slrig(command, *solve, tmp_path / "absent", *output)
     assert result.exit_code == 2, result.output
     assert structlog.is_configured()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from slrig.api.keys import ALL_SCOPES, FIRST_NAME, GIVEN_NAME, KeyRing, first_key
+from slrig.api.keys import ALL_SCOPES, FIRST_NAME, GIVEN_NAME, Key, KeyRing, first_key
 from slrig.api.scopes import Scope
 from slrig.errors import ConfigError, StorageError
 
@@ -18,13 +18,18 @@ def ring(folder: Path, *, given: str | None = None, now: datetime = NOW) -> KeyR
     return KeyRing(folder / "keys.json", given=given, clock=lambda: now)
 
 
+def known(keys: KeyRing, key: str | None) -> Key:
+    found = keys.find(str(key))
+    assert found is not None
+    return found
+
+
 def test_a_key_is_seen_once_and_kept_as_its_digest(tmp_path: Path) -> None:
     key = ring(tmp_path).add("Ann", [Scope.SCAN])
     path = tmp_path / "keys.json"
     assert key not in path.read_text()
     assert path.stat().st_mode & 0o777 == 0o600
-    found = ring(tmp_path).find(key)
-    assert found is not None
+    found = known(ring(tmp_path), key)
     assert (found.name, found.scopes, found.fault(NOW)) == ("Ann", (Scope.LOOK, Scope.SCAN), None)
     assert ring(tmp_path).find(key[:-1]) is None
 
@@ -34,16 +39,13 @@ def test_what_another_process_changes_holds_at_once(tmp_path: Path) -> None:
     key = elsewhere.add("Ann", [])
     assert serving.find(key) is not None
     elsewhere.revoke("Ann")
-    revoked = serving.find(key)
-    assert revoked is not None
-    assert revoked.fault(NOW) == "was revoked on 2026-11-24"
+    assert known(serving, key).fault(NOW) == "was revoked on 2026-11-24"
     assert serving.find(elsewhere.add("Ann", [])) is not None
 
 
 def test_a_key_ends_when_it_was_said_to(tmp_path: Path) -> None:
     key = ring(tmp_path).add("guest", [], life=timedelta(days=2))
-    found = ring(tmp_path).find(key)
-    assert found is not None
+    found = known(ring(tmp_path), key)
     assert found.fault(NOW + timedelta(days=1.9)) is None
     assert found.fault(NOW + timedelta(days=2)) == "expired on 2026-11-26"
 
@@ -64,21 +66,16 @@ def test_names_are_told_apart(tmp_path: Path) -> None:
 def test_the_first_start_makes_a_key_and_a_lost_one_is_replaced(tmp_path: Path) -> None:
     keys = ring(tmp_path)
     first = first_key(keys, fresh=False)
-    assert first is not None
     assert first_key(keys, fresh=False) is None
     fresh = first_key(keys, fresh=True)
-    assert fresh is not None
-    old, new = keys.find(first), keys.find(fresh)
-    assert old is not None
-    assert new is not None
+    old, new = known(keys, first), known(keys, fresh)
     assert old.fault(NOW) is not None
     assert (new.name, new.scopes, new.fault(NOW)) == (FIRST_NAME, ALL_SCOPES, None)
 
 
 def test_the_key_of_the_environment_is_kept_nowhere(tmp_path: Path) -> None:
     keys = ring(tmp_path, given="the key of tests")
-    found = keys.find("the key of tests")
-    assert found is not None
+    found = known(keys, "the key of tests")
     assert (found.name, found.scopes) == (GIVEN_NAME, ALL_SCOPES)
     assert first_key(keys, fresh=False) is None
     assert list(tmp_path.iterdir()) == []

@@ -81,11 +81,6 @@ def test_the_page_is_small() -> None:
     assert sum(len(gzip.compress(path.read_bytes(), 6)) for path in files) < MOST_GZIPPED_BYTES
 
 
-def test_screens_have_one_subject() -> None:
-    lengths = {path.name: len(path.read_text(encoding="utf-8").splitlines()) for path in FOLDER.glob("*.*")}
-    assert {name: lines for name, lines in lengths.items() if lines > 400} == {}
-
-
 def test_marks_are_on_what_is_saturated_and_in_light_on_what_is_dark() -> None:
     image = np.full((16, 30), 128, dtype=np.uint8)
     image[:, :10], image[:, 20:] = 255, 3
