@@ -7,14 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fastapi.testclient import TestClient
-from typer.testing import CliRunner
 
 from slrig.catalogue.store import Catalogue, open_catalogue
-from slrig.cli.commands import app
 from tests.postgres import LOGIN, Postgres
-from tests.unit.api.conftest import KEY, ServedBench
+from tests.unit.api.conftest import ServedBench, client_of
 from tests.unit.catalogue.test_store import job, row, unseen_for_an_hour
+from tests.unit.command import slrig
 
 
 @pytest.fixture
@@ -32,64 +30,60 @@ def catalogue(address: str) -> Iterator[Catalogue]:
 
 def test_a_fleet_is_listed_with_its_ages(address: str, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")
-    told = CliRunner().invoke(app, ["fleet", "--catalogue", address])
+    told = slrig("fleet", "--catalogue", address)
     assert (told.exit_code, "no rig writes to" in told.output) == (0, True), told.output
     for name in ("hall-1", "hall-2"):
         catalogue.see(row(name))
     catalogue.copy([job("hall-1", state="failed", fault_message="too dark"), job("hall-2")])
     unseen_for_an_hour(catalogue, "hall-2")
-    told = CliRunner().invoke(app, ["fleet"], env={"SLRIG_CATALOGUE": address})
+    told = slrig("fleet", SLRIG_CATALOGUE=address)
     _, one, two = [line.split() for line in told.output.splitlines() if line.strip() and "━" not in line]
     assert one[:2] == ["hall-1", "busy"]
     assert {"failed", "3,", "4", "copy"} <= set(one)
     assert two[:5] == ["hall-2", "unseen", "60", "min", "ago"]
     assert "?" in two
-    told = CliRunner().invoke(app, ["fleet", "--catalogue", address, "--json"])
+    told = slrig("fleet", "--catalogue", address, "--json")
     assert [each["state"] for each in json.loads(told.output)["rigs"]] == ["busy", "unseen"]
 
 
 def test_a_service_says_what_its_catalogue_says_or_what_to_set(address: str, tmp_path: Path) -> None:
-    headers = {"Authorization": f"Bearer {KEY}"}
     without = ServedBench(tmp_path / "without")
-    with TestClient(without.app, base_url="http://127.0.0.1", headers=headers) as client:
+    with client_of(without) as client:
         refused = client.get("/fleet")
         assert (refused.status_code, "catalogue_login_file" in refused.json()["detail"]) == (404, True)
         assert client.get("/rig").json()["fleet"] is False
         assert "slrig_catalogue" not in client.get("/metrics").text
     served = ServedBench(tmp_path / "data", catalogue=address)
     assert served.service.copier is not None
-    with TestClient(served.app, base_url="http://127.0.0.1", headers=headers) as client:
+    with client_of(served) as client:
         assert client.get("/rig").json()["fleet"] is True
         while served.service.copier.status().fault is not None:
             served.service.copier._ending.wait(0.01)
         found = client.get("/fleet").json()
         assert [each["name"] for each in found["rigs"]] == ["bench"]
-        told = CliRunner().invoke(app, ["fleet", "--catalogue", address, "--json"])
+        told = slrig("fleet", "--catalogue", address, "--json")
         (here,), (there,) = found["rigs"], json.loads(told.output)["rigs"]
         assert here | {"seen_s": 0} == there | {"seen_s": 0}
         assert "slrig_catalogue_waiting 0.0" in client.get("/metrics").text
 
 
-def in_one_line(words: str) -> str:
-    """What a terminal has broken into lines, by how long a folder's name is."""
-    return " ".join(words.split())
-
-
-def test_the_login_is_told_to_nobody(postgres: Postgres, tmp_path: Path) -> None:
+def test_login_is_in_no_answer(postgres: Postgres, tmp_path: Path) -> None:
     login = tmp_path / "login"
     login.write_text(LOGIN + "\n")
     login.chmod(0o644)
     settings = tmp_path / "settings.toml"
     settings.write_text(f'catalogue = "{postgres.address("cli")}"\ncatalogue_login_file = "login"\n')
-    told = CliRunner().invoke(app, ["fleet", "--settings", str(settings)])
-    assert (told.exit_code, "chmod 600" in in_one_line(told.stderr)) == (2, True)
+
+    def told(words: str) -> tuple[int, bool]:
+        result = slrig("fleet", "--settings", settings)
+        assert "another" not in result.output
+        # A terminal breaks lines by how long a folder's name is.
+        return result.exit_code, words in " ".join(result.output.split())
+
+    assert told("chmod 600") == (2, True)
     login.chmod(0o600)
-    told = CliRunner().invoke(app, ["fleet", "--settings", str(settings)])
-    assert (told.exit_code, 'database "cli" does not exist' in in_one_line(told.stderr)) == (2, True)
+    assert told('database "cli" does not exist') == (2, True)
     postgres.execute("CREATE DATABASE cli")
-    told = CliRunner().invoke(app, ["fleet", "--settings", str(settings)])
-    assert (told.exit_code, "no rig writes to postgresql://127.0.0.1" in in_one_line(told.output)) == (0, True)
+    assert told("no rig writes to postgresql://127.0.0.1") == (0, True)
     login.write_text("slrig:another")
-    told = CliRunner().invoke(app, ["fleet", "--settings", str(settings)])
-    assert (told.exit_code, "password authentication failed" in in_one_line(told.stderr)) == (2, True)
-    assert "another" not in told.output + told.stderr
+    assert told("password authentication failed") == (2, True)

@@ -6,16 +6,15 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from slrig.cli import init
-from slrig.cli.commands import app
 from slrig.cli.init import failure_of, typed
 from slrig.config import RigConfig, read_rig
 from slrig.devices import Camera, FoundDevice, Projector
 from slrig.discovery import Findings, MissingLibrary, open_rig
 from slrig.errors import DriverBrokenError
 from tests.unit import test_discovery
+from tests.unit.command import slrig
 
 LEFT = FoundDevice("v4l2", "usb-046d_C920_1A-video-index0", "HD Pro Webcam C920 (/dev/video0)")
 RIGHT = FoundDevice("v4l2", "usb-046d_C920_2B-video-index0", "HD Pro Webcam C920 (/dev/video2)")
@@ -45,8 +44,7 @@ class Bench:
     def run_with(self, findings: Findings, *arguments: str, answers: str | None = None) -> tuple[int, str]:
         self._monkeypatch.setattr(init, "found_devices", lambda: findings)
         self._monkeypatch.setattr(init, "terminal", lambda: answers is not None)
-        given = ["init", "--output", str(self.path), *arguments]
-        result = CliRunner().invoke(app, given, input=answers)
+        result = slrig("init", "--output", self.path, *arguments, typed=answers)
         return result.exit_code, result.output
 
     def rig(self) -> RigConfig:

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from slrig.bundle.stage import StageAngle, write_stage
 from slrig.cli import model_shoot
-from slrig.cli.commands import app
 from slrig.client.events import Progress
 from slrig.devices import Rig
 from slrig.errors import DeviceGoneError, ServiceError
@@ -21,6 +20,7 @@ from slrig.scan.artefacts import encode_mesh_ply
 from slrig.scan.plan import ScanPlan
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, seen
 from tests.unit.capture.fake_rig import FakeTurntable, fake_rig
+from tests.unit.command import slrig
 
 STAGE = ["--axis-point", *map(str, AXIS_POINT_MM), "--axis-direction", *map(str, AXIS)]
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "demo.toml"
@@ -64,7 +64,7 @@ def bench(made: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 
 def model(*words: object, typed: str = "") -> Result:
-    return CliRunner().invoke(app, ["model", *map(str, words)], input=typed, env={"COLUMNS": "120"})
+    return slrig("model", *words, typed=typed, COLUMNS="120")
 
 
 @pytest.mark.slow

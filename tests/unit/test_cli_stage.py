@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from typer.testing import CliRunner
 
 from slrig.bundle.stage_file import AxisSource, StageRecord, encode_stage, read_stage
-from slrig.cli.commands import app
 from slrig.combine.stage import with_axis
 from slrig.model import MeasuredAxis, PlaneKind
 from slrig.scan.artefacts import encode_mesh_ply
+from tests.unit.command import done, refused, slrig
 from tests.unit.views.test_stage_planes import AXIS, PLATE, WALL, joined
 
 
@@ -22,14 +21,11 @@ def test_planes_are_added_to_what_the_file_says_of_the_axis(tmp_path: Path) -> N
     axis = MeasuredAxis(AXIS.point_mm, AXIS.direction, 1e-4 * np.eye(6))
     record = with_axis(StageRecord(), axis, source=AxisSource.BOARD, of="board")
     file.write_bytes(encode_stage(record))
-    done = CliRunner().invoke(app, ["stage", "planes", str(scan), "--stage", str(file)], env={"COLUMNS": "160"})
-    assert done.exit_code == 0, done.output
-    assert [line.split()[0] for line in done.stdout.splitlines()] == ["plane", "backdrop", "plate", "stage"]
+    shown = done("stage", "planes", scan, "--stage", file, COLUMNS="160")
+    assert [line.split()[0] for line in shown.splitlines()] == ["plane", "backdrop", "plate", "stage"]
     after = read_stage(file)
     assert [plane.kind for plane in after.planes] == [PlaneKind.BACKDROP, PlaneKind.PLATE]
     assert after.history == record.history
     file.write_text("{}")
-    refused = CliRunner().invoke(app, ["stage", "planes", str(scan), "--stage", str(file)])
-    assert refused.exit_code == 2
-    assert "is not a valid stage" in refused.stderr
+    assert "is not a valid stage" in refused(slrig("stage", "planes", scan, "--stage", file))
     assert file.read_text() == "{}"

@@ -98,9 +98,9 @@ def client(session: TestClient, served: ServedBench) -> Iterator[TestClient]:
         session.delete(f"/scan/{scan['id']}")
 
 
-def client_of(served: ServedBench) -> TestClient:
+def client_of(served: ServedBench, *, key: str | None = KEY) -> TestClient:
     """A client that holds the key of a service; within `with`, the service runs."""
-    headers = {"Authorization": f"Bearer {KEY}"}
+    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
     return TestClient(served.app, base_url=HERE, headers=headers, raise_server_exceptions=False)
 
 

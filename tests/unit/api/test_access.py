@@ -20,9 +20,8 @@ from slrig.api.app import bare_app, create_app
 from slrig.api.keys import KeyRing
 from slrig.api.scopes import READING, Scope, needed_scope
 from slrig.api.sessions import LINK_PATH, Sessions
-from tests.unit.api.conftest import KEY, ServedBench, ended
+from tests.unit.api.conftest import HERE, KEY, ServedBench, client_of, ended
 
-HERE = "http://127.0.0.1"
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin", "Origin": HERE, "Referer": f"{HERE}/docs"}
 
 
@@ -34,8 +33,7 @@ def ring(served: ServedBench) -> Iterator[KeyRing]:
 
 
 def stranger(served: ServedBench, key: str | None = None) -> TestClient:
-    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
-    return TestClient(served.app, base_url=HERE, headers=headers, raise_server_exceptions=False)
+    return client_of(served, key=key)
 
 
 def sessions(served: ServedBench) -> Sessions:
@@ -183,44 +181,37 @@ def test_a_session_ends_with_its_time_and_with_its_key(
     assert "a session that is over" in other.get("/scan").json()["detail"]
 
 
-@pytest.mark.parametrize(
-    "headers",
-    [
-        {"Sec-Fetch-Site": "cross-site"},
-        {"Sec-Fetch-Site": "same-site", "Origin": "http://127.0.0.1:3000"},
-        {"Origin": "https://evil.example"},
-        {"Origin": "null"},
-        {"Origin": "http://127.0.0.1:3000"},
-        {"Origin": "http://127.0.0.1.evil.example"},
-        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"},
-    ],
+FOREIGN_PAGES = (
+    {"Sec-Fetch-Site": "cross-site"},
+    {"Sec-Fetch-Site": "same-site", "Origin": "http://127.0.0.1:3000"},
+    {"Origin": "https://evil.example"},
+    {"Origin": "null"},
+    {"Origin": "http://127.0.0.1:3000"},
+    {"Origin": "http://127.0.0.1.evil.example"},
+    {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"},
 )
+
+
 @pytest.mark.parametrize("keyed", [True, False])
-def test_what_a_foreign_page_sends_moves_nothing(
-    client: TestClient, served: ServedBench, headers: dict[str, str], keyed: bool
-) -> None:
-    browser = logged_in(served)
-    if not keyed:
-        browser = TestClient(create_app(served.service, ring=None), base_url=HERE)
+def test_requests_of_a_foreign_page_move_nothing(client: TestClient, served: ServedBench, keyed: bool) -> None:
+    browser = logged_in(served) if keyed else TestClient(create_app(served.service, ring=None), base_url=HERE)
     before = client.get("/scan").json()
-    for method, path in (("POST", "/scan"), ("POST", "/session"), ("GET", "/preview/cam0?light=white")):
-        response = browser.request(method, path, headers=headers)
-        assert (response.status_code, response.json()["type"]) == (403, "/problems/foreign-page"), path
+    for headers in FOREIGN_PAGES:
+        for method, path in (("POST", "/scan"), ("POST", "/session"), ("GET", "/preview/cam0?light=white")):
+            response = browser.request(method, path, headers=headers)
+            assert (response.status_code, response.json()["type"]) == (403, "/problems/foreign-page"), (path, headers)
+        # A link on another page may lead here; nothing else of it may read.
+        assert browser.get("/scan", headers=headers).status_code == (200 if "Sec-Fetch-Mode" in headers else 403)
     assert client.get("/scan").json() == before
-    if "Sec-Fetch-Mode" in headers:
-        # A link on another page may lead here.
-        assert browser.get("/scan", headers=headers).status_code == 200
-    elif "Origin" in headers or "Sec-Fetch-Site" in headers:
-        assert browser.get("/scan", headers=headers).status_code == 403
 
 
-def test_a_picture_that_moves_light_says_which_page_it_is_on(client: TestClient, served: ServedBench) -> None:
+def test_picture_that_moves_light_says_which_page_it_is_on(client: TestClient, served: ServedBench) -> None:
     # Browsers send neither Sec-Fetch-Site nor Origin with a picture of an address that is neither local nor encrypted.
     browser = logged_in(served)
-    assert browser.get("/preview/none?light=white").status_code == 403
-    assert browser.get("/preview/none?light=white", headers={"Referer": "http://127.0.0.1:3000/"}).status_code == 403
-    assert browser.get("/preview/none?light=white", headers={"Referer": f"{HERE}/docs"}).status_code == 404
-    assert client.get("/preview/none?light=white").status_code == 404
+    path = "/preview/none?light=white"
+    for headers, status in (({}, 403), ({"Referer": f"{HERE}:3000/"}, 403), ({"Referer": f"{HERE}/docs"}, 404)):
+        assert browser.get(path, headers=headers).status_code == status
+    assert client.get(path).status_code == 404
 
 
 def test_own_pages_and_programs_are_served(client: TestClient, served: ServedBench) -> None:
@@ -232,7 +223,7 @@ def test_own_pages_and_programs_are_served(client: TestClient, served: ServedBen
         ended(client, scan.json()["id"])
 
 
-def test_who_asked_for_a_scan_is_on_record(client: TestClient, served: ServedBench, ring: KeyRing) -> None:
+def test_name_of_the_key_is_on_record(client: TestClient, served: ServedBench, ring: KeyRing) -> None:
     scan = stranger(served, ring.add("Ann", [Scope.SCAN])).post("/scan").json()
     assert scan["requested_by"] == "Ann"
     assert ended(client, scan["id"])["requested_by"] == "Ann"
@@ -244,9 +235,7 @@ def test_who_asked_for_a_scan_is_on_record(client: TestClient, served: ServedBen
     ]
     older = client.get(client.get("/audit?limit=1").json()["next"]).json()["entries"]
     assert older[0]["who"] == "Ann"
-
-
-def test_strangers_and_readers_are_not_put_on_record(client: TestClient, served: ServedBench) -> None:
+    # Strangers and readers are not on it.
     before = client.get("/audit").json()
     stranger(served).post("/scan")
     client.get("/scan")
