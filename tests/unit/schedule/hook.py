@@ -66,7 +66,7 @@ class Hook:
             self.server.socket = context.wrap_socket(self.server.socket, server_side=True)
         self.port: int = self.server.server_port
         self.url = f"http{'' if certificate is None else 's'}://127.0.0.1:{self.port}{PATH}"
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True).start()
 
     def next(self) -> dict[str, Any]:
         """What came first of what was not looked at yet."""

@@ -16,7 +16,6 @@ from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.desk import AcceptanceDesk
 from slrig.accept.report import write_reports
 from slrig.accept.running import evaluated
-from slrig.calibrate.calibrating import Calibrations
 from slrig.errors import (
     CalibrationError,
     DeviceError,
@@ -33,10 +32,9 @@ from slrig.jobs.database import Database
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.records import JobKind, JobState, utc_now
 from slrig.jobs.store import JobStore
+from slrig.schedule import rig_tasks
 from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.rig_tasks import error_of
-from slrig.schedule.scheduler import Scheduler
-from slrig.schedule.store import ScheduleStore
 from slrig.schedule.tasks import Tasks
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
@@ -44,7 +42,7 @@ from slrig.verify.verification import VerificationTools
 from tests.unit.accept.test_desk import PLAN, desk, desks, queue
 from tests.unit.calibrate.calibration_bench import CalibrationBench
 from tests.unit.jobs.tame_queue import TameQueue
-from tests.unit.scan.fakes import WAIT_S, SetClock
+from tests.unit.scan.fakes import WAIT_S
 from tests.unit.verify.health_bench import a_verification
 
 __all__ = ["desk", "desks", "queue"]
@@ -53,12 +51,11 @@ BOARD = {"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}
 
 
 class TaskBench(CalibrationBench):
-    """A runner over a tame bench, the desks beside it, and a schedule over them on a clock that a test sets."""
+    """A runner over a tame bench, the desks over it, and the tasks of schedules over them."""
 
     def __init__(self, tmp_path: Path, *, positioner: bool = True) -> None:
         super().__init__(tmp_path, positioner=positioner)
         self.queue = self.runner.queue
-        self.calibrations = Calibrations(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
         self.health = HealthStore(Database(self.folder.database))
         tools = self.tame.tools()
         verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_verification())
@@ -74,9 +71,6 @@ class TaskBench(CalibrationBench):
             self.queue, self.calibrations, self.verifications, self.acceptance,
             tidy=lambda: self.tidied.append(len(self.calibrations.latest())),
         )  # fmt: skip
-        self.clock = SetClock()
-        self.schedules = ScheduleStore(Database(self.folder.database))
-        self.scheduler = Scheduler(self.schedules, self.tasks, clock=self.clock, execute=lambda call: call())
 
     def do(self, task: TaskKind, *, cancelled: Callable[[], bool] = lambda: False, **options: Any) -> Mapping[str, Any]:
         """One run."""
@@ -96,7 +90,6 @@ class TaskBench(CalibrationBench):
     def close(self) -> None:
         super().close()
         self.health.database.close()
-        self.schedules.database.close()
 
 
 def scheduled(task: TaskKind, options: Mapping[str, Any]) -> tuple[Schedule, Run]:
@@ -109,10 +102,25 @@ ID = UUID("3f2a0000-9f0e-4c57-8a39-5f8a4f0c2b11")
 HOLDER = "schedule 3f2a0000, {} due 06:30"
 
 
+@pytest.fixture(autouse=True)
+def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig_tasks, "LOOK_S", 0.005)
+
+
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[TaskBench]:
     made = TaskBench(tmp_path)
     made.runner.start()
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TaskBench]:
+    """A bench whose rig is open, for tests that change nothing."""
+    made = TaskBench(tmp_path_factory.mktemp("opened"))
+    made.runner.start()
+    made.open()
     yield made
     made.close()
 
@@ -133,51 +141,20 @@ def checked(tasks: Tasks, task: TaskKind, options: Mapping[str, Any]) -> None:
         ("calibration", {"board": BOARD, "activate": "yes", "poses": 3}, "activate.*poses"),
         ("acceptance", {"repeats": 0}, "repeats.*are: artefacts, volume_mm, wanted_mm, limits"),
         ("acceptance", {"artefacts": {"plane_mm": [1, 2]}}, "sphere: missing"),
-    ],
-)
-def test_options_that_no_run_could_be_done_with_are_refused_at_once(
-    bench: TaskBench, task: str, options: dict[str, Any], words: str
-) -> None:
-    with pytest.raises(ScheduleError, match=words):
-        checked(bench.tasks, TaskKind(task), options)
-
-
-@pytest.mark.parametrize(
-    ("task", "options", "words"),
-    [
+        # What can only fail on this rig.
         ("verification", {}, r"not known: no calibration that was made here is in use\. Give the schedule .*\"board\""),
         ("verification", {"board": BOARD, "position": 3}, "no 3; it has 0 to 2: near, far"),
         ("calibration", {"board": BOARD, "positions": [0, "upside down", 7]}, "no 'upside down', 7; it has 0 to 2"),
     ],
 )
-def test_work_that_can_only_fail_on_this_rig_is_refused_at_once(
-    bench: TaskBench, task: str, options: dict[str, Any], words: str
+def test_options_with_which_no_run_can_succeed_are_refused_at_once(
+    opened: TaskBench, task: str, options: dict[str, Any], words: str
 ) -> None:
-    bench.open()
     with pytest.raises(ScheduleError, match=words):
-        checked(bench.tasks, TaskKind(task), options)
+        checked(opened.tasks, TaskKind(task), options)
 
 
-def test_work_that_needs_a_positioner_is_refused_where_there_is_none(tmp_path: Path) -> None:
-    bench = TaskBench(tmp_path, positioner=False)
-    orders: list[tuple[TaskKind, dict[str, Any]]] = [
-        (TaskKind.CALIBRATION, {"board": BOARD}),
-        (TaskKind.ACCEPTANCE, {}),
-        (TaskKind.VERIFICATION, {"board": BOARD, "position": 0}),
-    ]
-    for task, options in orders:
-        # Nobody knows before the rig is open: a run is refused then.
-        checked(bench.tasks, task, options)
-    bench.runner.start()
-    bench.open()
-    for task, options in orders:
-        with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
-            checked(bench.tasks, task, options)
-    checked(bench.tasks, TaskKind.VERIFICATION, {"board": BOARD})
-    bench.close()
-
-
-def test_options_that_are_right_are_taken(bench: TaskBench) -> None:
+def test_valid_options_are_accepted(bench: TaskBench) -> None:
     bench.use_a_calibration()
     exact = {"value_mm": 30, "uncertainty_mm": 0.001}
     artefacts = {"sphere": exact, "bar": exact, "plane_mm": [160, 110], "sphere_form_mm": 0, "plane_form_mm": 0}
@@ -189,6 +166,28 @@ def test_options_that_are_right_are_taken(bench: TaskBench) -> None:
         (TaskKind.ACCEPTANCE, {"artefacts": artefacts, "volume_mm": [[0, 0, 0], [1, 1, 1.5]], "repeats": 2}),
     ):
         checked(bench.tasks, task, options)
+
+
+def test_work_that_needs_a_positioner_is_refused_where_there_is_none(tmp_path: Path) -> None:
+    bench = TaskBench(tmp_path, positioner=False)
+    orders: list[tuple[TaskKind, dict[str, Any]]] = [
+        (TaskKind.CALIBRATION, {"board": BOARD}),
+        (TaskKind.ACCEPTANCE, {}),
+        (TaskKind.VERIFICATION, {"board": BOARD, "position": 0}),
+    ]
+    for task, options in orders:
+        # It is not known before the rig is open: a run is refused then.
+        checked(bench.tasks, task, options)
+    bench.runner.start()
+    bench.open()
+    for task, options in orders:
+        with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
+            checked(bench.tasks, task, options)
+    with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
+        bench.do(TaskKind.CALIBRATION, board=BOARD)
+    assert bench.calibrations.latest() == []
+    checked(bench.tasks, TaskKind.VERIFICATION, {"board": BOARD})
+    bench.close()
 
 
 def test_calibration_takes_every_pose_solves_and_is_used_only_if_asked(bench: TaskBench) -> None:
@@ -232,15 +231,6 @@ def test_device_that_fails_ends_the_run(bench: TaskBench) -> None:
     # It is tried again from the first pose on, and nothing is left of it.
     assert bench.calibrations.latest() == []
     assert bench.tidied == [0]
-
-
-def test_rig_without_a_positioner_is_told_in_words(tmp_path: Path) -> None:
-    bench = TaskBench(tmp_path, positioner=False)
-    bench.runner.start()
-    with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
-        bench.do(TaskKind.CALIBRATION, board=BOARD)
-    assert bench.calibrations.latest() == []
-    bench.close()
 
 
 def test_rig_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
@@ -320,42 +310,6 @@ def test_run_that_is_cancelled_lets_the_rig_go(bench: TaskBench, task: TaskKind)
     assert len(errors) == 1
     bench.gate.set()
     assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
-
-
-def test_schedule_that_finds_a_scan_tries_again_within_its_grace(bench: TaskBench) -> None:
-    bench.use_a_calibration()
-    order = Order(Cron("30 12 * * *", "UTC"), TaskKind.VERIFICATION, retry_s=60.0)
-    schedule = bench.schedules.create(order, bench.clock())
-    scan = bench.held()
-    bench.clock.move(minutes=30)
-    bench.scheduler.tick()
-    (waiting,) = bench.schedules.runs(schedule.id)
-    assert (waiting.state, waiting.attempts) == (RunState.WAITING, 1)
-    assert f"rig busy: The rig is held by scan {scan.id}" in (waiting.reason or "")
-    bench.gate.set()
-    bench.until(scan.id)
-    bench.clock.move(minutes=1)
-    bench.scheduler.tick()
-    (done,) = bench.schedules.runs(schedule.id)
-    assert (done.state, done.reason) == (RunState.SUCCEEDED, "at try 2")
-    assert done.result is not None
-    assert done.result["state"] == "good"
-
-
-def test_schedule_that_is_removed_during_its_run_is_forgotten(bench: TaskBench) -> None:
-    bench.use_a_calibration()
-    schedule = bench.schedules.create(Order(Cron("30 12 * * *", "UTC"), TaskKind.VERIFICATION), bench.clock())
-    bench.clock.move(minutes=30)
-    bench.gate.clear()
-    bench.began.clear()
-    run = threading.Thread(target=bench.scheduler.tick)
-    run.start()
-    assert bench.began.wait(WAIT_S)
-    bench.schedules.remove(schedule.id)
-    bench.gate.set()
-    run.join(WAIT_S)
-    assert bench.schedules.all() == []
-    bench.scheduler.tick()
 
 
 def test_acceptance_is_measured_by_script_and_tells_its_decision(
