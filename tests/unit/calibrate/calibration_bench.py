@@ -177,17 +177,14 @@ class TameCalibrating:
 
 
 class CalibrationBench(Bench):
-    """A runner over a tame bench, and calibrations beside it. solve : a task of the worker, for the tame one."""
+    """A runner over a tame bench, and calibrations over it."""
 
-    def __init__(self, tmp_path: Path, *, positioner: bool = False, solve: str | None = None) -> None:
+    def __init__(self, tmp_path: Path, *, positioner: bool = False) -> None:
         super().__init__(tmp_path)
         self.tame = TameCalibrating(self)
         self._positioner = positioner
-        tools = self.tame.tools()
-        if solve is not None:
-            tools = replace(tools, solve=self.worker.task(solve, "solve"))
         self.jobs = JobStore(self.store.database, JobKind.POSE, JobKind.SOLVE)
-        self.calibrations = Calibrations(self.folder, self.runner, self.jobs, rig_name="bench", tools=tools)
+        self.calibrations = Calibrations(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
 
     def restarted(self) -> Calibrations:
         """The calibrations as the next start of the service has them."""

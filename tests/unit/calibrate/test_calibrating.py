@@ -1,21 +1,22 @@
-"""A session from its first pose to the calibration in use, and what it bears on the way."""
+"""A session from its first pose to the calibration in use, restarts, imports, and which calibrations are kept."""
 
 from __future__ import annotations
 
 import json
 import shutil
-import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from uuid import uuid4
+from uuid import UUID, uuid4
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 from slrig.bundle.calibration_file import read_calibration, write_calibration
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionState
+from slrig.calibrate.retention import Retention, named_by_scans
 from slrig.calibrate.store import CalibrationStore
 from slrig.errors import (
     ArtefactNotReadyError,
@@ -29,7 +30,6 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.jobs.records import JobKind, JobState
-from slrig.jobs.store import JobStore
 from slrig.model import Size
 from slrig.scan.sweep import sweep
 from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench, tame_calibration
@@ -86,6 +86,15 @@ def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBe
     assert bench.calibrations.active == session_id
     assert list(bench.folder.incoming.iterdir()) == []
     assert bench.opened[0][1].dark
+
+    events = bench.jobs.events_of(session_id, after=0)
+    numbers = [event.number for event in events]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == bench.jobs.last_event_of(session_id)
+    of_each = ["queued", "capturing", "computing", "succeeded"]
+    of_all = [*of_each, *of_each, "queued", "computing", "succeeded"]
+    assert [event.data["state"] for event in events if event.kind == "state"] == of_all
+    assert {"capture", "adjust"} <= {event.data["stage"] for event in events if event.kind == "progress"}
 
 
 def test_pose_is_shot_along_both_axes_and_knows_no_earlier_calibration(bench: CalibrationBench) -> None:
@@ -146,56 +155,6 @@ def test_pose_and_scan_stand_in_one_line(bench: CalibrationBench) -> None:
     assert bench.until_pose(session_id, waiting.number).state is JobState.SUCCEEDED
 
 
-def test_cancel_ends_a_pose_under_way_and_one_that_waits(bench: CalibrationBench) -> None:
-    session_id = bench.session()
-    first = bench.held_pose(session_id)
-    second = bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=True)
-    assert bench.calibrations.poses.cancel(session_id, second.number).state is JobState.CANCELLED
-    bench.calibrations.poses.cancel(session_id, first.number)
-    assert bench.until_pose(session_id, first.number).state is JobState.CANCELLED
-    assert bench.opened[0][1].dark
-    assert list(bench.folder.incoming.iterdir()) == []
-    assert bench.calibrations.poses.cancel(session_id, first.number).state is JobState.CANCELLED
-
-
-def test_device_that_vanishes_fails_the_pose_and_is_opened_again(bench: CalibrationBench) -> None:
-    session_id = bench.session()
-    bench.error = DeviceGoneError("Camera 'cam0' was unplugged.")
-    pose = bench.shot(session_id)
-    assert (pose.state, None if pose.fault is None else pose.fault.code) == (JobState.FAILED, "device-gone")
-    assert bench.opened_again.wait(WAIT_S)
-    assert bench.shot(session_id).state is JobState.SUCCEEDED
-
-
-def test_full_disk_during_a_pose_fails_it_and_leaves_nothing(bench: CalibrationBench) -> None:
-    session_id = bench.session()
-    bench.error = StorageError("000.png: the disk refused: No space left on device")
-    pose = bench.shot(session_id)
-    assert (pose.state, None if pose.fault is None else pose.fault.code) == (JobState.FAILED, "storage")
-    assert list(bench.folder.incoming.iterdir()) == []
-    assert not bench.calibrations.store.pose(session_id, 1).exists()
-    assert not bench.opened[0][1].closed
-    bench.free_bytes = 1000
-    with pytest.raises(StorageError, match="are free"):
-        bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=False)
-    assert bench.calibrations.register.get(session_id).latest_pose == 1
-
-
-def test_full_disk_while_a_pose_is_read_fails_it(bench: CalibrationBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    session_id = bench.session()
-
-    def commit(*_: object) -> None:
-        message = "Writing failed: No space left on device."
-        raise StorageError(message)
-
-    monkeypatch.setattr(CalibrationStore, "commit_pose", commit)
-    pose = bench.shot(session_id)
-    monkeypatch.undo()
-    assert (pose.state, None if pose.fault is None else pose.fault.code) == (JobState.FAILED, "storage")
-    assert list(bench.folder.incoming.iterdir()) == []
-    assert bench.shot(session_id).state is JobState.SUCCEEDED
-
-
 def test_end_that_the_disk_refuses_is_not_lost(bench: CalibrationBench, monkeypatch: pytest.MonkeyPatch) -> None:
     session_id = bench.session()
     pose = bench.held_pose(session_id)
@@ -211,32 +170,6 @@ def test_end_that_the_disk_refuses_is_not_lost(bench: CalibrationBench, monkeypa
     assert bench.shot(session_id).state is JobState.SUCCEEDED
     (record,) = CalibrationStore(bench.folder).load()
     assert record.coverage == {"poses": ["pose 1", "pose 2"]}
-
-
-def test_end_that_the_records_refuse_is_on_record_when_they_take_it(
-    bench: CalibrationBench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    session_id = bench.session()
-    refused = threading.Event()
-
-    def finish(*_: object, **__: object) -> bool:
-        refused.set()
-        message = "The service's records could not be used: database or disk is full."
-        raise StorageError(message)
-
-    monkeypatch.setattr(JobStore, "finish", finish)
-    pose = bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=True)
-    assert refused.wait(WAIT_S)
-    monkeypatch.undo()
-    assert bench.until_pose(session_id, pose.number).state is JobState.SUCCEEDED
-
-
-def test_defect_in_the_reading_is_told_without_its_traceback(bench: CalibrationBench) -> None:
-    bench.tame.read_error = ZeroDivisionError("secret")
-    pose = bench.shot(bench.session())
-    assert (pose.state, None if pose.fault is None else pose.fault.code) == (JobState.FAILED, "unexpected")
-    assert pose.fault is not None
-    assert "secret" not in pose.fault.message
 
 
 def test_dropped_pose_is_in_no_solve_and_its_number_is_not_given_again(bench: CalibrationBench) -> None:
@@ -372,22 +305,6 @@ def test_calibration_in_use_is_not_deleted_and_can_be_let_go(bench: CalibrationB
         bench.calibrations.register.get(session_id)
 
 
-def test_scan_uses_the_active_calibration(bench: CalibrationBench) -> None:
-    seen = []
-    capture = bench.runner._tools.capture
-
-    def watched(rig: object, *given: object, **options: object) -> object:
-        seen.append(getattr(rig, "calibration"))  # noqa: B009 - any rig
-        return capture(rig, *given, **options)  # type: ignore[arg-type] # as it came
-
-    object.__setattr__(bench.runner._tools, "capture", watched)
-    bench.until(bench.scan().id)
-    bench.calibrations.activate(bench.solved())
-    bench.until(bench.scan().id)
-    assert seen[0] is None
-    assert seen[1].cameras["cam0"].matrix[0, 0] == 80.0
-
-
 def test_calibration_of_other_devices_is_not_activated(bench: CalibrationBench) -> None:
     bench.until(bench.scan().id)
     path = bench.folder.root / "other.json"
@@ -428,6 +345,10 @@ def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: Calibrat
     bench.calibrations.activate(active)
     session_id = bench.session()
     bench.shot(session_id)
+    solving = bench.session()
+    bench.shot(solving)
+    bench.tame.solving.clear()
+    bench.calibrations.solves.solve(solving)
     staged = bench.folder.staging(bench.held_pose(session_id).id)
     assert staged.is_dir()
     # What a power cut leaves, seen by the next start.
@@ -440,24 +361,10 @@ def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: Calibrat
     fault = record.poses[1].fault
     assert fault is not None
     assert (fault.code, "Start it again" in fault.message) == ("scan-interrupted", True)
-    assert [each.id for each in again.latest()] == [session_id, active]
-    assert [each.observation.name for each in again.store.readings(record)] == ["pose 1"]
-
-
-def test_end_of_the_service_cuts_off_what_is_under_way(bench: CalibrationBench) -> None:
-    session_id, other = bench.session(), bench.session()
-    bench.shot(other)
-    bench.tame.solving.clear()
-    bench.calibrations.solves.solve(other)
-    bench.held_pose(session_id)
-    bench.runner.close()
-    bench.calibrations.close()
-    assert bench.opened[0][1].dark
-    register = bench.calibrations.register
-    assert register.pose(session_id, 1).state is JobState.INTERRUPTED
     # A solve may end yet; the next start tells of one that did not.
-    assert bench.restarted().register.get(other).state is SessionState.FAILED
-    bench.tame.solving.set()
+    assert again.register.get(solving).state is SessionState.FAILED
+    assert [each.id for each in again.latest()] == [solving, session_id, active]
+    assert [each.observation.name for each in again.store.readings(record)] == ["pose 1"]
 
 
 def test_pose_that_waited_is_shot_after_a_restart_and_one_with_its_frames_is_read(bench: CalibrationBench) -> None:
@@ -536,13 +443,66 @@ def test_active_calibration_that_is_gone_ends_the_start(bench: CalibrationBench)
         bench.restarted()
 
 
-def test_events_tell_of_poses_and_of_the_solve(bench: CalibrationBench) -> None:
-    session_id = bench.solved(poses=1)
-    events = bench.jobs.events_of(session_id, after=0)
-    numbers = [event.number for event in events]
-    assert numbers == sorted(set(numbers))
-    assert numbers[-1] == bench.jobs.last_event_of(session_id)
-    assert [event.data["state"] for event in events if event.kind == "state"] == [
-        "queued", "capturing", "computing", "succeeded", "queued", "computing", "succeeded",
-    ]  # fmt: skip
-    assert {"capture", "adjust"} <= {event.data["stage"] for event in events if event.kind == "progress"}
+def a_scan(bench: CalibrationBench, *, report: object = None, bundle: UUID | None = None) -> None:
+    """The folder of a scan that names a calibration in its report, or has its file in its bundle."""
+    folder = bench.folder.scan(uuid4())
+    (folder / "bundle").mkdir(parents=True)
+    if report is not None:
+        (folder / "report.json").write_text(json.dumps(report))
+    if bundle is not None:
+        store = bench.calibrations.store
+        shutil.copy(store.solve(bundle, 1) / "calibration.json", folder / "bundle" / "calibration.json")
+
+
+def test_only_what_is_neither_new_nor_needed_is_removed(bench: CalibrationBench) -> None:
+    in_report, twice, in_bundle, active, empty, unused, newest = (
+        *(bench.solved() for _ in range(4)), bench.session(), bench.solved(), bench.session(),
+    )  # fmt: skip
+    bench.calibrations.solves.solve(twice)
+    bench.until_session(twice, lambda found: found.solve == 2)
+    bench.calibrations.activate(active)
+    a_scan(bench, report={"calibration": {"id": str(in_report)}})
+    a_scan(bench, report={"calibration": {"id": f"{twice}.2"}})
+    a_scan(bench, bundle=in_bundle)
+    nothings: list[object] = [{}, [], "not a report"]
+    for nothing in nothings:
+        a_scan(bench, report=nothing)
+    places = [bench.calibrations.store.folder(each) for each in (empty, unused)]
+    assert all(place.is_dir() for place in places)
+    assert Retention(bench.calibrations, bench.folder, keep=7)() == ()
+    with capture_logs() as log:
+        assert Retention(bench.calibrations, bench.folder, keep=1)() == (empty, unused)
+    told = [each["calibration"] for each in log if each["event"] == "old calibration removed"]
+    assert told == [str(empty), str(unused)]
+    assert not any(place.exists() for place in places)
+    assert [record.id for record in bench.calibrations.latest()] == [newest, active, in_bundle, twice, in_report]
+    assert Retention(bench.calibrations, bench.folder, keep=1)() == ()
+
+
+def test_a_pose_under_way_keeps_its_session(bench: CalibrationBench) -> None:
+    old = bench.session()
+    bench.held_pose(old)
+    bench.session()
+    tidy = Retention(bench.calibrations, bench.folder, keep=1)
+    assert tidy() == ()
+    bench.gate.set()
+    bench.until_pose(old, 1)
+    assert tidy() == (old,)
+
+
+def test_one_that_states_no_error_is_known_by_its_numbers(bench: CalibrationBench, tmp_path: Path) -> None:
+    given = tmp_path / "given.json"
+    kept, gone = (tame_calibration(focal_px=focal) for focal in (80.0, 90.0))
+    imported = []
+    for each in (kept, gone):
+        write_calibration(given, each)
+        document = json.loads(given.read_text())
+        document.pop("solved")
+        imported.append(bench.calibrations.submit(json.dumps(document).encode(), ".json").id)
+    bench.session()
+    a_scan(bench, report={"calibration": {"id": kept.digest}})
+    assert named_by_scans(bench.folder.scans) == {kept.digest}
+    tidy = Retention(bench.calibrations, bench.folder, keep=1, named=lambda: {gone.digest})
+    # Others than scans name them too.
+    assert tidy() == ()
+    assert Retention(bench.calibrations, bench.folder, keep=1)() == (imported[1],)

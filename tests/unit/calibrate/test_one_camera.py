@@ -56,13 +56,11 @@ def test_the_camera_is_known_with_its_deviations() -> None:
 
 
 def test_the_error_is_said_to_be_across_the_line_of_sight() -> None:
-    told = result().verdict
-    assert "a point of known distance is expected within" in told.summary
-    assert "mm across the line of sight (1 in" in told.summary
-    assert told.summary.endswith(
-        "; it cannot scan alone: that takes a projector or a second camera, calibrated with it"
-    )
-    (error,) = (each for each in told.judged if each.figure == "error")
+    verdict = result().verdict
+    assert "a point of known distance is expected within" in verdict.summary
+    assert "mm across the line of sight (1 in" in verdict.summary
+    assert verdict.summary.endswith("that takes a projector or a second camera, calibrated with it")
+    (error,) = (each for each in verdict.judged if each.figure == "error")
     assert "off across the line of sight by the calibration; twice that" in error.words
     assert "noise of the light" not in error.words
 
@@ -85,8 +83,8 @@ def test_what_is_not_known_is_null_in_json_and_no_number_on_screen_and_page() ->
     words = " ".join(" ".join(page.words).split())
     assert "Expected error across the line of sight" in words
     assert "by how much a point of known distance may lie wrong across the line of sight there" in words
-    for told in (stream.getvalue(), words):
-        assert not {"nan", "inf", "none"} & set(told.lower().split())
+    for text in (stream.getvalue(), words):
+        assert not {"nan", "inf", "none"} & set(text.lower().split())
 
 
 def test_each_pose_is_judged_without_a_word_of_light() -> None:
@@ -111,7 +109,7 @@ def test_it_is_kept_and_exchanged_as_any_other(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.solved.covariance, result().solution.covariance)
 
 
-def test_two_of_them_are_compared_by_their_lenses() -> None:
+def test_two_such_calibrations_are_compared_by_their_lenses() -> None:
     found = comparison(result().calibration, result().calibration)
     assert found.words[0].endswith("they have one device in common, and a point takes two.")
     assert found.devices["left"].focal_percent.value == 0
