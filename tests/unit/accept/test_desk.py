@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,6 @@ from slrig.errors import (
     JobNotFoundError,
     NothingToReconstructError,
     RigBusyError,
-    ScanInterruptedError,
     ScanStateError,
     StorageError,
     UnsupportedByDeviceError,
@@ -40,9 +40,8 @@ from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobRecord
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
-from slrig.scan.artefacts import encode_mesh_ply
 from tests.unit.accept.test_plan import VOLUME
-from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, nothing_captured, scan_of
+from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, take_scans_from
 from tests.unit.jobs.tame_queue import PowerCut, TameQueue
 from tests.unit.scan.fakes import WAIT_S, TameProjector
 
@@ -80,16 +79,7 @@ def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameQueue) -> 
     """Makes the desk of a service, and of one after it over the same folder."""
     folder = DataFolder(tmp_path)
     database = Database(folder.database)
-    monkeypatch.setattr(acceptance, "capture_frames", nothing_captured)
-
-    def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
-        name = bundle.parent.name.lstrip(".").rsplit("-", 1)[0]
-        output.mkdir()
-        step = next(step for step in PLAN.steps if step.name == name)
-        (output / "mesh.ply").write_bytes(encode_mesh_ply(scan_of(step)))
-        return {}
-
-    monkeypatch.setattr("slrig.scan.reconstruct.reconstruct_bundle", reconstruct)
+    take_scans_from(monkeypatch, PLAN)
 
     def make(*, wanted_mm: float | None = None) -> Desk:
         desk = Desk(
@@ -145,15 +135,6 @@ def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: Desk,
         desk.measure(test.id, wait=False, scripted=False)
 
 
-def test_a_script_measures_all_that_are_left_in_one_loan(desk: Desk, queue: TameQueue) -> None:
-    test = desk.open(the_plan)
-    desk.measure(test.id, wait=False, scripted=True)
-    assert desk.get(test.id).state is AcceptanceState.FINISHED
-    assert len(queue.holders) == 1
-    assert queue.bare.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
-    assert desk.latest() == (desk.get(test.id),)
-
-
 def test_a_position_that_went_wrong_may_be_measured_again(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     test = desk.open(the_plan)
 
@@ -186,14 +167,6 @@ def test_a_cancelled_test_is_over(desk: Desk, queue: TameQueue) -> None:
         desk.file(running.id, "report.json")
 
 
-def test_a_held_rig_is_refused_and_the_test_stays_open(desk: Desk, queue: TameQueue) -> None:
-    test = desk.open(the_plan)
-    queue.busy = "1"
-    with pytest.raises(RigBusyError):
-        desk.measure(test.id, wait=False, scripted=False)
-    assert desk.get(test.id).state is AcceptanceState.OPEN
-
-
 def test_what_cannot_be_tested_is_refused(desk: Desk, queue: TameQueue) -> None:
     with pytest.raises(JobNotFoundError, match="No acceptance test"):
         desk.get(uuid4())
@@ -202,6 +175,11 @@ def test_what_cannot_be_tested_is_refused(desk: Desk, queue: TameQueue) -> None:
     assert failure_code(desk, exact.id) == InvalidInputError.code
     queue.bare.positioner.poses = ("sphere-1",)  # type: ignore[union-attr, misc]
     test = desk.open(the_plan)
+    queue.busy = "1"
+    with pytest.raises(RigBusyError):
+        desk.measure(test.id, wait=False, scripted=False)
+    assert desk.get(test.id).state is AcceptanceState.OPEN
+    queue.busy = None
     desk.measure(test.id, wait=False, scripted=True)
     assert failure_code(desk, test.id) == UnsupportedByDeviceError.code
     facts = queue.rig.facts
@@ -214,17 +192,24 @@ def test_what_cannot_be_tested_is_refused(desk: Desk, queue: TameQueue) -> None:
         desk.open(the_plan)
 
 
-def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks) -> None:
+def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks, queue: TameQueue, tmp_path: Path) -> None:
     before = desks()
     waiting, test = before.open(the_plan), before.open(the_plan)
     before.measure(waiting.id, wait=False, scripted=False)
     before.measure(test.id, wait=False, scripted=True)
+    # A script measures all that are left in one loan of the rig.
+    assert len(queue.holders) == 2
+    assert queue.bare.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
     after = desks()
     for each in (waiting.id, test.id):
         assert record_json(after.get(each)) == record_json(before.get(each))
     assert [each.id for each in after.latest()] == [test.id, waiting.id]
     assert after.get(test.id).decision is Decision.PASSES
     assert after.file(test.id, "report.html").is_file()
+    # It was cut off between its report and its record.
+    kept, finished = tmp_path / "acceptance" / str(test.id) / "test.json", before.get(test.id)
+    kept.write_bytes(record_json(replace(finished, state=AcceptanceState.OPEN, decision=None)))
+    assert record_json(desks().get(test.id)) == record_json(finished)
     # One that waits for its next position goes on.
     assert after.get(waiting.id).state is AcceptanceState.OPEN
     after.measure(waiting.id, wait=False, scripted=True)
@@ -235,64 +220,37 @@ def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks) -> Non
     assert [each.id for each in desks().latest()] == [third.id, waiting.id]
 
 
-def cut_off(desk: Desk, test_id: UUID, queue: TameQueue, *, after_captures: int) -> None:
-    """Have the service end, as it were, in the middle of a capture: nothing is told of how it ended."""
+@pytest.mark.parametrize("ending", [PowerCut(), interruption()], ids=["killed", "ended in good order"])
+def test_test_that_was_cut_off_is_interrupted_and_goes_on(
+    desks: Desks, queue: TameQueue, ending: BaseException
+) -> None:
+    before = desks()
+    test = before.open(the_plan)
 
     def cancelled() -> bool:
-        if len(desk.get(test_id).readings) == after_captures:
-            raise PowerCut
+        if len(before.get(test.id).readings) == 1:
+            raise ending
         return False
 
     queue.cancelled = cancelled
-    with pytest.raises(PowerCut):
-        desk.measure(test_id, wait=False, scripted=True)
+    with suppress(PowerCut):
+        before.measure(test.id, wait=False, scripted=True)
     queue.cancelled = lambda: False
-
-
-def test_a_test_that_was_cut_off_is_told_as_interrupted_and_goes_on(desks: Desks, queue: TameQueue) -> None:
-    before = desks()
-    test = before.open(the_plan)
-    cut_off(before, test.id, queue, after_captures=1)
     stray = before._store.folder(test.id) / ".sphere-1-2"
-    stray.mkdir()
+    stray.mkdir(exist_ok=True)
     after = desks()
-    record = after.get(test.id)
-    assert record.state is AcceptanceState.INTERRUPTED
-    assert failure_code(after, test.id) == ScanInterruptedError.code
+    assert after.get(test.id).state is AcceptanceState.INTERRUPTED
+    assert after.get(test.id).fault == failure_of(interruption())
     assert not stray.exists()
     with pytest.raises(ArtefactNotReadyError, match="is interrupted"):
         after.file(test.id, "report.json")
     assert desks().get(test.id).state is AcceptanceState.INTERRUPTED
     queue.bare.positioner.moves.clear()  # type: ignore[union-attr]
     after.measure(test.id, wait=False, scripted=True)
-    # Between repeats nothing may be moved: the first position begins anew.
+    # Between repeats nothing may be moved: the first position is measured from its first capture on.
     assert queue.bare.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
     assert after.get(test.id).state is AcceptanceState.FINISHED
     assert [each.take for each in after.get(test.id).readings if each.step == "sphere-1"] == [0, 1]
-
-
-def test_a_service_that_ends_in_good_order_interrupts_a_test_too(desks: Desks, queue: TameQueue) -> None:
-    before = desks()
-    test = before.open(the_plan)
-
-    def ending() -> bool:
-        raise interruption()
-
-    queue.cancelled = ending
-    before.measure(test.id, wait=False, scripted=True)
-    for desk in (before, desks()):
-        assert desk.get(test.id).state is AcceptanceState.INTERRUPTED
-        assert desk.get(test.id).fault == failure_of(interruption())
-
-
-def test_a_test_that_was_cut_off_after_its_report_is_finished(desks: Desks, tmp_path: Path) -> None:
-    before = desks()
-    test = before.open(the_plan)
-    before.measure(test.id, wait=False, scripted=True)
-    finished = before.get(test.id)
-    kept = tmp_path / "acceptance" / str(test.id) / "test.json"
-    kept.write_bytes(record_json(replace(finished, state=AcceptanceState.OPEN, decision=None)))
-    assert record_json(desks().get(test.id)) == record_json(finished)
 
 
 def test_what_cannot_be_read_is_put_aside(desks: Desks, tmp_path: Path) -> None:

@@ -1,24 +1,34 @@
-"""An acceptance test's figures against artefacts of known form, its decisions, and its run with a tame rig."""
+"""An acceptance test: its figures on artefacts of known form, its decisions, its scale, its run and its record."""
 
 from __future__ import annotations
 
 import json
+import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from datetime import UTC, datetime
+from io import StringIO
 from pathlib import Path
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 
 from slrig.accept import running as acceptance
-from slrig.accept.evaluation import Reading, reading
-from slrig.accept.plan import AcceptancePlan, Artefact, Limits, Quantity, Step, usual_limits
+from slrig.accept.evaluation import Evidence, Reading, reading
+from slrig.accept.plan import AcceptancePlan, Artefact, Artefacts, Certified, Limits, Quantity, Step, usual_limits
 from slrig.accept.positions import acceptance_plan
-from slrig.accept.running import Place, run_acceptance
+from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
+from slrig.accept.report import document, report_html
+from slrig.accept.running import run_acceptance
+from slrig.accept.scale import scale_by_bar
 from slrig.accept.verdicts import AcceptanceResult, verdicts
 from slrig.calibration.artefacts import Decision
+from slrig.cli.accept import tell
 from slrig.devices import Rig
 from slrig.errors import (
     CalibrationError,
@@ -39,7 +49,7 @@ PLAN = acceptance_plan(
     RIG, VOLUME, replace(GOOD, expansion_per_k=0.0), rendered=True, limits=usual_limits(VOLUME, 0.02), repeats=2
 )
 NOISE_MM = 0.005
-GRID = 90
+GRID = 60
 
 
 def step_of(artefact: Artefact, number: int = 1) -> Step:
@@ -143,12 +153,12 @@ def test_an_artefact_that_is_not_there_is_told_by_its_position(artefact: Artefac
         reading(scan_of(step_of(Artefact.PLANE)), step, 0, PLAN)
 
 
-def told(step: str, take: int, error: float) -> Reading:
-    return Reading(step, take, {Quantity.SPACING: error}, 0.005, 0.005, 0.02, 9, 0, 0.0)
+def measured(step: str, take: int, error_mm: float) -> Reading:
+    return Reading(step, take, {Quantity.SPACING: error_mm}, 0.005, 0.005, 0.02, 9, 0, 0.0)
 
 
-def test_the_worst_position_decides_and_scatter_is_only_told() -> None:
-    readings = [told("bar-1", 0, 0.004), told("bar-1", 1, 0.006), told("bar-2", 0, -0.012)]
+def test_the_worst_position_decides_and_scatter_is_only_measured() -> None:
+    readings = [measured("bar-1", 0, 0.004), measured("bar-1", 1, 0.006), measured("bar-2", 0, -0.012)]
     (found,) = verdicts(readings, PLAN)
     assert (found.step, found.error_mm, found.repeats) == ("bar-2", -0.012, 2)
     assert found.scatter_mm == pytest.approx(np.std([0.004, 0.006], ddof=1))
@@ -174,7 +184,7 @@ def test_a_noisier_scanner_meets_the_same_limit_and_the_same_uncertainty(artefac
     [(0.016, Decision.PASSES), (0.019, Decision.UNDECIDED), (0.0215, Decision.UNDECIDED), (-0.023, Decision.FAILS)],
 )
 def test_an_error_within_its_uncertainty_of_the_limit_is_undecided(error: float, expected: Decision) -> None:
-    (found,) = verdicts([told("bar-1", 0, error)], PLAN)
+    (found,) = verdicts([measured("bar-1", 0, error)], PLAN)
     assert np.isnan(found.scatter_mm)
     assert found.uncertainty.expanded_mm == pytest.approx(0.002)
     assert found.decision is expected
@@ -204,35 +214,37 @@ def nothing_captured(rig: Rig, _plan: object, folder: Path, **_: object) -> Tame
 Scan = Callable[[Step], Mesh]
 
 
+def take_scans_from(monkeypatch: pytest.MonkeyPatch, plan: AcceptancePlan, scan: Scan = scan_of) -> None:
+    """Have every capture of a plan's step be reconstructed as `scan` says."""
+
+    def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
+        name = bundle.parent.name.lstrip(".").rsplit("-", 1)[0]
+        output.mkdir()
+        step = next(step for step in plan.steps if step.name == name)
+        (output / "mesh.ply").write_bytes(encode_mesh_ply(scan(step)))
+        return {}
+
+    monkeypatch.setattr(acceptance, "capture_frames", nothing_captured)
+    monkeypatch.setattr("slrig.scan.reconstruct.reconstruct_bundle", reconstruct)
+
+
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., AcceptanceResult]:
     """Run a test with a rig whose scans are made by `scan`."""
-    monkeypatch.setattr(acceptance, "capture_frames", nothing_captured)
 
     def go(
         plan: AcceptancePlan = PLAN,
         *,
         scan: Scan = scan_of,
         names: tuple[str, ...] | None = None,
-        place: Place | None = None,
-        again: Callable[[Step, SlrigError], bool] | None = None,
         cancelled: Callable[[], bool] = lambda: False,
         calibration: Calibration | None = RIG,
+        **asked: Any,
     ) -> AcceptanceResult:
         positioner = TamePositioner(tuple(step.name for step in plan.steps) if names is None else names)
         rig = Rig("tame", {}, None, {}, calibration, positioner=positioner)  # type: ignore[arg-type]
-
-        def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
-            name = bundle.parent.name.lstrip(".").rsplit("-", 1)[0]
-            output.mkdir()
-            step = next(step for step in plan.steps if step.name == name)
-            (output / "mesh.ply").write_bytes(encode_mesh_ply(scan(step)))
-            return {}
-
-        monkeypatch.setattr("slrig.scan.reconstruct.reconstruct_bundle", reconstruct)
-        return run_acceptance(
-            rig, plan, tmp_path / "out", progress=lambda *_: None, cancelled=cancelled, place=place, again=again
-        )
+        take_scans_from(monkeypatch, plan, scan)
+        return run_acceptance(rig, plan, tmp_path / "out", progress=lambda *_: None, cancelled=cancelled, **asked)
 
     return go
 
@@ -291,19 +303,20 @@ def test_a_bad_scanner_fails(run: Callable[..., AcceptanceResult]) -> None:
     assert result.verdicts[0].error_mm == pytest.approx(0.11, abs=0.002)
 
 
-def test_a_positioner_that_does_not_know_the_positions_is_refused(
-    run: Callable[..., AcceptanceResult], tmp_path: Path
+@pytest.mark.parametrize(
+    ("asked", "error", "words"),
+    [
+        ({"names": ("sphere-1", "pose 2")}, UnsupportedByDeviceError, "needs the positions sphere-2, bar-1, plane-1"),
+        ({"names": ()}, UnsupportedByDeviceError, "no positioner"),
+        ({"calibration": None}, CalibrationError, "has no calibration"),
+    ],
+)
+def test_rig_that_cannot_be_tested_is_refused_before_anything_is_written(
+    run: Callable[..., AcceptanceResult], tmp_path: Path, asked: dict[str, Any], error: type[SlrigError], words: str
 ) -> None:
-    with pytest.raises(UnsupportedByDeviceError, match=r"needs the positions sphere-2, bar-1, plane-1"):
-        run(SHORT, names=("sphere-1", "pose 2"))
-    with pytest.raises(UnsupportedByDeviceError, match="no positioner"):
-        run(SHORT, names=())
+    with pytest.raises(error, match=words):
+        run(SHORT, **asked)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_rig_without_calibration_is_refused(run: Callable[..., AcceptanceResult]) -> None:
-    with pytest.raises(CalibrationError, match="has no calibration"):
-        run(SHORT, calibration=None)
 
 
 def test_results_are_not_mixed_with_other_files(run: Callable[..., AcceptanceResult], tmp_path: Path) -> None:
@@ -342,3 +355,103 @@ def test_an_artefact_that_was_not_found_is_placed_again(run: Callable[..., Accep
     assert result.complete
     assert len(refused) == 1
     assert "found 0" in refused[0]
+
+
+RECORD = AcceptanceRecord(
+    3,
+    UUID(int=7),
+    datetime(2026, 11, 22, 8, 30, 0, 250_000, tzinfo=UTC),
+    "bench",
+    "0123456789ab",
+    replace(PLAN, exposure_s=0.02, notes="after the move"),
+    AcceptanceState.OPEN,
+    (measured("sphere-1", 0, 0.004), replace(measured("sphere-1", 1, -0.001), noise_mm=math.nan)),
+    decision=Decision.UNDECIDED,
+)
+
+
+def test_a_record_survives_its_json() -> None:
+    text = record_json(RECORD)
+    found = record_from_json(text, "test.json")
+    assert record_json(found) == text
+    assert math.isnan(found.readings[1].noise_mm)
+    assert found.readings[0] == RECORD.readings[0]
+    assert replace(found, plan=RECORD.plan, readings=()) == replace(RECORD, readings=())
+    assert [step.name for step in found.plan.steps] == [step.name for step in PLAN.steps]
+    for mine, theirs in zip(found.plan.steps, PLAN.steps, strict=True):
+        np.testing.assert_array_equal(mine.centre_mm, theirs.centre_mm)
+        np.testing.assert_array_equal(mine.axis, theirs.axis)
+    np.testing.assert_array_equal(found.plan.volume_mm, PLAN.volume_mm)
+    assert (found.plan.artefacts, found.plan.limits) == (PLAN.artefacts, PLAN.limits)
+
+
+def test_a_position_begins_anew_where_its_repeats_were_not_finished() -> None:
+    one = replace(RECORD, readings=RECORD.readings[:1])
+    assert one.from_first_take().readings == ()
+    # Both captures of the first position are there, and the second position follows.
+    assert RECORD.from_first_take().readings == RECORD.readings
+    assert json.loads(record_json(RECORD))["readings"][1]["noise_mm"] is None
+
+
+LENGTH_MM = 110.0
+BAR = replace(GOOD, distance=Certified(LENGTH_MM, 0.002), expansion_per_k=0.0)
+
+POINTS = Evidence(np.array([[0.0, 0.0, 0.0]]), np.ones(1, np.uint8), np.zeros(1), np.zeros(1))
+
+
+def of_bars(share: float, *, scatter_mm: float = 0.004, places: int = 7, seed: int = 3) -> list[Reading]:
+    """A bar in places, the first measured three times, by a rig that measures everything too long by a share."""
+    off = np.random.default_rng(seed).normal(share * LENGTH_MM, scatter_mm, places)
+    first = [measured("bar-1", take, off[0]) for take in range(3)]
+    return [*first, *(measured(f"bar-{place + 1}", 0, off[place]) for place in range(1, places))]
+
+
+@pytest.mark.parametrize(("share", "words"), [(0.002, "longer .* so much smaller"), (-0.009, "shorter .* larger")])
+def test_a_board_of_another_size_is_named(share: float, words: str) -> None:
+    found = scale_by_bar(of_bars(share), BAR)
+    assert found is not None
+    assert found.places == 7
+    assert abs(found.share - share) < 3 * found.sigma < 1e-4
+    assert found.words is not None
+    assert re.search(words, found.words)
+    assert f"{abs(found.share):.2%}" in found.words
+
+
+@pytest.mark.parametrize("share", [0.0, 0.0008])
+def test_less_than_a_thousandth_is_stated_and_not_blamed_on_the_board(share: float) -> None:
+    found = scale_by_bar(of_bars(share), BAR)
+    assert found is not None
+    assert found.share == pytest.approx(share, abs=5e-5)
+    assert found.words is None
+
+
+@pytest.mark.parametrize("artefacts", [BAR, replace(BAR, distance=Certified(LENGTH_MM, 0.2))])
+def test_what_the_places_or_the_certificate_do_not_tell_is_not_measured(artefacts: Artefacts) -> None:
+    scattered = artefacts is BAR
+    found = scale_by_bar(of_bars(0.002, scatter_mm=0.4 if scattered else 0.004), artefacts)
+    assert found is not None
+    assert found.sigma > 0.0008
+    assert found.words is None
+
+
+def test_a_scale_is_not_told_from_two_places() -> None:
+    assert scale_by_bar(of_bars(0.01, places=2), BAR) is None
+    sphere = Reading("sphere-1", 0, {Quantity.SIZE: 0.3}, 0.005, 0.005, 0.02, 9, 0, 0.0)
+    assert scale_by_bar([sphere], BAR) is None
+
+
+def test_wrong_scale_is_shown_on_terminal_and_page() -> None:
+    when = datetime(2026, 11, 27, tzinfo=UTC)
+
+    def result(share: float) -> AcceptanceResult:
+        readings = tuple(of_bars(share))
+        return AcceptanceResult("bench", when, when, PLAN, RIG, readings, verdicts(readings, PLAN))
+
+    for each, wrong in ((result(0.002), True), (result(0.0), False)):
+        terminal = Console(file=StringIO(), width=300)
+        tell(each, terminal)
+        page = report_html(each, lambda _: POINTS)
+        assert isinstance(terminal.file, StringIO)
+        for text in (terminal.file.getvalue(), page):
+            assert ("The bar measures 0.20" in text) is wrong
+        assert document(each)["scale"] == each.scale
