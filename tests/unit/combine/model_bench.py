@@ -132,33 +132,28 @@ class ModelBench(Bench):
 
     def over(self, model_id: UUID) -> JobRecord:
         """The model once it is in a final state."""
-        ended = threading.Event()
-
-        def look() -> None:
-            if self.models.get(model_id).state.final:
-                ended.set()
-
-        unwatch = self.models.watch(model_id, look)
-        look()
-        assert ended.wait(WAIT_S)
-        unwatch()
-        return self.models.get(model_id)
+        return until(self.models, model_id, lambda model: model.state.final)
 
     def close(self) -> None:
         self.tame.gate.set()
         super().close()
 
 
-def until_told(models: JobStore, model_id: UUID, words: str) -> JobRecord:
-    """A model once its progress says this."""
-    told = threading.Event()
+def until(models: JobStore, model_id: UUID, reached: Callable[[JobRecord], bool]) -> JobRecord:
+    """A model once `reached` says so of it."""
+    found = threading.Event()
 
     def look() -> None:
-        if words in models.get(model_id).progress.detail:
-            told.set()
+        if reached(models.get(model_id)):
+            found.set()
 
     unwatch = models.watch(model_id, look)
     look()
-    assert told.wait(WAIT_S), models.get(model_id).progress
+    assert found.wait(WAIT_S), models.get(model_id)
     unwatch()
     return models.get(model_id)
+
+
+def until_told(models: JobStore, model_id: UUID, words: str) -> JobRecord:
+    """A model once its progress says this."""
+    return until(models, model_id, lambda model: words in model.progress.detail)

@@ -24,7 +24,6 @@ from slrig.errors import (
     ConfigError,
     JobNotFoundError,
     QueueFullError,
-    RegistrationRefusedError,
     ScanStateError,
     SlrigError,
     StorageError,
@@ -153,15 +152,6 @@ def test_scans_that_a_model_needs_stay_until_it_is_over(bench: ModelBench) -> No
     assert list(bench.folder.incoming.iterdir()) == []
 
 
-def test_one_that_fails_says_why_and_leaves_nothing(bench: ModelBench) -> None:
-    bench.tame.error = RegistrationRefusedError("view two overlaps no other")
-    plan = ModelPlan(bench.kept_scans(None, None), GivenPoses((STILL, STILL)))
-    failed = bench.over(bench.desk.combine(plan).id)
-    assert failed.fault == failure_of(RegistrationRefusedError("view two overlaps no other"))
-    assert not bench.desk.store.place(failed.id).exists()
-    assert list(bench.folder.incoming.iterdir()) == []
-
-
 def test_the_newest_models_are_kept(tmp_path: Path) -> None:
     bench = ModelBench(tmp_path, keep=2)
     plan = ModelPlan(bench.kept_scans(0.0, 40.0), TurntablePoses(AXIS))
@@ -219,19 +209,6 @@ def test_what_was_cut_off_is_made_once_more_and_no_file_is_lost(tmp_path: Path) 
     }
     assert [each.name for each in bench.folder.orphans.iterdir()] == ["model-stranger"]
     assert list(bench.folder.incoming.iterdir()) == []
-    bench.close()
-
-
-def test_one_that_the_end_of_the_service_cuts_off_goes_on_at_the_next_start(tmp_path: Path) -> None:
-    ended = ModelBench(tmp_path)
-    ended.tame.gate.clear()
-    model_id = ended.desk.combine(ModelPlan(ended.kept_scans(0.0, 40.0), TurntablePoses(AXIS))).id
-    assert ended.tame.began.wait(10)
-    ended.runner.queue.end()
-    ended.tame.error = interruption()
-    ended.close()
-    bench = ModelBench(tmp_path)
-    assert bench.over(model_id).state is JobState.SUCCEEDED
     bench.close()
 
 

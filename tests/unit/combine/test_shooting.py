@@ -43,7 +43,7 @@ AXIS = StatedAxis((4.0, 45.0, 12.0), (0.0, -1.0, 0.0))
 STILL = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def asked(views: int = 4, *, by_hand: bool = False, exposure_s: float | None = None) -> ModelPlan:
+def shoot_plan(views: int = 4, *, by_hand: bool = False, exposure_s: float | None = None) -> ModelPlan:
     return ModelPlan((), TurntablePoses(AXIS), shoot=ShootPlan(views, ScanPlan(exposure_s=exposure_s), by_hand))
 
 
@@ -105,11 +105,11 @@ def bench(tmp_path: Path) -> Iterator[ShootingBench]:
 
 
 def started(bench: ShootingBench, plan: ModelPlan | None = None, *, wait: bool = False) -> UUID:
-    return bench.shooting.shoot(plan or asked(), label="cup", wait=wait).id
+    return bench.shooting.shoot(plan or shoot_plan(), label="cup", wait=wait).id
 
 
 def test_all_views_are_shot_around_the_table_and_the_model_is_made_of_them(bench: ShootingBench) -> None:
-    model_id = started(bench, asked(exposure_s=0.02))
+    model_id = started(bench, shoot_plan(exposure_s=0.02))
     made = bench.over(model_id)
     assert (made.state, made.label, bench.shot) == (JobState.SUCCEEDED, "cup", [0.0, 90.0, 180.0, 270.0])
     scans = bench.runner.series(model_id)
@@ -147,7 +147,7 @@ def test_a_view_that_fails_is_told_and_a_devices_fault_is_tried_twice_more(bench
     gone = DeviceGoneError("left was unplugged")
     bench.faults = {90.0: [ScanEvidenceError("white is not brighter than black")], 180.0: [gone], 270.0: [gone] * 9}
     poses = GivenPoses(tuple(((1.0, 0.0, 0.0, float(view)), *STILL[1:]) for view in range(4)))
-    made = bench.over(started(bench, replace(asked(), poses=poses)))
+    made = bench.over(started(bench, replace(shoot_plan(), poses=poses)))
     assert made.state is JobState.SUCCEEDED
     assert [bench.shot.count(angle) for angle in (0.0, 90.0, 180.0, 270.0)] == [1, 1, 2, 3]
     assert made.summary is not None
@@ -194,10 +194,10 @@ def test_what_cannot_be_shot_is_refused_and_nothing_is_on_record(tmp_path: Path)
     with pytest.raises(UnsupportedByDeviceError, match=r"this rig has no turntable\. Turn it by hand"):
         started(bench)
     with pytest.raises(ConfigError, match="axis: expected that of the stage"):
-        started(bench, replace(asked(), poses=TurntablePoses()))
+        started(bench, replace(shoot_plan(), poses=TurntablePoses()))
     bench.held()
     with pytest.raises(RigBusyError):
-        started(bench, asked(by_hand=True))
+        started(bench, shoot_plan(by_hand=True))
     assert bench.models.states() == {}
     for wrong in (1, 73):
         with pytest.raises(ConfigError, match=f"views: expected 2 to 72, found {wrong}"):
@@ -205,9 +205,9 @@ def test_what_cannot_be_shot_is_refused_and_nothing_is_on_record(tmp_path: Path)
     bench.close()
 
 
-def test_by_hand_each_view_waits_for_a_word_and_the_last_may_be_shot_again(tmp_path: Path) -> None:
+def test_by_hand_each_view_waits_for_a_person_and_the_last_may_be_shot_again(tmp_path: Path) -> None:
     bench = ShootingBench(tmp_path, table=False)
-    model_id = started(bench, asked(3, by_hand=True))
+    model_id = started(bench, shoot_plan(3, by_hand=True))
     waiting = bench.until_told(model_id, "turn the object by 120° for view 2 of 3")
     assert (waiting.state, waiting.progress.stage, bench.shot) == (JobState.CAPTURING, "turn", [0.0])
     with pytest.raises(ScanStateError, match="has 1 good views of 3; it takes two"):
@@ -236,7 +236,7 @@ def test_by_hand_each_view_waits_for_a_word_and_the_last_may_be_shot_again(tmp_p
 
 def test_by_hand_it_may_end_early_with_what_there_is(tmp_path: Path) -> None:
     bench = ShootingBench(tmp_path, table=False)
-    model_id = started(bench, asked(8, by_hand=True))
+    model_id = started(bench, shoot_plan(8, by_hand=True))
     bench.until_told(model_id, "view 2 of 8")
     bench.shooting.shoot_view(model_id, again=False, wait=False)
     bench.until_told(model_id, "turn the object by 45° for view 3 of 8")
@@ -263,7 +263,7 @@ def killed(root: Path, leave: Callable[[ShootingBench, UUID], None], *, by_hand:
     """A model on record as a kill of the service leaves it."""
     bench = ShootingBench(root, start=False)
     bench.store.after_end = lambda _: None
-    plan = asked(by_hand=by_hand)
+    plan = shoot_plan(by_hand=by_hand)
     model_id = bench.models.create(plan_json(plan), rig="bench", label="cup").id
     leave(bench, model_id)
     bench.close()
@@ -289,37 +289,20 @@ def view(bench: ShootingBench, model_id: UUID, number: int, state: JobState, *, 
     return record.id
 
 
-def nothing_shot(bench: ShootingBench, model_id: UUID) -> None:
-    del bench, model_id
+def left(*states: JobState, count: str | None = None) -> Callable[[ShootingBench, UUID], None]:
+    """Leaves views that came so far, and a model that was capturing. count : of the angle of those that succeeded."""
+
+    def leave(bench: ShootingBench, model_id: UUID) -> None:
+        for number, state in enumerate(states, start=1):
+            view(bench, model_id, number, state, count=count)
+        if states:
+            bench.models.advance(model_id, JobState.CAPTURING)
+
+    return leave
 
 
-def between_views(bench: ShootingBench, model_id: UUID) -> None:
-    view(bench, model_id, 1, JobState.SUCCEEDED)
-    for number in (2, 3, 4):
-        view(bench, model_id, number, JobState.QUEUED)
-    bench.models.advance(model_id, JobState.CAPTURING)
-
-
-def within_a_view(bench: ShootingBench, model_id: UUID) -> None:
-    view(bench, model_id, 1, JobState.SUCCEEDED)
-    view(bench, model_id, 2, JobState.CAPTURING)
-    for number in (3, 4):
-        view(bench, model_id, number, JobState.QUEUED)
-    bench.models.advance(model_id, JobState.CAPTURING)
-
-
-def the_table_lost_its_place(bench: ShootingBench, model_id: UUID) -> None:
-    for number in (1, 2):
-        view(bench, model_id, number, JobState.SUCCEEDED, count="before")
-    for number in (3, 4):
-        view(bench, model_id, number, JobState.QUEUED)
-    bench.models.advance(model_id, JobState.CAPTURING)
-
-
-def all_shot(bench: ShootingBench, model_id: UUID) -> None:
-    for number in (1, 2, 3, 4):
-        view(bench, model_id, number, JobState.SUCCEEDED)
-    bench.models.advance(model_id, JobState.CAPTURING)
+DONE, CAPTURING, QUEUED = JobState.SUCCEEDED, JobState.CAPTURING, JobState.QUEUED
+all_shot, between_views = left(DONE, DONE, DONE, DONE), left(DONE, QUEUED, QUEUED, QUEUED)
 
 
 def named(bench: ShootingBench, model_id: UUID) -> None:
@@ -339,14 +322,16 @@ def combining(bench: ShootingBench, model_id: UUID) -> None:
 @pytest.mark.parametrize(
     ("leave", "shot"),
     [
-        (nothing_shot, [0.0, 90.0, 180.0, 270.0]),
+        (left(), [0.0, 90.0, 180.0, 270.0]),
         (between_views, [90.0, 180.0, 270.0]),
-        (within_a_view, [180.0, 270.0, 90.0]),
-        (the_table_lost_its_place, [180.0, 270.0, 0.0, 90.0]),
+        (left(DONE, CAPTURING, QUEUED, QUEUED), [180.0, 270.0, 90.0]),
+        # The table lost its place.
+        (left(DONE, DONE, QUEUED, QUEUED, count="before"), [180.0, 270.0, 0.0, 90.0]),
         (all_shot, []),
         (named, []),
         (combining, []),
     ],
+    ids=["nothing", "between views", "within a view", "another place", "all shot", "named", "combining"],
 )
 def test_after_a_kill_exactly_the_missing_views_are_shot(
     tmp_path: Path, leave: Callable[[ShootingBench, UUID], None], shot: list[float]
@@ -362,40 +347,22 @@ def test_after_a_kill_exactly_the_missing_views_are_shot(
     bench.close()
 
 
-def test_after_a_kill_a_model_by_hand_waits_where_it_was(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("first_was_shot", "shot"), [(True, []), (False, [0.0])])
+def test_after_a_kill_a_model_by_hand_waits_where_it_was(
+    tmp_path: Path, first_was_shot: bool, shot: list[float]
+) -> None:
     def leave(bench: ShootingBench, model_id: UUID) -> None:
-        view(bench, model_id, 1, JobState.SUCCEEDED)
-        bench.models.advance(model_id, JobState.CAPTURING)
+        if first_was_shot:
+            view(bench, model_id, 1, JobState.SUCCEEDED)
+            bench.models.advance(model_id, JobState.CAPTURING)
 
     model_id = killed(tmp_path, leave, by_hand=True)
     bench = ShootingBench(tmp_path, table=False)
     waiting = bench.until_told(model_id, "turn the object by 90° for view 2 of 4")
-    assert (waiting.state, bench.shot) == (JobState.CAPTURING, [])
+    assert (waiting.state, bench.shot) == (JobState.CAPTURING, shot)
     bench.shooting.cancel(model_id)
     cancelled = ScanCancelledError("The model was cancelled while its views were shot. They stay.")
     assert bench.over(model_id).fault == failure_of(cancelled)
-    bench.close()
-
-
-def test_the_end_of_the_service_leaves_the_rest_to_the_next_start(tmp_path: Path) -> None:
-    ended = ShootingBench(tmp_path)
-    ended.gate.clear()
-    model_id = started(ended)
-    assert ended.began.wait(WAIT_S)
-    ended.close()
-    assert ended.shot == [0.0]
-    bench = ShootingBench(tmp_path)
-    assert bench.over(model_id).state is JobState.SUCCEEDED
-    # The one that had the rig is shot again, after those that waited.
-    assert bench.shot == [90.0, 180.0, 270.0, 0.0]
-    bench.close()
-
-
-def test_a_model_by_hand_whose_scans_never_came_on_record_is_begun_at_the_next_start(tmp_path: Path) -> None:
-    model_id = killed(tmp_path, nothing_shot, by_hand=True)
-    bench = ShootingBench(tmp_path)
-    bench.until_told(model_id, "turn the object by 90° for view 2 of 4")
-    assert bench.shot == [0.0]
     bench.close()
 
 

@@ -1,25 +1,29 @@
-"""Rigs that a doctor does not meet every day: other triggers, projectors that hold their patterns, no calibration."""
+"""Unusual rigs: other triggers, projectors that hold their patterns, no calibration, cameras that sharpen."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
+import cv2
 import numpy as np
 import pytest
 
 from simulated_rig.device import SimulatedHead, open_head
-from slrig.devices import Camera, CameraInfo, CameraSettings, Projector, ProjectorInfo, Rig, Shown, Trigger
-from slrig.devices.camera import AppliedSettings
+from slrig.devices import Camera, CameraSettings, Projector, Rig, Trigger
 from slrig.doctor import timing
 from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine
-from slrig.doctor.findings import Severity
+from slrig.doctor.findings import Finding, Severity
+from slrig.doctor.geometry import picture
 from slrig.doctor.light import look
+from slrig.doctor.measures.pictures import depth_mm_per_px
+from slrig.doctor.sharpening import sharpening
 from slrig.doctor.viewing import Viewer
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
-from slrig.model import Frame, PatternSequence, White
+from slrig.model import FloatArray, Frame, PatternSequence, Pinhole, Pixels, Size, White
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.unit.simulated_rig.building import FACING_PLATE, head_options
 
@@ -27,36 +31,37 @@ LAMP = {"size_px": [96, 72], "focal_px": [400.0, 400.0], "blur_px": 0.4}
 EYE = {"size_px": [96, 72], "focal_px": [520.0, 520.0], "blur_px": 0.4}
 
 
+PRINTED = """
+[[object]]
+shape = "plane"
+size_mm = [400.0, 400.0]
+rotation_deg = [6.0, -10.0, 0.0]
+albedo = 0.8
+texture = { kind = "checker", contrast = 0.6, scale_mm = 35.0 }
+"""
+Process = Callable[[Pixels], Pixels]
+
+
 class OtherCamera:
-    """A rendered camera with other triggers, that loses frames now and then."""
+    """A rendered camera that is another in what a test names. lose : the reads, counted from 1, that time out.
+
+    change : what it makes of its frames before it gives them.
+    """
 
     def __init__(
-        self,
-        camera: Camera,
-        triggers: frozenset[Trigger],
-        *,
-        lose: frozenset[int] = frozenset(),
-        notes: tuple[str, ...] = (),
-    ) -> None:
-        self._camera = camera
-        self._notes = notes
-        self._triggers = triggers
-        self._lose = lose
+        self, camera: Camera, *, lose: Container[int] = (), change: Callable[[Frame], Frame] = lambda each: each,
+        **info: Any,
+    ) -> None:  # fmt: skip
+        self._camera, self._lose, self._change = camera, lose, change
+        self.info = replace(camera.info, **info)
         self._reads = 0
 
-    @property
-    def info(self) -> CameraInfo:
-        return replace(self._camera.info, triggers=self._triggers, notes=self._notes)
-
-    def configure(self, settings: CameraSettings) -> AppliedSettings:
-        return self._camera.configure(settings)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        assert trigger in self._triggers
+        assert trigger in self.info.triggers
         self._camera.arm(count, trigger)
-
-    def trigger(self) -> None:
-        self._camera.trigger()
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         self._reads += 1
@@ -64,41 +69,19 @@ class OtherCamera:
         if self._reads in self._lose:
             message = "lost"
             raise FrameTimeoutError(message)
-        return frame
-
-    def disarm(self) -> None:
-        self._camera.disarm()
-
-    def close(self) -> None:
-        self._camera.close()
-
-
-class VagueCamera(OtherCamera):
-    """A rendered camera whose time stamps are off by 10 ms either way, at random, and that says so or does not."""
-
-    def __init__(self, camera: Camera, *, says_so: bool) -> None:
-        super().__init__(camera, frozenset({Trigger.FREE}))
-        self._rng = np.random.default_rng(5)
-        self._error_ns = 10_000_000 if says_so else 0
-
-    def read(self, after_ns: int, timeout_s: float) -> Frame:
-        frame = super().read(after_ns, timeout_s)
-        off_ns = int(self._rng.integers(-10_000_000, 10_000_000))
-        start_ns, end_ns = frame.t_start_ns + off_ns, frame.t_end_ns + off_ns
-        return replace(frame, t_start_ns=start_ns, t_end_ns=end_ns, t_err_ns=self._error_ns)
+        return self._change(frame)
 
 
 class HoldingProjector:
-    """A rendered projector that takes a run of the patterns that it holds, and no others."""
+    """A rendered projector that takes a run of the patterns that it holds, and no others. greys : and any of greys."""
 
     def __init__(self, projector: Projector, held: PatternSequence, *, greys: bool = False) -> None:
         self._projector = projector
         self._held = held
         self._greys = greys
 
-    @property
-    def info(self) -> ProjectorInfo:
-        return self._projector.info
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._projector, name)
 
     def load(self, sequence: PatternSequence) -> None:
         of_greys = all(isinstance(each, White) for each in sequence.patterns[1:])
@@ -111,29 +94,21 @@ class HoldingProjector:
             sequence = PatternSequence(sequence.projector, sequence.patterns, lit)
         self._projector.load(sequence)
 
-    def show(self, index: int) -> Shown:
-        return self._projector.show(index)
 
-    def play(self, exposure_s: float, period_s: float) -> None:
-        self._projector.play(exposure_s, period_s)
-
-    def stop(self) -> None:
-        self._projector.stop()
-
-    def blank(self) -> None:
-        self._projector.blank()
-
-    def close(self) -> None:
-        self._projector.close()
+def with_camera(rig: Rig, **other: Any) -> Rig:
+    """The rig with a camera that is another, see `OtherCamera`."""
+    return replace(rig, cameras={"eye": cast("Camera", OtherCamera(rig.cameras["eye"], **other))})
 
 
 @contextmanager
-def small_rig(folder: Path, **options: object) -> Iterator[Rig]:
+def small_rig(
+    folder: Path, scene: str = FACING_PLATE, *, eye: Any = EYE, lamp: Any = LAMP, exposure_s: float = 0.014, **more: Any
+) -> Iterator[Rig]:
     """An open rendered rig; its projector is dark in the end."""
-    (folder / "scene.toml").write_text(FACING_PLATE)
-    head = open_head(head_options(camera=EYE, projector=LAMP, ambient=0.02, **options), folder)
+    (folder / "scene.toml").write_text(scene)
+    head = open_head(head_options(camera=eye, projector=lamp, ambient=0.02, **more), folder)
     assert isinstance(head, SimulatedHead)
-    settings = {"eye": CameraSettings(0.014)}
+    settings = {"eye": CameraSettings(exposure_s)}
     with Rig("small", dict(head.cameras), head.projector, settings, head.calibration, head, clock=head.clock) as opened:
         yield opened
         assert not head.projector.lit
@@ -153,93 +128,215 @@ def own(rig: Rig) -> PatternSequence:
     return encode(patterns, size)
 
 
-def examined(rig: Rig) -> Diagnosis:
-    return examine(rig, own_sequence=own(rig))
+def examined(rig: Rig, **asked: Any) -> Diagnosis:
+    return examine(rig, own_sequence=own(rig), **asked)
 
 
 def names(diagnosis: Diagnosis, severity: Severity) -> set[str]:
     return {each.name for each in diagnosis.of(severity)}
 
 
+def holding(rig: Rig, held: PatternSequence, *, greys: bool = False) -> Rig:
+    """The rig with a projector that holds its patterns."""
+    return replace(rig, projector=cast("Projector", HoldingProjector(rig.projector, held, greys=greys)))
+
+
 @pytest.mark.parametrize("trigger", [Trigger.FREE, Trigger.SOFTWARE])
-def test_a_sound_rig_is_sound_by_any_trigger_though_frames_are_lost(rig: Rig, trigger: Trigger) -> None:
-    camera = OtherCamera(rig.cameras["eye"], frozenset({trigger}), lose=frozenset(range(5, 400, 31)))
-    diagnosis = examined(replace(rig, cameras={"eye": camera}))
+def test_sound_rig_is_sound_by_any_trigger_though_frames_are_lost(rig: Rig, trigger: Trigger) -> None:
+    steps: list[str] = []
+    diagnosis = examined(
+        with_camera(rig, triggers=frozenset({trigger}), lose=range(5, 400, 31)),
+        told=lambda step, _fraction, _detail: steps.append(step),
+    )
     assert diagnosis.of(Severity.FAULT) == ()
     assert diagnosis.of(Severity.NOTE) == ()
     assert {"patterns.verified", "picture.upright", "focus.sharp", "sharpening.none", "flicker.none"} <= names(
         diagnosis, Severity.OK
     )
     # A camera that waits for its trigger while the projector works sees no flash as it happens.
-    told = "timing.late" if trigger is Trigger.FREE else "timing.punctual"
-    assert told in names(diagnosis, Severity.OK)
+    timed = "timing.late" if trigger is Trigger.FREE else "timing.punctual"
+    assert timed in names(diagnosis, Severity.OK)
+    order = list(dict.fromkeys(steps))
+    assert order[:2] == ["patterns", "light"]
+    assert "flashes before eye" in order
+    assert order[-1] == "exposure"
 
 
-def test_a_triggered_camera_that_sees_no_flash_happen_still_tells_late_light(tmp_path: Path) -> None:
+def test_triggered_camera_that_sees_no_flash_happen_still_shows_late_light(tmp_path: Path) -> None:
     with small_rig(tmp_path, faults={"light_delay_s": 0.008}) as rig:
         viewer = Viewer(rig, "eye", wait_s=0.5)
         seen, _ = look(viewer, doctor_sequence(rig.projector.info.size), others="")
         assert seen is not None
-        told = timing.punctual(rig, seen, ScanEvidenceError("no flash was seen as it happened"))
-    assert (told.name, told.severity) == ("timing.late", Severity.FAULT)
-    assert "no flash was seen as it happened" in told.found
+        found = timing.punctual(rig, seen, ScanEvidenceError("no flash was seen as it happened"))
+    assert (found.name, found.severity) == ("timing.late", Severity.FAULT)
+    assert "no flash was seen as it happened" in found.found
 
 
 @pytest.mark.parametrize(("says_so", "name"), [(True, "timing.stamps"), (False, "timing.jitter")])
 def test_vague_time_stamps_are_not_put_down_to_the_projector(rig: Rig, says_so: bool, name: str) -> None:
-    vague = replace(rig, cameras={"eye": VagueCamera(rig.cameras["eye"], says_so=says_so)})
-    seen, _ = look(Viewer(vague, "eye", wait_s=0.1), doctor_sequence(rig.projector.info.size), others="")
+    """Stamps are off by 10 ms either way, at random, and the camera states that or does not."""
+    rng = np.random.default_rng(5)
+
+    def vague(frame: Frame) -> Frame:
+        off_ns = int(rng.integers(-10_000_000, 10_000_000))
+        start_ns, end_ns = frame.t_start_ns + off_ns, frame.t_end_ns + off_ns
+        return replace(frame, t_start_ns=start_ns, t_end_ns=end_ns, t_err_ns=10_000_000 if says_so else 0)
+
+    rig = with_camera(rig, triggers=frozenset({Trigger.FREE}), change=vague)
+    seen, _ = look(Viewer(rig, "eye", wait_s=0.1), doctor_sequence(rig.projector.info.size), others="")
     assert seen is not None
-    _, findings = timing.latency(vague, {"eye": seen}, search_s=0.1, told=lambda *_: None)
-    [told] = [each for each in findings if each.name in {"timing.stamps", "timing.jitter"}]
-    assert told.name == name
-    assert told.subject == ("camera 'eye'" if says_so else "projector")
-    assert ("they are the limit of what can be measured" in told.found) is says_so
+    _, findings = timing.latency(rig, {"eye": seen}, search_s=0.1, told=lambda *_: None)
+    [found] = [each for each in findings if each.name in {"timing.stamps", "timing.jitter"}]
+    assert found.name == name
+    assert found.subject == ("camera 'eye'" if says_so else "projector")
+    assert ("they are the limit of what can be measured" in found.found) is says_so
 
 
-def test_what_a_driver_tells_of_its_camera_is_passed_on(rig: Rig) -> None:
-    slow = OtherCamera(rig.cameras["eye"], frozenset({Trigger.FREE}), notes=("gives 5 frames per second",))
-    [told] = examined(replace(rig, cameras={"eye": slow})).of(Severity.NOTE)
-    assert (told.name, told.subject) == ("device.told", "camera 'eye'")
-    assert "gives 5 frames per second" in told.found
+def test_rig_without_calibration_has_its_picture_judged_and_its_drivers_notes_passed_on(rig: Rig) -> None:
+    slow = with_camera(rig, triggers=frozenset({Trigger.FREE}), notes=("gives 5 frames per second",))
+    diagnosis = examined(replace(slow, calibration=None))
+    assert names(diagnosis, Severity.NOTE) == {"device.uncalibrated", "device.told"}
+    [note] = [each for each in diagnosis.findings if each.name == "device.told"]
+    assert note.subject == "camera 'eye'"
+    assert "gives 5 frames per second" in note.found
+    assert "picture.upright" in names(diagnosis, Severity.OK)
 
 
-def test_a_camera_on_a_wire_is_left_alone_and_named(rig: Rig) -> None:
-    wired = OtherCamera(rig.cameras["eye"], frozenset({Trigger.HARDWARE}))
-    diagnosis = examined(replace(rig, cameras={"eye": wired}))
-    [told] = diagnosis.of(Severity.NOTE)
-    assert told.name == "device.unexamined"
-    assert "can be triggered by wire only (hardware)" in told.found
+def test_camera_on_a_wire_is_left_alone_and_named(rig: Rig) -> None:
+    diagnosis = examined(with_camera(rig, triggers=frozenset({Trigger.HARDWARE})))
+    [note] = diagnosis.of(Severity.NOTE)
+    assert note.name == "device.unexamined"
+    assert "can be triggered by wire only (hardware)" in note.found
     assert diagnosis.healthy
     assert diagnosis.exposures == {}
 
 
-def test_a_projector_that_holds_its_patterns_is_examined_with_them(rig: Rig) -> None:
-    diagnosis = examined(replace(rig, projector=HoldingProjector(rig.projector, own(rig))))
+def test_projector_that_holds_its_patterns_is_examined_with_them(rig: Rig) -> None:
+    diagnosis = examined(holding(rig, own(rig)))
     assert diagnosis.of(Severity.FAULT) == ()
     assert {"patterns.own", "response.binary", "picture.untold", "focus.untold"} <= names(diagnosis, Severity.OK)
     assert diagnosis.response is None
     assert diagnosis.synchronisation is None
 
 
-def test_a_projector_of_one_bit_has_no_response(rig: Rig) -> None:
-    held = doctor_sequence(rig.projector.info.size)
-    diagnosis = examined(replace(rig, projector=HoldingProjector(rig.projector, held, greys=True)))
+def test_projector_of_one_bit_has_no_response(rig: Rig) -> None:
+    diagnosis = examined(holding(rig, doctor_sequence(rig.projector.info.size), greys=True))
     assert diagnosis.healthy
     assert "response.binary" in names(diagnosis, Severity.OK)
     assert "patterns.own" not in names(diagnosis, Severity.OK)
 
 
-def test_a_rig_without_calibration_is_told_so_and_its_picture_is_still_judged(rig: Rig) -> None:
-    diagnosis = examined(replace(rig, calibration=None))
-    assert names(diagnosis, Severity.NOTE) == {"device.uncalibrated"}
-    assert "picture.upright" in names(diagnosis, Severity.OK)
+def grey(values: FloatArray) -> Pixels:
+    return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
 
 
-def test_progress_is_told(rig: Rig) -> None:
-    stages: list[str] = []
-    examine(rig, own_sequence=own(rig), told=lambda stage, _fraction, _detail: stages.append(stage))
-    order = list(dict.fromkeys(stages))
-    assert order[:2] == ["patterns", "light"]
-    assert "flashes before eye" in order
-    assert order[-1] == "exposure"
+def unsharp(amount: float, sigma_px: float = 1.5) -> Process:
+    def process(image: Pixels) -> Pixels:
+        bare = image.astype(np.float64)
+        return grey(bare + amount * (bare - cv2.GaussianBlur(bare, (0, 0), sigma_px)))
+
+    return process
+
+
+def gamma(image: Pixels) -> Pixels:
+    return grey(255 * (image / 255) ** (1 / 2.2))
+
+
+def blurred(image: Pixels) -> Pixels:
+    return grey(cv2.GaussianBlur(image.astype(np.float64), (0, 0), 2.0))
+
+
+def jpeg(quality: int) -> Process:
+    def process(image: Pixels) -> Pixels:
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+    return process
+
+
+def noisy(image: Pixels) -> Pixels:
+    return grey(image + np.random.default_rng(int(image.astype(np.int64).sum())).normal(0, 8, image.shape))
+
+
+def after(*steps: Process) -> Process:
+    def process(image: Pixels) -> Pixels:
+        for step in steps:
+            image = step(image)
+        return image
+
+    return process
+
+
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    """A rig before a plate with a printed board, whose edges a camera may sharpen."""
+    eye, lamp = (
+        {"size_px": size, "focal_px": [focal] * 2, "blur_px": 0.5}
+        for size, focal in (([240, 192], 600.0), ([256, 192], 520.0))
+    )
+    with small_rig(
+        tmp_path_factory.mktemp("printed"), PRINTED, eye={**eye, "saturation_s": 0.022}, lamp=lamp, exposure_s=1 / 60
+    ) as opened:
+        yield opened
+
+
+def judged(rig: Rig, process: Process, *, calibrated: bool = True) -> Finding:
+    """The finding on a camera that processes its pictures so."""
+    viewer = Viewer(
+        with_camera(rig, change=lambda frame: replace(frame, image=process(frame.image))), "eye", wait_s=0.1
+    )
+    sequence = doctor_sequence(rig.projector.info.size)
+    seen, _ = look(viewer, sequence, others="")
+    assert seen is not None
+    shown, _ = picture(viewer, sequence, seen, rig.calibration)
+    [found] = sharpening("eye", seen, shown, rig.calibration if calibrated else None)
+    return found
+
+
+def test_an_unsharp_mask_is_named_with_its_cost(printed: Rig) -> None:
+    found = judged(printed, unsharp(1.5))
+    assert (found.name, found.severity) == ("sharpening.halo", Severity.FAULT)
+    assert "the camera sharpens: beside edges its pictures exceed white and black by" in found.found
+    assert "mm of depth where the optical axes meet" in found.found
+    assert "control sharpness" in found.remedy
+    assert "mm of depth" not in judged(printed, unsharp(1.5), calibrated=False).found
+
+
+@pytest.mark.parametrize("process", [unsharp(0.5), after(gamma, unsharp(1.0), jpeg(80)), unsharp(1.5, 1.0)])
+@pytest.mark.slow
+def test_less_of_it_is_named_too(printed: Rig, process: Process) -> None:
+    found = judged(printed, process)
+    assert found.name == "sharpening.halo"
+    assert found.severity in (Severity.NOTE, Severity.FAULT)
+
+
+@pytest.mark.parametrize(
+    "process",
+    [after(), blurred, gamma, noisy, jpeg(90), jpeg(50), after(gamma, jpeg(75)), after(blurred, noisy)],
+    ids=["plain", "blur", "gamma", "noise", "jpeg 90", "jpeg 50", "gamma, jpeg", "blur, noise"],
+)
+@pytest.mark.slow
+def test_nothing_else_is_taken_for_it(printed: Rig, process: Process) -> None:
+    found = judged(printed, process)
+    assert (found.name, found.severity) == ("sharpening.none", Severity.OK)
+
+
+def test_depth_per_pixel_is_that_of_two_rays() -> None:
+    # Axes that cross at right angles, 500 mm from each: a pixel to the side of one is as far along the other.
+    camera = pinhole(np.eye(3), (0.0, 0.0, -500.0))
+    across = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    projector = pinhole(across, (-500.0, 0.0, 0.0))
+    assert depth_mm_per_px(camera, projector) == pytest.approx(500 / 600, rel=0.01)
+    # Turned towards each other by 10° each: the sheet of light is cut at 20°.
+    turn = np.deg2rad(10)
+    left, right = (
+        np.array([[np.cos(a), 0, -np.sin(a)], [0, 1.0, 0], [np.sin(a), 0, np.cos(a)]]) for a in (turn, -turn)
+    )
+    one, other = (pinhole(each, tuple(-500 * each[2])) for each in (left, right))
+    assert depth_mm_per_px(one, other) == pytest.approx(500 / 600 / np.sin(2 * turn), rel=0.02)
+    assert np.isnan(depth_mm_per_px(camera, pinhole(np.eye(3), (60.0, 0.0, -500.0))))
+
+
+def pinhole(rotation: FloatArray, centre_mm: tuple[float, ...]) -> Pinhole:
+    matrix = np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]])
+    return Pinhole(Size(640, 480), matrix, np.zeros(5), rotation, -rotation @ np.array(centre_mm))
