@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,6 @@ from pydantic import BaseModel, ConfigDict
 from slrig.bundle import write_calibration
 from slrig.config import read_rig
 from slrig.devices import (
-    AppliedSettings,
     Camera,
     CameraInfo,
     CameraSettings,
@@ -21,7 +21,6 @@ from slrig.devices import (
     Projector,
     ProjectorInfo,
     Rig,
-    Shown,
     Trigger,
 )
 from slrig.discovery import found_devices, installed_drivers, open_rig
@@ -30,25 +29,24 @@ from slrig.errors import (
     ConfigError,
     DeviceError,
     DeviceGoneError,
-    DeviceStateError,
     DriverBrokenError,
-    DriverNotFoundError,
 )
-from slrig.model import Calibration, CameraFormat, Frame, PatternSequence, Size, Truth
+from slrig.model import Calibration, CameraFormat, Size, Truth
 from tests.samples import CAMERA, PROJECTOR, sample_calibration
+from tests.unit.scan.fakes import TameCamera, TameProjector
 
 OPENED: list[FakeDevice] = []
 
 
 class FakeDevice:
-    """Remembers how it was opened and whether it was closed."""
+    """Remembers how it was opened and how often it was closed."""
 
     def __init__(self, name: str, options: Mapping[str, object], folder: Path) -> None:
-        self.name, self.options, self.folder, self.closed = name, options, folder, 0
+        self.name, self.options, self.folder, self.closings = name, options, folder, 0
         OPENED.append(self)
 
     def close(self) -> None:
-        self.closed += 1
+        self.closings += 1
         if self.options.get("close") == "fails":
             message = "unplugged"
             raise DeviceGoneError(message)
@@ -57,55 +55,22 @@ class FakeDevice:
             raise OSError(message)
 
 
-class FakeCamera(FakeDevice):
+class FakeCamera(FakeDevice, TameCamera):
     """A camera that shows nothing."""
 
-    @property
-    def info(self) -> CameraInfo:
-        size = Size(CAMERA.width_px, int(str(self.options.get("rows", CAMERA.height_px))))
-        return CameraInfo(
-            self.name, "fake", "1", CameraFormat(size, 8), frozenset({Trigger.SOFTWARE}), (0.02, 0.5), (1, 4)
-        )
-
-    def configure(self, settings: CameraSettings) -> AppliedSettings:
-        return AppliedSettings(settings.exposure_s, settings.gain)
-
-    def arm(self, count: int, trigger: Trigger) -> None:
-        del count, trigger
-
-    def trigger(self) -> None:
-        pass
-
-    def read(self, after_ns: int, timeout_s: float) -> Frame:
-        del after_ns, timeout_s
-        message = "not armed"
-        raise DeviceStateError(message)
-
-    def disarm(self) -> None:
-        pass
+    def __init__(self, name: str, options: Mapping[str, object], folder: Path) -> None:
+        super().__init__(name, options, folder)
+        form = CameraFormat(Size(CAMERA.width_px, int(str(options.get("rows", CAMERA.height_px)))), 8)
+        self.info = CameraInfo(name, "fake", "1", form, frozenset({Trigger.SOFTWARE}), (0.02, 0.5), (1, 4))
 
 
-class FakeProjector(FakeDevice):
+class FakeProjector(FakeDevice, TameProjector):
     """A projector that stays dark."""
 
-    @property
-    def info(self) -> ProjectorInfo:
-        return ProjectorInfo(self.name, "fake", "1", PROJECTOR, plays=False, latency_s=0.0)
-
-    def load(self, sequence: PatternSequence) -> None:
-        del sequence
-
-    def show(self, index: int) -> Shown:
-        return Shown(index, 0, 0)
-
-    def play(self, exposure_s: float, period_s: float) -> None:
-        del exposure_s, period_s
-
-    def stop(self) -> None:
-        pass
-
-    def blank(self) -> None:
-        pass
+    def __init__(self, name: str, options: Mapping[str, object], folder: Path) -> None:
+        super().__init__(name, options, folder)
+        self.blank_error = None
+        self.info = ProjectorInfo(name, "fake", "1", PROJECTOR, plays=False, latency_s=0.0)
 
 
 class FakeHead:
@@ -145,10 +110,6 @@ class _Options(BaseModel):
     port: int
 
 
-def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
-    return FakeCamera(name, options, folder)
-
-
 def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     return FakeProjector("projector", options, folder)
 
@@ -184,7 +145,7 @@ def find_crashing() -> NoReturn:
 HERE = __name__
 DECLARED = f"""
 [slrig.cameras]
-fake = {HERE}:open_camera
+fake = {HERE}:FakeCamera
 lost = {HERE}:open_lost
 crashing = {HERE}:open_crashing
 strict = {HERE}:open_strict
@@ -242,7 +203,7 @@ def test_a_rig_is_opened_with_its_options(tmp_path: Path) -> None:
     assert rig.settings["right"] == CameraSettings(0.02, 1.0)
     assert rig.calibration is None
     rig.close()
-    assert [device.closed for device in OPENED] == [1, 1, 1]
+    assert [device.closings for device in OPENED] == [1, 1, 1]
 
 
 def test_the_scans_exposure_is_that_of_cameras_without_one(tmp_path: Path) -> None:
@@ -268,7 +229,7 @@ def test_either_kind_of_rig_may_have_a_positioner(tmp_path: Path) -> None:
     assert isinstance(rig.positioner, FakeStage)
     assert dict(OPENED[-1].options) == {"port": "a"}
     rig.close()
-    assert [device.closed for device in OPENED] == [1, 1, 1]
+    assert [device.closings for device in OPENED] == [1, 1, 1]
     (tmp_path / "rig.toml").write_text(f'name = "demo"\n[head]\ndriver = "fake"\n{STAGE}')
     assert isinstance(open_rig(read_rig(tmp_path / "rig.toml")).positioner, FakeStage)
 
@@ -277,11 +238,11 @@ def test_a_second_positioner_is_refused_and_all_is_closed_again(tmp_path: Path) 
     (tmp_path / "rig.toml").write_text(f'name = "demo"\n[head]\ndriver = "staged"\n{STAGE}')
     with pytest.raises(ConfigError, match="its head has a positioner, and its file names another; leave one out"):
         open_rig(read_rig(tmp_path / "rig.toml"))
-    assert [device.closed for device in OPENED if device.options] == [1]
+    assert [device.closings for device in OPENED if device.options] == [1]
     OPENED.clear()
     with pytest.raises(ConfigError, match=r"(?s)2 of its tables.*camera driver 'fkae'.*positioner driver 'tabel'"):
         _open(tmp_path, _camera("left", "fkae"), STAGE.replace("fake", "tabel"))
-    assert [device.closed for device in OPENED] == [1]
+    assert [device.closings for device in OPENED] == [1]
 
 
 def test_the_rig_files_calibration_comes_before_the_heads(tmp_path: Path) -> None:
@@ -292,17 +253,26 @@ def test_the_rig_files_calibration_comes_before_the_heads(tmp_path: Path) -> Non
     assert list(calibration.cameras) == ["right"]
 
 
-def test_a_calibration_of_one_camera_alone_is_refused_before_a_scan_fails_by_it(tmp_path: Path) -> None:
-    write_calibration(tmp_path / "own.json", replace(sample_calibration(cameras=("right",)), projector=None))
-    (tmp_path / "rig.toml").write_text('name = "demo"\ncalibration = "own.json"\n[head]\ndriver = "fake"\n')
-    with pytest.raises(CalibrationError, match=r"own\.json: .*of camera 'right' alone, without a projector"):
-        open_rig(read_rig(tmp_path / "rig.toml"))
-
-
-def test_an_unknown_driver_is_told_with_those_installed(tmp_path: Path) -> None:
-    with pytest.raises(DriverNotFoundError, match=r"camera driver 'fkae'.*broken, constant, crashing.*, fake, .*lost"):
-        _open(tmp_path, _camera("left"), _camera("right", "fkae"))
-    assert [device.closed for device in OPENED] == [1, 1]
+@pytest.mark.parametrize(
+    ("calibration", "words"),
+    [
+        (sample_calibration(), r"own\.json: .*\n.*cameras\.left: expected 40 x 99"),
+        (
+            replace(sample_calibration(cameras=("left",)), projector=None),
+            r"own\.json: .*of camera 'left' alone, without a projector",
+        ),
+        (None, r"own\.json: expected a readable file"),
+    ],
+)
+def test_calibration_that_does_not_fit_is_refused_and_all_is_closed(
+    tmp_path: Path, calibration: Calibration | None, words: str
+) -> None:
+    if calibration is not None:
+        write_calibration(tmp_path / "own.json", calibration)
+    rows = "rows = 99" if calibration is not None and calibration.projector else ""
+    with pytest.raises(CalibrationError, match=words):
+        _open(tmp_path, _camera("left", more=rows), top='calibration = "own.json"')
+    assert [device.closings for device in OPENED] == [1, 1]
 
 
 def test_faults_of_several_tables_are_told_together_and_all_is_closed(tmp_path: Path) -> None:
@@ -317,16 +287,18 @@ def test_faults_of_several_tables_are_told_together_and_all_is_closed(tmp_path: 
         )
     told = str(caught.value)
     assert told.startswith("rig 'bench': 3 of its tables are wrong; correct each and try again:\n")
+    assert re.search(r"camera driver 'fkae'.*broken, constant, crashing.*, fake, .*lost", told)
+    assert "  port: " in told
     order = [
         "projector driver 'skreen'",
         "camera driver 'fkae'",
         "camera driver 'strict' does not take",
-        "speed: unknown",
+        "  speed: unknown key; remove it",
     ]
     places = [told.index(part) for part in order]
     assert places == sorted(places)
     assert "is not there" not in told
-    assert [(device.name, device.closed) for device in OPENED] == [("top", 1)]
+    assert [(device.name, device.closings) for device in OPENED] == [("top", 1)]
 
 
 @pytest.mark.parametrize(
@@ -344,43 +316,21 @@ def test_devices_already_open_are_closed_when_one_fails(
 ) -> None:
     with pytest.raises(error, match=part):
         _open(tmp_path, _camera("left"), _camera("right", driver))
-    assert [(device.name, device.closed) for device in OPENED] == [("projector", 1), ("left", 1)]
+    assert [(device.name, device.closings) for device in OPENED] == [("projector", 1), ("left", 1)]
 
 
-@pytest.mark.parametrize("how", ["fails", "breaks"])
-def test_a_device_that_cannot_be_closed_does_not_hide_the_error(tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize(("how", "words"), [("fails", "unplugged"), ("breaks", "Input/output error")])
+def test_device_that_cannot_be_closed_hides_no_error_and_keeps_no_other_open(
+    tmp_path: Path, how: str, words: str
+) -> None:
+    left = _camera("left", more=f'close = "{how}"')
     with pytest.raises(DeviceGoneError, match="right is not there"):
-        _open(tmp_path, _camera("left", more=f'close = "{how}"'), _camera("right", "lost"))
-    assert [device.closed for device in OPENED] == [1, 1]
-
-
-@pytest.mark.parametrize("how", ["fails", "breaks"])
-def test_a_device_that_cannot_be_closed_keeps_no_other_open(tmp_path: Path, how: str) -> None:
-    rig = _open(tmp_path, _camera("left", more=f'close = "{how}"'), _camera("right"))
-    assert [str(fault) for fault in rig.close()] == ["unplugged" if how == "fails" else "Input/output error"]
-    assert [device.closed for device in OPENED] == [1, 1, 1]
-
-
-def test_options_a_driver_does_not_take_are_all_told(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError) as caught:
-        _open(tmp_path, _camera("left", "strict", 'port = "x"\nspeed = 5'))
-    assert "camera driver 'strict' does not take these options" in str(caught.value)
-    assert "  speed: unknown key; remove it" in str(caught.value).splitlines()
-    assert "  port: " in str(caught.value)
-    assert [device.closed for device in OPENED] == [1]
-
-
-def test_a_calibration_for_another_camera_is_refused_and_all_is_closed(tmp_path: Path) -> None:
-    write_calibration(tmp_path / "own.json", sample_calibration())
-    with pytest.raises(CalibrationError, match=r"own\.json: .*\n.*cameras\.left: expected 40 x 99"):
-        _open(tmp_path, _camera("left", more="rows = 99"), top='calibration = "own.json"')
-    assert [device.closed for device in OPENED] == [1, 1]
-
-
-def test_a_missing_calibration_is_told_and_all_is_closed(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"own\.json: expected a readable file"):
-        _open(tmp_path, _camera("left"), top='calibration = "own.json"')
-    assert [device.closed for device in OPENED] == [1, 1]
+        _open(tmp_path, left, _camera("right", "lost"))
+    assert [device.closings for device in OPENED] == [1, 1]
+    OPENED.clear()
+    rig = _open(tmp_path, left, _camera("right"))
+    assert [str(fault) for fault in rig.close()] == [words]
+    assert [device.closings for device in OPENED] == [1, 1, 1]
 
 
 def test_a_driver_provided_twice_is_refused(tmp_path: Path) -> None:
@@ -408,8 +358,3 @@ def test_a_failing_finder_does_not_hide_what_others_found() -> None:
     findings = found_devices()
     assert FoundDevice("fake", "usb-1", "a fake camera") in findings.devices
     assert ["finder driver 'lost' failed: OSError: no bus" in str(fault) for fault in findings.faults] == [True]
-
-
-def test_the_fakes_are_what_the_protocols_ask_for() -> None:
-    assert isinstance(FakeCamera("left", {}, Path()), Camera)
-    assert isinstance(FakeProjector("projector", {}, Path()), Projector)
