@@ -1,4 +1,4 @@
-"""A verification in line with the scans: shot, read, judged, put on record; refused, cancelled, busy: told in words."""
+"""A verification in line with the scans: shot, judged with those before it, put on record, or refused in words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
-from uuid import UUID, uuid4
+from uuid import UUID
 
 import pytest
 
@@ -19,12 +19,9 @@ from slrig.calibration.observations import PoseObservation, ViewFigures
 from slrig.devices import Rig
 from slrig.errors import (
     CalibrationStateError,
-    JobNotFoundError,
     PoseRefusedError,
     RigBusyError,
-    ScanCancelledError,
 )
-from slrig.failure import interruption
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobRecord, JobState
@@ -130,8 +127,14 @@ def test_a_verification_is_shot_judged_and_put_on_record(folder: DataFolder, sto
     assert found == latest
     assert calibration is CALIBRATION
     assert list(folder.incoming.iterdir()) == []
-    # It outlives the service.
-    assert desk_of(folder, store, queue_of()).jobs.get(job.id) == job
+    # Both outlive the service.
+    again = HealthStore(Database(folder.database))
+    assert desk_of(folder, again, queue_of()).jobs.get(job.id) == job
+    kept = again.latest()
+    assert kept is not None
+    assert kept.document() == latest.document()
+    assert kept.found.document() == a_verification().document()
+    again.database.close()
 
 
 def test_a_rig_that_is_held_names_its_holder(folder: DataFolder, store: HealthStore) -> None:
@@ -164,35 +167,6 @@ def test_a_board_that_moved_is_refused_and_leaves_nothing(folder: DataFolder, st
     assert list(folder.incoming.iterdir()) == []
 
 
-def test_a_cancelled_one_is_cancelled(folder: DataFolder, store: HealthStore) -> None:
-    queue = queue_of()
-    queue.error = ScanCancelledError("asked to")
-    desk = desk_of(folder, store, queue)
-    job = done(desk)
-    assert job.state is JobState.CANCELLED
-    assert desk.cancel(job.id).state is JobState.CANCELLED
-    with pytest.raises(JobNotFoundError, match="GET /rig/health/history"):
-        desk.jobs.get(uuid4())
-
-
-def test_one_that_the_end_of_the_service_cuts_off_is_interrupted(folder: DataFolder, store: HealthStore) -> None:
-    def cut_off(*_: Any, **__: Any) -> TameRecording:
-        raise interruption()
-
-    tools = VerificationTools(capture=cut_off, read=read, judge=look)
-    assert done(desk_of(folder, store, queue_of(), tools=tools)).state is JobState.INTERRUPTED
-
-
-def test_one_that_waits_at_the_end_of_the_service_waits_on(folder: DataFolder, store: HealthStore) -> None:
-    queue = queue_of()
-    queue.error = interruption()
-    job = desk_of(folder, store, queue).shoot(BOARD)
-    assert job.state is JobState.QUEUED
-    after = desk_of(folder, store, queue_of())
-    after.take_up()
-    assert over(after, job.id).state is JobState.SUCCEEDED
-
-
 def test_after_a_kill_one_that_waited_is_shot_and_one_under_way_is_interrupted(
     folder: DataFolder, store: HealthStore
 ) -> None:
@@ -208,13 +182,6 @@ def test_after_a_kill_one_that_waited_is_shot_and_one_under_way_is_interrupted(
     assert cut_off.state is JobState.INTERRUPTED
     assert cut_off.fault is not None
     assert cut_off.fault.code == "scan-interrupted"
-
-
-def test_only_so_many_finished_ones_stay_on_record(folder: DataFolder, store: HealthStore) -> None:
-    desk = desk_of(folder, store, queue_of())
-    made = [done(desk).id for _ in range(4)]
-    desk.jobs.prune(2)
-    assert [job.id for job in desk.jobs.page(before=None, limit=9)] == made[:1:-1]
 
 
 def test_a_recorded_pose_is_judged(tmp_path: Path) -> None:
@@ -241,3 +208,25 @@ def test_a_scan_is_stamped_with_the_health_of_its_time(store: HealthStore) -> No
     assert stamp["verification"] == str(record.id)
     assert stamp["verified_at"] == "2026-11-20T10:00:00+00:00"
     assert health_stamp(Health(HealthState.UNKNOWN, ()), None)["verified_at"] is None
+
+
+def test_history_is_newest_first_limited_and_since(store: HealthStore) -> None:
+    for hour in range(6):
+        store.add(a_verification(), calibration="one" if hour < 4 else "two", at=hours(hour))
+    assert [record.at for record in store.history(limit=2)] == [hours(5), hours(4)]
+    assert [record.at for record in store.history(since=hours(3))] == [hours(5), hours(4), hours(3)]
+    assert [record.at for record in store.since_calibration("one")] == [hours(hour) for hour in range(4)]
+
+
+def test_a_look_is_judged_with_those_before_it_since_the_calibration(store: HealthStore) -> None:
+    for hour in range(3):
+        store.add(a_verification(), calibration="one", at=hours(hour))
+    # One look that is bad by a little is no alarm; the same one after a calibration without others is.
+    assert store.add(a_verification(1.8, evidence=10), calibration="one", at=hours(4)).health.state is HealthState.GOOD
+    assert store.add(a_verification(1.8, evidence=10), calibration="one", at=hours(5)).health.state is HealthState.WATCH
+    assert store.health_of("one").state is HealthState.WATCH
+    assert store.health_of("two").state is HealthState.UNKNOWN
+    assert store.add(a_verification(1.8, evidence=10), calibration="two", at=hours(6)).health.state is HealthState.WATCH
+    knocked = store.add(a_verification(12, evidence=4000), calibration="one", at=hours(7)).health
+    assert knocked.state is HealthState.STALE
+    assert "camera 'left' turned by 0.050" in " ".join(knocked.reasons)
