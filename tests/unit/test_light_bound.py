@@ -89,6 +89,7 @@ def test_white_noise_gives_the_closed_form_of_a_gaussian_stripe() -> None:
     assert np.ptp(bound.row_px) < 0.1 * expected
     np.testing.assert_allclose(bound.width_px, SIGMA_PX, rtol=0.01)
     np.testing.assert_allclose(bound.tilt_cosine, 1.0, rtol=1e-6)
+    assert np.median(bound.snr) == pytest.approx(height_e(exposed) / 3000.0, rel=0.01)
 
 
 def test_shot_noise_alone_gives_the_width_over_the_root_of_the_photons() -> None:
@@ -103,8 +104,7 @@ def test_shot_noise_alone_gives_the_width_over_the_root_of_the_photons() -> None
     np.testing.assert_allclose(bound.row_known_px[middle], SIGMA_PX / np.sqrt(photons), rtol=0.02)
 
 
-@pytest.mark.parametrize("sensor", [WHITE_NOISE, SHOT_NOISE], ids=["white", "shot"])
-@pytest.mark.parametrize("phase_px", [0.0, 0.25, 0.5])
+@pytest.mark.parametrize(("sensor", "phase_px"), [(WHITE_NOISE, 0.25), (SHOT_NOISE, 0.5)])
 def test_unknown_height_background_and_width_cost_nothing_by_symmetry(
     sensor: dict[str, float], phase_px: float
 ) -> None:
@@ -112,14 +112,10 @@ def test_unknown_height_background_and_width_cost_nothing_by_symmetry(
     assert (bound.row_px >= bound.row_known_px * (1 - 1e-9)).all()
     middle = np.abs(bound.column_px - 60) < 30
     np.testing.assert_allclose(bound.row_px[middle], bound.row_known_px[middle], rtol=2e-3)
-
-
-def test_they_cost_something_where_the_albedo_breaks_the_symmetry() -> None:
-    bound = bound_of(
-        exposed_view(WHITE_NOISE, texture={"kind": "checker", "contrast": 0.9, "scale_mm": 13.0}),
-    )
-    cost = bound.row_px / bound.row_known_px
-    assert cost.max() > 1.1
+    # They cost something where the albedo breaks the symmetry.
+    checker = {"kind": "checker", "contrast": 0.9, "scale_mm": 13.0}
+    uneven = bound_of(exposed_view(sensor, phase_px=phase_px, texture=checker))
+    assert (uneven.row_px / uneven.row_known_px).max() > 1.1
 
 
 def test_an_estimator_on_the_sensor_s_own_frames_attains_the_bound_and_none_beats_it() -> None:
@@ -168,11 +164,6 @@ def test_noise_of_white_and_black_counts_until_they_are_repeated_without_end() -
     assert (once > twice).all()
     assert (twice > alone * 1.01).all()
     np.testing.assert_allclose(endless, alone, rtol=1e-6)
-
-
-def test_signal_to_noise_is_the_height_over_the_noise_at_the_stripe() -> None:
-    exposed = exposed_view(WHITE_NOISE)
-    assert np.median(bound_of(exposed).snr) == pytest.approx(height_e(exposed) / 3000.0, rel=0.01)
 
 
 def test_clipped_samples_tell_nothing() -> None:

@@ -1,4 +1,4 @@
-"""Notices to a real MQTT broker: in order, until acknowledged, whatever becomes of the broker and of the service."""
+"""Notices to an MQTT broker: addresses, logins and certificates. tests/e2e/test_signals has them come in order."""
 
 from __future__ import annotations
 
@@ -21,22 +21,20 @@ from slrig.schedule.mqtt import Broker
 from slrig.schedule.receivers import senders_of, wanted_kinds
 from tests.unit.scan.fakes import SetClock
 from tests.unit.schedule.hook import own_certificate
-from tests.unit.schedule.mosquitto import LOGIN, PREFIX, Mosquitto, Subscriber
+from tests.unit.schedule.mosquitto import LOGIN, Mosquitto
 
 
 class Bench:
-    """An outbox for two receivers, one of which is a broker that is told when a test says."""
+    """An outbox for a broker, which is sent to when a test says."""
 
     def __init__(self, folder: Path, url: str, login: str | None = LOGIN, *, timeout_s: float = 5.0) -> None:
-        self.clock = SetClock()
         self.database = Database(folder / "slrig.sqlite")
-        wanted = {"webhook": ["run.failed"], "mqtt": get_args(NoticeKind)}
-        self.outbox = Outbox(self.database, rig="bench", wanted=wanted, clock=self.clock)
+        self.outbox = Outbox(self.database, rig="bench", wanted={"mqtt": get_args(NoticeKind)})
         self.broker = Broker(self.outbox, url, login, timeout_s=timeout_s)
 
-    def put(self, kind: NoticeKind, words: str) -> None:
+    def put(self, words: str) -> None:
         with self.database.changing() as session:
-            self.outbox.put(session, kind, words)
+            self.outbox.put(session, "job.ended", words)
 
     def empty(self) -> None:
         """Step until nothing waits; nothing may fail."""
@@ -51,64 +49,18 @@ def broker(tmp_path: Path) -> Iterator[Mosquitto]:
     made.stop()
 
 
-def test_broker_that_is_down_for_hours_is_told_all_in_order_by_the_next_start_of_the_service(
-    tmp_path: Path, broker: Mosquitto
-) -> None:
-    broker.start()
-    Subscriber(broker).close()
-    first = Bench(tmp_path, broker.url)
-    first.put("health.changed", "1")
-    first.empty()
-    broker.stop()
-    first.put("run.failed", "2")
-    first.put("job.ended", "3")
-    with structlog.testing.capture_logs() as log:
-        waits: list[float] = []
-        while sum(waits) < timedelta(hours=5).total_seconds():
-            waits.append(first.broker.step() or 0)
-            first.clock.move(seconds=waits[-1])
-    assert waits[:10] == [1, 2, 4, 8, 16, 32, 64, 128, 256, 300]
-    assert {(line["receiver"], line["host"], line["cause"]) for line in log} == {
-        ("mqtt", "127.0.0.1", "ConnectionRefusedError")
-    }
-    # Each receiver has a queue of its own, with what it wants.
-    assert [first.outbox.waiting(receiver)[0] for receiver in ("mqtt", "webhook")] == [2, 1]
-    to_webhook = first.outbox.oldest("webhook")
-    assert to_webhook is not None
-    first.database.close()
-
-    second = Bench(tmp_path, broker.url)
-    broker.start()
-    second.put("run.failed", "4")
-    second.empty()
-    assert [second.outbox.waiting(receiver)[0] for receiver in ("mqtt", "webhook")] == [0, 2]
-    # The broker kept for its subscriber what came while that was away, and kept it through its own restart.
-    subscriber = Subscriber(broker)
-    came = [subscriber.next() for _ in range(4)]
-    subscriber.close()
-    assert subscriber.came.empty()
-    assert [(topic, body["words"]) for topic, body in came] == [
-        (f"{PREFIX}/health.changed", "rig 'bench': 1"),
-        (f"{PREFIX}/run.failed", "rig 'bench': 2"),
-        (f"{PREFIX}/job.ended", "rig 'bench': 3"),
-        (f"{PREFIX}/run.failed", "rig 'bench': 4"),
-    ]
-    assert came[1][1] == to_webhook.body
-    assert len({body["id"] for _, body in came}) == 4
-    second.database.close()
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("login", ["rig:wrong", None])
 def test_what_a_broker_refuses_waits(tmp_path: Path, broker: Mosquitto, login: str | None) -> None:
     broker.start()
     bench = Bench(tmp_path, broker.url, login)
-    bench.put("job.ended", "1")
+    bench.put("1")
     with structlog.testing.capture_logs() as log:
         assert bench.broker.step() == 1
-    # A wrong password is refused at the connection, somebody without rights at the notice.
+    # A wrong password is refused at the connection, a user without rights at the notice.
     assert [line["cause"] for line in log] == ["Not authorized"]
     assert "wrong" not in str(log)
-    bench.put("job.ended", "2")
+    bench.put("2")
     bench.broker = Broker(bench.outbox, broker.url, LOGIN)
     bench.empty()
     bench.database.close()
@@ -118,12 +70,13 @@ def test_broker_that_gives_no_answer_costs_one_try(tmp_path: Path) -> None:
     pytest.importorskip("paho.mqtt.client", reason="needs paho-mqtt: pip install 'slrig[mqtt]'")
     with socket.create_server(("127.0.0.1", 0)) as deaf, structlog.testing.capture_logs() as log:
         bench = Bench(tmp_path, f"mqtt://127.0.0.1:{deaf.getsockname()[1]}/x", timeout_s=0.2)
-        bench.put("job.ended", "1")
+        bench.put("1")
         assert bench.broker.step() == 1
     assert [line["cause"] for line in log] == ["no answer"]
     bench.database.close()
 
 
+@pytest.mark.slow
 # The library leaves the socket of a handshake that fails to Python's collector.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_certificate_counts_where_its_authority_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,7 +84,7 @@ def test_certificate_counts_where_its_authority_is_known(tmp_path: Path, monkeyp
     broker = Mosquitto(tmp_path, certificate=pem)
     broker.start()
     bench = Bench(tmp_path, broker.url)
-    bench.put("job.ended", "1")
+    bench.put("1")
     with structlog.testing.capture_logs() as log:
         assert bench.broker.step() == 1
     # Threads of other tests may still log.
@@ -151,7 +104,7 @@ def test_certificate_counts_where_its_authority_is_known(tmp_path: Path, monkeyp
         "mqtt://host:70000/rig", "mqtt://host/rig/#", "mqtt://host/+/rig", "mqtt://host/rig?x=secret",
     ],
 )  # fmt: skip
-def test_address_that_is_none_is_refused_and_not_repeated(tmp_path: Path, url: str) -> None:
+def test_invalid_address_is_refused_and_not_repeated(tmp_path: Path, url: str) -> None:
     pytest.importorskip("paho.mqtt.client", reason="needs paho-mqtt: pip install 'slrig[mqtt]'")
     with pytest.raises(ConfigError, match=r"^mqtt_url: expected mqtt://HOST:PORT/PREFIX") as error:
         Bench(tmp_path, url)

@@ -201,16 +201,6 @@ def test_run_that_a_person_asks_for_waits_as_others_do_and_has_no_twin(desk: Des
         desk.store.run_now(UUID(int=1), desk.now)
 
 
-def test_restart_forgets_nothing(new_desk: NewDesk) -> None:
-    daily = new_desk().daily()
-    now = START + timedelta(hours=1)
-    new_desk(now=now).look()
-    third = new_desk(now=now)
-    third.look()
-    assert third.rows(daily) == [("23 06:00", RunState.SUCCEEDED, 1)]
-    assert third.done == []
-
-
 @pytest.mark.parametrize(
     ("busy", "error", "reason"),
     [
@@ -332,15 +322,6 @@ def test_clock_that_was_wrong_by_years_is_followed_when_it_is_right_again(desk: 
     assert desk.store.get(daily.id).next_due == START + timedelta(hours=1)
     desk.look(hours=1)
     assert desk.rows(daily) == [("23 06:00", RunState.SUCCEEDED, 1)]
-
-
-@pytest.mark.parametrize(("night", "due"), [(utc(2026, 3, 28, 23), "29 01:00"), (utc(2026, 10, 24, 23), "25 00:30")])
-def test_nights_when_clocks_change_have_one_run(new_desk: NewDesk, night: datetime, due: str) -> None:
-    desk = new_desk(now=night)
-    nightly = desk.daily(cron=Cron("30 2 * * *", BERLIN))
-    for _ in range(10):
-        desk.look(minutes=30)
-    assert desk.rows(nightly) == [(due, RunState.SUCCEEDED, 1)]
 
 
 def test_two_processes_on_one_database_start_a_run_once(new_desk: NewDesk) -> None:
