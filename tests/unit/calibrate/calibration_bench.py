@@ -25,6 +25,7 @@ from slrig.errors import PoseRefusedError, ScanCancelledError
 from slrig.jobs.records import JobKind
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration, Pinhole, Size, Solved
+from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import Progress, ScanPlan
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S, TameBench, TameRecording
@@ -215,6 +216,17 @@ class CalibrationBench(Bench):
         unwatch()
         return register.get(session_id)
 
+    def record(self, session_id: UUID) -> SessionRecord:
+        """The session as it is."""
+        return self.calibrations.register.get(session_id)
+
+    @property
+    def in_use(self) -> ActiveCalibration:
+        """The calibration that scans are made with."""
+        active = self.runner.status().active
+        assert active is not None
+        return active
+
     def session(self) -> UUID:
         """A session that was opened."""
         return self.calibrations.open(BOARD).id
@@ -232,14 +244,19 @@ class CalibrationBench(Bench):
         assert self.began.wait(WAIT_S)
         return pose
 
+    def solve(self, session_id: UUID, state: SessionState = SessionState.SOLVED) -> SessionRecord:
+        """Solve a session, which ends in this state."""
+        self.calibrations.solves.solve(session_id)
+        record = self.until_session(session_id, lambda found: found.state is not SessionState.SOLVING)
+        assert record.state is state, record.fault
+        return record
+
     def solved(self, *, poses: int = 2) -> UUID:
         """A session that was solved."""
         session_id = self.session()
         for _ in range(poses):
             self.shot(session_id)
-        self.calibrations.solves.solve(session_id)
-        record = self.until_session(session_id, lambda found: found.state is not SessionState.SOLVING)
-        assert record.state is SessionState.SOLVED, record.fault
+        self.solve(session_id)
         return session_id
 
     def close(self) -> None:

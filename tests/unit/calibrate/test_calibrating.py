@@ -60,7 +60,7 @@ def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBe
     assert [first.state, second.state] == [JobState.SUCCEEDED] * 2
     assert first.answer == {"corners_found": {"cam0": 12}}
     assert bench.tame.judged == [[], ["pose 1"]]
-    record = bench.calibrations.register.get(session_id)
+    record = bench.record(session_id)
     assert record.coverage == {"poses": ["pose 1", "pose 2"]}
     assert record.next_move == {"words": "tilt it", "enough": False}
     assert (dict(record.cameras), record.projector) == ({"cam0": Size(64, 48)}, Size(64, 40))
@@ -68,9 +68,7 @@ def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBe
     assert {path.name for path in place.iterdir()} == {"bundle", "answer.json", "picture-cam0.png", "reading.npz"}
     assert (place / "picture-cam0.png").read_bytes() == PNG
 
-    bench.calibrations.solves.solve(session_id)
-    done = bench.until_session(session_id, lambda found: found.state is not SessionState.SOLVING)
-    assert (done.state, done.solve) == (SessionState.SOLVED, 1)
+    assert bench.solve(session_id).solve == 1
     assert bench.tame.solved == [["pose 1", "pose 2"]]
     path = bench.calibrations.file(session_id, "calibration.json")
     solved = read_calibration(path).solved
@@ -80,9 +78,7 @@ def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBe
 
     assert bench.runner.status().active is None
     bench.calibrations.activate(session_id)
-    active = bench.runner.status().active
-    assert active is not None
-    assert active.name == str(session_id)
+    assert bench.in_use.name == str(session_id)
     assert bench.calibrations.active == session_id
     assert list(bench.folder.incoming.iterdir()) == []
     assert bench.opened[0][1].dark
@@ -128,8 +124,7 @@ def test_bad_pose_is_refused_with_its_cause_and_its_picture(bench: CalibrationBe
     good = bench.shot(session_id)
     assert good.number == 3
     assert bench.tame.judged[-1] == []
-    bench.calibrations.solves.solve(session_id)
-    bench.until_session(session_id, lambda found: found.state is SessionState.SOLVED)
+    bench.solve(session_id)
     assert bench.tame.solved == [["pose 3"]]
 
 
@@ -148,7 +143,7 @@ def test_pose_and_scan_stand_in_one_line(bench: CalibrationBench) -> None:
     with pytest.raises(RigBusyError) as busy:
         bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=False)
     assert busy.value.holder == str(scan.id)
-    assert bench.calibrations.register.get(session_id).latest_pose == 1
+    assert bench.record(session_id).latest_pose == 1
     waiting = bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=True)
     assert bench.calibrations.register.pose(session_id, waiting.number).state is JobState.QUEUED
     bench.gate.set()
@@ -177,7 +172,7 @@ def test_dropped_pose_is_in_no_solve_and_its_number_is_not_given_again(bench: Ca
     bench.shot(session_id)
     bench.shot(session_id)
     bench.calibrations.poses.drop(session_id, 1)
-    record = bench.calibrations.register.get(session_id)
+    record = bench.record(session_id)
     assert [pose.number for pose in record.poses] == [2]
     assert record.coverage == {"poses": ["pose 2"]}
     assert not bench.calibrations.store.pose(session_id, 1).exists()
@@ -212,23 +207,24 @@ def test_failed_or_cancelled_pose_ends_its_script(moved: CalibrationBench) -> No
     moved.gate.clear()
     first = moved.calibrations.poses.script(session_id, (), PoseRequest(), wait=False)
     assert moved.began.wait(WAIT_S)
-    assert moved.calibrations.register.get(session_id).script == (1, 2)
+    assert moved.record(session_id).script == (1, 2)
     moved.calibrations.poses.cancel(session_id, first.number)
     assert moved.until_pose(session_id, first.number).state is JobState.CANCELLED
     moved.gate.set()
     moved.error = DeviceGoneError("Camera 'cam0' was unplugged.")
     second = moved.calibrations.poses.script(session_id, (), PoseRequest(), wait=True)
     assert moved.until_pose(session_id, second.number).state is JobState.FAILED
-    record = moved.calibrations.register.get(session_id)
+    record = moved.record(session_id)
     assert (record.script, record.latest_pose, moved.tame.visited) == ((), 2, [0, 0])
 
 
 def test_rig_without_a_positioner_says_so(bench: CalibrationBench) -> None:
     bench.until(bench.scan().id)
+    poses = bench.calibrations.poses
     with pytest.raises(UnsupportedByDeviceError, match="no positioner"):
-        bench.calibrations.poses.shoot(bench.session(), PoseRequest(position=0), wait=False)
+        poses.shoot(bench.session(), PoseRequest(position=0), wait=False)
     with pytest.raises(UnsupportedByDeviceError, match="no positioner"):
-        bench.calibrations.poses.script(bench.session(), (), PoseRequest(), wait=False)
+        poses.script(bench.session(), (), PoseRequest(), wait=False)
 
 
 def test_solve_is_refused_until_it_makes_sense(bench: CalibrationBench) -> None:
@@ -256,17 +252,15 @@ def test_failed_solve_tells_why_and_another_pose_opens_the_session_again(bench: 
     session_id = bench.session()
     bench.shot(session_id)
     bench.tame.solve_error = SolveRefusedError("All poses are parallel: tilt the board.")
-    bench.calibrations.solves.solve(session_id)
-    failed = bench.until_session(session_id, lambda found: found.state is SessionState.FAILED)
+    failed = bench.solve(session_id, SessionState.FAILED)
     assert failed.fault is not None
     assert (failed.fault.code, failed.solve) == ("solve-refused", 0)
     with pytest.raises(CalibrationStateError, match="was not solved yet"):
         bench.calibrations.activate(session_id)
     bench.tame.solve_error = None
     bench.shot(session_id)
-    assert bench.calibrations.register.get(session_id).state is SessionState.OPEN
-    bench.calibrations.solves.solve(session_id)
-    bench.until_session(session_id, lambda found: found.state is SessionState.SOLVED)
+    assert bench.record(session_id).state is SessionState.OPEN
+    bench.solve(session_id)
 
 
 def test_second_solve_changes_no_calibration_in_use(bench: CalibrationBench) -> None:
@@ -274,20 +268,14 @@ def test_second_solve_changes_no_calibration_in_use(bench: CalibrationBench) -> 
     bench.calibrations.activate(session_id)
     bench.shot(session_id)
     bench.tame.calibration = tame_calibration(focal_px=81.0)
-    bench.calibrations.solves.solve(session_id)
-    record = bench.until_session(session_id, lambda found: found.state is SessionState.SOLVED)
-    assert record.solve == 2
+    assert bench.solve(session_id).solve == 2
     # The solve was held against the one in use.
     assert [None if each is None else each.cameras["cam0"].matrix[0, 0] for each in bench.tame.earlier] == [None, 80.0]
-    active = bench.runner.status().active
-    assert active is not None
-    assert active.calibration.cameras["cam0"].matrix[0, 0] == 80.0
+    assert bench.in_use.calibration.cameras["cam0"].matrix[0, 0] == 80.0
     bench.calibrations.activate(session_id)
-    active = bench.runner.status().active
-    assert active is not None
-    assert active.calibration.solved is not None
-    assert active.calibration.solved.id == f"{session_id}.2"
-    assert active.calibration.cameras["cam0"].matrix[0, 0] == 81.0
+    assert bench.in_use.calibration.solved is not None
+    assert bench.in_use.calibration.solved.id == f"{session_id}.2"
+    assert bench.in_use.calibration.cameras["cam0"].matrix[0, 0] == 81.0
 
 
 def test_calibration_in_use_is_not_deleted_and_can_be_let_go(bench: CalibrationBench) -> None:
@@ -302,11 +290,18 @@ def test_calibration_in_use_is_not_deleted_and_can_be_let_go(bench: CalibrationB
     bench.calibrations.delete(session_id)
     assert not bench.calibrations.store.folder(session_id).exists()
     with pytest.raises(CalibrationNotFoundError):
-        bench.calibrations.register.get(session_id)
+        bench.record(session_id)
 
 
-def test_calibration_of_other_devices_is_not_activated(bench: CalibrationBench) -> None:
+def test_import_of_other_devices_is_not_activated_and_of_no_calibration_leaves_no_trace(
+    bench: CalibrationBench,
+) -> None:
     bench.until(bench.scan().id)
+    with pytest.raises(CalibrationError, match="the calibration sent") as refused:
+        bench.calibrations.submit(b"{}", ".json")
+    assert str(bench.folder.root) not in str(refused.value)
+    assert bench.calibrations.latest() == []
+    assert list(bench.folder.incoming.iterdir()) == []
     path = bench.folder.root / "other.json"
     write_calibration(path, tame_calibration(camera=Size(640, 480)))
     record = bench.calibrations.submit(path.read_bytes(), ".json")
@@ -330,14 +325,6 @@ def test_exported_calibration_comes_in_again(bench: CalibrationBench, name: str)
     with pytest.raises(ArtefactNotReadyError, match="was imported"):
         bench.calibrations.file(record.id, "report.html")
     bench.calibrations.activate(record.id)
-
-
-def test_text_that_is_no_calibration_is_refused_without_a_trace(bench: CalibrationBench) -> None:
-    with pytest.raises(CalibrationError, match="the calibration sent") as refused:
-        bench.calibrations.submit(b"{}", ".json")
-    assert str(bench.folder.root) not in str(refused.value)
-    assert bench.calibrations.latest() == []
-    assert list(bench.folder.incoming.iterdir()) == []
 
 
 def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: CalibrationBench) -> None:
@@ -399,7 +386,7 @@ def test_poses_outlive_their_records_and_records_do_not_outlive_their_files(benc
     poses = [bench.shot(session_id) for _ in range(2)]
     bench.tame.refusals = ("hold it still.",)
     bench.shot(session_id)
-    before = bench.calibrations.register.get(session_id)
+    before = bench.record(session_id)
     bench.jobs.delete_of(session_id)
     again = bench.restarted().register.get(session_id)
     told = [(pose.number, pose.state, pose.answer, pose.fault) for pose in again.poses]
@@ -410,15 +397,10 @@ def test_poses_outlive_their_records_and_records_do_not_outlive_their_files(benc
     assert (lost.state, None if lost.fault is None else lost.fault.code) == (JobState.FAILED, "storage")
 
 
-def test_folder_that_is_no_session_is_put_aside(bench: CalibrationBench) -> None:
+def test_links_are_not_followed_and_folders_of_no_session_put_aside(bench: CalibrationBench, tmp_path: Path) -> None:
     stray = bench.folder.calibrations / str(uuid4())
     stray.mkdir()
     (stray / "session.json").write_text('{"number": 1}')
-    assert CalibrationStore(bench.folder).load() == []
-    assert (bench.folder.orphans / stray.name / "session.json").is_file()
-
-
-def test_links_among_the_calibrations_are_not_followed(bench: CalibrationBench, tmp_path: Path) -> None:
     session_id, store = bench.solved(), bench.calibrations.store
     place, elsewhere = store.folder(session_id), tmp_path / "elsewhere"
     solved = store.solve(session_id, 1) / "calibration.json"
@@ -430,6 +412,7 @@ def test_links_among_the_calibrations_are_not_followed(bench: CalibrationBench, 
     place.symlink_to(elsewhere)
     (bench.folder.calibrations / "nowhere").symlink_to(tmp_path / "absent")
     assert CalibrationStore(bench.folder).load() == []
+    assert (bench.folder.orphans / stray.name / "session.json").is_file()
     store.delete(session_id)
     assert not place.is_symlink()
     assert (elsewhere / "session.json").is_file()
@@ -458,8 +441,7 @@ def test_only_what_is_neither_new_nor_needed_is_removed(bench: CalibrationBench)
     in_report, twice, in_bundle, active, empty, unused, newest = (
         *(bench.solved() for _ in range(4)), bench.session(), bench.solved(), bench.session(),
     )  # fmt: skip
-    bench.calibrations.solves.solve(twice)
-    bench.until_session(twice, lambda found: found.solve == 2)
+    bench.solve(twice)
     bench.calibrations.activate(active)
     a_scan(bench, report={"calibration": {"id": str(in_report)}})
     a_scan(bench, report={"calibration": {"id": f"{twice}.2"}})
