@@ -184,7 +184,9 @@ def test_frames_that_were_taken_here_are_computed_here(pool: Pool, tmp_path: Pat
     assert pool.local.done[0].where == {"where": "local", "because": "the pool does not answer when the frames came"}
 
 
-def test_workers_of_other_versions_are_not_used() -> None:
+def test_workers_of_other_versions_are_not_used_nor_those_of_a_pool_for_other_tasks(pool: Pool) -> None:
+    assert pool.worker.task("tests.unit.scan.fake_pipeline:process_id", "examination")() > 0
+    assert len(pool.local.done) == 1
     cluster = DaskCluster("tcp://127.0.0.1:1", None)
     mine, newer = ({"resources": {resource(found): 1}} for found in (versions(), {**versions(), "code": "0"}))
     assert "no workers" in str(cluster._lack([]))
@@ -211,11 +213,6 @@ def test_what_workers_can_do_is_asked_for_when_they_change(monkeypatch: pytest.M
         asyncio.run(cluster._watch(SimpleNamespace(scheduler=Scheduler())))  # type: ignore[arg-type]
     assert asked == [0, -1, *[0] * 8, -1, *[0] * 9]
     assert not cluster.usable()
-
-
-def test_other_tasks_stay_here(pool: Pool) -> None:
-    assert pool.worker.task("tests.unit.scan.fake_pipeline:process_id", "examination")() > 0
-    assert len(pool.local.done) == 1
 
 
 def test_a_service_that_ends_interrupts_what_is_in_the_pool(pool: Pool, tmp_path: Path) -> None:
@@ -250,22 +247,17 @@ def fault(answer: Answer) -> tuple[str, str]:
     return answer.fault.code, answer.fault.message
 
 
-def test_a_machine_of_other_versions_computes_nothing(pool: Pool, tmp_path: Path) -> None:
-    newer = replace(order(pool, tmp_path), versions={**versions(), "numba": "0"})
-    code, message = fault(pool.cluster.host.done(newer, lambda _: None))
+def test_a_machine_answers_what_went_wrong(pool: Pool, tmp_path: Path) -> None:
+    answer = pool.cluster.host.done
+    given = order(pool, tmp_path / "one")
+    newer = replace(given, versions={**versions(), "numba": "0"})
+    code, message = fault(answer(newer, lambda _: None))
     assert (code, "have changed" in message) == (POOL_FAULT, True)
     assert [task.what for task in pool.remote.done] == ["statement of versions"]
-
-
-def test_a_bundle_that_was_changed_in_the_store_is_not_computed(pool: Pool, tmp_path: Path) -> None:
-    given = order(pool, tmp_path)
     obstore.put(pool.objects, f"bundles/{given.bundle}.tar", b"another bundle")
-    assert "not what was put there" in fault(pool.cluster.host.done(given, lambda _: None))[1]
-
-
-@pytest.mark.parametrize(("what", "code"), [("fail", "nothing-to-reconstruct"), ("break", "unexpected")])
-def test_whatever_goes_wrong_is_answered(pool: Pool, tmp_path: Path, what: str, code: str) -> None:
-    assert fault(pool.cluster.host.done(order(pool, tmp_path, what), lambda _: None))[0] == code
+    assert "not what was put there" in fault(answer(given, lambda _: None))[1]
+    for what, code in (("fail", "nothing-to-reconstruct"), ("break", "unexpected")):
+        assert fault(answer(order(pool, tmp_path / what, what), lambda _: None))[0] == code
 
 
 def test_a_machine_that_loses_its_process_leaves_the_job_to_another_try(
@@ -341,9 +333,7 @@ def test_a_job_that_its_rig_gave_up_is_stopped_in_the_middle(pool: Pool, tmp_pat
     assert code == "scan-cancelled"
     assert {"job": "job"} in heard[1:]
     assert not [each for each in pool.objects.list().collect() if each["path"].startswith("results/")]
-
-
-def test_a_job_ends_when_its_machine_leaves_the_pool(pool: Pool, tmp_path: Path) -> None:
+    # So is one whose machine leaves the pool.
     leave: Any = pool.cluster.host.teardown
-    code, _ = fault(pool.cluster.host.done(order(pool, tmp_path, "hang"), lambda _: leave(None)))
-    assert code == "scan-cancelled"
+    left = order(pool, tmp_path / "left", "hang")
+    assert fault(pool.cluster.host.done(left, lambda _: leave(None)))[0] == "scan-cancelled"

@@ -85,12 +85,6 @@ def test_a_slow_line_carries_one_part_at_a_time(tmp_path: Path, monkeypatch: pyt
     assert asked == [1, 1]
 
 
-def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match=r"file/shared: the pool's store cannot be opened \(OSError\)"):
-        open_store((tmp_path / "file" / "shared").as_uri())
-
-
 def test_a_store_that_is_gone_is_named_and_nothing_else(tmp_path: Path) -> None:
     with pytest.raises(PoolError) as caught:
         open_store("s3://scans/hall").put_bundle(bundle(tmp_path / "bundle"), lambda: None)
@@ -109,7 +103,10 @@ def test_an_address_that_is_none_is_refused_without_being_repeated(address: str)
     assert "secret" not in str(caught.value)
 
 
-def test_scans_do_not_travel_unencrypted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_store_that_cannot_be_used_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"file/shared: the pool's store cannot be opened \(OSError\)"):
+        open_store((tmp_path / "file" / "shared").as_uri())
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://store.plant.example:9000")
     with pytest.raises(ConfigError, match="unencrypted"):
         open_store("s3://scans/hall")

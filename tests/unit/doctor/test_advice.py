@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from slrig.doctor.advice import exposure_advice, unsnapped
+from slrig.doctor.advice import ExposureAdvice, exposure_advice, unsnapped
 from slrig.doctor.findings import Finding, Severity, fault, ok
 from slrig.doctor.flicker import Flicker
 from slrig.doctor.light import Seen
@@ -53,22 +55,23 @@ def test_an_exposure_is_kept_or_snapped(
     assert ("kept" in advice.reason) is (expected_s == own_s)
 
 
-def test_three_refreshes_serve_mains_too_where_they_do_not_saturate() -> None:
-    advice = exposure_advice(seen(0.02, longest_s=0.06), LIMITS_S, refresh_hz=60.0, flickers=(MAINS,))
-    assert advice.exposure_s == pytest.approx(0.05)
-    assert advice.reason == "3 × the refresh period (16.7 ms)"
+def test_advice_gives_its_reason_and_keeps_to_the_limits() -> None:
+    def advised(
+        own_s: float, longest_s: float, limits_s: tuple[float, float] = LIMITS_S, **more: Any
+    ) -> ExposureAdvice:
+        return exposure_advice(
+            seen(own_s, longest_s=longest_s), limits_s, **{"refresh_hz": 60.0, "flickers": (), **more}
+        )
 
-
-def test_light_too_bright_for_one_period_says_so() -> None:
-    advice = exposure_advice(seen(0.02, longest_s=0.01), LIMITS_S, refresh_hz=60.0, flickers=())
+    # Three refreshes serve the mains, too.
+    advice = advised(0.02, 0.06, flickers=(MAINS,))
+    assert (advice.exposure_s, advice.reason) == (pytest.approx(0.05), "3 × the refresh period (16.7 ms)")
+    # Light is too bright for one period.
+    advice = advised(0.02, 0.01)
     assert advice.exposure_s == 0.01
     assert "less than the refresh period (16.7 ms)" in advice.reason
-
-
-def test_a_camera_sets_limits() -> None:
-    advice = exposure_advice(seen(0.08), (1e-3, 0.03), refresh_hz=None, flickers=())
-    assert advice.exposure_s == 0.03
-    assert advice.usable_s == (0.002, 0.03)
+    advice = advised(0.08, 0.04, (1e-3, 0.03), refresh_hz=None)
+    assert (advice.exposure_s, advice.usable_s) == (0.03, (0.002, 0.03))
 
 
 def test_an_exposure_beside_the_refresh_is_noted() -> None:

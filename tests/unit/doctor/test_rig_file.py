@@ -141,9 +141,6 @@ def test_a_file_is_overwritten_only_by_force(old: Path) -> None:
     assert new.read_text() == "precious"
     write_rig_file(diagnosis(), old, new, force=True)
     assert read_rig(new).cameras[0].exposure_s == 0.0166667
-    assert sorted(each.name for each in old.parent.iterdir()) == ["calibrations", "new.toml", "old.toml"]
-
-
-def test_a_folder_that_is_not_there_is_told(old: Path) -> None:
     with pytest.raises(StorageError, match="create the folder first"):
         write_rig_file(diagnosis(), old, old.parent / "absent" / "new.toml", force=False)
+    assert sorted(each.name for each in old.parent.iterdir()) == ["calibrations", "new.toml", "old.toml"]

@@ -19,8 +19,7 @@ from slrig.jobs.records import JobKind, JobRecord, JobState, acting_as
 from slrig.jobs.store import JobStore
 from slrig.schedule.notices import TOLD, NoticedHealth, tell_run
 from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
-from slrig.schedule.store import ScheduleStore
-from tests.unit.schedule.desk import Desk
+from tests.unit.jobs.tame_queue import PowerCut
 from tests.unit.verify.health_bench import a_verification, hours
 
 DUE = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
@@ -71,27 +70,10 @@ def test_runs_that_a_person_has_to_know_of_are_told_and_no_others(database: Data
     assert len({each["id"] for each in sent}) == len(sent)
 
 
-def test_run_that_fails_by_the_clock_is_told_with_its_row(tmp_path: Path) -> None:
-    desk = Desk(tmp_path / "slrig.sqlite")
-    outbox = Outbox(desk.store.database, rig="bench", wanted={"webhook": get_args(NoticeKind)}, clock=lambda: desk.now)
-    desk.store = ScheduleStore(
-        desk.store.database, notice=lambda session, schedule, run: tell_run(outbox, session, schedule, run)
-    )
-    schedule = desk.store.create(Order(Cron("0 6 * * *", "UTC"), TaskKind.VERIFICATION, label="daily"), desk.now)
-    (due,) = desk.store.record_due(DUE.replace(hour=6, minute=0))
-    desk.store.finish(due, RunState.FAILED, desk.now, reason="no board")
-    desk.store.finish(due, RunState.FAILED, desk.now, reason="again")
-    (one,) = told(outbox)
-    assert (one["kind"], one["schedule"]["label"], one["run"]["reason"]) == ("run.failed", "daily", "no board")
-    assert one["schedule"]["id"] == str(schedule.id)
-    desk.store.database.close()
-
-
 def test_health_is_told_when_it_changes(database: Database, outbox: Outbox) -> None:
     health = NoticedHealth(database, outbox)
-    for hour, look in enumerate(
-        [a_verification(), a_verification(), a_verification(6.0, evidence=400.0), a_verification(6.0, evidence=400.0)]
-    ):
+    knocked = a_verification(6.0, evidence=400.0)
+    for hour, look in enumerate([a_verification(), a_verification(), knocked, knocked]):
         health.add(look, calibration="one", at=hours(hour))
     health.add(a_verification(), calibration="two", at=hours(9))
     first, second = told(outbox)
@@ -150,15 +132,12 @@ def test_end_that_cannot_be_recorded_is_not_told_and_notice_that_cannot_be_writt
     jobs = JobStore(database, JobKind.SCAN, outbox=outbox)
     job = jobs.create({}, rig="bench", label=None)
 
-    class PowerCutError(Exception):
-        pass
-
     def put(*_: object, **__: object) -> None:
-        raise PowerCutError
+        raise PowerCut
 
     with monkeypatch.context() as patch:
         patch.setattr(outbox, "put", put)
-        with pytest.raises(PowerCutError):
+        with pytest.raises(PowerCut):
             jobs.finish(job.id, JobState.SUCCEEDED)
     assert jobs.get(job.id).state is JobState.QUEUED
     assert [event.kind for event in jobs.events(job.id, after=0)] == ["state"]
@@ -167,11 +146,11 @@ def test_end_that_cannot_be_recorded_is_not_told_and_notice_that_cannot_be_writt
 
     def cut_off(session: Session, job: JobRecord) -> None:
         ended(session, job)
-        raise PowerCutError
+        raise PowerCut
 
     with monkeypatch.context() as patch:
         patch.setattr(outbox, "ended", cut_off)
-        with pytest.raises(PowerCutError):
+        with pytest.raises(PowerCut):
             jobs.finish(job.id, JobState.SUCCEEDED)
     assert (told(outbox), outbox.news["webhook"].is_set()) == ([], False)
     jobs.finish(job.id, JobState.SUCCEEDED)

@@ -78,7 +78,7 @@ class TaskBench(CalibrationBench):
 
     def use_a_calibration(self) -> None:
         """Have scans use a calibration whose board is known."""
-        self.calibrations.activate(self.solved())
+        self.calibrations.activate(self.solved(poses=1))
 
     def open(self) -> None:
         """Wait until the rig is open."""
@@ -212,7 +212,13 @@ def test_calibration_that_is_not_to_be_used_is_not_activated(bench: TaskBench, m
     assert bench.calibrations.active is None
 
 
-def test_poses_that_are_refused_are_told_and_a_solve_that_fails_fails_the_run(bench: TaskBench) -> None:
+def test_device_or_solve_that_fails_fails_the_run(bench: TaskBench) -> None:
+    bench.error = DeviceError("the camera does not answer")
+    with pytest.raises(DeviceError, match="the camera does not answer"):
+        bench.do(TaskKind.CALIBRATION, board=BOARD)
+    # It is tried again from the first pose on, and nothing is left of it.
+    assert bench.calibrations.latest() == []
+    assert bench.tidied == [0]
     bench.tame.unseen = True
     with pytest.raises(SolveRefusedError, match="no accepted pose"):
         bench.do(TaskKind.CALIBRATION, board=BOARD)
@@ -222,15 +228,6 @@ def test_poses_that_are_refused_are_told_and_a_solve_that_fails_fails_the_run(be
     bench.tame.solve_error = SolveRefusedError("all poses are parallel")
     with pytest.raises(SolveRefusedError, match="all poses are parallel"):
         bench.do(TaskKind.CALIBRATION, board=BOARD)
-
-
-def test_device_that_fails_ends_the_run(bench: TaskBench) -> None:
-    bench.error = DeviceError("the camera does not answer")
-    with pytest.raises(DeviceError, match="the camera does not answer"):
-        bench.do(TaskKind.CALIBRATION, board=BOARD)
-    # It is tried again from the first pose on, and nothing is left of it.
-    assert bench.calibrations.latest() == []
-    assert bench.tidied == [0]
 
 
 def test_rig_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
@@ -270,25 +267,8 @@ def test_busy_rig_is_told_before_anything_was_done(bench: TaskBench) -> None:
     assert len(bench.calibrations.latest()) == before
 
 
-def test_scan_that_finds_the_rig_held_reads_which_schedule_holds_it(bench: TaskBench) -> None:
-    bench.use_a_calibration()
-    bench.gate.clear()
-    bench.began.clear()
-    told: list[Mapping[str, Any]] = []
-    run = threading.Thread(target=lambda: told.append(bench.do(TaskKind.VERIFICATION)))
-    run.start()
-    assert bench.began.wait(WAIT_S)
-    with pytest.raises(RigBusyError) as error:
-        bench.scan()
-    assert error.value.holder == HOLDER.format("verification")
-    assert f"POST /schedule/{ID}/cancel" in str(error.value)
-    bench.gate.set()
-    run.join(WAIT_S)
-    assert told[0]["state"] == "good"
-
-
 @pytest.mark.parametrize("task", [TaskKind.VERIFICATION, TaskKind.CALIBRATION])
-def test_run_that_is_cancelled_lets_the_rig_go(bench: TaskBench, task: TaskKind) -> None:
+def test_run_holds_the_rig_in_the_name_of_its_schedule_until_it_is_cancelled(bench: TaskBench, task: TaskKind) -> None:
     bench.use_a_calibration()
     schedule, _ = scheduled(task, {})
     with pytest.raises(ScanStateError, match="no run under way"):
@@ -305,6 +285,10 @@ def test_run_that_is_cancelled_lets_the_rig_go(bench: TaskBench, task: TaskKind)
     run = threading.Thread(target=do)
     run.start()
     assert bench.began.wait(WAIT_S)
+    if task is TaskKind.VERIFICATION:
+        with pytest.raises(RigBusyError, match=f"POST /schedule/{ID}/cancel") as busy:
+            bench.scan()
+        assert busy.value.holder == HOLDER.format(task)
     bench.tasks.cancel(schedule)
     run.join(WAIT_S)
     assert len(errors) == 1

@@ -44,12 +44,6 @@ def test_levels_are_those_of_the_lit_part() -> None:
     assert levels.shortest_exposure_s(0.01) == pytest.approx(0.01 * 10 / (100 / 1.5), rel=0.1)
 
 
-def test_noise_alone_lights_nothing() -> None:
-    even = np.full(SHAPE, 90.0)
-    levels = light_levels(frames(even, noise_dn=4.0), frames(even, noise_dn=4.0, seed=1), full_scale=255)
-    assert levels.lit_share < 0.002
-
-
 def test_saturation_is_counted_among_what_is_lit() -> None:
     white, black = lit_part(120.0, 20.0)
     white[10:20, 20:60] = 400.0
@@ -57,6 +51,10 @@ def test_saturation_is_counted_among_what_is_lit() -> None:
     assert levels.saturated_share == pytest.approx(0.25)
     assert not levels.usable[10:20].any()
     assert levels.longest_exposure_s(0.01) == 0.005
+    # Noise alone lights nothing.
+    even = np.full(SHAPE, 90.0)
+    levels = light_levels(frames(even, noise_dn=4.0), frames(even, noise_dn=4.0, seed=1), full_scale=255)
+    assert levels.lit_share < 0.002
 
 
 @pytest.mark.parametrize("gamma", [0.7, 1.0, 2.2])
@@ -71,16 +69,10 @@ def test_a_response_is_told_by_its_gamma_and_its_knees(gamma: float, black_knee:
     assert curve.white_knee == pytest.approx(white_knee, abs=6)
     assert (np.diff(curve.light) >= 0).all()
     assert curve.residual < 0.004
-
-
-def test_light_that_falls_with_the_grey_value_is_told() -> None:
-    values = np.linspace(0, 255, 33)
-    light = values / 255
-    light[20] -= 0.2
-    assert response_curve(list(values), list(light)).reversal == pytest.approx(0.2 - 1 / 32, abs=1e-6)
-
-
-def test_a_camera_that_is_not_linear_is_told_by_its_exposures() -> None:
+    # Light that falls with the grey value.
+    falling = values / 255
+    falling[20] -= 0.2
+    assert response_curve(list(values), list(falling)).reversal == pytest.approx(0.2 - 1 / 32, abs=1e-6)
     exposures_s = [0.004, 0.008, 0.016]
     assert camera_exponent(exposures_s, [e**0.45 for e in exposures_s]) == pytest.approx(0.45)
 
@@ -100,14 +92,11 @@ def test_swings_are_told_from_uneven_samples_whatever_the_mean_rate() -> None:
     assert [swing.frequency_hz for swing in found] == pytest.approx([100.0, 180.0], abs=0.02)
     assert [swing.amplitude for swing in found] == pytest.approx([5.0, 2.0], abs=0.2)
     assert all(not swing.aliases_hz for swing in found)
+    assert swings(t_s, sampled(t_s, 0.002), exposure_s=0.002) == (), "noise alone"
+    assert swings(t_s, np.full(128, 7.0), exposure_s=0.002) == ()
+    assert passed(120.0, 1 / 60) == pytest.approx(0.0, abs=1e-12), "whole periods"
     assert found[0].amplitude * passed(found[0].frequency_hz, 0.01) == pytest.approx(0.0, abs=0.01)
     assert found[0].amplitude * passed(found[0].frequency_hz, 0.005) == pytest.approx(5 * 2 / np.pi, abs=0.2)
-
-
-def test_noise_is_no_swing() -> None:
-    t_s = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.05, 128))
-    assert swings(t_s, sampled(t_s, 0.002), exposure_s=0.002) == ()
-    assert swings(t_s, np.full(128, 7.0), exposure_s=0.002) == ()
 
 
 def test_even_samples_say_what_they_cannot_tell_apart() -> None:
@@ -117,10 +106,6 @@ def test_even_samples_say_what_they_cannot_tell_apart() -> None:
     told_hz = (swing.frequency_hz, *swing.aliases_hz)
     for candidate_hz in (50.0, 80.0, 100.0, 130.0):
         assert min(abs(each - candidate_hz) for each in told_hz) < 0.1
-
-
-def test_whole_periods_pass_nothing() -> None:
-    assert passed(120.0, 1 / 60) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("rate_hz", [23.976, 59.94, 60.0, 120.0, 240.0])
