@@ -204,10 +204,9 @@ def test_a_rig_is_opened_with_its_options(tmp_path: Path) -> None:
     assert rig.calibration is None
     rig.close()
     assert [device.closings for device in OPENED] == [1, 1, 1]
-
-
-def test_the_scans_exposure_is_that_of_cameras_without_one(tmp_path: Path) -> None:
-    rig = _open(tmp_path, _camera("left"), _camera("right", more="exposure_s = 0.3"), "[scan]\nexposure_s = 0.1\n")
+    # The scan's exposure is that of cameras without one.
+    own = _camera("right", more="exposure_s = 0.3")
+    rig = _open(tmp_path, _camera("left"), own, "[scan]\nexposure_s = 0.1\n")
     assert [settings.exposure_s for settings in rig.settings.values()] == [0.1, 0.3]
 
 
@@ -219,6 +218,12 @@ def test_a_head_brings_its_cameras_and_calibration(tmp_path: Path) -> None:
     assert rig.calibration is not None
     assert rig.head is not None
     assert dict(OPENED[0].options) == {"seed": 1}
+    # The rig file's calibration comes before the head's.
+    write_calibration(tmp_path / "own.json", sample_calibration(cameras=("right",)))
+    (tmp_path / "rig.toml").write_text('name = "demo"\ncalibration = "own.json"\n[head]\ndriver = "fake"\n')
+    calibration = open_rig(read_rig(tmp_path / "rig.toml")).calibration
+    assert calibration is not None
+    assert list(calibration.cameras) == ["right"]
 
 
 STAGE = '[positioner]\ndriver = "fake"\nport = "a"\n'
@@ -243,14 +248,6 @@ def test_a_second_positioner_is_refused_and_all_is_closed_again(tmp_path: Path) 
     with pytest.raises(ConfigError, match=r"(?s)2 of its tables.*camera driver 'fkae'.*positioner driver 'tabel'"):
         _open(tmp_path, _camera("left", "fkae"), STAGE.replace("fake", "tabel"))
     assert [device.closings for device in OPENED] == [1]
-
-
-def test_the_rig_files_calibration_comes_before_the_heads(tmp_path: Path) -> None:
-    write_calibration(tmp_path / "own.json", sample_calibration(cameras=("right",)))
-    (tmp_path / "rig.toml").write_text('name = "demo"\ncalibration = "own.json"\n[head]\ndriver = "fake"\n')
-    calibration = open_rig(read_rig(tmp_path / "rig.toml")).calibration
-    assert calibration is not None
-    assert list(calibration.cameras) == ["right"]
 
 
 @pytest.mark.parametrize(
@@ -333,25 +330,19 @@ def test_device_that_cannot_be_closed_hides_no_error_and_keeps_no_other_open(
     assert [device.closings for device in OPENED] == [1, 1, 1]
 
 
-def test_a_driver_provided_twice_is_refused(tmp_path: Path) -> None:
-    _install(tmp_path / "site", "other_drivers", f"[slrig.cameras]\nfake = {HERE}:open_camera\n")
-    with pytest.raises(DriverBrokenError, match="several packages: fake_drivers, other_drivers"):
-        _open(tmp_path, _camera("left"))
-
-
-def test_a_broken_driver_does_not_hide_the_others() -> None:
-    drivers = {(one.kind, one.name): one for one in installed_drivers() if one.package == "fake_drivers"}
+def test_a_broken_driver_does_not_hide_the_others_and_one_of_two_packages_is_refused(tmp_path: Path) -> None:
+    found = installed_drivers()
+    assert [one.fault for one in found if (one.kind, one.name) == ("head", "simulated")] == [None]
+    drivers = {(one.kind, one.name): one for one in found if one.package == "fake_drivers"}
     assert len(drivers) == 13
     faulty = {key for key, one in drivers.items() if one.fault is not None}
     assert faulty == {("camera", "broken"), ("camera", "constant")}
     broken = drivers["camera", "broken"]
     assert (broken.package, broken.version, broken.target) == ("fake_drivers", "1.2", "no_such_module:open_camera")
     assert "ModuleNotFoundError" in str(broken.fault)
-
-
-def test_the_rendered_rig_is_installed() -> None:
-    simulated = [one for one in installed_drivers() if (one.kind, one.name) == ("head", "simulated")]
-    assert [one.fault for one in simulated] == [None]
+    _install(tmp_path / "site", "other_drivers", f"[slrig.cameras]\nfake = {HERE}:FakeCamera\n")
+    with pytest.raises(DriverBrokenError, match="several packages: fake_drivers, other_drivers"):
+        _open(tmp_path, _camera("left"))
 
 
 def test_a_failing_finder_does_not_hide_what_others_found() -> None:

@@ -32,8 +32,7 @@ def moved_px(seen_by: Pinhole, other: Pinhole) -> FloatArray:
     return np.abs(pixel(MIDDLE_MM + 1e-3 * (MIDDLE_MM - other.centre_mm)) - pixel(MIDDLE_MM))
 
 
-@pytest.mark.parametrize("projector_known", [True, False])
-@pytest.mark.parametrize("roll_deg", [0.0, 30.0, 90.0, 200.0])
+@pytest.mark.parametrize(("projector_known", "roll_deg"), [(True, 0.0), (True, 30.0), (False, 90.0), (False, 200.0)])
 @pytest.mark.parametrize(("x_mm", "y_mm"), [(120.0, 0.0), (-110.0, 40.0), (10.0, 130.0), (0.0, -90.0), (-70.0, -75.0)])
 def test_the_axis_is_the_one_along_which_depth_shows(
     x_mm: float, y_mm: float, roll_deg: float, *, projector_known: bool
@@ -74,8 +73,5 @@ def test_of_several_cameras_the_longest_baseline_of_the_first_decides() -> None:
     assert triangulated_axis(cameras, None) is Axis.ROW
     assert triangulated_axis(cameras[:2], None) is Axis.COLUMN
     assert share_across(Axis.ROW, cameras, None) == 1.0
-
-
-@pytest.mark.parametrize("cameras", [[standing(0.0, 0.0)], [standing(0.0, 0.0), standing(0.0, 0.0)]])
-def test_without_a_baseline_columns_are_as_good_as_rows(cameras: list[Pinhole]) -> None:
-    assert triangulated_axis(cameras, None) is Axis.COLUMN
+    # Without a baseline columns are as good as rows.
+    assert triangulated_axis(cameras[:1], None) is triangulated_axis(cameras[:1] * 2, None) is Axis.COLUMN

@@ -14,13 +14,21 @@ LINUX = pytest.mark.skipif(sys.platform != "linux", reason="resident memory is r
 
 
 @LINUX
-@pytest.mark.parametrize(("much", "calls"), [(0, [0]), (2**60, [])])
-def test_memory_goes_back_where_much_is_held(monkeypatch: pytest.MonkeyPatch, much: int, calls: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("much", "statm", "calls"), [(0, memory._STATM, [0]), (2**60, memory._STATM, []), (0, Path("absent"), [])]
+)
+def test_memory_goes_back_where_much_is_held(
+    monkeypatch: pytest.MonkeyPatch, much: int, statm: Path, calls: list[int]
+) -> None:
     called: list[int] = []
     monkeypatch.setattr(memory, "_MUCH_BYTES", much)
+    monkeypatch.setattr(memory, "_STATM", statm)
     monkeypatch.setattr(memory, "_trim", lambda: called.append)
     memory.give_back()
     assert called == calls
+    # A C library without the call is left alone.
+    monkeypatch.setattr(memory, "_trim", lambda: None)
+    memory.give_back()
 
 
 @LINUX
@@ -32,17 +40,3 @@ def test_what_is_resident_is_told() -> None:
         for page in range(0, asked, mmap.PAGESIZE):
             held[page] = 1
         assert memory._resident_bytes() - before == pytest.approx(asked, rel=0.1)
-
-
-def test_nothing_is_given_back_where_nothing_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    called: list[int] = []
-    monkeypatch.setattr(memory, "_STATM", tmp_path / "statm")
-    monkeypatch.setattr(memory, "_trim", lambda: called.append)
-    memory.give_back()
-    assert called == []
-
-
-def test_a_library_without_the_call_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "_MUCH_BYTES", 0)
-    monkeypatch.setattr(memory, "_trim", lambda: None)
-    memory.give_back()

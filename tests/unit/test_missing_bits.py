@@ -65,15 +65,11 @@ def test_finer_bits_go_with_the_missing_one_in_every_camera(lacking: tuple[tuple
         expected[key] = pattern
     assert seen(cut) == expected
     assert {p.bit for p in cut.patterns if isinstance(p, Gray)} == set(range(kept))
+    other = recorded(("left", 5), rows=True)
+    rows = [p for p in other.patterns if isinstance(p, Gray) and p.axis is Axis.ROW]
+    cut_of_both, (_,) = without_missing_bits(other)
+    assert [p for p in cut_of_both.patterns if isinstance(p, Gray) and p.axis is Axis.ROW] == rows
     assert [s.time_s for s in cut.shots] == sorted(s.time_s or 0.0 for s in cut.shots)
-
-
-def test_the_other_axis_keeps_its_code() -> None:
-    capture = recorded(("left", 5), rows=True)
-    cut, told = without_missing_bits(capture)
-    assert len(told) == 1
-    rows = [p for p in capture.patterns if isinstance(p, Gray) and p.axis is Axis.ROW]
-    assert [p for p in cut.patterns if isinstance(p, Gray) and p.axis is Axis.ROW] == rows
 
 
 @pytest.mark.parametrize(

@@ -177,6 +177,10 @@ def test_a_cancelled_model_takes_its_waiting_views_with_it(bench: ShootingBench)
     bench.gate.clear()
     model_id = started(bench)
     assert bench.began.wait(WAIT_S)
+    with pytest.raises(ScanStateError, match="is not shot by hand"):
+        bench.shooting.combine(model_id)
+    with pytest.raises(ScanStateError, match="is not shot by hand"):
+        bench.shooting.shoot_view(model_id, again=True, wait=True)
     with (
         pytest.raises(ScanStateError, match=f"needed by model {model_id}"),
         bench.desk.unused(bench.runner.series(model_id)[3].id),
@@ -202,6 +206,20 @@ def test_what_cannot_be_shot_is_refused_and_nothing_is_on_record(tmp_path: Path)
     for wrong in (1, 73):
         with pytest.raises(ConfigError, match=f"views: expected 2 to 72, found {wrong}"):
             ShootPlan(wrong)
+    bench.close()
+
+
+def test_by_hand_it_may_end_early_with_what_there_is(tmp_path: Path) -> None:
+    bench = ShootingBench(tmp_path, table=False)
+    model_id = started(bench, shoot_plan(4, by_hand=True))
+    bench.until_told(model_id, "view 2 of 4")
+    bench.shooting.shoot_view(model_id, again=False, wait=False)
+    bench.until_told(model_id, "turn the object by 90° for view 3 of 4")
+    bench.shooting.combine(model_id)
+    made = bench.over(model_id)
+    assert made.state is JobState.SUCCEEDED
+    assert made.summary is not None
+    assert made.summary["notes"] == [f"view {n} of 4, at {90 * n - 90}°, is not in it: it was not shot" for n in (3, 4)]
     bench.close()
 
 
@@ -232,31 +250,6 @@ def test_by_hand_each_view_waits_for_a_person_and_the_last_may_be_shot_again(tmp
     with pytest.raises(ScanStateError, match=f"Model {model_id} is succeeded"):
         bench.shooting.shoot_view(model_id, again=True, wait=False)
     bench.close()
-
-
-def test_by_hand_it_may_end_early_with_what_there_is(tmp_path: Path) -> None:
-    bench = ShootingBench(tmp_path, table=False)
-    model_id = started(bench, shoot_plan(8, by_hand=True))
-    bench.until_told(model_id, "view 2 of 8")
-    bench.shooting.shoot_view(model_id, again=False, wait=False)
-    bench.until_told(model_id, "turn the object by 45° for view 3 of 8")
-    bench.shooting.combine(model_id)
-    made = bench.over(model_id)
-    assert made.state is JobState.SUCCEEDED
-    assert made.summary is not None
-    assert made.summary["notes"][0] == "view 3 of 8, at 90°, is not in it: it was not shot"
-    assert len(made.summary["notes"]) == 6
-    bench.close()
-
-
-def test_a_model_that_the_table_turns_waits_for_no_hand(bench: ShootingBench) -> None:
-    bench.gate.clear()
-    model_id = started(bench)
-    with pytest.raises(ScanStateError, match="is not shot by hand"):
-        bench.shooting.combine(model_id)
-    with pytest.raises(ScanStateError, match="is not shot by hand"):
-        bench.shooting.shoot_view(model_id, again=True, wait=True)
-    bench.shooting.cancel(model_id)
 
 
 def killed(root: Path, leave: Callable[[ShootingBench, UUID], None], *, by_hand: bool = False) -> UUID:

@@ -65,9 +65,8 @@ def test_thresholds_and_the_recalibration_are_named() -> None:
         assert words in texts
     assert texts.count("calibrated") == 1
     assert "left - projector" in texts
-
-
-def test_one_verification_and_none_are_drawn_too() -> None:
+    odd = VerificationRecord(1, UUID(int=1), hours(0), "<b>", warm_up()[0].found, judged([]))
+    assert "<b>" not in health_svg([odd, warm_up()[0]])
     assert len(list(parsed(health_svg(warm_up()[:1])).iter(f"{_SVG}circle"))) >= 1
     assert "Nothing was verified yet" in health_svg([])
 
@@ -78,9 +77,3 @@ def test_a_calibration_that_states_no_error_has_no_axis_of_it() -> None:
     assert "No verification tells an expected error" in health_svg([silent])
     assert "Expected error of a scan, mm" not in health_svg([silent])
     assert "No verification tells an expected error" not in health_svg([silent, record])
-
-
-def test_words_in_the_picture_are_escaped() -> None:
-    record = warm_up()[0]
-    odd = VerificationRecord(1, UUID(int=1), hours(0), "<b>", record.found, judged([]))
-    assert "<b>" not in health_svg([odd, record])
