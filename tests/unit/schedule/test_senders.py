@@ -1,7 +1,9 @@
-"""The webhook: in order, signed, until taken; whatever its receiver does, it holds up nothing."""
+"""Senders of notices: a webhook, signed, in order, until taken; an MQTT broker. A receiver holds up nothing."""
 
 from __future__ import annotations
 
+import builtins
+import socket
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,25 +17,38 @@ from slrig.config import NoticeKind, ServiceSettings, read_settings
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Notice, Outbox
-from slrig.schedule.receivers import senders_of
+from slrig.schedule.mqtt import Broker
+from slrig.schedule.receivers import senders_of, wanted_kinds
+from slrig.schedule.sending import Sender
 from slrig.schedule.webhook import Webhook, signature, signing_key
 from tests.unit.jobs.tame_queue import PowerCut
 from tests.unit.scan.fakes import WAIT_S, SetClock
 from tests.unit.schedule.hook import PATH, SECRET, Hook, own_certificate, signed
+from tests.unit.schedule.mosquitto import LOGIN, Mosquitto
 
 KEY = signing_key(SECRET, "here")
 BODY = b'{"test": 2432232314}'
 
 
 class Bench:
-    """An outbox on a clock that is set by hand, and a webhook that takes a step when a test says."""
+    """An outbox on a clock that is set by hand, and the sender of a webhook or a broker, which steps when it has to."""
 
-    def __init__(self, folder: Path, hook: Hook, *, most: int = 10_000) -> None:
+    def __init__(self, folder: Path, url: str, *, most: int = 10_000, **broker: Any) -> None:
         self.clock = SetClock()
         self.database = Database(folder / "slrig.sqlite")
-        wanted = {"webhook": get_args(NoticeKind)}
+        receiver = "mqtt" if url.startswith("mqtt") else "webhook"
+        wanted = {receiver: get_args(NoticeKind)}
         self.outbox = Outbox(self.database, rig="bench", wanted=wanted, clock=self.clock, most=most)
-        self.webhook = Webhook(self.outbox, hook.url, KEY, clock=self.clock, timeout_s=0.5)
+        self.sender: Sender = (
+            Broker(self.outbox, url, **{"login": LOGIN, **broker})
+            if receiver == "mqtt"
+            else Webhook(self.outbox, url, KEY, clock=self.clock, timeout_s=0.5)
+        )
+
+    @property
+    def waiting(self) -> int:
+        """How many notices wait."""
+        return self.outbox.waiting(self.sender.receiver)[0]
 
     def put(self, *names: str) -> None:
         for name in names:
@@ -44,7 +59,7 @@ class Bench:
         """Step as the clock says until it has moved on by so much. Returns how long it waited between steps."""
         end, waits = self.clock.now + until, []
         while self.clock.now < end:
-            wait_s = self.webhook.step()
+            wait_s = self.sender.step()
             assert wait_s is not None
             waits.append(wait_s)
             self.clock.move(seconds=wait_s)
@@ -52,8 +67,22 @@ class Bench:
 
     def empty(self) -> None:
         """Step until nothing waits; nothing may fail."""
-        while (wait_s := self.webhook.step()) is not None:
+        while (wait_s := self.sender.step()) is not None:
             assert wait_s == 0
+
+    def fails(self) -> str:
+        """Step once; the try has to fail. Returns its cause."""
+        with structlog.testing.capture_logs() as log:
+            assert self.sender.step() == 1
+        # Threads of other tests may still log.
+        (line,) = (each for each in log if each["event"] == "a notice was not delivered")
+        assert (line["host"], line["tries"]) == ("127.0.0.1", 1)
+        assert "hidden-part" not in str(log)
+        return str(line["cause"])
+
+    def close(self) -> None:
+        self.sender.close()
+        self.database.close()
 
 
 @pytest.fixture
@@ -65,10 +94,9 @@ def hook() -> Iterator[Hook]:
 
 @pytest.fixture
 def bench(tmp_path: Path, hook: Hook) -> Iterator[Bench]:
-    made = Bench(tmp_path, hook)
+    made = Bench(tmp_path, hook.url)
     yield made
-    made.webhook.close()
-    made.database.close()
+    made.close()
 
 
 def came(hook: Hook) -> list[dict[str, Any]]:
@@ -93,7 +121,7 @@ def test_signature_is_that_of_the_published_vector() -> None:
 def test_notice_is_signed_with_the_time_of_the_try_and_keeps_its_id(bench: Bench, hook: Hook) -> None:
     bench.put("of a ß")
     hook.status = 503
-    bench.webhook.step()
+    bench.sender.step()
     bench.clock.move(seconds=90)
     hook.status = 200
     bench.empty()
@@ -132,7 +160,7 @@ def test_receiver_that_is_down_for_an_hour_is_told_all_once_and_in_order(bench: 
     # What fails next begins with a short wait again.
     hook.status = 500
     bench.put("4")
-    assert bench.webhook.step() == 1
+    assert bench.sender.step() == 1
 
 
 def test_what_waits_outlives_a_kill_and_what_was_taken_then_comes_again_under_its_id(
@@ -144,8 +172,8 @@ def test_what_waits_outlives_a_kill_and_what_was_taken_then_comes_again_under_it
     bench.put("1", "2")
     monkeypatch.setattr(bench.outbox, "sent", cut_off)
     with pytest.raises(PowerCut):
-        bench.webhook.step()
-    again = Bench(tmp_path, hook)
+        bench.sender.step()
+    again = Bench(tmp_path, hook.url)
     again.empty()
     told = came(hook)
     assert [each["words"] for each in told] == [f"rig 'bench': {name}" for name in ("1", "1", "2")]
@@ -170,14 +198,14 @@ def test_three_days_are_long_enough_and_the_log_says_what_went(bench: Bench, hoo
 
 
 def test_no_more_wait_than_may_and_the_oldest_go(tmp_path: Path, hook: Hook) -> None:
-    bench = Bench(tmp_path, hook, most=3)
+    bench = Bench(tmp_path, hook.url, most=3)
     bench.put("0")
     bench.empty()
     came(hook)
     with structlog.testing.capture_logs() as log:
         bench.put("1", "2", "3", "4", "5")
     assert [each["cause"] for each in log] == 2 * ["more than 3 wait"]
-    assert (bench.outbox.waiting("webhook")[0], bench.outbox.dropped) == (3, 2)
+    assert (bench.waiting, bench.outbox.dropped) == (3, 2)
     bench.empty()
     assert names(hook) == ["3", "4", "5"]
     bench.database.close()
@@ -187,15 +215,15 @@ def test_receiver_that_is_gone_is_told_nothing_more_by_this_process(tmp_path: Pa
     hook.status = 410
     bench.put("1")
     with structlog.testing.capture_logs() as log:
-        assert bench.webhook.step() == 300
+        assert bench.sender.step() == 300
     assert [each["event"] for each in log] == [
         "the receiver is gone: nothing is sent before the next start of the service"
     ]
     hook.status = 200
     bench.put("2")
-    assert bench.webhook.step() == 300
+    assert bench.sender.step() == 300
     assert names(hook) == ["1"]
-    again = Bench(tmp_path, hook)
+    again = Bench(tmp_path, hook.url)
     again.empty()
     assert names(hook) == ["1", "2"]
     again.database.close()
@@ -204,12 +232,10 @@ def test_receiver_that_is_gone_is_told_nothing_more_by_this_process(tmp_path: Pa
 def test_redirect_is_not_followed(bench: Bench, hook: Hook) -> None:
     hook.status, hook.headers = 307, {"Location": hook.url}
     bench.put("1")
-    with structlog.testing.capture_logs() as log:
-        assert bench.webhook.step() == 1
-    assert log[0]["cause"] == "status 307"
+    assert bench.fails() == "status 307"
     assert names(hook) == ["1"]
     hook.status = 303
-    assert bench.webhook.step() == 2
+    assert bench.sender.step() == 2
     assert names(hook) == ["1"]
 
 
@@ -229,23 +255,17 @@ def _drips(hook: Hook) -> None:
 def test_receiver_without_an_answer_costs_one_try(bench: Bench, hook: Hook, how: Callable[[Hook], None]) -> None:
     how(hook)
     bench.put("1")
-    with structlog.testing.capture_logs() as log:
-        # A receiver that hangs answers in the end, and so a sender that waited for it would succeed.
-        assert bench.webhook.step() == 1
-    (line,) = log
-    assert (line["event"], line["host"], line["tries"]) == ("a notice was not delivered", "127.0.0.1", 1)
-    assert "hidden-part" not in str(log)
-    assert bench.outbox.waiting("webhook")[0] == 1
+    # A receiver that hangs answers in the end, and so a sender that waited for it would succeed.
+    bench.fails()
+    assert bench.waiting == 1
 
 
 def test_certificate_of_an_unknown_authority_is_refused(tmp_path: Path) -> None:
     pem = own_certificate(tmp_path)
     hook = Hook(certificate=pem)
-    bench = Bench(tmp_path, hook)
+    bench = Bench(tmp_path, hook.url)
     bench.put("1")
-    with structlog.testing.capture_logs() as log:
-        assert bench.webhook.step() == 1
-    assert log[0]["cause"] == "ConnectError"
+    assert bench.fails() == "ConnectError"
     assert hook.came.empty()
     hook.close()
     bench.database.close()
@@ -263,23 +283,23 @@ def test_notice_that_was_taken_is_not_sent_again_while_the_records_refuse(
         patch.setattr(bench.outbox, "sent", refuse)
         for _ in range(3):
             with pytest.raises(StorageError):
-                bench.webhook.step()
+                bench.sender.step()
     bench.empty()
     assert names(hook) == ["1", "2"]
 
 
 def test_thread_sends_what_waits_and_what_comes_and_ends_when_closed(bench: Bench, hook: Hook) -> None:
     bench.put("1")
-    bench.webhook.start()
+    bench.sender.start()
     assert hook.next()["words"].endswith("1")
     bench.put("2", "3")
     assert [hook.next()["words"][-1] for _ in range(2)] == ["2", "3"]
     bench.put("4")
-    bench.webhook.close()
-    bench.webhook.close()
+    bench.sender.close()
+    bench.sender.close()
     assert hook.next()["words"].endswith("4")
-    bench.webhook._thread.join(WAIT_S)
-    assert bench.outbox.waiting("webhook")[0] == 0
+    bench.sender._thread.join(WAIT_S)
+    assert bench.waiting == 0
 
 
 @pytest.mark.parametrize("how", [_refuses, _hangs])
@@ -288,20 +308,20 @@ def test_end_of_the_service_does_not_wait_for_a_receiver(
 ) -> None:
     monkeypatch.setattr("slrig.schedule.sending._END_S", 0.01)
     how(hook)
-    bench.webhook = Webhook(bench.outbox, hook.url, KEY, timeout_s=WAIT_S)
-    bench.webhook.start()
+    bench.sender = Webhook(bench.outbox, hook.url, KEY, timeout_s=WAIT_S)
+    bench.sender.start()
     bench.put("1")
     if how is _hangs:
         hook.next()
     bench.put("2")
-    bench.webhook.close()
-    thread = bench.webhook._thread
+    bench.sender.close()
+    thread = bench.sender._thread
     assert thread.is_alive() or how is _refuses, "it was closed while the receiver held it"
-    assert bench.outbox.waiting("webhook")[0] == 2
+    assert bench.waiting == 2
     hook.close()
     thread.join(WAIT_S)
     assert not thread.is_alive()
-    assert bench.outbox.waiting("webhook")[0] == 2, "what is answered later is for the next start"
+    assert bench.waiting == 2, "what is answered later is for the next start"
 
 
 @pytest.mark.parametrize("secret", ["whsec_c2hvcnQ=", "whsec_" + "A" * 88, "no base64!", "whsec_", "ß"])
@@ -359,3 +379,108 @@ def test_address_that_is_none_is_refused_and_not_repeated(url: str) -> None:
     with pytest.raises(ConfigError, match="webhook_url: expected an address that begins with http") as error:
         read_settings(webhook_url=url)
     assert url not in str(error.value)
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Mosquitto]:
+    made = Mosquitto(tmp_path)
+    yield made
+    made.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("login", ["rig:wrong", None])
+def test_what_a_broker_refuses_waits(tmp_path: Path, broker: Mosquitto, login: str | None) -> None:
+    broker.start()
+    bench = Bench(tmp_path, broker.url, login=login)
+    bench.put("1")
+    # A wrong password is refused at the connection, a user without rights at the notice.
+    assert bench.fails() == "Not authorized"
+    bench.put("2")
+    bench.sender = Broker(bench.outbox, broker.url, LOGIN)
+    bench.empty()
+    bench.close()
+
+
+def test_broker_that_gives_no_answer_costs_one_try(tmp_path: Path) -> None:
+    pytest.importorskip("paho.mqtt.client", reason="needs paho-mqtt: pip install 'slrig[mqtt]'")
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        bench = Bench(tmp_path, f"mqtt://127.0.0.1:{deaf.getsockname()[1]}/x", timeout_s=0.2)
+        bench.put("1")
+        assert bench.fails() == "no answer"
+    bench.close()
+
+
+@pytest.mark.slow
+# The library leaves the socket of a handshake that fails to Python's collector.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_certificate_of_a_broker_counts_where_its_authority_is_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pem = own_certificate(tmp_path)
+    broker = Mosquitto(tmp_path, certificate=pem)
+    broker.start()
+    bench = Bench(tmp_path, broker.url)
+    bench.put("1")
+    assert bench.fails() == "SSLCertVerificationError"
+    monkeypatch.setenv("SSL_CERT_FILE", str(pem))
+    bench.sender = Broker(bench.outbox, broker.url, LOGIN)
+    bench.empty()
+    bench.close()
+    broker.stop()
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://host/rig", "mqtt://host", "mqtt://host/", "mqtt:///rig", "mqtt://ann:secret@host/rig",
+        "mqtt://host:70000/rig", "mqtt://host/rig/#", "mqtt://host/+/rig", "mqtt://host/rig?x=secret",
+    ],
+)  # fmt: skip
+def test_invalid_address_of_a_broker_is_refused_and_not_repeated(tmp_path: Path, url: str) -> None:
+    pytest.importorskip("paho.mqtt.client", reason="needs paho-mqtt: pip install 'slrig[mqtt]'")
+    outbox = Bench(tmp_path, "mqtt://host/rig").outbox
+    with pytest.raises(ConfigError, match=r"^mqtt_url: expected mqtt://HOST:PORT/PREFIX") as error:
+        Broker(outbox, url, LOGIN)
+    assert "secret" not in str(error.value)
+
+
+def test_settings_name_a_broker_and_hide_the_login(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert wanted_kinds(ServiceSettings()) == {}
+    login = tmp_path / "login"
+    login.write_text(f"{LOGIN}\n")
+    login.chmod(0o644)
+    file = tmp_path / "settings.toml"
+    file.write_text('mqtt_url = "mqtt://[::1]/rigs/"\nmqtt_login_file = "login"\n')
+    settings, outbox = read_settings(file), Outbox(Database(tmp_path / "slrig.sqlite"))
+    assert wanted_kinds(settings) == {"mqtt": get_args(NoticeKind)}
+    with pytest.raises(ConfigError, match=r"mqtt_login_file: .* may be read by others.*chmod 600"):
+        senders_of(settings, outbox)
+    monkeypatch.setenv("SLRIG_MQTT_LOGIN", LOGIN)
+    settings = read_settings(file)
+    assert settings.mqtt_login == SecretStr(LOGIN)
+    assert LOGIN not in repr(settings)
+
+    real = builtins.__import__
+
+    def without(name: str, *given: Any, **named: Any) -> Any:
+        if name.startswith("paho"):
+            raise ModuleNotFoundError(name)
+        return real(name, *given, **named)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(
+        ConfigError, match=r"^mqtt_url needs a library.* pip install 'slrig\[mqtt\]', or leave mqtt_url out$"
+    ):
+        senders_of(settings, outbox)
+
+
+def test_what_waits_for_a_receiver_that_is_no_longer_named_is_dropped_as_late_as_any(tmp_path: Path) -> None:
+    clock, database = SetClock(), Database(tmp_path / "slrig.sqlite")
+    both, one = ({name: get_args(NoticeKind) for name in names} for names in (("mqtt", "webhook"), ("webhook",)))
+    for wanted, hours, left in ((both, 0, 1), (one, 71, 1), (one, 2, 0)):
+        clock.now += timedelta(hours=hours)
+        outbox = Outbox(database, rig="bench", wanted=wanted, clock=clock)
+        with database.changing() as session:
+            outbox.put(session, "run.failed", "a run")
+        assert outbox.waiting("mqtt")[0] == left
