@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,18 +15,14 @@ from slrig.accept.plan import (
     Certified,
     Limits,
     Quantity,
-    exact_artefacts,
     usual_limits,
 )
 from slrig.accept.positions import acceptance_plan, rig_volume_mm
 from slrig.accept.scene import turn_deg
 from slrig.accept.uncertainty import error_uncertainty
-from slrig.config import read_rig
-from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError
 from slrig.model import Calibration, Pinhole, Size
 
-RIGS = Path(__file__).parents[3] / "config" / "rigs"
 VOLUME = np.array([[-100.0, -75.0, -40.0], [100.0, 75.0, 40.0]])
 GOOD = Artefacts(
     Certified(30.0, 0.001), Certified(110.0, 0.002), (160.0, 110.0), sphere_form_mm=0.001, plane_form_mm=0.002
@@ -188,21 +183,3 @@ def test_the_volume_of_a_rig_without_a_stated_one_is_what_all_devices_see() -> N
     away = replace(camera, translation_mm=np.array([5000.0, 0.0, 600.0]))
     with pytest.raises(InvalidInputError, match="no common view"):
         rig_volume_mm(Calibration({"left": camera}, away))
-
-
-@pytest.mark.slow
-def test_the_shipped_rig_takes_the_positions_that_are_prescribed_for_it() -> None:
-    config = read_rig(RIGS / "rendered-acceptance.toml")
-    assert config.head is not None
-    with open_rig(config) as rig:
-        calibration = rig.calibration
-    assert calibration is not None
-    volume = rig_volume_mm(calibration)
-    plan = acceptance_plan(calibration, volume, exact_artefacts(volume), rendered=True)
-    poses: dict[str, dict[str, object]] = {pose["name"]: pose for pose in config.head.options["pose"]}  # type: ignore[attr-defined]
-    for step in plan.steps:
-        pose = poses.pop(step.name)
-        assert pose["object"] == step.artefact
-        assert pose["position_mm"] == pytest.approx(step.centre_mm, abs=2e-3)
-        assert pose.get("rotation_deg", (0, 0, 0)) == pytest.approx(turn_deg(step), abs=1e-3)
-    assert not poses

@@ -5,15 +5,12 @@ from __future__ import annotations
 import io
 import json
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from slrig.bundle import read_calibration, write_calibration
 from slrig.bundle.calibration_file import check_rays
-from slrig.bundle.opencv_calibration import read_opencv_calibration, write_opencv_calibration
 from slrig.calibrate.pose_judging import judgement, summary
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
@@ -99,23 +96,7 @@ def test_each_pose_is_judged_without_a_word_of_light() -> None:
     assert "projector" not in json.dumps(first.standing.next_move)
 
 
-def test_it_is_kept_and_exchanged_as_any_other(tmp_path: Path) -> None:
-    write_calibration(tmp_path / "a.json", result().calibration)
-    write_opencv_calibration(tmp_path / "a.yml", result().calibration)
-    for found in (read_calibration(tmp_path / "a.json"), read_opencv_calibration(tmp_path / "a.yml")):
-        assert found.projector is None
-        assert found.solved is not None
-        np.testing.assert_array_equal(found.cameras["left"].matrix, result().calibration.cameras["left"].matrix)
-        np.testing.assert_array_equal(found.solved.covariance, result().solution.covariance)
-
-
-def test_two_such_calibrations_are_compared_by_their_lenses() -> None:
-    found = comparison(result().calibration, result().calibration)
-    assert found.words[0].endswith("they have one device in common, and a point takes two.")
-    assert found.devices["left"].focal_percent.value == 0
-
-
-def test_it_is_no_calibration_for_scans_or_looks_at_a_board() -> None:
+def test_it_is_no_calibration_for_scans_and_is_compared_by_its_lens() -> None:
     with pytest.raises(CalibrationError) as refusal:
         check_rays(result().calibration, ["left", "right"], "calibration 3f2a")
     assert str(refusal.value) == (
@@ -125,3 +106,6 @@ def test_it_is_no_calibration_for_scans_or_looks_at_a_board() -> None:
     )
     with pytest.raises(CalibrationError, match="one of camera 'left' alone: calibrate it again"):
         verify_by_board([poses()[0][0].observation], CHESSBOARD, result().calibration)
+    found = comparison(result().calibration, result().calibration)
+    assert found.words[0].endswith("they have one device in common, and a point takes two.")
+    assert found.devices["left"].focal_percent.value == 0

@@ -151,18 +151,6 @@ def test_names_and_titles_are_shown_as_text() -> None:
     assert Page(found).words.count(label) > 5
 
 
-def test_a_devices_name_keeps_its_capitals() -> None:
-    whole, solution = result(), result().solution
-    cameras = dict.fromkeys(("Nikon D5", "Canon"), whole.calibration.cameras["left"])
-    pinholes = replace(whole.calibration, cameras=cameras, projector=None)
-    residuals = dict.fromkeys(cameras, solution.residuals["left"])
-    named = replace(whole, solution=replace(solution, residuals=residuals), calibration=pinholes)
-    white = {POSES[0]: {"Canon": np.full((1024, 1280), 90, dtype=np.uint8)}}
-    words = Page(report_html(named, [], white, board=BOARD, title="two cameras")).words
-    assert "Camera 'Nikon D5' and camera 'Canon':" in "".join(words)
-    assert f"{POSES[0]}, camera 'Canon'" in words
-
-
 def test_verdict_comes_first_and_in_words() -> None:
     verdict = result().verdict
     assert page().figures["grade"] == verdict.grade.words.capitalize()
@@ -178,19 +166,19 @@ def test_verdict_comes_first_and_in_words() -> None:
     assert "It is bad." in found.words
 
 
-def test_expected_error_is_the_results() -> None:
+def test_every_number_is_that_of_the_result_and_its_covariance() -> None:
     expected = result().expected
-    assert page().number("point_mm") == pytest.approx(expected.point_mm, rel=5e-3)
-    assert page().number("odd_even_mm") == pytest.approx(0.0171, rel=5e-3)
+    for figure, value in (
+        ("point_mm", expected.point_mm),
+        ("odd_even_mm", 0.0171),
+        ("noise_mm", expected.noise_mm),
+        ("total_mm", expected.total_mm),
+        ("length_mm_per_m", 1000 * expected.length_share),
+    ):
+        assert page().number(figure) == pytest.approx(value, rel=5e-3)
     assert "0.89 times what is stated for two halves" in " ".join(" ".join(page().words).split())
-    assert page().number("noise_mm") == pytest.approx(expected.noise_mm, rel=5e-3)
-    assert page().number("total_mm") == pytest.approx(expected.total_mm, rel=5e-3)
-    assert page().number("length_mm_per_m") == pytest.approx(1000 * expected.length_share, rel=5e-3)
     flat = "The board is flat as far as the poses tell: 0.031 ± 0.012 mm from its lowest to its highest corner."
     assert flat in page().words
-
-
-def test_every_number_of_every_device_is_the_results() -> None:
     seen = 0
     for device in device_figures(result()):
         left = device.residuals
@@ -207,14 +195,9 @@ def test_every_number_of_every_device_is_the_results() -> None:
             seen += 1
     assert seen == 4 + 2 + 4 + 1
     assert f"{PROJECTOR}.k2" not in page().figures
-
-
-def test_numbers_come_from_calibration_and_covariance() -> None:
     camera, projector = device_figures(result())
-    assert camera.values["cx"].value == 641.2
-    assert camera.values["k2"].sigma == pytest.approx(2e-3)
-    assert projector.values["cy"].value == 842.4
-    assert projector.values["cy"].sigma == pytest.approx(0.61)
+    assert (camera.values["cx"].value, projector.values["cy"].value) == (641.2, 842.4)
+    assert (camera.values["k2"].sigma, projector.values["cy"].sigma) == pytest.approx((2e-3, 0.61))
     assert [axis.sigma for axis in camera.centre_mm] == [0, 0, 0]
     np.testing.assert_allclose([axis.value for axis in projector.centre_mm], devices()[PROJECTOR].centre_mm)
 
@@ -293,16 +276,18 @@ def test_figures_that_could_not_be_measured_are_named_so() -> None:
     assert "nan" not in " ".join(found.words).lower().split()
 
 
-def test_report_of_cameras_alone_needs_no_projector() -> None:
+def test_report_of_cameras_alone_needs_no_projector_and_keeps_their_capitals() -> None:
     whole, solution = result(), result().solution
-    solution = replace(
-        solution,
-        calibration=replace(solution.calibration, projector=None),
-        covariance=solution.covariance[:15, :15],
-        residuals={"left": solution.residuals["left"]},
+    names = ("Nikon D5", "Canon")
+    cameras, residuals = (
+        dict.fromkeys(names, each) for each in (whole.calibration.cameras["left"], solution.residuals["left"])
     )
-    calibration = replace(whole.calibration, projector=None, solved=None)
-    alone = replace(whole, solution=solution, calibration=calibration)
-    found = Page(report_html(alone, [], board=BOARD, title="one camera"))
-    assert "left.fx" in found.figures
+    pinholes = replace(solution.calibration, cameras=cameras, projector=None)
+    solution = replace(solution, calibration=pinholes, residuals=residuals)
+    alone = replace(whole, solution=solution, calibration=replace(pinholes, solved=None))
+    white = {POSES[0]: {"Canon": np.full((1024, 1280), 90, dtype=np.uint8)}}
+    found = Page(report_html(alone, [], white, board=BOARD, title="two cameras"))
+    assert "Camera 'Nikon D5' and camera 'Canon':" in "".join(found.words)
+    assert f"{POSES[0]}, camera 'Canon'" in found.words
+    assert "Canon.fx" in found.figures
     assert not any(name.startswith(PROJECTOR) for name in found.figures)

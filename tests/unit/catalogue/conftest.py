@@ -12,7 +12,7 @@ from slrig.catalogue.store import Catalogue, open_catalogue
 from tests.postgres import LOGIN, Postgres
 
 
-@pytest.fixture(params=["sqlite", "postgres"])
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.slow)])
 def address(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
     """Where an empty database is."""
     if request.param == "sqlite":

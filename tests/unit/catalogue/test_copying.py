@@ -9,7 +9,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from slrig.catalogue import copying
-from slrig.catalogue.copying import BATCH, Copier
+from slrig.catalogue.copying import Copier
 from slrig.catalogue.fleet import BEAT_S
 from slrig.catalogue.store import Catalogue, open_catalogue
 from slrig.errors import CatalogueError
@@ -54,17 +54,20 @@ def labels(catalogue: Catalogue) -> list[str]:
     return [label for (label,) in sql(catalogue, "SELECT label FROM finished_job ORDER BY number")]
 
 
-def test_jobs_come_once_and_in_order_whatever_their_record_becomes(rig: Rig, catalogue: Catalogue) -> None:
+def test_jobs_come_once_and_in_order_whatever_their_record_becomes(
+    rig: Rig, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(copying, "BATCH", 5)
     # Retention removes one, and another's files are lost, before the catalogue was ever reached.
-    names = [f"part {number}" for number in range(BATCH + 3)]
+    names = [f"part {number}" for number in range(8)]
     for name in names:
         rig.end_job(name, deleted=name == "part 1")
     lost = rig.jobs.page(before=None, limit=1)[0]
     rig.jobs.lose_files(lost.id, JobFailure("storage", "its files are gone"))
-    assert rig.copies.waiting()[0] == BATCH + 4
+    assert rig.copies.waiting()[0] == 9
     assert rig.copier.step() == BEAT_S
     assert labels(catalogue) == names
-    (last,) = sql(catalogue, "SELECT state, fault_code, points, triangles FROM finished_job WHERE label = 'part 202'")
+    (last,) = sql(catalogue, "SELECT state, fault_code, points, triangles FROM finished_job WHERE label = 'part 7'")
     assert last == ("failed", "storage", None, None)
     assert rig.copies.waiting() == (0, 0.0)
     assert [(each.name, each.uncopied) for each in catalogue.fleet().rigs] == [("hall-3", 0)]

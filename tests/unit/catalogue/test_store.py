@@ -97,13 +97,8 @@ def test_a_fleet_is_told_with_what_is_known_and_no_more(catalogue: Catalogue) ->
     catalogue.copy(scans)
     unseen_for_an_hour(catalogue, "hall-1")
     one, two, three = catalogue.fleet().rigs
-    assert (three.name, three.state, three.words, three.waiting, three.health) == (
-        "hall-3",
-        "busy",
-        "scan 1",
-        2,
-        "valid",
-    )
+    told = (three.name, three.state, three.words, three.waiting, three.health)
+    assert told == ("hall-3", "busy", "scan 1", 2, "valid")
     assert three.last_scan is not None
     assert asdict(three.last_scan) == {
         "id": scans[1]["job"], "label": "the last", "state": "failed", "finished_at": NOW, "error": "too dark",
@@ -139,7 +134,8 @@ def test_tables_of_another_slrig_are_refused_and_left_as_they_are(catalogue: Cat
         catalogue.fleet()
 
 
-def test_a_rig_needs_no_right_but_to_read_and_write_rows(postgres: Postgres) -> None:
+@pytest.mark.slow
+def test_a_rig_needs_no_right_but_to_read_and_write_rows(postgres: Postgres, tmp_path: Path) -> None:
     postgres.execute("CREATE DATABASE rights")
     owner = open_catalogue(postgres.address("rights"), LOGIN, None)
     rig = open_catalogue(postgres.address("rights"), "rig:its-own", None)
@@ -154,6 +150,9 @@ def test_a_rig_needs_no_right_but_to_read_and_write_rows(postgres: Postgres) -> 
     assert [each.scans_of_day for each in rig.fleet().rigs] == [1]
     owner.close()
     rig.close()
+    encrypted = open_catalogue(postgres.address(), LOGIN, own_certificate(tmp_path))
+    with pytest.raises(CatalogueError, match="refuses SSL"):
+        encrypted.open()
 
 
 @pytest.mark.parametrize(
@@ -174,6 +173,7 @@ def test_an_address_that_cannot_be_used_is_refused_and_not_repeated(address: str
     assert PASSWORD not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_a_certificate_has_to_be_of_the_authority_and_of_the_host(tmp_path: Path) -> None:
     pem = own_certificate(tmp_path)
     with Postgres(certificate=pem) as server:
@@ -195,12 +195,6 @@ def test_a_certificate_has_to_be_of_the_authority_and_of_the_host(tmp_path: Path
     assert (plain.check_hostname, plain.verify_mode) == (True, ssl.CERT_REQUIRED)
     with pytest.raises(ConfigError, match="PEM file"):
         open_catalogue("postgresql://127.0.0.1/fleet", LOGIN, tmp_path / "none.pem")
-
-
-def test_a_server_without_tls_is_refused_where_it_is_asked_for(postgres: Postgres, tmp_path: Path) -> None:
-    asked = open_catalogue(postgres.address(), LOGIN, own_certificate(tmp_path))
-    with pytest.raises(CatalogueError, match="refuses SSL"):
-        asked.open()
 
 
 def test_a_database_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
