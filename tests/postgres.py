@@ -51,18 +51,11 @@ class Postgres:
         self.said: list[str] = []
         password = self._folder / "password"
         password.write_text(PASSWORD)
-        self._options = [
-            "-c",
-            "unix_socket_directories=",
-            "-c",
-            f"port={self.port}",
-            "-c",
-            "listen_addresses=127.0.0.1",
-        ]
+        self._options = ["--unix_socket_directories=", f"--port={self.port}", "--listen_addresses=127.0.0.1"]
         if certificate is not None:
             shutil.copy(certificate, self._folder / "certificate.pem")
             own = self._folder / "certificate.pem"
-            self._options += ["-c", "ssl=on", "-c", f"ssl_cert_file={own}", "-c", f"ssl_key_file={own}"]
+            self._options += ["--ssl=on", f"--ssl_cert_file={own}", f"--ssl_key_file={own}"]
         for path in (self._folder, *self._folder.iterdir()):
             path.chmod(0o700 if path.is_dir() else 0o600)
             if self._user:

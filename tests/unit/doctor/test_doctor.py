@@ -340,3 +340,25 @@ def test_depth_per_pixel_is_that_of_two_rays() -> None:
 def pinhole(rotation: FloatArray, centre_mm: tuple[float, ...]) -> Pinhole:
     matrix = np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]])
     return Pinhole(Size(640, 480), matrix, np.zeros(5), rotation, -rotation @ np.array(centre_mm))
+
+
+@pytest.mark.slow
+def test_the_sense_of_the_current_is_found_and_all_else_waits_for_it(tmp_path: Path) -> None:
+    from drivers.dlpc350.planes import MIRRORS
+    from tests.contract.dlpc350_bench import Table
+    from tests.contract.suite import rig_of
+
+    # Not as on the LightCrafter 4500.
+    inverted = False
+    shown = doctor_sequence(MIRRORS)
+    table = Table(tmp_path, shown, led_inverted=inverted)
+    head = table.connected(led_current_inverted=None, image_load_s=0.05)
+    settings = dict.fromkeys(head.cameras, CameraSettings(0.03))
+    with replace(rig_of(head), settings=settings) as rig:
+        diagnosis = examine(rig, own_sequence=shown, search_s=0.1)
+        assert table.engine.lit is None
+    (found,) = (each for each in diagnosis.findings if each.name == "light.current")
+    assert found.severity is Severity.NOTE
+    assert f"led_current_inverted = {str(inverted).lower()}" in found.remedy
+    assert diagnosis.synchronisation is None
+    assert not diagnosis.exposures
