@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,7 +29,9 @@ from slrig.errors import (
 )
 from slrig.jobs.database import Database
 from slrig.schedule.records import Cron, Order, RunState, TaskKind
+from slrig.schedule.scheduler import LOOK_S
 from tests.unit.jobs.tame_queue import PowerCut
+from tests.unit.scan.fakes import WAIT_S
 from tests.unit.schedule.desk import START, Desk
 
 BERLIN = "Europe/Berlin"
@@ -356,17 +360,36 @@ def test_run_of_a_dead_process_is_interrupted_when_it_is_silent_for_long(new_des
     assert other.rows(daily)[1:] == [("24 06:00", RunState.SUCCEEDED, 1)]
 
 
-def test_service_that_starts_alone_ends_what_was_left(new_desk: NewDesk) -> None:
+class Wanted(threading.Event):
+    """What the loop waits for. waits : the limits of each wait, s."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits: queue.Queue[float | None] = queue.Queue()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.waits.put(timeout)
+        return super().wait(WAIT_S)
+
+
+def test_loop_ends_what_was_left_and_waits_for_the_next_due_time(new_desk: NewDesk) -> None:
     one = new_desk()
     daily = one.daily()
     one.now += timedelta(hours=1)
     one.store.record_due(one.now)
     assert one.store.start(one.run(daily), one.now)
     other = new_desk(now=one.now)
+    wanted = other.scheduler._wanted = Wanted()
     other.scheduler.start()
-    other.scheduler.close()
+    assert wanted.waits.get(timeout=WAIT_S) == LOOK_S
     assert other.rows(daily) == [("23 06:00", RunState.INTERRUPTED, 1)]
     assert other.told == [(START + timedelta(hours=1), RunState.INTERRUPTED)]
+    for seconds, wait_s in ((24 * 3600 - 4, 4.0), (4, LOOK_S)):
+        other.now += timedelta(seconds=seconds)
+        other.scheduler.wake()
+        assert wanted.waits.get(timeout=WAIT_S) == wait_s
+    assert len(other.done) == 1
+    other.scheduler.close()
 
 
 class Cut:
