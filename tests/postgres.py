@@ -69,7 +69,7 @@ class Postgres:
         )  # fmt: skip
 
     def address(self, database: str = "postgres") -> str:
-        """As a service is told it."""
+        """As the settings of a service name it."""
         return f"postgresql://127.0.0.1:{self.port}/{database}"
 
     def start(self) -> None:

@@ -53,7 +53,7 @@ def test_camera_is_set_while_it_is_not_armed_and_read_while_it_is() -> None:
         (CameraSettings(0.01, 2.0), "gain 2, it takes 1 only"),
     ],
 )
-def test_settings_out_of_range_are_told_with_the_range(settings: CameraSettings, words: str) -> None:
+def test_settings_out_of_range_are_refused_with_the_range(settings: CameraSettings, words: str) -> None:
     with pytest.raises(UnsupportedByDeviceError, match=words):
         CameraState("left").check_settings(settings, INFO)
 

@@ -272,7 +272,7 @@ def test_calibration_that_does_not_fit_is_refused_and_all_is_closed(
     assert [device.closings for device in OPENED] == [1, 1]
 
 
-def test_faults_of_several_tables_are_told_together_and_all_is_closed(tmp_path: Path) -> None:
+def test_faults_of_several_tables_are_reported_together_and_all_is_closed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         _open(
             tmp_path,

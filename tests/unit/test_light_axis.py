@@ -61,7 +61,7 @@ def test_with_a_projector_all_cameras_decide_by_what_they_resolve() -> None:
     assert share_across(Axis.ROW, two, projector) == pytest.approx(0.6)
 
 
-def test_an_axis_tells_depth_to_cameras_whose_baseline_lies_across_it() -> None:
+def test_axis_gives_depth_to_cameras_with_a_baseline_across_it() -> None:
     cameras, projector = [standing(10.0, 90.0), standing(80.0, 80.0), standing(120.0, 0.0)], standing(0.0, 0.0)
     assert told_depth(Axis.COLUMN, cameras, projector) == [False, True, True]
     assert told_depth(Axis.ROW, cameras, projector) == [True, True, False]

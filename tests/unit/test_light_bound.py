@@ -177,7 +177,7 @@ def test_crossings_are_where_the_true_map_says_and_stripes_at_the_border_are_lef
 
 
 @pytest.mark.parametrize(("past_px", "found"), [(1, False), (4, True)])
-def test_a_stripe_beside_the_edge_of_the_surface_is_left_out(past_px: int, *, found: bool) -> None:
+def test_stripe_next_to_the_edge_of_the_surface_is_left_out(past_px: int, *, found: bool) -> None:
     # The line of column 96 is at camera column 60, the middle of the image, x = -20 mm; the plate ends farther right.
     right_mm = -20.0 + past_px * 500.0 / 400.0
     bound = bound_of(exposed_view(WHITE_NOISE, size_mm=[200.0, 800.0], position_mm=[right_mm - 100.0, 0.0, 0.0]))
@@ -186,7 +186,7 @@ def test_a_stripe_beside_the_edge_of_the_surface_is_left_out(past_px: int, *, fo
     assert 120.0 not in bound.line_px
 
 
-def test_all_shifts_at_one_pixel_tell_what_all_pixels_of_one_stripe_tell() -> None:
+def test_all_shifts_at_one_pixel_bound_as_all_pixels_of_one_stripe() -> None:
     # One pixel is one column here: what shift k shows at a pixel is what shift 0 shows k pixels farther.
     exposed = exposed_view(SHOT_NOISE, phase_px=0.2)
     unknown, known = pixel_bound(exposed, [lines(shift)[0] for shift in range(PERIOD)])

@@ -32,7 +32,7 @@ def test_memory_goes_back_where_much_is_held(
 
 
 @LINUX
-def test_what_is_resident_is_told() -> None:
+def test_resident_memory_is_measured() -> None:
     asked = 2**26
     before = memory._resident_bytes()
     # From the system itself: an array may be given memory that earlier tests have freed, and that is resident already.

@@ -75,7 +75,7 @@ def test_a_message_is_the_same_after_its_way_through_cdr(release: str) -> None:
 
 
 @pytest.mark.parametrize("turn", [(0, 0, 0), (np.pi, 0, 0), (0, -np.pi, 0), (0.1, 0.2, np.pi - 1e-9), (0.3, -2.9, 0.4)])
-def test_a_point_is_seen_where_transform_and_camera_info_say(turn: tuple[float, float, float]) -> None:
+def test_point_projects_where_transform_and_camera_info_say(turn: tuple[float, float, float]) -> None:
     rotation = np.asarray(cv2.Rodrigues(np.array(turn, dtype=np.float64))[0])
     matrix = np.array([[1900.0, 0, 482.8], [0, 1901.9, 379.4], [0, 0, 1]])
     device = Pinhole(Size(960, 768), matrix, np.array(BARREL), rotation, np.array([12.0, -40, 350]))
@@ -100,7 +100,7 @@ def test_a_time_that_ros_does_not_count_is_none(seconds: float, stamp_ns: int) -
     assert Messages(class_of=dict, sequence=list, seconds=seconds).stamp_ns == stamp_ns  # type: ignore[arg-type]
 
 
-def test_cameras_whose_names_ros_does_not_tell_apart_share_a_topic() -> None:
+def test_cameras_with_names_equal_to_ros_share_a_topic() -> None:
     library("rosbags.rosbag2")
     calibration = Calibration({"a-b": TURNED, "a_b": TURNED}, None)
     data = encode_bag(calibration, [], {}, None)

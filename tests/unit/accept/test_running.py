@@ -122,7 +122,7 @@ def test_noise_alone_gives_the_form_error_of_noise(artefact: Artefact) -> None:
 
 
 @pytest.mark.parametrize("scale", [0.999, 1.0, 1.002])
-def test_a_scanner_that_measures_too_large_is_told_by_how_much(scale: float) -> None:
+def test_scanner_that_measures_too_large_has_that_error(scale: float) -> None:
     sphere, _ = reading(scan_of(step_of(Artefact.SPHERE), scale=scale), step_of(Artefact.SPHERE), 0, PLAN)
     bar, _ = reading(scan_of(step_of(Artefact.BAR), scale=scale), step_of(Artefact.BAR), 0, PLAN)
     assert sphere.errors_mm[Quantity.SIZE] == pytest.approx(30 * (scale - 1), abs=0.001)
@@ -149,7 +149,7 @@ def test_what_is_steep_or_at_a_border_counts_as_all_else(part: str) -> None:
 
 
 @pytest.mark.parametrize("artefact", [Artefact.SPHERE, Artefact.BAR])
-def test_an_artefact_that_is_not_there_is_told_by_its_position(artefact: Artefact) -> None:
+def test_missing_artefact_is_named_by_its_position(artefact: Artefact) -> None:
     step = step_of(artefact)
     with pytest.raises(NothingToReconstructError, match=f"{step.name}: expected .* of 30 mm, found"):
         reading(scan_of(step_of(Artefact.PLANE)), step, 0, PLAN)
@@ -381,7 +381,7 @@ def test_a_record_survives_its_json() -> None:
     assert (found.plan.artefacts, found.plan.limits) == (PLAN.artefacts, PLAN.limits)
 
 
-def test_a_position_begins_anew_where_its_repeats_were_not_finished() -> None:
+def test_position_starts_from_its_first_capture_where_repeats_are_missing() -> None:
     one = replace(RECORD, readings=RECORD.readings[:1])
     assert one.from_first_take().readings == ()
     # Both captures of the first position are there, and the second position follows.
@@ -421,7 +421,7 @@ def test_scale_of_a_thousandth_or_more_is_blamed_on_the_board(share: float, word
 
 
 @pytest.mark.parametrize("artefacts", [BAR, replace(BAR, distance=Certified(LENGTH_MM, 0.2))])
-def test_what_the_places_or_the_certificate_do_not_tell_is_not_measured(artefacts: Artefacts) -> None:
+def test_scale_that_places_or_certificate_leave_open_is_not_stated(artefacts: Artefacts) -> None:
     scattered = artefacts is BAR
     found = scale_by_bar(of_bars(0.002, scatter_mm=0.4 if scattered else 0.004), artefacts)
     assert found is not None

@@ -1,4 +1,4 @@
-"""Poses of a calibration board, shot by a small rendered rig: frames in memory, and the truth beside them."""
+"""Poses of a calibration board, shot by a small rendered rig: frames in memory, and the truth."""
 
 from __future__ import annotations
 

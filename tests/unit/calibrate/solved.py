@@ -51,7 +51,7 @@ def _turned(*, about_x: float, about_y: float, about_z: float) -> FloatArray:
 
 
 def devices() -> dict[str, Pinhole]:
-    """The rig: the camera in the world's frame, the projector beside it with its principal point below its image."""
+    """The rig: the camera in the world's frame, the projector next to it with its principal point below its image."""
     turned = _turned(about_x=0.0, about_y=-15.0, about_z=0.3)
     return {
         "left": Pinhole(

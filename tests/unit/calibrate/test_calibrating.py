@@ -248,7 +248,7 @@ def test_solve_is_refused_until_it_makes_sense(bench: CalibrationBench) -> None:
     bench.until_session(session_id, lambda found: found.state is SessionState.SOLVED)
 
 
-def test_failed_solve_tells_why_and_another_pose_opens_the_session_again(bench: CalibrationBench) -> None:
+def test_failed_solve_states_why_and_another_pose_opens_the_session_again(bench: CalibrationBench) -> None:
     session_id = bench.session()
     bench.shot(session_id)
     bench.tame.solve_error = SolveRefusedError("All poses are parallel: tilt the board.")

@@ -1,4 +1,4 @@
-"""One camera calibrated alone: solved from made-up poses, told on screen and page, kept as a file, and no scan's."""
+"""One camera calibrated alone: solved from made-up poses, shown on screen and page, and of no use to scans."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def test_pose_gives_every_corner_and_light_that_is_right_within_what_it_states(r
 
 
 @pytest.mark.slow
-def test_without_line_shift_code_edges_tell_the_light() -> None:
+def test_without_line_shift_code_edges_give_the_light() -> None:
     found = read_captured(shot(line_shift=False), BOARD, "gray")
     for rms_px, ratio, count in off_px(found.observation.correspondences["left"]).values():
         # An edge every two columns.
@@ -230,7 +230,7 @@ def test_clipped_paper_is_counted() -> None:
     assert found.figures["left"].saturated > 0.3
 
 
-def test_capture_from_another_rig_is_told_apart(pose: Capture, tmp_path: Path) -> None:
+def test_capture_from_another_rig_is_refused(pose: Capture, tmp_path: Path) -> None:
     first, smaller = without(pose, Gray, LineShift), shot(Standing(scale=0.25), patterns=ENDS)
     sizes = []
     for name, each in enumerate((pose, pose, smaller, replace(first, projector=Size(640, 480)))):

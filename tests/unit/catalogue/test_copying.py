@@ -104,7 +104,7 @@ def test_what_ended_without_a_catalogue_or_what_it_lost_is_brought_up(tmp_path: 
     rig.database.close()
 
 
-def test_a_rig_is_seen_at_each_beat(rig: Rig, catalogue: Catalogue) -> None:
+def test_state_of_a_rig_is_copied_at_each_beat(rig: Rig, catalogue: Catalogue) -> None:
     rig.copier.step()
     rig.standing["state"] = "fault"
     rig.now_s = BEAT_S - 1
@@ -115,9 +115,7 @@ def test_a_rig_is_seen_at_each_beat(rig: Rig, catalogue: Catalogue) -> None:
     assert catalogue.fleet().rigs[0].state == "fault"
 
 
-def test_a_catalogue_that_is_away_is_told_of_and_nobody_waits_for_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unreachable_catalogue_is_logged_and_holds_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(copying, "FIRST_WAIT_S", 0.01)
     folder = tmp_path / "share"
     catalogue = open_catalogue(f"sqlite:///{folder}/fleet.sqlite", None, None)

@@ -58,7 +58,7 @@ def unseen_for_an_hour(catalogue: Catalogue, name: str) -> None:
         connection.execute(update(RigRow).where(RigRow.name == name).values(seen_at=an_hour_ago))
 
 
-def test_migrations_give_the_tables_that_the_code_uses_whoever_comes_first(address: str) -> None:
+def test_migrations_give_the_tables_that_the_code_uses_also_to_several_at_once(address: str) -> None:
     rigs = [open_catalogue(address, LOGIN, None) for _ in range(4)]
     with ThreadPoolExecutor(len(rigs)) as together:
         for done in [together.submit(each.open) for each in rigs]:
@@ -83,7 +83,7 @@ def test_a_job_is_one_row_however_often_it_comes(catalogue: Catalogue) -> None:
     assert catalogue.known([jobs[0]["job"], "another"]) == {jobs[0]["job"]}
 
 
-def test_a_fleet_is_told_with_what_is_known_and_no_more(catalogue: Catalogue) -> None:
+def test_fleet_lists_what_is_known_and_no_more(catalogue: Catalogue) -> None:
     catalogue.open()
     for name in ("hall-3", "hall-1", "hall-2"):
         catalogue.see(row(name, state="stopped" if name == "hall-2" else "busy"))

@@ -27,7 +27,7 @@ from tests.unit.scan.fakes import WAIT_S
 
 
 def kept_scan(store: JobStore, folder: DataFolder, *, angle_deg: float | None = None, mesh: bytes = b"ply") -> UUID:
-    """A scan that succeeded, on a stage if an angle is told."""
+    """A scan that succeeded, on a stage if there is an angle."""
     scan_id = uuid4()
     folder.scan(scan_id).mkdir()
     (folder.scan(scan_id) / "mesh.ply").write_bytes(mesh)
@@ -41,9 +41,8 @@ def kept_scan(store: JobStore, folder: DataFolder, *, angle_deg: float | None = 
 
 
 class TameCombining:
-    """Combines nothing. asked : what it was told of each model, meshes, poses; planes : of the last one. error : raised
-    in place of the next one. axis : what it says it found. While `gate` is clear it goes on; `began` is set when one
-    does.
+    """Combines nothing. asked : what each model was to be made of; planes : of the last one. error : raised in place of
+    the next one. axis : what it says it found. While `gate` is clear it goes on; `began` is set when one does.
     """
 
     def __init__(self) -> None:
@@ -103,7 +102,7 @@ def model_files(
 
 
 class ModelBench(Bench):
-    """A desk for models beside a runner of scans. start : begin at once; else what is taken up waits for that."""
+    """A desk for models and a runner of scans. start : begin at once; else what is taken up waits for that."""
 
     def __init__(self, root: Path, *, keep: int = 100, start: bool = True, axis: MeasuredAxis | None = None) -> None:
         super().__init__(root)

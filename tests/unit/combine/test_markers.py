@@ -54,7 +54,7 @@ def test_corners_of_a_marker_lie_where_they_were_painted_within_what_is_stated()
     assert np.sqrt(np.mean((off / found[7].sigma_mm[:, None]) ** 2)) < 2.5
 
 
-def test_frames_are_looked_for_beside_the_mesh_that_was_made_of_them(tmp_path: Path) -> None:
+def test_frames_are_found_next_to_the_mesh_made_of_them(tmp_path: Path) -> None:
     for mesh, bundle in (("a/mesh.ply", "a/bundle"), ("view-3/mesh.ply", "bundle-3"), ("b/mesh.ply", "b")):
         (tmp_path / bundle).mkdir(parents=True)
         (tmp_path / bundle / "bundle.json").write_text("{}")

@@ -109,7 +109,7 @@ def test_views_are_cut_by_the_stages_planes_and_the_axis_found_is_noted(tmp_path
         made = bench.over(bench.desk.combine(ModelPlan(scans, TurntablePoses(), cut=cut)).id)
         assert [each.kind for each in bench.tame.planes] == [PlaneKind.PLATE] * cut
         assert bench.stage.record().history[-1].of == str(made.id)
-    # The same scans once more tell nothing new, nor does an axis that somebody has said.
+    # The same scans once more add nothing, nor does an axis that a person has stated.
     for known, poses in ((scans, TurntablePoses()), (bench.kept_scans(0.0, 40.0), TurntablePoses(AXIS))):
         bench.over(bench.desk.combine(ModelPlan(known, poses)).id)
         assert bench.stage.record().history[-1].of == str(made.id)
@@ -314,7 +314,7 @@ def test_all_views_are_shot_around_the_table_and_the_model_is_made_of_them(shoot
     told = [event.data for event in shooting.models.events(model_id, after=0)]
     assert [each["state"] for each in told if "time" in each] == ["queued", "capturing", "computing", "succeeded"]
     details = [each["detail"] for each in told if each.get("stage") == "view"]
-    # A view that is computed is told while the next is shot, which may have ended, too, on a busy machine.
+    # Progress of a view that is computed comes while the next is shot; that may have ended, too, on a busy machine.
     assert details == sorted(details)
     assert details[0] == "view 1 of 4"
     assert set(details) <= {f"view {number} of 4" for number in (1, 2, 3, 4)}
@@ -324,7 +324,7 @@ def test_all_views_are_shot_around_the_table_and_the_model_is_made_of_them(shoot
     assert "notes" not in made.summary
 
 
-def test_a_last_view_that_ends_before_it_is_told_is_no_first_one(
+def test_last_view_that_ends_before_its_progress_is_recorded_is_no_first_one(
     shooting: ShootingBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model_id = started(shooting)
@@ -336,7 +336,7 @@ def test_a_last_view_that_ends_before_it_is_told_is_no_first_one(
     assert [each.detail for each in told] == ["view 4 of 4"]
 
 
-def test_a_view_that_fails_is_told_and_a_devices_fault_is_tried_twice_more(shooting: ShootingBench) -> None:
+def test_failed_view_is_noted_and_a_device_fault_is_tried_twice_more(shooting: ShootingBench) -> None:
     gone = DeviceGoneError("left was unplugged")
     shooting.faults = {90.0: [ScanEvidenceError("white is not brighter than black")], 180.0: [gone], 270.0: [gone] * 9}
     poses = GivenPoses(tuple(((1.0, 0.0, 0.0, float(view)), *STILL[1:]) for view in range(4)))

@@ -66,7 +66,7 @@ def test_each_side_shows_what_lies_there_at_one_scale() -> None:
         assert bool(columns.mean() > middle) is to_the_right, side
 
 
-def test_what_is_open_is_seen_in_red_from_behind() -> None:
+def test_open_surface_is_red_from_behind() -> None:
     ball = trimesh.creation.icosphere(4, 10.0)
     lid = ball.triangles_center[:, 1] < -6.0  # above
     page = shown(of(trimesh.Trimesh(ball.vertices, ball.faces[~lid], process=False)))

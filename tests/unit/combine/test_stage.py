@@ -44,7 +44,7 @@ def test_models_improve_what_a_board_began(stage: StageStore) -> None:
     assert state_of(record) == (StageState.KNOWN, "")
 
 
-def test_a_stage_that_was_moved_is_told_and_its_axis_kept(stage: StageStore) -> None:
+def test_moved_stage_is_reported_and_its_axis_kept(stage: StageStore) -> None:
     stage.put_axis(axis(), source=AxisSource.BOARD, of="session", at=NOON)
     stage.put_planes([PLATE])
     found = stage.note(axis(0.7, 0.01), of="m", at=NOON + timedelta(hours=1))

@@ -136,7 +136,7 @@ class Pool:
         self.worker = PooledWorker(self.local, self.cluster, self.store, clock=self.clock)
 
     def passes(self, seconds: float) -> Callable[[Order], None]:
-        """An act: time passes, and nobody answers."""
+        """An act: time passes without an answer."""
 
         def act(_order: Order) -> None:
             self.clock.now_s += seconds

@@ -52,7 +52,7 @@ def greet(client: ssl.SSLContext, server: ssl.SSLContext) -> None:
     assert ends[1].read() == b"hello"
 
 
-def test_members_of_one_pool_know_one_another_and_nobody_else(tmp_path: Path) -> None:
+def test_members_of_one_pool_accept_one_another_and_no_others(tmp_path: Path) -> None:
     ours, theirs = tmp_path / "ours", tmp_path / "theirs"
     made = CliRunner().invoke(app, ["pool", "certificates", str(ours)])
     assert made.output.split() == [str(ours / name) for name in ("scheduler", "worker", "rig")]

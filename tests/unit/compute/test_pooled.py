@@ -197,7 +197,7 @@ def test_workers_of_other_versions_are_not_used_nor_those_of_a_pool_for_other_ta
     assert cluster._lack([newer, mine]) is None
 
 
-def test_what_workers_can_do_is_asked_for_when_they_change(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_abilities_are_queried_when_they_change(monkeypatch: pytest.MonkeyPatch) -> None:
     members = {"one": {"resources": {resource(versions()): 1}}}
     asked: list[int] = []
 
@@ -277,7 +277,7 @@ def test_a_machine_that_loses_its_process_leaves_the_job_to_another_try(
     )
 
 
-def test_a_stage_is_told_now_and_then(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_sent_at_intervals(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given, heard = order(pool, tmp_path), list[Mapping[str, Any]]()
 
     def run(task: Task, *, progress: Callable[[str, float, str], None] = lambda *_: None, **_: object) -> object:

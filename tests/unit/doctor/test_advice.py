@@ -74,7 +74,7 @@ def test_advice_gives_its_reason_and_keeps_to_the_limits() -> None:
     assert (advice.exposure_s, advice.usable_s) == (0.03, (0.002, 0.03))
 
 
-def test_an_exposure_beside_the_refresh_is_noted() -> None:
+def test_exposure_that_misses_the_refresh_is_noted() -> None:
     assert unsnapped(seen(0.02), None) == []
     assert unsnapped(seen(1 / 30), 60.0) == []
     [told] = unsnapped(seen(0.02), 60.0)

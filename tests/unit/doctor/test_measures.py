@@ -71,7 +71,7 @@ def test_saturation_is_counted_among_what_is_lit() -> None:
 
 @pytest.mark.parametrize("gamma", [0.7, 1.0, 2.2])
 @pytest.mark.parametrize(("black_knee", "white_knee"), [(0.0, 255.0), (30.0, 220.0)])
-def test_a_response_is_told_by_its_gamma_and_its_knees(gamma: float, black_knee: float, white_knee: float) -> None:
+def test_response_is_found_by_its_gamma_and_its_knees(gamma: float, black_knee: float, white_knee: float) -> None:
     values = np.linspace(0, 255, 33)
     light = np.clip((values - black_knee) / (white_knee - black_knee), 0, 1) ** gamma
     light += 0.002 * np.random.default_rng(0).standard_normal(33)
@@ -98,7 +98,7 @@ def sampled(t_s: FloatArray, exposure_s: float, *parts: tuple[float, float], noi
     return np.asarray(light)
 
 
-def test_swings_are_told_from_uneven_samples_whatever_the_mean_rate() -> None:
+def test_swings_are_found_in_uneven_samples_whatever_the_mean_rate() -> None:
     t_s = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.05, 128))
     found = swings(t_s, sampled(t_s, 0.002, (100.0, 5.0), (180.0, 2.0)), exposure_s=0.002)
     assert [swing.frequency_hz for swing in found] == pytest.approx([100.0, 180.0], abs=0.02)
@@ -111,7 +111,7 @@ def test_swings_are_told_from_uneven_samples_whatever_the_mean_rate() -> None:
     assert found[0].amplitude * passed(found[0].frequency_hz, 0.005) == pytest.approx(5 * 2 / np.pi, abs=0.2)
 
 
-def test_even_samples_say_what_they_cannot_tell_apart() -> None:
+def test_even_samples_list_the_aliases() -> None:
     # 30 frames per second show 100 Hz as 10 Hz, as they show 20, 40, 50, 70, 80 … Hz.
     t_s = np.arange(128) / 30
     [swing] = swings(t_s, sampled(t_s, 0.002, (100.0, 5.0)), exposure_s=0.002)
@@ -121,7 +121,7 @@ def test_even_samples_say_what_they_cannot_tell_apart() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [23.976, 59.94, 60.0, 120.0, 240.0])
-def test_a_refresh_is_told_from_instants_at_random_moments(rate_hz: float) -> None:
+def test_refresh_rate_is_found_from_random_instants(rate_hz: float) -> None:
     rng = np.random.default_rng(3)
     asked_s = np.cumsum(rng.uniform(0.02, 0.08, 48))
     shown_ns = np.ceil(asked_s * rate_hz) / rate_hz * 1e9 + rng.normal(0, 1e5, 48)
@@ -129,7 +129,7 @@ def test_a_refresh_is_told_from_instants_at_random_moments(rate_hz: float) -> No
     assert found == pytest.approx(rate_hz, rel=5e-4)
 
 
-def test_instants_that_lie_on_no_grid_tell_no_refresh() -> None:
+def test_instants_on_no_grid_give_no_refresh_rate() -> None:
     asked_ns = np.cumsum(np.random.default_rng(3).uniform(2e7, 8e7, 48))
     assert refresh_hz([round(t) for t in asked_ns]) is None
     assert refresh_hz([5, 5, 5]) is None
@@ -166,7 +166,7 @@ def test_a_picture_is_mirrored_or_turned(jacobian: list[list[float]], mirrored: 
     assert found.camera_px == pytest.approx(abs(np.linalg.det(jacobian)) ** -0.5, rel=0.05)
 
 
-def test_too_few_codes_tell_nothing() -> None:
+def test_too_few_codes_give_no_orientation() -> None:
     column_px, row_px = positions([[1.0, 0.0], [0.0, 1.0]])
     few = np.zeros(PICTURE, np.bool_)
     few[:5, :5] = True
@@ -207,7 +207,7 @@ def bars(period_px: float, blur_px: float, camera_px: float, *, noise_dn: float 
     ("blur_px", "camera_px", "noise_dn"),
     [(0.5, 1.6, 0.0), (0.5, 0.8, 5.0), (1.0, 0.8, 5.0), (2.5, 1.6, 5.0), (6.0, 0.8, 0.0)],
 )
-def test_bars_tell_their_blur(blur_px: float, camera_px: float, noise_dn: float) -> None:
+def test_bars_give_the_blur(blur_px: float, camera_px: float, noise_dn: float) -> None:
     contrast = np.full((50, 200), 100.0)
     found = [
         bar_contrast(
@@ -235,14 +235,14 @@ def squares(side_px: int, blur_px: float, noise_dn: float) -> FloatArray:
 
 
 @pytest.mark.parametrize(("blur_px", "noise_dn"), [(0.6, 1.0), (1.5, 0.0), (3.5, 1.0)])
-def test_edges_tell_their_blur(blur_px: float, noise_dn: float) -> None:
+def test_edges_give_the_blur(blur_px: float, noise_dn: float) -> None:
     found = edge_blur(squares(60, blur_px, noise_dn), np.ones((300, 300), np.bool_), noise_dn=max(noise_dn, 0.3))
     assert found is not None
     # The sharpest fifth of the edges lies a little below the truth in noise.
     assert found.sigma_px == pytest.approx(blur_px, rel=0.12, abs=0.15)
 
 
-def test_no_edges_tell_nothing() -> None:
+def test_without_edges_there_is_no_blur() -> None:
     rng = np.random.default_rng(0)
     even = 100 + rng.standard_normal((300, 300))
     assert edge_blur(even, np.ones((300, 300), np.bool_), noise_dn=1.0) is None

@@ -80,7 +80,7 @@ class Hook:
 
 
 def own_certificate(folder: Path) -> Path:
-    """A file with a certificate for this machine that nobody vouches for, and its key."""
+    """A file with a certificate for this machine of no known authority, and its key."""
     pem, certificate = folder / "own.pem", folder / "own.crt"
     subprocess.run(  # noqa: S603 - our own command
         ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", pem, "-out", certificate,  # noqa: S607 - whichever there is

@@ -1,4 +1,4 @@
-"""Debian's MQTT broker on this machine, and somebody who subscribed there."""
+"""Debian's MQTT broker on this machine, and a subscriber of it."""
 
 from __future__ import annotations
 

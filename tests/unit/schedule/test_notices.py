@@ -51,7 +51,7 @@ def run(state: RunState, *, count: int = 1) -> Run:
     return Run(4, SCHEDULE.id, DUE, state, "rig busy: a scan", count, 1, DUE, None, None, None, None)
 
 
-def test_runs_that_a_person_has_to_know_of_are_told_and_no_others(database: Database, outbox: Outbox) -> None:
+def test_runs_that_need_a_person_give_a_notice_and_no_others(database: Database, outbox: Outbox) -> None:
     with database.changing() as session:
         for state in RunState:
             tell_run(outbox, session, SCHEDULE, run(state, count=3))
@@ -70,7 +70,7 @@ def test_runs_that_a_person_has_to_know_of_are_told_and_no_others(database: Data
     assert len({each["id"] for each in sent}) == len(sent)
 
 
-def test_health_is_told_when_it_changes(database: Database, outbox: Outbox) -> None:
+def test_health_gives_a_notice_when_it_changes(database: Database, outbox: Outbox) -> None:
     health = NoticedHealth(database, outbox)
     knocked = a_verification(6.0, evidence=400.0)
     for hour, look in enumerate([a_verification(), a_verification(), knocked, knocked]):
@@ -82,7 +82,7 @@ def test_health_is_told_when_it_changes(database: Database, outbox: Outbox) -> N
     assert (second["health"]["before"], second["health"]["state"]) == ("stale", "good")
 
 
-def test_end_of_a_job_of_any_kind_is_told_once(database: Database, outbox: Outbox) -> None:
+def test_end_of_a_job_of_any_kind_gives_one_notice(database: Database, outbox: Outbox) -> None:
     parent, at = uuid4(), JobState
     fault = JobFailure("pose-refused", "no board is in view")
     made: list[tuple[JobKind, dict[str, Any], UUID | None, JobState, dict[str, str]]] = [
@@ -126,7 +126,7 @@ def test_end_of_a_job_of_any_kind_is_told_once(database: Database, outbox: Outbo
     assert one["words"] == f"rig 'bench': position {job.id} succeeded"
 
 
-def test_end_that_cannot_be_recorded_is_not_told_and_notice_that_cannot_be_written_holds_its_end(
+def test_end_and_notice_are_recorded_together_or_not_at_all(
     database: Database, outbox: Outbox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     jobs = JobStore(database, JobKind.SCAN, outbox=outbox)

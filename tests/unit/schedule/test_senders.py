@@ -142,7 +142,7 @@ def test_notice_is_signed_with_the_time_of_the_try_and_keeps_its_id(bench: Bench
     assert third["headers"]["webhook-id"] == third["id"]
 
 
-def test_receiver_that_is_down_for_an_hour_is_told_all_once_and_in_order(bench: Bench, hook: Hook) -> None:
+def test_receiver_that_is_down_for_an_hour_gets_all_once_and_in_order(bench: Bench, hook: Hook) -> None:
     hook.status = 500
     bench.put("1", "2")
     waits = bench.pass_time(timedelta(hours=1))
@@ -211,7 +211,7 @@ def test_no_more_wait_than_may_and_the_oldest_go(tmp_path: Path, hook: Hook) -> 
     bench.database.close()
 
 
-def test_receiver_that_is_gone_is_told_nothing_more_by_this_process(tmp_path: Path, bench: Bench, hook: Hook) -> None:
+def test_receiver_that_is_gone_gets_nothing_more_from_this_process(tmp_path: Path, bench: Bench, hook: Hook) -> None:
     hook.status = 410
     bench.put("1")
     with structlog.testing.capture_logs() as log:

@@ -190,7 +190,7 @@ def test_work_that_needs_a_positioner_is_refused_where_there_is_none(tmp_path: P
     bench.close()
 
 
-def test_calibration_takes_every_pose_solves_and_is_used_only_if_asked(bench: TaskBench) -> None:
+def test_calibration_takes_every_pose_solves_and_is_used_only_if_ordered(bench: TaskBench) -> None:
     told = bench.do(TaskKind.CALIBRATION, board=BOARD)
     assert bench.tame.visited == [0, 1, 2]
     assert bench.tame.solved == [["pose 1", "pose 2", "pose 3"]]
@@ -230,7 +230,7 @@ def test_device_or_solve_that_fails_fails_the_run(bench: TaskBench) -> None:
         bench.do(TaskKind.CALIBRATION, board=BOARD)
 
 
-def test_rig_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
+def test_rig_that_cannot_be_opened_fails_the_run_with_its_cause(tmp_path: Path) -> None:
     bench = TaskBench(tmp_path)
     bench.open_error = DeviceError("no camera is plugged in")
     bench.runner.start()
@@ -256,7 +256,7 @@ def test_verification_is_of_the_board_in_use(bench: TaskBench) -> None:
         bench.do(TaskKind.VERIFICATION)
 
 
-def test_busy_rig_is_told_before_anything_was_done(bench: TaskBench) -> None:
+def test_busy_rig_is_refused_before_anything_is_done(bench: TaskBench) -> None:
     bench.use_a_calibration()
     before = len(bench.calibrations.latest())
     scan = bench.held()
@@ -296,7 +296,7 @@ def test_run_holds_the_rig_in_the_name_of_its_schedule_until_it_is_cancelled(ben
     assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
 
 
-def test_acceptance_is_measured_by_script_and_tells_its_decision(
+def test_acceptance_is_measured_by_script_and_gives_its_decision(
     desk: AcceptanceDesk, queue: TameQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
@@ -312,7 +312,7 @@ def test_acceptance_is_measured_by_script_and_tells_its_decision(
         tasks(schedule, run, lambda: False)
 
 
-def test_fault_of_a_busy_rig_is_not_told_as_one() -> None:
+def test_fault_of_a_busy_rig_is_that_of_a_device() -> None:
     assert type(error_of(JobFailure("rig-busy", "held"))) is DeviceError
     assert type(error_of(JobFailure("unexpected", "odd"))) is SlrigError
     assert type(error_of(JobFailure("pose-refused", "dark"))) is PoseRefusedError

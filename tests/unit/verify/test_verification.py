@@ -151,7 +151,7 @@ def test_a_rig_that_is_held_names_its_holder(folder: DataFolder, store: HealthSt
     assert done(desk, wait=True).state is JobState.SUCCEEDED
 
 
-def test_a_rig_without_a_calibration_is_told_what_to_do(folder: DataFolder, store: HealthStore) -> None:
+def test_rig_without_a_calibration_fails_with_a_remedy(folder: DataFolder, store: HealthStore) -> None:
     desk = desk_of(folder, store, queue_of(None))
     job = done(desk)
     assert job.state is JobState.FAILED
