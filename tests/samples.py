@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import tempfile
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 
+from slrig.jobs.database import Database
 from slrig.model import (
     Axis,
     Black,
@@ -64,3 +69,19 @@ def sample_calibration(*, cameras: tuple[str, ...] = ("left", "right")) -> Calib
     """A calibration for `sample_capture`."""
     devices = {name: pinhole(turn_rad=0.1 * place) for place, name in enumerate(cameras)}
     return Calibration(devices, pinhole(PROJECTOR, turn_rad=-0.2))
+
+
+@cache
+def _empty_database() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "slrig.sqlite"
+        Database(path).close()
+        return path.read_bytes()
+
+
+def put_database(path: Path) -> Path:
+    """Put the file of an empty database there, unless one is there: to make its tables takes three times as long."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists():
+        path.write_bytes(_empty_database())
+    return path

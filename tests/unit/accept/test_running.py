@@ -49,7 +49,7 @@ PLAN = acceptance_plan(
     RIG, VOLUME, replace(GOOD, expansion_per_k=0.0), rendered=True, limits=usual_limits(VOLUME, 0.02), repeats=2
 )
 NOISE_MM = 0.005
-GRID = 60
+GRID = 40
 
 
 def step_of(artefact: Artefact, number: int = 1) -> Step:

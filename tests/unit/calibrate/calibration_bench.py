@@ -27,6 +27,7 @@ from slrig.jobs.store import JobStore
 from slrig.model import Calibration, Pinhole, Size, Solved
 from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import Progress, ScanPlan
+from tests.samples import put_database
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S, TameBench, TameRecording
 
@@ -181,6 +182,7 @@ class CalibrationBench(Bench):
     """A runner over a tame bench, and calibrations over it."""
 
     def __init__(self, tmp_path: Path, *, positioner: bool = False) -> None:
+        put_database(tmp_path / "data" / "slrig.sqlite")
         super().__init__(tmp_path)
         self.tame = TameCalibrating(self)
         self._positioner = positioner

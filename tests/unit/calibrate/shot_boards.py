@@ -33,18 +33,12 @@ _WHITE = 0.85
 class Standing:
     """Where a board stands before the rig, and how it is seen.
 
-    away : nothing but the wall is in view. dark : albedo of the ink. white : the brightest paper over full scale.
-    blur_px, scale : of the camera, and its pixels over those of the rig file.
+    away : nothing but the wall is in view.
     """
 
     rotation_deg: tuple[float, float, float] = ROTATION_DEG
     position_mm: tuple[float, float, float] = POSITION_MM
-    board: Board = BOARD
     away: bool = False
-    dark: float = 0.05
-    white: float = _WHITE
-    blur_px: float = 0.6
-    scale: float = _SCALE
 
     def shifted(self, shift_mm: tuple[float, float, float]) -> Standing:
         x, y, z = (here + by for here, by in zip(self.position_mm, shift_mm, strict=True))
@@ -61,11 +55,11 @@ def patterns_for(size: Size, *, line_shift: bool = True) -> tuple[Pattern, ...]:
 
 @cache
 def exposed(standing: Standing) -> tuple[ExposedView, View]:
-    """The rig's camera before a board, exposed so that its brightest paper comes to `standing.white`."""
+    """The rig's camera before a board, exposed so that its brightest paper comes to `_WHITE` of full scale."""
     table = tomllib.loads(_RIG.read_text(encoding="utf-8"))["head"]
     head = {key: table[key] for key in ("scene", "seed", "samples_per_axis", "ambient")}
-    head["projector"] = _scaled(table["projector"], standing.scale)
-    head["camera"] = [_scaled(table["camera"][0], standing.scale) | {"blur_px": standing.blur_px}]
+    head["projector"] = _scaled(table["projector"], _SCALE)
+    head["camera"] = [_scaled(table["camera"][0], _SCALE) | {"blur_px": 0.6}]
     options = HeadOptions.model_validate(head)
     eye, lamp = options.camera[0], options.projector
     stage = Stage(
@@ -80,7 +74,7 @@ def exposed(standing: Standing) -> tuple[ExposedView, View]:
     sensor = eye.sensor()
     full = ExposedView(view, lamp.size, lamp.response(), sensor, sensor.saturation_s)
     brightest = float(np.percentile(full.ends[0], 99.9)) / sensor.full_well_e
-    return replace(full, exposure_s=sensor.saturation_s * standing.white / brightest), view
+    return replace(full, exposure_s=sensor.saturation_s * _WHITE / brightest), view
 
 
 def shot(
@@ -130,9 +124,9 @@ def position_at(truth: CameraTruth, pixels_px: FloatArray, axis: int) -> FloatAr
 def _scene(standing: Standing) -> Scene:
     wall = {"shape": "plane", "size_mm": [900.0, 800.0], "position_mm": [0.0, 0.0, 260.0], "albedo": 0.35}
     board = {
-        "shape": "board", "kind": standing.board.kind.value, "columns": standing.board.columns,
-        "rows": standing.board.rows, "square_mm": standing.board.square_mm, "position_mm": standing.position_mm,
-        "rotation_deg": standing.rotation_deg, "albedo_dark": standing.dark,
+        "shape": "board", "kind": BOARD.kind.value, "columns": BOARD.columns,
+        "rows": BOARD.rows, "square_mm": BOARD.square_mm, "position_mm": standing.position_mm,
+        "rotation_deg": standing.rotation_deg, "albedo_dark": 0.05,
     }  # fmt: skip
     return Scene.model_validate({"object": [wall] if standing.away else [board, wall]})
 

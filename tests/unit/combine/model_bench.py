@@ -22,6 +22,7 @@ from slrig.model import MeasuredAxis, StagePlane
 from slrig.scan.plan import Progress, ScanPlan
 from slrig.scan.records import plan_json
 from slrig.scan.sweep import sweep
+from tests.samples import put_database
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S
 
@@ -105,6 +106,7 @@ class ModelBench(Bench):
     """A desk for models and a runner of scans. start : begin at once; else what is taken up waits for that."""
 
     def __init__(self, root: Path, *, keep: int = 100, start: bool = True, axis: MeasuredAxis | None = None) -> None:
+        put_database(root / "data" / "slrig.sqlite")
         super().__init__(root)
         self.tame = TameCombining()
         self.models = JobStore(self.store.database, JobKind.MODEL)

@@ -12,6 +12,7 @@ from slrig.jobs.database import Database
 from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
+from tests.samples import put_database
 
 START = datetime(2026, 11, 23, 5, 0, tzinfo=UTC)
 """A Monday."""
@@ -28,7 +29,8 @@ class Desk:
         self.told: list[tuple[datetime, RunState]] = []
         self.during: Callable[[], None] = lambda: None
         self.store = ScheduleStore(
-            Database(database), notice=lambda _session, _schedule, run: self.told.append((run.due, run.state))
+            Database(put_database(database)),
+            notice=lambda _session, _schedule, run: self.told.append((run.due, run.state)),
         )
         self.scheduler = Scheduler(
             self.store,

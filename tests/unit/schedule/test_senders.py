@@ -21,6 +21,7 @@ from slrig.schedule.mqtt import Broker
 from slrig.schedule.receivers import senders_of, wanted_kinds
 from slrig.schedule.sending import Sender
 from slrig.schedule.webhook import Webhook, signature, signing_key
+from tests.samples import put_database
 from tests.unit.jobs.tame_queue import PowerCut
 from tests.unit.scan.fakes import WAIT_S, SetClock
 from tests.unit.schedule.hook import PATH, SECRET, Hook, own_certificate, signed
@@ -35,7 +36,7 @@ class Bench:
 
     def __init__(self, folder: Path, url: str, *, most: int = 10_000, **broker: Any) -> None:
         self.clock = SetClock()
-        self.database = Database(folder / "slrig.sqlite")
+        self.database = Database(put_database(folder / "slrig.sqlite"))
         receiver = "mqtt" if url.startswith("mqtt") else "webhook"
         wanted = {receiver: get_args(NoticeKind)}
         self.outbox = Outbox(self.database, rig="bench", wanted=wanted, clock=self.clock, most=most)
