@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -156,6 +157,7 @@ def test_sound_rig_is_sound_by_any_trigger_though_frames_are_lost(rig: Rig, trig
     # A camera that waits for its trigger while the projector works sees no flash as it happens.
     timed = "timing.late" if trigger is Trigger.FREE else "timing.punctual"
     assert timed in names(diagnosis, Severity.OK)
+    assert any(re.search(r"\b[1-9]\d% of full scale", each.found) for each in diagnosis.findings)
     order = list(dict.fromkeys(steps))
     assert order[:2] == ["patterns", "light"]
     assert "flashes before eye" in order

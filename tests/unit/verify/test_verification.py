@@ -286,6 +286,7 @@ def test_thresholds_and_the_recalibration_are_named() -> None:
     for words in ("stated", "watch, 1.4 x", "stale, 3 x", "watch (mean)", "stale (mean)"):
         assert words in texts
     assert texts.count("calibrated") == 1
+    assert health_svg(warm_up()).count('stroke-dasharray="2 3"') == 1, "a line where it was calibrated again"
     assert "left - projector" in texts
     odd = VerificationRecord(1, UUID(int=1), hours(0), "<b>", warm_up()[0].found, judged([]))
     assert "<b>" not in health_svg([odd, warm_up()[0]])
