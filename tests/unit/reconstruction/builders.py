@@ -22,7 +22,7 @@ from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.linking import StripeEnsemble
 from slrig.reconstruction.stripes import Stripes
 
-_TO_THE_LAST_BIT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 300, 1e-15)
+_TO_THE_LAST_BIT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-15)
 
 
 def looking(

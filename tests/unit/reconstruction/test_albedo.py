@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.model import AlbedoMark, FloatArray, Pinhole
+from slrig.model import AlbedoMark, FloatArray, Pinhole, Size
 from slrig.reconstruction.albedo import (
     BRIGHT_ALBEDO,
     BRIGHT_PERCENT,
@@ -20,9 +20,18 @@ from slrig.reconstruction.albedo import (
     albedo,
     sampled,
 )
-from tests.unit.reconstruction.builders import CAMERA, OTHER_CAMERA, PROJECTOR, Sphere, opencv_rays
+from tests.unit.reconstruction import builders
+from tests.unit.reconstruction.builders import PROJECTOR, Sphere, opencv_rays
 
 BALL = Sphere()
+
+
+def coarse(device: Pinhole) -> Pinhole:
+    """The device with a sixth of its pixels."""
+    return replace(device, size=Size(256, 192), matrix=device.matrix * [[0.4], [0.4], [1.0]])
+
+
+CAMERA, OTHER_CAMERA = coarse(builders.CAMERA), coarse(builders.OTHER_CAMERA)
 SHAPE = CAMERA.size.shape
 SOUND = (AlbedoMark.NONE, AlbedoMark.SHADED)
 
@@ -48,7 +57,7 @@ def normals_of(points_mm: FloatArray) -> FloatArray:
 
 def seen_by(device: Pinhole, gain: float = 1.0, channels: int = 1) -> LitView:
     """The ball before a camera whose values are `gain` times as large as another's."""
-    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]].reshape(2, -1).astype(np.float64)
+    rows, columns = np.indices(SHAPE).reshape(2, -1).astype(np.float64)
     points = on_ball(device, np.stack([columns, rows], axis=1))
     decoded = np.isfinite(points[:, 0])
     light = np.zeros((len(points), channels), dtype=np.float32)
@@ -62,7 +71,7 @@ def on_ball(device: Pinhole, pixels_px: FloatArray) -> FloatArray:
         return BALL.seen_along(device.centre_mm, opencv_rays(device, pixels_px))
 
 
-def points_in(*views: LitView, shared: bool = True, count: int = 4000) -> LitPoints:
+def points_in(*views: LitView, shared: bool = True, count: int = 3000) -> LitPoints:
     """Random points that each camera sees, lit; those of the first are seen by all others as well."""
     random = np.random.default_rng(1)
     parts, pixels = [], []

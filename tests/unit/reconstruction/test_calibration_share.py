@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import cv2
@@ -286,17 +285,3 @@ def test_tangents_follow_the_curve_and_stop_at_bridges() -> None:
     )
     assert tangents[:5, 1] == pytest.approx([3, 3, 3, 1, 1])
     assert np.isnan(tangents[5:]).all()
-
-
-def test_the_share_of_many_vertices_takes_little_time() -> None:
-    calibration = calibrated({"left": left_camera()}, light_source())
-    few, few_normals = surface(400, 10)
-    points, normals = np.tile(few, (250, 1)), np.tile(few_normals, (250, 1))
-    source, camera = np.zeros(len(points), dtype=np.uint8), np.zeros(len(points), dtype=np.int32)
-    modes = calibration_modes(calibration, ["left"], Axis.COLUMN)
-    assert modes is not None
-    calibration_sigma(modes, points[:10], normals[:10], source[:10], camera[:10], none(10))
-    began_s = time.process_time()
-    calibration_sigma(modes, points, normals, source, camera, none(len(points)))
-    # Measured: 0.03 s of processor time; the limit leaves room for slower machines.
-    assert time.process_time() - began_s < 0.3

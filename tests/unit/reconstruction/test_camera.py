@@ -152,17 +152,6 @@ def test_code_edges_stand_for_lines_where_those_are_not_resolved() -> None:
     assert sharp.ensemble.points_px.tobytes() == plain.ensemble.points_px.tobytes()
 
 
-@pytest.mark.parametrize("noise", [2.0, 4.0])
-def test_stated_deviations_are_those_of_the_noise(noise: float) -> None:
-    curves, _ = walk(rendered(slope, patterns(), noise=noise))
-    for level in (15, 60, 120):
-        variance = curves.noise.variance(np.full((1, 1), level, dtype=np.float32))[0, 0]
-        assert variance == pytest.approx(noise**2 + 1 / 12, rel=0.2)
-    # 0.52 columns per pixel; the albedo makes some stripes surer than others.
-    missed = errors_px(curves, slope) / np.hypot(0.52, 0.03) / curves.ensemble.sigma_px
-    assert np.sqrt(np.mean(missed**2)) == pytest.approx(1.0, rel=0.1)
-
-
 def test_without_line_frames_code_edges_stand_in() -> None:
     curves, _ = walk(rendered(slope, patterns(line_shift=False, cell_px=2)))
     position = curves.ensemble.position_px
@@ -263,29 +252,6 @@ def test_a_dark_room_gives_no_curves() -> None:
     assert (curves.refusal == Refusal.NOT_LIT).all()
 
 
-def test_the_same_frames_give_the_same_curves() -> None:
-    capture = rendered(cliff, patterns())
-    arrays: list[list[NDArray[np.generic]]] = []
-    for _ in range(2):
-        ensemble = walk(capture)[0].ensemble
-        arrays.append([ensemble.points_px, ensemble.sigma_px, ensemble.offsets, ensemble.bridge_after])
-    for one, other in zip(*arrays, strict=True):
-        assert one.tobytes() == other.tobytes()
-
-
-def test_lines_are_looked_for_in_the_frames_that_show_them() -> None:
-    every = rendered(slope, patterns())
-    shown = [p for p in every.patterns if not isinstance(p, LineShift) or p.shift in (1, 6)]
-    shots = tuple(
-        Shot(shown.index(every.patterns[s.pattern]), s.camera, s.image)
-        for s in every.shots
-        if every.patterns[s.pattern] in shown
-    )
-    curves, _ = walk(Capture(PROJECTOR, tuple(shown), every.cameras, shots))
-    assert {int(p) % 8 for p in curves.ensemble.position_px} == {1, 6}
-    assert np.sqrt(np.mean(errors_px(curves, slope) ** 2)) < 0.03
-
-
 def streamed(capture: Capture, order: Sequence[int], entered: Callable[[str], None] = lambda _: None) -> CameraCurves:
     """The curves by the frames that tell, as they come in this order."""
     shots = telling_shots(capture, "eye")
@@ -317,16 +283,6 @@ def test_frames_that_come_one_by_one_in_any_order_give_the_same_bits(line_shift:
             assert getattr(got.ensemble, name).tobytes() == getattr(wanted.ensemble, name).tobytes()
         assert got.refusal.tobytes() == wanted.refusal.tobytes()
         assert (got.scale_px, got.stripe_count) == (wanted.scale_px, wanted.stripe_count)
-
-
-def test_nothing_waits_once_every_frame_is_in() -> None:
-    capture = rendered(slope, patterns())
-    count = len(telling_shots(capture, "eye"))
-    told: list[str] = []
-    streamed(capture, range(count), told.append)
-    last = told.index(f"frame {count - 1}")
-    assert told[last + 1 :] == ["locate stripes", "refine stripes", "identify stripes", "link stripes", "finish"]
-    assert "refine stripes" not in told[:last]
 
 
 def bent(image: NDArray[np.uint8], _: np.random.Generator) -> NDArray[np.uint8]:

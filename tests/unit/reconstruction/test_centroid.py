@@ -76,49 +76,12 @@ def test_smooth_texture_of_seven_to_one_bends_it_a_tenth_as_much() -> None:
     assert np.sqrt((after**2).mean()) < 0.2 * np.sqrt((before**2).mean())
 
 
-def test_rows_are_treated_as_columns_are() -> None:
-    x = fine_x()
-    measured, white = seen_through_blur(np.exp(0.4 * np.sin(x)), 40 + 1.1 * x)
-    across = at_pixel_centres(PositionMap(as_map(measured), as_map(0 * measured)), as_map(white), NOISELESS, BLUR_PX)
-    down = at_pixel_centres(
-        PositionMap(as_map(measured).T.copy(), as_map(0 * measured).T.copy()),
-        as_map(white).T.copy(),
-        NOISELESS.T.copy(),
-        BLUR_PX,
-    )
-    np.testing.assert_array_equal(down.position.T[2], across.position[2])
-
-
 def test_an_even_surface_stays_as_it_is() -> None:
     position = as_map(40 + 1.3 * np.arange(30.0))
     sigma = np.full_like(position, 0.02)
     centred = at_pixel_centres(PositionMap(position, sigma), np.full_like(position, 100), 0 * position, BLUR_PX)
     np.testing.assert_array_equal(centred.position, position)
     np.testing.assert_array_equal(centred.sigma, sigma)
-
-
-def test_pixels_at_the_border_or_beside_no_light_stay_as_they_are() -> None:
-    position = as_map(40 + 1.3 * np.arange(30.0))
-    position[2, 10] = np.nan
-    contrast = np.tile(np.linspace(20, 200, 30), (5, 1)).astype(np.float32)
-    contrast[2, 20] = 0
-    centred = at_pixel_centres(PositionMap(position, np.zeros_like(position)), contrast, 0 * contrast, BLUR_PX).position
-    assert np.isnan(centred[2, 10])
-    # Beside an unlit pixel there is no brightness on one side, at the map's border no slope.
-    np.testing.assert_array_equal(centred[2, [0, 19, 21, 29]], position[2, [0, 19, 21, 29]])
-    assert (centred[2, [5, 6, 14, 15, 16, 25]] != position[2, [5, 6, 14, 15, 16, 25]]).all()
-
-
-def test_a_step_of_the_surface_does_not_enter_the_slope() -> None:
-    x = np.arange(40.0)
-    position = as_map(40 + 1.2 * x + np.where(x > 20, 30.0, 0.0))
-    contrast = np.tile(np.exp(0.1 * x), (5, 1)).astype(np.float32)
-    centred = at_pixel_centres(PositionMap(position, np.zeros_like(position)), contrast, 0 * contrast, BLUR_PX).position
-    moved = (position - centred)[2]
-    clear = np.r_[3:20, 23:37]
-    # Pixels at the step do not move, which bends the slope of those beside them by what they should have moved.
-    np.testing.assert_allclose(moved[clear], BLUR_PX**2 * 1.2 * 0.1, rtol=0.02)
-    np.testing.assert_array_equal(moved[20:22], 0)
 
 
 def test_noise_of_white_and_black_hardly_enters() -> None:

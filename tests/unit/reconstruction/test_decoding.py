@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.model import Axis, Gray, IntArray, Refusal, Size
+from slrig.model import Axis, Gray, IntArray, Refusal
 from slrig.patterns.positions import index_of_word
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames
@@ -132,12 +132,6 @@ def test_every_pixel_is_read_as_the_rules_say(*, paired: bool, noise: NoiseModel
 
 
 @pytest.mark.parametrize("paired", [True, False], ids=["inverses", "threshold"])
-def test_every_cell_is_read_exactly(*, paired: bool) -> None:
-    for cell in range(64):
-        assert read(one_pixel(swings_of(cell), paired=paired)) == (cell, cell, Refusal.NONE)
-
-
-@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "threshold"])
 def test_a_bit_at_its_own_edge_leaves_two_neighbours(*, paired: bool) -> None:
     for cell in range(63):
         swings = swings_of(cell)
@@ -207,18 +201,3 @@ def test_the_centre_of_an_interval_is_nan_where_refused() -> None:
         np.array([[4, -1]], dtype=np.int32), np.array([[5, -1]], dtype=np.int32), np.array([[0, 3]], dtype=np.uint8)
     )
     np.testing.assert_array_equal(code.centre(), [[4.5, np.nan]])
-
-
-def test_words_are_numbered_along_the_projector() -> None:
-    light = [word_of(cell) for cell in range(64)]
-    numbers = [int("".join(map(str, word)), 2) for word in light]
-    assert [int(WORDS[number]) for number in numbers] == list(range(64))
-    assert Size(256, 1).along(Axis.COLUMN) // 4 == 64
-
-
-def test_frames_are_left_alone() -> None:
-    frames = random_frames(1, paired=True)
-    before = [np.array(frames.bits), frames.white.copy(), frames.black.copy(), WORDS.copy()]
-    decode(frames, QUIET, WORDS, 50, LIMITS)
-    for array, earlier in zip([frames.bits, frames.white, frames.black, WORDS], before, strict=True):
-        np.testing.assert_array_equal(array, earlier)

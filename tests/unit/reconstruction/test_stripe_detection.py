@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from slrig.reconstruction.steger import (
     newton_step,
     taylor_step,
 )
-from slrig.reconstruction.stripes import LinePoints, StripeLimits, Stripes, chained, edge_points, stripe_points
+from slrig.reconstruction.stripes import LinePoints, StripeLimits, Stripes, chained, stripe_points
 from tests.unit.reconstruction.builders import gaussian_stripe, grid
 
 SHAPE = (80, 90)
@@ -71,11 +72,11 @@ def taylor_oracle(r: FloatArray, kind: int) -> tuple[float, float, float]:
 
 
 @KINDS
-@pytest.mark.parametrize("sigma", [1.0, 1.7])
-def test_the_first_step_is_stegers_equation(kind: int, sigma: float) -> None:
+@pytest.mark.parametrize(("sigma", "shape"), [(1.0, (70, 45)), (2.5, (40, 33)), (1.4, (70, 6))])
+def test_the_first_step_is_stegers_equation(kind: int, sigma: float, shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(9)
-    # More than one block of rows; narrow enough that borders, reflected about the outermost pixels, count.
-    image = gaussian_filter(rng.normal(0, 1, (70, 45)), 0.8).astype(np.float32)
+    # More than one block of rows; narrower than the kernel, too: borders are reflected about the outermost pixels.
+    image = gaussian_filter(rng.normal(0, 1, shape), 0.8).astype(np.float32)
     noise = rng.uniform(0.01, 0.05, image.shape).astype(np.float32)
     lit = np.asarray(rng.random(image.shape) < 0.9)
     sampled = kernels(sigma)
@@ -96,7 +97,7 @@ def test_the_first_step_is_stegers_equation(kind: int, sigma: float) -> None:
             wanted = (0.0, 0.0, 0.0)
         np.testing.assert_allclose([*offset[y, x], strength[y, x]], wanted, rtol=1e-3, atol=3e-4)
         kept += wanted[2] > 0
-    assert 0.05 * image.size < kept < 0.6 * image.size
+    assert 10 < kept < 0.6 * image.size
 
 
 def newton_oracle(
@@ -154,6 +155,42 @@ def test_the_second_step_is_a_correlation_with_kernels_centred_on_the_point(kind
             assert abs(float(normals[i] @ wanted[1])) == pytest.approx(1, abs=1e-9)
             assert strength[i] == pytest.approx(wanted[2], rel=1e-9)
     assert 40 < kept.sum() < 860
+
+
+@KINDS
+@pytest.mark.parametrize("shape", [(20, 60), (20, 7)])
+def test_unlit_margins_change_nothing_between_them(kind: int, shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(6)
+    image, noise = rng.normal(0, 1, shape).astype(np.float32), np.full(shape, 0.1, dtype=np.float32)
+    everywhere = taylor_step(image, noise, np.ones(shape, dtype=np.bool_), np.float32(0.5), *kernels(1.2), kind)
+    for begin, end in ((0, 3), (2, 4), (shape[1] - 1, shape[1]), (shape[1] // 2, shape[1] - 1)):
+        lit = np.zeros(shape, dtype=np.bool_)
+        lit[3:-1, begin:end] = rng.uniform(0, 1, (16, end - begin)) > 0.3
+        offset, response = taylor_step(image, noise, lit, np.float32(0.5), *kernels(1.2), kind)
+        np.testing.assert_array_equal(response, np.where(lit, everywhere[1], 0))
+        np.testing.assert_array_equal(offset, np.where(lit[..., None], everywhere[0], 0))
+
+
+@KINDS
+@pytest.mark.parametrize("beyond", [(0, 0), (0, 3), (4, 0), (2, 2)])
+def test_second_step_ends_with_the_image(kind: int, beyond: tuple[int, int]) -> None:
+    # Its window, 11 pixels wide, ends with the image's last pixel: no others may count, nor be read.
+    rng = np.random.default_rng(9)
+    wide = cv2.GaussianBlur(rng.normal(0, 1, (40, 40)).astype(np.float32), (0, 0), 2.0)
+    rows, columns = np.arange(10, 30, dtype=np.int32), rng.integers(10, 30, 20).astype(np.int32)
+    offset = np.zeros((40, 40, 2), dtype=np.float32)
+    wanted = newton_step(wide, offset, columns, rows, 1.3, kind)
+    assert wanted[4].any()
+    for i in range(len(rows)):
+        top, left = rows[i] - 5 - beyond[0], columns[i] - 5 - beyond[1]
+        cut = np.ascontiguousarray(wide[top : rows[i] + 6, left : columns[i] + 6])
+        at = np.array([5 + beyond[1]], dtype=np.int32), np.array([5 + beyond[0]], dtype=np.int32)
+        x, y, normals, response, kept = newton_step(cut, offset[: len(cut), : cut.shape[1]].copy(), *at, 1.3, kind)
+        assert kept[0] == wanted[4][i]
+        if kept[0]:
+            np.testing.assert_allclose([x[0] + left, y[0] + top], [wanted[0][i], wanted[1][i]], atol=1e-10)
+            np.testing.assert_allclose(normals[0], wanted[2][i], atol=1e-10)
+            assert response[0] == pytest.approx(wanted[3][i], rel=1e-10)
 
 
 @pytest.mark.parametrize("sigma", [1.0, 1.4, 2.5])
@@ -214,14 +251,6 @@ def test_noise_alone_makes_no_stripe() -> None:
     assert len(found(image, noise=0.05)) == 0
 
 
-def test_points_lie_on_lit_pixels_only() -> None:
-    x, y = grid(SHAPE)
-    lit = np.asarray(y < 30)
-    points = found(gaussian_stripe(x - 45.2, 1.2), lit=lit).points_px
-    assert len(points) > 20
-    assert points[:, 1].max() < 30.5
-
-
 def test_nothing_is_found_where_the_kernel_leaves_the_image() -> None:
     x, y = grid(SHAPE)
     stripes = found(gaussian_stripe(x - 2.0, 1.2) + gaussian_stripe(y - 40.0, 1.2))
@@ -268,14 +297,3 @@ def test_no_frames_and_frames_without_points_have_no_stripes() -> None:
     assert nothing.offsets.tolist() == [0]
     assert nothing.points_px.shape == nothing.normals.shape == (0, 2)
     assert len(nothing.sigma_px) == len(nothing.frame) == 0
-
-
-def test_the_frame_is_left_alone() -> None:
-    x, _ = grid(SHAPE)
-    image = gaussian_stripe(x - 45.2, 1.2)
-    before = image.copy()
-    found(image)
-    edge_points(
-        image, np.full(SHAPE, 0.01, dtype=np.float32), np.ones(SHAPE, dtype=np.bool_), StripeLimits(), sigma_px=1.0
-    )
-    np.testing.assert_array_equal(image, before)
