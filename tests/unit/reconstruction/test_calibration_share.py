@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -23,6 +24,8 @@ from tests.unit.calibration.perturbed import (
     right_camera,
 )
 
+# Scans by an uncalibrated or exact rig need none of these kernels, which take seconds to compile.
+pytestmark = pytest.mark.slow
 BOX = np.array([[-60.0, -50, 550], [60, 50, 660]])
 NAMES = ("left", "right")
 
@@ -129,8 +132,31 @@ def sigma_of(moves: list[FloatArray], normals: NDArray[np.float32]) -> FloatArra
     return np.asarray(np.sqrt(sum(np.einsum("ni,ni->n", normals, move) ** 2 for move in moves)))
 
 
-def none(count: int) -> FloatArray:
-    return np.full((count, 3), np.nan)
+def share(
+    calibration: Calibration,
+    points: FloatArray,
+    normals: NDArray[np.float32],
+    *,
+    cameras: Sequence[str] = ("left",),
+    axis: Axis = Axis.COLUMN,
+    source: int = 0,
+    camera: int = 0,
+    tangents: FloatArray | None = None,
+) -> FloatArray:
+    """The share in points that are all of one source and camera; tangents : NaN for none."""
+    modes = calibration_modes(calibration, cameras, axis)
+    assert modes is not None
+    count = len(points)
+    return calibration_sigma(
+        modes, points, normals, np.full(count, source, dtype=np.uint8), np.full(count, camera, dtype=np.int32),
+        np.full((count, 3), np.nan) if tangents is None else tangents,
+    )  # fmt: skip
+
+
+def changes(calibration: Calibration) -> FloatArray:
+    """Independent errors of the parameters, one a row."""
+    assert calibration.solved is not None
+    return factor(calibration.solved.covariance).T
 
 
 @pytest.mark.parametrize("axis", [Axis.COLUMN, Axis.ROW])
@@ -143,55 +169,44 @@ def test_the_share_of_a_camera_and_a_projector(axis: Axis) -> None:
             projector, rotation=turn @ projector.rotation, translation_mm=turn @ projector.translation_mm
         )
     calibration = calibrated({"left": camera}, projector)
-    points, normals = surface(300, 1, camera, projector)
+    points, normals = surface(100, 1, camera, projector)
     places = places_in_box(camera, projector)
     row = int(axis is Axis.ROW)
-    assert calibration.solved is not None
     moves = []
-    for change in factor(calibration.solved.covariance).T:
+    for change in changes(calibration):
         field = by_light(camera, projector, points, change, row)
         moves.append(without_rigid(field, by_light(camera, projector, places, change, row), points, places))
     modes = calibration_modes(calibration, ["left"], axis)
     assert modes is not None
     assert modes.modes.shape[1] < 21
-    found = calibration_sigma(
-        modes, points, normals, np.zeros(len(points), dtype=np.uint8), np.zeros(len(points), dtype=np.int32),
-        none(len(points)),
-    )  # fmt: skip
     expected = sigma_of(moves, normals)
-    assert np.abs(found / expected - 1).max() < 0.01
+    assert np.abs(share(calibration, points, normals, axis=axis) / expected - 1).max() < 0.01
 
 
 def test_the_share_of_two_cameras() -> None:
     left, right = left_camera(), right_camera()
     calibration = calibrated({"left": left, "right": right}, None)
-    points, normals = surface(250, 3)
+    points, normals = surface(100, 3)
     places = places_in_box(left, right)
     tangents = np.cross(normals, [1.0, 0.3, 0.1])
-    assert calibration.solved is not None
     moves = []
-    for change in factor(calibration.solved.covariance).T:
+    for change in changes(calibration):
         rigid = by_stripe(left, right, places, epipolar_tangents(places), change)
         moves.append(without_rigid(by_stripe(left, right, points, tangents, change), rigid, points, places))
-    modes = calibration_modes(calibration, NAMES, Axis.COLUMN)
-    assert modes is not None
-    source = np.full(len(points), Source.CAMERA_CAMERA, dtype=np.uint8)
-    found = calibration_sigma(modes, points, normals, source, np.zeros(len(points), dtype=np.int32), tangents)
-    assert np.abs(found / sigma_of(moves, normals) - 1).max() < 0.01
-    across = calibration_sigma(
-        modes, points, normals, source, np.zeros(len(points), dtype=np.int32), epipolar_tangents(points)
-    )
-    without = calibration_sigma(
-        modes, points, normals, source, np.zeros(len(points), dtype=np.int32), none(len(points))
-    )
-    assert without == pytest.approx(across, rel=1e-4)
+
+    def found(tangents: FloatArray | None) -> FloatArray:
+        source = int(Source.CAMERA_CAMERA)
+        return share(calibration, points, normals, cameras=NAMES, source=source, tangents=tangents)
+
+    assert np.abs(found(tangents) / sigma_of(moves, normals) - 1).max() < 0.01
+    assert found(None) == pytest.approx(found(epipolar_tangents(points)), rel=1e-4)
 
 
 def test_the_share_of_two_cameras_and_a_projector() -> None:
     """Points of either camera, and the mean of both by how far each sees a point move along the projector's ray."""
     left, right, projector = left_camera(), right_camera(), light_source()
     calibration = calibrated({"left": left, "right": right}, projector)
-    points, normals = surface(200, 5)
+    points, normals = surface(100, 5)
     places = places_in_box(projector)
     places = places[inside(left, places) | inside(right, places)]
 
@@ -207,22 +222,16 @@ def test_the_share_of_two_cameras_and_a_projector() -> None:
     def moved(at: FloatArray, change: FloatArray) -> list[FloatArray]:
         own = [np.concatenate([change[15 * k : 15 * k + 15], change[30:]]) for k in range(2)]
         single = [by_light(each, projector, at, own[k], 0) for k, each in enumerate((left, right))]
-        share = parts(at)
-        return [*single, share[0][:, None] * single[0] + share[1][:, None] * single[1]]
+        part = parts(at)
+        return [*single, part[0][:, None] * single[0] + part[1][:, None] * single[1]]
 
-    assert calibration.solved is not None
     moves: list[list[FloatArray]] = [[], [], []]
-    for change in factor(calibration.solved.covariance).T:
+    for change in changes(calibration):
         rigid = moved(places, change)[2]
         for kind, field in enumerate(moved(points, change)):
             moves[kind].append(without_rigid(field, rigid, points, places))
-    modes = calibration_modes(calibration, NAMES, Axis.COLUMN)
-    assert modes is not None
     for kind, (source, camera) in enumerate(((0, 0), (0, 1), (int(Source.ALL), 0))):
-        found = calibration_sigma(
-            modes, points, normals, np.full(len(points), source, dtype=np.uint8),
-            np.full(len(points), camera, dtype=np.int32), none(len(points)),
-        )  # fmt: skip
+        found = share(calibration, points, normals, cameras=NAMES, source=source, camera=camera)
         assert np.abs(found / sigma_of(moves[kind], normals) - 1).max() < 0.01
 
 
@@ -235,38 +244,23 @@ def test_cameras_in_another_order_and_one_that_is_not_in_the_scan() -> None:
     alone = Calibration(
         {"left": left}, projector, replace(whole.solved, covariance=whole.solved.covariance[np.ix_(kept, kept)])
     )
-    shares = []
-    for calibration in (whole, alone):
-        modes = calibration_modes(calibration, ["left"], Axis.COLUMN)
-        assert modes is not None
-        source, camera = np.zeros(len(points), dtype=np.uint8), np.zeros(len(points), dtype=np.int32)
-        shares.append(calibration_sigma(modes, points, normals, source, camera, none(len(points))))
-    assert shares[0] == pytest.approx(shares[1])
+    assert share(whole, points, normals) == pytest.approx(share(alone, points, normals))
 
 
 def test_without_a_normal_the_viewing_ray_stands() -> None:
     calibration = calibrated({"left": left_camera()}, light_source())
     points, _ = surface(30, 8)
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
-    modes = calibration_modes(calibration, ["left"], Axis.COLUMN)
-    assert modes is not None
-    source, camera = np.zeros(len(points), dtype=np.uint8), np.zeros(len(points), dtype=np.int32)
-    along = calibration_sigma(modes, points, rays.astype(np.float32), source, camera, none(len(points)))
+    along = share(calibration, points, rays.astype(np.float32))
     unknown = np.full((len(points), 3), np.nan, dtype=np.float32)
-    found = calibration_sigma(modes, points, unknown, source, camera, none(len(points)))
-    assert found == pytest.approx(along, rel=1e-4)
+    assert share(calibration, points, unknown) == pytest.approx(along, rel=1e-4)
 
 
 def test_a_calibration_without_covariance_has_no_modes_and_an_exact_one_no_share() -> None:
     plain = Calibration({"left": left_camera()}, light_source())
     assert calibration_modes(plain, ["left"], Axis.COLUMN) is None
     exact = Calibration(plain.cameras, plain.projector, Solved("id", "now", np.zeros((30, 30)), BOX, 0.0))
-    modes = calibration_modes(exact, ["left"], Axis.COLUMN)
-    assert modes is not None
-    points, normals = surface(5, 9)
-    zero = np.zeros(len(points))
-    found = calibration_sigma(modes, points, normals, zero.astype(np.uint8), zero.astype(np.int32), none(len(points)))
-    assert (found == 0).all()
+    assert (share(exact, *surface(5, 9)) == 0).all()
 
 
 def test_a_volume_that_no_device_sees_is_refused_with_words() -> None:

@@ -50,9 +50,9 @@ def swings_of(cell: int) -> list[float]:
     return [2.0 * bit - 1.0 for bit in word_of(cell)]
 
 
-def read(frames: AxisFrames, *, cells: int = 64, limits: DecodingLimits = LIMITS) -> tuple[int, int, Refusal]:
+def read(frames: AxisFrames, *, cells: int = 64) -> tuple[int, int, Refusal]:
     """(lowest, highest, refusal) of the only pixel."""
-    code = decode(frames, QUIET, WORDS, cells, limits)
+    code = decode(frames, QUIET, WORDS, cells, LIMITS)
     return int(code.lowest[0, 0]), int(code.highest[0, 0]), Refusal(int(code.refusal[0, 0]))
 
 
@@ -132,68 +132,61 @@ def test_every_pixel_is_read_as_the_rules_say(*, paired: bool, noise: NoiseModel
 
 
 @pytest.mark.parametrize("paired", [True, False], ids=["inverses", "threshold"])
-def test_a_bit_at_its_own_edge_leaves_two_neighbours(*, paired: bool) -> None:
+def test_a_cell_is_read_exactly_and_at_its_edge_as_one_of_two_neighbours(*, paired: bool) -> None:
     for cell in range(63):
         swings = swings_of(cell)
-        turning = next(b for b in range(BITS) if swings[b] != swings_of(cell + 1)[b])
-        swings[turning] = 0.0
+        assert read(one_pixel(swings, paired=paired)) == (cell, cell, Refusal.NONE)
+        swings[turning(cell)] = 0.0
         assert read(one_pixel(swings, paired=paired)) == (cell, cell + 1, Refusal.NONE)
 
 
-def test_a_coarse_bit_in_doubt_away_from_its_edge_is_refused() -> None:
-    # Bit 0 changes between cells 31 and 32 only; in doubt at cell 5 it could mean 5 or 58.
-    swings = swings_of(5)
-    swings[0] = 0.0
-    assert read(one_pixel(swings)) == (-1, -1, Refusal.AMBIGUOUS_BIT)
+def turning(cell: int) -> int:
+    """The bit that changes between a cell and the next."""
+    return next(b for b in range(BITS) if swings_of(cell)[b] != swings_of(cell + 1)[b])
 
 
-def test_finest_bits_lost_in_blur_cost_resolution_only() -> None:
-    swings = swings_of(21)
-    swings[-1] = swings[-2] = 0.0
-    assert read(one_pixel(swings)) == (20, 23, Refusal.NONE)
+def with_bits(cell: int, **changed: float) -> AxisFrames:
+    """A pixel of a cell, some of its bits (b0 is the most significant) between black (-1) and white (1)."""
+    swings = swings_of(cell)
+    for name, swing in changed.items():
+        swings[int(name[1:])] = swing
+    return one_pixel(swings)
 
 
-def test_a_bit_just_outside_the_margin_is_certain_and_one_inside_is_not() -> None:
-    swings = swings_of(20)
-    swings[-1] = -0.09
-    assert read(one_pixel(swings)) == (20, 20, Refusal.NONE)
-    swings[-1] = -0.07
-    assert read(one_pixel(swings)) == (20, 21, Refusal.NONE)
-
-
-def test_more_doubts_than_are_followed_are_refused() -> None:
-    assert read(one_pixel([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])) == (-1, -1, Refusal.AMBIGUOUS_BIT)
-
-
-def test_an_interval_reaching_beyond_the_projector_ends_at_its_last_cell() -> None:
-    swings = swings_of(39)
-    turning = next(b for b in range(BITS) if swings[b] != swings_of(40)[b])
-    swings[turning] = 0.0
-    assert read(one_pixel(swings), cells=40) == (39, 39, Refusal.NONE)
-    assert read(one_pixel(swings_of(40)), cells=40) == (-1, -1, Refusal.BEYOND_PROJECTOR)
-
-
-@pytest.mark.parametrize("white", [21.0, 23.0])
-def test_what_the_projector_does_not_light_is_refused_first(white: float) -> None:
-    dark = one_pixel([0.0] * BITS, white=white, black=20.0)
-    assert read(dark) == (-1, -1, Refusal.NOT_LIT)
-
-
-def test_clipping_is_told_from_doubt() -> None:
-    # Ambient light lifts bit and inverse over full scale: they are equal, and no noise is to blame.
+def clipped() -> AxisFrames:
+    """Light from elsewhere lifts bit and inverse over full scale: they are equal, and no noise is to blame."""
     frames = one_pixel(swings_of(9), ambient=400.0)
-    clipped = code_frames(
-        bits=np.minimum(frames.bits, np.float32(255)),
-        inverses=np.minimum(frames.inverses, np.float32(255)) if frames.inverses is not None else None,
-        white=frames.white,
+    assert frames.inverses is not None
+    full = np.float32(255)
+    return code_frames(
+        bits=np.minimum(frames.bits, full), inverses=np.minimum(frames.inverses, full), white=frames.white,
         black=frames.black,
-    )
-    assert read(clipped) == (-1, -1, Refusal.SATURATED)
+    )  # fmt: skip
 
 
-def test_without_inverses_a_clipped_white_has_no_middle() -> None:
-    assert read(one_pixel(swings_of(9), white=255.0, paired=False))[2] is Refusal.SATURATED
-    assert read(one_pixel(swings_of(9), white=255.0))[2] is Refusal.NONE
+REFUSED = (-1, -1)
+READ: dict[str, tuple[AxisFrames, tuple[int, int], Refusal]] = {
+    # Bit 0 changes between cells 31 and 32 only; in doubt at cell 5 it could mean 5 or 58.
+    "a coarse bit in doubt away from its edge": (with_bits(5, b0=0.0), REFUSED, Refusal.AMBIGUOUS_BIT),
+    "the finest bits lost in blur": (with_bits(21, b4=0.0, b5=0.0), (20, 23), Refusal.NONE),
+    "just outside the margin": (with_bits(20, b5=-0.09), (20, 20), Refusal.NONE),
+    "just inside the margin": (with_bits(20, b5=-0.07), (20, 21), Refusal.NONE),
+    "more doubts than are followed": (one_pixel([1.0, *[0.0] * 5]), REFUSED, Refusal.AMBIGUOUS_BIT),
+    "the projector's last cell": (with_bits(39, **{f"b{turning(39)}": 0.0}), (39, 39), Refusal.NONE),
+    "beyond the projector": (with_bits(40), REFUSED, Refusal.BEYOND_PROJECTOR),
+    "not lit, whatever the bits": (one_pixel([0.0] * BITS, white=23.0, black=20.0), REFUSED, Refusal.NOT_LIT),
+    "clipped": (clipped(), REFUSED, Refusal.SATURATED),
+    "clipped white, which leaves no middle": (
+        one_pixel(swings_of(9), white=255.0, paired=False), REFUSED, Refusal.SATURATED,
+    ),
+    "clipped white beside inverses": (one_pixel(swings_of(9), white=255.0), (9, 9), Refusal.NONE),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", READ)
+def test_a_pixel_is_read_as_an_interval_or_refused_for_one_cause(case: str) -> None:
+    frames, interval, refusal = READ[case]
+    assert read(frames, cells=40) == (*interval, refusal)
 
 
 def test_the_centre_of_an_interval_is_nan_where_refused() -> None:
