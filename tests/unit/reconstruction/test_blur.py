@@ -49,8 +49,7 @@ def told(
     return told_blur(frames, seen_at, np.ones(SHAPE, dtype=np.bool_), expected_px)
 
 
-@pytest.mark.parametrize("blur_px", [0.4, 0.65, 1.0, 1.4])
-@pytest.mark.parametrize("focus_px", [0.3, 1.5])
+@pytest.mark.parametrize(("blur_px", "focus_px"), [(0.4, 0.3), (0.65, 1.5), (1.4, 1.5)])
 def test_lines_tell_the_blur_whatever_the_projectors(blur_px: float, focus_px: float) -> None:
     blur = told(blur_px, np.array([0.5, 1.9, 0.8, 1.5]), focus_px)
     assert blur.by_lines

@@ -48,8 +48,10 @@ def loss_in_fact(image: Image, seen: Image) -> NDArray[np.float64]:
     return np.asarray(np.mean(np.square(waves), axis=0, dtype=np.float64))
 
 
-@pytest.mark.parametrize("quality", [95, 90, 75, 50])
-@pytest.mark.parametrize(("colour", "limited"), [(False, False), (True, False), (False, True)])
+@pytest.mark.parametrize(
+    ("quality", "colour", "limited"),
+    [(95, False, False), (50, False, False), (90, True, False), (75, False, True)],
+)
 def test_the_loss_is_told_by_the_decoded_pixels(quality: int, colour: bool, limited: bool) -> None:
     seen = decoded(stripes(), quality, colour=colour, limited=limited)
     before = decoded(stripes(), 100, colour=colour, limited=limited)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,16 +20,20 @@ SHAPE = (300, 400)
 BITS = 9
 EVERYWHERE = np.ones(SHAPE, dtype=np.bool_)
 STENCIL = np.outer([1.0, 2.0, 3.0, 2.0, 1.0], [1.0, 2.0, 3.0, 2.0, 1.0])
+Kernel = tuple[tuple[float, ...], ...]
+ALONE: Kernel = ((1.0,),)
+SMOOTH: Kernel = ((1 / 16, 2 / 16, 1 / 16), (2 / 16, 4 / 16, 2 / 16), (1 / 16, 2 / 16, 1 / 16))
 PHASES = PixelSum(STENCIL, (0.12, 0.02))
 
 
-def noisy(kernel: FloatArray, *, bits: int = BITS, deviation: float = 2.0, rows: float = 0.0) -> AxisFrames:
+@cache
+def noisy(kernel: Kernel, *, bits: int = BITS, rows: float = 0.0) -> AxisFrames:
     """A plate under a code, with white noise run through a kernel, and with noise of whole rows."""
     random = np.random.default_rng(5)
     x, _ = grid(SHAPE)
 
     def seen(light: FloatArray | float) -> NDArray[np.float32]:
-        noise = deviation * convolve(random.standard_normal(SHAPE), kernel, mode="wrap")
+        noise = 2.0 * convolve(random.standard_normal(SHAPE), np.array(kernel), mode="wrap")
         noise += rows * random.standard_normal((SHAPE[0], 1))
         return np.asarray(30.0 + 0.02 * x + 120.0 * light + noise, dtype=np.float32)
 
@@ -42,7 +47,7 @@ def noisy(kernel: FloatArray, *, bits: int = BITS, deviation: float = 2.0, rows:
     )
 
 
-def by_sums(kernel: FloatArray, summed: PixelSum) -> float:
+def by_sums(kernel: Kernel, summed: PixelSum) -> float:
     """Σ |w * k|² over Σ|w|² Σ k²: what noise of that kernel does to the sum."""
     reach = len(summed.weights) // 2
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
@@ -55,24 +60,24 @@ def by_sums(kernel: FloatArray, summed: PixelSum) -> float:
 @pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_sum(1.0)], ids=["phases", "values", "edges"])
 @pytest.mark.parametrize(
     "kernel",
-    [np.outer([1, 2, 1], [1, 2, 1]) / 16, np.array([[0, 0, 0], [1, 2, 1], [0, 0, 0]]) / 4],
+    [SMOOTH, ((0, 0, 0), (0.25, 0.5, 0.25), (0, 0, 0))],
     ids=["interpolated", "along rows"],
 )
-def test_sums_err_more_by_noise_that_neighbours_share(kernel: FloatArray, summed: PixelSum) -> None:
+def test_sums_err_more_by_noise_that_neighbours_share(kernel: Kernel, summed: PixelSum) -> None:
     frames = noisy(kernel)
-    expected = by_sums(kernel, summed)
+    expected = by_sums(np.array(kernel), summed)
     assert expected > 1.4
     assert shared_noise(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(expected, rel=0.08)
 
 
 @pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_sum(1.0)], ids=["phases", "values", "edges"])
 def test_independent_noise_stays_as_it_is(summed: PixelSum) -> None:
-    frames = noisy(np.array([[1.0]]))
+    frames = noisy(ALONE)
     assert shared_noise(frames, estimate_noise(frames), EVERYWHERE, summed) == 1.0
 
 
 def test_rows_that_err_as_a_whole_are_told() -> None:
-    frames = noisy(np.array([[1.0]]), rows=1.0)
+    frames = noisy(ALONE, rows=1.0)
     # Of the sums' variance, rows add Σ over rows of (Σ over columns of w)², a quarter as strong as pixels' noise.
     rows = np.sum(STENCIL.sum(axis=1) ** 2) / np.sum(STENCIL**2)
     found = shared_noise(frames, estimate_noise(frames), EVERYWHERE, PixelSum(STENCIL))
@@ -80,7 +85,7 @@ def test_rows_that_err_as_a_whole_are_told() -> None:
 
 
 def test_lamps_that_a_bit_shares_with_its_inverse_err_frames_but_not_their_difference() -> None:
-    frames = noisy(np.array([[1.0]]))
+    frames = noisy(ALONE)
     assert frames.inverses is not None
     lamp = 3.0 * np.random.default_rng(6).standard_normal((BITS, 1, 1)).astype(np.float32)
     lit = replace(frames, bits=frames.bits + lamp, inverses=frames.inverses + lamp)
@@ -90,13 +95,13 @@ def test_lamps_that_a_bit_shares_with_its_inverse_err_frames_but_not_their_diffe
 
 
 def test_a_model_that_is_too_small_is_made_up_for_and_one_too_large_is_not() -> None:
-    frames = noisy(np.array([[1.0]]))
+    frames = noisy(ALONE)
     assert shared_noise(frames, NoiseModel(2.0, 0.0), EVERYWHERE, PHASES) == pytest.approx(2.0, rel=0.05)
     assert shared_noise(frames, NoiseModel(8.0, 0.0), EVERYWHERE, PHASES) == 1.0
 
 
 def test_edges_of_the_code_do_not_count_where_they_break_the_sum() -> None:
-    frames = noisy(np.array([[1.0]]))
+    frames = noisy(ALONE)
     assert frames.inverses is not None
     bits = np.array(frames.bits)
     broken = bits.copy()
@@ -109,10 +114,10 @@ def test_edges_of_the_code_do_not_count_where_they_break_the_sum() -> None:
 
 
 def test_what_tells_nothing_changes_nothing() -> None:
-    frames = noisy(np.outer([1, 2, 1], [1, 2, 1]) / 16)
+    frames = noisy(SMOOTH)
     noise = estimate_noise(frames)
     assert shared_noise(replace(frames, inverses=None), noise, EVERYWHERE, PHASES) == 1.0
     assert shared_noise(frames, noise, ~EVERYWHERE, PHASES) == 1.0
-    assert shared_noise(noisy(np.array([[1.0]]), bits=2), noise, EVERYWHERE, PHASES) == 1.0
+    assert shared_noise(noisy(ALONE, bits=2), noise, EVERYWHERE, PHASES) == 1.0
     clipped = replace(frames, full_scale=100.0)
     assert shared_noise(clipped, noise, EVERYWHERE, PHASES) == 1.0

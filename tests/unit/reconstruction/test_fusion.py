@@ -212,7 +212,7 @@ def scattered(count: int) -> tuple[list[FusedFrames], dict[str, NDArray[np.bool_
 
 
 def test_the_noise_that_is_stated_is_the_noise_that_there_is() -> None:
-    tries, parts = scattered(24)
+    tries, parts = scattered(10)
     for part in parts.values():
         assert np.count_nonzero(part) > 2000
     line = np.array([each.frames.lines[3] for each in tries], dtype=np.float64)
@@ -233,8 +233,8 @@ def test_the_noise_that_is_stated_is_the_noise_that_there_is() -> None:
 )
 def test_fused_exposures_have_less_noise_than_the_best_of_them(exposures_s: Sequence[float], most: float) -> None:
     dark = NOISY.brightness * 0.08 < 200
-    together = np.array([fused(NOISY, seed=seed, exposures_s=exposures_s).frames.lines[3] for seed in range(16)])
-    longest = (NOISY.capture((0.08,), seed=seed) for seed in range(16))
+    together = np.array([fused(NOISY, seed=seed, exposures_s=exposures_s).frames.lines[3] for seed in range(8)])
+    longest = (NOISY.capture((0.08,), seed=seed) for seed in range(8))
     alone = np.array([axis_frames(each, "eye", COLUMN).lines[3] for each in longest])
     assert together.var(axis=0, ddof=1)[dark].mean() < most * alone.var(axis=0, ddof=1)[dark].mean()
 

@@ -22,6 +22,9 @@ from tests.unit.reconstruction.builders import (
     opencv_rays,
 )
 
+# Rigs with a calibrated projector need none of these kernels.
+pytestmark = pytest.mark.slow
+
 BALL = Sphere()
 ROWS = np.arange(60.0, 180.0, 1.3)
 COLUMNS = [110.0, 138.5, 166.0, 190.0]
