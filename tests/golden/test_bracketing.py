@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 
-from slrig.bundle import read_bundle
 from slrig.capture.evidence import EvidenceSummary
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -155,16 +154,3 @@ def test_a_bracket_gives_the_same_bytes_live_from_disk_and_replayed(tmp_path: Pa
     assert frames(again) == frames(bundle)
     reconstructed(again, tmp_path / "new")
     require_equal(tmp_path / "new", tmp_path / "read")
-
-
-@pytest.mark.slow
-def test_an_exposure_that_is_of_no_use_is_told_and_the_others_are_used(tmp_path: Path) -> None:
-    plan = ScanPlan(exposures_s=(0.015, 1.0, 4.0))
-    bundle = captured(small_rig(tmp_path), plan, tmp_path / "bundle")
-    report = reconstructed(bundle, tmp_path / "out")
-    (bright,) = report["notes"]
-    assert bright.startswith("an exposure was left out: 1 s is too bright for camera 'left': white is saturated on ")
-    assert report["identity"].startswith("26/26 patterns verified")
-    # What is left is no bracket, and is reconstructed as what it is.
-    assert {shot.exposure_s for shot in read_bundle(bundle).capture.shots} == {0.015}
-    assert "exposures" not in report["cameras"]["left"]

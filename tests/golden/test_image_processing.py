@@ -1,4 +1,7 @@
-"""Scans whose camera interpolated, bent or compressed its frames: the error stated is the one found, and it is told.
+"""Scans by cameras and in light as benches have them: the error stated is the one found, and what is wrong is told.
+
+Cameras that interpolate, bend or compress their frames; a bright room, exposure that creeps, lamps on mains before a
+rolling shutter, lenses that are sharp at one distance.
 
 `tests/bench/test_image_processing.py` has the whole table.
 """
@@ -6,8 +9,9 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +20,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slrig.errors import ScanEvidenceError
 from slrig.scan.plan import PatternPlan
 from tests.golden.test_bundles import reconstructed
 from tests.golden.test_light_axis import BALL, LEFT, PROJECTOR, rig_file, scanned
 
+pytestmark = pytest.mark.slow
 PLANS = {"lines": PatternPlan(), "Gray only": PatternPlan(line_shift=False, gray_cell_px=2)}
 BALANCE = (0.55, 1.0, 0.7)
 """What red, green and blue pixels see of white light."""
@@ -85,9 +91,9 @@ def scored(folder: Path, work: Path, **processing: Any) -> Any:
     ("scene", "processing", "least_covered"),
     [
         pytest.param("vase", {"quality": 75}, 0.93, id="vase-75"),
-        pytest.param("gauge", {"quality": 50, "kept": True}, 0.97, id="gauge-50-files", marks=pytest.mark.slow),
-        pytest.param("terrace", {"gamma": 2.2, "quality": 75}, 0.96, id="terrace-gamma-75", marks=pytest.mark.slow),
-        pytest.param("terrace", {"mosaic": True}, 0.96, id="terrace-mosaic", marks=pytest.mark.slow),
+        pytest.param("gauge", {"quality": 50, "kept": True}, 0.97, id="gauge-50-files"),
+        pytest.param("terrace", {"gamma": 2.2, "quality": 75}, 0.96, id="terrace-gamma-75"),
+        pytest.param("terrace", {"mosaic": True}, 0.96, id="terrace-mosaic"),
     ],
 )
 def test_an_error_is_what_is_stated(
@@ -104,8 +110,52 @@ def test_an_error_is_what_is_stated(
 
 
 @dataclass(frozen=True)
+class Light:
+    """What differs from the ideal. rms, complete : how much worse than there a scan may be: times, and share lost;
+    sigma : the error over what is stated for it, at most.
+    """
+
+    camera: Mapping[str, Any] = field(default_factory=dict)
+    projector: Mapping[str, Any] = field(default_factory=dict)
+    head: str = "ambient = 0.01"
+    faults: str = ""
+    rms: float = 1.2
+    complete: float = 0.01
+    sigma: float = 1.3
+
+
+# Measured with lines, ideal 9.6 µm: 9.1, 12.8, 9.6 and 19.4. The webcam's values are made straight first; its deviation
+# is a little larger, so that it smooths more.
+LIGHTS = {
+    "webcam": Light({"response": 0.45}, rms=1.05),
+    "bright room": Light(head="ambient = 0.3", rms=1.4),
+    "creeping exposure": Light({"exposure_drift": 0.0015}, rms=1.1),
+    "rolling bands": Light({"line_time_s": 3e-5}, head="ambient = 0.1\nambient_flicker_depth = 0.3", rms=2.3),
+    # Sharp at the ball; on the wall behind it the projector's spread is 1.5 px more, and the camera's 1.0 px. The rms,
+    # 40.2 and 57.3 µm, is that of the shadow's border, where the projector's spread is wider than what is refused; the
+    # median error is 10 µm. 1.10 and 1.39 times what is stated.
+    # The projector's focus changes with the slope here, and lines would tell 0.56 px of blur for 0.67; but slopes are
+    # so even that what is expected stands.
+    "focus over depth": Light(
+        {"focus_mm": 540.0, "defocus_px": 9.5}, {"focus_mm": 570.0, "defocus_px": 15.0}, rms=4.9, sigma=1.5
+    ),
+}
+
+
+def rig_of(folder: Path, light: Light) -> Path:
+    """A ball before a wall, in this light."""
+    rig = rig_file(
+        folder, BALL, {**PROJECTOR, "position_mm": (105.0, 0.0, -590.0), **light.projector}, {**LEFT, **light.camera}
+    )
+    text = rig.read_text()
+    assert text.count("ambient = 0.01") == 1
+    rig.write_text(text.replace("ambient = 0.01", light.head) + light.faults)
+    return rig
+
+
+@dataclass(frozen=True)
 class Ideal:
-    """A scan of a small scene before anything is done to its frames: its plan, bundle, and figures against truth."""
+    """A scan in the best light before anything is done to its frames: plan, bundle, and figures against truth."""
 
     plan: PatternPlan
     bundle: Path
@@ -114,13 +164,10 @@ class Ideal:
 
 @pytest.fixture(scope="module", params=[*PLANS.values()], ids=[*PLANS])
 def ideal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Ideal:
-    folder = tmp_path_factory.mktemp("ideal") / "rig"
-    rig = rig_file(folder, BALL, {**PROJECTOR, "position_mm": (105.0, 0.0, -590.0)}, LEFT)
-    truth = scanned(rig, plan=request.param)["truth"]
-    return Ideal(request.param, folder / "bundle", truth)
+    rig = rig_of(tmp_path_factory.mktemp("ideal") / "rig", Light())
+    return Ideal(request.param, rig.parent / "bundle", scanned(rig, plan=request.param)["truth"])
 
 
-@pytest.mark.slow
 # Eight draws of noisy rows cost 2.0 to 2.4 times the error.
 @pytest.mark.parametrize(("processing", "worse"), [({"gamma": 2.2}, 1.05), ({"rows": 1.5}, 2.5)], ids=["bent", "rows"])
 def test_bent_values_cost_next_to_nothing_and_noisy_rows_are_stated(
@@ -134,9 +181,33 @@ def test_bent_values_cost_next_to_nothing_and_noisy_rows_are_stated(
     assert any("gamma 2.2" in note for note in report["notes"]) == ("gamma" in processing)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("quality", [95, 80])
 def test_so_it_is_of_a_small_scene_and_of_code_edges(tmp_path: Path, ideal: Ideal, quality: int) -> None:
     truth = scored(ideal.bundle, tmp_path, quality=quality)["truth"]
     assert 0.7 < truth["error_over_sigma_p68"] < 1.4
     assert truth["complete_0.3mm"] > ideal.truth["complete_0.3mm"] - 0.02
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_light_of_a_bench_is_not_shot_again_and_the_surface_is_as_good(tmp_path: Path, ideal: Ideal, name: str) -> None:
+    light = LIGHTS[name]
+    report = scanned(rig_of(tmp_path / "rig", light), plan=ideal.plan)
+    truth, evidence = report["truth"], report["evidence"]
+    sys.stdout.write(
+        f"{name:20} {evidence['patterns_verified']:>7}, rms {1000 * truth['rms_mm']:5.1f} "
+        f"({1000 * ideal.truth['rms_mm']:.1f}) µm, covered {truth['complete_0.3mm']:.2%} "
+        f"({ideal.truth['complete_0.3mm']:.2%}), error/σ {truth['error_over_sigma_p68']:.2f}\n"
+    )
+    assert not evidence["shot_again"]
+    assert not evidence["contradictions"]
+    assert truth["rms_mm"] <= light.rms * ideal.truth["rms_mm"]
+    assert truth["error_over_sigma_p68"] <= light.sigma
+    assert truth["complete_0.3mm"] >= ideal.truth["complete_0.3mm"] - light.complete
+
+
+def test_automatic_exposure_is_refused_in_words(tmp_path: Path) -> None:
+    stepped = Light(faults="[head.faults]\nexposure_step_frames = [9]\nexposure_step = 0.75\n")
+    with pytest.raises(
+        ScanEvidenceError, match=r"7[3-7]% of the light of white and black, evenly .* automatic exposure"
+    ):
+        scanned(rig_of(tmp_path / "rig", stepped), plan=PatternPlan())

@@ -36,7 +36,7 @@ name = "bench"
 [head]
 driver = "simulated"
 scene = "plate.toml"
-seed = {seed}
+seed = 1
 samples_per_axis = 1
 ambient = {ambient}
 exposure_s = {exposure_s}
@@ -63,6 +63,7 @@ read_noise_e = {noise_e}
 line_time_s = {line_s}
 """
 
+pytestmark = pytest.mark.slow
 PROJECTOR = Size(96, 72)
 SHUTTERS_S = (0.0, 15e-6, 60e-6)
 
@@ -74,16 +75,13 @@ def written(
     exposure_s: float,
     line_s: float = 0.0,
     bit_depth: int = 8,
-    seed: int = 1,
     stated_s: float = 0.02,
     ambient: float = 0.05,
     twin_line_s: float | None = None,
 ) -> Path:
     """The path of a rig file: light comes `latency_s` later than the projector says it does."""
     (folder / "plate.toml").write_text(PLATE)
-    text = RIG.format(
-        seed=seed, ambient=ambient, exposure_s=exposure_s, stated_s=stated_s, latency_s=latency_s, line_s=line_s
-    )
+    text = RIG.format(ambient=ambient, exposure_s=exposure_s, stated_s=stated_s, latency_s=latency_s, line_s=line_s)
     lines = [("left", -60.0, line_s), *([("right", 180.0, twin_line_s)] if twin_line_s is not None else [])]
     for name, x_mm, line in lines:
         text += CAMERA.format(
@@ -108,50 +106,24 @@ def require_truth(found: CameraLatency, *, latency_s: float, line_s: float) -> N
     assert abs(found.line_time_s - line_s) <= (0.02 * line_s if line_s else 1e-7)
 
 
-@pytest.mark.parametrize("line_s", SHUTTERS_S)
-@pytest.mark.parametrize(
-    ("latency_s", "exposure_s", "bit_depth", "trigger"),
-    [
-        (0.012, 0.005, 12, Trigger.FREE),
-        (0.047, 0.010, 8, Trigger.SOFTWARE),
-        (0.083, 0.020, 8, Trigger.FREE),
-    ],
-)
-def test_latency_and_shutter_are_those_of_the_rig_file(
-    tmp_path: Path, latency_s: float, exposure_s: float, bit_depth: int, trigger: Trigger, line_s: float
-) -> None:
-    path = written(tmp_path, latency_s=latency_s, exposure_s=exposure_s, line_s=line_s, bit_depth=bit_depth)
-    require_truth(found_on(path, trigger), latency_s=latency_s, line_s=line_s)
-
-
-@pytest.mark.slow
+@pytest.mark.parametrize("ambient", [0.05, 0.2])
 @pytest.mark.parametrize(
     ("exposure_s", "line_s", "latency_s", "bit_depth", "trigger"),
     [
         (0.005, SHUTTERS_S[0], 0.012, 12, Trigger.FREE),
-        (0.005, SHUTTERS_S[1], 0.047, 12, Trigger.FREE),
         (0.005, SHUTTERS_S[2], 0.083, 8, Trigger.SOFTWARE),
-        (0.010, SHUTTERS_S[0], 0.047, 8, Trigger.SOFTWARE),
         (0.010, SHUTTERS_S[1], 0.083, 8, Trigger.FREE),
         (0.010, SHUTTERS_S[2], 0.012, 12, Trigger.FREE),
         (0.020, SHUTTERS_S[0], 0.083, 12, Trigger.SOFTWARE),
-        (0.020, SHUTTERS_S[1], 0.012, 8, Trigger.SOFTWARE),
-        (0.020, SHUTTERS_S[2], 0.047, 8, Trigger.FREE),
+        (0.020, SHUTTERS_S[1], 0.047, 8, Trigger.SOFTWARE),
     ],
 )
-def test_latency_and_shutter_in_a_bright_room(
-    tmp_path: Path, exposure_s: float, line_s: float, latency_s: float, bit_depth: int, trigger: Trigger
+def test_latency_and_shutter_are_those_of_the_rig_file(
+    tmp_path: Path, exposure_s: float, line_s: float, latency_s: float, bit_depth: int, trigger: Trigger, ambient: float
 ) -> None:
-    """Each value of each column stands beside each value of every other one."""
-    path = written(
-        tmp_path,
-        latency_s=latency_s,
-        exposure_s=exposure_s,
-        line_s=line_s,
-        bit_depth=bit_depth,
-        seed=2,
-        ambient=0.2,
-    )
+    """In a dim and in a bright room."""
+    told = {"latency_s": latency_s, "exposure_s": exposure_s, "line_s": line_s}
+    path = written(tmp_path, **told, bit_depth=bit_depth, ambient=ambient)
     require_truth(found_on(path, trigger), latency_s=latency_s, line_s=line_s)
 
 
@@ -187,14 +159,6 @@ def test_the_command_prints_json(tmp_path: Path) -> None:
     assert document["cameras"]["left"]["rolling"] is False
 
 
-def test_the_command_says_why_it_cannot_measure(tmp_path: Path) -> None:
-    path = written(tmp_path, latency_s=0.0, exposure_s=0.01)
-    path.write_text(path.read_text().replace("[head.faults]", "[head.faults]\nlamp_off = true"))
-    done = CliRunner().invoke(app, ["latency", str(path)])
-    assert done.exit_code == 2
-    assert "sees no flash" in done.stderr
-
-
 def images(path: Path, synchronisation: Synchronisation | None) -> dict[tuple[int, str], FloatArray]:
     """The frames of one sequence, by pattern and camera."""
     patterns = scan_patterns(
@@ -205,7 +169,6 @@ def images(path: Path, synchronisation: Synchronisation | None) -> dict[tuple[in
         return {(shot.pattern, shot.camera): shot.image.astype(np.float64) for shot in shots}
 
 
-@pytest.mark.slow
 def test_a_scan_with_a_late_projector_is_right_once_its_latency_is_known(tmp_path: Path) -> None:
     honest = images(written(tmp_path, latency_s=0.0, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0), None)
     path = written(tmp_path, latency_s=0.031, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +10,21 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from simulated_rig.device import simulated_head
 from slrig.bundle.poses_file import read_poses
 from slrig.bundle.stage_file import StageRecord, encode_stage
 from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
-from slrig.devices import CameraSettings, Rig, Turntable
 from slrig.model import PlaneKind, StagePlane
-from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import ReconstructionPlan, ScanPlan
-from slrig.scan.reconstruct import reconstruct_bundle
 from slrig.views.stage_planes import cut
 from slrig.views.turntable import turntable
-from tests.golden.test_stage import VASE
+from tests.golden.test_stage import AXIS as STAGE_AXIS
+from tests.golden.test_stage import VASE, scanned
 from tests.turned_views import displacement_mm
 
 pytestmark = pytest.mark.slow
 
-CONFIG = Path(__file__).parents[2] / "config"
 ANGLES = (0.0, 25.0, 50.0)
-AXIS_POINT, AXIS = np.array([2.0, 0.0, 1.5]), np.array([0.0, -1.0, 0.0])
+AXIS_POINT, AXIS = STAGE_AXIS.point_mm, STAGE_AXIS.direction
 PLATE = """
 [[object]]
 name = "plate"
@@ -47,37 +41,11 @@ rotation_deg = [-90.0, 0.0, 0.0]
 """
 
 
-def scanned(folder: Path) -> None:
-    """Scans at ANGLES from above, each with its bundle in it, as the service keeps them."""
-    (folder / "scene.toml").write_text(VASE + PLATE)
-    options: dict[str, Any] = tomllib.loads((CONFIG / "rigs" / "turntable.toml").read_text())["head"]
-    del options["driver"]
-    options |= {"scene": "scene.toml", "samples_per_axis": 2}
-    options["turntable"] |= {
-        "point_mm": AXIS_POINT.tolist(), "direction": AXIS.tolist(), "objects": ["vase", "plate"]
-    }  # fmt: skip
-    options["projector"] |= {
-        "size_px": [448, 400], "principal_px": [223.5, 199.5], "position_mm": [105.0, -390.0, -440.0]
-    }  # fmt: skip
-    options["camera"][0] |= {
-        "size_px": [384, 352], "principal_px": [191.5, 175.5], "position_mm": [-150.0, -400.0, -400.0]
-    }  # fmt: skip
-    head = simulated_head(options, folder)
-    with Rig(
-        "from above", head.cameras, head.projector, {"left": CameraSettings(0.0167)}, head.calibration, head,
-        clock=head.clock, positioner=head.positioner,
-    ) as rig:  # fmt: skip
-        assert isinstance(rig.positioner, Turntable)
-        for angle in ANGLES:
-            rig.positioner.turn(angle)
-            scan = folder / "scans" / f"{angle:03.0f}"
-            capture_frames(
-                rig, ScanPlan(), folder / "bundle", progress=lambda *_: None, cancelled=lambda: False
-            ).finish()
-            reconstruct_bundle(
-                folder / "bundle", scan, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
-            )
-            (folder / "bundle").rename(scan / "bundle")
+FROM_ABOVE = {
+    "head": {"samples_per_axis": 2},
+    "projector": {"size_px": [448, 400], "principal_px": [223.5, 199.5], "position_mm": [105.0, -390.0, -440.0]},
+    "camera": {"size_px": [384, 352], "principal_px": [191.5, 175.5], "position_mm": [-150.0, -400.0, -400.0]},
+}
 
 
 def modelled(folder: Path, name: str, *told: str) -> tuple[dict[str, Any], list[float], str]:
@@ -98,7 +66,7 @@ def modelled(folder: Path, name: str, *told: str) -> tuple[dict[str, Any], list[
 
 
 def test_markers_hold_the_turn_of_a_vase_that_its_shape_leaves_free(tmp_path: Path) -> None:
-    scanned(tmp_path)
+    scanned(tmp_path, VASE + PLATE, ANGLES, FROM_ABOVE)
     # By an angle that is 1° and 2° wrong the vase stays wrong, and that it may is said.
     axis = ["--axis-point", *map(str, AXIS_POINT), "--axis-direction", *map(str, AXIS)]
     report, off_mm, told = modelled(tmp_path, "by-angle", "--angle", "26", *axis)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from slrig.bundle.stage_file import read_stage
 from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
 from slrig.devices import CameraSettings, Rig, Turntable
-from slrig.model import Mesh, PlaneKind, StageAxis
+from slrig.model import PlaneKind, StageAxis
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
@@ -31,18 +31,8 @@ pytestmark = pytest.mark.slow
 
 CONFIG = Path(__file__).parents[2] / "config"
 BOARD_ANGLES = (-50.0, -30.0, -10.0, 10.0, 30.0, 50.0)
-BOARD = (
-    "--board",
-    "charuco",
-    "--corners",
-    "6x4",
-    "--square-mm",
-    "26",
-    "--marker-mm",
-    "20",
-    "--dictionary",
-    "DICT_4X4_50",
-)
+BOARD = ["--board", "charuco", "--corners", "6x4", "--square-mm", "26", "--marker-mm", "20"]
+BOARD += ["--dictionary", "DICT_4X4_50"]
 VIEW_ANGLES = (0.0, 12.0, 24.0)
 
 
@@ -117,37 +107,47 @@ albedo = 0.4
 AXIS = axis_of([2.0, 0.0, 1.5], [0.0, -1.0, 0.0])
 
 
-def scanned(folder: Path, scene: str, angles_deg: Sequence[float]) -> list[Mesh]:
-    """Scans of a scene whose wall stands still, by the rig of the figure on a turntable, from higher up."""
-    folder.mkdir()
+HIGHER = {
+    "projector": {"position_mm": [105.0, -260.0, -540.0]},
+    "camera": {"position_mm": [-150.0, -262.0, -500.0]},
+}
+"""Where the devices of the turntable's rig stand to look down on it."""
+
+
+def scanned(
+    folder: Path, scene: str, angles_deg: Sequence[float], devices: Mapping[str, Mapping[str, Any]] = HIGHER
+) -> list[Path]:
+    """Scans of a scene whose wall stands still, by the rig of the figure on a turntable; each has its bundle in it."""
+    folder.mkdir(exist_ok=True)
     (folder / "scene.toml").write_text(scene)
     options: dict[str, Any] = tomllib.loads((CONFIG / "rigs" / "turntable.toml").read_text())["head"]
     del options["driver"]
-    options["scene"] = "scene.toml"
+    options |= {"scene": "scene.toml", **devices.get("head", {})}
     turned = [each["name"] for each in tomllib.loads(scene)["object"] if each["name"] != "wall"]
     options["turntable"] |= {
         "point_mm": AXIS.point_mm.tolist(), "direction": AXIS.direction.tolist(), "objects": turned
     }  # fmt: skip
-    options["projector"]["position_mm"] = [105.0, -260.0, -540.0]
-    options["camera"][0]["position_mm"] = [-150.0, -262.0, -500.0]
-    head, meshes = simulated_head(options, folder), []
+    options["projector"] |= devices["projector"]
+    options["camera"][0] |= devices["camera"]
+    head, scans = simulated_head(options, folder), []
     settings = {"left": CameraSettings(0.0167)}
     with Rig(
         "from above", head.cameras, head.projector, settings, head.calibration, head, clock=head.clock,
         positioner=head.positioner,
     ) as rig:  # fmt: skip
         for angle in angles_deg:
-            bundle, output = recorded(rig, angle, folder / f"{angle}", rows=False), folder / f"{angle}-scan"
+            bundle, scan = recorded(rig, angle, folder / "bundle", rows=False), folder / "scans" / f"{angle:03.0f}"
             reconstruct_bundle(
-                bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
+                bundle, scan, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
             )
-            meshes.append(read_mesh(output / "mesh.ply"))
-    return meshes
+            bundle.rename(scan / "bundle")
+            scans.append(scan)
+    return scans
 
 
 def test_plate_and_wall_are_found_and_a_vase_alone_is_left_where_the_stage_put_it(tmp_path: Path) -> None:
     (empty,) = scanned(tmp_path / "empty", STAGE, [0.0])
-    planes = stage_planes(empty, AXIS)
+    planes = stage_planes(read_mesh(empty / "mesh.ply"), AXIS)
     for plane, kind, normal, at in zip(
         planes, (PlaneKind.PLATE, PlaneKind.BACKDROP), ([0, -1, 0], [0, 0, -1]), ([0, 26, 0], [0, 0, 52]), strict=True
     ):
@@ -155,9 +155,9 @@ def test_plate_and_wall_are_found_and_a_vase_alone_is_left_where_the_stage_put_i
         assert np.arccos(min(1.0, float(plane.normal @ normal))) < 1e-4
         assert abs((plane.point_mm - at) @ normal) < 0.002
         assert plane.sigma_mm < 0.015
-    views = scanned(tmp_path / "views", VASE + STAGE, VIEW_ANGLES)
+    scans = scanned(tmp_path / "views", VASE + STAGE, VIEW_ANGLES)
     true = turntable(AXIS.point_mm, AXIS.direction, np.deg2rad(VIEW_ANGLES))
-    cuts = [cut(view, planes).mesh for view in views]
+    cuts = [cut(read_mesh(scan / "mesh.ply"), planes).mesh for scan in scans]
     # The vase alone is left, but for the margin above the plate.
     for mesh in cuts:
         assert mesh.vertices_mm[:, 1].max() < 26 - 1.0

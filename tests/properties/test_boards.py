@@ -25,7 +25,7 @@ boards = some.builds(
 )
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(board=boards, page=some.sampled_from([*PAGES_MM, FIT]))
 def test_all_that_is_printed_lies_on_the_page_or_the_largest_square_is_told(board: Board, page: str) -> None:
     try:
@@ -58,7 +58,7 @@ def test_all_that_is_printed_lies_on_the_page_or_the_largest_square_is_told(boar
     assert float(tree.get("width", "").removesuffix("mm")) == pytest.approx(width)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(board=boards, seed=some.integers(0, 999))
 def test_numberings_come_back_to_where_they_began(board: Board, seed: int) -> None:
     random = np.random.default_rng(seed)
@@ -72,7 +72,7 @@ def test_numberings_come_back_to_where_they_began(board: Board, seed: int) -> No
         assert again == numbers
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     angles=some.tuples(*[some.floats(-0.7, 0.7)] * 3),
     lens=some.tuples(some.floats(-0.2, 0.2), some.floats(-0.003, 0.003), some.floats(-0.003, 0.003)),

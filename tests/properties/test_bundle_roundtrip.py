@@ -112,7 +112,7 @@ def _solved_calibrations(draw: st.DrawFn) -> Calibration:
     return replace(calibration, solved=solved)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(_captures())
 def test_a_bundle_comes_back_as_it_was_written(capture: Capture) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -157,7 +157,7 @@ def _same(got: Calibration, want: Calibration) -> None:
             np.testing.assert_array_equal(left, right)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(calibrations)
 def test_a_calibration_comes_back_bit_by_bit(calibration: Calibration) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -166,7 +166,7 @@ def test_a_calibration_comes_back_bit_by_bit(calibration: Calibration) -> None:
         _same(read_calibration(path), calibration)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(calibrations | _solved_calibrations(), st.sampled_from(["yml", "yaml", "xml"]))
 def test_an_opencv_calibration_comes_back_bit_by_bit(calibration: Calibration, ending: str) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -130,7 +130,7 @@ def stripes(draw: st.DrawFn) -> list[Stripe]:
     [[200j, 1 + 200j], [0j, 1 + 0j], [0j, 1.4 + 0j], [0j, 1 + 0j, 1.9761823382088286 + 0.2169517056147391j],
      [-2.0826390966750035e-292j, 6.123233995736766e-17 + 1j]]
 )  # fmt: skip
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=100)
 @given(stripes())
 def test_linking_is_the_papers_procedure(drawn: list[Stripe]) -> None:
     points, numbers, bridges = linked_by_the_paper(drawn)
@@ -142,7 +142,7 @@ def test_linking_is_the_papers_procedure(drawn: list[Stripe]) -> None:
     assert sum(bridges) == len(drawn) - 1
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(stripes(), st.integers(0, 2**32 - 1))
 def test_a_curve_does_not_depend_on_the_order_or_the_direction_in_which_stripes_were_found(
     drawn: list[Stripe], seed: int

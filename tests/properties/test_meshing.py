@@ -16,13 +16,13 @@ from slrig.meshing.initial import initial_mesh
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.optimisation import NO_FLIPS, optimised
 from slrig.meshing.runs import neighbouring_curves, whole_curves
-from slrig.meshing.strips import strips, to_drop
+from slrig.meshing.strips import strips
 from slrig.meshing.topology import topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
 from tests.unit.meshing.plain import boundary_edges
 
 # The first call of a kernel compiles it.
-unhurried = settings(deadline=None)
+unhurried = settings(deadline=None, max_examples=40)
 seeds = st.integers(0, 2**32 - 1)
 # A lattice makes squares, collinear and coincident points common.
 lattice = arrays.arrays(np.float64, (4, 3), elements=st.integers(-2, 2).map(float))
@@ -119,23 +119,6 @@ def test_what_is_dropped_leaves_a_manifold_and_is_counted(lengths: list[int], se
         assert mesh.dropped_at_bridges == 0
     np.testing.assert_array_equal(points, before[0])
     np.testing.assert_array_equal(bridge, before[1])
-
-
-@unhurried
-@given(st.integers(2, 12), st.integers(2, 12), seeds)
-def test_unmeasured_points_leave_the_mesh(ours: int, theirs: int, seed: int) -> None:
-    points, offsets = surface([ours, theirs], seed)
-    missing = seed % len(points)
-    points[missing] = np.nan
-    faces = strips(points, whole_curves(np.array([[0, 1]]), offsets))
-    assert len(faces) == ours + theirs - 2
-    depth_edge, bridge = to_drop(
-        points, faces, np.zeros(len(points), dtype=np.bool_), np.ones(len(points)),
-        depth_edge_ratio=1e6, keep_holes=False,
-    )  # fmt: skip
-    with_it = (faces == missing).any(axis=1)
-    assert (depth_edge | bridge)[with_it].all()
-    assert not (depth_edge | bridge)[~with_it].any()
 
 
 @unhurried

@@ -34,3 +34,21 @@ def harmonic_indices(corners_mm: FloatArray) -> FloatArray:
     squares = np.einsum("ijk,ijk->i", sides, sides)
     area_mm2 = np.linalg.norm(np.cross(sides[:, 1], sides[:, 2]), axis=1) / 2
     return np.asarray(np.divide(squares, area_mm2, out=np.full(len(squares), np.inf), where=area_mm2 > 0))
+
+
+def faces_of(*rows: tuple[int, int, int]) -> IntArray:
+    return np.array(rows, dtype=np.int32).reshape(-1, 3)
+
+
+def grid_faces(rows: int, columns: int) -> IntArray:
+    """Two triangles a cell of a grid of vertices, counter-clockwise where columns run to the right and rows down."""
+    index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    a, b, c, d = (index[s, t].ravel() for s in (np.s_[:-1], np.s_[1:]) for t in (np.s_[:-1], np.s_[1:]))
+    return np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
+
+
+def soup(seed: int, *, points: int = 700, faces: int = 5000) -> tuple[FloatArray, IntArray]:
+    """Triangles between random points, three different ones each."""
+    random = np.random.default_rng(seed)
+    corners = np.stack([random.permutation(points)[:3] for _ in range(faces)])
+    return random.normal(size=(points, 3)), corners.astype(np.int32)

@@ -7,11 +7,7 @@ import pytest
 
 from slrig.meshing.adjacency import in_groups, neighbours
 from slrig.model import IntArray
-
-
-def faces_of(*rows: tuple[int, int, int]) -> IntArray:
-    return np.array(rows, dtype=np.int32).reshape(-1, 3)
-
+from tests.unit.meshing.plain import faces_of
 
 TETRAHEDRON = faces_of((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
 
@@ -36,7 +32,7 @@ def patch(rows: int, columns: int, seed: int) -> IntArray:
     return np.array(turned, dtype=np.int32)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_neighbours_agree_with_a_dictionary_of_edges(seed: int) -> None:
     faces = patch(9, 13, seed)
     found = neighbours(faces, vertex_count=9 * 13)
@@ -51,11 +47,8 @@ def test_a_closed_surface_has_no_boundary() -> None:
     assert (neighbours(TETRAHEDRON, vertex_count=4) >= 0).all()
 
 
-def test_faces_that_meet_in_a_vertex_alone_are_no_neighbours() -> None:
+def test_faces_back_to_back_are_neighbours_three_times_and_those_that_meet_in_a_vertex_are_none() -> None:
     assert (neighbours(faces_of((0, 1, 2), (0, 3, 4)), vertex_count=5) == -1).all()
-
-
-def test_two_faces_back_to_back_are_neighbours_three_times() -> None:
     assert neighbours(faces_of((0, 1, 2), (0, 2, 1)), vertex_count=3).tolist() == [[1, 1, 1], [0, 0, 0]]
 
 
@@ -87,11 +80,3 @@ def test_groups_list_corners_by_vertex() -> None:
         wanted = [3 * i + k for i, face in enumerate(faces.tolist()) for k in range(3) if face[k] == vertex]
         assert corners[starts[vertex] : starts[vertex + 1]].tolist() == wanted
     assert starts[-1] == len(corners) == faces.size
-
-
-def test_faces_are_left_alone_and_may_be_a_view() -> None:
-    faces = patch(6, 7, 4)
-    kept = faces.copy()
-    reversed_view = faces[:, ::-1]
-    assert neighbours(reversed_view, vertex_count=42).tolist() == plain_neighbours(reversed_view)
-    np.testing.assert_array_equal(faces, kept)

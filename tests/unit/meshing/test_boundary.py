@@ -14,7 +14,7 @@ from slrig.meshing.boundary_rules import following, may_add
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.boundary_oracle import as_set, smoothed_by_hand
-from tests.unit.meshing.plain import boundary_edges
+from tests.unit.meshing.plain import boundary_edges, faces_of, grid_faces
 
 ANYTHING_MM = 1e6
 
@@ -23,17 +23,11 @@ def flat(*places: tuple[float, float]) -> FloatArray:
     return np.array([(x, y, 0.0) for x, y in places], dtype=np.float64)
 
 
-def faces_of(*rows: tuple[int, int, int]) -> IntArray:
-    return np.array(rows, dtype=np.int32).reshape(-1, 3)
-
-
 def grid(rows: int, columns: int, *, slant: float = 0.0) -> tuple[FloatArray, IntArray]:
     """A flat grid of unit cells, counter-clockwise seen from above; each row `slant` further to the right."""
     row, column = np.mgrid[:rows, :columns]
     points = np.stack([column + slant * row, row, np.zeros_like(row)], axis=-1).reshape(-1, 3).astype(np.float64)
-    index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
-    a, b, c, d = (index[s, t].ravel() for s in (np.s_[:-1], np.s_[1:]) for t in (np.s_[:-1], np.s_[1:]))
-    return points, np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
+    return points, grid_faces(rows, columns)
 
 
 def with_border_point(points: FloatArray, y: float, *, columns: int) -> FloatArray:
@@ -78,23 +72,6 @@ def test_a_spike_goes_with_its_triangles() -> None:
     np.testing.assert_array_equal(result.adjacency, neighbours(result.faces, vertex_count=len(points)))
 
 
-def test_the_side_that_the_mesh_is_seen_from_makes_no_difference() -> None:
-    points, faces = grid(5, 7)
-    for y in (-1.5, 0.9):
-        moved = with_border_point(points, y, columns=7)
-        mirrored = smoothed(moved * (1, 1, -1), faces[:, ::-1], everywhere(points))
-        direct = smoothed(moved, faces, everywhere(points))
-        assert as_set(mirrored.faces[:, ::-1]) == as_set(direct.faces)
-
-
-def test_psi_says_what_is_sharp() -> None:
-    points, faces = grid(5, 7)
-    points = with_border_point(points, -1.2, columns=7)
-    angle = 2 * math.atan(1 / 1.2)
-    assert smoothed(points, faces, everywhere(points), psi_rad=angle - 0.01).removed_triangles == 0
-    assert smoothed(points, faces, everywhere(points), psi_rad=angle + 0.01).removed_triangles > 0
-
-
 @pytest.mark.parametrize("psi_rad", [0.0, math.pi, math.nan])
 def test_an_angle_that_means_nothing_is_refused(psi_rad: float) -> None:
     points, faces = grid(2, 2)
@@ -130,18 +107,6 @@ def test_a_notch_between_surfaces_that_face_apart_stays_open() -> None:
     assert smoothed(roof(75), faces, everywhere(points)).added.sum() == 0
 
 
-def test_no_sliver_is_added() -> None:
-    # A square corner of surface bent in at vertex 0, the gap 80° wide, one side long and the other short.
-    side = 0.1
-    gap = math.radians(80)
-    points = flat((0, 0), (1, 0), (side * math.cos(gap), side * math.sin(gap)), (0.7, -1), (-1, -1), (-1, 1))
-    faces = faces_of((1, 0, 3), (3, 0, 4), (4, 0, 5), (5, 0, 2))
-    assert smoothed(points, faces, everywhere(points)).added.sum() == 0
-    points[2] = (0.5 * math.cos(gap), 0.5 * math.sin(gap), 0)
-    result = smoothed(points, faces, everywhere(points), most_rounds=1)
-    assert (0, 1, 2) in as_set(result.faces[result.added])
-
-
 def test_a_hole_of_three_edges_is_closed() -> None:
     points, faces = grid(5, 5)
     hole = faces[9]
@@ -149,19 +114,6 @@ def test_a_hole_of_three_edges_is_closed() -> None:
     assert as_set(result.faces) == as_set(faces)
     assert as_set(result.faces[result.added]) == as_set(hole[None])
     np.testing.assert_array_equal(result.adjacency, neighbours(result.faces, vertex_count=len(points)))
-
-
-def test_a_hole_of_three_edges_with_a_long_one_stays() -> None:
-    points, faces = grid(5, 5)
-    assert smoothed(points, np.delete(faces, 9, axis=0), everywhere(points, 1.4)).added.sum() == 0
-
-
-def test_an_edge_that_exists_is_not_made_again() -> None:
-    # A double pyramid over triangle 012, two of its upper faces missing: at 1 the gap's far edge 02 has two faces.
-    points = np.array([(0, 0, 0), (1, 0, 0), (0.5, 0.9, 0), (0.5, 0.3, 0.4), (0.5, 0.3, -0.4)], dtype=np.float64)
-    faces = faces_of((2, 0, 3), (1, 0, 4), (2, 1, 4), (0, 2, 4))
-    result = smoothed(points, faces, everywhere(points))
-    np.testing.assert_array_equal(result.faces, faces)
 
 
 def test_a_notch_that_another_stretch_of_boundary_runs_into_is_not_covered() -> None:
@@ -200,45 +152,6 @@ def test_a_slanted_border_is_not_peeled() -> None:
     assert not result.added[: len(faces) - result.removed_triangles].any()
 
 
-def test_a_long_spike_goes_down_to_its_foot() -> None:
-    # One curve reaches three points further than its neighbours do.
-    points, faces = grid(5, 7)
-    extra = np.array([(3, -1, 0), (3, -2, 0), (3, -3, 0)], dtype=np.float64)
-    at = len(points)
-    tooth = faces_of((at, 3, 2), (3, at, 4), (at + 1, at, 2), (at, at + 1, 4), (at + 2, at + 1, 2), (at + 1, at + 2, 4))
-    points, faces = np.concatenate((points, extra)), np.concatenate((faces, tooth))
-    result = smoothed(points, faces, everywhere(points))
-    assert not np.isin([at + 1, at + 2], result.faces).any()
-    assert result.removed_triangles == 4
-    assert as_set(result.faces) > as_set(grid(5, 7)[1])
-
-
-def test_a_zigzag_is_filled_tooth_by_tooth_and_loses_nothing() -> None:
-    columns = 601
-    points, faces = grid(4, columns)
-    # Tips at odd columns; each of the notches between two of them is 67° wide.
-    points[1:columns:2, 1] = -1.5
-    result = smoothed(points, faces, everywhere(points))
-    assert result.removed_triangles == 0
-    wanted = {(k - 1, k + 1, k) for k in range(2, columns - 1, 2)}
-    assert as_set(result.faces[result.added]) == wanted
-    np.testing.assert_array_equal(result.adjacency, neighbours(result.faces, vertex_count=len(points)))
-
-
-def test_rounds_limit_how_far_a_slot_is_filled() -> None:
-    points, faces = grid(4, 40)
-    # The middle row of cells is missing from the left on, but for the last ones.
-    points[40 * 2 :, 1] -= 0.3
-    middle = faces[:, 0] // 40 == 1
-    kept = faces[~(middle & (faces.min(axis=1) % 40 < 30))]
-    points += np.random.default_rng(1).uniform(-0.02, 0.02, points.shape)
-    few = smoothed(points, kept, everywhere(points, 3.0), most_rounds=4)
-    more = smoothed(points, kept, everywhere(points, 3.0), most_rounds=12)
-    assert few.rounds == 4
-    assert more.rounds > few.rounds
-    assert 0 < few.added.sum() < more.added.sum() < 30
-
-
 def test_shrinking_takes_long_boundary_edges_from_outside_inwards() -> None:
     # A fan of long triangles beside a dense grid, as at the end of a curve that its neighbour does not reach.
     points, faces = grid(4, 4)
@@ -250,18 +163,6 @@ def test_shrinking_takes_long_boundary_edges_from_outside_inwards() -> None:
     np.testing.assert_array_equal(result.faces, faces)
     assert result.removed_triangles == len(fan)
     np.testing.assert_array_equal(result.adjacency, neighbours(faces, vertex_count=len(points)))
-
-
-def test_shrinking_leaves_long_edges_inside() -> None:
-    points, faces = grid(4, 4)
-    points *= 6
-    narrow = everywhere(points, 6.1)
-    # Diagonals are 8.5 mm long, and none of them is on the boundary.
-    assert shrunk(points, faces, narrow).removed_triangles == 0
-    narrow[5] = 1.0
-    assert shrunk(points, faces, narrow).removed_triangles == 0
-    narrow[1] = 1.0
-    assert shrunk(points, faces, narrow).removed_triangles > 0
 
 
 def test_shrinking_agrees_with_dropping_until_nothing_changes() -> None:
@@ -283,11 +184,6 @@ def test_shrinking_agrees_with_dropping_until_nothing_changes() -> None:
         result = shrunk(points, faces, longest)
         np.testing.assert_array_equal(result.faces, left)
         assert result.removed_triangles == len(faces) - len(left)
-
-
-def test_lambda_is_five_millimetres_on_dense_points() -> None:
-    points, faces = grid(5, 5)
-    np.testing.assert_array_equal(longest_boundary_edge_mm(points, faces), everywhere(points, 5.0))
 
 
 def test_lambda_follows_the_wider_spacing_of_sparse_curves() -> None:
@@ -348,7 +244,7 @@ def test_nothing_to_do_on_no_faces() -> None:
 
 def test_smoothing_agrees_with_plain_python() -> None:
     seen: Counter[str] = Counter()
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         points, faces = grid(10, 10)
         points += rng.normal(0, 0.18, points.shape)

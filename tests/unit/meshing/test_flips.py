@@ -36,11 +36,6 @@ def flips(points: FloatArray) -> bool:
     return bool(prefers_flip(points, 0, 1, 2, 3))
 
 
-def kite(half_pq: float, half_fw: float, *, fold: float = 0.0) -> FloatArray:
-    """p, q, f, w with diagonals of these half lengths; f and w raised by `fold`."""
-    return np.array([[-half_pq, 0, 0], [half_pq, 0, 0], [0, half_fw, fold], [0, -half_fw, fold]])
-
-
 TETRAHEDRA = {
     "any": (1.0, 1.0, 1.0),
     "nearly flat": (1.0, 1.0, 0.05),
@@ -53,7 +48,7 @@ TETRAHEDRA = {
 def test_the_verdict_is_that_of_the_angles(kind: str) -> None:
     rng = np.random.default_rng(17)
     rules: dict[tuple[str, bool], int] = {}
-    for _ in range(4000):
+    for _ in range(800):
         points = rng.normal(0, 1, (4, 3)) * TETRAHEDRA[kind]
         wanted, margin, rule = verdict(*points)
         if margin < 1e-7:
@@ -61,30 +56,17 @@ def test_the_verdict_is_that_of_the_angles(kind: str) -> None:
         assert flips(points) == wanted
         rules[rule, wanted] = rules.get((rule, wanted), 0) + 1
     assert set(rules) == {("forced", True), ("forbidden", False), ("delaunay", True), ("delaunay", False)}
-    assert min(rules.values()) > 50
+    assert min(rules.values()) > 10
 
 
 def test_the_verdict_does_not_depend_on_size_place_or_turn() -> None:
     rng = np.random.default_rng(18)
     turn, _ = np.linalg.qr(rng.normal(0, 1, (3, 3)))
-    for _ in range(500):
+    for _ in range(100):
         points = rng.normal(0, 1, (4, 3))
         if verdict(*points)[1] > 1e-6:
             moved = 1e3 * points @ turn.T + [300.0, -200.0, 900.0]
             assert flips(np.ascontiguousarray(moved)) == flips(points)
-
-
-def test_no_edge_flips_back_at_once() -> None:
-    rng = np.random.default_rng(19)
-    both_kept = 0
-    for spread in (1.0, 0.0):
-        for _ in range(3000):
-            points = rng.normal(0, 1, (4, 3)) * [1, 1, spread]
-            there, back = flips(points), bool(prefers_flip(points, 2, 3, 0, 1))
-            assert not (there and back)
-            both_kept += not there and not back
-    # Only a tie keeps either edge.
-    assert both_kept == 0
 
 
 def test_on_a_lattice_ties_keep_the_edge() -> None:
@@ -94,20 +76,6 @@ def test_on_a_lattice_ties_keep_the_edge() -> None:
             square = corners * scale + offset * scale
             assert not flips(square)
             assert not prefers_flip(square, 2, 3, 0, 1)
-
-
-def test_names_of_ends_and_of_opposite_vertices_may_be_swapped() -> None:
-    rng = np.random.default_rng(20)
-    for _ in range(500):
-        points = rng.normal(0, 1, (4, 3))
-        wanted = flips(points)
-        assert bool(prefers_flip(points, 1, 0, 2, 3)) == wanted
-        assert bool(prefers_flip(points, 0, 1, 3, 2)) == wanted
-
-
-def test_the_shorter_diagonal_of_a_kite_is_preferred() -> None:
-    assert flips(kite(2.0, 1.0))
-    assert not flips(kite(1.0, 2.0))
 
 
 def angled_kite(at_p: float, at_q: float, *, bend: float = 0.0, turn: float = 0.0) -> FloatArray:
@@ -126,7 +94,7 @@ def test_gamma_overrules_delaunay_both_ways(bend: float) -> None:
     # Figure 5: on few samples of a cylinder the sums of angles prefer an edge that makes a sharp triangle.
     rng = np.random.default_rng(21)
     overruled = 0
-    for _ in range(400):
+    for _ in range(100):
         at_p = math.radians(rng.uniform(128, 150))
         at_q = rng.uniform(0.2, 0.95) * (math.pi - at_p)
         points = angled_kite(at_p, at_q, bend=bend, turn=rng.uniform(0, math.pi))
@@ -138,7 +106,7 @@ def test_gamma_overrules_delaunay_both_ways(bend: float) -> None:
         assert prefers_flip(points, 2, 3, 0, 1)
         assert prefers_flip(points, 0, 1, 2, 3, *constraint(FlipRule.DELAUNAY))
         overruled += 1
-    assert overruled > 100
+    assert overruled > 25
 
 
 @pytest.mark.parametrize("beyond", [-1e-9, 1e-9])
@@ -183,7 +151,7 @@ def test_dyers_rule_compares_the_sums_alone(kind: str) -> None:
     rng = np.random.default_rng(22)
     verdicts = []
     dyer = constraint(FlipRule.DELAUNAY, 0.1)
-    for _ in range(2000):
+    for _ in range(400):
         points = rng.normal(0, 1, (4, 3)) * TETRAHEDRA[kind]
         p, q, f, w = points
         margin = abs(angle(p, f, q) + angle(p, w, q) - angle(f, p, w) - angle(f, q, w))
@@ -192,7 +160,7 @@ def test_dyers_rule_compares_the_sums_alone(kind: str) -> None:
         found = bool(prefers_flip(points, 0, 1, 2, 3, *dyer))
         assert found == delaunay(points)
         verdicts.append(found)
-    assert 200 < sum(verdicts) < len(verdicts) - 200
+    assert 40 < sum(verdicts) < len(verdicts) - 40
 
 
 @pytest.mark.parametrize("gamma", [0.0, 0.2, math.pi / 2, 2.5, math.pi])
@@ -200,7 +168,7 @@ def test_gamma_may_be_any_angle(gamma: float) -> None:
     rng = np.random.default_rng(23)
     constrained = constraint(FlipRule.CONSTRAINED, gamma)
     forced = 0
-    for _ in range(2000):
+    for _ in range(300):
         points = rng.normal(0, 1, (4, 3)) * [4, 1, 0.3]
         p, q, f, w = points
         excess = max(angle(p, f, q), angle(p, w, q)) - max(angle(f, p, w), angle(f, q, w))

@@ -132,28 +132,6 @@ def test_points_in_no_triangle_have_no_normal() -> None:
     assert np.flatnonzero(lone).tolist() == list(range((COLUMNS - 1) * ROWS, COLUMNS * ROWS))
 
 
-def test_one_curve_makes_no_surface() -> None:
-    points, _, _ = relief(wave())
-    mesh = meshed(points[:ROWS], np.array([0, ROWS], dtype=np.int32), np.array([3.0]))
-    assert mesh.faces.shape == (0, 3)
-    assert mesh.strip_pairs == mesh.strip_triangles == 0
-    assert np.isnan(vertex_normals(points, mesh.faces)).all()
-
-
-def test_no_points_make_no_surface() -> None:
-    mesh = meshed(np.zeros((0, 3)), np.zeros(1, dtype=np.int32), np.zeros(0))
-    assert mesh.faces.shape == mesh.adjacency.shape == (0, 3)
-
-
-def test_the_same_curves_give_the_same_mesh() -> None:
-    points, offsets, position = relief(wave())
-    before = points.copy()
-    one, other = meshed(points, offsets, position), meshed(points, offsets, position)
-    assert one.faces.tobytes() == other.faces.tobytes()
-    assert one.adjacency.tobytes() == other.adjacency.tobytes()
-    np.testing.assert_array_equal(points, before)
-
-
 @pytest.mark.parametrize("behind", [False, True])
 def test_the_mesh_knows_its_neighbours_after_the_drop(*, behind: bool) -> None:
     depth = wave()

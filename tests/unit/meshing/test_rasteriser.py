@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from slrig.meshing import rasteriser
 from slrig.meshing.rasteriser import View, normals_seen, rasterised
 from slrig.model import FloatArray, IntArray, Size
+from tests.unit.meshing.plain import grid_faces
 
 SIZE = Size(50, 40)
 
@@ -85,18 +86,6 @@ def test_normals_are_those_of_the_triangle_that_is_seen_on_the_side_that_is_seen
     assert found == pytest.approx(expected / np.where(length > 0, length, 1), abs=1e-5)
 
 
-def test_a_normal_that_is_not_known_counts_for_nothing() -> None:
-    placed = placed_at(np.array([[1.0, 1.0], [1.0, 8.0], [8.0, 1.0]]), np.ones(3))
-    faces = np.array([[0, 1, 2]], dtype=np.int32)
-    normals = np.array([[0, 0, -1], [np.nan, np.nan, np.nan], [0, 0, -1]], dtype=np.float32)
-    found, front = normals_seen(rasterised(placed, faces, Size(10, 10)), placed, normals, faces)
-    assert front[2, 2]
-    assert tuple(found[2, 2]) == (0, 0, -1)
-    assert not found[1, 9].any()
-    nothing, _ = normals_seen(rasterised(placed, faces, Size(10, 10)), placed, np.full_like(normals, np.nan), faces)
-    assert not nothing.any()
-
-
 def test_views_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     placed, faces, normals = random_triangles(300, seed=1)
 
@@ -123,20 +112,6 @@ def test_of_equally_near_triangles_the_first_is_seen(monkeypatch: pytest.MonkeyP
     assert np.array_equal(again.face, once.face)
 
 
-def test_interpolation_is_linear_in_space_not_in_the_picture() -> None:
-    # A plane z = 200 + 2 x seen by an ideal camera with f = 100 px: 1/z is linear in the column.
-    corners = np.array([[-40, -30, 120], [40, -30, 280], [-40, 30, 120], [40, 30, 280]], dtype=np.float64)
-    pixels = 100 * corners[:, :2] / corners[:, 2:] + (32, 24)
-    faces = np.array([[0, 2, 1], [1, 2, 3]], dtype=np.int32)
-    view = rasterised(placed_at(pixels, corners[:, 2]), faces, Size(64, 48))
-    columns = np.arange(64)
-    expected = 200 / (1 - 2 * (columns - 32) / 100)
-    row = view.depth_mm[24]
-    seen = np.isfinite(row)
-    assert seen.sum() > 30
-    assert row[seen] == pytest.approx(expected[seen])
-
-
 def test_front_is_counter_clockwise_in_the_picture() -> None:
     pixels = np.array([[1, 1], [1, 8], [8, 1]], dtype=np.float64)  # down, then right: counter-clockwise to the eye
     placed, normals = placed_at(pixels, np.ones(3)), np.zeros((3, 3), dtype=np.float32)
@@ -150,9 +125,7 @@ def test_a_sheet_of_small_triangles_has_no_holes() -> None:
     side = np.linspace(-0.5, 30.5, 32)  # its edges pass between pixel centres; then through them
     for shift in (0.0, 0.5):
         x, y = (axis.ravel() + shift for axis in np.meshgrid(side, side))
-        index = np.arange(32 * 32, dtype=np.int32).reshape(32, 32)
-        a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel()
-        faces = np.concatenate((np.stack((a, c, b), 1), np.stack((b, c, d), 1)))
+        faces = grid_faces(32, 32)
         view = rasterised(placed_at(np.stack((x, y), 1), np.full(len(x), 300.0)), faces, Size(34, 34))
         seen = np.zeros((34, 34), dtype=bool)
         seen[: 31 + round(2 * shift), : 31 + round(2 * shift)] = True

@@ -7,6 +7,7 @@ import pytest
 
 from slrig.meshing.search_tree import SearchTree
 from slrig.model import FloatArray, IntArray
+from tests.unit.meshing.plain import grid_faces
 
 
 def soup(count: int, seed: int) -> tuple[FloatArray, IntArray]:
@@ -52,7 +53,7 @@ def plain_reaches(origin: FloatArray, direction: FloatArray, corners: FloatArray
 @pytest.mark.parametrize("count", [1, 3, 4, 5, 61, 300])
 def test_distances_are_those_of_trying_every_triangle(count: int) -> None:
     vertices, faces = soup(count, count)
-    points = np.random.default_rng(0).uniform(-15, 15, (60, 3))
+    points = np.random.default_rng(0).uniform(-15, 15, (20, 3))
     expected = [plain_distance(point, vertices[faces]) for point in points]
     assert SearchTree.over(vertices, faces).distances_mm(points) == pytest.approx(np.array(expected), abs=1e-6)
 
@@ -61,7 +62,7 @@ def test_rays_are_those_of_trying_every_triangle() -> None:
     vertices, faces = soup(250, 9)
     random = np.random.default_rng(2)
     origin = np.array([1.0, -30.0, 4.0])
-    directions = random.uniform(-8, 8, (120, 3)) - origin
+    directions = random.uniform(-8, 8, (40, 3)) - origin
     directions[0] = (0.0, 1.0, 0.0)
     tree = SearchTree.over(vertices, faces)
     reaches = [plain_reaches(origin, direction, vertices[faces]) for direction in directions]
@@ -74,20 +75,11 @@ def test_a_ray_through_vertices_and_along_edges_does_not_slip_through() -> None:
     side = np.arange(-20.0, 21.0)
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     vertices = np.stack((x, y, 0.01 * x * y), axis=1)
-    index = np.arange(41 * 41, dtype=np.int32).reshape(41, 41)
-    a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel()
-    faces = np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
+    faces = grid_faces(41, 41)
     eye = np.array([3.7, -2.9, -90.3])
     inner = vertices[(np.abs(vertices[:, :2]) < 20).all(axis=1)]
     reach = SearchTree.over(vertices, faces).first_hits(eye, inner - eye)
     assert reach == pytest.approx(np.ones(len(inner)), abs=1e-6)
-
-
-def test_a_triangle_behind_the_origin_is_not_met() -> None:
-    vertices = np.array([[-1, -1, 5], [1, -1, 5], [0, 2, 5]], dtype=np.float32)
-    tree = SearchTree.over(vertices, np.array([[0, 1, 2]], dtype=np.int32))
-    ways = np.array([[0, 0, 1], [0, 0, -1], [0, 0, 2]], dtype=np.float64)
-    assert tree.first_hits(np.zeros(3), ways).tolist() == [5.0, np.inf, 2.5]
 
 
 def test_a_tree_of_nothing_is_infinitely_far() -> None:

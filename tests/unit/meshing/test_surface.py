@@ -105,18 +105,3 @@ def test_a_hole_at_a_bridge_stays_open_when_holes_are_kept() -> None:
         )  # fmt: skip
         holes[keep_holes] = 1 - topology_counts(made.faces).euler_characteristic
     assert holes == {True: 1, False: 0}
-
-
-def test_the_unconstrained_rule_can_be_chosen() -> None:
-    random = np.random.default_rng(5)
-    points, offsets = jagged_curves()
-    rough = points + random.normal(0, 0.4, points.shape)
-    flipped = replace(LIMITS, smooth_boundary=False)
-    constrained, _ = meshed(rough, offsets, flipped)
-    delaunay, _ = meshed(rough, offsets, replace(flipped, flip_rule=FlipRule.DELAUNAY))
-    assert not np.array_equal(constrained.faces, delaunay.faces)
-
-
-def test_nothing_makes_an_empty_mesh() -> None:
-    made, _ = meshed(np.zeros((0, 3)), np.zeros(1, dtype=np.int32))
-    assert len(made.faces) == 0

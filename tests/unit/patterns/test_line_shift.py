@@ -7,7 +7,7 @@ import pytest
 
 from slrig.errors import PatternError
 from slrig.model import Axis, LineShift, Size
-from slrig.patterns.line_shift import is_whole, line_count, line_number, line_position_px, line_profile
+from slrig.patterns.line_shift import is_whole, line_count, line_position_px, line_profile
 
 
 def test_rows_are_lit_for_the_row_axis() -> None:
@@ -34,12 +34,6 @@ def test_positions_are_the_mean_of_the_lit_positions() -> None:
 
 def test_a_frame_without_a_whole_line_has_none() -> None:
     assert line_count(LineShift(Axis.COLUMN, 7, 8, line_width_px=4), 8) == 0
-
-
-def test_number_and_position_undo_each_other() -> None:
-    pattern = LineShift(Axis.COLUMN, 5, 8)
-    numbers = np.arange(20)
-    assert (line_number(line_position_px(numbers, pattern), pattern) == numbers).all()
 
 
 def test_a_projector_shorter_than_a_period_is_refused() -> None:

@@ -102,48 +102,6 @@ def test_each_line_is_named_by_the_cells_it_may_be_seen_in(
 
 
 @AXES
-def test_a_cell_never_names_a_line_half_a_period_away(axis: Axis) -> None:
-    code, size = code_of(axis, 61, 4, 3), size_of(axis, 61)
-    lines = [LineShift(axis, shift, 8, 2) for shift in range(8)]
-    table = line_positions(lines, code, size)
-    apart = np.abs(table - cell_positions(code, size))
-    assert np.nanmax(apart) <= 4
-    centres = [{float(run.mean()) for run in lit_runs(line, size) if len(run) == 2} for line in lines]
-    for frame, row in enumerate(table):
-        assert set(row[np.isfinite(row)].tolist()) <= centres[frame]
-
-
-def test_lines_that_the_border_cuts_have_no_position() -> None:
-    # 18 columns, period 8, width 7: the lines of shift 1 lie at 4 and 12; of shift 5 at 8 and, cut by the
-    # border on both sides, about 0 and 16.
-    size, code = Size(18, 1), code_of(Axis.COLUMN, 18, 4, 0)
-    lines = [LineShift(Axis.COLUMN, k, 8, 7) for k in (1, 5)]
-    table = line_positions(lines, code, size)
-    # Cell 1 lies nearer to 4, cell 3 to 12; cell 4 beside the border can only mean a line that has no place there.
-    np.testing.assert_array_equal(table[0, [0, 1, 2, 3]], [4, 4, 12, 12])
-    assert np.isnan(table[1, [0, 4]]).all()
-    np.testing.assert_array_equal(table[1, [1, 2]], [8, 8])
-    # The light of a cut line is there, in part.
-    assert line_profile(lines[1], size)[0, [0, 3, 4]].tolist() == [255, 255, 0]
-
-
-@AXES
-def test_lines_beside_the_border_have_no_position_and_all_others_do(axis: Axis) -> None:
-    code, size = code_of(axis, 40, 4, 0), size_of(axis, 40)
-    for width_px, left_out in ((1, [0, 1, 2, 37, 38, 39]), (2, [0.5, 1.5, 2.5, 36.5, 37.5, 38.5]), (7, [])):
-        table = line_positions([LineShift(axis, shift, 8, width_px) for shift in range(8)], code, size)
-        every = np.arange(40 - width_px + 1) + (width_px - 1) / 2
-        assert sorted(set(table[np.isfinite(table)].tolist())) == sorted(set(every.tolist()) - set(left_out))
-
-
-def test_only_the_frames_that_were_shown_have_a_row() -> None:
-    code, size = code_of(Axis.COLUMN, 40, 4, 0), Size(40, 1)
-    lines = [LineShift(Axis.COLUMN, shift, 8) for shift in range(8)]
-    everything = line_positions(lines, code, size)
-    np.testing.assert_array_equal(line_positions([lines[5], lines[2]], code, size), everything[[5, 2]])
-
-
-@AXES
 @EXTENTS
 def test_each_edge_is_named_by_the_cells_on_either_side_of_it(
     axis: Axis, extent_px: int, cell_px: int, offset_px: int

@@ -6,7 +6,6 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
-import numpy as np
 import pytest
 
 from slrig.errors import PatternError
@@ -62,12 +61,6 @@ def test_what_tells_how_a_camera_sees_comes_before_the_lines_of_its_axis_and_the
         assert patterns[patterns.index(bit) + 1] == replace(bit, inverted=True)
 
 
-def test_gray_only_has_cells_of_two_pixels_and_no_lines() -> None:
-    patterns = patterns_of(Size(64, 48), line_shift=False)
-    assert len(patterns) == 2 + 2 * 5 + 2
-    assert all(pattern.cell_px == 2 for pattern in patterns if isinstance(pattern, Gray))
-
-
 def test_rows_follow_columns_with_bits_of_their_own() -> None:
     axes = [pattern.axis for pattern in patterns_of(Size(64, 30), rows=True) if isinstance(pattern, Gray | LineShift)]
     assert axes == [Axis.COLUMN] * (2 * 4 + 8) + [Axis.ROW] * (2 * 3 + 8)
@@ -97,13 +90,6 @@ def test_images_are_spread_from_profiles_and_cannot_be_written() -> None:
     assert (sequence.image(0) == 255).all()
     assert not sequence.image(1).any()
     assert not sequence.image(2).flags.writeable
-
-
-def test_a_large_sequence_stays_small() -> None:
-    size = Size(4096, 2160)
-    sequence = encode(patterns_of(size, rows=True), size)
-    assert sum(profile.nbytes for profile in sequence.profiles) < 500_000
-    assert all(profile.dtype == np.uint8 for profile in sequence.profiles)
 
 
 def test_an_empty_sequence_is_refused() -> None:

@@ -209,16 +209,6 @@ def _brightened(shot: Shot, capture: Capture, glint: NDArray[np.bool_]) -> Shot:
     return replace(shot, image=np.where(glint, brighter, shot.image).astype(np.uint8))
 
 
-def test_pixels_that_see_past_the_projector_are_counted_as_such() -> None:
-    def beyond(x: FloatArray, y: FloatArray) -> FloatArray:
-        return np.asarray(slope(x, y) + 45.0)
-
-    curves, _ = walk(rendered(beyond, patterns()))
-    assert curves.ensemble.position_px.max() <= 127
-    assert (curves.refusal == Refusal.NOT_LIT).mean() > 0.2
-    assert curves.decoded_pixels == pytest.approx(int(((beyond(*grid(CAMERA.shape))) < 127.5).sum()), rel=0.05)
-
-
 def test_a_dark_room_gives_no_curves() -> None:
     def nowhere(x: FloatArray, y: FloatArray) -> FloatArray:
         return np.full((x + y).shape, np.nan)

@@ -67,17 +67,6 @@ def test_noise_of_an_even_surface_stays_as_it_is() -> None:
     assert abs(moved.mean()) < 2e-5
 
 
-def test_a_surface_that_bends_within_the_wide_window_is_judged_by_the_narrow_one() -> None:
-    x, _ = fine_grid()
-    measured, true = seen_through_blur(40 + 1.1 * x + 0.8 * np.sqrt(x * x + 1.0))
-    after = np.abs(freed(measured) - true)[INNER]
-    before = np.abs(measured - true)[INNER]
-    assert before.max() > 0.09
-    assert after.max() < 0.45 * before.max()
-    # The wide window alone would move these by 0.007 and 0.015 px: it reaches the bend, and the surface is even.
-    assert after[:, [8, 16]].max() < 0.002
-
-
 def test_a_surface_bends_up_to_its_border() -> None:
     x, y = fine_grid()
     measured, true = seen_through_blur(40 + 1.1 * x + 0.2 * y - 0.015 * x * x + 0.01 * x * y - 0.01 * y * y)

@@ -53,21 +53,6 @@ def test_bends_are_second_differences_that_neither_slope_nor_noise_explains() ->
     assert 50 < wanted.sum() < sure.sum() < 1000
 
 
-def test_the_noise_of_a_dark_surface_is_no_step_and_a_step_in_it_is_still_seen() -> None:
-    rng = np.random.default_rng(2)
-    x, y = grid((120, 160))
-    noise = np.where(y < 60, 0.02, 0.5)
-    for height, expected in ((0.0, False), (14.0, True)):
-        position = (20 + 1.1 * x + height * (x > 80) + noise * rng.normal(0, 1, x.shape)).astype(np.float32)
-        seen = PositionMap(position, noise.astype(np.float32))
-        step = near_edges(seen, np.zeros(x.shape, dtype=np.bool_), 0.0, LIMITS)[1]
-        # Four sigmas in 38 000 tries of four directions: a handful by chance.
-        assert step[:, :78].mean() < 1e-3
-        assert step[5:115, 80:82].all() == expected
-    loud = near_edges(PositionMap(position, np.zeros_like(position)), np.zeros(x.shape, dtype=np.bool_), 0.0, LIMITS)
-    assert loud[1][60:, :78].mean() > 0.2
-
-
 def test_a_filter_keeps_clear_by_its_own_reach_and_by_more_where_stripes_are_wide() -> None:
     for blur_px, reach_px in ((0.4, 2.0), (1.0, 2.0), (1.6, 3.2)):
         limits = LIMITS.for_filters(blur_px)
@@ -119,20 +104,6 @@ def test_a_slanted_depth_step_leaves_no_way_through_it(rise: float) -> None:
     left, right = set(np.unique(label[(~far)[1:-1, 1:-1]])), set(np.unique(label[far[1:-1, 1:-1]]))
     assert left & right <= {0}
     assert step.mean() < 0.15
-
-
-def test_a_hole_in_a_smooth_surface_is_no_depth_step() -> None:
-    x, _ = grid(SHAPE)
-    position = 20 + 1.2 * x
-    position[:, 20] = np.nan
-    position[10, 5] = np.nan
-    assert not steps(position)[1].any()
-
-
-def test_a_surface_seen_at_a_grazing_angle_is_no_step() -> None:
-    # The position runs by 4 to 7 px per pixel: it bends by more than 0.9 px, and by less than half of its slope.
-    x, _ = grid(SHAPE)
-    assert not steps(20 + 4 * x + 0.6 * np.maximum(x - 20, 0) ** 1.6)[1].any()
 
 
 def test_a_coarse_map_needs_a_higher_step() -> None:

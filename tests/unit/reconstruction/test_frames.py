@@ -127,18 +127,6 @@ def test_ends_that_are_shown_several_times_before_the_code_have_less_noise(openi
     assert frames.ends_repeats == opening
 
 
-def test_one_exposure_that_the_camera_names_a_little_differently_is_one() -> None:
-    seen = [(p, v, 0.02 + 1e-4 * index) for index, (p, v, _) in enumerate([*ENDS, *plain(*BITS), *ENDS])]
-    frames = axis_frames(capture_of(*seen), "eye", Axis.COLUMN)
-    assert (frames.white == 200).all()
-    assert frames.exposure_ratio == 1.0
-
-
-def test_missing_inverses_are_said_to_be_missing() -> None:
-    frames = axis_frames(capture_of(*ENDS, *plain(*BITS), *plain(INVERSES[0])), "eye", Axis.COLUMN)
-    assert frames.inverses is None
-
-
 def test_a_bit_shown_only_inverted_is_turned_back() -> None:
     frames = axis_frames(capture_of(*ENDS, *plain(BITS[0]), (INVERSES[1], 60, None)), "eye", Axis.COLUMN)
     assert first_pixels(frames.bits) == [50, 200 + 10 - 60]

@@ -113,20 +113,3 @@ def test_blocks_of_points_give_what_each_point_gives(seed: int, axis: Axis) -> N
     np.testing.assert_array_equal(cause[sure], why[sure])
     met = sure & (why == Refusal.NONE)
     np.testing.assert_allclose(points[met], expected[met], rtol=1e-11, atol=1e-9)
-
-
-@pytest.mark.parametrize("axis", list(Axis))
-def test_a_point_does_not_depend_on_those_beside_it(axis: Axis) -> None:
-    camera, projector = rig(11, axis)
-    ensemble = scattered(11)
-    together = on_light_sheets(ensemble, camera, projector, axis)
-    alone = ensemble_of(
-        list(ensemble.points_px[:, None, :]), np.repeat(ensemble.position_px, np.diff(ensemble.offsets)).tolist()
-    )
-    met = together[-1] == Refusal.NONE
-    assert 100 < np.count_nonzero(met) < len(met) - 100
-    points, deviation, along, cause = on_light_sheets(alone, camera, projector, axis)
-    np.testing.assert_array_equal(cause, together[-1])
-    np.testing.assert_array_equal(points[met], together[0][met])
-    np.testing.assert_array_equal(deviation[met], together[1][met])
-    np.testing.assert_array_equal(along[met], together[2][met])

@@ -61,12 +61,6 @@ def test_the_variance_of_dark_and_bright_pixels_is_recovered(
         assert variance == pytest.approx(read_variance + slope * level, rel=0.1)
 
 
-def test_a_textured_surface_does_not_look_noisy_when_inverses_are_there() -> None:
-    found = estimate_noise(frames_with_noise(1.5, 0.02, paired=True, texture=0.2))
-    assert found.slope == pytest.approx(0.02, rel=0.1)
-    assert variance_at(found, 100.0) == pytest.approx(3.5, rel=0.1)
-
-
 def test_whole_numbers_of_a_bright_surface_tell_the_noise_of_the_dark() -> None:
     # Of eight bits and few frames; no level of the sums is dark.
     rng, (x, y) = np.random.default_rng(5), grid(SHAPE)

@@ -24,9 +24,6 @@ from tests.unit.reconstruction.refining import fitted_points
 SHAPE = (60, 80)
 QUIET = NoiseModel(1e-4, 0.0)
 PATTERNS = pytest.mark.parametrize(("period_px", "width_px"), [(4, 1), (4, 2), (6, 1), (8, 1), (8, 3), (8, 4), (16, 2)])
-Fit = tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]
-
-
 def lines(period_px: int = 8, width_px: int = 1, axis: Axis = Axis.COLUMN) -> tuple[LineShift, ...]:
     return tuple(LineShift(axis, shift, period_px, width_px) for shift in range(period_px))
 
@@ -125,17 +122,6 @@ def test_a_pixel_with_a_clipped_line_has_no_position() -> None:
     clipped = np.max([10 + 300_000.0 * bars(position, line, 0.9) for line in lines()], axis=0) >= 65535.0
     np.testing.assert_array_equal(np.isnan(found.position), clipped & (x >= 20))
     assert clipped[x >= 20].any()
-
-
-@pytest.mark.parametrize("height", [6.0, 40_000.0])
-def test_dark_surfaces_and_deep_samples_are_measured_alike(height: float) -> None:
-    x, y = grid((100, 100))
-    position = 30.0 + 0.4 * x + 0.1 * y
-    noise = NoiseModel((0.02 * height) ** 2, 0.0)
-    found = seen(position, lines(), height=height, noise=noise)
-    z = (found.position - position) / found.sigma
-    assert np.mean(z**2) == pytest.approx(1.0, abs=0.06)
-    assert float(found.sigma.mean()) == pytest.approx(0.02 * 8 / (2 * math.pi) * math.sqrt(4) / 0.81, rel=0.1)
 
 
 def test_lines_at_the_projectors_border_do_not_wrap() -> None:

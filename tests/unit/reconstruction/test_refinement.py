@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.model import Axis, FloatArray, LineShift, Size
+from slrig.model import Axis, FloatArray, LineShift
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.edges import beside_steps_px
 from slrig.reconstruction.phase import PositionMap
 from slrig.reconstruction.refinement import Refinement, refined
 from slrig.reconstruction.stripes import LinePoints, chained
 from tests.unit.reconstruction.builders import cells_of, grid, nearest_lines
-from tests.unit.reconstruction.refining import fitted_points, line_crossings
+from tests.unit.reconstruction.refining import line_crossings
 
 SHAPE = (60, 80)
-PROJECTOR = Size(160, 128)
 LINES = tuple(LineShift(Axis.COLUMN, shift, 8, 1) for shift in range(8))
 _, POSITION_OF = nearest_lines(LINES, 4, 400)
 EVERYWHERE = np.ones(SHAPE, dtype=np.bool_)
@@ -254,19 +253,3 @@ def test_points_too_coarse_to_use_are_left_out() -> None:
     assert 0 < sum(len(each.points_px) for each in fewer.points) < sum(len(each.points_px) for each in every.points)
     assert max(each.sigma_px.max() for each in fewer.points) < 0.15
     assert max(each.sigma_px.max() for each in every.points) < 0.5
-
-
-def test_what_is_skipped_as_already_there_is_there() -> None:
-    """Points and crossings refined by themselves, and each crossing kept unless its pixel holds a point."""
-    surface = tilted(1.1, 0.4)
-    here, code = mapped(surface, noise=0.05)
-    usable = np.asarray(np.random.default_rng(8).random(SHAPE) > 0.05)
-    frame, starts, targets = line_crossings(here, usable, code, POSITION_OF)
-    drawn = np.random.default_rng(9).random(len(frame)) < 0.6
-    found = [points_at(starts[drawn & (frame == k)]) for k in range(8)]
-    refinement = refined([*found], here, usable, code, POSITION_OF)
-    for k, points in enumerate(refinement.points):
-        mine = frame == k
-        ended, _, sigma_px, good, _ = fitted_points(here, usable, starts[mine], targets[mine])
-        wanted = {tuple(each) for each in np.rint(ended[good & (sigma_px < 0.5)]).astype(int)}
-        assert {tuple(each) for each in np.rint(points.points_px).astype(int)} == wanted

@@ -69,27 +69,62 @@ def test_points_are_left_out_with_all_that_belongs_to_them() -> None:
     assert kept.position_px.tolist() == [0.0, 8.0]
 
 
-def test_a_bridge_is_carried_to_the_last_point_before_it_that_stays() -> None:
-    curves = curves_of([(0, [1.0, 2.0, 3.0]), (1, [7.0, 8.0, 9.0])])
-    assert np.flatnonzero(curves.bridge_after).tolist() == [2]
-    assert np.flatnonzero(selected(curves, keeping(6, 2)).bridge_after).tolist() == [1]
-    assert np.flatnonzero(selected(curves, keeping(6, 1, 2, 3)).bridge_after).tolist() == [0]
-    assert np.flatnonzero(selected(curves, keeping(6, 3)).bridge_after).tolist() == [2]
+Curve = list[tuple[int, list[float]]]
+TWO: list[Curve] = [[(0, [1.0, 2.0, 3.0]), (1, [7.0, 8.0, 9.0])]]
+THREE: list[Curve] = [[(0, [1.0, 2.0]), (1, [5.0]), (2, [9.0, 10.0])]]
+PAIR: list[Curve] = [[(0, [1.0, 2.0]), (1, [5.0, 6.0])], [(2, [1.0, 2.0]), (3, [5.0, 6.0])]]
 
 
-def test_a_whole_stripe_between_two_others_leaves_one_bridge() -> None:
-    curves = curves_of([(0, [1.0, 2.0]), (1, [5.0]), (2, [9.0, 10.0])])
-    kept = selected(curves, keeping(5, 2))
-    assert np.flatnonzero(kept.bridge_after).tolist() == [1]
+@pytest.mark.parametrize(
+    ("curves", "left_out", "bridges"),
+    [
+        (TWO, [], [2]),
+        (TWO, [2], [1]),
+        (TWO, [1, 2, 3], [0]),
+        (TWO, [3], [2]),
+        (THREE, [2], [1]),
+        # What follows the bridge is left out, so the curve ends before it.
+        (PAIR, [2, 3], [3]),
+        (PAIR, [4, 5], [1]),
+    ],
+)
+def test_a_bridge_is_carried_to_the_last_point_before_it_that_stays_and_never_out_of_a_curve(
+    curves: list[Curve], left_out: list[int], bridges: list[int]
+) -> None:
+    made = curves_of(*curves)
+    kept = selected(made, keeping(len(made.points_mm), *left_out))
+    assert np.flatnonzero(kept.bridge_after).tolist() == bridges
 
 
-def test_no_bridge_leads_out_of_a_curve() -> None:
-    # What follows the bridge is left out, so the curve ends before it.
-    curves = curves_of([(0, [1.0, 2.0]), (1, [5.0, 6.0])], [(2, [1.0, 2.0]), (3, [5.0, 6.0])])
-    tail_gone = selected(curves, keeping(8, 2, 3))
-    assert np.flatnonzero(tail_gone.bridge_after).tolist() == [3]
-    head_gone = selected(curves, keeping(8, 4, 5))
-    assert np.flatnonzero(head_gone.bridge_after).tolist() == [1]
+@pytest.mark.parametrize(
+    ("curves", "points", "bridges"),
+    [
+        (
+            [[(0, [50.0, 51.0, 52.0]), (1, [10.0, 11.0]), (2, [30.0, 31.0])], [(3, [5.0, 6.0])]],
+            [100, 101, 200, 201, 0, 1, 2, 300, 301],
+            [1, 3],
+        ),
+        # A stripe that runs upwards is turned.
+        ([[(0, [9.0, 8.0, 7.0, 6.0]), (1, [1.0, 2.0, 3.0])]], [100, 101, 102, 3, 2, 1, 0], [2]),
+        # Row noise of one point is no reason to fold the curve.
+        ([[(0, [1.0, 2.2, 2.1, 3.0, 4.0])]], [0, 1, 2, 3, 4], []),
+        ([[(0, [4.0])], [], [(1, [9.0]), (2, [2.0])]], [0, 200, 100], [1]),
+        ([], [], []),
+    ],
+)
+def test_stripes_of_a_curve_follow_one_another_by_row(
+    curves: list[Curve], points: list[int], bridges: list[int]
+) -> None:
+    made = curves_of(*curves)
+    ordered = ordered_along_sheet(made)
+    assert told(ordered) == points
+    assert ordered.offsets.tolist() == made.offsets.tolist()
+    assert np.flatnonzero(ordered.bridge_after).tolist() == bridges
+    np.testing.assert_array_equal(ordered.deviation_mm, ordered.points_mm + 1000)
+    # What is in order is left as it is.
+    again = ordered_along_sheet(ordered)
+    assert told(again) == points
+    np.testing.assert_array_equal(again.bridge_after, ordered.bridge_after)
 
 
 def test_keeping_everything_or_nothing() -> None:
@@ -102,52 +137,10 @@ def test_keeping_everything_or_nothing() -> None:
     assert len(none.points_mm) == len(none.bridge_after) == 0
 
 
-def test_stripes_of_a_curve_follow_one_another_by_row() -> None:
-    curves = curves_of([(0, [50.0, 51.0, 52.0]), (1, [10.0, 11.0]), (2, [30.0, 31.0])], [(3, [5.0, 6.0])])
-    ordered = ordered_along_sheet(curves)
-    assert told(ordered) == [100, 101, 200, 201, 0, 1, 2, 300, 301]
-    assert ordered.offsets.tolist() == curves.offsets.tolist()
-    assert np.flatnonzero(ordered.bridge_after).tolist() == [1, 3]
-    np.testing.assert_array_equal(ordered.deviation_mm, ordered.points_mm + 1000)
-
-
-def test_a_stripe_that_runs_upwards_is_turned() -> None:
-    ordered = ordered_along_sheet(curves_of([(0, [9.0, 8.0, 7.0, 6.0]), (1, [1.0, 2.0, 3.0])]))
-    assert told(ordered) == [100, 101, 102, 3, 2, 1, 0]
-    assert ordered.along_px.tolist() == [1, 2, 3, 6, 7, 8, 9]
-    assert np.flatnonzero(ordered.bridge_after).tolist() == [2]
-
-
-def test_points_keep_their_order_within_a_stripe() -> None:
-    # Row noise of one point is no reason to fold the curve.
-    ordered = ordered_along_sheet(curves_of([(0, [1.0, 2.2, 2.1, 3.0, 4.0])]))
-    assert told(ordered) == [0, 1, 2, 3, 4]
-
-
-def test_curves_of_one_point_and_of_none_keep_their_places() -> None:
-    ordered = ordered_along_sheet(curves_of([(0, [4.0])], [], [(1, [9.0]), (2, [2.0])]))
-    assert told(ordered) == [0, 200, 100]
-    assert ordered.offsets.tolist() == [0, 1, 1, 3]
-    assert np.flatnonzero(ordered.bridge_after).tolist() == [1]
-    assert len(ordered_along_sheet(curves_of()).points_mm) == 0
-
-
-def test_what_is_in_order_is_left_as_it_is() -> None:
-    curves = curves_of([(0, [1.0, 2.0]), (1, [5.0, 6.0])], [(2, [1.0]), (3, [3.0])])
-    again = ordered_along_sheet(ordered_along_sheet(curves))
-    assert told(again) == told(curves)
-    np.testing.assert_array_equal(again.bridge_after, curves.bridge_after)
-
-
 def test_only_the_part_of_an_error_along_the_normal_counts() -> None:
     deviation = np.array([[0.3, 0.0, 0.4], [0.3, 0.0, 0.4], [0.3, 0.0, -0.4], [0.3, 0.0, 0.4]])
     normals = np.array([[0, 0, 1], [1, 0, 0], [0.6, 0, 0.8], [np.nan] * 3], dtype=np.float32)
     np.testing.assert_allclose(sigma_along_normal(deviation, normals), [0.4, 0.3, 0.14, 0.5], atol=1e-7)
-
-
-def test_an_unmeasured_point_has_no_deviation() -> None:
-    normals = np.array([[0, 0, 1]], dtype=np.float32)
-    assert np.isnan(sigma_along_normal(np.full((1, 3), np.nan), normals)).all()
 
 
 @pytest.mark.parametrize("depth_mm", [300.0, 900.0])

@@ -193,30 +193,6 @@ def test_second_step_ends_with_the_image(kind: int, beyond: tuple[int, int]) -> 
             assert response[0] == pytest.approx(wanted[3][i], rel=1e-10)
 
 
-@pytest.mark.parametrize("sigma", [1.0, 1.4, 2.5])
-def test_sampled_kernels_are_exact_for_constants_ramps_and_parabolas(sigma: float) -> None:
-    zero, one, two = (kernel.astype(np.float64) for kernel in kernels(sigma))
-    at = np.arange(len(zero)) - len(zero) // 2
-    assert len(zero) % 2 == 1
-    moments = [[float((kernel * at**power).sum()) for power in range(3)] for kernel in (zero, one, two)]
-    np.testing.assert_allclose(
-        [moments[0][0], *moments[1], moments[2][0], moments[2][2] / 2], [1, 0, 1, 0, 0, 1], atol=2e-6
-    )
-    assert moments[0][2] == pytest.approx(sigma**2, rel=0.03)
-
-
-def test_the_frame_is_filtered_by_correlation() -> None:
-    """A point's place before the second step follows from sums over windows, written out."""
-    image = gaussian_stripe(grid((30, 30))[0] - 14.3, 1.3)
-    noise = np.full(image.shape, 0.01, dtype=np.float32)
-    points = stripe_points(image, noise, np.ones(image.shape, dtype=np.bool_), StripeLimits(), sigma_px=1.3)
-    x, y = points.points_px.T
-    # A straight bar smoothed to S² = 2σ² answers with -g'' = σ/S³ on its centre line.
-    np.testing.assert_allclose(points.strength, 1.3 / (2 * 1.3**2) ** 1.5, rtol=5e-3)
-    np.testing.assert_allclose(x, 14.3, atol=1e-3)
-    assert sorted(np.rint(y).astype(int).tolist()) == list(range(5, 25))
-
-
 def test_a_faint_stretch_belongs_to_a_strong_stripe_but_not_to_itself() -> None:
     x, y = grid(SHAPE)
     height = np.where(y < 40, 1.0, 0.3)

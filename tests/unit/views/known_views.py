@@ -17,6 +17,7 @@ from simulated_rig.casting import caster
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.topology import used_vertices
 from slrig.model import FloatArray, Mesh
+from tests.unit.meshing.plain import grid_faces
 
 DISTANCE_MM = 400.0
 _DEPTH_STEP = 6.0  # an edge longer than so many pixels joins a front to what is behind it
@@ -135,9 +136,7 @@ def _slow(points: FloatArray, length_mm: float, random: Any) -> FloatArray:
 
 
 def _grid_faces(points: FloatArray, columns: int, longest_mm: float) -> NDArray[np.int32]:
-    index = np.arange(len(points), dtype=np.int32).reshape(-1, columns)
-    a, b, c, d = (each.ravel() for each in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
-    faces = np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
+    faces = grid_faces(len(points) // columns, columns)
     edges = points[faces] - points[np.roll(faces, 1, axis=1)]
     # NaN is not below.
     return np.ascontiguousarray(faces[(np.linalg.norm(edges, axis=2) < longest_mm).all(axis=1)])

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 
 from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.meshing.search_tree import SearchTree
@@ -16,27 +15,17 @@ from slrig.model.srgb import light_of, srgb_of
 from slrig.views.fusion import _FOLDED, _OUTWARD, FusedModel, _halve, fused
 from slrig.views.fusion_mean import PoseErrors, Rule, mean_values
 from slrig.views.fusion_sheets import sheets
-from tests.unit.views.known_views import Noise, View, around, plate_on_box, star, views_of
+from tests.unit.meshing.plain import grid_faces
+from tests.unit.views.known_views import Noise, View, around, star, views_of
+
+# Only models of several views need these kernels.
+pytestmark = pytest.mark.slow
 
 QUIET = Noise(sigma_mm=0.001, slow_mm=0.0)
 
 
 def model_of(views: list[View], *, voxel_mm: float | None = None) -> FusedModel:
     return fused([view.mesh for view in views], [view.pose for view in views], voxel_mm=voxel_mm)
-
-
-def tree(truth: trimesh.Trimesh) -> SearchTree:
-    return SearchTree.over(truth.vertices, np.asarray(truth.faces, np.int32))
-
-
-def on(mesh: Mesh, pose: FloatArray | None = None) -> FloatArray:
-    """(20000, 3) points spread evenly over a mesh."""
-    vertices = mesh.vertices_mm.astype(float)
-    if pose is not None:
-        vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
-    return np.asarray(
-        trimesh.sample.sample_surface(trimesh.Trimesh(vertices, mesh.faces, process=False), 20_000, seed=0)[0]
-    )
 
 
 def rms(values: FloatArray) -> float:
@@ -55,45 +44,12 @@ def sheet(
     """A square at z = height, seen from above or below."""
     side = np.arange(-half_mm, half_mm + 0.01, 0.4)
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
-    index = np.arange(len(x), dtype=np.int32).reshape(len(side), -1)
-    a, b, c, d = (each.ravel() for each in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
-    faces = np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
+    faces = grid_faces(len(side), len(side))
     return Mesh(
         np.stack((x, y, np.full_like(x, height_mm)), 1).astype(np.float32), faces[:, ::-1].copy() if down else faces,
         np.tile(np.array([0, 0, -1 if down else 1], np.float32), (len(x), 1)), np.full((len(x), 3), colour, np.uint8),
         np.full(len(x), mark, np.uint8), np.full(len(x), sigma_mm, np.float32), np.zeros(len(x), np.int32),
     )  # fmt: skip
-
-
-def test_eight_views_of_a_bumpy_ball_are_closed_and_better_than_one() -> None:
-    truth = star()
-    views = views_of(truth, around(8), 0.2)
-    model = model_of(views)
-    counts = topology_counts(model.mesh.faces)
-    assert (counts.euler_characteristic, counts.boundary_edges, counts.nonmanifold_edges) == (2, 0, 0)
-    known = tree(truth)
-    single = [rms(known.distances_mm(on(view.mesh, view.pose))) for view in views]
-    assert rms(known.distances_mm(on(model.mesh))) < 0.8 * min(single)
-    # The slow error of 4 µm was found in what the views say of one another.
-    assert model.correlated_mm == pytest.approx(0.004, abs=0.002)
-    off = known.distances_mm(model.mesh.vertices_mm) / model.mesh.sigma_mm
-    assert 0.8 < np.quantile(off, 0.6827) < 1.25
-    seen = np.concatenate([view.seen_mm for view in views])[::5]
-    near = SearchTree.over(model.mesh.vertices_mm, model.mesh.faces).distances_mm(seen) < 0.05
-    assert near.mean() > 0.998
-    assert set(np.unique(model.views)) <= set(range(1, 9))
-
-
-def test_a_thin_plate_has_both_its_sides_and_sharp_edges() -> None:
-    truth = plate_on_box(0.8)
-    model = model_of(views_of(truth, around(8), 0.15, QUIET))
-    counts = topology_counts(model.mesh.faces)
-    assert (counts.nonmanifold_edges, counts.misoriented_edges, counts.components) == (0, 0, 1)
-    # Edges that are cut off by a triangle in each voxel are 60 µm low in the mean there.
-    assert rms(tree(truth).distances_mm(on(model.mesh))) < 0.012
-    a, b, c = (model.mesh.vertices_mm[model.mesh.faces[:, k]].astype(float) for k in range(3))
-    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
-    assert volume == pytest.approx(truth.volume, rel=0.01)
 
 
 def test_it_is_open_where_nothing_was_seen() -> None:

@@ -13,6 +13,8 @@ from slrig.views.fusion_nearest import nearest_to_corners, nearest_within
 from slrig.views.fusion_sheets import Sheets, sheets
 from tests.unit.views.known_views import around, plate_on_box, views_of
 
+# Only models of several views need these kernels.
+pytestmark = pytest.mark.slow
 VOXEL_MM = 1.1
 VIEWS = 4
 _ROOT = np.random.default_rng(3).normal(size=(6 * VIEWS, 6 * VIEWS)) * np.tile([1e-4] * 3 + [1e-3] * 3, VIEWS)[:, None]

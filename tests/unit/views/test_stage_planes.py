@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from slrig.errors import StageRefusedError
-from slrig.model import FloatArray, IntArray, Mesh, PlaneKind, StageAxis
+from slrig.model import FloatArray, Mesh, PlaneKind, StageAxis
 from slrig.views.stage_planes import cut, stage_planes
+from tests.unit.meshing.plain import grid_faces
 
 UP = np.array([0.0, -0.8, -0.6])
 """Of a stage that a camera in the origin looks down on."""
@@ -36,12 +37,9 @@ def ball(middle: FloatArray, radius_mm: float) -> Mesh:
 
 
 def meshed(points: FloatArray, columns: int, normals: FloatArray) -> Mesh:
-    numbers = np.arange(len(points), dtype=np.int32).reshape(-1, columns)
-    a, b, c, d = (each.ravel() for each in (numbers[:-1, :-1], numbers[:-1, 1:], numbers[1:, :-1], numbers[1:, 1:]))
-    faces: IntArray = np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])]).astype(np.int32)
     return Mesh(
         vertices_mm=points.astype(np.float32),
-        faces=faces,
+        faces=grid_faces(len(points) // columns, columns),
         normals=np.broadcast_to(normals, points.shape).astype(np.float32),
         colour=np.full((len(points), 3), 128, dtype=np.uint8),
         mark=np.zeros(len(points), dtype=np.uint8),
