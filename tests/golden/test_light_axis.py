@@ -2,14 +2,11 @@
 
 Camera and projector stand above one another instead of side by side, images and picture are transposed, and the scene
 is symmetric. Whatever differs between two twins but for the noise is an axis that was mistaken for the other one.
-
-`pytest tests/golden/test_light_axis.py -s -m slow` prints the table.
 """
 
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +22,7 @@ from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.golden.test_bundles import reconstructed
 
+pytestmark = pytest.mark.slow
 # Plates that float before one another by less than the depth-edge limit of a spacing that is taken twice too large.
 TERRACES = """name = "terraces"
 [[object]]
@@ -108,19 +106,6 @@ def scanned(rig: Path, *, plan: PatternPlan | None = None, projector_known: bool
     return report
 
 
-def row(name: str, report: Mapping[str, Any]) -> str:
-    truth, initial = report["truth"], report["mesh"]["initial"]
-    return (
-        f"{name:28} {report['axis']:6} {1000 * truth['rms_mm']:7.1f} {1000 * truth['p99_mm']:7.1f} "
-        f"{100 * truth['complete_0.1mm']:6.2f} {100 * truth['complete_0.3mm']:6.2f} "
-        f"{100 * truth['false_area_0.5mm']:6.3f} {initial['dropped_at_depth_edges']:6} {report['mesh']['points']}\n"
-    )
-
-
-HEADING = (
-    "                                         rms     p99  complete, %   false, %    at depth\n"
-    "                             axis         µm      µm  0.1 mm 0.3 mm  0.5 mm  edges  points\n"
-)  # fmt: skip
 DIAMOND = {**PROJECTOR, **FINE_COLUMNS, "position_mm": (105.0, 0.0, -590.0)}
 CENTRAL = {**PROJECTOR, "position_mm": (0.0, -20.0, -600.0)}
 LEFT = {**CAMERA, "position_mm": (-150.0, 0.0, -560.0)}
@@ -138,11 +123,9 @@ def alike(one: Mapping[str, Any], other: Mapping[str, Any]) -> None:
     assert one["mesh"]["points"] == pytest.approx(other["mesh"]["points"], rel=0.002)
 
 
-@pytest.mark.slow
 def test_rows_of_a_diamond_array_of_mirrors_are_meshed_like_the_columns_of_its_twin(tmp_path: Path) -> None:
     columns = scanned(rig_file(tmp_path / "columns", TERRACES, DIAMOND, LEFT))
     rows = scanned(rig_file(tmp_path / "rows", TERRACES, exchanged(DIAMOND), exchanged(LEFT)))
-    sys.stdout.write(f"\n{HEADING}{row('diamond, columns', columns)}{row('diamond, rows', rows)}")
     # Neither scan was told its axis: by itself each plays the one that tells depth, and no other.
     assert (columns["axis"], rows["axis"]) == ("column", "row")
     assert rows["frames"]["patterns"] == columns["frames"]["patterns"]
@@ -152,7 +135,6 @@ def test_rows_of_a_diamond_array_of_mirrors_are_meshed_like_the_columns_of_its_t
     assert dropped[0] == pytest.approx(dropped[1], rel=0.02)
 
 
-@pytest.mark.slow
 def test_two_cameras_meet_on_fine_rows_as_on_coarse_ones(tmp_path: Path) -> None:
     def seen_by_two(name: str, size_px: tuple[int, int], focal_px: tuple[float, float]) -> float:
         # A camera's pixel is as wide as two columns, and as high as two coarse rows or four fine ones.
@@ -160,7 +142,6 @@ def test_two_cameras_meet_on_fine_rows_as_on_coarse_ones(tmp_path: Path) -> None
         fine = {**CENTRAL, "size_px": size_px, "focal_px": focal_px}
         report = scanned(rig_file(tmp_path / name, BALL, fine, {**LEFT, **coarse}, {**RIGHT, **coarse}))
         by_source = report["redundancy"]["points_by_source"]
-        sys.stdout.write(f"\n{HEADING}{row(name, report)}{by_source}\n")
         return float(by_source["all"] / sum(by_source.values()))
 
     coarse = seen_by_two("square", (384, 384), (1800.0, 1800.0))
@@ -168,13 +149,11 @@ def test_two_cameras_meet_on_fine_rows_as_on_coarse_ones(tmp_path: Path) -> None
     assert seen_by_two("fine_rows", (384, 768), (1800.0, 3600.0)) == pytest.approx(coarse, abs=0.02)
 
 
-@pytest.mark.slow
 def test_cameras_above_one_another_need_no_projector_calibration_either(tmp_path: Path) -> None:
     # Lying stripes with one axis played; standing ones with both, of which the right one is taken.
     above = scanned(rig_file(tmp_path / "above", BALL, *map(exchanged, (CENTRAL, LEFT, RIGHT))), projector_known=False)
     rig = rig_file(tmp_path / "beside", BALL, CENTRAL, LEFT, RIGHT)
     beside = scanned(rig, plan=PatternPlan(rows=True), projector_known=False)
-    sys.stdout.write(f"\n{HEADING}{row('pair, beside', beside)}{row('pair, above', above)}")
     assert (beside["axis"], above["axis"]) == ("column", "row")
     assert beside["truth"]["rms_mm"] < 0.012
     alike(beside, above)
@@ -184,7 +163,6 @@ def test_cameras_above_one_another_need_no_projector_calibration_either(tmp_path
         assert report["truth"]["facing_camera_area"] == 1
 
 
-@pytest.mark.slow
 def test_a_projector_that_lies_on_its_side_shows_in_its_stripes(tmp_path: Path) -> None:
     lying = {**exchanged(CENTRAL), "down": (1.0, 0.0, 0.0)}
     rig = rig_file(tmp_path / "lying", BALL, lying, exchanged(LEFT), exchanged(RIGHT))
@@ -195,7 +173,6 @@ def test_a_projector_that_lies_on_its_side_shows_in_its_stripes(tmp_path: Path) 
     both = scanned(rig, plan=PatternPlan(rows=True), projector_known=False)
     shutil.rmtree(tmp_path / "lying" / "bundle")
     columns = scanned(rig, plan=PatternPlan(rows=False), projector_known=False)
-    sys.stdout.write(f"\n{HEADING}{row('lying, both axes', both)}{row('lying, columns', columns)}")
     assert both["axis"] == columns["axis"] == "column"
     assert both["truth"]["rms_mm"] < 0.012
     alike(both, columns)

@@ -10,7 +10,6 @@ import pytest
 
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrunk, smoothed
-from slrig.meshing.boundary_rules import following, may_add
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.boundary_oracle import as_set, smoothed_by_hand
@@ -79,34 +78,6 @@ def test_an_angle_that_means_nothing_is_refused(psi_rad: float) -> None:
         smoothed(points, faces, everywhere(points), psi_rad=psi_rad)
 
 
-def deep_notch() -> tuple[FloatArray, IntArray]:
-    points, faces = grid(5, 7)
-    points[3, 1], points[10, 1] = 1.2, 1.6
-    return points, faces
-
-
-def test_a_notch_as_wide_as_a_depth_edge_stays_open() -> None:
-    points, faces = deep_notch()
-    # Its mouth is 2 mm wide.
-    assert smoothed(points, faces, everywhere(points, 2.01)).added.sum() == 1
-    assert smoothed(points, faces, everywhere(points, 1.99)).added.sum() == 0
-
-
-def test_a_notch_between_surfaces_that_face_apart_stays_open() -> None:
-    points, faces = deep_notch()
-
-    # A roof with its ridge along the notch: each side falls away at the angle, and the fill would be level.
-    def roof(angle_deg: float) -> FloatArray:
-        aside = points[:, 0] - 3
-        bent = points.copy()
-        bent[:, 0] = 3 + aside * math.cos(math.radians(angle_deg))
-        bent[:, 2] = -np.abs(aside) * math.sin(math.radians(angle_deg))
-        return bent
-
-    assert smoothed(roof(30), faces, everywhere(points)).added.sum() == 1
-    assert smoothed(roof(75), faces, everywhere(points)).added.sum() == 0
-
-
 def test_a_hole_of_three_edges_is_closed() -> None:
     points, faces = grid(5, 5)
     hole = faces[9]
@@ -114,20 +85,6 @@ def test_a_hole_of_three_edges_is_closed() -> None:
     assert as_set(result.faces) == as_set(faces)
     assert as_set(result.faces[result.added]) == as_set(hole[None])
     np.testing.assert_array_equal(result.adjacency, neighbours(result.faces, vertex_count=len(points)))
-
-
-def test_a_notch_that_another_stretch_of_boundary_runs_into_is_not_covered() -> None:
-    def fits(tip: tuple[float, float]) -> bool:
-        points = flat((0.8, 1), (0, 0), (-0.8, 1), tip, (-0.2, 1.6), (1, 0), (0, -1), (-1, 0.2), (-1.2, 1.2))
-        faces = faces_of((0, 1, 5), (5, 1, 6), (6, 1, 7), (1, 2, 7), (7, 2, 8), (8, 2, 4), (2, 3, 4))
-        across = neighbours(faces, vertex_count=len(points))
-        degree = np.bincount(faces.ravel()).astype(np.int32)
-        into = 2  # from 0 to 1, opposite corner 2 of face 0
-        out = following(faces, across, into)
-        return bool(may_add(points, faces, across, degree, everywhere(points), into, out))
-
-    assert fits((0.2, 1.3))
-    assert not fits((0.0, 0.6))
 
 
 @pytest.mark.parametrize("width", [1, 2])

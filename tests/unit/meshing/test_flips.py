@@ -18,16 +18,21 @@ def angle(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
     return math.acos(np.clip(float(u @ v) / math.sqrt(float(u @ u) * float(v @ v)), -1, 1))
 
 
-def verdict(p: FloatArray, q: FloatArray, f: FloatArray, w: FloatArray) -> tuple[bool, float, str]:
-    """Section 3.1 of the paper, word by word: flip, how far from the nearest threshold, and by which rule."""
+def verdict(
+    p: FloatArray, q: FloatArray, f: FloatArray, w: FloatArray, gamma: float = math.pi / 6
+) -> tuple[bool, float, str]:
+    """Section 3.1 of the paper, word by word: flip, how far from the nearest threshold, and by which rule.
+
+    With γ = π the sums of angles decide alone, as by Dyer's rule.
+    """
     theta_pq = max(angle(f, p, w), angle(f, q, w))
     theta_fw = max(angle(p, f, q), angle(p, w, q))
     excess = theta_fw - theta_pq
     opposite = angle(p, f, q) + angle(p, w, q) - angle(f, p, w) - angle(f, q, w)
-    margin = abs(abs(excess) - math.pi / 6)
-    if excess > math.pi / 6:
+    margin = abs(abs(excess) - gamma)
+    if excess > gamma:
         return True, margin, "forced"
-    if -excess > math.pi / 6:
+    if -excess > gamma:
         return False, margin, "forbidden"
     return opposite > 0, min(margin, abs(opposite)), "delaunay"
 
@@ -44,19 +49,28 @@ TETRAHEDRA = {
 }
 
 
+GAMMAS = [math.pi / 6, 0.2, math.pi / 2, 2.5]
+
+
 @pytest.mark.parametrize("kind", TETRAHEDRA)
-def test_the_verdict_is_that_of_the_angles(kind: str) -> None:
+@pytest.mark.parametrize("gamma", GAMMAS)
+@pytest.mark.parametrize("rule", FlipRule)
+def test_the_verdict_is_that_of_the_angles(kind: str, gamma: float, rule: FlipRule) -> None:
     rng = np.random.default_rng(17)
+    constrained = rule is FlipRule.CONSTRAINED
     rules: dict[tuple[str, bool], int] = {}
-    for _ in range(800):
+    for _ in range(150):
         points = rng.normal(0, 1, (4, 3)) * TETRAHEDRA[kind]
-        wanted, margin, rule = verdict(*points)
+        wanted, margin, by = verdict(*points, gamma=gamma if constrained else math.pi)
         if margin < 1e-7:
             continue
-        assert flips(points) == wanted
-        rules[rule, wanted] = rules.get((rule, wanted), 0) + 1
-    assert set(rules) == {("forced", True), ("forbidden", False), ("delaunay", True), ("delaunay", False)}
-    assert min(rules.values()) > 10
+        assert bool(prefers_flip(points, 0, 1, 2, 3, *constraint(rule, gamma))) == wanted
+        rules[by, wanted] = rules.get((by, wanted), 0) + 1
+    seen = {("delaunay", True), ("delaunay", False)}
+    if constrained and gamma < 1:
+        seen |= {("forced", True), ("forbidden", False)}
+    assert seen <= set(rules)
+    assert min(rules[each] for each in seen) > 5
 
 
 def test_the_verdict_does_not_depend_on_size_place_or_turn() -> None:
@@ -78,35 +92,13 @@ def test_on_a_lattice_ties_keep_the_edge() -> None:
             assert not prefers_flip(square, 2, 3, 0, 1)
 
 
-def angled_kite(at_p: float, at_q: float, *, bend: float = 0.0, turn: float = 0.0) -> FloatArray:
-    """p, q, f, w in a plane with these angles at p and q, pq its axis; wrapped round a cylinder of curvature `bend`."""
+def angled_kite(at_p: float, at_q: float, turn: float) -> FloatArray:
+    """p, q, f, w in a plane with these angles at p and q, pq its axis, turned."""
     height = 2 / (1 / math.tan(at_p / 2) + 1 / math.tan(at_q / 2))
     along = height / math.tan(at_p / 2) - 1
     flat = np.array([[-1.0, 0.0], [1.0, 0.0], [along, height], [along, -height]])
     x, y = (flat @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])).T
-    if bend == 0:
-        return np.stack([x, y, np.zeros(4)], axis=1)
-    return np.stack([np.sin(bend * x) / bend, y, np.cos(bend * x) / bend], axis=1)
-
-
-@pytest.mark.parametrize("bend", [0.0, 0.15, 0.3])
-def test_gamma_overrules_delaunay_both_ways(bend: float) -> None:
-    # Figure 5: on few samples of a cylinder the sums of angles prefer an edge that makes a sharp triangle.
-    rng = np.random.default_rng(21)
-    overruled = 0
-    for _ in range(100):
-        at_p = math.radians(rng.uniform(128, 150))
-        at_q = rng.uniform(0.2, 0.95) * (math.pi - at_p)
-        points = angled_kite(at_p, at_q, bend=bend, turn=rng.uniform(0, math.pi))
-        wanted, margin, rule = verdict(*points)
-        if margin < 1e-6 or rule != "forbidden" or not delaunay(points):
-            continue
-        assert not wanted
-        assert not flips(points)
-        assert prefers_flip(points, 2, 3, 0, 1)
-        assert prefers_flip(points, 0, 1, 2, 3, *constraint(FlipRule.DELAUNAY))
-        overruled += 1
-    assert overruled > 25
+    return np.stack([x, y, np.zeros(4)], axis=1)
 
 
 @pytest.mark.parametrize("beyond", [-1e-9, 1e-9])
@@ -115,7 +107,7 @@ def test_gamma_is_thirty_degrees(beyond: float) -> None:
     for at_q in np.radians(np.arange(5.0, 41.0)):
         # In a plane θ_fw = π - (at_p + at_q)/2, so θ_pq - θ_fw = γ + beyond at:
         at_p = (math.pi + GAMMA + beyond - at_q / 2) / 1.5
-        points = angled_kite(at_p, at_q, turn=at_q)
+        points = angled_kite(at_p, at_q, at_q)
         assert delaunay(points)
         # Beyond γ the largest angles decide against Delaunay, short of it Delaunay holds.
         assert flips(points) == (beyond < 0)
@@ -144,40 +136,6 @@ def test_squares_on_a_cylinder_keep_the_edge_they_have() -> None:
             quad = np.stack([one[k], other[k + 1], one[k + 1], other[k]])
             assert not flips(quad)
             assert not prefers_flip(quad, 2, 3, 0, 1)
-
-
-@pytest.mark.parametrize("kind", TETRAHEDRA)
-def test_dyers_rule_compares_the_sums_alone(kind: str) -> None:
-    rng = np.random.default_rng(22)
-    verdicts = []
-    dyer = constraint(FlipRule.DELAUNAY, 0.1)
-    for _ in range(400):
-        points = rng.normal(0, 1, (4, 3)) * TETRAHEDRA[kind]
-        p, q, f, w = points
-        margin = abs(angle(p, f, q) + angle(p, w, q) - angle(f, p, w) - angle(f, q, w))
-        if margin < 1e-7:
-            continue
-        found = bool(prefers_flip(points, 0, 1, 2, 3, *dyer))
-        assert found == delaunay(points)
-        verdicts.append(found)
-    assert 40 < sum(verdicts) < len(verdicts) - 40
-
-
-@pytest.mark.parametrize("gamma", [0.0, 0.2, math.pi / 2, 2.5, math.pi])
-def test_gamma_may_be_any_angle(gamma: float) -> None:
-    rng = np.random.default_rng(23)
-    constrained = constraint(FlipRule.CONSTRAINED, gamma)
-    forced = 0
-    for _ in range(300):
-        points = rng.normal(0, 1, (4, 3)) * [4, 1, 0.3]
-        p, q, f, w = points
-        excess = max(angle(p, f, q), angle(p, w, q)) - max(angle(f, p, w), angle(f, q, w))
-        if abs(abs(excess) - gamma) < 1e-7:
-            continue
-        wanted = excess > 0 if abs(excess) > gamma else delaunay(points)
-        assert bool(prefers_flip(points, 0, 1, 2, 3, *constrained)) == wanted
-        forced += abs(excess) > gamma
-    assert (forced > 0) == (gamma < 3)
 
 
 def test_the_constraint_is_that_of_the_paper_unless_told_otherwise() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -72,14 +70,6 @@ def test_the_front_faces_the_eye(*, mirrored: bool, behind: bool) -> None:
     assert mesh.faces.flags.c_contiguous
 
 
-def test_normals_are_those_of_the_surface() -> None:
-    x, y = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS), indexing="ij")
-    points, offsets, position = relief(0.5 * x - 0.25 * y)
-    mesh = meshed(points, offsets, position)
-    wanted = np.array([0.5, -0.25, -1.0]) / math.sqrt(1 + 0.25 + 0.0625)
-    np.testing.assert_allclose(vertex_normals(points, mesh.faces), np.tile(wanted, (len(points), 1)), atol=1e-6)
-
-
 def test_a_cliff_is_not_skinned() -> None:
     depth = wave()
     depth[6:] += 40
@@ -115,21 +105,6 @@ def test_bridges_are_dropped_on_request_and_drops_overlap_in_the_count() -> None
     assert holed.dropped_at_bridges == 4
     assert holed.dropped_at_depth_edges == 2 * ROWS - 2
     assert holed.dropped_triangles == 2 * ROWS - 2 + 3
-
-
-def test_codes_too_far_apart_are_not_joined() -> None:
-    points, offsets, position = relief(wave())
-    position = position + np.where(np.arange(COLUMNS) >= 5, 8.0, 0.0)
-    assert meshed(points, offsets, position).strip_pairs == COLUMNS - 2
-    assert meshed(points, offsets, position, widest_step_px=16.0).strip_pairs == COLUMNS - 1
-
-
-def test_points_in_no_triangle_have_no_normal() -> None:
-    points, offsets, position = relief(wave())
-    position = position + np.where(np.arange(COLUMNS) >= COLUMNS - 1, 80.0, 0.0)
-    mesh = meshed(points, offsets, position)
-    lone = np.isnan(vertex_normals(points, mesh.faces)).any(axis=1)
-    assert np.flatnonzero(lone).tolist() == list(range((COLUMNS - 1) * ROWS, COLUMNS * ROWS))
 
 
 @pytest.mark.parametrize("behind", [False, True])

@@ -81,26 +81,26 @@ def pairs_of(position_px: list[float], counts: list[int], *, widest_step_px: flo
     return pairs
 
 
-def test_neighbours_are_consecutive_codes() -> None:
-    assert pairs_of([3.0, 4.0, 5.0, 7.0, 8.0], [5, 5, 5, 5, 5]) == [[0, 1], [1, 2], [3, 4]]
-
-
-def test_a_gap_may_be_allowed() -> None:
-    assert pairs_of([3.0, 4.0, 6.0, 9.0], [5] * 4, widest_step_px=2.0) == [[0, 1], [1, 2]]
-
-
-def test_an_empty_curve_has_no_neighbours_and_may_be_stepped_over() -> None:
-    assert pairs_of([3.0, 4.0, 5.0], [5, 0, 5]) == []
-    assert pairs_of([3.0, 4.0, 5.0], [5, 0, 5], widest_step_px=2.0) == [[0, 2]]
+@pytest.mark.parametrize(
+    ("position_px", "counts", "widest_step_px", "pairs"),
+    [
+        ([3.0, 4.0, 5.0, 7.0, 8.0], [5] * 5, 1.0, [[0, 1], [1, 2], [3, 4]]),
+        ([3.0, 4.0, 6.0, 9.0], [5] * 4, 2.0, [[0, 1], [1, 2]]),
+        # An empty curve has no neighbours and may be stepped over.
+        ([3.0, 4.0, 5.0], [5, 0, 5], 1.0, []),
+        ([3.0, 4.0, 5.0], [5, 0, 5], 2.0, [[0, 2]]),
+        ([], [], 1.0, []),
+        ([3.0], [9], 1.0, []),
+    ],
+)
+def test_neighbours_are_consecutive_codes(
+    position_px: list[float], counts: list[int], widest_step_px: float, pairs: list[list[int]]
+) -> None:
+    assert pairs_of(position_px, counts, widest_step_px=widest_step_px) == pairs
 
 
 def test_a_step_that_is_a_third_of_a_pixel_is_not_lost_to_rounding() -> None:
     assert len(pairs_of([k / 3 for k in range(100)], [2] * 100, widest_step_px=1 / 3)) == 99
-
-
-def test_no_curve_or_one_has_no_neighbours() -> None:
-    assert pairs_of([], []) == []
-    assert pairs_of([3.0], [9]) == []
 
 
 def dropped(
@@ -127,26 +127,6 @@ def test_a_triangle_with_a_long_edge_crosses_a_depth_edge() -> None:
         assert dropped(points, faces) == ([False, True], [False, False], [False, True])
         assert dropped(points, faces, ratio=4.9)[0] == [True, True]
         assert dropped(points, faces, ratio=7.1)[0] == [False, False]
-
-
-def test_what_is_long_depends_on_how_finely_the_rig_samples_there() -> None:
-    points = np.array([[0.0, 0, 0], [3, 0, 0], [3, 4, 0], [0, 0, 7], [0, 1, 0]])
-    # The mean over the three corners counts.
-    assert dropped(points, TRIANGLES, sampling=np.array([1, 1, 0.6, 1.5, 1.5]))[0] == [False, False]
-    assert dropped(points, TRIANGLES, sampling=np.array([1, 1, 0.6, 1, 1]))[0] == [False, True]
-    assert dropped(points, TRIANGLES, sampling=np.array([0.9, 0.8, 0.7, 1, 1]))[0] == [True, True]
-
-
-def test_triangles_over_a_bridge_go_when_holes_are_kept() -> None:
-    first, second = curve(0.0, np.array([0, 1, 2, 3, 4, 5.0])), curve(1.0, np.array([0, 1, 2, 3, 4, 5.0]))
-    points = np.concatenate([first, second])
-    faces = between(first, second)
-    bridge = np.zeros(12, dtype=np.bool_)
-    bridge[[2, 9]] = True
-    over = [bool({2, 3} <= set(face) or {9, 10} <= set(face)) for face in faces.tolist()]
-    assert sum(over) == 2
-    assert dropped(points, faces, bridge_after=bridge, keep_holes=True) == ([False] * 10, over, over)
-    assert dropped(points, faces, bridge_after=bridge)[2] == [False] * 10
 
 
 def test_an_edge_across_is_no_step_over_a_bridge() -> None:
