@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from slrig.meshing.normals import vertex_normals
 from slrig.model import FloatArray, IntArray, Mesh
 from slrig.views.turntable import turntable
+from tests.unit.meshing.plain import grid_faces, mesh_of
 
 Radius = Callable[[FloatArray], FloatArray]
 """From unit directions (n, 3) to the distance of the surface from the object's middle, mm."""
@@ -95,7 +96,7 @@ def plane(tilts_deg: Sequence[float]) -> Turned:
     for pose in poses:
         points = flat @ pose[:3, :3]
         faces = _triangles(points, rows.shape, 4.0)
-        views.append(_mesh(points, faces, np.full(len(points), 0.01)))
+        views.append(mesh_of(points, faces, sigma_mm=0.01))
     return Turned(views, list(poses))
 
 
@@ -133,26 +134,12 @@ def _view(
     number[used] = np.arange(len(used))
     points, faces = points[used], number[faces]
     sigma = noise_mm / np.maximum(np.abs((vertex_normals(points, faces) * ways[used]).sum(axis=1)), 0.15)
-    return _mesh(points, faces, sigma)
+    return mesh_of(points, faces, sigma_mm=sigma)
 
 
-def _mesh(points: FloatArray, faces: IntArray, sigma_mm: FloatArray) -> Mesh:
-    return Mesh(
-        vertices_mm=points.astype(np.float32),
-        faces=faces,
-        normals=vertex_normals(points, faces),
-        colour=np.full((len(points), 3), 128, dtype=np.uint8),
-        mark=np.zeros(len(points), dtype=np.uint8),
-        sigma_mm=sigma_mm.astype(np.float32),
-        stripe=np.zeros(len(points), dtype=np.int32),
-    )
-
-
-def _triangles(points: FloatArray, shape: tuple[int, ...], longest_mm: float) -> IntArray:
+def _triangles(points: FloatArray, shape: tuple[int, int], longest_mm: float) -> IntArray:
     """Two triangles for each cell of the grid, wound to be seen from -z, without those that span a step in depth."""
-    index = np.arange(len(points), dtype=np.int32).reshape(shape)
-    a, b, c, d = (index[s, t].ravel() for s in (np.s_[:-1], np.s_[1:]) for t in (np.s_[:-1], np.s_[1:]))
-    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
+    faces = grid_faces(*shape)[:, ::-1]
     edges = np.stack([np.linalg.norm(points[faces[:, k]] - points[faces[:, k - 1]], axis=1) for k in range(3)])
     return np.ascontiguousarray(faces[(edges < longest_mm).all(axis=0)])
 

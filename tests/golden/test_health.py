@@ -1,25 +1,31 @@
 """A rendered rig is calibrated, then a device is turned, moved or zoomed, and one look at the board tells which.
 
 The rig is small (320 x 256 pixels), with blur, noise and distorted lenses; what is changed is changed in the renderer,
-which shares no geometry with what judges it.
+which shares no geometry with what judges it. And a board whose row lines lie nearly along the image's rows.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from slrig.bundle import Bundle, read_bundle
 from slrig.calibrate.pose_reading import read_pose
 from slrig.calibrate.solving import solve_poses
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.health.verdict import HealthState, judged
 from slrig.calibration.solution import PROJECTOR
-from slrig.model import Calibration, Size
+from slrig.capture.evidence import check_capture
+from slrig.model import Axis, Calibration, Capture, LineShift, Size
+from slrig.scan.acquisition import capture_frames
+from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.verify.verification import verify_bundle
-from tests.rendered_boards import board_options, rendered_poses
+from tests.bench.test_calibration_seeds import rig_options
+from tests.rendered_boards import board_head, board_options, board_rig, board_scene, rendered_poses
 
 pytestmark = pytest.mark.slow
 
@@ -81,3 +87,45 @@ def test_a_rig_that_did_not_change_is_good_in_every_pose(tmp_path: Path, calibra
         assert judged([found]).state is HealthState.GOOD
         assert max(abs(pair.mean_px) for pair in found.pairs) < 0.02
         assert abs(found.scale_percent or 1) < 0.03
+
+
+POSE = 4
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    """A board in whose lower part few row lines are seen, each at the border of a code cell in shift 0.
+
+    Its capture was once refused for damage that it does not have.
+    """
+    folder = tmp_path_factory.mktemp("lines")
+    options = rig_options(28)
+    with board_rig(board_head(folder, options, board_scene("chessboard")), options) as rig:
+        assert rig.positioner is not None
+        rig.positioner.move(POSE)
+        plan = ScanPlan(patterns=PatternPlan(rows=True))
+        capture_frames(rig, plan, folder / "pose", progress=lambda *_: None, cancelled=lambda: False).finish()
+    return read_bundle(folder / "pose")
+
+
+def test_few_lines_along_the_rows_are_no_damage(recorded: Bundle) -> None:
+    assert check_capture(recorded.capture).faults == ()
+
+
+def test_rows_of_another_frame_are_damage(recorded: Bundle) -> None:
+    capture = recorded.capture
+    index = next(
+        number
+        for number, shot in enumerate(capture.shots)
+        if isinstance(pattern := capture.patterns[shot.pattern], LineShift)
+        and pattern.axis is Axis.ROW
+        and pattern.shift == 2
+    )
+    shot, other = capture.shots[index], capture.shots[index + 4]
+    image = shot.image.copy()
+    middle = len(image) // 2
+    image[middle - 40 : middle + 20] = np.roll(other.image, 11, axis=1)[middle - 40 : middle + 20]
+    shots = (*capture.shots[:index], replace(shot, image=image), *capture.shots[index + 1 :])
+    damaged = Capture(capture.projector, capture.patterns, capture.cameras, shots)
+    (found,) = check_capture(damaged).faults
+    assert "its lines are not where the Gray code says" in found

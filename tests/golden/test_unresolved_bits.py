@@ -35,7 +35,7 @@ GRAY_ONLY = PatternPlan(line_shift=False, gray_cell_px=1)
 LEAST_SWING = 5.0
 
 
-PLATES = "".join(
+PLATES = 'name = "plates"\n' + "".join(
     f'[[object]]\nshape = "plane"\nposition_mm = [{x}, 0.0, 0.0]\nsize_mm = [54.0, 80.0]\n'
     f"rotation_deg = [0.0, {turn_deg}, 0.0]\n"
     for x, turn_deg in ((-28.0, 20.0), (28.0, -38.0))

@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from slrig.meshing.adjacency import neighbours
-from slrig.meshing.boundary import shrunk, smoothed
+from slrig.meshing.boundary import smoothed
 from slrig.meshing.runs import neighbouring_curves, whole_curves
 from slrig.meshing.strips import strips
 from slrig.meshing.topology import topology_counts
@@ -113,17 +113,3 @@ def test_smoothing_the_same_mesh_gives_the_same_mesh(mesh: tuple[FloatArray, Int
     # The unit of length means nothing; a power of two changes no digit.
     scaled = smoothed(points * 4.0, faces, allowed * 4.0, psi_rad=psi)
     np.testing.assert_array_equal(scaled.faces, first.faces)
-
-
-@unhurried
-@given(meshes, st.floats(0.2, 6.0), seeds)
-def test_shrinking_leaves_no_long_boundary_edge(mesh: tuple[FloatArray, IntArray], typical: float, seed: int) -> None:
-    points, faces = mesh
-    longest = typical * np.random.default_rng(seed).uniform(0.7, 1.3, len(points))
-    result = shrunk(points, faces, longest)
-    hold_together(result.faces, result.adjacency, len(points))
-    assert len(result.faces) == len(faces) - result.removed_triangles
-    edges = boundary_edges(result.faces)
-    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    assert (length <= longest[edges].min(axis=1) + 1e-12).all()
-    assert shrunk(points, result.faces, longest, adjacency=result.adjacency).removed_triangles == 0

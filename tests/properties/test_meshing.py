@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from itertools import pairwise
 
 import numpy as np
@@ -53,35 +52,6 @@ def surface(lengths: list[int], seed: int) -> tuple[FloatArray, IntArray]:
     ]
     offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
     return np.concatenate([np.zeros((0, 3)), *curves]), offsets
-
-
-@unhurried
-@given(st.integers(1, 40), st.integers(1, 40), seeds)
-def test_a_strip_has_exactly_i_plus_j_minus_two_triangles(ours: int, theirs: int, seed: int) -> None:
-    points, offsets = surface([ours, theirs], seed)
-    faces = strips(points, whole_curves(np.array([[0, 1]]), offsets))
-    assert len(faces) == ours + theirs - 2
-    directed = Counter((int(f[k]), int(f[(k + 1) % 3])) for f in faces for k in range(3))
-    assert max(directed.values(), default=1) == 1
-    assert all(directed[k, k + 1] == 1 for k in range(ours - 1))
-    assert all(directed[k + 1, k] == 1 for k in range(ours, ours + theirs - 1))
-
-
-@unhurried
-@given(counts, st.integers(1, 3), seeds)
-def test_any_curves_make_a_manifold(lengths: list[int], widest: int, seed: int) -> None:
-    points, offsets = surface(lengths, seed)
-    rng = np.random.default_rng(seed)
-    position = np.cumsum(rng.integers(1, 3, len(lengths))).astype(np.float64)
-    pairs = neighbouring_curves(position, offsets, widest_step_px=float(widest))
-    filled = [k for k, n in enumerate(lengths) if n]
-    wanted = [[a, b] for a, b in pairwise(filled) if position[b] - position[a] <= widest]
-    assert pairs.tolist() == wanted
-    faces = strips(points, whole_curves(pairs, offsets))
-    assert len(faces) == sum(lengths[a] + lengths[b] - 2 for a, b in wanted)
-    found = topology_counts(faces)
-    assert found.nonmanifold_edges == found.misoriented_edges == 0
-    assert found.duplicate_faces == found.degenerate_faces == 0
 
 
 @unhurried

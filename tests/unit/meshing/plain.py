@@ -1,10 +1,15 @@
-"""Meshes measured in plain numpy, for tests to compare with."""
+"""Meshes made and measured in plain numpy, for tests to compare with."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import fields
+from typing import Any
 
-from slrig.model import FloatArray, IntArray
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.meshing.normals import vertex_normals
+from slrig.model import FloatArray, IntArray, Mesh
 
 
 def boundary_edges(faces: IntArray) -> IntArray:
@@ -52,3 +57,35 @@ def soup(seed: int, *, points: int = 700, faces: int = 5000) -> tuple[FloatArray
     random = np.random.default_rng(seed)
     corners = np.stack([random.permutation(points)[:3] for _ in range(faces)])
     return random.normal(size=(points, 3)), corners.astype(np.int32)
+
+
+def mesh_of(
+    points_mm: NDArray[np.floating[Any]],
+    faces: IntArray,
+    *,
+    sigma_mm: float | FloatArray = 0.02,
+    normals: FloatArray | None = None,
+    colour: int = 128,
+    mark: int = 0,
+) -> Mesh:
+    """A mesh whose vertices are alike but for their places; normals : those of the faces if not given."""
+    count = len(points_mm)
+    return Mesh(
+        vertices_mm=np.asarray(points_mm, dtype=np.float32),
+        faces=faces,
+        normals=vertex_normals(points_mm.astype(np.float64), faces)
+        if normals is None
+        else np.broadcast_to(normals, (count, 3)).astype(np.float32),
+        colour=np.full((count, 3), colour, dtype=np.uint8),
+        mark=np.full(count, mark, dtype=np.uint8),
+        sigma_mm=np.broadcast_to(np.asarray(sigma_mm, dtype=np.float32), (count,)).copy(),
+        stripe=np.zeros(count, dtype=np.int32),
+    )
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in meshes)])
+    faces = [mesh.faces + np.int32(start) for mesh, start in zip(meshes, starts, strict=False)]
+    names = [field.name for field in fields(Mesh) if field.name != "faces"]
+    whole = {name: np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in names}
+    return Mesh(faces=np.concatenate(faces), **whole)

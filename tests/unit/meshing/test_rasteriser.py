@@ -8,7 +8,7 @@ from numba import config
 from numpy.typing import NDArray
 
 from slrig.meshing import rasteriser
-from slrig.meshing.rasteriser import View, normals_seen, rasterised
+from slrig.meshing.rasteriser import normals_seen, rasterised
 from slrig.model import FloatArray, IntArray, Size
 from tests.unit.meshing.plain import grid_faces
 
@@ -84,22 +84,6 @@ def test_normals_are_those_of_the_triangle_that_is_seen_on_the_side_that_is_seen
     assert 0.2 < front[which >= 0].mean() < 0.8
     assert np.array_equal(found_front, front)
     assert found == pytest.approx(expected / np.where(length > 0, length, 1), abs=1e-5)
-
-
-def test_views_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    placed, faces, normals = random_triangles(300, seed=1)
-
-    def view(threads: int) -> tuple[View, NDArray[np.float32], NDArray[np.bool_]]:
-        share_out(monkeypatch, threads)
-        found = rasterised(placed, faces, SIZE)
-        return found, *normals_seen(found, placed, normals, faces)
-
-    (alone, normal, front), *others = [view(threads) for threads in (1, 2, 3)]
-    for shared, its_normal, its_front in others:
-        assert np.array_equal(shared.depth_mm, alone.depth_mm, equal_nan=True)
-        assert np.array_equal(shared.face, alone.face)
-        assert np.array_equal(its_normal, normal)
-        assert np.array_equal(its_front, front)
 
 
 @pytest.mark.parametrize("threads", [1, 2])

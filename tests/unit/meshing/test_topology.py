@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-import pytest
 
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.angles import angle_rad
@@ -117,14 +116,6 @@ def test_no_face_is_no_fault() -> None:
     assert boundary_edges(none).shape == (0, 2)
     assert not used_vertices(none, 4).any()
     assert np.isnan(vertex_normals(np.zeros((4, 3)), none)).all()
-
-
-def test_vertex_normals_of_a_cube_do_not_depend_on_its_diagonals() -> None:
-    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-    faces = faces_of(*(row for a, b, c, d in sides for row in ((a, b, c), (a, c, d))))
-    assert topology_counts(faces).euler_characteristic == 2
-    assert vertex_normals(corners, faces) == pytest.approx(corners / np.sqrt(3), abs=1e-6)
 
 
 def test_a_vertex_without_area_has_no_normal() -> None:

@@ -25,7 +25,6 @@ from slrig.model import (
     White,
 )
 from slrig.patterns.positions import cell_positions, index_of_word
-from slrig.reconstruction.coded import Coded, line_image
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, axis_frames
 from slrig.reconstruction.fusion import FusedFrames, exposure_use, fused_frames
@@ -254,25 +253,6 @@ def test_the_use_of_each_exposure_is_told_from_short_to_long() -> None:
     assert exposure_use(told, ~everywhere)[0].weight == 0
 
 
-def test_shares_of_one_are_frames_as_they_are() -> None:
-    frames = axis_frames(PLATE.capture((0.02,), seed=3), "eye", COLUMN)
-    plain = NoiseModel(0.7, 0.02)
-    ones = np.ones(SHAPE, dtype=np.float32)
-    shared = replace(plain, read_share=ones, shot_share=ones)
-    np.testing.assert_allclose(shared.variance(frames.white), plain.variance(frames.white), rtol=1e-6)
-    for part in range(2):
-        one, other = position_of(frames, plain, PLATE)[part], position_of(frames, shared, PLATE)[part]
-        np.testing.assert_allclose(one, other, rtol=1e-5)
-    none = np.zeros(SHAPE, dtype=np.bool_)
-    code = CodeMap(np.zeros(SHAPE, dtype=np.int32), np.zeros(SHAPE, dtype=np.int32), np.zeros(SHAPE, dtype=np.uint8))
-    images = [
-        line_image(Coded(frames, noise, code, none, ones, None), index) for index in (0, 5) for noise in (plain, shared)
-    ]
-    for first in (0, 2):
-        np.testing.assert_allclose(images[first][0], images[first + 1][0], atol=1e-5)
-        np.testing.assert_allclose(images[first][1], images[first + 1][1], rtol=1e-4, atol=1e-6)
-
-
 def test_the_order_in_which_exposures_come_and_how_exactly_they_are_named_does_not_matter() -> None:
     capture = PLATE.capture(seed=2)
     told = fused_frames(capture, "eye", COLUMN)
@@ -280,14 +260,6 @@ def test_the_order_in_which_exposures_come_and_how_exactly_they_are_named_does_n
     again = fused_frames(replace(capture, shots=jittered[::-1]), "eye", COLUMN)
     for name in ("white", "black", "bits", "lines"):
         np.testing.assert_array_equal(getattr(told.frames, name), getattr(again.frames, name))
-
-
-def test_recorded_frames_are_left_alone() -> None:
-    capture = PLATE.capture(seed=2)
-    before = [shot.image.copy() for shot in capture.shots]
-    fused_frames(capture, "eye", COLUMN)
-    for shot, image in zip(capture.shots, before, strict=True):
-        np.testing.assert_array_equal(shot.image, image)
 
 
 REFUSED: Mapping[str, tuple[Callable[[Capture], Capture], Sequence[str]]] = {

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -47,26 +45,6 @@ def test_two_stripes_are_joined_end_to_end_whichever_way_they_were_found(
     assert ensemble.offsets.tolist() == [0, 35]
     assert ensemble.position_px.tolist() == [7.0]
     assert ensemble.stripe.tolist() == ([1] * 20 + [0] * 15 if swapped else [0] * 20 + [1] * 15)
-
-
-@pytest.mark.parametrize(("mine", "theirs"), [(0, 0), (0, 1), (1, 0), (1, 1)])
-def test_each_of_the_four_joins_is_chosen_when_it_is_the_smoothest(mine: int, theirs: int) -> None:
-    # Two arcs of one circle: the second lies beyond end `mine` of the first and turns its end `theirs` to it.
-    def arc(first: float, last: float, count: int) -> FloatArray:
-        angle = np.linspace(first, last, count)
-        return np.stack([60 * np.cos(angle), 60 * np.sin(angle)], axis=1)
-
-    a = arc(-0.2, 0.2, 30)
-    b = arc(0.3, 0.6, 24) if mine == 1 else arc(-0.3, -0.6, 24)
-    if theirs == 1:
-        b = b[::-1].copy()
-    ensemble = linked(a, b)
-    joined = [list(pair) for pair in points_between(ensemble)]
-    assert len(joined) == 1
-    ends = [a[-1 if mine else 0].tolist(), b[-1 if theirs else 0].tolist()]
-    assert sorted(joined[0]) == sorted(ends)
-    steps = np.linalg.norm(np.diff(ensemble.points_px, axis=0), axis=1)
-    assert np.sort(steps)[-2] < 1.0
 
 
 COLUMN = 150.0
@@ -127,36 +105,6 @@ def test_stripes_that_touch_are_joined_where_they_touch(gap: float, turned: tupl
     ensemble = linked(*stripes)
     np.testing.assert_array_equal(ensemble.points_px, np.concatenate([upper, lower]))
     assert points_between(ensemble) == [(upper[-1].tolist(), lower[0].tolist())]
-
-
-def test_pieces_of_one_line_that_interleave_with_another_codes_are_put_in_order() -> None:
-    # Two codes broken into five pieces each, given in any order and any direction: each is one line again.
-    rng = np.random.default_rng(12)
-    bent = {code: np.array([[x + 4 * math.sin(y / 25), y] for y in range(100)]) for code, x in ((3.0, 0.0), (4.0, 3.0))}
-    pieces = [(code, line[20 * k : 20 * k + 17]) for code, line in bent.items() for k in range(5)]
-    for _ in range(20):
-        order = rng.permutation(len(pieces))
-        stripes = [pieces[k][1][:: rng.choice([-1, 1])].copy() for k in order]
-        ensemble = linked(*stripes, position_px=[pieces[k][0] for k in order])
-        wanted = np.concatenate([piece for _, piece in pieces])
-        np.testing.assert_array_equal(ensemble.points_px, wanted)
-        assert ensemble.bridge_after.sum() == 8
-
-
-def test_the_nearest_centroid_comes_first_and_not_the_nearest_end() -> None:
-    # c's end is 4 px from a's, its centroid far; b's centroid is nearer. a then b, and c joins at the far end of both.
-    a, b, c = down(0.0, range(0, 30)), down(0.0, range(38, 46)), down(0.0, range(-90, -3))
-    ensemble = linked(a, b, c)
-    # The longest begins: c. Its nearest centroid is a's (14.5 against 41.5).
-    np.testing.assert_array_equal(ensemble.points_px, np.concatenate([c, a, b]))
-
-
-def test_after_a_join_the_centroid_is_that_of_all_points() -> None:
-    # Equation 2. a (20 points, y = 9.5) takes b (19 points, y = 39): the centroid goes to y = 23.9. Then d, at 57,
-    # is nearer (33.1) than c, at -12 (35.9); from a's own centroid c would have been (21.5 against 47.5).
-    a, b = down(0.0, range(0, 20)), down(0.0, range(30, 49))
-    c, d = down(21.0, range(-14, -9)), down(6.0, range(55, 60))
-    np.testing.assert_array_equal(linked(a, b, c, d).points_px, np.concatenate([c, a, b, d]))
 
 
 def test_codes_are_linked_apart_and_come_in_rising_order() -> None:

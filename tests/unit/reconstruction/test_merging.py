@@ -1,4 +1,7 @@
-"""Curves of two cameras merged along the light sheet: fused, filled, never doubled; the kernels against plain numpy."""
+"""Curves of two cameras merged along the light sheet: fused, filled, never doubled; the kernels against plain numpy.
+
+Cameras that contradict each other are told from cameras that are as good as they say.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import Axis, FloatArray, Pinhole, Source
+from slrig.reconstruction.agreement import FEWEST_POINTS, Disagreement, disagreement
 from slrig.reconstruction.merging import MergedCurves, _alone_kernel, _fuse_kernel, merged
 from slrig.reconstruction.triangulation import SheetCurves, camera_projector
 from tests.unit.reconstruction.builders import (
@@ -131,19 +135,6 @@ def test_what_each_camera_sees_alone_is_joined_by_a_bridge() -> None:
     assert (np.diff(result.curves.along_px)[at] > 29).all()
 
 
-def test_codes_of_either_camera_are_kept() -> None:
-    result = both(seen(CAMERA, ROWS, columns=[120.0, 160.0]), seen(OTHER_CAMERA, ROWS, columns=[140.0, 160.0]))
-    assert result.curves.position_px.tolist() == [120.0, 140.0, 160.0]
-    camera = [
-        set(result.camera[a:b].tolist())
-        for a, b in zip(result.curves.offsets[:-1], result.curves.offsets[1:], strict=True)
-    ]
-    assert camera[0] == {0}
-    assert camera[1] == {1}
-    assert 0 in camera[2]
-    require_one_sheet(result.curves)
-
-
 def test_three_cameras_are_merged_one_after_the_other() -> None:
     third = replace(CAMERA, translation_mm=CAMERA.translation_mm + np.array([15.0, 0.0, 0.0]))
     parts = [seen(CAMERA, ROWS[ROWS < 90]), seen(OTHER_CAMERA, ROWS[ROWS < 140] + 0.2), seen(third, ROWS + 0.5)]
@@ -250,3 +241,49 @@ def test_points_are_alone_where_the_first_camera_has_no_stretch(pair: tuple[Shee
             stretch = (rows[:-1] <= row) & (row <= rows[1:]) & (np.diff(rows) <= GAP_PX) & ~bridge[:-1]
             assert alone[i] == (not stretch.any() and not (np.abs(rows - row) < 0.5).any())
     assert 0 < alone.sum() < len(alone)
+
+
+NOISE_MM = 0.02
+
+
+def met(offset_mm: float, *, points: int = 5000, outlying: float = 0.0) -> MergedCurves:
+    """Two cameras whose noise is stated, and whose points are offset_mm apart; some see two different things."""
+    rng = np.random.default_rng(4)
+    apart = offset_mm + rng.normal(0, NOISE_MM, points)
+    apart[: round(outlying * points)] = 20.0
+    none: SheetCurves = None  # type: ignore[assignment] # nothing of the curves is asked
+    return MergedCurves(none, np.zeros(0, dtype=np.int32), apart / NOISE_MM, apart)
+
+
+def share(value_mm: float) -> FloatArray:
+    return np.full(100, value_mm)
+
+
+@pytest.mark.parametrize("outlying", [0.0, 0.2])
+def test_cameras_that_agree_within_their_noise_say_nothing(outlying: float) -> None:
+    assert disagreement(met(0.0, outlying=outlying), None) is None
+    assert disagreement(met(0.0, outlying=outlying), share(0.1)) is None
+
+
+@pytest.mark.parametrize("offset_mm", [0.5, -0.5])
+def test_cameras_that_contradict_each_other_are_told_by_how_much(offset_mm: float) -> None:
+    found = disagreement(met(offset_mm, outlying=0.1), None)
+    assert found is not None
+    assert found.apart_mm == pytest.approx(0.5, rel=0.02)
+    # 25 deviations apart, on the scale on which noise alone has 1.
+    assert found.over_sigma == pytest.approx(1.4826 * 25, rel=0.03)
+    assert found.sigma_mm == found.apart_mm
+    assert "0.50" in str(found)
+    assert "calibrate again" in str(found)
+
+
+def test_an_error_that_the_calibration_states_is_no_contradiction() -> None:
+    assert disagreement(met(0.2), share(0.15)) is None
+    assert isinstance(disagreement(met(0.2), share(0.02)), Disagreement)
+
+
+def test_few_points_that_both_see_say_nothing() -> None:
+    assert disagreement(met(0.5, points=FEWEST_POINTS - 1), None) is None
+    nothing = met(0.0)
+    same = MergedCurves(nothing.curves, nothing.camera, 0 * nothing.residual_sigma, 0 * nothing.residual_mm)
+    assert disagreement(same, None) is None

@@ -24,6 +24,8 @@ from tests.unit.reconstruction.refining import fitted_points
 SHAPE = (60, 80)
 QUIET = NoiseModel(1e-4, 0.0)
 PATTERNS = pytest.mark.parametrize(("period_px", "width_px"), [(4, 1), (4, 2), (6, 1), (8, 1), (8, 3), (8, 4), (16, 2)])
+
+
 def lines(period_px: int = 8, width_px: int = 1, axis: Axis = Axis.COLUMN) -> tuple[LineShift, ...]:
     return tuple(LineShift(axis, shift, period_px, width_px) for shift in range(period_px))
 
@@ -202,29 +204,6 @@ def plane(slope: float, angle_rad: float, x: FloatArray, y: FloatArray) -> Float
 def anywhere(count: int, seed: int = 4) -> FloatArray:
     """Points at least four pixels inside the image."""
     return np.random.default_rng(seed).uniform([4, 4], [SHAPE[1] - 5, SHAPE[0] - 5], (count, 2))
-
-
-@SLOPES
-def test_the_crossing_of_an_exact_plane_is_exact_whatever_pixels_are_missing(slope: float, angle_rad: float) -> None:
-    x, y = grid(SHAPE)
-    here = exact_map(plane(slope, angle_rad, x, y))
-    starts = anywhere(500)
-    targets = plane(slope, angle_rad, *starts.T) + slope * np.random.default_rng(5).uniform(-0.7, 0.7, 500)
-    for missing in (0.0, 0.25):
-        usable = np.random.default_rng(6).random(SHAPE) >= missing
-        points, normals, sigma_px, found, _ = fitted_points(here, usable, starts, targets)
-        columns, rows = np.rint(starts).astype(int).T
-        assert found.sum() > 0.95 * usable[rows, columns].sum()
-        assert not found[~usable[rows, columns]].any()
-        misses = (plane(slope, angle_rad, *points[found].T) - targets[found]) / slope
-        np.testing.assert_allclose(misses, 0, atol=1e-3 / abs(slope) * 0.1 + 2e-4)
-        # The way there is along the gradient, and the normal points to rising columns.
-        across = np.sign(slope) * np.array([math.cos(angle_rad), math.sin(angle_rad)])
-        np.testing.assert_allclose(normals[found], np.tile(across, (found.sum(), 1)), atol=2e-3)
-        moves = points[found] - starts[found]
-        np.testing.assert_allclose(moves @ [-across[1], across[0]], 0, atol=2e-3)
-        np.testing.assert_allclose(np.linalg.norm(normals[found], axis=1), 1, atol=1e-12)
-        assert (sigma_px[found] > 0).all()
 
 
 @SLOPES

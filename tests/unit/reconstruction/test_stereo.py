@@ -13,13 +13,11 @@ from slrig.reconstruction.triangulation import camera_camera
 from tests.unit.reconstruction.builders import (
     CAMERA,
     OTHER_CAMERA,
-    PROJECTOR,
     Sphere,
     ensemble_of,
     lit_rows,
     looking,
     opencv_pixels,
-    opencv_rays,
 )
 
 # Rigs with a calibrated projector need none of these kernels.
@@ -59,34 +57,6 @@ def test_curves_run_by_the_rows_of_the_first_camera() -> None:
     curves = camera_camera(backwards, seen(OTHER_CAMERA, COLUMNS, ROWS), CAMERA, OTHER_CAMERA)
     assert (np.diff(curves.along_px)[np.diff(curves.curve_of_point()) == 0] > 0).all()
     np.testing.assert_array_equal(curves.along_px, curves.pixels_px[:, 1])
-
-
-def lit_by_row(camera: Pinhole, row: float, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels of one projector row on the ball, and the normals of the stripe there."""
-    ray = opencv_rays(PROJECTOR, np.column_stack([columns, np.full(len(columns), row)]))
-    ahead = opencv_rays(PROJECTOR, np.column_stack([columns + 0.01, np.full(len(columns), row)]))
-    pixels, after = (opencv_pixels(camera, BALL.seen_along(PROJECTOR.centre_mm, each)) for each in (ray, ahead))
-    tangent = (after - pixels) / np.linalg.norm(after - pixels, axis=1)[:, None]
-    return pixels, np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
-
-
-def test_stripes_of_rows_run_by_the_columns_of_the_first_camera() -> None:
-    columns, rows = np.arange(100.0, 220.0, 1.3), [90.0, 110.5, 140.0]
-    above = looking(
-        (-80.0, 250.0, -490.0), (0.0, 0.0, 0.0), size=Size(640, 480), focal_px=(1380.0, 1390.0),
-        distortion=(-0.15, 0.05, -5e-4, 6e-4, 0.0),
-    )  # fmt: skip
-    ensembles = []
-    for camera, order in ((CAMERA, columns[::-1]), (above, columns)):
-        found = [lit_by_row(camera, row, order) for row in rows]
-        ensemble = ensemble_of([pixels for pixels, _ in found], rows, sigma_px=0.02)
-        ensembles.append(ensemble._replace(normals=np.concatenate([normals for _, normals in found])))
-    mine, theirs = ensembles
-    curves = camera_camera(mine, theirs, CAMERA, above)
-    assert len(curves.points_mm) >= len(rows) * (len(columns) - 2)
-    assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 2e-3
-    np.testing.assert_array_equal(curves.along_px, curves.pixels_px[:, 0])
-    assert (np.diff(curves.along_px)[np.diff(curves.curve_of_point()) == 0] > 0).all()
 
 
 def test_codes_that_one_camera_has_alone_give_nothing() -> None:

@@ -18,7 +18,6 @@ from tests.unit.reconstruction.builders import (
     lit_rows,
     looking,
     opencv_pixels,
-    opencv_rays,
 )
 
 BALL = Sphere()
@@ -98,39 +97,6 @@ def test_the_deviation_is_how_far_the_point_moves_with_its_stripe() -> None:
     np.testing.assert_allclose(curves.deviation_mm, (moved[0] - moved[1]) / 2, rtol=1e-3, atol=1e-7)
     # Depth resolution of the rig: Z²/(f b) per pixel.
     assert 0.5 < np.linalg.norm(curves.deviation_mm, axis=1).mean() / (0.03 * 520**2 / (1400 * 150)) < 2.0
-
-
-def test_points_behind_a_device_are_left_out_and_say_so() -> None:
-    straight = replace(PROJECTOR, distortion=np.zeros(5))
-    ahead = scattered_points(count=20)
-    pixels = opencv_pixels(CAMERA, ahead)
-    # Of a column far to the wrong side the plane is met where the ray is followed backwards.
-    edge = (2500.0 - straight.matrix[0, 2]) / straight.matrix[0, 0]
-    normal = np.array([1.0, 0.0, -edge]) @ straight.rotation
-    rays = opencv_rays(CAMERA, pixels)
-    assert ((straight.centre_mm - CAMERA.centre_mm) @ normal / (rays @ normal) < 0).all()
-    behind = ensemble_of([pixels, pixels], [150.0, 2500.0])
-    curves, cause = camera_projector(behind, CAMERA, straight, Axis.COLUMN)
-    assert np.diff(curves.offsets)[1] == 0
-    assert set(cause[20:].tolist()) == {Refusal.BEHIND_DEVICE}
-    assert np.count_nonzero(cause[:20] == Refusal.NONE) == len(curves.points_mm) > 0
-    depth = curves.points_mm @ CAMERA.rotation[2] + CAMERA.translation_mm[2]
-    assert (depth > 0).all()
-
-
-def test_points_behind_the_projector_are_left_out_and_say_so() -> None:
-    straight = replace(PROJECTOR, distortion=np.zeros(5))
-    turned = replace(straight, rotation=np.diag([-1.0, 1.0, -1.0]) @ straight.rotation)
-    away = replace(turned, translation_mm=-turned.rotation @ straight.centre_mm)
-    points = scattered_points(count=20)
-    x, _, z = away.rotation @ points.T + away.translation_mm[:, None]
-    # Behind it, but on the plane of a column all the same.
-    column = away.matrix[0, 0] * x / z + away.matrix[0, 2]
-    order = np.argsort(column)
-    ensemble = ensemble_of(list(opencv_pixels(CAMERA, points)[order][:, None, :]), column[order].tolist())
-    curves, cause = camera_projector(ensemble, CAMERA, away, Axis.COLUMN)
-    assert len(curves.points_mm) == 0
-    assert set(cause.tolist()) == {Refusal.BEHIND_DEVICE}
 
 
 def test_nothing_is_met_where_the_projectors_lens_has_turned_back() -> None:

@@ -15,7 +15,7 @@ from slrig.model.srgb import light_of, srgb_of
 from slrig.views.fusion import _FOLDED, _OUTWARD, FusedModel, _halve, fused
 from slrig.views.fusion_mean import PoseErrors, Rule, mean_values
 from slrig.views.fusion_sheets import sheets
-from tests.unit.meshing.plain import grid_faces
+from tests.unit.meshing.plain import grid_faces, mesh_of
 from tests.unit.views.known_views import Noise, View, around, star, views_of
 
 # Only models of several views need these kernels.
@@ -45,10 +45,9 @@ def sheet(
     side = np.arange(-half_mm, half_mm + 0.01, 0.4)
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     faces = grid_faces(len(side), len(side))
-    return Mesh(
-        np.stack((x, y, np.full_like(x, height_mm)), 1).astype(np.float32), faces[:, ::-1].copy() if down else faces,
-        np.tile(np.array([0, 0, -1 if down else 1], np.float32), (len(x), 1)), np.full((len(x), 3), colour, np.uint8),
-        np.full(len(x), mark, np.uint8), np.full(len(x), sigma_mm, np.float32), np.zeros(len(x), np.int32),
+    return mesh_of(
+        np.stack((x, y, np.full_like(x, height_mm)), 1), faces[:, ::-1].copy() if down else faces,
+        normals=np.array([0, 0, -1.0 if down else 1.0]), colour=colour, mark=mark, sigma_mm=sigma_mm,
     )  # fmt: skip
 
 

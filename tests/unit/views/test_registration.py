@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from slrig.errors import RegistrationRefusedError
-from slrig.meshing.normals import vertex_normals
 from slrig.meshing.topology import boundary_vertices
 from slrig.model import AlbedoMark, FloatArray, Mesh
 from slrig.views.freedom import Motion
@@ -16,6 +15,7 @@ from slrig.views.matching import side_of
 from slrig.views.registration import registered
 from slrig.views.turntable import found_axis, turntable
 from tests.turned_views import AXIS, AXIS_POINT_MM, Turned, bumpy, displacement_mm, plane, seen, vase, wrong_axis
+from tests.unit.meshing.plain import grid_faces, mesh_of
 
 ANGLES = [0.0, 40.0, 80.0]
 
@@ -105,13 +105,7 @@ def sheet(high: int, *, folded: bool = False) -> Mesh:
     if folded:
         points[:, 2] = np.maximum(points[:, 0] - 199, 0)
         points[:, 0] = np.minimum(points[:, 0], 199)
-    corner = np.array([x + 400 * y for y in range(high - 1) for x in range(399)])
-    upper, lower = np.stack([corner, corner + 1, corner + 400]), np.stack([corner + 1, corner + 401, corner + 400])
-    faces = np.concatenate([upper.T, lower.T]).astype(np.int32)
-    ones = np.ones(len(points), dtype=np.float32)
-    none = np.zeros(len(points), dtype=np.int32)
-    colour = np.zeros((len(points), 3), dtype=np.uint8)
-    return Mesh(points, faces, vertex_normals(points, faces), colour, none.astype(np.uint8), ones, none)
+    return mesh_of(points, grid_faces(high, 400), sigma_mm=1.0, colour=0)
 
 
 @pytest.mark.parametrize(("high", "rows"), [(40, 5), (20, 3), (10, 2), (6, 1)])

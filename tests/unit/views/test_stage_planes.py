@@ -8,7 +8,7 @@ import pytest
 from slrig.errors import StageRefusedError
 from slrig.model import FloatArray, Mesh, PlaneKind, StageAxis
 from slrig.views.stage_planes import cut, stage_planes
-from tests.unit.meshing.plain import grid_faces
+from tests.unit.meshing.plain import grid_faces, joined, mesh_of
 
 UP = np.array([0.0, -0.8, -0.6])
 """Of a stage that a camera in the origin looks down on."""
@@ -24,7 +24,7 @@ def patch(middle: FloatArray, normal: FloatArray, size_mm: float, noise_mm: floa
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
     points = middle + grid.reshape(-1, 2) @ across
     points += noise_mm * np.random.default_rng(seed).normal(size=(len(points), 1)) * normal
-    return meshed(points, len(steps), normal)
+    return mesh_of(points, grid_faces(len(steps), len(steps)), normals=normal)
 
 
 def ball(middle: FloatArray, radius_mm: float) -> Mesh:
@@ -33,28 +33,7 @@ def ball(middle: FloatArray, radius_mm: float) -> Mesh:
     x, y = (each.ravel() for each in np.meshgrid(u, u, indexing="ij"))
     z = -np.sqrt(np.clip(1 - (x**2 + y**2) / 2, 0, 1))
     way = np.column_stack([x / np.sqrt(2), y / np.sqrt(2), z])
-    return meshed(middle + radius_mm * way, len(u), way)
-
-
-def meshed(points: FloatArray, columns: int, normals: FloatArray) -> Mesh:
-    return Mesh(
-        vertices_mm=points.astype(np.float32),
-        faces=grid_faces(len(points) // columns, columns),
-        normals=np.broadcast_to(normals, points.shape).astype(np.float32),
-        colour=np.full((len(points), 3), 128, dtype=np.uint8),
-        mark=np.zeros(len(points), dtype=np.uint8),
-        sigma_mm=np.full(len(points), 0.02, dtype=np.float32),
-        stripe=np.zeros(len(points), dtype=np.int32),
-    )
-
-
-def joined(*parts: Mesh) -> Mesh:
-    first = np.cumsum([0, *(len(part.vertices_mm) for part in parts)])
-    names = ("vertices_mm", "normals", "colour", "mark", "sigma_mm", "stripe")
-    return Mesh(
-        faces=np.concatenate([part.faces + np.int32(begin) for part, begin in zip(parts, first[:-1], strict=True)]),
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names},
-    )
+    return mesh_of(middle + radius_mm * way, grid_faces(len(u), len(u)), normals=way)
 
 
 PLATE = patch(STAGE_MM, UP, 120.0, 0.03)
