@@ -9,8 +9,6 @@ from slrig.meshing.adjacency import in_groups, neighbours
 from slrig.model import IntArray
 from tests.unit.meshing.plain import faces_of
 
-TETRAHEDRON = faces_of((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3))
-
 
 def plain_neighbours(faces: IntArray) -> list[list[int]]:
     """The face that runs along each edge in the other direction, by a dictionary."""
@@ -40,11 +38,6 @@ def test_neighbours_agree_with_a_dictionary_of_edges(seed: int) -> None:
     assert found.tolist() == plain_neighbours(faces)
     assert (found == -1).any()
     assert (found >= 0).any()
-
-
-def test_a_closed_surface_has_no_boundary() -> None:
-    assert neighbours(TETRAHEDRON, vertex_count=4).tolist() == plain_neighbours(TETRAHEDRON)
-    assert (neighbours(TETRAHEDRON, vertex_count=4) >= 0).all()
 
 
 def test_faces_back_to_back_are_neighbours_three_times_and_those_that_meet_in_a_vertex_are_none() -> None:

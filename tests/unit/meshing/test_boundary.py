@@ -109,19 +109,6 @@ def test_a_slanted_border_is_not_peeled() -> None:
     assert not result.added[: len(faces) - result.removed_triangles].any()
 
 
-def test_shrinking_takes_long_boundary_edges_from_outside_inwards() -> None:
-    # A fan of long triangles beside a dense grid, as at the end of a curve that its neighbour does not reach.
-    points, faces = grid(4, 4)
-    far = flat((1, -9), (2, -9), (3, -9))
-    at = len(points)
-    fan = faces_of((at, 1, 0), (at, at + 1, 1), (at + 1, 2, 1), (at + 1, at + 2, 2), (at + 2, 3, 2))
-    points, joined = np.concatenate((points, far)), np.concatenate((faces, fan))
-    result = shrunk(points, joined, everywhere(points, 5.0))
-    np.testing.assert_array_equal(result.faces, faces)
-    assert result.removed_triangles == len(fan)
-    np.testing.assert_array_equal(result.adjacency, neighbours(faces, vertex_count=len(points)))
-
-
 def test_shrinking_agrees_with_dropping_until_nothing_changes() -> None:
     rng = np.random.default_rng(2)
     for _ in range(20):

@@ -96,15 +96,6 @@ def test_of_equally_near_triangles_the_first_is_seen(monkeypatch: pytest.MonkeyP
     assert np.array_equal(again.face, once.face)
 
 
-def test_front_is_counter_clockwise_in_the_picture() -> None:
-    pixels = np.array([[1, 1], [1, 8], [8, 1]], dtype=np.float64)  # down, then right: counter-clockwise to the eye
-    placed, normals = placed_at(pixels, np.ones(3)), np.zeros((3, 3), dtype=np.float32)
-    for order, seen in (((0, 1, 2), True), ((0, 2, 1), False)):
-        faces = np.array([order], dtype=np.int32)
-        _, front = normals_seen(rasterised(placed, faces, Size(10, 10)), placed, normals, faces)
-        assert front[2, 2] == seen
-
-
 def test_a_sheet_of_small_triangles_has_no_holes() -> None:
     side = np.linspace(-0.5, 30.5, 32)  # its edges pass between pixel centres; then through them
     for shift in (0.0, 0.5):

@@ -34,20 +34,17 @@ def patterns_of(
     )
 
 
-def test_white_and_black_open_and_close() -> None:
-    patterns = patterns_of(Size(64, 48))
+def test_white_and_black_open_and_close_bits_with_their_inverses_and_each_shift_once() -> None:
+    patterns = patterns_of(Size(64, 48), period_px=5)
     assert patterns[:2] == patterns[-2:] == (White(), Black())
-
-
-def test_each_bit_is_followed_by_its_inverse_most_significant_first() -> None:
-    bits = [pattern for pattern in patterns_of(Size(64, 48)) if isinstance(pattern, Gray)]
-    assert [(pattern.bit, pattern.inverted) for pattern in bits] == [(b, i) for b in range(4) for i in (False, True)]
-    assert {(pattern.bits, pattern.cell_px) for pattern in bits} == {(4, 4)}
-
-
-def test_every_shift_is_played_once() -> None:
-    lines = [pattern for pattern in patterns_of(Size(64, 48), period_px=5) if isinstance(pattern, LineShift)]
+    bits = [pattern for pattern in patterns if isinstance(pattern, Gray)]
+    # Most significant first, in cells of half a period.
+    assert [(pattern.bit, pattern.inverted) for pattern in bits] == [(b, i) for b in range(5) for i in (False, True)]
+    assert {(pattern.bits, pattern.cell_px) for pattern in bits} == {(5, 2)}
+    lines = [pattern for pattern in patterns if isinstance(pattern, LineShift)]
     assert lines == [LineShift(Axis.COLUMN, shift, 5) for shift in range(5)]
+    alone = patterns_of(Size(64, 48), line_shift=False)
+    assert alone == tuple(pattern for pattern in patterns if not isinstance(pattern, LineShift))
 
 
 def test_what_tells_how_a_camera_sees_comes_before_the_lines_of_its_axis_and_the_other_bits_after() -> None:

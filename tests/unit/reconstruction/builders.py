@@ -139,6 +139,29 @@ def lit_rows(column_px: float, rows_px: FloatArray, surface: Sphere, *, projecto
     return surface.seen_along(projector.centre_mm, opencv_rays(projector, pixels))
 
 
+BALL = Sphere()
+
+
+def seen_on_ball(
+    camera: Pinhole,
+    columns: list[float],
+    rows: FloatArray,
+    *,
+    sigma_px: float = 0.01,
+    noise_px: float = 0.0,
+    seed: int = 0,
+) -> StripeEnsemble:
+    """Stripes of projector columns on the ball, with true normals; steps of more than ten rows are bridges."""
+    pixels = [opencv_pixels(camera, lit_rows(column, rows, BALL)) for column in columns]
+    ahead = [opencv_pixels(camera, lit_rows(column, rows + 0.01, BALL)) for column in columns]
+    cuts = tuple(np.flatnonzero(np.abs(np.diff(rows)) > 10).tolist())
+    ensemble = ensemble_of(pixels, columns, sigma_px=sigma_px, breaks=dict.fromkeys(range(len(columns)), cuts))
+    along = np.concatenate([np.zeros((0, 2)), *ahead]) - ensemble.points_px
+    normals = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
+    noise = noise_px * np.random.default_rng(seed).normal(0, 1, len(normals))
+    return ensemble._replace(points_px=ensemble.points_px + noise[:, None] * normals, normals=normals)
+
+
 def stripes_of(
     chains: list[FloatArray], *, frame: list[int] | None = None, normals: list[FloatArray] | None = None
 ) -> Stripes:

@@ -16,17 +16,8 @@ from slrig.model import Axis, FloatArray, Pinhole, Source
 from slrig.reconstruction.agreement import FEWEST_POINTS, Disagreement, disagreement
 from slrig.reconstruction.merging import MergedCurves, _alone_kernel, _fuse_kernel, merged
 from slrig.reconstruction.triangulation import SheetCurves, camera_projector
-from tests.unit.reconstruction.builders import (
-    CAMERA,
-    OTHER_CAMERA,
-    PROJECTOR,
-    Sphere,
-    ensemble_of,
-    lit_rows,
-    opencv_pixels,
-)
+from tests.unit.reconstruction.builders import BALL, CAMERA, OTHER_CAMERA, PROJECTOR, seen_on_ball
 
-BALL = Sphere()
 COLUMNS = [120.0, 140.0, 160.0, 180.0]
 ROWS = np.arange(60.0, 180.0, 0.9)
 GAP_PX = 4.0
@@ -41,14 +32,10 @@ def seen(
     seed: int = 0,
     sigma_px: float = 0.02,
 ) -> SheetCurves:
-    """What one camera triangulates of the ball; a step of more than 4 rows is a bridge."""
+    """What one camera triangulates of the ball."""
     columns = COLUMNS if columns is None else columns
-    pixels = [opencv_pixels(camera, lit_rows(column, rows, BALL)) for column in columns]
-    cuts = tuple(int(cut) for cut in np.flatnonzero(np.diff(rows) > GAP_PX))
-    ensemble = ensemble_of(pixels, columns, sigma_px=sigma_px, breaks=dict.fromkeys(range(len(columns)), cuts))
-    noise = np.random.default_rng(seed).normal(0, noise_px, len(ensemble.points_px)) if noise_px else 0.0
-    moved = ensemble.points_px + np.multiply.outer(noise, [1.0, 0.0]) if noise_px else ensemble.points_px
-    return camera_projector(ensemble._replace(points_px=moved), camera, PROJECTOR, Axis.COLUMN)[0]
+    stripes = seen_on_ball(camera, columns, rows, sigma_px=sigma_px, noise_px=noise_px, seed=seed)
+    return camera_projector(stripes, camera, PROJECTOR, Axis.COLUMN)[0]
 
 
 def both(first: SheetCurves, second: SheetCurves) -> MergedCurves:
@@ -114,16 +101,6 @@ def test_a_hole_of_one_camera_is_filled_by_the_other_and_is_no_bridge_any_more(*
     assert (result.curves.source[filled] == Source.CAMERA_PROJECTOR).all()
     assert (result.camera[filled] == (0 if swapped else 1)).all()
     assert np.abs(BALL.distance_mm(result.curves.points_mm)).max() < 2e-4
-
-
-def test_a_hole_that_is_half_filled_keeps_a_bridge_over_the_rest() -> None:
-    first = seen(CAMERA, ROWS[(ROWS < 100) | (ROWS > 130)])
-    result = both(first, seen(OTHER_CAMERA, ROWS[ROWS < 115] + 0.3))
-    require_one_sheet(result.curves)
-    at = np.flatnonzero(result.curves.bridge_after)
-    assert len(at) == len(COLUMNS)
-    assert (result.curves.along_px[at] > 113).all()
-    assert (result.curves.along_px[at + 1] > 130).all()
 
 
 def test_what_each_camera_sees_alone_is_joined_by_a_bridge() -> None:

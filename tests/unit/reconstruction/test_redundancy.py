@@ -20,20 +20,20 @@ from slrig.reconstruction.redundancy import (
 )
 from slrig.reconstruction.triangulation import SheetCurves, camera_projector
 from tests.unit.reconstruction.builders import (
+    BALL,
     CAMERA,
     OTHER_CAMERA,
     PROJECTOR,
-    Sphere,
     ensemble_of,
     lit_rows,
     opencv_pixels,
     opencv_rays,
+    seen_on_ball,
 )
 
 # Only scans by two cameras need this kernel.
 pytestmark = pytest.mark.slow
 
-BALL = Sphere()
 COLUMNS = [100.0, 120.0, 140.0, 160.0, 180.0, 200.0]
 ROWS = np.arange(50.0, 190.0, 0.8)
 GAP_PX = 4.0
@@ -59,17 +59,9 @@ def normals_along(pixels: FloatArray) -> FloatArray:
 def seen(
     camera: Pinhole, *, believed: Pinhole | None = None, rows: FloatArray = ROWS, noise_px: float = 0.0, seed: int = 0
 ) -> SheetCurves:
-    """What a camera triangulates of the ball with the pose it is believed to have; gaps of the rows are bridges."""
-    rng = np.random.default_rng(seed)
-    pixels, normals = [], []
-    for column in COLUMNS:
-        curve = opencv_pixels(camera, lit_rows(column, rows, BALL))
-        normals.append(normals_along(curve))
-        pixels.append(curve + rng.normal(0, 1, len(curve))[:, None] * noise_px * normals[-1])
-    cuts = tuple(int(cut) for cut in np.flatnonzero(np.diff(rows) > GAP_PX))
-    ensemble = ensemble_of(pixels, COLUMNS, sigma_px=noise_px or 0.01, breaks=dict.fromkeys(range(len(COLUMNS)), cuts))
-    ensemble = ensemble._replace(normals=np.concatenate(normals))
-    return camera_projector(ensemble, believed or camera, PROJECTOR, Axis.COLUMN)[0]
+    """What a camera triangulates of the ball with the pose it is believed to have."""
+    stripes = seen_on_ball(camera, COLUMNS, rows, sigma_px=noise_px or 0.01, noise_px=noise_px, seed=seed)
+    return camera_projector(stripes, believed or camera, PROJECTOR, Axis.COLUMN)[0]
 
 
 def both(first: SheetCurves, second: SheetCurves, *, other: Pinhole = OTHER_CAMERA) -> SpareEquation:
@@ -99,36 +91,6 @@ def test_a_turned_second_camera_shows_as_the_shift_of_its_image(degrees: tuple[f
     predicted = np.concatenate(wanted)
     assert spare.residual_px.mean() == pytest.approx(predicted.mean(), rel=0.02, abs=2e-3)
     assert spare.residual_px.std() == pytest.approx(predicted.std(), rel=0.1, abs=5e-3)
-
-
-def test_a_turned_first_camera_shows_as_the_depth_it_gets_wrong() -> None:
-    believed = turned(CAMERA, degrees=(0.0, 0.05, 0.0))
-    spare = both(seen(CAMERA, believed=believed), seen(OTHER_CAMERA))
-    wanted = []
-    for column in COLUMNS:
-        truth = lit_rows(column, ROWS, BALL)
-        wrong = on_column(believed, opencv_pixels(CAMERA, truth), column)
-        found = opencv_pixels(OTHER_CAMERA, truth)
-        wanted.append(((found - opencv_pixels(OTHER_CAMERA, wrong)) * normals_along(found)).sum(axis=1))
-    predicted = float(np.concatenate(wanted).mean())
-    assert abs(predicted) > 0.5
-    assert spare.residual_px.mean() == pytest.approx(predicted, rel=0.02)
-
-
-def on_column(camera: Pinhole, pixels: FloatArray, column_px: float) -> FloatArray:
-    """(n, 3): where rays meet the light of one column, by bisection on OpenCV's projection."""
-    rays = opencv_rays(camera, pixels)
-    near, far = np.full(len(rays), 200.0), np.full(len(rays), 900.0)
-
-    def off(depth: FloatArray) -> FloatArray:
-        return opencv_pixels(PROJECTOR, camera.centre_mm + depth[:, None] * rays)[:, 0] - column_px
-
-    rising = off(far) > off(near)
-    for _ in range(60):
-        middle = (near + far) / 2
-        beyond = (off(middle) > 0) == rising
-        near, far = np.where(beyond, near, middle), np.where(beyond, middle, far)
-    return np.asarray(camera.centre_mm + near[:, None] * rays)
 
 
 def test_the_sign_is_that_of_rising_columns_however_the_stripes_were_found() -> None:

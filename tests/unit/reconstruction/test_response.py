@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from slrig.model import Black, FloatArray, White
+from slrig.model import FloatArray
 from slrig.reconstruction.decoding import DecodingLimits
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
 from slrig.reconstruction.response import found_gamma, gain, in_light
@@ -105,23 +105,3 @@ def test_errors_grow_as_the_slope_of_light_over_values(gamma: float) -> None:
     light, wanted = (FULL * (each / FULL) ** gamma for each in (seen, value))
     grown = float(np.mean((light - wanted) ** 2)) / 0.25
     assert gain([wanted.astype(np.float32)], gamma, FULL) == pytest.approx(grown, rel=0.02)
-
-
-def test_images_that_come_later_are_made_straight_as_they_come() -> None:
-    bent = seen_by(2.2)
-    stacks = FrameStacks.of(bent)
-    early = FrameStacks(stacks.patterns, SHAPE, full_scale=FULL)
-    late = FrameStacks(stacks.patterns, SHAPE, full_scale=FULL)
-    late.straighten(2.2)
-    assert bent.inverses is not None
-    for each in (early, late):
-        for bit, (direct, inverse) in enumerate(zip(bent.bits, bent.inverses, strict=True)):
-            each.put(replace(bent.gray, bit=bit), direct)
-            each.put(replace(bent.gray, bit=bit, inverted=True), inverse)
-        each.put(White(), bent.white)
-        each.put(Black(), bent.black)
-    early.straighten(2.2)
-    one, other = early.frames(), late.frames()
-    np.testing.assert_array_equal(one.bits, other.bits)
-    assert (one.white == other.white).all()
-    assert (one.black == FULL * (bent.black / FULL) ** np.float32(2.2)).mean() > 0.99

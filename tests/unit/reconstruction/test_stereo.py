@@ -8,22 +8,20 @@ import numpy as np
 import pytest
 
 from slrig.model import FloatArray, Pinhole, Size
-from slrig.reconstruction.linking import StripeEnsemble
 from slrig.reconstruction.triangulation import camera_camera
 from tests.unit.reconstruction.builders import (
+    BALL,
     CAMERA,
     OTHER_CAMERA,
-    Sphere,
-    ensemble_of,
     lit_rows,
     looking,
     opencv_pixels,
+    seen_on_ball,
 )
 
 # Rigs with a calibrated projector need none of these kernels.
 pytestmark = pytest.mark.slow
 
-BALL = Sphere()
 ROWS = np.arange(60.0, 180.0, 1.3)
 COLUMNS = [110.0, 138.5, 166.0, 190.0]
 # The baseline to this one runs obliquely: epipolar lines cross the stripes at about 45°.
@@ -33,34 +31,25 @@ OBLIQUE_CAMERA = looking(
 )  # fmt: skip
 
 
-def seen(
-    camera: Pinhole, columns: list[float], rows: FloatArray, *, breaks: dict[int, tuple[int, ...]] | None = None
-) -> StripeEnsemble:
-    """Whole columns on the ball with their true normals."""
-    pixels = [opencv_pixels(camera, lit_rows(column, rows, BALL)) for column in columns]
-    ahead = [opencv_pixels(camera, lit_rows(column, rows + 0.01, BALL)) for column in columns]
-    tangent = np.concatenate(ahead) - np.concatenate(pixels)
-    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
-    ensemble = ensemble_of(pixels, columns, sigma_px=0.02, breaks=breaks)
-    return ensemble._replace(normals=np.stack([tangent[:, 1], -tangent[:, 0]], axis=1))
-
-
 def test_the_other_curve_is_crossed_between_its_points() -> None:
-    other = seen(OTHER_CAMERA, COLUMNS, ROWS + 0.55)
-    curves = camera_camera(seen(CAMERA, COLUMNS, ROWS), other, CAMERA, OTHER_CAMERA)
+    other = seen_on_ball(OTHER_CAMERA, COLUMNS, ROWS + 0.55)
+    curves = camera_camera(seen_on_ball(CAMERA, COLUMNS, ROWS), other, CAMERA, OTHER_CAMERA)
     assert len(curves.points_mm) == len(COLUMNS) * (len(ROWS) - 1)
     assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 2e-3
 
 
 def test_curves_run_by_the_rows_of_the_first_camera() -> None:
-    backwards = seen(CAMERA, COLUMNS, ROWS[::-1].copy())
-    curves = camera_camera(backwards, seen(OTHER_CAMERA, COLUMNS, ROWS), CAMERA, OTHER_CAMERA)
+    backwards = seen_on_ball(CAMERA, COLUMNS, ROWS[::-1].copy())
+    curves = camera_camera(backwards, seen_on_ball(OTHER_CAMERA, COLUMNS, ROWS), CAMERA, OTHER_CAMERA)
     assert (np.diff(curves.along_px)[np.diff(curves.curve_of_point()) == 0] > 0).all()
     np.testing.assert_array_equal(curves.along_px, curves.pixels_px[:, 1])
 
 
 def test_codes_that_one_camera_has_alone_give_nothing() -> None:
-    first, second = seen(CAMERA, [110.0, 138.5, 166.0], ROWS), seen(OTHER_CAMERA, [138.5, 150.0, 166.0, 190.0], ROWS)
+    first, second = (
+        seen_on_ball(CAMERA, [110.0, 138.5, 166.0], ROWS),
+        seen_on_ball(OTHER_CAMERA, [138.5, 150.0, 166.0, 190.0], ROWS),
+    )
     curves = camera_camera(first, second, CAMERA, OTHER_CAMERA)
     assert curves.position_px.tolist() == [110.0, 138.5, 166.0]
     assert np.diff(curves.offsets)[0] == 0
@@ -70,9 +59,8 @@ def test_codes_that_one_camera_has_alone_give_nothing() -> None:
 
 def test_nothing_is_crossed_on_a_bridge() -> None:
     gap = (ROWS < 100) | (ROWS > 130)
-    upper = int((ROWS < 100).sum())
-    second = seen(OTHER_CAMERA, [138.5], ROWS[gap], breaks={0: (upper - 1,)})
-    curves = camera_camera(seen(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
+    second = seen_on_ball(OTHER_CAMERA, [138.5], ROWS[gap])
+    curves = camera_camera(seen_on_ball(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
     met = opencv_pixels(CAMERA, lit_rows(138.5, ROWS, BALL))[:, 1]
     hidden = met[~gap]
     assert len(curves.points_mm) > 50
@@ -80,14 +68,15 @@ def test_nothing_is_crossed_on_a_bridge() -> None:
 
 
 def test_beyond_the_other_cameras_curve_there_is_no_point() -> None:
-    second = seen(OTHER_CAMERA, [138.5], ROWS[30:60])
-    curves = camera_camera(seen(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
+    second = seen_on_ball(OTHER_CAMERA, [138.5], ROWS[30:60])
+    curves = camera_camera(seen_on_ball(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
     assert 28 <= len(curves.points_mm) <= 30
 
 
 @pytest.mark.parametrize("other", [OTHER_CAMERA, OBLIQUE_CAMERA], ids=["beside", "oblique"])
 def test_the_deviation_adds_the_errors_of_both_cameras(other: Pinhole) -> None:
-    first, second = seen(CAMERA, COLUMNS, ROWS[2:-2]), seen(other, COLUMNS, ROWS + 0.2)
+    first = seen_on_ball(CAMERA, COLUMNS, ROWS[2:-2], sigma_px=0.02)
+    second = seen_on_ball(other, COLUMNS, ROWS + 0.2, sigma_px=0.02)
     curves = camera_camera(first, second, CAMERA, other)
     assert len(curves.points_mm) == len(first.points_px)
 
@@ -108,5 +97,5 @@ def test_the_deviation_adds_the_errors_of_both_cameras(other: Pinhole) -> None:
 def test_a_camera_without_parallax_gives_nothing() -> None:
     # Both at one place: every ray meets every other at the centre only.
     turned = replace(CAMERA, matrix=CAMERA.matrix * [[1.05], [1.05], [1.0]])
-    curves = camera_camera(seen(CAMERA, COLUMNS, ROWS), seen(turned, COLUMNS, ROWS), CAMERA, turned)
+    curves = camera_camera(seen_on_ball(CAMERA, COLUMNS, ROWS), seen_on_ball(turned, COLUMNS, ROWS), CAMERA, turned)
     assert len(curves.points_mm) == 0

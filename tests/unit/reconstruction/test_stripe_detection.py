@@ -265,11 +265,3 @@ def test_stripes_of_several_frames_stand_in_the_frames_order() -> None:
     }
     for point, normal, sigma in zip(stripes.points_px, stripes.normals, stripes.sigma_px, strict=True):
         assert every[tuple(point)] == (*normal, sigma)
-
-
-def test_no_frames_and_frames_without_points_have_no_stripes() -> None:
-    assert len(chained([], SHAPE)) == 0
-    nothing = chained([points_of(np.zeros(SHAPE, dtype=np.float32))], SHAPE)
-    assert nothing.offsets.tolist() == [0]
-    assert nothing.points_px.shape == nothing.normals.shape == (0, 2)
-    assert len(nothing.sigma_px) == len(nothing.frame) == 0

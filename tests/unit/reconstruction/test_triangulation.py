@@ -11,16 +11,14 @@ from slrig.model import Axis, FloatArray, Pinhole, Refusal, Size, Source
 from slrig.reconstruction.linking import StripeEnsemble
 from slrig.reconstruction.triangulation import camera_projector
 from tests.unit.reconstruction.builders import (
+    BALL,
     CAMERA,
     PROJECTOR,
-    Sphere,
     ensemble_of,
-    lit_rows,
     looking,
     opencv_pixels,
+    seen_on_ball,
 )
-
-BALL = Sphere()
 
 
 def scattered_points(*, count: int = 300) -> FloatArray:
@@ -61,18 +59,10 @@ def test_a_strongly_distorted_projector_is_met_exactly() -> None:
     assert np.abs(plain.points_mm - points[order][: len(plain.points_mm)]).max() > 1.0
 
 
-def on_ball(
-    columns: list[float], rows: FloatArray, *, breaks: dict[int, tuple[int, ...]] | None = None
-) -> StripeEnsemble:
-    """What the camera sees of whole columns on the ball."""
-    pixels = [opencv_pixels(CAMERA, lit_rows(column, rows, BALL)) for column in columns]
-    return ensemble_of(pixels, columns, breaks=breaks)
-
-
 def test_curves_on_a_ball_lie_on_the_ball_in_order_of_rows() -> None:
     rows = np.arange(60.0, 180.0, 1.7)
     columns = [100.0, 131.5, 160.0, 190.25]
-    curves, _ = camera_projector(on_ball(columns, rows), CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, _ = camera_projector(seen_on_ball(CAMERA, columns, rows), CAMERA, PROJECTOR, Axis.COLUMN)
     assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 1e-6
     assert curves.position_px.tolist() == columns
     assert np.diff(curves.offsets).tolist() == [len(rows)] * 4
@@ -82,7 +72,7 @@ def test_curves_on_a_ball_lie_on_the_ball_in_order_of_rows() -> None:
 
 def test_the_deviation_is_how_far_the_point_moves_with_its_stripe() -> None:
     rows = np.arange(70.0, 170.0, 9.0)
-    ensemble = on_ball([120.0, 170.0], rows)
+    ensemble = seen_on_ball(CAMERA, [120.0, 170.0], rows)
     rng = np.random.default_rng(2)
     angle = rng.uniform(-0.5, 0.5, len(ensemble.points_px))
     ensemble = ensemble._replace(
@@ -132,7 +122,7 @@ def test_points_lit_by_no_row_of_the_projector_are_left_out() -> None:
     # A projector half as high would not have lit rows below its last.
     rows = np.arange(60.0, 180.0, 5.0)
     cut = replace(PROJECTOR, size=replace(PROJECTOR.size, height_px=121))
-    curves, cause = camera_projector(on_ball([140.0, 160.0], rows), CAMERA, cut, Axis.COLUMN)
+    curves, cause = camera_projector(seen_on_ball(CAMERA, [140.0, 160.0], rows), CAMERA, cut, Axis.COLUMN)
     kept = rows[rows < 120 + 2]
     np.testing.assert_allclose(curves.along_px, np.tile(kept, 2), atol=1e-6)
     expected = np.where(rows < 120 + 2, Refusal.NONE, Refusal.OFF_PROJECTOR)
@@ -140,7 +130,7 @@ def test_points_lit_by_no_row_of_the_projector_are_left_out() -> None:
 
 
 def test_unmeasured_pixels_give_no_points() -> None:
-    ensemble = on_ball([140.0], np.arange(60.0, 180.0, 5.0))
+    ensemble = seen_on_ball(CAMERA, [140.0], np.arange(60.0, 180.0, 5.0))
     ensemble.points_px[3] = np.nan
     curves, cause = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     assert cause.tolist() == [Refusal.NO_INTERSECTION if index == 3 else Refusal.NONE for index in range(24)]
@@ -150,7 +140,7 @@ def test_unmeasured_pixels_give_no_points() -> None:
 
 def test_bridges_are_kept_and_stripes_follow_by_row() -> None:
     rows = np.concatenate([np.arange(60.0, 80.0), np.arange(120.0, 150.0), np.arange(95.0, 110.0)])
-    ensemble = on_ball([140.0], rows, breaks={0: (19, 49)})
+    ensemble = seen_on_ball(CAMERA, [140.0], rows)
     curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     np.testing.assert_allclose(curves.along_px, np.sort(rows), atol=1e-6)
     assert curves.stripe.tolist() == [0] * 20 + [2] * 15 + [1] * 30
