@@ -68,9 +68,8 @@ def test_of_a_texture_out_of_focus_what_is_stated_holds(texture: str, tmp_path: 
 
 
 # For each object: exposures from too short to too long, and a bracket that does it.
-SWEEPS = {
+SWEEPS = {  # of the dark and the mixed object; the whole sweep has the shiny one, too
     "dark": ((1 / 2,), (2,), (1, 8)),
-    "shiny": ((1 / 4,), (2,), (1 / 4, 2)),
     "mixed": ((1,), (1 / 4, 4), (1 / 16, 1 / 2, 4)),
 }
 WITHIN = 0.1

@@ -61,7 +61,8 @@ def test_the_verdict_is_that_of_the_angles(kind: str, gamma: float, rule: FlipRu
     rules: dict[tuple[str, bool], int] = {}
     for _ in range(150):
         points = rng.normal(0, 1, (4, 3)) * TETRAHEDRA[kind]
-        wanted, margin, by = verdict(*points, gamma=gamma if constrained else math.pi)
+        p, q, f, w = points
+        wanted, margin, by = verdict(p, q, f, w, gamma if constrained else math.pi)
         if margin < 1e-7:
             continue
         assert bool(prefers_flip(points, 0, 1, 2, 3, *constraint(rule, gamma))) == wanted
