@@ -31,7 +31,8 @@ from slrig.model import AlbedoMark, Black, Capture, FloatArray, LightMap, Pinhol
 from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.light_board import with_light_map
 from slrig.scan.plan import ScanPlan
-from tests.golden.test_bracketing import captured, reconstructed
+from tests.golden.test_bracketing import captured
+from tests.golden.test_bundles import reconstructed
 
 pytestmark = pytest.mark.slow
 CONFIG = Path(__file__).parents[2] / "config"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -14,9 +12,9 @@ from slrig.discovery import open_rig
 from slrig.model import Calibration, Shot
 from slrig.model.header import CaptureHeader
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import ReconstructionPlan, ScanPlan
-from slrig.scan.reconstruct import reconstruct_bundle
+from slrig.scan.plan import ScanPlan
 from slrig.scan.stream import LiveScan
+from tests.golden.test_bundles import reconstructed
 
 pytestmark = pytest.mark.slow
 CONFIG = Path(__file__).parents[2] / "config"
@@ -66,12 +64,6 @@ def captured(rig: Path, plan: ScanPlan, bundle: Path, watching: Watching | None 
     return bundle
 
 
-def reconstructed(bundle: Path, output: Path, live: LiveScan | None = None) -> Mapping[str, Any]:
-    return reconstruct_bundle(
-        bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False, live=live
-    )
-
-
 def test_a_bracket_is_more_complete_and_no_less_exact_than_any_of_its_exposures(tmp_path: Path) -> None:
     rig = glossy_rig(tmp_path)
     singles = []
@@ -111,7 +103,7 @@ def test_a_bracket_gives_the_same_bytes_live_and_from_disk(tmp_path: Path) -> No
     watching = Watching()
     bundle = captured(small_rig(tmp_path), ScanPlan(exposures_s=EXPOSURES_S), tmp_path / "bundle", watching)
     read = reconstructed(bundle, tmp_path / "read")
-    live = reconstructed(bundle, tmp_path / "live", watching.live)
+    live = reconstructed(bundle, tmp_path / "live", live=watching.live)
     for name in ("mesh.ply", "points.ply"):
         assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "read" / name).read_bytes(), name
     assert all(live[part] == read[part] for part in ("notes", "identity", "frames", "evidence", "cameras"))

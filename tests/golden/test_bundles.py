@@ -20,10 +20,10 @@ GOALS = {"vase": (0.022, 0.07), "terrace": (0.016, 0.06), "gauge": (0.025, 0.09)
 SCENES = tuple(GOALS)
 
 
-def reconstructed(bundle: Path, output: Path) -> Any:
+def reconstructed(bundle: Path, output: Path, plan: ReconstructionPlan | None = None, **options: Any) -> Any:
     """Reconstruct a bundle as the service does; the report."""
     return reconstruct_bundle(
-        bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
+        bundle, output, plan=plan or ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False, **options
     )
 
 

@@ -39,41 +39,14 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, FloatArray, Pinhole, Solved
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
-from slrig.scan.reconstruct import reconstruct_bundle
+from slrig.scan.plan import PatternPlan, ScanPlan
+from tests.golden.test_bundles import reconstructed
 from tests.unit.calibration.perturbed import aligned, met_with_projector, pixels
 from tests.unit.calibration.solving.against_truth import in_first_camera
 
 pytestmark = pytest.mark.slow
 
-RIG = """name = "small"
-[head]
-driver = "simulated"
-scene = "scene.toml"
-seed = {seed}
-samples_per_axis = 2
-ambient = 0.01
-{poses}
-[head.projector]
-size_px = [512, 384]
-focal_px = [2200.0, 2202.2]
-principal_px = [258.3, 189.6]
-distortion = [0.03, -0.02, 0.0003, 0.0, 0.0]
-position_mm = [105.0, -10.0, -590.0]
-target_mm = [0.0, 0.0, 0.0]
-blur_px = 0.6
-gamma = 1.8
-[[head.camera]]
-name = "left"
-size_px = [480, 384]
-saturation_s = 0.02
-focal_px = [1900.0, 1901.9]
-principal_px = [241.4, 189.7]
-distortion = [-0.11, 0.15, -0.0003, 0.0005, 0.0]
-position_mm = [-150.0, -12.0, -560.0]
-target_mm = [0.0, 0.0, 0.0]
-blur_px = 0.6
-"""
+RELIEF = (Path(__file__).parents[2] / "config" / "rigs" / "relief.toml").read_text(encoding="utf-8")
 POSES = """carries_calibration = false
 [head.poses]
 count = 20
@@ -130,15 +103,22 @@ class Measured:
     exact: Calibration
     found: Mapping[tuple[str, int], Found]
     meshes: Mapping[tuple[str, int], Mapping[str, NDArray[Any]]]
-    reports: list[dict[str, Any]]
+
+
+def rig_file(folder: Path, scene: str, seed: int, poses: str = "") -> Path:
+    """The rig of the relief before another scene, with a sample less a pixel."""
+    folder.mkdir()
+    (folder / "scene.toml").write_text(scene)
+    usual = 'scene = "../scenes/relief.toml"\nseed = 15\nsamples_per_axis = 3\nambient = 0.01\n'
+    assert usual in RELIEF
+    head = f'scene = "scene.toml"\nseed = {seed}\nsamples_per_axis = 2\nambient = 0.01\n{poses}'
+    (folder / "rig.toml").write_text(RELIEF.replace(usual, head))
+    return folder / "rig.toml"
 
 
 def captured(folder: Path, scene: str, seed: int, bundle: Path) -> Calibration:
     """Capture one thing; the rig's exact calibration, in its own world."""
-    folder.mkdir()
-    (folder / "scene.toml").write_text(scene)
-    (folder / "rig.toml").write_text(RIG.format(seed=seed, poses=""))
-    with open_rig(read_rig(folder / "rig.toml")) as rig:
+    with open_rig(read_rig(rig_file(folder, scene, seed))) as rig:
         capture_frames(rig, ScanPlan(), bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
         # What is compared with the truth here is compared below.
         for path in (*bundle.glob("truth*"), bundle / "visible_points.npy"):
@@ -149,12 +129,9 @@ def captured(folder: Path, scene: str, seed: int, bundle: Path) -> Calibration:
 
 def observed(folder: Path, seed: int) -> Observations:
     """What a rig that does not know its calibration sees of a board in twenty poses."""
-    folder.mkdir()
-    (folder / "scene.toml").write_text(BOARD_SCENE)
-    (folder / "rig.toml").write_text(RIG.format(seed=seed, poses=POSES.format(seed=seed)))
     plan = ScanPlan(patterns=PatternPlan(rows=True))
     seen = []
-    with open_rig(read_rig(folder / "rig.toml")) as rig:
+    with open_rig(read_rig(rig_file(folder, BOARD_SCENE, seed, POSES.format(seed=seed)))) as rig:
         assert rig.positioner is not None
         for index, name in enumerate(rig.positioner.poses):
             rig.positioner.move(index)
@@ -234,7 +211,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Measured:
         ),
     )
     write_calibration(root / "solved.json", solved)
-    meshes, reports = {}, []
+    meshes = {}
     for kind, shape in OBJECTS.items():
         for place, (position, turn) in enumerate(zip(PLACES, TURNS_DEG, strict=True)):
             scene = (
@@ -243,15 +220,11 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Measured:
             )
             name = f"{kind}{place}"
             truth = captured(root / f"rig-{name}", scene, 100 + place, root / name)
-            report = reconstruct_bundle(
-                root / name, root / f"out-{name}", plan=ReconstructionPlan(), calibration=root / "solved.json",
-                progress=lambda *_: None, cancelled=lambda: False,
-            )  # fmt: skip
-            reports.append(report)
+            reconstructed(root / name, root / f"out-{name}", calibration=root / "solved.json")
             meshes[kind, place] = vertices(root / f"out-{name}" / "mesh.ply")
     points = {key: np.column_stack([mesh[name] for name in "xyz"]) for key, mesh in meshes.items()}
     found = after_one_rigid_motion(points, truth.cameras["left"])
-    return Measured(stated, solved, in_first_camera(truth), found, meshes, reports)
+    return Measured(stated, solved, in_first_camera(truth), found, meshes)
 
 
 def rms(parts: list[FloatArray]) -> float:

@@ -15,10 +15,9 @@ import pytest
 
 from slrig.cli.quality import quality_lines
 from slrig.model import FloatArray
-from slrig.scan.plan import ReconstructionPlan
-from slrig.scan.reconstruct import reconstruct_bundle
 from slrig.scan.records import report_summary
 from tests.golden.conftest import Scan
+from tests.golden.test_bundles import reconstructed
 
 pytestmark = pytest.mark.slow
 DEGREES = 0.05
@@ -38,10 +37,7 @@ def report_of(recorded: Path, folder: Path, change: CalibrationChange | None = N
         change(calibration)
     folder.mkdir(exist_ok=True)
     (folder / "calibration.json").write_text(json.dumps(calibration))
-    reconstruct_bundle(
-        recorded, folder / "out", plan=ReconstructionPlan(), calibration=folder / "calibration.json",
-        progress=lambda *_: None, cancelled=lambda: False,
-    )  # fmt: skip
+    reconstructed(recorded, folder / "out", calibration=folder / "calibration.json")
     report: dict[str, Any] = json.loads((folder / "out" / "report.json").read_text())
     return report
 

@@ -19,11 +19,11 @@ from slrig.combine.combining import read_mesh
 from slrig.devices import CameraSettings, Rig, Turntable
 from slrig.model import PlaneKind, StageAxis
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
-from slrig.scan.reconstruct import reconstruct_bundle
+from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.views.registration import registered
 from slrig.views.stage_planes import cut, stage_planes
 from slrig.views.turntable import turntable
+from tests.golden.test_bundles import reconstructed
 from tests.rendered_boards import board_head, board_options, board_rig, board_scene
 from tests.turned_views import displacement_mm
 
@@ -137,9 +137,7 @@ def scanned(
     ) as rig:  # fmt: skip
         for angle in angles_deg:
             bundle, scan = recorded(rig, angle, folder / "bundle", rows=False), folder / "scans" / f"{angle:03.0f}"
-            reconstruct_bundle(
-                bundle, scan, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
-            )
+            reconstructed(bundle, scan)
             bundle.rename(scan / "bundle")
             scans.append(scan)
     return scans

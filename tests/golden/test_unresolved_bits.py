@@ -19,7 +19,7 @@ from slrig.model import Axis
 from slrig.reconstruction.frames import axis_frames
 from slrig.scan.placing import placed_vertices
 from slrig.scan.plan import PatternPlan, ReconstructionPlan
-from slrig.scan.reconstruct import reconstruct_bundle
+from tests.golden.test_bundles import reconstructed
 from tests.golden.test_light_axis import Device, rig_file, scanned
 
 pytestmark = pytest.mark.slow
@@ -74,10 +74,7 @@ def test_both_halves_are_covered(tmp_path: Path) -> None:
     assert any("does not resolve the finest Gray bit" in note for note in report["notes"])
     assert not any("the mesh covers" in note for note in report["notes"])
     # A limit at depth edges that takes most triangles for such makes a thin mesh, which is told.
-    report = reconstruct_bundle(
-        rig.parent / "bundle", tmp_path / "thin", plan=ReconstructionPlan(depth_edge_ratio=1.2),
-        progress=lambda *_: None, cancelled=lambda: False,
-    )  # fmt: skip
+    report = reconstructed(rig.parent / "bundle", tmp_path / "thin", ReconstructionPlan(depth_edge_ratio=1.2))
     notes = report["notes"]
     assert isinstance(notes, list)
     assert any("of what camera 'camera0' decoded" in note for note in notes), notes
