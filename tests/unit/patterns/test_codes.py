@@ -1,4 +1,4 @@
-"""Gray code against truths small enough to write down."""
+"""Gray code and line shift against truths small enough to write down; properties are in tests/properties."""
 
 from __future__ import annotations
 
@@ -6,29 +6,24 @@ import numpy as np
 import pytest
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Gray, Size
+from slrig.model import Axis, Gray, LineShift, Size
 from slrig.model.gray_code import from_gray, to_gray
 from slrig.patterns.gray import (
-    cell_centre_px,
     edge_indices,
     gray_bits,
     gray_profile,
     require_addressable,
 )
+from slrig.patterns.line_shift import is_whole, line_count, line_profile
 
 
 def test_three_bits_are_the_table_in_every_textbook() -> None:
     assert to_gray(np.arange(8)).tolist() == [0b000, 0b001, 0b011, 0b010, 0b110, 0b111, 0b101, 0b100]
 
 
-def test_from_gray_undoes_to_gray_for_every_word_of_sixteen_bits() -> None:
-    index = np.arange(2**16)
-    assert (from_gray(to_gray(index)) == index).all()
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.int64])
-def test_from_gray_works_in_every_integer_width(dtype: type[np.generic]) -> None:
-    index = np.arange(100, dtype=dtype)
+def test_from_gray_undoes_to_gray_in_every_integer_width(dtype: type[np.generic]) -> None:
+    index = np.arange(2**8 if dtype is np.uint8 else 2**16, dtype=dtype)
     assert (from_gray(to_gray(index)) == index).all()
 
 
@@ -41,13 +36,6 @@ def test_cell_and_offset_move_the_edges() -> None:
     # Cells of 2, offset 1: cells are [0], [1 2], [3 4], [5]; the last bit of their words is 0, 1, 1, 0.
     lit = gray_profile(Gray(Axis.COLUMN, 1, 2, cell_px=2, offset_px=1), Size(6, 1))[0]
     assert (lit // 255).tolist() == [0, 1, 1, 1, 1, 0]
-
-
-def test_cell_centres_are_the_mean_of_their_positions() -> None:
-    positions = np.arange(1, 10)  # whole cells of 3 when the offset is 2
-    cells = (positions + 2) // 3
-    for cell in np.unique(cells):
-        assert cell_centre_px(cell, cell_px=3, offset_px=2) == positions[cells == cell].mean()
 
 
 @pytest.mark.parametrize(
@@ -78,3 +66,24 @@ def test_a_projector_smaller_than_the_code_is_refused_with_both_numbers() -> Non
 def test_edges_of_a_bit_that_does_not_exist_are_refused(bit: int) -> None:
     with pytest.raises(PatternError, match=r"bits 0 \(most significant\) to 2"):
         edge_indices(bit, 3)
+
+
+def test_lines_lie_along_rows_for_the_row_axis() -> None:
+    profile = line_profile(LineShift(Axis.ROW, 1, 4), Size(3, 6))
+    assert profile.shape == (6, 1)
+    assert (profile[:, 0] // 255).tolist() == [0, 1, 0, 0, 0, 1]
+
+
+def test_a_wide_line_at_the_border_is_cut() -> None:
+    pattern = LineShift(Axis.COLUMN, 7, 8, line_width_px=2)
+    lit = np.flatnonzero(line_profile(pattern, Size(16, 1))[0])
+    # The line at 7 and 8 is whole; those at −1 and 0 and at 15 and 16 are cut.
+    assert lit.tolist() == [0, 7, 8, 15]
+    assert is_whole([-1, 0, 1], pattern, 16).tolist() == [False, True, False]
+    assert line_count(pattern, 16) == 1
+    assert line_count(pattern, 17) == 2
+
+
+def test_a_projector_shorter_than_a_period_is_refused() -> None:
+    with pytest.raises(PatternError, match=r"has 6 columns.*period is 8 px"):
+        line_profile(LineShift(Axis.COLUMN, 0, 8), Size(6, 100))
