@@ -31,8 +31,7 @@ from tests.unit.reconstruction.builders import (
     seen_on_ball,
 )
 
-# Only scans by two cameras need this kernel.
-pytestmark = pytest.mark.slow
+by_kernel = pytest.mark.slow  # which only scans by two cameras need
 
 COLUMNS = [100.0, 120.0, 140.0, 160.0, 180.0, 200.0]
 ROWS = np.arange(50.0, 190.0, 0.8)
@@ -68,6 +67,7 @@ def both(first: SheetCurves, second: SheetCurves, *, other: Pinhole = OTHER_CAME
     return spare_equation(first, second, other, Axis.COLUMN, widest_gap_px=GAP_PX)
 
 
+@by_kernel
 def test_the_residual_of_a_good_calibration_is_its_stated_noise() -> None:
     rows = ROWS + 0.001
     spare = both(seen(CAMERA, noise_px=0.03, seed=1), seen(OTHER_CAMERA, rows=rows, noise_px=0.05, seed=2))
@@ -78,6 +78,7 @@ def test_the_residual_of_a_good_calibration_is_its_stated_noise() -> None:
     assert (spare.sigma_px > 0.05).all()
 
 
+@by_kernel
 @pytest.mark.parametrize("degrees", [(0.0, 0.05, 0.0), (0.0, 0.0, 0.05), (0.05, 0.0, 0.0)])
 def test_a_turned_second_camera_shows_as_the_shift_of_its_image(degrees: tuple[float, float, float]) -> None:
     # The oracle: where truth is seen, less where the turned camera is believed to see it, across the stripe.
@@ -93,6 +94,7 @@ def test_a_turned_second_camera_shows_as_the_shift_of_its_image(degrees: tuple[f
     assert spare.residual_px.std() == pytest.approx(predicted.std(), rel=0.1, abs=5e-3)
 
 
+@by_kernel
 def test_the_sign_is_that_of_rising_columns_however_the_stripes_were_found() -> None:
     # A second camera on its side: its stripes lie along its rows, and columns rise upwards or downwards.
     for roll in (90.0, 180.0, -90.0):
@@ -107,6 +109,7 @@ def test_the_sign_is_that_of_rising_columns_however_the_stripes_were_found() -> 
         assert abs(spare.residual_px.mean()) > 0.8
 
 
+@by_kernel
 def test_rows_of_light_count_towards_higher_rows() -> None:
     columns = [60.0, 100.0, 140.0]
     along = np.arange(60.0, 200.0, 0.8)
@@ -132,6 +135,7 @@ def lit_row(row_px: float, columns_px: FloatArray) -> FloatArray:
     return BALL.seen_along(PROJECTOR.centre_mm, opencv_rays(PROJECTOR, pixels))
 
 
+@by_kernel
 def test_points_on_a_gap_of_the_other_camera_have_no_partner() -> None:
     gap = (ROWS > 100) & (ROWS < 120)
     spare = both(seen(CAMERA), seen(OTHER_CAMERA, rows=ROWS[~gap]))
@@ -140,6 +144,7 @@ def test_points_on_a_gap_of_the_other_camera_have_no_partner() -> None:
     assert np.abs(spare.residual_px).max() < 1e-3
 
 
+@by_kernel
 def test_sheets_that_one_camera_has_alone_are_left_out() -> None:
     first, second = seen(CAMERA), seen(OTHER_CAMERA)
     apart = replace(second, position_px=second.position_px + 1)
@@ -189,6 +194,7 @@ def test_points_of_two_different_things_are_counted_and_left_out() -> None:
     assert made.mean_px == pytest.approx(0.5, abs=0.01)
 
 
+@by_kernel
 def test_without_a_spare_equation_the_reason_is_told() -> None:
     part = seen(CAMERA)
     alone = redundancy([part], {"left": CAMERA}, Axis.COLUMN, widest_gap_px=GAP_PX)
@@ -201,6 +207,7 @@ def test_without_a_spare_equation_the_reason_is_told() -> None:
     assert "projector is not calibrated" in (spent.reason or "")
 
 
+@by_kernel
 def test_three_cameras_make_three_pairs() -> None:
     third = turned(CAMERA, degrees=(0.0, 0.0, 3.0))
     devices = {"left": CAMERA, "right": OTHER_CAMERA, "third": third}
