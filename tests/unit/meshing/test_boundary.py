@@ -71,6 +71,19 @@ def test_a_spike_goes_with_its_triangles() -> None:
     np.testing.assert_array_equal(result.adjacency, neighbours(result.faces, vertex_count=len(points)))
 
 
+@pytest.mark.parametrize(("triangles", "removed"), [(6, 6), (7, 0)])
+def test_a_spike_of_many_triangles_stays(triangles: int, removed: int) -> None:
+    # A wedge of 50° in rings about its tip, vertex 0.
+    angle = np.radians(np.linspace(-25, 25, triangles + 1))
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(triangles + 1)], axis=1)
+    points = np.concatenate([np.zeros((1, 3)), *(radius * ring for radius in (1.0, 1.3, 1.6, 1.9))])
+    steps = np.arange(1, triangles + 1, dtype=np.int32)
+    tip = np.stack([0 * steps, steps, steps + 1], axis=1)
+    faces = np.concatenate([tip, 1 + grid_faces(4, triangles + 1)[:, ::-1]])
+    result = smoothed(points, faces, everywhere(points), psi_rad=1.2, most_rounds=1)
+    assert result.removed_triangles == removed
+
+
 @pytest.mark.parametrize("psi_rad", [0.0, math.pi, math.nan])
 def test_an_angle_that_means_nothing_is_refused(psi_rad: float) -> None:
     points, faces = grid(2, 2)
