@@ -1,4 +1,4 @@
-"""Fusion against a single view and what people use today, on the same views: Open3D's screened Poisson and its TSDF.
+"""Fusion against a single view and what people use today, on the same views: Open3D's screened Poisson.
 
 pip install '.[test,bench]'                          # in a virtual environment of its own
 pytest tests/bench/test_fusion.py -s -p no:dash
@@ -16,14 +16,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from slrig.meshing.rasteriser import rasterised
 from slrig.meshing.search_tree import SearchTree
 from slrig.meshing.topology import topology_counts
-from slrig.model import Size
 from slrig.views.fusion import fused
-from slrig.views.fusion_sheets import sampling_mm
 from tests.unit.views.known_views import (
-    DISTANCE_MM,
     View,
     around,
     flange,
@@ -61,41 +57,6 @@ def poisson(views: Sequence[View], depth: int) -> Surface:
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
 
 
-def depth_images(views: Sequence[View], directions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Per view (H, W) float32 depth, mm, 0 for none; (3, 3) pixels; (4, 4) world to camera: as its camera saw it."""
-    pictures, focal_px, side = [], DISTANCE_MM / PIXEL_MM, 401
-    matrix = np.array([[focal_px, 0, side // 2], [0, focal_px, side // 2], [0, 0, 1]])
-    for view, towards in zip(views, directions, strict=True):
-        direction = -towards  # in which the camera looks
-        right = np.cross(direction, (0.3, 0.1, 1.0))
-        right /= np.linalg.norm(right)
-        turn = np.stack([right, np.cross(direction, right), direction])
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = turn, (0, 0, DISTANCE_MM)
-        seen = (view.mesh.vertices_mm @ view.pose[:3, :3].T + view.pose[:3, 3]) @ turn.T + pose[:3, 3]
-        placed = np.column_stack([(seen[:, :2] / seen[:, 2:]) * focal_px + side // 2, seen[:, 2]]).astype(np.float32)
-        depth = rasterised(placed, view.mesh.faces, Size(side, side)).depth_mm
-        pictures.append((np.ascontiguousarray(np.nan_to_num(depth)), matrix, pose))
-    return pictures
-
-
-def tsdf(pictures: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], voxel_mm: float) -> Surface:
-    """By Open3D's VoxelBlockGrid: ScalableTSDFVolume 0.20 takes depth for thousandths, and makes an empty mesh."""
-    import open3d as o3d
-    import open3d.core as o3c
-
-    grid = o3d.t.geometry.VoxelBlockGrid(
-        attr_names=("tsdf", "weight"), attr_dtypes=(o3c.float32, o3c.float32), attr_channels=((1), (1)),
-        voxel_size=voxel_mm, block_resolution=8, block_count=50_000,
-    )  # fmt: skip
-    for depth, matrix, pose in pictures:
-        image = o3d.t.geometry.Image(o3c.Tensor(depth))
-        where = o3c.Tensor(matrix), o3c.Tensor(pose), 1.0, 2 * DISTANCE_MM
-        grid.integrate(grid.compute_unique_block_coordinates(image, *where, 4.0), image, *where, 4.0)
-    mesh = grid.extract_triangle_mesh(0.5).to_legacy()
-    return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
-
-
 class Figures(NamedTuple):
     """Of a surface: errors of points spread over it, the share of what was seen within 0.1 mm of it, and its cost."""
 
@@ -130,8 +91,8 @@ def figures(known: SearchTree, seen_mm: np.ndarray, made: Callable[[], Surface])
 @pytest.mark.parametrize("name", OBJECTS)
 def test_fusion_beside_one_view_and_open3d(name: str, count: int, capsys: pytest.CaptureFixture[str]) -> None:
     """Poisson smooths: on a surface without edges it may be a little better, at its best depth."""
-    truth, directions = OBJECTS[name](), around(count)
-    views = views_of(truth, directions, PIXEL_MM)
+    truth = OBJECTS[name]()
+    views = views_of(truth, around(count), PIXEL_MM)
     known = SearchTree.over(truth.vertices, np.asarray(truth.faces, np.int32))
     seen = np.concatenate([view.seen_mm for view in views])[::11]
     model = fused([view.mesh for view in views], [view.pose for view in views])  # compiled
@@ -147,9 +108,6 @@ def test_fusion_beside_one_view_and_open3d(name: str, count: int, capsys: pytest
     if importlib.util.find_spec("open3d") is not None:
         for depth in (8, 9):
             rows[f"Poisson, depth {depth}"] = figures(known, seen, partial(poisson, views, depth))
-        pictures, sampled = depth_images(views, directions), sampling_mm([view.mesh for view in views])
-        for voxel in (1.25, 2.0):
-            rows[f"TSDF, {voxel} samples"] = figures(known, seen, partial(tsdf, pictures, voxel * sampled))
     with capsys.disabled():
         print(f"\n{name}, {count} views, {len(model.mesh.faces)} triangles; error over σ at 68 %: {told:.2f}")  # noqa: T201
         print("\n".join(f"  {method:<19}{row}" for method, row in rows.items()))  # noqa: T201
@@ -162,8 +120,6 @@ def test_fusion_beside_one_view_and_open3d(name: str, count: int, capsys: pytest
     if len(rows) == 2:
         pytest.skip("Open3D is not installed; pip install '.[test,bench]' in a fresh venv")
     for method, row in rows.items():
-        if method.startswith("TSDF"):
-            assert mine.rms_um < row.rms_um, method
-        elif method.startswith("Poisson"):
+        if method.startswith("Poisson"):
             assert mine.rms_um < 1.15 * row.rms_um, method
             assert mine.cpu_s <= row.cpu_s, method

@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import os
 import statistics
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -31,9 +30,8 @@ from slrig.discovery import open_rig
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.bench.test_pipeline_speed import RIG
-from tests.e2e.conftest import KEY, ServiceProcess, Start, start
-
-__all__ = ["start"]
+from tests.bench.test_whole_commands import told
+from tests.e2e.conftest import KEY, ServiceProcess, Start
 
 RUNS, ROW = 5, 10
 FRAMES_PER_S = 30
@@ -123,15 +121,6 @@ def warmed(client: Client) -> None:
         Watched(client).clock()
 
 
-def told(rows: Mapping[str, tuple[float, float | None]], title: str) -> None:
-    load = f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
-    sys.stdout.write(f"\n{title}, {load}\n")
-    for what, (seconds, goal) in rows.items():
-        sys.stdout.write(f"{what:36} {seconds:7.3f}{'' if goal is None else f'   goal {goal:.2f}'}\n")
-    missed = {what: seconds for what, (seconds, goal) in rows.items() if goal is not None and seconds > goal}
-    assert not missed
-
-
 def test_from_the_last_frame_to_each_file(start: Start, replayed: Path) -> None:
     service = start(replayed, fresh=True)
     with service.client() as client:
@@ -153,7 +142,7 @@ def test_from_the_last_frame_to_each_file(start: Start, replayed: Path) -> None:
         rows[f"last frame to {name}"] = (statistics.median(taken), goal)
     rows["last frame to the end"] = (median(lambda c: c.over_s - c.captured_s), TO_ALL_S)
     rows["processor seconds, service and worker"] = (computed_s, None)
-    told(rows, f"one scan at a time, medians of {RUNS}")
+    told(f"one scan at a time, medians of {RUNS}", rows)
 
 
 def test_from_one_scan_to_the_next(start: Start, replayed: Path) -> None:
@@ -173,7 +162,7 @@ def test_from_one_scan_to_the_next(start: Start, replayed: Path) -> None:
         "last frame to mesh.ply": (statistics.median(c.files_s["mesh.ply"] - c.captured_s for c in clocks), None),
         "last POST to last end": (clocks[-1].over_s - clocks[-1].posted_s, None),
     }
-    told(rows, f"{ROW} scans in a row, each sent when the rig is free")
+    told(f"{ROW} scans in a row, each sent when the rig is free", rows)
 
 
 def test_viewers_do_not_slow_a_capture(start: Start, replayed: Path) -> None:
@@ -212,8 +201,8 @@ def test_viewers_do_not_slow_a_capture(start: Start, replayed: Path) -> None:
         pairs = [(capture_s(0), capture_s(VIEWERS)) for _ in range(RUNS)]
     alone_s, watched_s = (statistics.median(each) for each in zip(*pairs, strict=True))
     told(
-        {"capture alone": (alone_s, None), f"beside {VIEWERS} viewers": (watched_s, MOST_SLOWER * alone_s)},
         f"capture of a scan, medians of {RUNS}",
+        {"capture alone": (alone_s, None), f"beside {VIEWERS} viewers": (watched_s, MOST_SLOWER * alone_s)},
     )
 
 

@@ -15,7 +15,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,7 +121,7 @@ def busy(count: int) -> Iterator[None]:
             each.communicate()
 
 
-def told(title: str, rows: dict[str, tuple[float, float | None]]) -> None:
+def told(title: str, rows: Mapping[str, tuple[float, float | None]]) -> None:
     """Print the table; fail where a value is beyond its goal."""
     sys.stdout.write(f"\n{title}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
     for what, (value, goal) in rows.items():

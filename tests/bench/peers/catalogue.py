@@ -11,9 +11,8 @@ from pathlib import Path
 from slrig.model import Surface
 from tests.bench.peers.gray import Decoder, columns_by_arrays, columns_by_opencv, gray_mesh
 from tests.bench.peers.measuring import Meter, Phase
+from tests.bench.peers.meshers import ball_pivoting, image_delaunay, poisson
 from tests.bench.peers.ours import copied_without_truth, read_mesh, reconstruct
-from tests.bench.peers.poisson_and_balls import ball_pivoting, poisson
-from tests.bench.peers.qhull import crust, image_delaunay
 from tests.bench.peers.scene import Cloud, read_cloud, read_gray_frames
 
 Run = Callable[[Meter], Surface]
@@ -91,10 +90,5 @@ METHODS: dict[str, Method] = {
         "our points + Poisson, depth 9 (Open3D)",
         from_frames=False,
         prepare=partial(_of_cloud, mesher=poisson, library="open3d"),
-    ),
-    "crust": Method(
-        "our points + raw crust (Qhull)",
-        from_frames=False,
-        prepare=partial(_of_cloud, mesher=crust, library="scipy.spatial"),
     ),
 }

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import resource
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -71,7 +69,7 @@ def measured(run: Callable[[Meter], Result], *, compiles: bool) -> tuple[Result,
 
     compiles : the first run may spend long on compiling, so there is always a second.
     """
-    before_mb = _resident_mb()
+    before_mb = _status_mb("VmRSS")
     meters: list[Meter] = []
     while True:
         meter = Meter()
@@ -94,31 +92,15 @@ def measured(run: Callable[[Meter], Result], *, compiles: bool) -> tuple[Result,
 
 
 def reset_peak() -> None:
-    """Make the system forget this process's peak of resident memory, where it can (Linux)."""
-    if _CLEAR.exists():
-        _CLEAR.write_text(_RESET_PEAK, encoding="ascii")
+    """Make Linux forget this process's peak of resident memory."""
+    _CLEAR.write_text(_RESET_PEAK, encoding="ascii")
 
 
 def peak_resident_mb() -> float:
-    """The most resident memory since `reset_peak`, MiB; since the process began where the peak cannot be reset."""
-    found = _status_mb("VmHWM")
-    if found is not None:
-        return found
-    # Bytes on macOS, KiB elsewhere.
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    """The most resident memory since `reset_peak`, MiB."""
+    return _status_mb("VmHWM")
 
 
-def _resident_mb() -> float:
-    found = _status_mb("VmRSS")
-    return peak_resident_mb() if found is None else found
-
-
-def _status_mb(key: str) -> float | None:
-    if not _STATUS.exists():
-        return None
-    for line in _STATUS.read_text(encoding="ascii", errors="replace").splitlines():
-        name, _, value = line.partition(":")
-        if name == key:
-            return int(value.split()[0]) / 1024
-    return None
+def _status_mb(key: str) -> float:
+    lines = _STATUS.read_text(encoding="ascii", errors="replace").splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{key}:"))

@@ -1,4 +1,4 @@
-"""The comparison as a table: plain text for a terminal, Markdown for tests/bench/README.md."""
+"""The comparison as a table in Markdown, which a terminal shows as well."""
 
 from __future__ import annotations
 
@@ -34,21 +34,6 @@ class Row:
     cost: Cost | None
     figures: Figures | None
     reason: str = ""
-
-
-def as_text(rows: list[Row], *, title: str) -> str:
-    """Return the table in columns, with its notes."""
-    lines = [list(HEADINGS), *_cells(rows)]
-    widths = [max(len(line[column]) for line in lines if len(line) > column) for column in range(len(HEADINGS))]
-    shown = []
-    for line in lines:
-        first = line[0].ljust(widths[0])
-        if len(line) < len(HEADINGS):
-            shown.append(f"{first}  {line[1]}")
-        else:
-            rest = (cell.rjust(width) for cell, width in zip(line[1:], widths[1:], strict=True))
-            shown.append("  ".join([first, *rest]))
-    return "\n".join([title, "", shown[0], "-" * len(shown[0]), *shown[1:], "", *NOTES])
 
 
 def as_markdown(rows: list[Row], *, title: str) -> str:

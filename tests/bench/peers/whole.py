@@ -15,7 +15,7 @@ import trimesh
 
 from tests.bench.peers.gray import columns_by_arrays, gray_mesh, triangulated_mm
 from tests.bench.peers.measuring import Meter
-from tests.bench.peers.poisson_and_balls import ball_pivoting
+from tests.bench.peers.meshers import ball_pivoting
 from tests.bench.peers.scene import read_cloud, read_gray_frames
 
 

@@ -34,13 +34,6 @@ def test_an_edge_of_three_triangles_is_not_a_fold() -> None:
     assert fold_count(vertices, faces) == 0
 
 
-def test_folds_of_a_box_are_its_edges() -> None:
-    corners = np.array([(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))], dtype=np.int32)
-    assert fold_count(corners, faces) == 12
-
-
 TAKES_MEMORY = """
 import json
 import numpy as np

@@ -1,20 +1,28 @@
-"""Peers: ball pivoting and Poisson reconstruction of the same cloud, by Open3D."""
+"""Peers that mesh our cloud: ball pivoting and Poisson by Open3D, Delaunay triangles of the image by scipy."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
+from scipy.spatial import Delaunay, KDTree
 
 from slrig.model import Surface
 from tests.bench.peers.measuring import Meter, Phase
-from tests.bench.peers.scene import Cloud
+from tests.bench.peers.scene import Cloud, towards_camera, without_long_edges
 
 _NORMAL_NEIGHBOURS = 16
 _BALL_RADII_IN_SPACINGS = (1.0, 2.0, 4.0)
 _POISSON_DEPTH = 9
 _FARTHEST_IN_SPACINGS = 2.0
+
+
+def image_delaunay(cloud: Cloud, meter: Meter) -> Surface:
+    """Triangulate where the camera sees the points; drop long edges."""
+    meter.enter(Phase.MESH)
+    faces = Delaunay(cloud.pixels_px).simplices
+    kept = without_long_edges(cloud.points_mm, faces, spacing_mm=cloud.spacing_mm)
+    return towards_camera(cloud.points_mm, kept, cloud.eye_mm)
 
 
 def ball_pivoting(cloud: Cloud, meter: Meter) -> Surface:
