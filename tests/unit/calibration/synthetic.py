@@ -24,7 +24,7 @@ class Recipe:
     twentieth of the board; outlying : the share of light that is off by up to 40 px; stated_share : stated deviations
     over true ones. side : lit places along each side of the board. bumped : a device, and the first pose after its
     bump; moved_pose : one in which the board moves between the cameras. flipped : views counted from the other end.
-    bow_mm : the board's bow at its far ends.
+    bow_mm : the board's bow at its far ends. stretched : how many times as wide and as high the print is as it says.
     """
 
     seed: int = 0
@@ -46,6 +46,7 @@ class Recipe:
     moved_pose: int | None = None
     flipped: tuple[tuple[str, int], ...] = ()
     offsets_mm: FloatArray | None = None
+    stretched: tuple[float, float] = (1.0, 1.0)
     bow_mm: float = 0.0
 
 
@@ -114,7 +115,7 @@ def made(recipe: Recipe, truth: Calibration | None = None) -> tuple[Observations
     """Observations of the true rig, and that rig: of the recipe, unless another one is given."""
     rng = np.random.default_rng(recipe.seed)
     truth = rig(recipe) if truth is None else truth
-    corners = recipe.board.points_mm.copy()
+    corners = recipe.board.points_mm * [*recipe.stretched, 1.0]
     if recipe.offsets_mm is not None:
         corners += recipe.offsets_mm
     poses = []

@@ -1,4 +1,4 @@
-"""Spheres and planes: fits against truth that a test made, and the figures of VDI/VDE 2634-2."""
+"""Spheres and planes: fits against truth that a test made, VDI/VDE 2634-2, and finding both in a scan."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from slrig.calibration.artefacts import (
     REJECTED_SHARE,
     Decision,
+    ball_points,
     decision,
     dispersion_mm,
     fitted_plane,
     fitted_sphere,
+    plane_points,
 )
 from slrig.errors import NothingToReconstructError
 from slrig.model import FloatArray
@@ -90,3 +93,89 @@ def test_too_few_points_are_refused() -> None:
 )
 def test_the_rule_of_decision(error_mm: float, uncertainty_mm: float, told: Decision) -> None:
     assert decision(error_mm, 0.02, uncertainty_mm) is told
+
+
+def ball(count: int, x_mm: float, seed: int) -> tuple[FloatArray, FloatArray]:
+    centre = (x_mm, 5.0, 500.0)
+    points = cap(count, centre_mm=centre, radius_mm=15.0, sigma_mm=0.01, seed=seed)
+    outwards = points - np.array(centre)
+    return points, outwards / np.linalg.norm(outwards, axis=1)[:, None]
+
+
+def wall(tilt_deg: float = 0.0, sigma_mm: float = 0.01) -> tuple[FloatArray, FloatArray]:
+    x, y = np.meshgrid(np.linspace(-120, 120, 200), np.linspace(-80, 80, 140))
+    turn = np.deg2rad(tilt_deg)
+    noise = sigma_mm * np.random.default_rng(1).standard_normal(x.size)
+    flat = np.column_stack([x.ravel(), y.ravel(), noise])
+    rotation = np.array([(np.cos(turn), 0, np.sin(turn)), (0, 1, 0), (-np.sin(turn), 0, np.cos(turn))])
+    normals = np.tile(rotation @ (0, 0, -1), (x.size, 1))
+    return flat @ rotation.T + (0.0, 0.0, 560.0), normals
+
+
+def turned_a_little(normals: FloatArray, seed: int) -> FloatArray:
+    """Normals of a noisy mesh: off by a few degrees."""
+    off = normals + 0.05 * np.random.default_rng(seed).standard_normal(normals.shape)
+    return np.asarray(off / np.linalg.norm(off, axis=1)[:, None])
+
+
+def scene() -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """Two balls 100 mm apart before a wall, and whose each point is: 0 wall, 1, 2 balls."""
+    parts = [wall(), ball(6000, -50.0, 2), ball(4000, 50.0, 3)]
+    owner = np.concatenate([np.full(len(part[0]), index) for index, part in enumerate(parts)])
+    normals = np.concatenate([turned_a_little(part[1], index) for index, part in enumerate(parts)])
+    return np.concatenate([part[0] for part in parts]), normals, owner
+
+
+def test_two_balls_before_a_wall_are_found() -> None:
+    points, normals, owner = scene()
+    (first, _), (second, _) = ball_points(points, normals, 30.0, 2)
+    assert (owner[first] == 1).mean() > 0.999
+    assert (owner[second] == 2).mean() > 0.999
+    assert len(first) > 0.98 * 6000
+    ends = [fitted_sphere(points[each]).centre_mm for each in (first, second)]
+    assert abs(np.linalg.norm(ends[0] - ends[1]) - 100.0) < 0.003
+
+
+def test_a_third_ball_is_missed_in_words() -> None:
+    points, normals, _ = scene()
+    with pytest.raises(NothingToReconstructError, match=r"expected 3 balls of 30 mm, found 2"):
+        ball_points(points, normals, 30.0, 3)
+    with pytest.raises(NothingToReconstructError, match=r"expected 1 ball of 80 mm, found 0"):
+        ball_points(points, normals, 80.0, 1)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 25.0])
+def test_the_wall_is_found_behind_the_balls(tilt_deg: float) -> None:
+    points, normals, owner = scene()
+    points[owner == 0], normals[owner == 0] = wall(tilt_deg)
+    chosen, turned = plane_points(points, normals, 240.0)
+    assert turned == 0
+    assert (owner[chosen] == 0).all()
+    assert len(chosen) > 0.99 * (owner == 0).sum()
+    true = np.array((np.sin(np.deg2rad(tilt_deg)), 0, np.cos(np.deg2rad(tilt_deg))))
+    assert abs(fitted_plane(points[chosen]).normal @ true) > 1 - 1e-8
+
+
+def test_no_plane_is_told() -> None:
+    points, normals = ball(400, 0.0, 1)
+    with pytest.raises(NothingToReconstructError, match="expected a plane"):
+        plane_points(points[:90], normals[:90], 240.0)
+    with pytest.raises(NothingToReconstructError, match="expected a plane"):
+        plane_points(np.zeros((0, 3)), np.zeros((0, 3)), 240.0)
+
+
+def test_a_rod_at_the_ball_is_counted_apart_and_a_point_far_off_is_not() -> None:
+    points, normals = ball(3000, 0.0, 1)
+    centre = np.array((0.0, 5.0, 500.0))
+    # A rod of half the ball's radius, from the ball's side outwards.
+    angle, along = np.meshgrid(np.linspace(np.pi, 2 * np.pi, 40), np.linspace(12.0, 30.0, 60))
+    outwards = np.column_stack([np.zeros(angle.size), np.cos(angle.ravel()), np.sin(angle.ravel())])
+    rod = centre + 7.5 * outwards + np.outer(along.ravel(), (1.0, 0.0, 0.0))
+    touching = int((np.abs(np.linalg.norm(rod - centre, axis=1) - 15.0) < 0.05 * 15.0).sum())
+    # Of the ball's own points some lie half a millimetre off, fifty times their noise.
+    far = np.arange(0, 3000, 10)
+    points[far] += 0.5 * normals[far]
+    ((found, turned),) = ball_points(np.vstack([points, rod]), np.vstack([normals, outwards]), 30.0, 1)
+    assert np.array_equal(found, np.arange(3000))
+    assert turned == pytest.approx(touching, abs=40)
+    assert touching > 100

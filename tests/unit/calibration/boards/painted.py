@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from slrig.calibration.board import Board, BoardKind
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Eye:
     """A camera before a board: X_camera = rotation @ X_board + translation_mm."""
 
@@ -103,7 +104,7 @@ def painted(
     """(H, W) float64, 0 to 1 and not clipped: the board as the eye sees it; `noise` is white and Gaussian."""
     look = look or Print()
     rows, columns = np.mgrid[: eye.height, : eye.width].astype(np.float64)
-    place = _on_board(eye, columns, rows)
+    place = _on_board(eye)
     by_column = np.stack([np.gradient(each, axis=1) for each in place])
     by_row = np.stack([np.gradient(each, axis=0) for each in place])
     image = _reflectance(board, look, *place)
@@ -145,8 +146,10 @@ def _bent(x: Array, y: Array, distortion: tuple[float, ...]) -> tuple[Array, Arr
     )
 
 
-def _on_board(eye: Eye, columns: Array, rows: Array) -> Array:
+@cache
+def _on_board(eye: Eye) -> Array:
     """(2, H, W): where each pixel's ray meets the board's plane."""
+    rows, columns = np.mgrid[: eye.height, : eye.width].astype(np.float64)
     u, v = (columns - eye.principal[0]) / eye.focal_px, (rows - eye.principal[1]) / eye.focal_px
     x, y = u.copy(), v.copy()
     for _ in range(60 if any(eye.distortion) else 0):

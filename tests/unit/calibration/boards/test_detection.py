@@ -1,9 +1,14 @@
-"""Boards found in painted images whose every corner is known, and refused where they are not to be used."""
+"""Boards found in painted images whose every corner is known, and refused where they are not to be used.
+
+OpenCV before 4.6 printed ChArUco boards with an even number of rows of squares with a light square first: OLD.
+Of each promise one kind of board, or what tells kinds apart, is in the core; the other kinds are slow.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -31,7 +36,10 @@ CHESSBOARD = Board(BoardKind.CHESSBOARD, 8, 5, 14.0)
 CIRCLES = Board(BoardKind.CIRCLES, 4, 7, 11.0)
 EVEN_CIRCLES = Board(BoardKind.CIRCLES, 4, 6, 12.0)
 ALL = [CHARUCO, CHESSBOARD, CIRCLES]
+OLD = Print(light_first=True)
+KINDS = [(CHARUCO, Print()), (CHESSBOARD, Print()), (CIRCLES, Print()), (CHARUCO, OLD)]
 LENS = (-0.12, 0.06, 0.001, -0.001, 0.0)
+FINE: dict[str, Any] = {"width": 640, "height": 512, "focal_px": 800.0}
 NOISE = 0.01
 
 
@@ -42,45 +50,56 @@ def slow(*values: object) -> Any:
 
 def title(given: object) -> str:
     """A short name for a case."""
+    if isinstance(given, Print):
+        return "old" if given.light_first else "today's"
     return given.title if isinstance(given, Board) else str(given)[:30]
 
 
+@cache
 def eye(board: Board, **further: Any) -> Eye:
     given: dict[str, Any] = {
         "distance_mm": 205.0,
         "tilt_deg": (20.0, -25.0),
         "roll_deg": 12.0,
         "distortion": LENS,
+        "width": 400,
+        "height": 320,
+        "focal_px": 500.0,
     } | further
     return looking(board, **given)
 
 
+@cache
 def shot(board: Board, seen_by: Eye | None = None, *, noise: float = NOISE, **look: Any) -> NDArray[np.uint8]:
     image = painted(board, seen_by or eye(board), **({"samples": 4} | look))
-    return as_8_bit(image + np.random.default_rng(1).normal(0, noise, image.shape))
+    found = as_8_bit(image + np.random.default_rng(1).normal(0, noise, image.shape))
+    found.flags.writeable = False
+    return found
 
 
 def misses(view: BoardView, board: Board, seen_by: Eye) -> NDArray[np.float64]:
     return view.points_px - seen_by.seen(board_points(board)[view.corner])
 
 
-@pytest.mark.parametrize("board", ALL, ids=title)
+@pytest.mark.parametrize(("board", "look"), [slow(*KINDS[0]), *KINDS[1:]], ids=title)
 @pytest.mark.parametrize(
     ("tilt_deg", "blur_px", "noise", "most_rms_px"),
     [
-        ((0.0, 0.0), 0.6, 0.0, 0.007),
-        pytest.param((0.0, 0.0), 1.0, 0.01, 0.015, marks=pytest.mark.slow),
+        slow((0.0, 0.0), 0.6, 0.0, 0.007),
+        slow((0.0, 0.0), 1.0, 0.01, 0.015),
         ((30.0, -35.0), 0.7, 0.01, 0.02),
-        pytest.param((-30.0, 20.0), 1.5, 0.03, 0.07, marks=pytest.mark.slow),
+        slow((-30.0, 20.0), 1.5, 0.03, 0.07),
     ],
 )
 def test_corners_lie_where_they_are_within_what_they_state(
-    board: Board, tilt_deg: tuple[float, float], blur_px: float, noise: float, most_rms_px: float
+    board: Board, look: Print, tilt_deg: tuple[float, float], blur_px: float, noise: float, most_rms_px: float
 ) -> None:
-    seen_by = eye(board, tilt_deg=tilt_deg)
+    seen_by = eye(board, tilt_deg=tilt_deg, **FINE)
     # Four samples a side leave edges of their own making, of a size with what is measured here.
-    image = shot(board, seen_by, blur_px=blur_px, noise=noise, look=Print(shading=(0.4, -0.3)), samples=7)
+    shaded = replace(look, shading=(0.4, -0.3))
+    image = shot(board, seen_by, blur_px=blur_px, noise=noise, look=shaded, samples=7)
     view = find_board(image, board, full_scale=255)
+    assert view.light_first is look.light_first
     assert len(view.corner) == board.corner_count
     off = misses(view, board, seen_by)
     assert np.sqrt((off**2).mean()) < most_rms_px
@@ -91,9 +110,10 @@ def test_corners_lie_where_they_are_within_what_they_state(
         assert share > 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", [CHARUCO, CHESSBOARD], ids=title)
 def test_corners_are_placed_better_than_opencv_places_them(board: Board) -> None:
-    seen_by = eye(board)
+    seen_by = eye(board, **FINE)
     image = shot(board, seen_by)
     ours = misses(find_board(image, board, full_scale=255), board, seen_by)
     if board.kind is BoardKind.CHESSBOARD:
@@ -112,8 +132,9 @@ def test_corners_are_placed_better_than_opencv_places_them(board: Board) -> None
     assert np.sqrt((ours**2).mean()) < 0.6 * np.sqrt((off**2).mean())
 
 
+@pytest.mark.slow
 def test_the_centre_of_a_circle_is_not_the_centre_of_its_ellipse() -> None:
-    seen_by = eye(CIRCLES, tilt_deg=(40.0, 0.0), roll_deg=0.0, distance_mm=150.0)
+    seen_by = eye(CIRCLES, tilt_deg=(40.0, 0.0), roll_deg=0.0, distance_mm=150.0, **FINE)
     image = painted(CIRCLES, seen_by, samples=8)
     view = find_board(image, CIRCLES, full_scale=1.0)
     off = misses(view, CIRCLES, seen_by)
@@ -127,24 +148,25 @@ def test_the_centre_of_a_circle_is_not_the_centre_of_its_ellipse() -> None:
     assert np.abs(np.mean(np.array(nearest) - truth, axis=0)).max() > 10 * np.abs(off.mean(axis=0)).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.3, 0.4, 0.6])
 def test_circles_of_any_radius_are_found(radius: float) -> None:
-    seen_by = eye(CIRCLES)
+    seen_by = eye(CIRCLES, **FINE)
     view = find_board(shot(CIRCLES, seen_by, look=Print(circle_radius=radius)), CIRCLES, full_scale=255)
     assert len(view.corner) == CIRCLES.corner_count
     assert np.sqrt((misses(view, CIRCLES, seen_by) ** 2).mean()) < 0.02
 
 
-@pytest.mark.parametrize("roll_deg", [107.0, 184.0])
-@pytest.mark.parametrize("board", ALL, ids=title)
-def test_a_board_with_one_numbering_has_it_however_it_is_held(board: Board, roll_deg: float) -> None:
+@pytest.mark.parametrize("roll_deg", [slow(107.0), 184.0])
+@pytest.mark.parametrize(("board", "look"), [slow(*KINDS[0]), *KINDS[1:3], slow(*KINDS[3])], ids=title)
+def test_a_board_with_one_numbering_has_it_however_it_is_held(board: Board, look: Print, roll_deg: float) -> None:
     seen_by = eye(board, roll_deg=roll_deg)
-    view = find_board(shot(board, seen_by), board, full_scale=255)
+    view = find_board(shot(board, seen_by, look=look), board, full_scale=255)
     assert np.abs(misses(view, board, seen_by)).max() < 0.1
 
 
-@pytest.mark.parametrize("roll_deg", [10.0, 190.0])
-@pytest.mark.parametrize("board", [Board(BoardKind.CHESSBOARD, 7, 5, 14.0), EVEN_CIRCLES], ids=title)
+@pytest.mark.parametrize("roll_deg", [slow(10.0), 190.0])
+@pytest.mark.parametrize("board", [Board(BoardKind.CHESSBOARD, 7, 5, 14.0), slow(EVEN_CIRCLES)], ids=title)
 def test_a_board_with_two_numberings_has_the_true_one_among_them(board: Board, roll_deg: float) -> None:
     seen_by = eye(board, roll_deg=roll_deg)
     view = find_board(shot(board, seen_by), board, full_scale=255)
@@ -155,7 +177,7 @@ def test_a_board_with_two_numberings_has_the_true_one_among_them(board: Board, r
     assert (grid[:, -1] - grid[:, 0]).mean(axis=0)[0] > 0
 
 
-@pytest.mark.parametrize("full_scale", [1023.0, 1.0])
+@pytest.mark.parametrize("full_scale", [1023.0, slow(1.0)])
 def test_any_depth_of_image_gives_the_same_corners(full_scale: float) -> None:
     image = painted(CHESSBOARD, eye(CHESSBOARD), samples=3)
     kind = np.float32 if full_scale == 1.0 else np.uint16
@@ -171,23 +193,43 @@ def test_a_dim_image_is_enough_and_its_corners_say_so() -> None:
     assert np.median(dim_view.sigma_px) > 2 * np.median(bright.sigma_px)
 
 
-def test_a_part_of_a_charuco_board_is_enough() -> None:
+@pytest.mark.parametrize("look", [Print(), OLD], ids=title)
+def test_a_part_of_a_charuco_board_is_enough(look: Print) -> None:
     seen_by = eye(CHARUCO, shift_mm=(45.0, 20.0))
-    view = find_board(shot(CHARUCO, seen_by), CHARUCO, full_scale=255)
+    view = find_board(shot(CHARUCO, seen_by, look=look), CHARUCO, full_scale=255)
+    assert view.light_first is look.light_first
     assert 8 <= len(view.corner) < CHARUCO.corner_count
     assert np.abs(misses(view, CHARUCO, seen_by)).max() < 0.06
-    inside = seen_by.seen(board_points(CHARUCO))
-    within = ((inside > 8) & (inside < np.array([639, 511]) - 8)).all(axis=1)
+    places = seen_by.seen(board_points(CHARUCO))
+    within = ((places > 8) & (places < np.array([seen_by.width, seen_by.height]) - 9)).all(axis=1)
     assert set(np.flatnonzero(within)) - set(view.corner.tolist()) == set()
 
 
-@pytest.mark.parametrize("board", ALL, ids=title)
-def test_corners_are_placed_again_after_a_small_movement(board: Board) -> None:
+@pytest.mark.parametrize(("board", "look"), [(CHARUCO, OLD), *(slow(*each) for each in KINDS[:3])], ids=title)
+def test_corners_are_placed_again_after_a_small_movement(board: Board, look: Print) -> None:
     before, after = eye(board), eye(board, shift_mm=(0.1, -0.05))
-    view = find_board(shot(board, before), board, full_scale=255)
-    again = placed_again(shot(board, after), view, board, full_scale=255)
+    view = find_board(shot(board, before, look=look), board, full_scale=255)
+    again = placed_again(shot(board, after, look=look), view, board, full_scale=255)
+    assert again.light_first is look.light_first
     assert again.corner.tolist() == view.corner.tolist()
     assert np.abs(misses(again, board, after).mean(axis=0)).max() < 0.02 < np.abs(misses(again, board, before)).max()
+
+
+def test_boards_of_an_odd_number_of_rows_of_squares_have_one_layout() -> None:
+    odd = Board(BoardKind.CHARUCO, 7, 4, 14.0)
+    assert not find_board(shot(odd), odd, full_scale=255).light_first
+
+
+def test_the_old_layout_is_opencvs_own_print() -> None:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
+    printed = cv2.aruco.CharucoBoard((8, 6), 14.0, 10.5, dictionary)
+    printed.setLegacyPattern(True)
+    image = printed.generateImage((8 * 60, 6 * 60), marginSize=0)
+    image = cv2.copyMakeBorder(image, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+    view = find_board(image, CHARUCO, full_scale=255)
+    assert view.light_first
+    expected = 40 + (board_points(CHARUCO)[view.corner, :2] / 14.0 + 1) * 60 - 0.5
+    assert np.abs(view.points_px - expected).max() < 0.05
 
 
 def refused(image: NDArray[np.uint8], board: Board, words: str) -> None:
@@ -195,58 +237,47 @@ def refused(image: NDArray[np.uint8], board: Board, words: str) -> None:
         find_board(image, board, full_scale=255)
 
 
-@pytest.mark.parametrize("board", ALL, ids=title)
+@pytest.mark.parametrize("board", [CHARUCO, slow(CHESSBOARD), slow(CIRCLES)], ids=title)
 def test_nothing_in_view_is_refused_with_the_likely_cause(board: Board) -> None:
     random = np.random.default_rng(3)
-    refused(as_8_bit(random.normal(0.4, 0.02, (512, 640))), board, "not in view")
-    refused(as_8_bit(random.normal(0.01, 0.003, (512, 640))), board, "too dark")
-    refused(as_8_bit(random.normal(0.4, 0.001, (512, 640))), board, "no contrast")
+    refused(as_8_bit(random.normal(0.4, 0.02, (320, 400))), board, "not in view")
+    refused(as_8_bit(random.normal(0.01, 0.003, (320, 400))), board, "too dark")
+    refused(as_8_bit(random.normal(0.4, 0.001, (320, 400))), board, "no contrast")
     refused(as_8_bit(20 * painted(board, eye(board), samples=1)), board, "clipped to white")
 
 
-@pytest.mark.parametrize("board", [CHARUCO, CHESSBOARD], ids=title)
-def test_a_board_out_of_focus_is_refused(board: Board) -> None:
-    refused(shot(board, blur_px=11.0), board, "out of focus")
+@pytest.mark.parametrize(("board", "blur_px"), [(CHARUCO, 9.0), slow(CHESSBOARD, 11.0)], ids=title)
+def test_a_board_out_of_focus_is_refused(board: Board, blur_px: float) -> None:
+    seen_by = eye(board, **FINE) if board is CHESSBOARD else eye(board)
+    refused(shot(board, seen_by, blur_px=blur_px, samples=2), board, "out of focus")
 
 
 @pytest.mark.parametrize(
     ("asked", "there", "words"),
     [
-        (CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 7, 11.0), "another board.*found a chessboard of 10 x 7"),
-        pytest.param(
-            CHESSBOARD,
-            Board(BoardKind.CHESSBOARD, 10, 5, 11.0),
-            "another board.*found a chessboard of 10 x 5",
-            marks=pytest.mark.slow,
-        ),
+        slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 7, 11.0), "another board.*found a chessboard of 10 x 7"),
+        slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 5, 11.0), "another board.*found a chessboard of 10 x 5"),
         slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 6, 4, 16.0), "another board.*found a chessboard of 6 x 4"),
-        pytest.param(
-            CHESSBOARD,
-            Board(BoardKind.CHESSBOARD, 7, 6, 14.0),
-            "another board.*found a chessboard of 7 x 6",
-            marks=pytest.mark.slow,
-        ),
-        (CHESSBOARD, Board(BoardKind.CHARUCO, 8, 5, 14.0), "another board.*ChArUco.*DICT_5X5"),
+        slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 7, 6, 14.0), "another board.*found a chessboard of 7 x 6"),
+        slow(CHESSBOARD, Board(BoardKind.CHARUCO, 8, 5, 14.0), "another board.*ChArUco.*DICT_5X5"),
         slow(CHESSBOARD, CIRCLES, "another board.*circles"),
         slow(CHARUCO, CHESSBOARD, "another board.*chessboard of 8 x 5"),
         slow(CHARUCO, CIRCLES, "another board.*circles"),
         (CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, dictionary="DICT_4X4_100"), "another board.*DICT_4X4"),
-        (CHARUCO, Board(BoardKind.CHARUCO, 9, 6, 12.0), "another board.*marker .* is in view.*9 corners in a row"),
+        slow(CHARUCO, Board(BoardKind.CHARUCO, 9, 6, 12.0), "another board.*marker .* is in view.*9 corners in a row"),
         (CHARUCO, Board(BoardKind.CHARUCO, 5, 4, 16.0), "another board.*do not stand.*5 corners in a row"),
-        (CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, marker_mm=7.7), "another board.*0.5. of a square wide"),
-        (CIRCLES, Board(BoardKind.CIRCLES, 4, 9, 9.0), "another board.*7 rows of 4"),
-        pytest.param(
-            CIRCLES, Board(BoardKind.CIRCLES, 5, 7, 9.0), "another board.*7 rows of 4", marks=pytest.mark.slow
-        ),
+        slow(CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, marker_mm=7.7), "another board.*0.5. of a square wide"),
+        slow(CIRCLES, Board(BoardKind.CIRCLES, 4, 9, 9.0), "another board.*7 rows of 4"),
+        slow(CIRCLES, Board(BoardKind.CIRCLES, 5, 7, 9.0), "another board.*7 rows of 4"),
         slow(CIRCLES, CHESSBOARD, "another board.*chessboard of 8 x 5"),
     ],
     ids=title,
 )
 def test_another_board_is_refused_and_named(asked: Board, there: Board, words: str) -> None:
-    refused(shot(there, eye(there)), asked, words)
+    refused(shot(there, eye(there, **FINE)), asked, words)
 
 
-@pytest.mark.parametrize("there", [CHARUCO, CIRCLES], ids=title)
+@pytest.mark.parametrize("there", [CHARUCO, slow(CIRCLES)], ids=title)
 def test_corners_that_were_given_the_wrong_way_round_are_named(there: Board) -> None:
     asked = Board(there.kind, there.rows, there.columns, there.square_mm)
     words = f"another board.*turn them round, corners .--corners. {there.columns}x{there.rows}"
@@ -268,11 +299,12 @@ def test_a_chessboard_is_the_same_whichever_way_round_its_corners_are_given() ->
     assert across[0] * down[1] - across[1] * down[0] == 1
 
 
-@pytest.mark.parametrize("board", [CHARUCO, EVEN_CIRCLES], ids=title)
+@pytest.mark.parametrize("board", [CHARUCO, slow(EVEN_CIRCLES)], ids=title)
 def test_a_mirrored_print_is_refused(board: Board) -> None:
     refused(shot(board, look=Print(mirrored=True)), board, "mirrored print.*without mirroring")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", [CHESSBOARD, CIRCLES], ids=title)
 def test_a_mirrored_print_that_is_its_own_mirror_image_does_no_harm(board: Board) -> None:
     seen_by = eye(board)
@@ -287,9 +319,9 @@ def test_a_mirrored_print_that_is_its_own_mirror_image_does_no_harm(board: Board
 @pytest.mark.parametrize(
     ("board", "shift_mm", "side"),
     [
-        (CHESSBOARD, (55.0, 0.0), "right"),
-        (CHESSBOARD, (0.0, -45.0), "upper"),
-        (CIRCLES, (55.0, 0.0), "right"),
+        slow(CHESSBOARD, (55.0, 0.0), "right"),
+        slow(CHESSBOARD, (0.0, -45.0), "upper"),
+        slow(CIRCLES, (55.0, 0.0), "right"),
         (CIRCLES, (0.0, 55.0), "lower"),
     ],
     ids=title,
@@ -301,10 +333,11 @@ def test_half_a_board_is_refused_with_the_side_that_cuts_it_off(
     refused(shot(board, seen_by), board, f"half a board.*{side} side.*fully into view, or use a ChArUco")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", [CHESSBOARD, CIRCLES], ids=title)
 def test_a_covered_board_is_refused(board: Board) -> None:
-    image = shot(board, eye(board, roll_deg=0.0, tilt_deg=(5.0, 5.0)))
-    image[:, 400:] = 90
+    image = shot(board, eye(board, roll_deg=0.0, tilt_deg=(5.0, 5.0))).copy()
+    image[:, 250:] = 90
     refused(image, board, "take away what covers")
 
 
@@ -315,6 +348,7 @@ def light_to(towards_deg: float, squares: float) -> tuple[float, float, float]:
     return towards_deg, float((places @ towards).max()) + squares, 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("towards", [(145.0, 1.1), (220.0, 0.6), (320.0, 0.6)])
 def test_light_that_ends_beside_the_print_makes_no_other_board(towards: tuple[float, float]) -> None:
     """Lit and unlit paper alternate with the outermost squares there, as on a board with a line more."""
@@ -329,7 +363,9 @@ def test_a_board_that_the_light_ends_on_is_numbered_rightly_or_refused_in_the_ri
     found, refusals = 0, []
     for number in range(14):
         rng = np.random.default_rng(number)
-        seen_by = eye(CHESSBOARD, roll_deg=rng.uniform(-180, 180), tilt_deg=rng.uniform(-30, 30, 2))
+        seen_by = eye(
+            CHESSBOARD, roll_deg=rng.uniform(-180, 180), tilt_deg=(rng.uniform(-30, 30), rng.uniform(-30, 30))
+        )
         look = Print(lit=light_to(rng.uniform(0, 360), rng.uniform(-2.0, 1.2)))
         try:
             view = find_board(shot(CHESSBOARD, seen_by, look=look), CHESSBOARD, full_scale=255)
@@ -345,35 +381,47 @@ def test_a_board_that_the_light_ends_on_is_numbered_rightly_or_refused_in_the_ri
 
 
 def test_too_little_of_a_charuco_board_is_refused() -> None:
-    image = shot(CHARUCO, eye(CHARUCO, roll_deg=0.0, tilt_deg=(5.0, 5.0)))
-    image[:, 240:] = 90
+    image = shot(CHARUCO, eye(CHARUCO, roll_deg=0.0, tilt_deg=(5.0, 5.0))).copy()
+    image[:, 150:] = 90
     refused(image, CHARUCO, "too little of the charuco")
 
 
-@pytest.mark.parametrize("board", ALL, ids=title)
-def test_masks_follow_the_print(board: Board) -> None:
-    seen_by = eye(board)
-    image = painted(board, seen_by, blur_px=0.0, samples=4, look=Print(paper_squares=0.0, beyond=0.4))
-    view = find_board(painted(board, seen_by, samples=4), board, full_scale=1.0)
-    region = board_region(view, board, (512, 640))
-    light = light_squares(view, board, (512, 640))
-    inner = square_interior(view, board, (512, 640), margin_px=1.5)
+@pytest.mark.parametrize("look", [slow(Print()), OLD], ids=title)
+def test_markers_that_stand_so_in_both_layouts_are_too_little(look: Print) -> None:
+    """All markers but those of one row are covered: a step of one square aside they are the other layout's."""
+    straight = looking(CHARUCO, distance_mm=205.0)
+    image = shot(CHARUCO, straight, look=look).copy()
+    row = straight.seen(np.array([[0.0, 1.3 * 14, 0.0], [0.0, 2.7 * 14, 0.0]]))[:, 1].astype(int)
+    image[: row[0] - 7], image[row[1] + 7 :] = 90, 90
+    refused(image, CHARUCO, "too little of the charuco")
+
+
+@pytest.mark.parametrize(("board", "look"), [*(slow(*each) for each in KINDS[:3]), KINDS[3]], ids=title)
+def test_masks_follow_the_print(board: Board, look: Print) -> None:
+    seen_by = eye(board, **FINE)
+    size = (seen_by.height, seen_by.width)
+    bare = replace(look, paper_squares=0.0, beyond=0.4)
+    image = painted(board, seen_by, blur_px=0.0, samples=4, look=bare)
+    view = find_board(painted(board, seen_by, samples=4, look=look), board, full_scale=1.0)
+    region = board_region(view, board, size)
+    light = light_squares(view, board, size)
+    inner = square_interior(view, board, size, margin_px=1.5)
     on_print = np.abs(image - 0.4) > 1e-6
-    assert np.mean(region == on_print) > 0.995
+    assert np.mean(region == on_print) > 0.99
     # Away from edges each mask is right without an exception.
     assert inner.any()
     assert (inner & ~region).sum() == 0
-    assert np.allclose(image[inner & light], Print().white)
-    assert np.allclose(image[inner & ~light], Print().dark)
+    assert np.allclose(image[inner & light], look.white)
+    assert np.allclose(image[inner & ~light], look.dark)
     assert not light[~region].any()
-    share = np.isclose(image[on_print], Print().white).mean()
+    share = np.isclose(image[on_print], look.white).mean()
     assert light[region].mean() == pytest.approx(share, abs=0.05)
 
 
-@pytest.mark.parametrize("board", ALL, ids=title)
-@pytest.mark.parametrize("blur_px", [0.7, 2.0])
-def test_the_blur_is_measured(board: Board, blur_px: float) -> None:
-    image = shot(board, eye(board, distance_mm=170.0, tilt_deg=(5.0, 5.0)), blur_px=blur_px)
+@pytest.mark.parametrize(("board", "look"), [slow(*KINDS[0]), KINDS[1], slow(*KINDS[2]), KINDS[3]], ids=title)
+@pytest.mark.parametrize("blur_px", [slow(0.7), 1.3])
+def test_the_blur_is_measured(board: Board, look: Print, blur_px: float) -> None:
+    image = shot(board, eye(board, distance_mm=170.0, tilt_deg=(5.0, 5.0)), blur_px=blur_px, look=look)
     view = find_board(image, board, full_scale=255)
     # A pixel's own extent blurs by 1/sqrt(12).
     expected = np.hypot(blur_px, 12**-0.5)
@@ -387,60 +435,41 @@ def test_an_image_that_is_none_is_a_fault_of_the_caller() -> None:
         find_board(np.full((40, 40), np.nan), CHESSBOARD, full_scale=255)
 
 
-def reference_s() -> float:
-    """Processor time of filters that OpenCV runs on one image of 1280 x 1024: how fast this machine is, just now.
+@pytest.mark.realtime
+@pytest.mark.parametrize("there", [*ALL, None], ids=title)
+@pytest.mark.parametrize("asked", ALL, ids=title)
+def test_a_board_is_found_or_refused_in_the_time_of_a_few_filters(asked: Board, there: Board | None) -> None:
+    """A pose is answered within two seconds. Found took 0.13 to 0.22 s and refused 0.2 to 1.3 s, 8 filters 0.15 s."""
+    random = np.random.default_rng(3)
+    image = as_8_bit(random.normal(0.4, 0.02, (1024, 1280)))
+    if there is not None:
+        size: dict[str, Any] = {"width": 1280, "height": 1024, "focal_px": 1600.0}
+        wrong = Board(there.kind, there.columns + 2, there.rows + 2, 0.8 * there.square_mm)
+        shown = there if there == asked else wrong
+        image = shot(shown, eye(shown, **size))
 
-    0.13 to 0.16 s on a quiet core of the machine that measured the times below.
-    """
-    image = as_8_bit(np.random.default_rng(3).normal(0.4, 0.02, (1024, 1280)))
-    taken = []
-    for _ in range(3):
-        started = time.process_time()
+    def filters() -> None:
         for _ in range(4):
             cv2.medianBlur(image, 21)
             cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, 51, 2)
-        taken.append(time.process_time() - started)
-    return min(taken)
+
+    def answer() -> None:
+        try:
+            found = find_board(image, asked, full_scale=255)
+        except PoseRefusedError:
+            assert there != asked
+        else:
+            assert there == asked
+            assert len(found.corner) == asked.corner_count
+
+    assert least_s(answer) < (4 if there == asked else 15) * least_s(filters)
 
 
-def takes_less(limit_s: float, action: Callable[[], object]) -> bool:
-    """Whether it takes less processor time, at the third attempt at the latest: a busy machine only ever adds to it."""
+def least_s(action: Callable[[], object]) -> float:
+    """The least processor time of three runs."""
+    taken = []
     for _ in range(3):
         started = time.process_time()
         action()
-        if time.process_time() - started < limit_s:
-            return True
-    return False
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("board", ALL, ids=title)
-def test_a_board_is_found_in_half_a_second_of_one_core(board: Board) -> None:
-    """It took 0.13 to 0.22 s when it was measured."""
-    seen_by = eye(board, width=1280, height=1024, focal_px=1600.0)
-    image = shot(board, seen_by)
-    assert len(find_board(image, board, full_scale=255).corner) == board.corner_count
-    assert takes_less(4 * reference_s(), lambda: find_board(image, board, full_scale=255))
-
-
-@cache
-def large(there: Board | None) -> NDArray[np.uint8]:
-    """An image of 1280 x 1024 pixels of nothing, or of a board of this kind with two lines more each way."""
-    if there is None:
-        return as_8_bit(np.random.default_rng(3).normal(0.4, 0.02, (1024, 1280)))
-    other = Board(there.kind, there.columns + 2, there.rows + 2, 0.8 * there.square_mm)
-    return shot(other, eye(other, width=1280, height=1024, focal_px=1600.0))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("asked", [*ALL, Board(BoardKind.CHARUCO, 7, 5, 14.0, dictionary="DICT_4X4_100")], ids=title)
-@pytest.mark.parametrize("there", [*ALL, None], ids=title)
-def test_another_board_is_refused_within_two_seconds_of_one_core(asked: Board, there: Board | None) -> None:
-    """A pose is answered within two seconds. It took 0.2 to 1.3 s when it was measured."""
-    image = large(there)
-
-    def refusal() -> None:
-        with pytest.raises(PoseRefusedError):
-            find_board(image, asked, full_scale=255)
-
-    assert takes_less(15 * reference_s(), refusal)
+        taken.append(time.process_time() - started)
+    return min(taken)

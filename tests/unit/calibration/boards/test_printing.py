@@ -41,7 +41,11 @@ def painted_page(document: bytes, dots_per_mm: float) -> tuple[Any, tuple[float,
     return image.reshape(image.shape[:2]), (width, height), text
 
 
-@pytest.mark.parametrize(("board", "page", "size_mm"), BOARDS, ids=str)
+@pytest.mark.parametrize(
+    ("board", "page", "size_mm"),
+    [pytest.param(*each, marks=pytest.mark.slow if each[0].kind is BoardKind.CHESSBOARD else ()) for each in BOARDS],
+    ids=str,
+)
 def test_a_printed_board_has_its_true_size(board: Board, page: str, size_mm: tuple[float, float]) -> None:
     image, found_mm, _ = painted_page(board_pdf(board, page=page), 6.0)
     assert found_mm == pytest.approx(size_mm, abs=0.01)

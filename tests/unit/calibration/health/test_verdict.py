@@ -14,6 +14,8 @@ from slrig.calibration.health.verifying import verify_by_board
 from slrig.calibration.solution import PROJECTOR
 from tests.unit.calibration.health.drifting import BOARD, bench, look_of, true_error_mm, turned, zoomed
 
+SEED = int(os.environ.get("SLRIG_HEALTH_SEED", "0"))
+
 
 def figures(
     error_ratio: float = 1.0, *, mean_px: float = 0.01, rms_px: float = 0.05, evidence: float = 0.0
@@ -86,10 +88,10 @@ def test_a_creeping_size_is_watched_and_scatter_is_not() -> None:
 
 @pytest.mark.slow
 def test_no_alarm_on_many_clean_captures() -> None:
-    """12 of them; as many as SLRIG_CLEAN_CAPTURES says where it is set: 200 were looked at when the limits were set."""
+    """12 of them, or SLRIG_CLEAN_CAPTURES: 200 were looked at when the limits were set."""
     count = int(os.environ.get("SLRIG_CLEAN_CAPTURES", "12"))
     for number in range(2):
-        rig = bench(10 + number)
+        rig = bench(SEED + 10 + number, cameras=1 + number)
         verifications: list[Verification] = []
         for seed in range(count // 2):
             verifications.append(verify_by_board([look_of(rig.devices, 1000 * number + seed)], BOARD, rig.calibration))
@@ -97,9 +99,10 @@ def test_no_alarm_on_many_clean_captures() -> None:
 
 
 @pytest.mark.slow
-def test_a_warm_up_is_watched_before_the_error_doubles() -> None:
+@pytest.mark.parametrize("number", range(int(os.environ.get("SLRIG_HEALTH_RIGS", "1"))))
+def test_a_warm_up_is_watched_before_the_error_doubles(number: int) -> None:
     """Its first half, in which the error doubles and grows by a third again."""
-    rig = bench(2, known_px=0.05)
+    rig = bench(SEED + 2 + number, known_px=0.05)
     verifications: list[Verification] = []
     states, errors_mm = [], []
     for capture in range(30):

@@ -31,10 +31,10 @@ from tests.unit.calibration.perturbed import (
 
 @cache
 def whole() -> tuple[Solution, FloatArray]:
-    """A solution of a camera and a projector, and a hundred places in its volume."""
+    """A solution of a camera and a projector, and some forty places in its volume."""
     solution, observations = solved({"left": left_camera()}, light_source())
     _, places = volume_of(solution, observations)
-    return solution, places[:: len(places) // 100]
+    return solution, places[:: len(places) // 40]
 
 
 def halved(odd: FloatArray, even: FloatArray, covariance: FloatArray) -> tuple[Solution, FloatArray]:

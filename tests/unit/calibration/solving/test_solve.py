@@ -1,4 +1,4 @@
-"""The whole solve: what comes out against the truth, and what is refused."""
+"""The whole solve: what comes out against the truth, what is refused, and prints of another size than they say."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 
 from slrig.calibration.board import BoardShape
-from slrig.calibration.solution import CELLS, PROJECTOR, Solution
+from slrig.calibration.judging.board_size import check_scale, judged_size
+from slrig.calibration.judging.expected_error import expected_error
+from slrig.calibration.observations import Observations
+from slrig.calibration.solution import CELLS, PROJECTOR, ExpectedError, Solution
 from slrig.calibration.solving.adjustment import LENS_SIGMA
 from slrig.calibration.solving.solve import solve
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, FloatArray
+from tests.unit.calibration.perturbed import aligned, met_with_projector, pixels
 from tests.unit.calibration.solving.against_truth import in_deviations
 from tests.unit.calibration.synthetic import CHESSBOARD, Recipe, made
 
@@ -30,8 +34,8 @@ def solved(recipe: Recipe) -> tuple[Solution, Calibration]:
 @pytest.mark.parametrize(
     "recipe",
     [
-        pytest.param(SMALL, marks=pytest.mark.slow),
-        replace(SMALL, lens_shift=False, seed=1),
+        SMALL,
+        pytest.param(replace(SMALL, lens_shift=False, seed=1), marks=pytest.mark.slow),
         pytest.param(replace(SMALL, cameras=2, seed=2), marks=pytest.mark.slow),
         pytest.param(replace(SMALL, cameras=2, projector=False, seed=3), marks=pytest.mark.slow),
         replace(SMALL, projector=False, seed=4),
@@ -50,7 +54,6 @@ def test_every_number_is_within_its_own_deviation(recipe: Recipe) -> None:
     assert set(solution.poses) == {f"pose {number}" for number in range(recipe.poses)}
 
 
-@pytest.mark.slow
 def test_a_principal_point_outside_the_image_needs_no_help() -> None:
     solution, truth = solved(SMALL)
     assert truth.projector is not None
@@ -216,7 +219,8 @@ def test_a_bowed_board_is_found_and_does_no_harm(bow_mm: float) -> None:
 @pytest.mark.parametrize(
     "recipe",
     [
-        replace(SMALL, poses=4, seed=508),
+        SMALL,
+        pytest.param(replace(SMALL, poses=4, seed=508), marks=pytest.mark.slow),
         *(pytest.param(replace(SMALL, poses=5, seed=seed), marks=pytest.mark.slow) for seed in (600, 603, 604, 609)),
     ],
 )
@@ -260,3 +264,84 @@ def test_nearly_all_numbers_of_many_rigs_are_within_three_deviations() -> None:
     assert (np.abs(off) <= 3).mean() >= 0.95
     assert (np.abs(off) <= 3).mean(axis=0).min() >= (0.95 if rigs >= 40 else 0.75)
     assert 0.6 < np.sqrt(np.mean(off**2)) < 1.25
+
+
+def printed(wide: float, high: float, recipe: Recipe = SMALL) -> Recipe:
+    """The same with a print that is so many times as wide and as high as it says."""
+    return replace(recipe, stretched=(wide, high))
+
+
+def expected(recipe: Recipe) -> ExpectedError:
+    return expected_error(solved(recipe)[0], made(recipe)[0])
+
+
+def actual_mm(solution: Solution, stated: ExpectedError, truth: Calibration) -> float:
+    """Rms along the first camera's rays of what is measured with a calibration, after the best rigid motion."""
+    camera, places = truth.cameras["left"], stated.grid_mm
+    assert truth.projector is not None
+    assert solution.calibration.projector is not None
+    at, lit = pixels(camera, places), pixels(truth.projector, places)[:, 0]
+    own = solution.calibration.cameras["left"], solution.calibration.projector
+    found = aligned(met_with_projector(*own, at, lit, places, 0), places)
+    ray = places - camera.centre_mm
+    along = np.einsum("ni,ni->n", found - places, ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    return float(np.sqrt((along**2).mean()))
+
+
+def test_a_board_that_is_as_it_says_has_no_stretch() -> None:
+    size, stated = solved(SMALL)[0].size, expected(SMALL)
+    assert abs(size.stretch) < 3.5 * size.stretch_sigma
+    assert size.stretch_sigma < 3e-4
+    assert size.scale_sigma == pytest.approx(CHESSBOARD.square_sigma / np.sqrt(2))
+    assert 0.5 < stated.board_mm / stated.point_mm < 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("wide", "high"), [(1.002, 1.0), (1.0, 1.004), (0.9995, 1.0005)])
+def test_a_stretched_print_is_found_and_its_error_stated(wide: float, high: float) -> None:
+    (solution, truth), stated = solved(printed(wide, high)), expected(printed(wide, high))
+    size, stretch = solution.size, wide / high - 1
+    assert size.stretch == pytest.approx(stretch, abs=3.5 * size.stretch_sigma)
+    assert solution.board_shape_mm is None, "the stretch was taken for a bend"
+    # Which of the two is wrong no pose tells: the mean size is off by half of it, and that is what is stated.
+    assert actual_mm(solution, stated, truth) < 2.5 * stated.point_mm
+    if abs(stretch) > 1e-3:
+        assert 0.7 < stated.point_mm / actual_mm(solution, stated, truth) < 1.4
+        assert [each.figure for each in judged_size(solution, None)] == ["stretch"]
+    found = in_deviations(solution, truth, exact_board=False)
+    assert max(np.abs(list(found.values()))) < 3.5, found
+
+
+@pytest.mark.slow
+def test_a_stretched_board_may_be_bowed_as_well() -> None:
+    solution, truth = solved(printed(1.002, 1.0, replace(SMALL, poses=12, bow_mm=1.0)))
+    assert solution.bow is not None
+    assert solution.bow.solved
+    assert solution.size.stretch == pytest.approx(0.002, abs=3.5 * solution.size.stretch_sigma)
+    assert max(np.abs(list(in_deviations(solution, truth, exact_board=False).values()))) < 3.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.01, -0.005])
+def test_a_wrong_square_is_told_against_an_earlier_calibration_only(share: float) -> None:
+    wrong, truth = solved(printed(1 / (1 + share), 1 / (1 + share)))
+    assert not [*judged_size(wrong, None)]
+    found = check_scale(wrong, solved(SMALL)[0].calibration, CHESSBOARD)
+    assert found.share == pytest.approx(share, abs=4 * found.sigma + 1e-4)
+    assert f"the board's squares measure {CHESSBOARD.square_mm / (1 + found.share):.5g} mm" in found.words[0]
+    assert not check_scale(solved(SMALL)[0], truth, CHESSBOARD).words
+
+
+@pytest.mark.slow
+def test_a_ruler_makes_a_wrong_print_right() -> None:
+    across, down = CHESSBOARD.rulers_mm
+    recipe = printed(0.98, 0.99)
+    observations, truth = made(recipe)
+    told = CHESSBOARD.as_read(round(0.98 * across, 1), round(0.99 * down, 1))
+    read = Observations(told, observations.cameras, observations.projector, observations.poses)
+    solution = solve(read)
+    stated = expected_error(solution, read)
+    assert abs(solution.size.stretch) < 2.5e-3
+    assert actual_mm(solution, stated, truth) < 2.5 * stated.point_mm
+    found = in_deviations(solution, truth, exact_board=False)
+    assert max(np.abs(list(found.values()))) < 3.5, found
