@@ -10,6 +10,7 @@ import random
 import tempfile
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,8 +18,8 @@ import numpy as np
 import tifffile
 
 from slrig.bundle import write_bundle, write_calibration, write_opencv_calibration
+from slrig.model import Calibration, Solved
 from tests.samples import CAMERA, sample_calibration, sample_capture
-from tests.unit.test_opencv_solved import solved_calibration
 
 TOKENS = (
     *(b"!!opencv-matrix", b"!!opencv-nd-matrix", b"!!opencv-sparse-matrix", b"sizes: [ 1, 1 ]", b'dt: "65d"', b"dt: u"),
@@ -28,6 +29,15 @@ TOKENS = (
     *(b"\0", b"\t", b"\n", b"\r", b"\xff", b"\xef\xbb\xbf", b"\x1b[2J", b"\xed\xa0\x80", b"\\ud800", b"a" * 5000),
     *(b"solved", b"projector", b"..", b"/", b"2026-11-22", b"yesterday"),
 )
+
+
+def solved_calibration(seed: int = 0) -> Calibration:
+    """A calibration that states its error."""
+    calibration = sample_calibration()
+    count = 15 * (len(calibration.cameras) + (calibration.projector is not None))
+    root = np.random.default_rng(seed).normal(size=(count, count)) * np.geomspace(1e-8, 1e2, count)[:, None]
+    box = np.array([[-60.5, -40, 400], [60, 40.25, 520]])
+    return replace(calibration, solved=Solved("a1b2", "2026-11-22T06:12:49+00:00", root @ root.T, box, 0.00712))
 
 
 def good_calibrations() -> list[tuple[str, bytes]]:

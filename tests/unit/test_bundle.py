@@ -17,7 +17,6 @@ import tifffile
 from slrig.bundle import (
     BundleWriter,
     read_bundle,
-    read_calibration,
     read_truth,
     write_bundle,
     write_calibration,
@@ -274,12 +273,9 @@ def test_cut_truth_is_told(tmp_path: Path, name: str, kept: float) -> None:
 @pytest.mark.parametrize(
     ("name", "frames", "calibrated", "truth"),
     [
-        ("bundles/vase", 30, True, True),
-        ("bundles/terrace", 30, True, True),
         ("bundles/gauge", 60, True, True),
         ("captures/skull", 12, True, False),
         ("captures/boards/pose_0", 42, False, False),
-        ("captures/boards/pose_3", 42, False, False),
     ],
 )
 def test_bundles_of_others_are_read(shared: Path, name: str, frames: int, calibrated: bool, truth: bool) -> None:
@@ -300,11 +296,3 @@ def test_bundles_of_others_are_read(shared: Path, name: str, frames: int, calibr
         assert (found.visible_points_mm >= low - 0.01).all()
         assert (found.visible_points_mm <= high + 0.01).all()
         assert found.cameras == {}
-
-
-def test_calibration_json_beside_frames_is_the_calibration(tmp_path: Path) -> None:
-    write_bundle(tmp_path / "scan", sample_capture(), sample_calibration())
-    alone = read_calibration(tmp_path / "scan/calibration.json")
-    beside = read_bundle(tmp_path / "scan").calibration
-    assert beside is not None
-    np.testing.assert_array_equal(alone.cameras["right"].rotation, beside.cameras["right"].rotation)

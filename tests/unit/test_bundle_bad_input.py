@@ -8,6 +8,7 @@ import resource
 import struct
 import zlib
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,11 @@ import tifffile
 
 from slrig.bundle import images, read_bundle, read_capture, write_bundle
 from slrig.errors import BundleError, CalibrationError
+from slrig.model import Pixels
 from tests.samples import CAMERA, sample_calibration, sample_capture
 
 Edit = Callable[[dict[str, Any]], object]
+Spoil = Callable[[Path], object]
 
 
 @pytest.fixture
@@ -92,153 +95,184 @@ def test_an_enormous_png_is_refused_from_its_header(folder: Path, monkeypatch: p
     assert max(unpacked) < side
 
 
-def test_an_enormous_camera_is_refused_from_the_description(folder: Path) -> None:
-    _edit(folder / "bundle.json", lambda data: data["cameras"]["left"].update(size_px=[20_000, 20_000]))
-    _fault(
-        folder, "bundle.json", "cameras.left.size_px", "at most 67108864 pixels", "found 20000 x 20000", "crop or bin"
-    )
+def with_frame(name: str, make: Callable[[bytes], bytes]) -> Spoil:
+    """Another content of a frame's file, made of what it had."""
+
+    def spoil(folder: Path) -> None:
+        path = folder / "frames" / f"{name}.png"
+        path.write_bytes(make(path.read_bytes()))
+
+    return spoil
 
 
-def test_more_samples_than_memory_are_refused_from_the_description(folder: Path) -> None:
-    def repeat(data: dict[str, Any]) -> None:
-        data["cameras"]["left"]["size_px"] = [8000, 8000]
-        data["frames"] = data["frames"] * 20
-
-    _edit(folder / "bundle.json", repeat)
-    _fault(folder, "at most 4.3 GB of samples", "found 6.4 GB in 200 frames", "split the bundle")
+def with_image(name: str, image: Pixels) -> Spoil:
+    """Another image in a frame's file."""
+    return with_frame(name, lambda _: cv2.imencode(".png", image)[1].tobytes())
 
 
-@pytest.mark.parametrize("kept", [0, 7, 20, 60, 0.5, 0.99])
-def test_a_cut_png_is_told_as_cut(folder: Path, kept: float) -> None:
-    path = folder / "frames/left/003.png"
-    data = path.read_bytes()
-    path.write_bytes(data[: int(kept if kept >= 1 else kept * len(data))])
-    _fault(folder, "frames/left/003.png", "expected", "found", "frame")
+def with_description(change: Edit) -> Spoil:
+    return lambda folder: _edit(folder / "bundle.json", change)
 
 
-def test_a_damaged_png_is_told_as_damaged(folder: Path) -> None:
-    path = folder / "frames/left/003.png"
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0x10
-    path.write_bytes(data)
-    _fault(folder, "frames/left/003.png", "expected a sound PNG file", "found a wrong checksum", "copy the frame again")
+def with_tiff(page: int, spoil: Callable[[bytes], bytes] = bytes, **writing: Any) -> Spoil:
+    """The left camera's first frame as a page of a TIFF of five, spoilt."""
+
+    def write(folder: Path) -> None:
+        path = folder / "frames/left.tif"
+        with tifffile.TiffWriter(path) as tiff:
+            for value in range(5):
+                image = np.full(CAMERA.shape, value, np.uint8)
+                tiff.write(image, **{"photometric": "minisblack", "contiguous": False, **writing})
+        _edit(folder / "bundle.json", lambda data: data["frames"][0].update(file="frames/left.tif", page=page))
+        path.write_bytes(spoil(path.read_bytes()))
+
+    return write
 
 
-def test_a_png_with_too_few_rows_is_refused(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def tag_places(data: bytes, *names: str) -> list[int]:
+    """Where the values of a TIFF's first page's tags stand."""
+    with tifffile.TiffFile(BytesIO(data)) as tiff:
+        return [tiff.pages[0].tags[name].valueoffset for name in names]
+
+
+def with_unsound_strip(data: bytes) -> bytes:
+    with tifffile.TiffFile(BytesIO(data)) as tiff:
+        place = tiff.pages[1].dataoffsets[0]
+    return data[:place] + b"\xff" * 12 + data[place + 12 :]
+
+
+def with_a_vast_strip(data: bytes) -> bytes:
+    bomb, changed = _compressed_zeros(2**29), bytearray(data)
+    for place, value in zip(tag_places(data, "StripOffsets", "StripByteCounts"), (len(data), len(bomb)), strict=True):
+        changed[place : place + 4] = struct.pack("<I", value)
+    return bytes(changed) + bomb
+
+
+def of_vast_extent(data: bytes) -> bytes:
+    changed = bytearray(data)
+    for place in tag_places(data, "ImageWidth", "ImageLength"):
+        changed[place : place + 2] = struct.pack("<H", 20_000)
+    return bytes(changed)
+
+
+def of_fractions(_: bytes) -> bytes:
+    written = BytesIO()
+    tifffile.imwrite(written, np.zeros(CAMERA.shape, np.float32), photometric="minisblack")
+    return written.getvalue()
+
+
+def cut(kept: float) -> Callable[[bytes], bytes]:
+    """The first bytes of a file, or a share of it."""
+    return lambda data: data[: int(kept if kept >= 1 else kept * len(data))]
+
+
+def with_a_bit_turned(data: bytes) -> bytes:
+    place = len(data) // 2
+    return data[:place] + bytes([data[place] ^ 0x10]) + data[place + 1 :]
+
+
+def with_five_rows(_: bytes) -> bytes:
     width, height = CAMERA.width_px, CAMERA.height_px
-    (folder / "frames/left/003.png").write_bytes(_png(width, height, 8, 0, zlib.compress(bytes((width + 1) * 5))))
-    _fault(folder, "frames/left/003.png", "found data that cannot be decoded")
-    capfd.readouterr()
+    return _png(width, height, 8, 0, zlib.compress(bytes((width + 1) * 5)))
 
 
-def test_a_missing_frame_is_named(folder: Path) -> None:
-    (folder / "frames/right/001.png").unlink()
-    _fault(folder, "frames/right/001.png", "expected a frame file", "No such file", "remove its entry")
+def many_large_frames(data: dict[str, Any]) -> None:
+    data["cameras"]["left"]["size_px"] = [8000, 8000]
+    data["frames"] = data["frames"] * 20
 
 
-def test_the_first_bad_frame_in_order_is_the_one_told(folder: Path) -> None:
+def linked_out(folder: Path) -> None:
+    outside = folder.parent / "outside.png"
+    (folder / "frames/left/000.png").rename(outside)
+    (folder / "frames/left/000.png").symlink_to(outside)
+
+
+def first_of_several(folder: Path) -> None:
     for name in ("right/004", "left/001", "right/001"):
         (folder / f"frames/{name}.png").unlink()
-    assert "frames/left/001.png" in _fault(folder)
 
 
-def test_a_frame_of_another_size_is_refused(folder: Path) -> None:
-    assert cv2.imwrite(str(folder / "frames/left/000.png"), np.zeros((40, 30), np.uint8))
-    _fault(folder, "frames/left/000.png", "expected 40 x 30", "found 30 x 40", "correct size_px")
+BAD_FRAMES: dict[str, tuple[Spoil, tuple[str, ...]]] = {
+    **{
+        f"cut after {kept}": (with_frame("left/003", cut(kept)), ("frames/left/003.png", "expected", "found", "frame"))
+        for kept in (0, 7, 20, 60, 0.5, 0.99)
+    },
+    "damaged": (
+        with_frame("left/003", with_a_bit_turned),
+        ("frames/left/003.png", "expected a sound PNG file", "found a wrong checksum", "copy the frame again"),
+    ),
+    "too few rows": (with_frame("left/003", with_five_rows), ("left/003.png", "found data that cannot be decoded")),
+    "missing": (
+        lambda folder: (folder / "frames/right/001.png").unlink(),
+        ("frames/right/001.png", "expected a frame file", "No such file", "remove its entry"),
+    ),
+    "the first in order": (first_of_several, ("frames/left/001.png",)),
+    "another size": (
+        with_image("left/000", np.zeros((40, 30), np.uint8)),
+        ("frames/left/000.png", "expected 40 x 30", "found 30 x 40", "correct size_px"),
+    ),
+    "two bit depths": (
+        with_image("left/004", np.zeros(CAMERA.shape, np.uint16)),
+        ("frames/left/004.png", "expected 8-bit samples", "found 16-bit samples", "correct bit_depth"),
+    ),
+    "beyond full scale": (
+        with_description(lambda data: data["cameras"]["left"].update(bit_depth=7)),
+        ("samples of 0 to 127", "found a sample of", "right-align the samples"),
+    ),
+    "alpha": (
+        with_image("left/000", np.zeros((30, 40, 4), np.uint8)),
+        ("expected a grey or colour PNG", "an alpha channel", "save the frame as grey"),
+    ),
+    "another kind": (
+        with_frame("left/000", lambda _: b"GIF89a a film"),
+        ("expected a PNG, TIFF, BMP or JPEG file", "begins with", "save the frame as PNG"),
+    ),
+    "a page of a PNG": (
+        with_description(lambda data: data["frames"][0].update(page=1)),
+        ("frames/left/000.png", "page 0 only", "found page 1", "use a TIFF"),
+    ),
+    "a link out": (
+        linked_out,
+        ("frames/left/000.png", "found a link that leads out", "copy the frame into the bundle"),
+    ),
+    "an enormous camera": (
+        with_description(lambda data: data["cameras"]["left"].update(size_px=[20_000, 20_000])),
+        ("bundle.json", "cameras.left.size_px", "at most 67108864 pixels", "found 20000 x 20000", "crop or bin"),
+    ),
+    "more samples than memory": (
+        with_description(many_large_frames),
+        ("at most 4.3 GB of samples", "found 6.4 GB in 200 frames", "split the bundle"),
+    ),
+    **{
+        f"TIFF cut after {kept}": (with_tiff(4, cut(kept)), ("left.tif", "expected", "found"))
+        for kept in (6, 0.1, 0.5, 0.9)
+    },
+    "a page that is not there": (
+        with_tiff(5),
+        ("frames/left.tif", "expected a page 5", "found 5 pages", "correct `page`"),
+    ),
+    "unsound data": (
+        with_tiff(1, with_unsound_strip, compression="zlib"),
+        ("frames/left.tif", "data that cannot be unpacked", "copy the frame again"),
+    ),
+    "fractions": (with_tiff(0, of_fractions), ("expected unsigned grey or colour samples", "save the frame as grey")),
+    "an enormous TIFF": (with_tiff(0, of_vast_extent), ("expected 40 x 30", "found 20000 x 20000")),
+}
 
 
-def test_two_bit_depths_in_one_camera_are_refused(folder: Path) -> None:
-    assert cv2.imwrite(str(folder / "frames/left/004.png"), np.zeros(CAMERA.shape, np.uint16))
-    _fault(folder, "frames/left/004.png", "expected 8-bit samples", "found 16-bit samples", "correct bit_depth")
-
-
-def test_samples_beyond_full_scale_are_refused(tmp_path: Path) -> None:
-    write_bundle(tmp_path / "scan", sample_capture(bit_depth=12))
-    _edit(tmp_path / "scan/bundle.json", lambda data: data["cameras"]["left"].update(bit_depth=10))
-    _fault(tmp_path / "scan", "samples of 0 to 1023", "found a sample of", "right-align the samples")
-
-
-@pytest.mark.parametrize(("shape", "kind"), [((30, 40, 4), "an alpha channel")])
-def test_a_png_with_alpha_is_refused(folder: Path, shape: tuple[int, ...], kind: str) -> None:
-    assert cv2.imwrite(str(folder / "frames/left/000.png"), np.zeros(shape, np.uint8))
-    _fault(folder, "expected a grey or colour PNG", kind, "save the frame as grey")
-
-
-def test_another_kind_of_file_is_refused(folder: Path) -> None:
-    (folder / "frames/left/000.png").write_bytes(b"GIF89a a film")
-    _fault(folder, "expected a PNG, TIFF, BMP or JPEG file", "begins with", "save the frame as PNG")
-
-
-def _with_tiff(folder: Path, page: int, **writing: Any) -> Path:
-    path = folder / "frames/left.tif"
-    pages = [np.full(CAMERA.shape, value, np.uint8) for value in range(5)]
-    with tifffile.TiffWriter(path) as tiff:
-        for image in pages:
-            tiff.write(image, **{"photometric": "minisblack", "contiguous": False, **writing})
-    _edit(folder / "bundle.json", lambda data: data["frames"][0].update(file="frames/left.tif", page=page))
-    return path
-
-
-def test_a_page_that_is_not_there_is_refused(folder: Path) -> None:
-    _with_tiff(folder, 5)
-    _fault(folder, "frames/left.tif", "expected a page 5", "found 5 pages", "correct `page`")
-
-
-@pytest.mark.parametrize("kept", [6, 0.1, 0.5, 0.9])
-def test_a_cut_tiff_is_refused(folder: Path, kept: float) -> None:
-    path = _with_tiff(folder, 4)
-    data = path.read_bytes()
-    path.write_bytes(data[: int(kept if kept >= 1 else kept * len(data))])
-    _fault(folder, "frames/left.tif", "expected", "found")
-
-
-def test_a_tiff_with_unsound_data_is_refused(folder: Path) -> None:
-    path = _with_tiff(folder, 1, compression="zlib")
-    with tifffile.TiffFile(path) as tiff:
-        place = tiff.pages[1].dataoffsets[0]
-    data = bytearray(path.read_bytes())
-    data[place : place + 12] = b"\xff" * 12
-    path.write_bytes(data)
-    _fault(folder, "frames/left.tif", "data that cannot be unpacked", "copy the frame again")
+@pytest.mark.usefixtures("capfd")
+@pytest.mark.parametrize("case", BAD_FRAMES)
+def test_a_bad_frame_is_named_with_cause_and_remedy(folder: Path, case: str) -> None:
+    spoil, parts = BAD_FRAMES[case]
+    spoil(folder)
+    _fault(folder, *parts)
 
 
 def test_a_tiff_that_unpacks_to_too_much_is_refused(folder: Path) -> None:
-    path = _with_tiff(folder, 0, compression="zlib")
-    with tifffile.TiffFile(path) as tiff:
-        tags = tiff.pages[0].tags
-        places = [tags[name].valueoffset for name in ("StripOffsets", "StripByteCounts")]
-    bomb = _compressed_zeros(2**29)
-    data = bytearray(path.read_bytes())
-    for place, value in zip(places, (len(data), len(bomb)), strict=True):
-        data[place : place + 4] = struct.pack("<I", value)
-    path.write_bytes(bytes(data) + bomb)
+    with_tiff(0, with_a_vast_strip, compression="zlib")(folder)
     before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     _fault(folder, "frames/left.tif", "data that cannot be unpacked")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 64 * 1024
-
-
-def test_a_tiff_of_fractions_is_refused(folder: Path) -> None:
-    path = _with_tiff(folder, 0)
-    tifffile.imwrite(path, np.zeros(CAMERA.shape, np.float32), photometric="minisblack")
-    _fault(folder, "expected unsigned grey or colour samples", "save the frame as grey")
-
-
-def test_an_enormous_tiff_is_refused_from_its_header(folder: Path) -> None:
-    path = _with_tiff(folder, 0)
-    data = path.read_bytes()
-    with tifffile.TiffFile(path) as tiff:
-        tags = tiff.pages[0].tags
-        places = [tags[name].valueoffset for name in ("ImageWidth", "ImageLength")]
-    changed = bytearray(data)
-    for place in places:
-        changed[place : place + 2] = struct.pack("<H", 20_000)
-    path.write_bytes(changed)
-    _fault(folder, "expected 40 x 30", "found 20000 x 20000")
-
-
-def test_a_png_has_one_page(folder: Path) -> None:
-    _edit(folder / "bundle.json", lambda data: data["frames"][0].update(page=1))
-    _fault(folder, "frames/left/000.png", "page 0 only", "found page 1", "use a TIFF")
 
 
 BAD_DESCRIPTIONS: dict[str, tuple[Edit, tuple[str, ...]]] = {
@@ -355,13 +389,6 @@ def test_a_folder_without_description_is_told(tmp_path: Path) -> None:
     _fault(tmp_path / "nowhere", "found no such folder", "give the folder that holds it")
 
 
-def test_a_link_out_of_the_bundle_is_refused(folder: Path, tmp_path: Path) -> None:
-    outside = tmp_path / "outside.png"
-    (folder / "frames/left/000.png").rename(outside)
-    (folder / "frames/left/000.png").symlink_to(outside)
-    _fault(folder, "frames/left/000.png", "found a link that leads out", "copy the frame into the bundle")
-
-
 @pytest.mark.parametrize("who", ["cameras.left", "projector"])
 def test_a_calibration_of_another_size_is_refused(folder: Path, who: str) -> None:
     def resize(data: dict[str, Any]) -> None:
@@ -398,6 +425,6 @@ def test_what_opencv_refuses_is_told(folder: Path, monkeypatch: pytest.MonkeyPat
         message = "OpenCV TIFF: failed TIFFGetField(tif, TIFFTAG_PHOTOMETRIC, &photometric)"
         raise cv2.error(message)
 
-    _with_tiff(folder, 0)
+    with_tiff(0)(folder)
     monkeypatch.setattr(cv2, "imdecodemulti", refuse)
     _fault(folder, "data that cannot be decoded")

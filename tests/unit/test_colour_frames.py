@@ -16,7 +16,7 @@ from drivers.replay import ReplayHead
 from slrig.bundle import read_bundle, read_capture, write_bundle
 from slrig.bundle.reading import open_bundle
 from slrig.capture.evidence import EvidenceSummary
-from slrig.devices import ProjectorInfo, Rig
+from slrig.devices import ProjectorInfo
 from slrig.errors import BundleError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, CameraFormat, Capture, Gray, PatternSequence, Pixels, Primary, Shot, Size, White
 from slrig.model.header import CaptureHeader
@@ -225,20 +225,6 @@ def test_a_recording_in_coloured_light_is_replayed_and_its_patterns_have_names(t
     assert ReplayHead(read_bundle(tmp_path / "lit")).projector.info.lights
     write_bundle(tmp_path / "grey", capture)
     assert not ReplayHead(read_bundle(tmp_path / "grey")).projector.info.lights
-
-
-def test_a_replayed_recording_has_the_colour_that_was_recorded(tmp_path: Path) -> None:
-    captured(coloured_rig(), tmp_path / "first")
-    head = ReplayHead(read_bundle(tmp_path / "first"))
-    assert {name: camera.info.colour for name, camera in head.cameras.items()} == {"left": True, "right": False}
-    rig = Rig("replay", head.cameras, head.projector, {}, head=head, clock=head.clock)
-    again = tmp_path / "again"
-    capture_frames(rig, ScanPlan(), again, progress=lambda *_: None, cancelled=lambda: False).finish()
-    for one, other in zip(read_bundle(tmp_path / "first").capture.shots, read_bundle(again).capture.shots, strict=True):
-        np.testing.assert_array_equal(one.image, other.image)
-        assert (one.colour is None) == (other.colour is None)
-        if one.colour is not None and other.colour is not None:
-            np.testing.assert_array_equal(one.colour, other.colour)
 
 
 def sequence_of(fake: FakeRig) -> PatternSequence:

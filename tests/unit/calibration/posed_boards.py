@@ -11,8 +11,10 @@ from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.calibration.solution import PROJECTOR, BoardPose
 from slrig.model import FloatArray, Pinhole, Size
+from tests.unit.calibration.synthetic import CHESSBOARD, inside, seen
 
-CHESSBOARD = Board(BoardKind.CHESSBOARD, 11, 8, 12.0)
+__all__ = ["CHESSBOARD"]
+
 CHARUCO = Board(BoardKind.CHARUCO, 11, 8, 12.0)
 SHARP = ViewFigures(moved_px=0.02, saturated=0.0, contrast=0.5, sharpness_px=0.8, decoded=0.9)
 
@@ -71,17 +73,6 @@ def held(
     return BoardPose(rotation, np.asarray(middle_mm, dtype=np.float64) - rotation @ board.points_mm.mean(axis=0))
 
 
-def seen_by(pinhole: Pinhole, points_mm: FloatArray) -> FloatArray:
-    """(n, 2) float64: where points of the world fall in a device."""
-    vector, _ = cv2.Rodrigues(pinhole.rotation)
-    points_px, _ = cv2.projectPoints(points_mm, vector, pinhole.translation_mm, pinhole.matrix, pinhole.distortion)
-    return np.asarray(points_px.reshape(-1, 2), dtype=np.float64)
-
-
-def inside(points_px: FloatArray, size: Size) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    return np.asarray(((points_px > 2) & (points_px < [size.width_px - 3, size.height_px - 3])).all(axis=1))
-
-
 @dataclass
 class Shooting:
     """Shoots poses of a board with a rig of known devices. A chessboard is seen whole or not at all."""
@@ -105,7 +96,7 @@ class Shooting:
         for camera, pinhole in self.devices.items():
             if camera == PROJECTOR:
                 continue
-            points_px = seen_by(pinhole, points_mm)
+            points_px = seen(pinhole, points_mm)
             corner = np.flatnonzero(inside(points_px, pinhole.size)).astype(np.int32)
             if len(corner) < self.board.corner_count and (self.board.kind is not BoardKind.CHARUCO or len(corner) < 6):
                 continue
@@ -121,7 +112,7 @@ class Shooting:
         across, down = np.meshgrid(np.linspace(left, right, 60), np.linspace(top, bottom, 45))
         flat = np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
         space = flat @ pose.rotation.T + pose.translation_mm
-        pixels_px, positions_px = seen_by(camera, space), seen_by(projector, space)
+        pixels_px, positions_px = seen(camera, space), seen(projector, space)
         lit = inside(positions_px, projector.size) & inside(pixels_px, camera.size)
         pixels_px, positions_px = pixels_px[lit], positions_px[lit]
         count = len(pixels_px)
