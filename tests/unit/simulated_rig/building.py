@@ -12,7 +12,8 @@ from simulated_rig.boards import Board
 from simulated_rig.device import SimulatedHead, simulated_head
 from simulated_rig.placed import turned_by
 from simulated_rig.tables import Triple
-from slrig.model import Axis, Black, FloatArray, LineShift, Pattern, PatternSequence, Pixels, Size, White
+from slrig.devices import Trigger
+from slrig.model import Axis, Black, FloatArray, Frame, LineShift, Pattern, PatternSequence, Pixels, Size, White
 
 FACING_PLATE = """
 [[object]]
@@ -68,6 +69,24 @@ def white_black_lines(size: Size, *, lines: int = 8) -> PatternSequence:
         patterns.append(LineShift(Axis.COLUMN, shift, 8))
         profiles.append(line_profile(size, shift))
     return PatternSequence(size, tuple(patterns), tuple(profiles))
+
+
+def taken(head: SimulatedHead, index: int, camera: str = "eye") -> Frame:
+    """One frame of one pattern, by software trigger, as a capture takes it; the camera is armed."""
+    eye, shown = head.cameras[camera], head.projector.show(index)
+    eye.trigger()
+    return eye.read(shown.t_visible_ns + shown.t_err_ns, 1.0)
+
+
+def frames_of(
+    head: SimulatedHead, *indices: int, sequence: PatternSequence | None = None, camera: str = "eye"
+) -> list[Frame]:
+    """Frames of patterns of a sequence, which is loaded first: white, black and lines unless it is given."""
+    head.projector.load(sequence or white_black_lines(head.projector.info.size))
+    head.cameras[camera].arm(len(indices), Trigger.SOFTWARE)
+    found = [taken(head, index, camera) for index in indices]
+    head.cameras[camera].disarm()
+    return found
 
 
 def corners_in_world_mm(board: Board, position_mm: Triple, rotation_deg: Triple) -> FloatArray:

@@ -10,10 +10,9 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from simulated_rig.device import SimulatedHead
 from simulated_rig.transport import LUMA
-from slrig.devices import Trigger
 from slrig.errors import ConfigError
-from slrig.model import FloatArray, Frame, Size
-from tests.unit.simulated_rig.building import FACING_PLATE, small_head, white_black_lines
+from slrig.model import FloatArray, Frame
+from tests.unit.simulated_rig.building import FACING_PLATE, frames_of, small_head
 
 PLATE = """
 [[object]]
@@ -32,20 +31,9 @@ scale_mm = 16.0
 colour = [1.0, 0.5, 0.1]
 """
 )
+WHITE, BLACK = 0, 1
 SEES = (0.7, 1.0, 0.6)
 QUIET = {"full_well_e": 1e9, "bit_depth": 16, "read_noise_e": 0.0}
-
-
-def white_and_black(head: SimulatedHead) -> tuple[Frame, Frame]:
-    head.projector.load(white_black_lines(Size(80, 60)))
-    camera = head.cameras["eye"]
-    camera.arm(4, Trigger.SOFTWARE)
-    found = []
-    for index in (0, 1):
-        shown = head.projector.show(index)
-        camera.trigger()
-        found.append(camera.read(shown.t_visible_ns + shown.t_err_ns, 1.0))
-    return found[0], found[1]
 
 
 def light_of(white: Frame, black: Frame) -> FloatArray:
@@ -62,11 +50,11 @@ def reflectance(head: SimulatedHead) -> FloatArray:
 
 
 def test_a_camera_that_sees_colour_has_the_grey_frames_that_it_had_without(tmp_path: Path) -> None:
-    mono = white_and_black(small_head(tmp_path, ambient=0.1))
-    colour = white_and_black(small_head(tmp_path, ambient=0.1, camera={"colour": SEES}))
+    mono = frames_of(small_head(tmp_path, ambient=0.1), WHITE, BLACK)
+    colour = frames_of(small_head(tmp_path, ambient=0.1, camera={"colour": SEES}), WHITE, BLACK)
     # White is white however it is told.
     scene = FACING_PLATE + "colour = [1.0, 1.0, 1.0]\n[object.texture]\ncolour = [1.0, 1.0, 1.0]\n"
-    told = white_and_black(small_head(tmp_path, scene, ambient=0.1, camera={"colour": SEES}))
+    told = frames_of(small_head(tmp_path, scene, ambient=0.1, camera={"colour": SEES}), WHITE, BLACK)
     for one, other, third in zip(mono, colour, told, strict=True):
         np.testing.assert_array_equal(one.image, other.image)
         np.testing.assert_array_equal(one.image, third.image)
@@ -77,13 +65,13 @@ def test_a_camera_that_sees_colour_has_the_grey_frames_that_it_had_without(tmp_p
 def test_frames_of_a_coloured_plate_have_its_colour_and_grey_is_its_luma(tmp_path: Path) -> None:
     head = small_head(tmp_path, PLATE, camera={"colour": (1.0, 1.0, 1.0), **QUIET})
     assert head.cameras["eye"].info.colour
-    white, black = white_and_black(head)
+    white, black = frames_of(head, WHITE, BLACK)
     light = light_of(white, black)
     np.testing.assert_allclose(light.mean(axis=(0, 1)) / light.mean(axis=(0, 1))[2], [0.2, 0.6, 1.0], rtol=1e-3)
     grey = white.image.astype(float) - black.image
     np.testing.assert_allclose(light @ LUMA, grey, rtol=2e-3)
     np.testing.assert_allclose(reflectance(head)[24, 32], 0.5 * np.array([0.2, 0.6, 1.0]), rtol=1e-5)
-    plain = white_and_black(small_head(tmp_path, PLATE.replace("colour = [0.2, 0.6, 1.0]", ""), camera=QUIET))
+    plain = frames_of(small_head(tmp_path, PLATE.replace("colour = [0.2, 0.6, 1.0]", ""), camera=QUIET), WHITE, BLACK)
     luma = 0.2 * 0.114 + 0.6 * 0.587 + 0.299
     np.testing.assert_allclose(grey.mean(), luma * (plain[0].image.mean() - plain[1].image.mean()), rtol=1e-3)
 
@@ -92,7 +80,7 @@ def test_frames_of_a_coloured_plate_have_its_colour_and_grey_is_its_luma(tmp_pat
 def test_a_coloured_texture_is_told_by_white_less_black(tmp_path: Path, blur_px: float, defocus_px: float) -> None:
     eye = {"colour": SEES, "blur_px": blur_px, "defocus_px": defocus_px, "focus_mm": 400.0, **QUIET}
     head = small_head(tmp_path, CHECKED, camera=eye, ambient=0.2)
-    light, truth = light_of(*white_and_black(head)), reflectance(head)
+    light, truth = light_of(*frames_of(head, WHITE, BLACK)), reflectance(head)
     hues = np.unique(np.round(truth[20:28, 10:54].reshape(-1, 3), 3), axis=0)
     assert {tuple(hue) for hue in hues} >= {(0.1, 0.3, 0.5), (0.5, 0.25, 0.05)}
     reach = 3 if blur_px == 0 else 9
@@ -108,7 +96,7 @@ def test_a_coloured_texture_is_told_by_white_less_black(tmp_path: Path, blur_px:
 
 def test_a_stale_frame_has_the_colour_of_the_one_before(tmp_path: Path) -> None:
     head = small_head(tmp_path, PLATE, camera={"colour": SEES}, faults={"stale_frames": [1]})
-    white, black = white_and_black(head)
+    white, black = frames_of(head, WHITE, BLACK)
     assert not light_of(white, black).any()
 
 

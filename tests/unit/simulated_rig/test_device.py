@@ -18,7 +18,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.model import Axis, Frame, PatternSequence, Size, White
-from tests.unit.simulated_rig.building import head_options, small_head, white_black_lines
+from tests.unit.simulated_rig.building import head_options, small_head, taken, white_black_lines
 
 SIZE = Size(80, 60)
 
@@ -32,13 +32,6 @@ def armed(folder: Path, trigger: Trigger = Trigger.SOFTWARE, **options: Any) -> 
     return head, camera
 
 
-def taken(head: SimulatedHead, camera: Camera, index: int) -> Frame:
-    """One frame of one pattern, by software trigger, as a capture takes it."""
-    shown = head.projector.show(index)
-    camera.trigger()
-    return camera.read(shown.t_visible_ns + shown.t_err_ns, 1.0)
-
-
 @pytest.mark.parametrize(("bit_depth", "full"), [(8, 255), (10, 1023), (12, 4095)])
 def test_brightness_follows_exposure_up_to_saturation(tmp_path: Path, bit_depth: int, full: int) -> None:
     head = small_head(tmp_path, camera={"bit_depth": bit_depth})
@@ -48,7 +41,7 @@ def test_brightness_follows_exposure_up_to_saturation(tmp_path: Path, bit_depth:
     for exposure_s in (0.004, 0.008, 0.2):
         assert camera.configure(CameraSettings(exposure_s)).exposure_s == exposure_s
         camera.arm(1, Trigger.SOFTWARE)
-        means.append(float(taken(head, camera, 0).image[20:28, 28:36].mean()))
+        means.append(float(taken(head, 0).image[20:28, 28:36].mean()))
         camera.disarm()
     assert means[1] == pytest.approx(2 * means[0], rel=0.02)
     # A plate of albedo 0.8 at the working distance; 0.02 s would saturate a white one.
@@ -57,10 +50,10 @@ def test_brightness_follows_exposure_up_to_saturation(tmp_path: Path, bit_depth:
 
 
 def test_noise_repeats_with_the_seed_and_differs_between_frames(tmp_path: Path) -> None:
-    head, camera = armed(tmp_path)
-    first, second = taken(head, camera, 0), taken(head, camera, 0)
-    again = taken(*armed(tmp_path), 0)
-    other = taken(*armed(tmp_path, seed=2), 0)
+    head, _camera = armed(tmp_path)
+    first, second = taken(head, 0), taken(head, 0)
+    again = taken(armed(tmp_path)[0], 0)
+    other = taken(armed(tmp_path, seed=2)[0], 0)
     np.testing.assert_array_equal(first.image, again.image)
     assert (first.image != second.image).mean() > 0.3
     assert (first.image != other.image).mean() > 0.3
@@ -113,8 +106,8 @@ def test_a_black_pattern_is_not_lit(tmp_path: Path) -> None:
 
 def test_a_frame_in_flight_when_the_pattern_changes_sees_both(tmp_path: Path) -> None:
     head, camera = armed(tmp_path, projector={"latency_s": 0.005, "visible_error_s": 0.0})
-    full = taken(head, camera, 0).image.mean(dtype=np.float64)
-    dark = taken(head, camera, 1).image.mean(dtype=np.float64)
+    full = taken(head, 0).image.mean(dtype=np.float64)
+    dark = taken(head, 1).image.mean(dtype=np.float64)
     camera.trigger()
     shown = head.projector.show(0)
     frame = camera.read(0, 1.0)
@@ -145,19 +138,19 @@ def test_a_free_running_camera_left_alone_keeps_only_its_last_buffers(tmp_path: 
 
 def test_real_time_frames_carry_the_monotonic_clock(tmp_path: Path) -> None:
     quick = {"exposure_s": 0.001, "readout_s": 0.0005, "saturation_s": 0.002}
-    head, camera = armed(tmp_path, realtime=True, camera=quick, projector={"latency_s": 0.001})
+    head, _camera = armed(tmp_path, realtime=True, camera=quick, projector={"latency_s": 0.001})
     before = head.clock.now_ns()
-    frame = taken(head, camera, 0)
+    frame = taken(head, 0)
     assert before < frame.t_start_ns < frame.t_end_ns <= head.clock.now_ns()
     assert frame.image.mean() > 20
 
 
 def test_a_dropped_frame_is_missed_counted_and_leaves_a_gap(tmp_path: Path) -> None:
-    head, camera = armed(tmp_path, faults={"drop_frames": [1]})
-    assert taken(head, camera, 0).dropped_count == 0
+    head, _camera = armed(tmp_path, faults={"drop_frames": [1]})
+    assert taken(head, 0).dropped_count == 0
     with pytest.raises(FrameTimeoutError, match="1 lost"):
-        taken(head, camera, 1)
-    again = taken(head, camera, 1)
+        taken(head, 1)
+    again = taken(head, 1)
     assert (again.sequence_number, again.dropped_count) == (2, 1)
 
 
@@ -181,8 +174,8 @@ def test_a_late_frame_times_out_and_comes_with_the_next_read(tmp_path: Path) -> 
 
 
 def test_a_stale_frame_has_the_old_image_under_new_times(tmp_path: Path) -> None:
-    head, camera = armed(tmp_path, faults={"stale_frames": [1]})
-    white, stale, line = (taken(head, camera, index) for index in (0, 2, 2))
+    head, _camera = armed(tmp_path, faults={"stale_frames": [1]})
+    white, stale, line = (taken(head, index) for index in (0, 2, 2))
     np.testing.assert_array_equal(stale.image, white.image)
     assert stale.t_start_ns > white.t_end_ns
     assert stale.sequence_number == 1
@@ -190,8 +183,8 @@ def test_a_stale_frame_has_the_old_image_under_new_times(tmp_path: Path) -> None
 
 
 def test_a_corrupt_frame_has_garbled_rows_and_sound_ones(tmp_path: Path) -> None:
-    head, camera = armed(tmp_path, faults={"corrupt_frames": [1]})
-    sound, corrupt = taken(head, camera, 1), taken(head, camera, 1)
+    head, _camera = armed(tmp_path, faults={"corrupt_frames": [1]})
+    sound, corrupt = taken(head, 1), taken(head, 1)
     assert corrupt.image[16:32].std() > 50
     assert corrupt.image[:16].std() < 3
     assert corrupt.image[32:].std() < 3
@@ -246,14 +239,14 @@ def test_faults_befall_only_the_cameras_they_name(tmp_path: Path) -> None:
 
 
 def test_a_lamp_that_is_off_lights_nothing(tmp_path: Path) -> None:
-    head, camera = armed(tmp_path, faults={"lamp_off": True})
-    assert taken(head, camera, 0).image.mean() < 1
+    head, _camera = armed(tmp_path, faults={"lamp_off": True})
+    assert taken(head, 0).image.mean() < 1
     assert not head.projector.lit
 
 
 def test_light_later_than_reported_gives_the_pattern_before(tmp_path: Path) -> None:
-    head, camera = armed(tmp_path, faults={"light_delay_s": 0.5})
-    frame = taken(head, camera, 0)
+    head, _camera = armed(tmp_path, faults={"light_delay_s": 0.5})
+    frame = taken(head, 0)
     assert frame.image.mean() < 3
     assert head.projector.showing == 0
     assert not head.projector.lit
@@ -274,10 +267,10 @@ def test_the_light_comes_within_the_stated_error(tmp_path: Path) -> None:
 
 
 def test_row_patterns_are_shown_along_rows(tmp_path: Path) -> None:
-    head, camera = armed(tmp_path)
+    head, _camera = armed(tmp_path)
     profile = np.where(np.arange(60) < 30, 255, 0).astype(np.uint8)[:, None]
     head.projector.load(PatternSequence(SIZE, (White(),), (profile,)))
-    image = taken(head, camera, 0).image.astype(np.float64)
+    image = taken(head, 0).image.astype(np.float64)
     assert SIZE.along(Axis.ROW) == 60
     assert image[:18].mean() > 40
     assert image[30:].mean() < 2
@@ -285,15 +278,15 @@ def test_row_patterns_are_shown_along_rows(tmp_path: Path) -> None:
 
 def test_exposure_that_creeps_gives_each_frame_more_light_than_the_one_before(tmp_path: Path) -> None:
     head, camera = armed(tmp_path, camera={"exposure_drift": 0.02, "bit_depth": 12})
-    first, *others = [float(taken(head, camera, 0).image[20:28, 28:36].mean()) for _ in range(6)]
+    first, *others = [float(taken(head, 0).image[20:28, 28:36].mean()) for _ in range(6)]
     assert others[-1] / first == pytest.approx(1.02**5, rel=0.01)
     camera.disarm()
     camera.arm(10, Trigger.SOFTWARE)
-    assert float(taken(head, camera, 0).image[20:28, 28:36].mean()) == pytest.approx(first, rel=0.01)
+    assert float(taken(head, 0).image[20:28, 28:36].mean()) == pytest.approx(first, rel=0.01)
 
 
 def test_automatic_exposure_steps_at_its_frames(tmp_path: Path) -> None:
     faults = {"exposure_step_frames": [2, 4], "exposure_step": 0.8}
-    head, camera = armed(tmp_path, camera={"bit_depth": 12}, faults=faults)
-    means = [float(taken(head, camera, 0).image[20:28, 28:36].mean()) for _ in range(5)]
+    head, _camera = armed(tmp_path, camera={"bit_depth": 12}, faults=faults)
+    means = [float(taken(head, 0).image[20:28, 28:36].mean()) for _ in range(5)]
     np.testing.assert_allclose(np.array(means) / means[0], [1, 1, 0.8, 0.8, 0.64], rtol=0.01)

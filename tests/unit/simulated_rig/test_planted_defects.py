@@ -9,24 +9,17 @@ import pytest
 
 from simulated_rig.device import SimulatedHead
 from simulated_rig.world import Flicker
-from slrig.devices import CameraSettings, Trigger
+from slrig.devices import CameraSettings
 from slrig.model import Axis, Black, FloatArray, LineShift, PatternSequence, Pixels, Size, White
-from tests.unit.simulated_rig.building import small_head, white_black_lines
+from tests.unit.simulated_rig.building import frames_of, small_head, white_black_lines
 
 PROJECTOR = Size(80, 60)
 
 
 def taken(head: SimulatedHead, index: int, sequence: PatternSequence, *, exposure_s: float = 0.01) -> FloatArray:
     """(H, W) float64: a frame of one pattern."""
-    camera = head.cameras["eye"]
-    camera.configure(CameraSettings(exposure_s))
-    head.projector.load(sequence)
-    camera.arm(1, Trigger.SOFTWARE)
-    shown = head.projector.show(index)
-    camera.trigger()
-    frame = camera.read(shown.t_visible_ns + shown.t_err_ns, 1.0)
-    camera.disarm()
-    return frame.image.astype(np.float64)
+    head.cameras["eye"].configure(CameraSettings(exposure_s))
+    return frames_of(head, index, sequence=sequence)[0].image.astype(np.float64)
 
 
 def half(axis: Axis) -> PatternSequence:

@@ -16,11 +16,10 @@ from simulated_rig.placed import turned_by
 from simulated_rig.poses import PoseSeries, made_up
 from slrig.calibration.board import Board as Designed
 from slrig.calibration.board import BoardKind
-from slrig.devices import Trigger
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Pixels
 from tests.rendered_boards import board_head, board_options, board_scene
-from tests.unit.simulated_rig.building import FACING_PLATE, corners_in_world_mm, small_head, white_black_lines
+from tests.unit.simulated_rig.building import FACING_PLATE, corners_in_world_mm, frames_of, small_head
 
 CHESSBOARD = Board.model_validate(
     {"shape": "board", "kind": "chessboard", "columns": 8, "rows": 5, "square_mm": 20.0, "margin_mm": 8.0}
@@ -35,16 +34,9 @@ def head_of(folder: Path, scene: str | None = None, **options: Any) -> Simulated
     return board_head(folder, board_options(**options), scene)
 
 
-def white(head: SimulatedHead, camera: str = "left") -> Pixels:
+def white(head: SimulatedHead) -> Pixels:
     """One white frame. Frames of a head are numbered, and their noise with them."""
-    head.projector.load(white_black_lines(head.projector.info.size))
-    eye = head.cameras[camera]
-    eye.arm(1, Trigger.SOFTWARE)
-    shown = head.projector.show(0)
-    eye.trigger()
-    frame = eye.read(shown.t_visible_ns + shown.t_err_ns, 1.0)
-    eye.disarm()
-    return frame.image
+    return frames_of(head, 0, camera="left")[0].image
 
 
 def board_depth_mm(head: SimulatedHead, position: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -58,9 +50,6 @@ def board_depth_mm(head: SimulatedHead, position: FloatArray, rotation: FloatArr
         [(u - eye.matrix[0, 2]) / eye.matrix[0, 0], (v - eye.matrix[1, 2]) / eye.matrix[1, 1], np.ones(u.shape)], -1
     )
     return np.asarray((normal @ at) / (rays @ normal), np.float64)
-
-
-# ---- series
 
 
 def test_a_series_repeats_with_its_seed_and_differs_with_another() -> None:
@@ -112,9 +101,6 @@ def test_a_board_that_does_not_fit_is_refused() -> None:
 def test_a_series_with_crossed_bounds_is_refused(tmp_path: Path, table: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="least <= most"):
         head_of(tmp_path, poses=table)
-
-
-# ---- the positioner
 
 
 def test_listed_poses_come_before_made_up_ones_and_the_first_is_taken_at_the_start(tmp_path: Path) -> None:

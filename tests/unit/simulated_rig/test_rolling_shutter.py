@@ -12,7 +12,7 @@ from simulated_rig.device import SimulatedHead
 from slrig.devices import Camera, Trigger
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, Frame, Size
-from tests.unit.simulated_rig.building import small_head, white_black_lines
+from tests.unit.simulated_rig.building import small_head, taken, white_black_lines
 
 EXPOSURE_NS = 10_000_000
 LINE_NS = 300_000
@@ -35,15 +35,9 @@ def lit(image: np.ndarray[Any, Any]) -> FloatArray:
     return np.asarray(image[:, 24:40].mean(axis=1, dtype=np.float64))
 
 
-def steady(head: SimulatedHead, camera: Camera, index: int) -> Frame:
-    shown = head.projector.show(index)
-    camera.trigger()
-    return camera.read(shown.t_visible_ns, 1.0)
-
-
 def test_the_times_of_a_frame_cover_every_row(tmp_path: Path) -> None:
-    head, camera = armed(tmp_path)
-    frame = steady(head, camera, WHITE)
+    head, _camera = armed(tmp_path)
+    frame = taken(head, WHITE)
     assert frame.t_end_ns - frame.t_start_ns == EXPOSURE_NS + SKEW_NS
     assert frame.shutter_skew_s == pytest.approx(SKEW_NS / 1e9)
     assert frame.exposure_s == 0.01
@@ -52,7 +46,7 @@ def test_the_times_of_a_frame_cover_every_row(tmp_path: Path) -> None:
 
 def test_each_row_gathers_the_light_of_its_own_exposure(tmp_path: Path) -> None:
     head, camera = armed(tmp_path)
-    black, white = lit(steady(head, camera, BLACK).image), lit(steady(head, camera, WHITE).image)
+    black, white = lit(taken(head, BLACK).image), lit(taken(head, WHITE).image)
     head.projector.show(BLACK)
     camera.trigger()
     shown = head.projector.show(WHITE)
@@ -68,7 +62,7 @@ def test_each_row_gathers_the_light_of_its_own_exposure(tmp_path: Path) -> None:
 
 def test_a_change_during_the_read_out_leaves_the_upper_rows_alone(tmp_path: Path) -> None:
     head, camera = armed(tmp_path, trigger_latency_s=0.0, exposure_s=0.012)
-    white = lit(steady(head, camera, WHITE).image)
+    white = lit(taken(head, WHITE).image)
     camera.trigger()
     head.projector.blank()
     frame = camera.read(0, 1.0)
@@ -85,8 +79,8 @@ def test_a_change_during_the_read_out_leaves_the_upper_rows_alone(tmp_path: Path
 
 
 def test_steady_light_looks_as_it_does_to_a_global_shutter(tmp_path: Path) -> None:
-    rolling = steady(*armed(tmp_path), WHITE)
-    still = steady(*armed(tmp_path, line_time_s=0.0), WHITE)
+    rolling = taken(armed(tmp_path)[0], WHITE)
+    still = taken(armed(tmp_path, line_time_s=0.0)[0], WHITE)
     np.testing.assert_array_equal(rolling.image, still.image)
     assert still.shutter_skew_s == 0.0
 
