@@ -11,9 +11,8 @@ from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.calibration.solution import PROJECTOR, BoardPose
 from slrig.model import FloatArray, Pinhole, Size
-from tests.unit.calibration.synthetic import CHESSBOARD, inside, seen
-
-__all__ = ["CHESSBOARD"]
+from tests.unit.calibration.synthetic import CHESSBOARD as CHESSBOARD
+from tests.unit.calibration.synthetic import inside, seen
 
 CHARUCO = Board(BoardKind.CHARUCO, 11, 8, 12.0)
 SHARP = ViewFigures(moved_px=0.02, saturated=0.0, contrast=0.5, sharpness_px=0.8, decoded=0.9)

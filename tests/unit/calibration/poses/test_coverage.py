@@ -20,6 +20,7 @@ from tests.unit.calibration.posed_boards import (
     CHESSBOARD,
     SHARP,
     Shooting,
+    device,
     first_poses,
     held,
     turned,
@@ -96,15 +97,28 @@ def test_the_guess_finds_the_devices_from_a_few_poses() -> None:
     poses = _first(shooting)
     poses.append(shooting.shot("pose_03", held(CHESSBOARD, tilt=(-30.0, 15.0), middle_mm=(60.0, 40.0, 540.0))))
     guess = rig_guess(poses, CHESSBOARD, shooting.sizes)
-    for name, device in guess.devices.items():
+    for name, guessed in guess.devices.items():
         truth = shooting.devices[name]
-        assert device.matrix[0, 0] == pytest.approx(truth.matrix[0, 0], rel=0.03), name
-        assert device.poses.keys() == {"pose_00", "pose_01", "pose_02", "pose_03"}
+        assert guessed.matrix[0, 0] == pytest.approx(truth.matrix[0, 0], rel=0.03), name
+        assert guessed.poses.keys() == {"pose_00", "pose_01", "pose_02", "pose_03"}
     # A lens shift beyond the image's edge is seen from the first poses on.
     assert guess.devices[PROJECTOR].matrix[1, 2] == pytest.approx(860, abs=40)
     way = guess.relative("left", "right")
     assert way is not None
     assert way.translation_mm == pytest.approx(shooting.devices["right"].translation_mm, abs=3.0)
+
+
+def test_a_wide_lens_is_guessed_too() -> None:
+    """A fit that starts from the usual lens alone ends at twice its focal length."""
+    wide = device(Size(1280, 1024), 500.0, (650.0, 500.0), (0.0,) * 5, BoardPose(np.eye(3), np.zeros(3)))
+    shooting = Shooting(CHESSBOARD, {"left": wide})
+    tilts = ((0.0, 0.0), (25.0, 0.0), (0.0, -25.0), (-30.0, 15.0))
+    poses = [
+        shooting.shot(f"pose_{index:02d}", held(CHESSBOARD, tilt=tilt, middle_mm=(0.0, 0.0, 200.0)))
+        for index, tilt in enumerate(tilts)
+    ]
+    found = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    assert found.matrix[0, 0] == pytest.approx(500, rel=0.03)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -301,6 +315,6 @@ def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Bo
     found = coverage(poses, board, shooting.sizes)
     assert found.missing == ()
     assert advice.words.startswith("enough")
-    for device in found.devices.values():
-        assert device.share >= 0.8
+    for each in found.devices.values():
+        assert each.share >= 0.8
     assert worst[-1] <= GOALS.sigma_px < worst[0]
