@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -118,6 +120,7 @@ def turned_a_little(normals: FloatArray, seed: int) -> FloatArray:
     return np.asarray(off / np.linalg.norm(off, axis=1)[:, None])
 
 
+@cache
 def scene() -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     """Two balls 100 mm apart before a wall, and whose each point is: 0 wall, 1, 2 balls."""
     parts = [wall(), ball(6000, -50.0, 2), ball(4000, 50.0, 3)]
@@ -144,9 +147,9 @@ def test_a_third_ball_is_missed_in_words() -> None:
         ball_points(points, normals, 80.0, 1)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 25.0])
+@pytest.mark.parametrize("tilt_deg", [pytest.param(0.0, marks=pytest.mark.slow), 25.0])
 def test_the_wall_is_found_behind_the_balls(tilt_deg: float) -> None:
-    points, normals, owner = scene()
+    points, normals, owner = (each.copy() for each in scene())
     points[owner == 0], normals[owner == 0] = wall(tilt_deg)
     chosen, turned = plane_points(points, normals, 240.0)
     assert turned == 0

@@ -51,19 +51,19 @@ def covariance() -> FloatArray:
 
 def test_halves_that_are_off_as_they_state_differ_by_what_is_stated() -> None:
     spread = covariance()
-    off = draws(spread, 800, 5)
+    off = draws(spread, 500, 5)
     found = []
     for odd, even in zip(off[::2], off[1::2], strict=True):
         made = odd_even(*halved(odd, even, spread))
         assert made is not None
         found.append(made)
     ratio = np.array([each.ratio for each in found])
-    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.07)
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.09)
     assert (ratio <= 1).mean() == pytest.approx(0.62, abs=0.08)
     assert (ratio <= 2).mean() > 0.95
     # The chance is one: as often below a share as that share says, five of a hundred below 5 %.
     chance = np.array([each.chance for each in found])
-    assert (chance < 0.05).mean() == pytest.approx(0.05, abs=0.035)
+    assert (chance < 0.05).mean() == pytest.approx(0.05, abs=0.045)
     assert (chance < 0.5).mean() == pytest.approx(0.5, abs=0.08)
     assert np.mean([each.fits for each in found]) > 0.98
 
