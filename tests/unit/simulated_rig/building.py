@@ -55,6 +55,16 @@ def small_head(folder: Path, scene: str = FACING_PLATE, **options: Any) -> Simul
     return simulated_head(head_options(**options), folder)
 
 
+def coarser(head: Mapping[str, Any], times: int) -> dict[str, Any]:
+    """Options of a head whose devices see the same with so many times fewer pixels each way."""
+
+    def device(table: Mapping[str, Any]) -> dict[str, Any]:
+        lengths = {key: [value / times for value in table[key]] for key in ("focal_px", "principal_px") if key in table}
+        return {**table, **lengths, "size_px": [length // times for length in table["size_px"]]}
+
+    return {**head, "projector": device(head["projector"]), "camera": [device(each) for each in head["camera"]]}
+
+
 def line_profile(size: Size, shift: int, *, period: int = 8) -> Pixels:
     """(1, Wp) uint8: every `period`-th column lit."""
     columns = np.arange(size.width_px)

@@ -10,7 +10,7 @@ import pytest
 
 from simulated_rig.device import open_head, simulated_head
 from slrig.errors import ConfigError
-from tests.unit.simulated_rig.building import FACING_PLATE, head_options, small_head
+from tests.unit.simulated_rig.building import FACING_PLATE, coarser, head_options, small_head
 
 RIGS = sorted((Path(__file__).parents[3] / "config" / "rigs").glob("*.toml"))
 RENDERED = [path for path in RIGS if tomllib.loads(path.read_text()).get("head", {}).get("driver") == "simulated"]
@@ -21,11 +21,7 @@ RENDERED = [path for path in RIGS if tomllib.loads(path.read_text()).get("head",
 def test_every_rendered_rig_we_ship_sees_a_lit_surface(path: Path) -> None:
     table = tomllib.loads(path.read_text())["head"]
     table.pop("driver")
-    for device in (table["projector"], *table["camera"]):
-        # An eighth of the pixels each way, of the same view.
-        device |= {key: [value / 8 for value in device[key]] for key in ("focal_px", "principal_px") if key in device}
-        device["size_px"] = [length // 8 for length in device["size_px"]]
-    head = simulated_head(table, path.parent)
+    head = simulated_head(coarser(table, 8), path.parent)
     assert (head.calibration is None) is ("calibration" in path.stem)
     truth = head.truth()
     assert list(truth.cameras) == list(head.exact_calibration.cameras) == list(head.cameras)

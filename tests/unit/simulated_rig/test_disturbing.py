@@ -15,14 +15,14 @@ from simulated_rig.light import Float32Array
 from slrig.devices import Trigger
 from slrig.errors import ConfigError
 from tests.rendered_boards import board_head, board_options
-from tests.unit.simulated_rig.building import head_options, small_head, white_black_lines
+from tests.unit.simulated_rig.building import coarser, head_options, small_head, white_black_lines
 
 POSES = [{"position_mm": [0.0, 0.0, 10.0 * k], "rotation_deg": [15.0, 10.0, 0.0]} for k in range(3)]
 BUMP = {"pose": 1, "turn_deg": [0.1, 0.3, 0.0], "shift_mm": [0.5, 0.0, 0.0]}
 
 
 def head_of(folder: Path, **options: Any) -> SimulatedHead:
-    return board_head(folder, board_options(poses=None, pose=POSES, **options))
+    return board_head(folder, coarser(board_options(poses=None, pose=POSES, **options), 2))
 
 
 def frames(head: SimulatedHead, count: int = 10) -> list[Float32Array]:
@@ -66,7 +66,7 @@ def test_a_bumped_camera_sees_otherwise_than_its_calibration_says(tmp_path: Path
     np.testing.assert_array_equal(stated.rotation, again.rotation)
     # What it sees at pose 1 is what a rig sees whose camera stands there from the beginning.
     there = pushed(stated, Push.model_validate({k: v for k, v in BUMP.items() if k != "pose"} | {"device": "left"}))
-    options = board_options(poses=None, pose=POSES)
+    options = coarser(board_options(poses=None, pose=POSES), 2)
     posed = {key: options["camera"][0][key] for key in options["camera"][0] if key not in ("position_mm", "target_mm")}
     posed |= {"rotation": there.rotation.tolist(), "translation_mm": there.translation_mm.tolist()}
     moved = board_head(tmp_path / "c", options | {"camera": [posed]})
@@ -87,9 +87,9 @@ def test_a_bumped_projector_lights_otherwise_and_moves_no_depth(tmp_path: Path) 
     here, there = head.truth().cameras["left"], steady.truth().cameras["left"]
     np.testing.assert_array_equal(here.depth_mm, there.depth_mm)
     moved = np.nanmedian(np.abs(here.projector_px - there.projector_px), axis=(0, 1))
-    # 0.3° about y is 2.0 px at 390 px, less what the shift takes back; 0.1° about x is 0.7 px.
-    assert 1.0 < moved[0] < 3.0
-    assert 0.3 < moved[1] < 1.2
+    # 0.3° about y is 1.0 px at 195 px, less what the shift takes back; 0.1° about x is 0.35 px.
+    assert 0.5 < moved[0] < 1.5
+    assert 0.15 < moved[1] < 0.6
 
 
 def test_drift_settles() -> None:
@@ -147,7 +147,7 @@ def test_a_board_that_moves_is_elsewhere_in_the_last_frame(tmp_path: Path) -> No
     kinds = len({image.tobytes() for image in seen})
     assert kinds == 5
     end = [POSES[1] | {"position_mm": [2.0, 0.0, 10.0]}]
-    there = board_head(tmp_path / "c", board_options(poses=None, pose=end))
+    there = board_head(tmp_path / "c", coarser(board_options(poses=None, pose=end), 2))
     # The same turn by way of a rotation matrix: equal but for rounding.
     np.testing.assert_allclose(seen[-1], frames(there)[0], atol=1e-4)
     # The next capture begins where this one did, and other poses stand still.

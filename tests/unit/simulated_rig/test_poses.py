@@ -19,7 +19,7 @@ from slrig.calibration.board import BoardKind
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Pixels
 from tests.rendered_boards import board_head, board_options, board_scene
-from tests.unit.simulated_rig.building import FACING_PLATE, corners_in_world_mm, frames_of, small_head
+from tests.unit.simulated_rig.building import FACING_PLATE, coarser, corners_in_world_mm, frames_of, small_head
 
 CHESSBOARD = Board.model_validate(
     {"shape": "board", "kind": "chessboard", "columns": 8, "rows": 5, "square_mm": 20.0, "margin_mm": 8.0}
@@ -30,8 +30,9 @@ ONE = {"position_mm": [0.0, 0.0, 20.0], "rotation_deg": [20.0, 0.0, 5.0], "name"
 TWO = {"position_mm": [15.0, -10.0, 40.0], "rotation_deg": [0.0, -25.0, 0.0]}
 
 
-def head_of(folder: Path, scene: str | None = None, **options: Any) -> SimulatedHead:
-    return board_head(folder, board_options(**options), scene)
+def head_of(folder: Path, scene: str | None = None, times: int = 2, **options: Any) -> SimulatedHead:
+    """A head before a board, with so many times fewer pixels each way."""
+    return board_head(folder, coarser(board_options(**options), times), scene)
 
 
 def white(head: SimulatedHead) -> Pixels:
@@ -126,7 +127,7 @@ def test_a_pose_looks_the_same_however_it_was_reached(tmp_path: Path) -> None:
 
 
 def test_the_truth_follows_the_pose(tmp_path: Path) -> None:
-    head = head_of(tmp_path, pose=[ONE, TWO])
+    head = head_of(tmp_path, times=1, pose=[ONE, TWO])
     assert head.positioner is not None
     before = head.truth()
     assert head.truth() is before
