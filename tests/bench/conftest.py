@@ -1,5 +1,5 @@
-"""Fixtures of other rooms that benches use."""
+"""A fixture of another room that benches use."""
 
-from tests.e2e.conftest import pool, start
+from tests.e2e.conftest import start
 
-__all__ = ["pool", "start"]
+__all__ = ["start"]

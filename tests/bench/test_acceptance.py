@@ -1,10 +1,7 @@
 """The acceptance test on a rendered rig, whatever the noise: `pytest -m slow tests/bench/test_acceptance.py -s`.
 
 The demonstration's rig at its usual size; SLRIG_SEEDS seeds (30), each the whole test of 23 positions, about a minute
-and a half of processor time. SLRIG_RIG names another rig file. A line per seed, the figures at the end. With
-SLRIG_BENCH_OUT they go into that folder: acceptance-RIG.jsonl has a line per seed, written as it comes, and seeds that
-are in it are not measured again, so that a run that was stopped goes on (empty the folder when the code has changed);
-acceptance-RIG.json has the summary.
+and a half of processor time. SLRIG_RIG names another rig file. A line per seed, the figures at the end.
 """
 
 from __future__ import annotations
@@ -93,14 +90,6 @@ def row(result: AcceptanceResult, folder: Path, seed: int) -> dict[str, Any]:
     return {"seed": seed, "decision": str(result.decision), "decisions": decisions, **told}
 
 
-def rows_so_far(path: Path | None) -> dict[int, dict[str, Any]]:
-    """The rows of an earlier run, by seed. A line that was cut off in the middle does not count."""
-    if path is None or not path.exists():
-        return {}
-    whole = [line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line.endswith("\n")]
-    return {found["seed"]: found for found in map(json.loads, whole)}
-
-
 def summary_of(rows: list[dict[str, Any]], plan: AcceptancePlan) -> dict[str, Any]:
     """The figures of the table over all seeds."""
     every = {name: np.array([each[name] for each in rows]) for name in LISTS}
@@ -146,34 +135,18 @@ def test_acceptance_over_seeds(tmp_path: Path) -> None:
     assert calibration is not None
     volume = rig_volume_mm(calibration)
     plan = acceptance_plan(calibration, volume, exact_artefacts(volume), rendered=True, repeats=1)
-    given = os.environ.get("SLRIG_BENCH_OUT")
-    target = None if not given else Path(given)
-    kept = None if target is None else target / f"acceptance-{RIG.stem}.jsonl"
-    if target is not None:
-        target.mkdir(parents=True, exist_ok=True)
-    found = rows_so_far(kept)
-    if kept is not None:
-        kept.write_text("".join(json.dumps(each) + "\n" for each in found.values()), encoding="utf-8")
+    rows = []
     for seed in range(1, SEEDS + 1):
-        if seed in found:
-            continue
         head = HeadTable.model_validate({**config.head.model_dump(), "seed": seed})
         folder = tmp_path / str(seed)
         with open_rig(scripted_config(replace(config, head=head), plan, folder / "scene")) as rig:
             result = run_acceptance(rig, plan, folder / "out", progress=lambda *_: None, cancelled=lambda: False)
-        found[seed] = row(result, folder / "out", seed)
+        rows.append(row(result, folder / "out", seed))
         shutil.rmtree(folder)
-        if kept is not None:
-            with kept.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(found[seed]) + "\n")
         told = ", ".join(f"{v.quantity} {1000 * v.error_mm:+.1f} µm {v.decision}" for v in result.verdicts)
-        print(f"seed {seed}: {told}; PF/σ at most {max(found[seed]['pf_sigmas']):.2f}", flush=True)  # noqa: T201
-    rows = [found[seed] for seed in range(1, SEEDS + 1)]
+        print(f"seed {seed}: {told}; PF/σ at most {max(rows[-1]['pf_sigmas']):.2f}", flush=True)  # noqa: T201
     summary = summary_of(rows, plan)
     print(json.dumps(summary, indent=2))  # noqa: T201
-    if target is not None:
-        path = target / f"acceptance-{RIG.stem}.json"
-        path.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     assert not [each["seed"] for each in rows if each["decision"] == Decision.FAILS]
     assert summary["spacing_worst_um"] <= summary["spacing_goal_um"]
     # The sphere that was rendered says what the fitted one says.

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import random
 import resource
+import select
 import signal
 import sqlite3
 import threading
@@ -25,7 +26,6 @@ from pathlib import Path
 from typing import Any
 
 from slrig.scan.artefacts import decode_mesh_ply
-from tests.bench.processes import alive, ends
 from tests.e2e.conftest import ServiceProcess, Start
 from tests.e2e.faulty_rig.service import half_written
 from tests.e2e.schedules import at_once
@@ -49,6 +49,13 @@ LOCKED_S = 7.0
 def calibrated_rig(folder: Path) -> Path:
     """A rig with a board, a positioner, and the calibration that it was rendered by."""
     return write_rig(folder, carries="true")
+
+
+def ends(descriptor: int, limit_s: float = 30.0) -> bool:
+    """Whether the process of a descriptor ends in time."""
+    ended = bool(select.select([descriptor], [], [], limit_s)[0])
+    os.close(descriptor)
+    return ended
 
 
 class Work:
@@ -144,7 +151,7 @@ def test_random_ends_lose_nothing(start: Start, tmp_path: Path) -> None:
             caller.ready()
         work = Work(service, kind, made, schedule)
         worker = service.worker_id()
-        watched = alive(worker)
+        watched = os.pidfd_open(worker)
         pause.wait(chance.uniform(0, SPAN_S[kind]))
         if harm == "stopped":
             os.kill(worker, signal.SIGSTOP)

@@ -26,12 +26,10 @@ from slrig.views.fusion_mean import registered_poses
 from slrig.views.matching import side_of
 from slrig.views.registration import registered
 from slrig.views.turntable import turntable
-from tests.turned_views import Turned, bumpy, displacement_mm, seen, wrong_axis
+from tests.turned_views import displacement_mm
 from tests.unit.views.known_views import Noise, flange, relief, star, vase, views_of
 
-ANGLES = [45.0 * number for number in range(8)]
 TILT_DEG = 25.0  # from which the camera looks down
-KINDS = ("ICP", "PLANE_ICP", "GICP")
 OBJECTS: dict[str, Callable[[], trimesh.Trimesh]] = {
     "figure": partial(star, subdivisions=7),
     "relief": relief,
@@ -68,31 +66,6 @@ def chained(
             ).T_target_source  # fmt: skip
         poses.append(poses[-1] @ step)
     return poses
-
-
-def worst_mm(turned: Turned, views: Sequence[Mesh], poses: Sequence[FloatArray]) -> float:
-    return max(displacement_mm(*each) for each in zip(views, poses, turned.poses, strict=True))
-
-
-def test_all_pairs_at_once_against_a_chain(capsys: pytest.CaptureFixture[str]) -> None:
-    peer = small_gicp()
-    turned = seen(bumpy, ANGLES, pitch_mm=0.5)
-    views, starts = turned.noisy(0, length_mm=3.0), wrong_axis(ANGLES)
-    began = time.process_time()
-    ours = worst_mm(turned, views, list(registered(views, starts).poses))
-    rows = [("slrig, all pairs at once", ours, time.process_time() - began)]
-    for kind in KINDS:
-        began = time.process_time()
-        rows.append(
-            (
-                f"small_gicp {kind}",
-                worst_mm(turned, views, chained(peer, kind, views, starts)),
-                time.process_time() - began,
-            )
-        )
-    with capsys.disabled():
-        print("\n" + "\n".join(f"{name:<26}{1e3 * wrong:10.1f} µm {cpu_s:6.1f} s" for name, wrong, cpu_s in rows))  # noqa: T201
-    assert ours < min(wrong for _, wrong, _ in rows[1:])
 
 
 def on_turntable(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from slrig.reconstruction.noise import NoiseModel
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import in_colour
-from slrig.scan.stream import ScanStream
+from slrig.scan.stream import CameraResult, ScanStream
 from tests.samples import CAMERA, noise, sample_calibration, sample_capture
 from tests.unit.capture.fake_rig import CameraFaults, FakeRig, fake_rig
 
@@ -248,24 +249,22 @@ def test_white_and_black_in_colour_reach_the_place_where_a_mesh_is_made(exposure
     capture = Capture(sequence.projector, sequence.patterns, {"left": scene.format}, tuple(shots))
     devices = sample_calibration()
     calibration = replace(devices, cameras={"left": replace(devices.cameras["left"], size=scene.camera)})
-    stream = ScanStream(
-        CaptureHeader.of(capture), calibration, entered=lambda *_: None, axis=Axis.COLUMN,
-        one_exposure=len(exposures_s) == 1,
-    )  # fmt: skip
-    for shot in capture.shots:
-        stream.take(shot)
-    [seen] = stream.finish()
+
+    def streamed(shots: Iterable[Shot]) -> CameraResult:
+        stream = ScanStream(
+            CaptureHeader.of(capture), calibration, entered=lambda *_: None, axis=Axis.COLUMN,
+            one_exposure=len(exposures_s) == 1,
+        )  # fmt: skip
+        for shot in shots:
+            stream.take(shot)
+        [seen] = stream.finish()
+        return seen
+
+    seen, mono = streamed(capture.shots), streamed(replace(shot, colour=None) for shot in capture.shots)
     white, black = (scene.image(sequence.profiles[index]).astype(np.float64) for index in range(2))
     assert seen.contrast.shape == (*scene.camera.shape, 3)
     # Red, green and blue, as colours are written.
     assert np.abs(seen.contrast - (white - black)[..., None] * hue[::-1]).mean() < 1.5
-    without = ScanStream(
-        CaptureHeader.of(capture), calibration, entered=lambda *_: None, axis=Axis.COLUMN,
-        one_exposure=len(exposures_s) == 1,
-    )  # fmt: skip
-    for shot in capture.shots:
-        without.take(replace(shot, colour=None))
-    [mono] = without.finish()
     assert mono.contrast.shape == (*scene.camera.shape, 1)
     np.testing.assert_array_equal(mono.white, seen.white)
     np.testing.assert_array_equal(mono.curves.refusal, seen.curves.refusal)

@@ -149,7 +149,8 @@ def test_a_third_ball_is_missed_in_words() -> None:
 
 @pytest.mark.parametrize("tilt_deg", [pytest.param(0.0, marks=pytest.mark.slow), 25.0])
 def test_the_wall_is_found_behind_the_balls(tilt_deg: float) -> None:
-    points, normals, owner = (each.copy() for each in scene())
+    points, normals, owner = scene()
+    points, normals = points.copy(), normals.copy()
     points[owner == 0], normals[owner == 0] = wall(tilt_deg)
     chosen, turned = plane_points(points, normals, 240.0)
     assert turned == 0
