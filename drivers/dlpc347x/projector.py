@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -15,7 +14,7 @@ from drivers.dlpc347x.options import EngineOptions
 from drivers.pattern_engine.light import HeldLight
 from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing, check_duty, light_us
-from slrig.devices import ProjectorInfo, Shown
+from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
@@ -45,6 +44,8 @@ class LightEngine(HeldLight[Engine]):
         An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
     options
         What the rig file says.
+    clock
+        The rig's; else the system's.
 
     Raises
     ------
@@ -54,8 +55,8 @@ class LightEngine(HeldLight[Engine]):
         The engine failed.
     """
 
-    def __init__(self, bus: Bus, options: EngineOptions) -> None:
-        super().__init__(Engine(bus), options)
+    def __init__(self, bus: Bus, options: EngineOptions, *, clock: Clock | None = None) -> None:
+        super().__init__(Engine(bus), options, clock=clock)
         self._options = options
         self._lines: Lines
         self._held: Mapping[Line, tuple[Place, ...]] = {}
@@ -105,7 +106,7 @@ class LightEngine(HeldLight[Engine]):
             self._begin_holding(repeats * entry.lasts_us / 1e6, again_s=LEFT_ALONE_S / 2)
             # Whether LEDs stay dark after the last repeat is not documented.
             self._dark_at_s = self._held_until_s + LEFT_ALONE_S
-        return self._shown(index, started_ns, time.monotonic_ns() + round(self._options.start_s * 1e9))
+        return self._shown(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
@@ -137,7 +138,7 @@ class LightEngine(HeldLight[Engine]):
         lasts_us = sum(entry.lasts_us for entry in entries)
         with self._lock:
             self._run(tuple(entries), 1)
-            self._dark_at_s = time.monotonic() + options.start_s + (lasts_us - END_US / 2) / 1e6
+            self._dark_at_s = self._now_s() + options.start_s + (lasts_us - END_US / 2) / 1e6
 
     def _breaks(self, at: int) -> bool:
         """Whether pattern `at` needs an entry of its own: it is not the next one in the flash, or lit otherwise."""
@@ -167,7 +168,7 @@ class LightEngine(HeldLight[Engine]):
             try:
                 self.blank()
                 self._engine.order(entries, repeats)
-                started_ns = time.monotonic_ns()
+                started_ns = self._clock.now_ns()
                 self._engine.leds(by_sequence=True)
                 self._engine.start()
             except BaseException:

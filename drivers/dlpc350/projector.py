@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 from drivers.dlpc350.engine import Command, Engine
 from drivers.dlpc350.flash import Flash, Place
 from drivers.dlpc350.options import EngineOptions
@@ -15,7 +13,7 @@ from drivers.pattern_engine.link import Kind, Link
 from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
 from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
-from slrig.devices import ProjectorInfo, Shown
+from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
@@ -34,6 +32,8 @@ class LightEngine(PatternEngine[Engine]):
         An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
     options, flash
         What the rig file says, and what lies in the engine's flash.
+    clock
+        The rig's; else the system's.
 
     Raises
     ------
@@ -43,8 +43,10 @@ class LightEngine(PatternEngine[Engine]):
         The engine failed.
     """
 
-    def __init__(self, link: Link, options: EngineOptions, flash: Flash, *, serial: str = "") -> None:
-        super().__init__(Engine(link), options)
+    def __init__(
+        self, link: Link, options: EngineOptions, flash: Flash, *, serial: str = "", clock: Clock | None = None
+    ) -> None:
+        super().__init__(Engine(link), options, clock=clock)
         self._options = options
         self._flash = flash
         self._serial = serial
@@ -120,14 +122,14 @@ class LightEngine(PatternEngine[Engine]):
                     engine.set_timing(timing)
                 engine.set_tables(tables, None if told is None else told[1])
                 engine.validate(VALIDATED_S)
-                started_ns = time.monotonic_ns()
+                started_ns = self._clock.now_ns()
                 engine.leds(by_sequence=True)
                 engine.start()
                 # A short sequence may be over before the engine could be asked.
                 if tables.length * timing.period_us >= _LONG_US:
                     engine.wait_until_running(RUNNING_S)
                 self._told, self._picture = (timing, tables), places[-1].image
-                return started_ns, time.monotonic_ns()
+                return started_ns, self._clock.now_ns()
             except BaseException:
                 self._picture = None
                 self._darken()

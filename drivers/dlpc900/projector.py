@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 from drivers.dlpc900.engine import MODE_S, ON_THE_FLY, SECOND_READY, Engine, Mirrors, definition
 from drivers.dlpc900.options import EngineOptions
 from drivers.dlpc900.pictures import Place, memory_of, packed
@@ -13,7 +11,7 @@ from drivers.pattern_engine.link import Kind, Link
 from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
 from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
-from slrig.devices import ProjectorInfo, Shown
+from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
@@ -34,6 +32,8 @@ class LightEngine(PatternEngine[Engine]):
         An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
     options
         What the rig file says.
+    clock
+        The rig's; else the system's.
 
     Raises
     ------
@@ -43,8 +43,8 @@ class LightEngine(PatternEngine[Engine]):
         The engine failed.
     """
 
-    def __init__(self, link: Link, options: EngineOptions, *, serial: str = "") -> None:
-        super().__init__(Engine(link), options)
+    def __init__(self, link: Link, options: EngineOptions, *, serial: str = "", clock: Clock | None = None) -> None:
+        super().__init__(Engine(link), options, clock=clock)
         self._options = options
         self._serial = serial
         self._mirrors: Mirrors
@@ -104,7 +104,7 @@ class LightEngine(PatternEngine[Engine]):
                 self._darken()
                 raise
             self._begin_holding(LEFT_ALONE_S, again_s=LEFT_ALONE_S / 2)
-        return self._shown(index, started_ns, time.monotonic_ns() + round(self._options.start_s * 1e9))
+        return self._shown(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
@@ -145,7 +145,7 @@ class LightEngine(PatternEngine[Engine]):
 
     def _start(self) -> int:
         """Start the sequence; return when that was begun."""
-        started_ns = time.monotonic_ns()
+        started_ns = self._clock.now_ns()
         self._engine.leds(by_sequence=True)
         self._engine.start()
         return started_ns

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from abc import ABC, abstractmethod
 from contextlib import suppress
 from functools import partial
@@ -12,7 +11,7 @@ from typing import Generic, Protocol, TypeVar
 
 from drivers.pattern_engine.options import LightOptions
 from drivers.pattern_engine.timing import LEFT_ALONE_S
-from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.errors import SlrigError
 
 
@@ -43,11 +42,12 @@ class HeldLight(ABC, Generic[SourceT]):
     """What implements `slrig.devices.Projector` on any engine, as far as engines are alike.
 
     A kind of engine calls `_take_over` when it is constructed, and `_begin_holding` when it has begun what it shows.
-    `_lock` keeps the engine's commands together.
+    `_lock` keeps the engine's commands together. clock : the rig's; else the system's.
     """
 
-    def __init__(self, engine: SourceT, options: LightOptions) -> None:
+    def __init__(self, engine: SourceT, options: LightOptions, *, clock: Clock | None = None) -> None:
         self._engine = engine
+        self._clock = clock or SystemClock()
         self._light = options
         self._state = ProjectorState("the light engine")
         self._lock = threading.RLock()
@@ -101,23 +101,29 @@ class HeldLight(ABC, Generic[SourceT]):
 
     def _begin_holding(self, alone_s: float, *, again_s: float) -> None:
         """Hold what was begun now, and ends by itself `alone_s` later; then each `again_s`."""
-        now_s = time.monotonic()
+        now_s = self._now_s()
         self._held_until_s = now_s + self._light.hold_s
         self._restart_at_s, self._restart_each_s = now_s + alone_s / 2, again_s
 
     def _shown(self, index: int, earliest_ns: int, latest_ns: int) -> Shown:
         """Wait until the latest instant at which light can begin."""
-        SystemClock().wait_until(latest_ns, self._state.closed)
+        self._clock.wait_until(latest_ns, self._state.closed)
         self._state.require_open()
         return Shown(index, (earliest_ns + latest_ns) // 2, (latest_ns - earliest_ns + 1) // 2)
+
+    def _now_s(self) -> float:
+        return self._clock.now_ns() / 1e9
 
     def _hold(self) -> None:
         """Start what is shown anew, before the engine ends it: it says that this program lives. End what does not
         end by itself, from `_dark_at_s` on. Runs until `close`.
         """
-        while not self._state.closed.wait(LEFT_ALONE_S / 20):
+        while True:
+            self._clock.wait_until(self._clock.now_ns() + round(LEFT_ALONE_S * 1e9 / 20), self._state.closed)
+            if self._state.closed.is_set():
+                return
             with self._lock:
-                now_s = time.monotonic()
+                now_s = self._now_s()
                 if now_s >= self._dark_at_s:
                     self._darken()
                 if not self._restart_at_s <= now_s < self._held_until_s:

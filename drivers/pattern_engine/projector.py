@@ -9,6 +9,7 @@ from drivers.pattern_engine.engine import Command, Engine
 from drivers.pattern_engine.light import HeldLight
 from drivers.pattern_engine.options import UsbLightOptions
 from drivers.pattern_engine.timing import Timing
+from slrig.devices import Clock
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 
 AWAKE_S = 10.0
@@ -27,8 +28,8 @@ EngineT = TypeVar("EngineT", bound=Engine)
 class PatternEngine(HeldLight[EngineT], ABC):
     """What implements `slrig.devices.Projector` and `UnprovenLight` on an engine with a USB port."""
 
-    def __init__(self, engine: EngineT, options: UsbLightOptions) -> None:
-        super().__init__(engine, options)
+    def __init__(self, engine: EngineT, options: UsbLightOptions, *, clock: Clock | None = None) -> None:
+        super().__init__(engine, options, clock=clock)
         self._light: UsbLightOptions = options
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields
@@ -182,7 +181,7 @@ class Client:
         return tuple(lacking)
 
     def show(self, index: int) -> tuple[int, int]:
-        """Light a pattern; return (t_visible_ns, t_err_ns), CLOCK_MONOTONIC."""
+        """Light a pattern; return (t_visible_ns, t_err_ns), on the link's clock."""
         with self._lock:
             reply = self._ask("SHOW", index, takes_s=self._box.light_s)
             return self._lit(reply, index)
@@ -256,21 +255,24 @@ class Client:
 
     def _greeted(self) -> Box:
         """Say HELLO until the box has started; many boards restart when their port is opened."""
-        until_s = time.monotonic() + self._open_s
+        link = self._link
+        until_ns = link.after(self._open_s)
         while True:
-            left_s = until_s - time.monotonic()
+            left_s = (until_ns - link.clock.now_ns()) / 1e9
             try:
-                box = self._checked(self._said_hello(max(left_s, self._link.reply_s)))
+                box = self._checked(self._said_hello(max(left_s, link.reply_s)))
                 for _ in range(_PINGS):
-                    self._pinged(self._link.ask("PING"))
+                    self._pinged(link.ask("PING"))
             except RefusedError as refusal:
                 if refusal.number == Refused.RANGE:
                     raise UnsupportedByDeviceError(self._beyond(refusal)) from refusal
                 if refusal.number not in {Refused.BUSY, Refused.SESSION}:
                     raise
                 # Another host's session may be about to end; and a box that restarts just now has forgotten ours.
-                if left_s > 0 and not self._link.closing.wait(_AGAIN_S):
-                    continue
+                if left_s > 0:
+                    link.clock.wait_until(link.after(_AGAIN_S), link.closing)
+                    if not link.closing.is_set():
+                        continue
                 raise DeviceBusyError(self._held(" ".join(refusal.words))) from refusal
             return box
 

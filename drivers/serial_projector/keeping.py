@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 
 from drivers.serial_projector.client import Client
+from slrig.devices import Clock
 from slrig.errors import DeviceError
 
 BEATS_PER_WATCHDOG = 5
@@ -15,12 +16,12 @@ class KeepAlive:
     """A thread that beats until it is stopped, except while the box is abandoned.
 
     It says that the process lives, not that its owner thread does: a pattern that a stuck owner leaves lit is put out
-    by the box after `max_on_s`.
+    by the box after `max_on_s`. clock : by which it waits.
     """
 
-    def __init__(self, client: Client, *, watchdog_s: float) -> None:
-        self._client = client
-        self._period_s = watchdog_s / BEATS_PER_WATCHDOG
+    def __init__(self, client: Client, *, watchdog_s: float, clock: Clock) -> None:
+        self._client, self._clock = client, clock
+        self._period_ns = round(watchdog_s * 1e9 / BEATS_PER_WATCHDOG)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="serial projector", daemon=True)
         self._thread.start()
@@ -32,7 +33,10 @@ class KeepAlive:
             self._thread.join()
 
     def _run(self) -> None:
-        while not self._stop.wait(self._period_s):
+        while True:
+            self._clock.wait_until(self._clock.now_ns() + self._period_ns, self._stop)
+            if self._stop.is_set():
+                return
             try:
                 self._client.beat()
             except DeviceError:

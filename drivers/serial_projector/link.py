@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import secrets
 import threading
-import time
 from collections import deque
 from dataclasses import dataclass, field
 
 from drivers.serial_port import SLICE_S, Port
 from drivers.serial_projector.frames import NUMBERS, Answer, Event, Refused, Splitter, Unread, framed, parsed
+from slrig.devices import Clock, SystemClock
 from slrig.errors import DeviceError, DeviceStateError
 
 MOST_TRIES = 12
+_NS_PER_S = 1_000_000_000
 _EVENTS = 4096
 
 
@@ -35,7 +36,7 @@ class SilentError(DeviceError):
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What the box answered. It obeyed at some instant between `sent_ns` and `received_ns` (CLOCK_MONOTONIC)."""
+    """What the box answered. It obeyed at some instant between `sent_ns` and `received_ns` (the link's clock)."""
 
     words: tuple[str, ...]
     sent_ns: int
@@ -57,7 +58,7 @@ class Link:
     """Commands to one box. One thread at a time uses it; `closing` ends a wait from another one.
 
     reply_s : how long an answer may take, beyond what the command itself takes. deadline_s : after which a command is
-    not sent again.
+    not sent again. clock : of both, and of the answers' instants.
     """
 
     port: Port
@@ -68,6 +69,7 @@ class Link:
     closing: threading.Event = field(default_factory=threading.Event)
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=_EVENTS))
     tally: Tally = field(default_factory=Tally)
+    clock: Clock = field(default_factory=SystemClock)
     _number: int = 0
     _splitter: Splitter = field(default_factory=Splitter)
     _waiting: deque[bytes] = field(default_factory=deque)
@@ -108,27 +110,31 @@ class Link:
         """
         self._number = (self._number + 1) % NUMBERS
         line = framed(" ".join(map(str, (self.session, self._number, verb, *numbers))))
-        begun_s = time.monotonic()
-        until_s = begun_s + (self.deadline_s if deadline_s is None else deadline_s)
+        until_ns = self.after(self.deadline_s if deadline_s is None else deadline_s)
         self.tally.commands += 1
-        first_ns = time.monotonic_ns()
+        first_ns = self.clock.now_ns()
         sent = 0
-        while sent < tries and (sent == 0 or time.monotonic() < until_s):
+        while sent < tries and (sent == 0 or self.clock.now_ns() < until_ns):
             self.port.write(line)
             self.tally.again += sent > 0
             sent += 1
-            answer = self._answer(time.monotonic() + self.reply_s + takes_s, while_closing)
+            answer = self._answer(self.after(self.reply_s + takes_s), while_closing)
             if answer is not None:
                 if answer.code is not None:
                     raise RefusedError(verb, answer.code, answer.words)
-                return Reply(answer.words, first_ns, time.monotonic_ns())
+                return Reply(answer.words, first_ns, self.clock.now_ns())
+        took_s = (self.clock.now_ns() - first_ns) / _NS_PER_S
         message = (
-            f"asked the trigger box for {verb} {sent} times in {time.monotonic() - begun_s:.2f} s, found no answer "
+            f"asked the trigger box for {verb} {sent} times in {took_s:.2f} s, found no answer "
             f"({self.tally.damaged} damaged lines so far); check its cable, its power and the baud rate"
         )
         raise SilentError(message)
 
-    def _answer(self, until_s: float, while_closing: bool) -> Answer | None:
+    def after(self, seconds: float) -> int:
+        """The time in so many seconds, ns."""
+        return self.clock.now_ns() + round(seconds * _NS_PER_S)
+
+    def _answer(self, until_ns: int, while_closing: bool) -> Answer | None:
         """The answer to the command that was sent last; None when it is time to send it again."""
         while True:
             while self._waiting:
@@ -145,11 +151,11 @@ class Link:
                     case None:
                         self.tally.damaged += 1
                         # That may have been it: a little longer, for what else is under way.
-                        until_s = min(until_s, time.monotonic() + SLICE_S)
+                        until_ns = min(until_ns, self.after(SLICE_S))
             if self.closing.is_set() and not while_closing:
                 message = "the projector was closed while it waited for the trigger box; open the rig again"
                 raise DeviceStateError(message)
-            left_s = until_s - time.monotonic()
+            left_s = (until_ns - self.clock.now_ns()) / _NS_PER_S
             if left_s <= 0:
                 return None
             self._waiting.extend(self._splitter.lines(self.port.read(min(left_s, SLICE_S))))

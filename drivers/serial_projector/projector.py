@@ -14,7 +14,7 @@ from drivers.serial_projector.keeping import KeepAlive
 from drivers.serial_projector.link import Link, RefusedError
 from drivers.serial_projector.options import SerialProjectorOptions
 from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each, export
-from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
@@ -43,10 +43,20 @@ class SerialProjector:
         Checked.
     export_folder
         Where `write_patterns` writes.
+    clock
+        The rig's.
     """
 
-    def __init__(self, open_port: Callable[[], Port], options: SerialProjectorOptions, *, export_folder: Path) -> None:
+    def __init__(
+        self,
+        open_port: Callable[[], Port],
+        options: SerialProjectorOptions,
+        *,
+        export_folder: Path,
+        clock: Clock | None = None,
+    ) -> None:
         self._open_port = open_port
+        self._clock = clock or SystemClock()
         self._options = options
         self._export_folder = export_folder
         limits = Limits(
@@ -56,7 +66,7 @@ class SerialProjector:
             bright=round(options.brightness * 1000),
         )
         port = open_port()
-        link = Link(port, options.reply_s, options.deadline_s)
+        link = Link(port, options.reply_s, options.deadline_s, clock=self._clock)
         try:
             self._client = Client(link, limits, label=options.port, open_s=options.open_s)
         except BaseException:
@@ -78,7 +88,7 @@ class SerialProjector:
         self._state = ProjectorState(f"the trigger box on {options.port}")
         self._wanted: tuple[int, ...] = ()
         self._lit: str | None = None
-        self._keeping = KeepAlive(self._client, watchdog_s=box.watchdog_ms / 1000)
+        self._keeping = KeepAlive(self._client, watchdog_s=box.watchdog_ms / 1000, clock=self._clock)
 
     @property
     def info(self) -> ProjectorInfo:
@@ -140,7 +150,7 @@ class SerialProjector:
         with self._dark_if_it_fails():
             t_visible_ns, t_err_ns = self._sent(lambda: self._client.show(index))
             self._lit = f"pattern {index} was lit"
-            SystemClock().wait_until(t_visible_ns + t_err_ns, self._state.closed)
+            self._clock.wait_until(t_visible_ns + t_err_ns, self._state.closed)
         return Shown(index, t_visible_ns, t_err_ns)
 
     def play(self, exposure_s: float, period_s: float) -> None:
