@@ -1,36 +1,86 @@
-"""Time for tests: it passes at once, and only where somebody waits for it."""
+"""A clock of tests: time passes at once where somebody waits for it. No test waits, and a busy machine changes none."""
 
 from __future__ import annotations
 
 import heapq
 import itertools
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Collection
+
+_PATIENCE_S = 5.0
+"""How long a thread may take to come to its next wait; one that hangs must not hang the test."""
 
 
 class VirtualClock:
-    """Implements `slrig.devices.Clock`. A wait for an instant moves the clock there. For one thread at a time."""
+    """Implements `slrig.devices.Clock`. A wait for an instant moves the clock there.
 
-    def __init__(self, now_ns: int = 10**12) -> None:
+    threads : names of threads that run next to the one under test: a driver's sign of life, a fake device's own
+    program. They do not make time pass. They sleep until another thread's wait has made it pass, and that wait goes on
+    when all of them sleep again or have ended. So what is due first is done first.
+    """
+
+    def __init__(self, now_ns: int = 10**12, *, threads: Collection[str] = ()) -> None:
         self._now_ns = now_ns
-        self._due: list[tuple[int, int, Callable[[], object]]] = []
+        self._threads = frozenset(threads)
+        self._changed = threading.Condition(threading.RLock())
+        self._due_ns: dict[threading.Thread, int] = {}
+        self._calls: list[tuple[int, int, Callable[[], object]]] = []
         self._order = itertools.count()
 
     def now_ns(self) -> int:
+        """See `Clock`."""
         return self._now_ns
 
     def wait_until(self, t_ns: int, stop: threading.Event) -> None:
-        while not stop.is_set() and self._due and self._due[0][0] <= t_ns:
-            due_ns, _, act = heapq.heappop(self._due)
-            self._now_ns = max(self._now_ns, due_ns)
-            act()
-        if not stop.is_set():
-            self._now_ns = max(self._now_ns, t_ns)
+        """See `Clock`. No time passes once `stop` is set."""
+        if threading.current_thread().name in self._threads:
+            self._sleep(t_ns, stop)
+        else:
+            self._pass(t_ns, stop)
 
     def advance(self, seconds: float) -> None:
-        """Let so much time pass."""
-        self.wait_until(self._now_ns + round(seconds * 1e9), threading.Event())
+        """Let time pass."""
+        self._pass(self._now_ns + round(seconds * 1e9), threading.Event())
 
     def call_at(self, t_ns: int, act: Callable[[], object]) -> None:
-        """Have something happen when a wait reaches an instant."""
-        heapq.heappush(self._due, (t_ns, next(self._order), act))
+        """Call a function when a wait reaches an instant."""
+        with self._changed:
+            heapq.heappush(self._calls, (t_ns, next(self._order), act))
+
+    def _sleep(self, t_ns: int, stop: threading.Event) -> None:
+        me = threading.current_thread()
+        with self._changed:
+            self._due_ns[me] = t_ns
+            self._changed.notify_all()
+            while me in self._due_ns and not stop.is_set():
+                # The owner of `stop` does not notify this clock.
+                self._changed.wait(0.002)
+            self._due_ns.pop(me, None)
+
+    def _pass(self, t_ns: int, stop: threading.Event) -> None:
+        with self._changed:
+            while not stop.is_set():
+                self._await_threads()
+                thread = min(self._due_ns, key=self._due_ns.__getitem__, default=None)
+                thread_ns = t_ns + 1 if thread is None else self._due_ns[thread]
+                if self._calls and self._calls[0][0] <= min(t_ns, thread_ns):
+                    due_ns, _, act = heapq.heappop(self._calls)
+                    self._now_ns = max(self._now_ns, due_ns)
+                    act()
+                elif thread is not None and thread_ns <= t_ns:
+                    self._now_ns = max(self._now_ns, self._due_ns.pop(thread))
+                    self._changed.notify_all()
+                else:
+                    self._now_ns = max(self._now_ns, t_ns)
+                    return
+
+    def _await_threads(self) -> None:
+        """Return when every named thread sleeps or has ended."""
+        until_s = time.monotonic() + _PATIENCE_S
+        while any(
+            each.name in self._threads and each not in self._due_ns and each is not threading.current_thread()
+            for each in threading.enumerate()
+        ):
+            self._changed.wait(0.001)
+            assert time.monotonic() < until_s, "a thread next to the test does not come to its next wait"

@@ -1,23 +1,23 @@
-"""Every turntable by one suite: the rendered one, and those on serial lines before stand-ins on pseudo-terminals."""
+"""Every turntable by one suite: the rendered one, and those on serial lines before stand-ins for their controllers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drivers.serial_turntable import open_grbl, open_turntable
 from simulated_rig.device import SimulatedHead, simulated_head
 from slrig.conformance import CHECKS, Examination, Outcome
 from slrig.devices import Rig, Turntable
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from tests.contract.benches import PLATE, beamer, eyes
 from tests.unit.conformance.model_rig import Maker, sequence
-from tests.unit.drivers.serial_turntable.controllers import GrblBoard, LineBoard, SkippingClock
+from tests.unit.drivers.serial_turntable.controllers import GrblBoard, LineBoard
 
 AXIS_POINT, AXIS = np.array([8.0, 0.0, 20.0]), np.array([0.1, -1.0, 0.2]) / np.linalg.norm([0.1, -1.0, 0.2])
 
@@ -68,20 +68,14 @@ def grbl(_folder: Path) -> Bench:
     """A table behind a worm gear: 2 mm of the axis Y are a degree."""
     board = GrblBoard(slow=4)
     board.places[1] = -7.0
-    options = {"port": board.path, "axis": "Y", "units_per_deg": 2.0, "speed_deg_s": 30.0, "approach_deg": 3.0}
-    opening = lambda: open_grbl(options, Path(), clock=SkippingClock())  # noqa: E731
-    bench = Bench(opening, lambda: (board.places[1] + 7.0) / 2.0, lambda: not board.left)
-    bench.callback(board.close)
-    return bench
+    options = {"axis": "Y", "units_per_deg": 2.0, "speed_deg_s": 30.0, "approach_deg": 3.0}
+    return Bench(partial(board.opened, **options), lambda: (board.places[1] + 7.0) / 2.0, lambda: not board.left)
 
 
 def lines(_folder: Path) -> Bench:
     """A board that counts left-handed."""
     board = LineBoard(steps=36000)
-    options = {"port": board.path, "reversed": True}
-    bench = Bench(lambda: open_turntable(options, Path(), clock=SkippingClock()), lambda: -board.at_deg)
-    bench.callback(board.close)
-    return bench
+    return Bench(partial(board.opened, reversed=True), lambda: -board.at_deg)
 
 
 BENCHES: Mapping[str, Callable[[Path], Bench]] = {

@@ -1,28 +1,21 @@
-"""Boxes on a serial line, and projectors on them, closed after each test."""
+"""Boxes on a line in memory, and projectors on them, closed after each test. Time is the tests' own."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
-from drivers.serial_projector import open_projector
+from drivers.serial_projector.options import SerialProjectorOptions
 from drivers.serial_projector.pattern_set import crc32_of_each
 from drivers.serial_projector.projector import SerialProjector
 from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
-from tests.unit.drivers.serial_projector.engines import (
-    CoreEngine,
-    Engine,
-    MicroPythonEngine,
-    Scene,
-    description,
-    micropython_package,
-)
-from tests.unit.drivers.serial_projector.line import SerialLine
+from tests.unit.drivers.serial_projector.engines import CoreEngine, Scene, description
+from tests.unit.drivers.serial_projector.line import MemoryLine
+from tests.virtual_clock import VirtualClock
 
 SIZE = Size(400, 300)
 
@@ -39,56 +32,63 @@ SEQUENCE = whole_sequence()
 CRC32 = crc32_of_each(SEQUENCE)
 
 
-@dataclass
 class Bench:
-    """A box on a line, what it did, and how to open it."""
+    """A box with SEQUENCE in its flash, on a line: what it did, and how to open it. `line` : options of `Line`."""
 
-    line: SerialLine
-    scene: Scene
-    open: Callable[..., SerialProjector]
+    def __init__(self, *, drift: float = 0.0, **line: Any) -> None:
+        self.clock = VirtualClock(beside=["serial projector"])
+        self.scene = Scene(at_ns=self.clock.now_ns())
+        self.engine = CoreEngine(self.scene, description(CRC32), drift=drift)
+        self.line = MemoryLine(self.engine, self.clock, **line)
+        self._opened: list[SerialProjector] = []
+
+    def open(self, folder: Path = Path(), **options: Any) -> SerialProjector:
+        """The driver at the other end of the line."""
+        table = SerialProjectorOptions(port="the line", **options)
+        projector = SerialProjector(self.line.opened, table, export_folder=folder / "patterns", clock=self.clock)
+        self._opened.append(projector)
+        return projector
+
+    def loaded(self, **options: Any) -> SerialProjector:
+        """The same, with SEQUENCE."""
+        projector = self.open(**options)
+        projector.load(SEQUENCE)
+        return projector
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass, for host and box."""
+        self.clock.advance(seconds)
+        self.line.catch_up()
 
     @property
-    def core(self) -> CoreEngine:
-        assert isinstance(self.line.engine, CoreEngine)
-        return self.line.engine
+    def lit(self) -> int | None:
+        """The pattern of the flash that is lit now."""
+        self.line.catch_up()
+        return self.scene.lit
+
+    @property
+    def patterns(self) -> list[int]:
+        """All that were lit, in order."""
+        return [pattern for pattern, _boot in self.scene.shown]
+
+    def close(self) -> None:
+        for projector in self._opened:
+            projector.close()
 
 
 @pytest.fixture
 def make_bench() -> Iterator[Callable[..., Bench]]:
-    """Makes a box with SEQUENCE in its flash; the options are those of `SerialLine`."""
     made: list[Bench] = []
-    opened: list[SerialProjector] = []
 
-    def make(*, engine: Callable[[Scene], Engine] | None = None, drift: float = 0.0, **line: Any) -> Bench:
-        scene = Scene()
-        inside = CoreEngine(scene, description(CRC32), drift=drift) if engine is None else engine(scene)
-        serial_line = SerialLine(inside, **line)
-
-        def open_it(folder: Path = Path(), **options: object) -> SerialProjector:
-            table = {"port": serial_line.path, "reply_s": 0.1, **options}
-            projector = cast("SerialProjector", open_projector(table, folder))
-            opened.append(projector)
-            return projector
-
-        made.append(Bench(serial_line, scene, open_it))
+    def make(**how: Any) -> Bench:
+        made.append(Bench(**how))
         return made[-1]
 
     yield make
-    for projector in opened:
-        projector.close()
     for bench in made:
-        bench.line.close()
+        bench.close()
 
 
 @pytest.fixture
 def bench(make_bench: Callable[..., Bench]) -> Bench:
     return make_bench()
-
-
-@pytest.fixture(params=["CPython", "MicroPython"])
-def either_bench(request: pytest.FixtureRequest, make_bench: Callable[..., Bench]) -> Bench:
-    """The core in either interpreter."""
-    if request.param == "CPython":
-        return make_bench()
-    package = micropython_package()
-    return make_bench(engine=lambda scene: MicroPythonEngine(scene, description(CRC32), package))

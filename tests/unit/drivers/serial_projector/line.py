@@ -1,4 +1,4 @@
-"""A serial line on a pseudo-terminal, with a box at its end, and everything that can happen to such a line."""
+"""A serial line with a box at its end, in memory or on a pseudo-terminal, and everything that can happen to it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import pty
 import random
 import select
 import threading
-import time
 import tty
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from tests.unit.drivers.serial_projector.engines import Engine
+from slrig.errors import DeviceGoneError
+from tests.unit.drivers.serial_projector.engines import CoreEngine
+from tests.virtual_clock import VirtualClock
 
 
 @dataclass
@@ -55,58 +57,157 @@ class Noise:
                 return line[:at] + self.rng.randbytes(self.rng.randrange(1, 9)) + line[at:]
 
 
-class SerialLine:
-    """A box on a pseudo-terminal, `path`, served by a thread. The box goes on when the line is cut.
+class Line(ABC):
+    """A box at the end of a line. The box goes on when the line is cut.
 
-    boot_s : how long the box takes to start. on_command : asked about each line from the host, with how many came so
-    far and its bytes; the line goes on to the box if it returns True.
+    boot_s : how long the box takes to start. on_command : called with each line from the host, how many came so far and
+    its bytes; the line goes on to the box if it returns True.
     """
 
     def __init__(
         self,
-        engine: Engine,
+        engine: CoreEngine,
         *,
         noise: Noise | None = None,
         boot_s: float = 0.0,
-        on_command: Callable[[SerialLine, int, bytes], bool] = lambda _line, _count, _data: True,
+        on_command: Callable[[Line, int, bytes], bool] = lambda _line, _count, _data: True,
     ) -> None:
         self.engine = engine
         self.noise = noise or Noise()
-        self._boot_s = boot_s
-        self._on_command = on_command
+        self.on_command = on_command
+        self._boot_ns = round(boot_s * 1e9)
+        self._deaf_until_ns = 0
+        self._commands = 0
+        self._rest = b""
+        self._cut = False
+
+    def restart(self) -> None:
+        """The box loses its power for a moment."""
+        self.engine.restart()
+        self._rest = b""
+        self._deaf_until_ns = self.engine.scene.now_ns() + self._boot_ns
+
+    @abstractmethod
+    def _deliver(self, data: bytes) -> None:
+        """Send what comes through to the host."""
+
+    def _take(self, data: bytes) -> None:
+        """Let the box have what the host sent."""
+        if self._is_deaf():
+            return
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            self._commands += 1
+            data = self.noise.through(line + b"\n")
+            if self.on_command(self, self._commands, data):
+                self._send(self.engine.feed(data))
+            if self._cut or self._is_deaf():
+                return
+
+    def _is_deaf(self) -> bool:
+        return self.engine.scene.now_ns() < self._deaf_until_ns
+
+    def _send(self, data: bytes) -> None:
+        for line in data.splitlines(keepends=True):
+            if not self._cut:
+                self._deliver(self.noise.through(line))
+
+
+class MemoryLine(Line):
+    """A line in memory, on a clock of tests. Implements `drivers.serial_port.Port`.
+
+    The box catches up with the clock whenever anybody looks: what was due meanwhile is done at the time when it was.
+    """
+
+    def __init__(self, engine: CoreEngine, clock: VirtualClock, **how: object) -> None:
+        super().__init__(engine, **how)  # type: ignore[arg-type]
+        self._clock = clock
+        self._waiting = b""
+        self._never = threading.Event()
+        self._lock = threading.RLock()
+
+    def opened(self) -> MemoryLine:
+        """The host's end."""
+        if self._cut:
+            message = "asked to open the line, there is none such"
+            raise DeviceGoneError(message)
+        self._waiting = b""
+        return self
+
+    def catch_up(self) -> None:
+        """Let the box do what is due by now."""
+        scene, now_ns = self.engine.scene, self._clock.now_ns()
+        assert scene.at_ns is not None
+        with self._lock:
+            while (due_ns := self._due_ns()) is not None and due_ns <= now_ns:
+                scene.at_ns = due_ns
+                self._send(self.engine.poll())
+            scene.at_ns = max(scene.at_ns, now_ns)
+
+    def cut(self) -> None:
+        """Pull the cable; the box has power of its own."""
+        self._cut = True
+
+    def plug_in(self) -> None:
+        """Plug the cable in again."""
+        self._rest, self._cut = b"", False
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Port`."""
+        until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while True:
+            self.catch_up()
+            self._require_plugged()
+            with self._lock:
+                data, self._waiting = self._waiting, b""
+            if data or self._clock.now_ns() >= until_ns:
+                return data
+            due_ns = self._due_ns()
+            self._clock.wait_until(until_ns if due_ns is None else min(due_ns, until_ns), self._never)
+
+    def write(self, data: bytes) -> None:
+        """See `Port`."""
+        self.catch_up()
+        self._require_plugged()
+        with self._lock:
+            self._take(data)
+
+    def close(self) -> None:
+        """See `Port`."""
+
+    def _due_ns(self) -> int | None:
+        wait_s, at_ns = self.engine.wait_s(), self.engine.scene.at_ns
+        return None if wait_s is None or at_ns is None else at_ns + max(round(wait_s * 1e9), 1000)
+
+    def _deliver(self, data: bytes) -> None:
+        self._waiting += data
+
+    def _require_plugged(self) -> None:
+        if self._cut:
+            message = "asked to use the line, found it gone: it was unplugged"
+            raise DeviceGoneError(message)
+
+
+class SerialLine(Line):
+    """A line on a pseudo-terminal, `path`, in real time; a thread serves the box."""
+
+    def __init__(self, engine: CoreEngine, **how: object) -> None:
+        super().__init__(engine, **how)  # type: ignore[arg-type]
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave)
         self.path = os.ttyname(self._slave)
         self._woken, self._wake = os.pipe()
-        self._deaf_until_s = 0.0
-        self._commands = 0
-        self._rest = b""
-        self._cut = False
         self._asked: list[Callable[[], None]] = []
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._serve, name="trigger box", daemon=True)
         self._thread.start()
 
-    def restart(self) -> None:
-        """The box loses its power for a moment; only from `on_command` or `do`."""
-        self.engine.restart()
-        self._rest = b""
-        self._deaf_until_s = time.monotonic() + self._boot_s
-
     def unplug(self) -> None:
-        """Pull the cable; the box has power of its own. Only from `on_command` or `do`."""
+        """Pull the cable; the box has power of its own. In the box's own thread."""
         if not self._cut:
             self._cut = True
             os.close(self._master)
             os.close(self._slave)
-
-    def plug_in(self) -> None:
-        """Plug the cable in again: `path` is another one. Only from `on_command` or `do`."""
-        if self._cut:
-            self._master, self._slave = pty.openpty()
-            tty.setraw(self._slave)
-            self.path = os.ttyname(self._slave)
-            self._rest, self._cut = b"", False
 
     def do(self, what: Callable[[], None]) -> None:
         """Have something done in the box's own thread, and wait for it."""
@@ -131,7 +232,7 @@ class SerialLine:
 
     def _serve(self) -> None:
         while True:
-            handles = [self._woken, *self.engine.handles(), *([] if self._cut else [self._master])]
+            handles = [self._woken, *([] if self._cut else [self._master])]
             ready, _, _ = select.select(handles, [], [], self.engine.wait_s())
             if self._woken in ready:
                 if not os.read(self._woken, 64):
@@ -145,19 +246,5 @@ class SerialLine:
             if not self._cut and self._master in ready:
                 self._take(os.read(self._master, 4096))
 
-    def _take(self, data: bytes) -> None:
-        if time.monotonic() < self._deaf_until_s:
-            return
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        for line in lines:
-            self._commands += 1
-            data = self.noise.through(line + b"\n")
-            if self._on_command(self, self._commands, data):
-                self._send(self.engine.feed(data))
-            if self._cut or time.monotonic() < self._deaf_until_s:
-                return
-
-    def _send(self, data: bytes) -> None:
-        for line in data.splitlines(keepends=True):
-            if not self._cut:
-                os.write(self._master, self.noise.through(line))
+    def _deliver(self, data: bytes) -> None:
+        os.write(self._master, data)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import importlib
 import sys
 from pathlib import Path
@@ -54,9 +53,7 @@ def test_usb_ports_are_found_by_lasting_names_and_not_opened(ports: Path) -> Non
     assert bridge.device == str(ports / "dev" / "ttyUSB1")
     assert "USB Serial" in bridge.label
     assert "not asked" in bridge.label
-
-
-def test_without_lasting_names_the_ports_own_are_used(ports: Path) -> None:
+    # Without lasting names, the ports' own are used.
     assert [each.device for each in finding.found_ports(ports / "none")] == [
         str(ports / "dev" / "ttyACM0"),
         str(ports / "dev" / "ttyUSB1"),
@@ -67,23 +64,14 @@ def test_what_this_machine_has_can_be_listed() -> None:
     assert all(each.driver == "serial_projector" for each in find_devices())
 
 
-@pytest.mark.parametrize("name", ["/dev/ttyACM0", "COM3", "socket://localhost:4000", "usb-none"])
-def test_names_that_are_no_link_are_left_as_they_are(name: str) -> None:
-    assert resolved(name) == name
+def test_names_that_are_no_link_are_left_as_they_are() -> None:
+    for name in ("/dev/ttyACM0", "COM3", "socket://localhost:4000", "usb-none"):
+        assert resolved(name) == name
 
 
 def test_without_pyserial_the_driver_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *rest: object) -> object:
-        if name.split(".")[0] == "serial":
-            raise ImportError(name)
-        return real(name, *rest)  # type: ignore[arg-type]
-
-    for name in [name for name in sys.modules if name.split(".")[0] == "serial"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "serial", None)
-    monkeypatch.setattr(builtins, "__import__", without)
+    for name in ["serial", *(name for name in sys.modules if name.startswith("serial."))]:
+        monkeypatch.setitem(sys.modules, name, None)
     for call in (find_devices, lambda: open_projector({"port": "/dev/ttyACM0"}, Path())):
         with pytest.raises(LibraryMissingError) as missing:
             call()

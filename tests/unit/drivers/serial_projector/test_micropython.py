@@ -15,10 +15,14 @@ import tests.unit.drivers.serial_projector
 from drivers.serial_projector.device import box, main, protocol, wire
 from drivers.serial_projector.frames import framed
 from drivers.serial_projector.pattern_set import crc32_of_all
+from tests.npm import npm_package
 from tests.unit.drivers.serial_projector import fake_pico
-from tests.unit.drivers.serial_projector.engines import FIRMWARE, micropython_package
 
+pytestmark = pytest.mark.slow
+
+PACKAGE = "@micropython/micropython-webassembly-pyscript@1.27.0"
 HERE = Path(tests.unit.drivers.serial_projector.__path__[0])
+FIRMWARE = Path(main.__file__).parent
 CRC32 = list(range(1000, 1026))
 
 PLAY = """
@@ -80,21 +84,15 @@ print(pico.did)
 
 
 def in_micropython(script: str, folder: Path) -> str:
-    command = ["node", str(HERE / "micropython_run.mjs"), str(micropython_package()), str(folder)]
+    command = ["node", str(HERE / "micropython_run.mjs"), str(npm_package(PACKAGE, "to run MicroPython")), str(folder)]
     done = subprocess.run(command, input=script, capture_output=True, text=True, check=False, timeout=60)  # noqa: S603
     assert done.returncode == 0, done.stderr + done.stdout[-2000:]
     return done.stdout
 
 
 def in_cpython(script: str, monkeypatch: pytest.MonkeyPatch) -> str:
-    for name, module in (
-        ("box", box),
-        ("wire", wire),
-        ("protocol", protocol),
-        ("main", main),
-        ("fake_pico", fake_pico),
-    ):
-        monkeypatch.setitem(sys.modules, name, module)
+    for module in (box, wire, protocol, main, fake_pico):
+        monkeypatch.setitem(sys.modules, module.__name__.rpartition(".")[2], module)
     told = io.StringIO()
     with contextlib.redirect_stdout(told):
         exec(compile(script, "script", "exec"), {})  # noqa: S102 - the script above

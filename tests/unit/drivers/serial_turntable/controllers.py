@@ -1,4 +1,4 @@
-"""Stand-ins for controllers of turntables, on pseudo-terminals: written from the protocols' documents alone.
+"""Stand-ins for controllers of turntables, at the far end of a port in memory: written from the protocols' documents.
 
 `GrblBoard` follows what GRBL 1.1 publishes of its interface and commands: realtime bytes are obeyed as they come, lines
 are answered in order, a status report is made when it is asked for. `LineBoard` follows the docstring of
@@ -7,72 +7,81 @@ drivers.serial_turntable. Motion is counted in reports, or in looks, not in time
 
 from __future__ import annotations
 
-import os
-import pty
-import select
 import threading
-import time
-import tty
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest import mock
 
-
-class SkippingClock:
-    """Time that passes, and jumps where somebody waits. Implements `slrig.devices.Clock`."""
-
-    def __init__(self) -> None:
-        self.skipped_ns = 0
-        self.waits_s: list[float] = []
-        self.on_wait: Callable[[], None] = lambda: None
-
-    def now_ns(self) -> int:
-        return time.monotonic_ns() + self.skipped_ns
-
-    def wait_until(self, t_ns: int, stop: threading.Event) -> None:
-        self.on_wait()
-        if not stop.is_set():
-            left_ns = max(t_ns - self.now_ns(), 0)
-            self.waits_s.append(left_ns / 1e9)
-            self.skipped_ns += left_ns
+from drivers.serial_turntable import open_grbl, open_turntable
+from slrig.devices import Turntable
+from slrig.errors import DeviceGoneError
+from tests.virtual_clock import VirtualClock
 
 
 @dataclass
 class Board(ABC):
-    """What sits at the end of the line; its own thread serves it. `heard` : all lines and realtime bytes."""
+    """What sits at the end of the line. Implements `drivers.serial_port.Port`.
 
+    heard : all lines and realtime bytes.
+    """
+
+    clock: VirtualClock = field(default_factory=VirtualClock, init=False)
     heard: list[str] = field(default_factory=list, init=False)
     silent: bool = field(default=False, init=False)
     on_line: Callable[[str], bytes | None] = field(default_factory=lambda: lambda _line: None, init=False)
-    """Asked first about each line; what it returns is sent instead of an answer."""
+    """Called first with each line; what it returns is sent instead of an answer."""
 
     def __post_init__(self) -> None:
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        self.path = os.ttyname(self._slave)
-        self._woken, self._wake = os.pipe()
-        self._open, self._rest = True, b""
-        self._unplugged = threading.Event()
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
+        self._rest, self._sent = b"", b""
+        self._unplugged, self._never = False, threading.Event()
+
+    def opened(self, **options: Any) -> Turntable:
+        """The driver at the other end of the line, on the board's clock."""
+        factory = open_grbl if isinstance(self, GrblBoard) else open_turntable
+        with mock.patch("drivers.serial_port.SerialPort", return_value=self):
+            return factory({"port": "wire", **options}, Path(), clock=self.clock)
 
     def say(self, data: bytes) -> None:
-        if not self.silent and not self._unplugged.is_set():
-            os.write(self._master, data)
+        if not self.silent and not self._unplugged:
+            self._sent += data
 
     def unplug(self) -> None:
-        """The cable is pulled; in the board's own thread."""
-        self._unplugged.set()
-        os.close(self._master)
-        os.close(self._slave)
+        """The cable is pulled."""
+        self._unplugged = True
 
     def close(self) -> None:
-        os.write(self._wake, b"x")
-        self._thread.join(10)
-        if not self._unplugged.is_set():
-            self.unplug()
-        os.close(self._wake)
-        os.close(self._woken)
+        """See `Port`. The board goes on, and may be opened again."""
+        self._sent = b""
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Port`."""
+        self._require_plugged()
+        if not self._sent:
+            self.clock.wait_until(self.clock.now_ns() + round(timeout_s * 1e9), self._never)
+        data, self._sent = self._sent, b""
+        return data
+
+    def write(self, data: bytes) -> None:
+        """See `Port`."""
+        self._require_plugged()
+        for value in data:
+            byte = bytes([value])
+            if self.realtime(byte):
+                continue
+            self._rest += byte
+            if byte == b"\n":
+                line, self._rest = self._rest.decode("ascii").strip(), b""
+                self.heard.append(line)
+                instead = self.on_line(line)
+                self.say(self.obey(line) if instead is None else instead)
+
+    def _require_plugged(self) -> None:
+        if self._unplugged:
+            message = "the turntable on wire was unplugged"
+            raise DeviceGoneError(message)
 
     def realtime(self, byte: bytes) -> bool:
         """Whether a byte is obeyed at once."""
@@ -82,24 +91,6 @@ class Board(ABC):
     @abstractmethod
     def obey(self, line: str) -> bytes:
         """The answer to a line."""
-
-    def _serve(self) -> None:
-        while not self._unplugged.is_set():
-            ready, _, _ = select.select([self._master, self._woken], [], [])
-            if self._master not in ready:
-                return
-            for value in os.read(self._master, 4096):
-                byte = bytes([value])
-                if self.realtime(byte) or self._unplugged.is_set():
-                    continue
-                self._rest += byte
-                if byte == b"\n":
-                    line, self._rest = self._rest.decode("ascii").strip(), b""
-                    self.heard.append(line)
-                    instead = self.on_line(line)
-                    answer = self.obey(line) if instead is None else instead
-                    if answer:
-                        self.say(answer)
 
 
 @dataclass
@@ -118,7 +109,7 @@ class GrblBoard(Board):
     def __post_init__(self) -> None:
         self.places, self.target, self.left = [0.0] * self.axes, 0.0, 0
         self.state = "Alarm" if self.locked else "Idle"
-        self.moved, self.reports, self.resets = 0, 0, 0
+        self.moved, self.reports = 0, 0
         self.axis, self.start = 0, 0.0
         super().__post_init__()
 
@@ -132,7 +123,6 @@ class GrblBoard(Board):
             if self.deaf:
                 self.deaf -= 1
                 return True
-            self.resets += 1
             self._rest = b""
             if self.left:
                 self.left, self.state = 0, "Alarm"
@@ -151,8 +141,6 @@ class GrblBoard(Board):
     def report(self) -> None:
         self.reports += 1
         instead = self.on_report(self.reports)
-        if self._unplugged.is_set():
-            return
         if self.state in {"Run", "Idle"} and self.left and not self.stuck:
             self.left -= 1
             share = 1 - self.left / self.slow
