@@ -7,6 +7,8 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Collection
+from typing import ClassVar
+from weakref import WeakKeyDictionary
 
 _PATIENCE_S = 5.0
 """How long a thread may take to come to its next wait; one that hangs must not hang the test."""
@@ -19,6 +21,9 @@ class VirtualClock:
     program. They do not make time pass. They sleep until another thread's wait has made it pass, and that wait goes on
     when all of them sleep again or have ended. So what is due first is done first.
     """
+
+    _clocks: ClassVar[WeakKeyDictionary[threading.Thread, VirtualClock]] = WeakKeyDictionary()
+    """The clock by which a thread sleeps: a thread of an earlier test may still end."""
 
     def __init__(self, now_ns: int = 10**12, *, threads: Collection[str] = ()) -> None:
         self._now_ns = now_ns
@@ -51,7 +56,7 @@ class VirtualClock:
     def _sleep(self, t_ns: int, stop: threading.Event) -> None:
         me = threading.current_thread()
         with self._changed:
-            self._due_ns[me] = t_ns
+            self._clocks[me], self._due_ns[me] = self, t_ns
             self._changed.notify_all()
             while me in self._due_ns and not stop.is_set():
                 # The owner of `stop` does not notify this clock.
@@ -77,10 +82,11 @@ class VirtualClock:
 
     def _await_threads(self) -> None:
         """Return when every named thread sleeps or has ended."""
-        until_s = time.monotonic() + _PATIENCE_S
+        until_s, me = time.monotonic() + _PATIENCE_S, threading.current_thread()
         while any(
-            each.name in self._threads and each not in self._due_ns and each is not threading.current_thread()
+            each.name in self._threads and each is not me and each not in self._due_ns
             for each in threading.enumerate()
+            if self._clocks.get(each, self) is self
         ):
             self._changed.wait(0.001)
             assert time.monotonic() < until_s, "a thread next to the test does not come to its next wait"

@@ -12,15 +12,15 @@ from __future__ import annotations
 import errno
 import struct
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from slrig.devices import Clock, SystemClock
 from slrig.model import Pixels
+from tests.contract.dlpc350_device import SEQUENCER, WHITE
 
-WHITE: Pixels = np.full((1, 1), 255, np.uint8)
 _LENGTHS = {0x05: 1, 0x50: 1, 0x52: 1, 0x54: 6, 0x90: 1, 0x92: 5, 0x98: 25, 0x9E: 2, 0xDE: 4, 0xDF: 2, 0xE0: 4}
 _READS = bytes.fromhex("06 51 53 55 5d 91 93 99 9d 9f d0 d1 d2 d3 d4 dd e3 e4")
 _ASKED = {0x93: 1, 0x99: 1, 0x9D: 6, 0xD3: 1, 0xDD: 4}
@@ -46,7 +46,7 @@ class Fake347x:
     light, pulse : told of every change of light (None: dark), and of every edge of TRIG_OUT_2, and when (ns).
     controller : its number. entry_bytes : of an entry, without its control: 23 in firmware of 2019. most_entries : of
     the order. counts_first : a sequence is played as often as it is to be repeated, and not once more. room : in the
-    flash, bytes.
+    flash, bytes. clock : as `FakeEngine` has it.
     """
 
     def __init__(
@@ -59,6 +59,7 @@ class Fake347x:
         most_entries: int = 64,
         counts_first: bool = False,
         room: int = 65536,
+        clock: Clock | None = None,
     ) -> None:
         self.commands: list[tuple[int, bytes]] = []
         self.shown: list[Pixels | None] = []
@@ -73,6 +74,7 @@ class Fake347x:
         self._light, self._pulse = light, pulse
         self._controller, self._entry_bytes, self._most_entries = controller, entry_bytes, most_entries
         self._counts_first = counts_first
+        self._clock = clock or SystemClock()
         self._communication = self._sequence = self._system = 0
         self._short = 0x81 & ~1
         self._length = self._at = 0
@@ -242,9 +244,8 @@ class Fake347x:
             times = data[1] + (0 if self._counts_first else 1)
             steps = [(entry, self._lines(entry)) for entry in map(_unpacked, self.order)]
             self._halt = threading.Event()
-            threading.Thread(
-                target=self._run, args=(self._halt, steps, 2**31 if data[1] == 255 else times), daemon=True
-            ).start()
+            played = (self._halt, steps, 2**31 if data[1] == 255 else times)
+            threading.Thread(target=self._run, args=played, name=SEQUENCER, daemon=True).start()
         else:
             self._refuse(2)
 
@@ -272,7 +273,7 @@ class Fake347x:
 
     def _run(self, halt: threading.Event, steps: list[tuple[_Entry, list[Pixels]]], times: int) -> None:
         # By a clock of its own: a thread that comes late tells of what was, for an engine's times are even.
-        at_ns = time.monotonic_ns()
+        at_ns = self._clock.now_ns()
         for _ in range(times):
             for entry, lines in steps:
                 for line in lines:
@@ -286,13 +287,13 @@ class Fake347x:
                     if not self._change(halt, at_ns, line, 0):
                         return
                     at_ns += entry.after_us * 1000
-        halt.wait((at_ns - time.monotonic_ns()) / 1e9)
+        self._clock.wait_until(at_ns, halt)
         with self._lock:
             if self._halt is halt:
                 self._halt = None
 
     def _change(self, halt: threading.Event, at_ns: int, mirrors: Pixels, leds: int) -> bool:
-        halt.wait(max(at_ns - time.monotonic_ns(), 0) / 1e9)
+        self._clock.wait_until(at_ns, halt)
         with self._lock:
             if halt.is_set():
                 return False
@@ -311,7 +312,7 @@ class Fake347x:
         if lit is not self._lit:
             self._lit = lit
             self.shown.append(lit)
-            self._light(lit, time.monotonic_ns() if at_ns is None else at_ns)
+            self._light(lit, self._clock.now_ns() if at_ns is None else at_ns)
 
 
 def _unpacked(data: bytes) -> _Entry:

@@ -12,20 +12,23 @@ import os
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.devices import Clock, SystemClock
 from slrig.model import Pixels
 
 REPORT = 64
 WHITE: Pixels = np.full((1, 1), 255, np.uint8)
+SEQUENCER = "fake engine"
+"""The name of the thread on which a fake engine plays."""
 
 _SETTINGS = {
     0x0B01: 3,
@@ -72,8 +75,8 @@ class FakeEngine:
     keeps
         Whether a start takes it from the buffer where it is still there. TI's documents say that a sequence repeats
         from there without a load (DLPU011, "Pattern Sequence Background"), and do not say it of another start.
-    command_s
-        How long each command takes.
+    clock
+        The one that its sequencer runs by, on a thread `SEQUENCER`.
     led_inverted
         Whether light falls as the registers of the currents rise; None: it is full unless all of them are 255.
     """
@@ -88,8 +91,8 @@ class FakeEngine:
         load_s: float = 0.0,
         standby: bool = False,
         keeps: bool = False,
-        command_s: float = 0.0,
         led_inverted: bool | None = None,
+        clock: Clock | None = None,
     ) -> None:
         self.faults = Faults()
         self.commands: list[tuple[int, bytes]] = []
@@ -104,9 +107,9 @@ class FakeEngine:
         }
         self._planes = {index: _planes(picture) for index, picture in pictures.items()}
         self._light, self._pulse, self._load_s = light, pulse, load_s
-        self._keeps, self._command_s, self._led_inverted = keeps, command_s, led_inverted
+        self._keeps, self._led_inverted = keeps, led_inverted
+        self._clock = clock or SystemClock()
         self._buffered: list[int] = []
-        self._never = threading.Event()
         self._mailboxes = {1: bytearray(64), 2: bytearray(128 * 3)}
         self._mirrors: Pixels | None = WHITE
         self._lit: Pixels | None = None
@@ -115,7 +118,6 @@ class FakeEngine:
         self._busy = 0
         self._pending: tuple[bytearray, int] | None = None
         self._halt: threading.Event | None = None
-        self._sequencer: threading.Thread | None = None
         self._lock = threading.RLock()
         self._relight()
 
@@ -147,8 +149,6 @@ class FakeEngine:
         flags, sequence = message[0], message[1]
         command = int.from_bytes(message[4:6], "little")
         data = bytes(message[6:length])
-        if self._command_s:
-            self._never.wait(self._command_s)
         with self._lock:
             self.commands.append((command, data)) if not flags & 0x80 else None
             if command in self.faults.silent:
@@ -209,8 +209,7 @@ class FakeEngine:
             self._stop()
         elif data == b"\2" and self._validated == 0 and self.registers[0x1A1B] == b"\1" and not self.running:
             self._halt = threading.Event()
-            self._sequencer = threading.Thread(target=self._run, args=(self._halt,), daemon=True)
-            self._sequencer.start()
+            threading.Thread(target=self._run, args=(self._halt,), name=SEQUENCER, daemon=True).start()
         else:
             return None
         return b""
@@ -247,24 +246,24 @@ class FakeEngine:
         exposure_us, period_us = struct.unpack("<II", self.registers[0x1A29])
         swaps = -1
         # Two pictures are loaded beforehand, of more than two only the first one.
-        loaded_ns = time.monotonic_ns() + round(self._load_s * 1e9 * min(len(images), 2))
+        loaded_ns = self._clock.now_ns() + round(self._load_s * 1e9 * min(len(images), 2))
         kept = self._keeps and self._buffered == images
         self._buffered = images
-        if halt.wait(0.0 if kept else self._load_s):
+        if self._halted(halt, 0.0 if kept else self._load_s):
             return
         for entry in entries:
             if entry >> 18 & 1:
                 swaps += 1
                 if len(images) > 2 and swaps > 0:
-                    if time.monotonic_ns() < loaded_ns:
+                    if self._clock.now_ns() < loaded_ns:
                         self._hardware |= 8
                         swaps -= 1
-                    loaded_ns = time.monotonic_ns() + round(self._load_s * 1e9)
+                    loaded_ns = self._clock.now_ns() + round(self._load_s * 1e9)
             if not self._step(halt, self._planes[images[swaps]], entry, exposure_us / 1e6):
                 return
             if entry >> 17 & 1 and not self._change(halt, None):
                 return
-            if halt.wait((period_us - exposure_us) / 1e6):
+            if self._halted(halt, (period_us - exposure_us) / 1e6):
                 return
         with self._lock:
             if self._halt is halt:
@@ -275,8 +274,13 @@ class FakeEngine:
         shown = 255 - plane if entry >> 16 & 1 else plane
         if not self._change(halt, shown if entry >> 12 & 7 else None):
             return False
-        self._pulse(time.monotonic_ns())
-        return not halt.wait(exposure_s)
+        self._pulse(self._clock.now_ns())
+        return not self._halted(halt, exposure_s)
+
+    def _halted(self, halt: threading.Event, seconds: float) -> bool:
+        """Let time pass, from now on: a thread that comes late must not hurry, for an engine's periods are even."""
+        self._clock.wait_until(self._clock.now_ns() + round(seconds * 1e9), halt)
+        return halt.is_set()
 
     def _change(self, halt: threading.Event, mirrors: Pixels | None) -> bool:
         with self._lock:
@@ -305,6 +309,7 @@ class FakeEngine:
             self._light(lit)
 
 
+@lru_cache(maxsize=8)
 def _planes(picture: bytes) -> tuple[Pixels, ...]:
     """The 24 planes of a BMP file: green's bits, red's, blue's, each from the least significant one."""
     pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)

@@ -12,15 +12,15 @@ from __future__ import annotations
 
 import struct
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.devices import Clock
 from slrig.model import Pixels, Size
-from tests.contract.dlpc350_device import FakeEngine, profile_of, repeated
+from tests.contract.dlpc350_device import SEQUENCER, FakeEngine, profile_of, repeated
 
 _SETTINGS = {0x0B01: 3, 0x1008: 1, 0x1009: 1, 0x1A05: 1, 0x1A1D: 5, 0x1A30: 1}
 _ANY_TIME = {0x0200: 1, 0x1A07: 1}
@@ -56,10 +56,10 @@ class Fake900(FakeEngine):
         mirrors: int = 1,
         version: tuple[int, int] = (6, 1),
         standby: bool = False,
-        command_s: float = 0.0,
         led_inverted: bool | None = None,
+        clock: Clock | None = None,
     ) -> None:
-        super().__init__({}, light=light, pulse=pulse, standby=standby, command_s=command_s, led_inverted=led_inverted)
+        super().__init__({}, light=light, pulse=pulse, standby=standby, led_inverted=led_inverted, clock=clock)
         for command, length in (_SETTINGS | _ANY_TIME).items():
             self.registers.setdefault(command, bytes(length))
         self.registers |= {0x1A1D: bytes(5), 0x1A1B: b"\1"}
@@ -212,7 +212,7 @@ class Fake900(FakeEngine):
         for step in steps:
             self._profile(step)
         self._halt = threading.Event()
-        threading.Thread(target=self._show, args=(self._halt, steps, shown), daemon=True).start()
+        threading.Thread(target=self._show, args=(self._halt, steps, shown), name=SEQUENCER, daemon=True).start()
         return b""
 
     def _show(self, halt: threading.Event, steps: list[_Entry], shown: int) -> None:
@@ -222,16 +222,15 @@ class Fake900(FakeEngine):
             if not self._change(halt, self._profile(entry) if entry.leds else None):
                 return
             if not triggered:
-                self._pulse(time.monotonic_ns())
+                self._pulse(self._clock.now_ns())
             triggered = True
-            # A thread that comes late must not hurry afterwards: an engine's periods are even.
-            if halt.wait(entry.exposure_us / 1e6):
+            if self._halted(halt, entry.exposure_us / 1e6):
                 return
             if entry.cleared and entry.dark_us:
                 triggered = False
                 if not self._change(halt, None):
                     return
-            if halt.wait(entry.dark_us / 1e6):
+            if self._halted(halt, entry.dark_us / 1e6):
                 return
         with self._lock:
             if self._halt is halt:

@@ -62,17 +62,19 @@ def test_light_covers_the_exposure_and_the_camera_s_start(
     assert lit(exposure_s, period_s, margin_s=margin_s, duty_limit=1.0) == expected
 
 
-def test_light_that_does_not_fit_is_refused() -> None:
-    with pytest.raises(UnsupportedByDeviceError, match="light takes 10500 µs, the period is 10400 µs"):
-        lit(0.010, 0.0104, margin_s=0.0005, duty_limit=1.0)
-    with pytest.raises(UnsupportedByDeviceError, match="lengthen the period"):
-        lit(0.0, 0.01, margin_s=0.0, duty_limit=1.0)
-
-
-def test_the_duty_limit_is_held() -> None:
-    with pytest.raises(UnsupportedByDeviceError, match=r"light is on for 50% of the time, duty_limit .* 40%"):
-        lit(0.010, 0.020, margin_s=0.0, duty_limit=0.4)
-    assert lit(0.010, 0.025, margin_s=0.0, duty_limit=0.4) == Timing(10_000, 25_000)
+@pytest.mark.parametrize(
+    ("exposure_s", "period_s", "margin_s", "duty_limit", "rule"),
+    [
+        (0.010, 0.0104, 0.0005, 1.0, "light takes 10500 µs, the period is 10400 µs"),
+        (0.0, 0.01, 0.0, 1.0, "lengthen the period"),
+        (0.010, 0.020, 0.0, 0.4, r"light is on for 50% of the time, duty_limit .* 40%"),
+    ],
+)
+def test_light_that_does_not_fit_is_refused(
+    exposure_s: float, period_s: float, margin_s: float, duty_limit: float, rule: str
+) -> None:
+    with pytest.raises(UnsupportedByDeviceError, match=rule):
+        lit(exposure_s, period_s, margin_s=margin_s, duty_limit=duty_limit)
 
 
 def test_pictures_beyond_the_buffers_need_time() -> None:
@@ -82,44 +84,56 @@ def test_pictures_beyond_the_buffers_need_time() -> None:
         check_loading((24, 12, 1), 10_000, 0.2)
 
 
-def test_table_entries_are_laid_out_as_the_manual_says() -> None:
-    places = (Place(3, 0, inverted=False), Place(3, 23, inverted=True), Place(3, 9, inverted=False))
-    tables = tables_of(places, (Colour.WHITE,) * len(places), dark_between=True)
-    words = [int.from_bytes(tables.patterns[3 * i : 3 * i + 3], "little") for i in range(3)]
-    assert words == [
-        0b0110_0111_0001_000000_00,
-        0b0011_0111_0001_010111_00,
-        0b0010_0111_0001_001001_00,
-    ]
-    assert (tables.images, tables.counts, tables.length) == (b"\3", (3,), 3)
-
-
-def test_colour_and_a_pattern_without_dark_between() -> None:
-    tables = tables_of((Place(0, 1, inverted=False),), (Colour.BLUE,), dark_between=False)
-    assert int.from_bytes(tables.patterns, "little") == 0b0100_0100_0001_000001_00
-
-
-def test_white_in_one_light_is_lit_by_that_led_alone() -> None:
-    options = EngineOptions(patterns="p")
-    colours = [options.colour_of(pattern) for pattern in (White(), Primary("green"), Primary("blue"))]
-    tables = tables_of([Place(0, 1, inverted=False)] * 3, colours, dark_between=False)
-    words = [int.from_bytes(tables.patterns[3 * i : 3 * i + 3], "little") for i in range(3)]
-    assert [word >> 12 & 7 for word in words] == [0b111, 0b010, 0b100]
-
-
-def test_each_change_of_picture_swaps_the_buffer() -> None:
-    places = [Place(image, 0, inverted=False) for image in (5, 5, 2, 5)]
-    tables = tables_of(places, (Colour.RED,) * len(places), dark_between=False)
-    assert [tables.patterns[3 * i + 2] >> 2 & 1 for i in range(4)] == [1, 0, 1, 1]
-    assert (tables.images, tables.counts) == (bytes([5, 2, 5]), (2, 1, 1))
-
-
-def test_a_table_of_two_pictures_is_sent_the_other_way_round() -> None:
+@pytest.mark.parametrize(
+    ("places", "colours", "dark_between", "words"),
+    [
+        (
+            [(3, 0, False), (3, 23, True), (3, 9, False)],
+            [Colour.WHITE] * 3,
+            True,
+            [0b0110_0111_0001_000000_00, 0b0011_0111_0001_010111_00, 0b0010_0111_0001_001001_00],
+        ),
+        ([(0, 1, False)], [Colour.BLUE], False, [0b0100_0100_0001_000001_00]),
+        # White in one light is lit by that LED alone.
+        (
+            [(0, 1, False)] * 3,
+            [
+                EngineOptions(patterns="p").colour_of(pattern)
+                for pattern in (White(), Primary("green"), Primary("blue"))
+            ],
+            False,
+            [0b0100_0111_0001_000001_00, 0b0000_0010_0001_000001_00, 0b0000_0100_0001_000001_00],
+        ),
+    ],
+    ids=["dark between", "no dark between", "colours"],
+)
+def test_table_entries_are_laid_out_as_the_manual_says(
+    places: list[tuple[int, int, bool]], colours: list[Colour], dark_between: bool, words: list[int]
+) -> None:
     tables = tables_of(
-        [Place(7, 0, inverted=False), Place(4, 0, inverted=False)], (Colour.RED, Colour.RED), dark_between=False
+        [Place(image, plane, inverted=inverted) for image, plane, inverted in places],
+        colours,
+        dark_between=dark_between,
     )
-    assert tables.images == bytes([4, 7])
-    assert tables.counts == (1, 1)
+    assert [int.from_bytes(tables.patterns[3 * i : 3 * i + 3], "little") for i in range(len(places))] == words
+
+
+@pytest.mark.parametrize(
+    ("pictures", "swaps", "images", "counts"),
+    [
+        ([3, 3, 3], [1, 0, 0], [3], (3,)),
+        ([5, 5, 2, 5], [1, 0, 1, 1], [5, 2, 5], (2, 1, 1)),
+        # A table of two pictures is sent the other way round.
+        ([7, 4], [1, 1], [4, 7], (1, 1)),
+    ],
+)
+def test_each_change_of_picture_swaps_the_buffer(
+    pictures: list[int], swaps: list[int], images: list[int], counts: tuple[int, ...]
+) -> None:
+    places = [Place(picture, 0, inverted=False) for picture in pictures]
+    tables = tables_of(places, (Colour.RED,) * len(places), dark_between=False)
+    assert [tables.patterns[3 * i + 2] >> 2 & 1 for i in range(len(places))] == swaps
+    assert (list(tables.images), tables.counts, tables.length) == (images, counts, len(places))
 
 
 def test_all_faults_of_the_options_are_told_at_once() -> None:

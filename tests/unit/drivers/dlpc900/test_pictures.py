@@ -10,7 +10,7 @@ from drivers.pattern_engine.planes import plane_of
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, PatternSequence, Size, White
 from slrig.patterns.sequence import encode
-from tests.contract.dlpc900_bench import MIRRORS, sequence
+from tests.contract.dlpc900_bench import sequence
 from tests.contract.dlpc900_device import unpacked
 
 
@@ -33,7 +33,7 @@ def test_long_runs_take_two_bytes() -> None:
     assert content[48:58] == bytes.fromhex("b4 24 789abc 00 01 b4 24 00")
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_picture_comes_out_as_it_went_in(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = Size(300 + seed, 7)
@@ -46,7 +46,7 @@ def test_any_picture_comes_out_as_it_went_in(seed: int) -> None:
 
 
 def test_patterns_lie_where_the_table_says_each_once() -> None:
-    shown = sequence(rows=True)
+    shown = sequence(Size(480, 270), rows=True)
     memory = memory_of(shown)
     for index in range(len(shown)):
         place = memory.places[index]
@@ -54,16 +54,16 @@ def test_patterns_lie_where_the_table_says_each_once() -> None:
     dark = memory.places[-1]
     assert not (memory.pictures[dark.picture] >> np.uint32(dark.plane) & 1).any()
     assert len(set(memory.places)) == len({profile.tobytes() for profile in shown.profiles})
-    # What 24 patterns take over USB. Mixed directions in one picture would take hundreds of kB.
-    assert max(len(packed(picture)) for picture in memory.pictures) < 20_000
+    # What 24 patterns take over USB. Mixed directions in one picture would take far more.
+    assert max(len(packed(picture)) for picture in memory.pictures) < 5_000
 
 
 def test_more_than_the_engine_holds_is_refused() -> None:
-    one = encode((White(),), MIRRORS)
-    with pytest.raises(UnsupportedByDeviceError, match=r"400 patterns .* takes 399 in 18"):
-        memory_of(PatternSequence(MIRRORS, one.patterns * 400, one.profiles * 400))
-    memory_of(PatternSequence(MIRRORS, one.patterns * 399, one.profiles * 399))
-    lines = tuple(LineShift(Axis.COLUMN, shift, 500) for shift in range(24 * MOST_PICTURES))
     small = Size(500, 2)
+    one = encode((White(),), small)
+    with pytest.raises(UnsupportedByDeviceError, match=r"400 patterns .* takes 399 in 18"):
+        memory_of(PatternSequence(small, one.patterns * 400, one.profiles * 400))
+    memory_of(PatternSequence(small, one.patterns * 399, one.profiles * 399))
+    lines = tuple(LineShift(Axis.COLUMN, shift, 500) for shift in range(24 * MOST_PICTURES))
     with pytest.raises(UnsupportedByDeviceError, match="in 19 pictures"):
         memory_of(encode((*lines, Black()), small))

@@ -9,6 +9,7 @@ import pytest
 
 from drivers import dlpc350, dlpc900
 from drivers.dlpc350.projector import DLPC350
+from drivers.dlpc900.projector import DLPC900
 from drivers.pattern_engine.finding import engines, found_devices, resolved
 from slrig.errors import ConfigError, DeviceGoneError, WrongSystemError
 
@@ -59,10 +60,17 @@ def test_the_engine_that_is_meant(tmp_path: Path) -> None:
     assert resolved("B", engines(DLPC350, tmp_path)).path == Path("/dev/hidraw1")
 
 
-def test_none_is_no_error_for_the_finder(tmp_path: Path) -> None:
+def test_the_first_interface_of_an_engine_is_found(tmp_path: Path) -> None:
+    for number, port in enumerate(("usb-1/input1", "usb-1/input0")):
+        plug(tmp_path, number, hid="0003:00000451:0000C900", serial="LCR3", port=port)
+    assert [(node.name, str(node.path)) for node in engines(DLPC900, tmp_path)] == [("LCR3", "/dev/hidraw1")]
+
+
+def test_none_is_no_error_for_the_finder_and_one_for_a_rig(tmp_path: Path) -> None:
     assert engines(DLPC350, tmp_path / "none") == ()
+    assert dlpc900.find_devices() == ()
     with pytest.raises(DeviceGoneError, match="asked for a light engine, plugged in: none"):
-        resolved(None, ())
+        dlpc900.open_projector({}, tmp_path)
 
 
 def test_other_systems_have_no_hidraw(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -40,38 +40,34 @@ def linked(engine: FakeEngine, *, answer_s: float = 5.0) -> Link:
     return Link(Cable(engine).host, "light engine", DLPC350, answer_s=answer_s)
 
 
+def answered(number: int, data: bytes, *, flags: int = 0xC0) -> bytes:
+    """An answer's reports, one after the other."""
+    message = bytes([flags, number]) + len(data).to_bytes(2, "little") + data
+    return message.ljust(-(-len(message) // 64) * 64, b"\0")
+
+
 def test_a_command_is_framed_as_the_manual_says() -> None:
+    long = bytes(range(200))
     with wired() as (link, far):
-        far.send(bytes([0x40, 1, 0, 0]).ljust(64, b"\0"))
+        far.send(answered(1, b"", flags=0x40))
         # What lay there before the link was opened would be forgotten; this came after.
         link.write(0x1A24, b"\2")
-        sent = far.recv(100)
-        assert sent == bytes([0, 0x40, 1, 3, 0, 0x24, 0x1A, 2]).ljust(65, b"\0")
-        far.send(bytes([0xC0, 2, 1, 0, 0x42]).ljust(64, b"\0"))
+        assert far.recv(100) == bytes([0, 0x40, 1, 3, 0, 0x24, 0x1A, 2]).ljust(65, b"\0")
+        far.send(answered(2, b"\x42"))
         assert link.read(0x1A0C, 1) == b"\x42"
         assert far.recv(100) == bytes([0, 0xC0, 2, 2, 0, 0x0C, 0x1A]).ljust(65, b"\0")
-
-
-def test_what_is_longer_than_a_report_goes_on_in_the_next_one() -> None:
-    data = bytes(range(200))
-    with wired() as (link, far):
-        far.send(bytes([0x40, 1, 0, 0]).ljust(64, b"\0"))
-        link.write(0x1A34, data)
+        # What is longer than a report goes on in the next one, both ways.
+        far.send(answered(3, b"", flags=0x40))
+        link.write(0x1A34, long)
         reports = [far.recv(100) for _ in range(4)]
         assert all(len(report) == 65 and report[0] == 0 for report in reports)
         together = b"".join(report[1:] for report in reports)
-        assert together[:6] == bytes([0x40, 1, 202, 0, 0x34, 0x1A])
-        assert together[6:206] == data
-        assert not any(together[206:])
-
-
-def test_a_long_answer_is_put_together() -> None:
-    data = bytes(range(100))
-    message = (bytes([0xC0, 1]) + len(data).to_bytes(2, "little") + data).ljust(128, b"\0")
-    with wired() as (link, far):
-        far.send(message[:64])
-        far.send(message[64:])
-        assert link.read(0x1A34, 100) == data
+        assert together == (bytes([0x40, 3, 202, 0, 0x34, 0x1A]) + long).ljust(256, b"\0")
+        for at in (0, 64):
+            far.send(answered(4, long[:100])[at : at + 64])
+        assert link.read(0x1A34, 100) == long[:100]
+        with pytest.raises(DeviceError, match="asked to send 507 bytes at once, it takes 506"):
+            link.write(0x1A34, bytes(507))
 
 
 def test_an_answer_to_an_earlier_command_is_passed_over(engine: FakeEngine) -> None:
@@ -85,70 +81,58 @@ def test_an_answer_to_an_earlier_command_is_passed_over(engine: FakeEngine) -> N
 def test_what_another_program_left_unread_is_forgotten() -> None:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with far:
-        far.send(bytes([0xC0, 1, 1, 0, 7]).ljust(64, b"\0"))
+        far.send(answered(1, b"\7"))
         link = Link(near.detach(), "light engine", DLPC350, answer_s=SHORT_S)
         with pytest.raises(DeviceError, match="did not answer"):
             link.read(0x1A0C, 1)
         link.close()
 
 
-def test_a_refusal_is_told(engine: FakeEngine) -> None:
+def test_a_refusal_and_a_silent_engine_are_told_and_it_may_come_back(engine: FakeEngine) -> None:
     engine.faults.refused.add(0x1A24)
+    engine.faults.silent.add(0x1A0C)
     link = linked(engine)
     with pytest.raises(DeviceError, match="refused the command 0x1a24"):
         link.write(0x1A24, b"\2")
-    assert link.read(0x1A0A, 1) == b"\1"
-    link.close()
-
-
-def test_a_silent_engine_is_given_up_and_may_come_back(engine: FakeEngine) -> None:
-    engine.faults.silent.add(0x1A0C)
-    link = linked(engine, answer_s=SHORT_S)
+    link._answer_s = SHORT_S
     with pytest.raises(DeviceError, match=r"did not answer the command 0x1a0c in 0\.05 s"):
         link.read(0x1A0C, 1)
     engine.faults.silent.clear()
+    link._answer_s = 5.0
     assert link.read(0x1A0C, 1) == b"\0"
     link.close()
 
 
 def test_an_answer_that_is_too_short_is_refused() -> None:
     with wired() as (link, far):
-        far.send(bytes([0xC0, 1, 1, 0, 7]).ljust(64, b"\0"))
+        far.send(answered(1, b"\7"))
         with pytest.raises(DeviceError, match="asked for 8 bytes of 0x1a29, it gave 1"):
             link.read(0x1A29, 8)
 
 
-def test_an_unplugged_engine_is_gone() -> None:
+def test_an_unplugged_engine_is_gone_and_a_closed_link_is_closed() -> None:
     with wired() as (link, far):
         far.close()
         for _ in range(2):
             with pytest.raises(DeviceGoneError, match="is gone"):
                 link.read(0x1A0C, 1)
-
-
-def test_more_than_the_engine_takes_is_not_sent() -> None:
-    with wired() as (link, _), pytest.raises(DeviceError, match="asked to send 507 bytes at once, it takes 506"):
-        link.write(0x1A34, bytes(507))
-
-
-def test_a_closed_link_is_closed() -> None:
-    with wired() as (link, _):
-        link.close()
-        link.close()
+        for _ in range(2):
+            link.close()
         with pytest.raises(DeviceStateError):
             link.write(0x1A24, b"\0")
 
 
-def test_a_node_that_is_not_there_is_gone(tmp_path: Path) -> None:
-    with pytest.raises(DeviceGoneError, match="No such file"):
-        open_link(tmp_path / "hidraw7", DLPC350)
-
-
-def test_a_node_that_is_no_engine_is_gone(tmp_path: Path) -> None:
+def test_a_node_that_is_not_there_or_no_engine_is_gone_and_a_held_one_is_busy(tmp_path: Path) -> None:
     path = tmp_path / "hidraw0"
+    with pytest.raises(DeviceGoneError, match="No such file"):
+        open_link(path, DLPC350)
     path.write_bytes(b"")
     with pytest.raises(DeviceGoneError, match="no hidraw node"):
         open_link(path, DLPC350)
+    with path.open("wb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(DeviceBusyError, match="another program holds it"):
+            open_link(path, DLPC350)
 
 
 @pytest.mark.parametrize(("vendor", "product"), [(0x0451, 0x6401), (0x046D, 0xC077)])
@@ -167,14 +151,6 @@ def test_a_number_that_was_given_to_another_device_is_noticed(
         open_link(path, DLPC350).close()
     else:
         with pytest.raises(DeviceGoneError, match="found 046d:c077"):
-            open_link(path, DLPC350)
-
-
-def test_a_node_that_another_program_holds_is_busy(tmp_path: Path) -> None:
-    path = tmp_path / "hidraw0"
-    with path.open("wb") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(DeviceBusyError, match="another program holds it"):
             open_link(path, DLPC350)
 
 

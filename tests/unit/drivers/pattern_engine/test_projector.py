@@ -1,34 +1,34 @@
-"""What every pattern engine's driver promises, above peers that speak their protocols and are as unhelpful as allowed.
+"""What the drivers of all pattern engines do alike, above peers that speak their protocols and are as unhelpful as
+allowed.
 
-What only one of them has (flash, tables, uploads) is tested beside it: `tests.unit.drivers.dlpc350`, `dlpc900`.
+What every projector promises is in the contract suite. What only one engine has (flash, tables, uploads) is tested in
+`tests.unit.drivers.dlpc347x`, `dlpc350` and `dlpc900`.
 """
 
 from __future__ import annotations
 
-import os
 import struct
 import threading
-import time
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
+from itertools import pairwise
+from typing import Any
 
 import pytest
 
 from slrig.devices import UnprovenLight
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
-from slrig.model import Size, White
-from slrig.patterns.sequence import encode
+from slrig.model import Size
 from tests.contract.dlpc350_device import WHITE
-from tests.unit.drivers.pattern_engine.engine_bench import BENCHES, LEDS, START_STOP, Bench
+from tests.unit.drivers.pattern_engine.engine_bench import BENCHES, LEDS, START_STOP, Bench, UsbBench
 
 MakesBench = Callable[..., Bench]
+USB = pytest.mark.parametrize("made", ["dlpc350", "dlpc900"], indirect=True)
 
 
 @pytest.fixture(params=BENCHES)
-def made(request: pytest.FixtureRequest, tmp_path: Path) -> MakesBench:
+def made(request: pytest.FixtureRequest) -> MakesBench:
     """Makes a bench of each kind; its arguments are the fake engine's."""
-    return partial(BENCHES[request.param], tmp_path)
+    return BENCHES[request.param]
 
 
 @pytest.fixture
@@ -36,65 +36,71 @@ def bench(made: MakesBench) -> Bench:
     return made()
 
 
+@pytest.fixture
+def usb_bench(made: MakesBench) -> UsbBench:
+    bench = made()
+    assert isinstance(bench, UsbBench)
+    return bench
+
+
 @pytest.mark.parametrize(
-    ("made", "size", "mode"),
+    ("made", "size", "registers"),
     [
-        # From the flash, triggered internally.
-        ("dlpc350", Size(912, 1140), {0x1A1B: 1, 0x1A22: 3, 0x1A23: 1}),
-        ("dlpc900", Size(1920, 1080), {0x1A1B: 3}),
+        # Patterns from the flash that wait for no trigger.
+        ("dlpc347x", Size(1280, 720), {0x05: 4, 0x90: 0, 0x50: 0}),
+        # From the flash, triggered internally; neither mirrored nor inverted.
+        ("dlpc350", Size(912, 1140), {0x1A1B: 1, 0x1A22: 3, 0x1A23: 1, 0x1008: 0, 0x1009: 0, 0x1A30: 0}),
+        ("dlpc900", Size(1920, 1080), {0x1A1B: 3, 0x1008: 0, 0x1009: 0, 0x1A30: 0}),
     ],
     indirect=["made"],
 )
-def test_an_engine_that_shines_is_dark_once_it_is_open(bench: Bench, size: Size, mode: dict[int, int]) -> None:
+def test_an_engine_that_shines_is_dark_once_it_is_open(made: MakesBench, size: Size, registers: dict[int, int]) -> None:
+    bench = made(flashed=None) if size == Size(1280, 720) else made()
     assert bench.engine.shown == [WHITE]
     projector = bench.open()
     assert bench.engine.shown[-1] is None
-    assert bench.engine.commands[0] == (LEDS, b"\0"), "the first thing that it was told"
-    # Neither mirrored nor inverted, and in pattern mode.
-    wanted = {0x1008: 0, 0x1009: 0, 0x1A30: 0, **mode}
-    assert {key: bench.engine.registers[key][0] for key in wanted} == wanted
-    assert (projector.info.size, projector.info.plays, projector.info.serial) == (size, True, "1")
+    assert bench.engine.commands[0] == bench.leds[:2], "the first thing that it was told"
+    assert {key: bench.engine.registers[key][0] for key in registers} == registers
+    assert (projector.info.size, projector.info.plays) == (size, True)
     projector.close()
 
 
 def test_each_pattern_is_shown_as_it_is(bench: Bench) -> None:
-    projector = bench.open()
-    projector.load(bench.sequence)
+    projector = bench.loaded()
     for index in (0, 2, 1, 0):
-        before_ns = time.monotonic_ns()
+        before_ns = bench.clock.now_ns()
         shown = projector.show(index)
         assert before_ns <= shown.t_visible_ns - shown.t_err_ns
-        assert shown.t_visible_ns + shown.t_err_ns <= time.monotonic_ns()
+        assert shown.t_visible_ns + shown.t_err_ns <= bench.clock.now_ns()
         assert bench.shows(bench.sequence.profiles[index])
     projector.close()
     assert bench.engine.lit is None
 
 
 def test_a_sequence_is_played_once_with_a_pulse_each(bench: Bench) -> None:
-    projector = bench.open(light_margin_s=0.002)
-    projector.load(bench.sequence)
-    bench.engine.shown.clear()
-    projector.play(0.01, 0.03)
-    assert bench.played.wait(5)
-    assert not threading.Event().wait(0.1), "time for a pulse too many"
-    projector.stop()
-    assert len(bench.pulses) == 3
-    assert [b - a > 25e6 for a, b in zip(bench.pulses, bench.pulses[1:], strict=False)] == [True, True]
-    profiles = [shown for shown in bench.engine.shown if shown is not None and shown is not WHITE]
-    assert [profile.tobytes() for profile in profiles] == [profile.tobytes() for profile in bench.sequence.profiles]
+    projector = bench.loaded(light_margin_s=0.002)
+    projector.play(0.003, 0.01)
+    bench.clock.advance(5)
     assert bench.engine.lit is None
+    assert [late - early for early, late in pairwise(bench.pulses)] == [10_000_000] * 2
+    shown = [shown.tobytes() for shown in bench.engine.shown if shown is not None and shown is not WHITE]
+    assert shown == [profile.tobytes() for profile in bench.sequence.profiles]
+    projector.stop()
     # What was shown before is played with its own times again.
     projector.show(0)
-    bench.played.clear()
     bench.pulses.clear()
-    projector.play(0.01, 0.03)
-    assert bench.played.wait(5)
+    projector.play(0.003, 0.01)
+    bench.clock.advance(5)
+    assert [late - early for early, late in pairwise(bench.pulses)] == [10_000_000] * 2
     projector.close()
 
 
 @pytest.mark.parametrize(
     ("made", "exposure_s", "period_s", "options", "rule"),
     [
+        ("dlpc347x", 0.01, 0.02, {}, "asked for 11000 µs of blue light, the engine has none; .* cameras by software"),
+        ("dlpc347x", 0.005, 0.006, {}, "the dark after it 202 µs, the period is 6000 µs; lengthen the period"),
+        ("dlpc347x", 0.005, 0.01, {"duty_limit": 0.5}, "duty_limit of the rig file allows 50%"),
         ("dlpc350", 0.01, 0.005, {}, "lengthen the period"),
         ("dlpc350", 0.01, 0.02, {"duty_limit": 0.3}, "duty_limit"),
         ("dlpc350", 150.0, 300.0, {}, "the longest is"),
@@ -109,48 +115,121 @@ def test_a_sequence_is_played_once_with_a_pulse_each(bench: Bench) -> None:
 def test_a_timing_against_the_rules_never_reaches_the_engine(
     bench: Bench, exposure_s: float, period_s: float, options: dict[str, object], rule: str
 ) -> None:
-    projector = bench.open(**options)
-    projector.load(bench.sequence)
-    bench.commands()
+    projector = bench.loaded(**options)
     with pytest.raises(UnsupportedByDeviceError, match=rule):
         projector.play(exposure_s, period_s)
     assert bench.commands() == []
     projector.close()
 
 
-def test_calls_in_the_wrong_state_or_of_the_wrong_size_are_refused(bench: Bench) -> None:
-    projector = bench.open()
-    uses: tuple[Callable[[], object], ...] = (lambda: projector.show(0), lambda: projector.play(0.01, 0.02))
+def test_an_unplugged_engine_is_gone_and_can_be_closed(bench: Bench) -> None:
+    projector = bench.loaded()
+    projector.show(0)
+    bench.unplug()
+    uses: tuple[Callable[[], object], ...] = (
+        lambda: projector.show(2),
+        lambda: projector.play(0.003, 0.01),
+        lambda: projector.load(bench.sequence),
+        projector.blank,
+    )
     for use in uses:
-        with pytest.raises(DeviceStateError, match="call load first"):
+        with pytest.raises(DeviceGoneError):
             use()
-    own = bench.sequence.projector
-    for size in (Size(1280, 800), Size(own.width_px, own.height_px + 1)):
-        with pytest.raises(UnsupportedByDeviceError, match=f"encode it for {own}"):
-            projector.load(encode((White(),), size))
-    projector.load(bench.sequence)
-    for index in (-1, 3):
-        with pytest.raises(UnsupportedByDeviceError, match="patterns 0 to 2"):
-            projector.show(index)
+    projector.close()
     projector.close()
     projector.blank()
-    projector.stop()
+    with pytest.raises(DeviceStateError, match="closed"):
+        projector.show(0)
+
+
+# How long a pattern is held.
+
+
+def test_a_pattern_is_held_for_as_long_as_asked_and_goes_dark_by_itself(bench: Bench) -> None:
+    projector = bench.loaded(hold_s=3.0)
+    shown = projector.show(0)
+    bench.clock.advance(2.9)
+    assert bench.shows(bench.sequence.profiles[0])
+    bench.clock.advance(2.1)
+    assert bench.engine.lit is None
+    assert bench.clock.now_ns() - shown.t_visible_ns < 5.1e9
     projector.close()
-    for use in (*uses, lambda: projector.load(bench.sequence)):
-        with pytest.raises(DeviceStateError, match="closed"):
-            use()
 
 
+def test_two_seconds_after_its_host_has_died_it_is_dark(bench: Bench) -> None:
+    projector = bench.loaded(hold_s=60.0)
+    projector.show(0)
+    bench.clock.advance(10)
+    assert bench.shows(bench.sequence.profiles[0]), "held by its host"
+    bench.died(projector)
+    bench.clock.advance(2)
+    assert bench.engine.lit is None
+    leds, _, by_sequence = bench.leds
+    assert bench.engine.registers[leds] == by_sequence, "it went dark by itself"
+
+
+@pytest.mark.parametrize("call", ["blank", "stop", "load", "close"])
+def test_what_is_dark_is_not_started_again(bench: Bench, call: str) -> None:
+    projector = bench.loaded()
+    projector.show(0)
+    calls: dict[str, Callable[[], object]] = {
+        "blank": projector.blank,
+        "stop": projector.stop,
+        "load": lambda: projector.load(bench.sequence),
+        "close": projector.close,
+    }
+    calls[call]()
+    bench.commands()
+    bench.clock.advance(10)
+    assert bench.commands() == []
+    assert bench.engine.lit is None
+    projector.close()
+
+
+def test_closing_from_another_thread_ends_a_wait_for_light(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    projector = bench.loaded()
+    wait_until, owner = bench.clock.wait_until, threading.current_thread()
+
+    def closed_meanwhile(t_ns: int, stop: threading.Event) -> None:
+        if threading.current_thread() is owner:
+            projector.close()
+        wait_until(t_ns, stop)
+
+    monkeypatch.setattr(bench.clock, "wait_until", closed_meanwhile)
+    with pytest.raises(DeviceStateError):
+        projector.show(2)
+    assert bench.engine.lit is None
+
+
+# Engines with a USB port.
+
+
+@USB
+def test_one_way_to_go_dark_is_enough_and_the_other_is_told(usb_bench: UsbBench) -> None:
+    projector = usb_bench.loaded()
+    projector.show(0)
+    usb_bench.engine.faults.refused.add(START_STOP)
+    with pytest.raises(DeviceError, match="refused the command 0x1a24"):
+        projector.blank()
+    assert usb_bench.engine.lit is None
+    projector.close()
+
+
+@USB
 @pytest.mark.parametrize(
-    ("option", "polarity", "sent"),
+    ("inverted", "polarity", "sent"),
     [(True, 0, [204, 255, 255]), (False, 0, [51, 0, 0]), (True, 1, [51, 0, 0]), (False, 1, [204, 255, 255])],
 )
 def test_the_led_current_is_set_in_the_sense_of_the_board(
-    bench: Bench, option: bool, polarity: int, sent: list[int]
+    usb_bench: UsbBench, inverted: bool, polarity: int, sent: list[int]
 ) -> None:
-    bench.engine.registers[0x1A05] = bytes([polarity])
-    bench.open(led="red", led_current=0.2, led_current_inverted=option).close()
-    assert list(bench.engine.registers[0x0B01]) == sent
+    usb_bench.engine.registers[0x1A05] = bytes([polarity])
+    usb_bench.open(led="red", led_current=0.2, led_current_inverted=inverted).close()
+    assert list(usb_bench.engine.registers[0x0B01]) == sent
+    # What it says to write into the rig file, once the doctor knows which way light goes.
+    projector = usb_bench.open(led_current_inverted=None)
+    assert projector.option_for(rises=inverted is bool(polarity)) == f"led_current_inverted = {str(inverted).lower()}"
+    projector.close()
 
 
 @pytest.mark.parametrize(
@@ -166,69 +245,54 @@ def test_the_led_current_is_set_in_the_sense_of_the_board(
     ],
     indirect=["made"],
 )
-def test_the_trigger_output_is_set(bench: Bench, options: dict[str, object], sent: bytes) -> None:
-    bench.open(**options).close()
-    assert bench.engine.registers[0x1A1D] == sent
+def test_the_trigger_output_is_set(usb_bench: UsbBench, options: dict[str, Any], sent: bytes) -> None:
+    usb_bench.open(**options).close()
+    assert usb_bench.engine.registers[0x1A1D] == sent
+
+
+@USB
+@pytest.mark.parametrize(
+    ("command", "got", "words"),
+    [
+        (0x0B01, bytes(3), r"asked for led current .. .. .., the engine gives 00 00 00"),
+        (0x1A1B, b"\0", r"asked for display mode 0., the engine gives 00"),
+        (0x1008, b"\1", "asked for flip long 00, the engine gives 01"),
+    ],
+)
+def test_a_setting_that_the_engine_bends_is_refused_and_it_is_dark(
+    usb_bench: UsbBench, command: int, got: bytes, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.dlpc900.projector.MODE_S", 0.02)
+    usb_bench.engine.registers[0x0B01] = b"\1\1\1"
+    usb_bench.engine.faults.bent = {command: got}
+    with pytest.raises(UnsupportedByDeviceError, match=words):
+        usb_bench.open()
+    assert usb_bench.engine.lit is None
 
 
 @pytest.mark.parametrize(
-    ("made", "command", "got", "words"),
-    [
-        ("dlpc350", 0x0B01, bytes(3), "asked for led current b3 b3 b3, the engine gives 00 00 00"),
-        ("dlpc350", 0x1A1B, b"\0", "asked for display mode 01, the engine gives 00"),
-        ("dlpc350", 0x1008, b"\1", "asked for flip long 00, the engine gives 01"),
-        ("dlpc900", 0x0B01, bytes(3), "asked for led current"),
-        ("dlpc900", 0x1A1B, b"\1", "asked for display mode 03, the engine gives 01"),
-        ("dlpc900", 0x1008, b"\1", "asked for flip long 00, the engine gives 01"),
-    ],
-    indirect=["made"],
+    ("made", "standby"), [("dlpc350", True), ("dlpc350", False), ("dlpc900", False)], indirect=["made"]
 )
-def test_a_setting_that_the_engine_bends_is_refused_and_it_is_dark(
-    bench: Bench, command: int, got: bytes, words: str
-) -> None:
-    bench.engine.faults.bent = {command: got}
-    with pytest.raises(UnsupportedByDeviceError, match=words):
-        bench.open()
-    assert bench.engine.lit is None
-
-
-def test_one_way_to_go_dark_is_enough_and_the_other_is_told(bench: Bench) -> None:
-    projector = bench.open()
-    projector.load(bench.sequence)
+def test_an_engine_in_standby_is_woken_and_may_be_sent_back(made: MakesBench, standby: bool) -> None:
+    bench = made(standby=True)
+    options = {"standby": True} if standby else {}
+    projector = bench.loaded(**options)
+    assert bench.engine.registers[0x0200] == b"\0"
     projector.show(0)
-    bench.engine.faults.refused.add(START_STOP)
-    with pytest.raises(DeviceError, match="refused the command 0x1a24"):
-        projector.blank()
+    projector.close()
+    assert bench.engine.registers[0x0200] == bytes([standby])
     assert bench.engine.lit is None
-    projector.close()
-
-
-@pytest.mark.parametrize("used", ["show", "play", "load", "blank", "show load blank"])
-def test_an_unplugged_engine_is_gone_and_can_be_closed(bench: Bench, used: str) -> None:
-    projector = bench.open()
-    projector.load(bench.sequence)
-    projector.show(0)
-    bench.cable.unplug()
-    uses: dict[str, Callable[[], object]] = {
-        "show": lambda: projector.show(2),
-        "play": lambda: projector.play(0.01, 0.02),
-        "load": lambda: projector.load(bench.sequence),
-        "blank": projector.blank,
-    }
-    for use in used.split():
-        with pytest.raises(DeviceGoneError, match="is gone"):
-            uses[use]()
-    projector.close()
-    projector.close()
-    projector.blank()
+    assert LEDS in bench.commands()
 
 
 # Which way the LEDs' current goes.
 
 
+@USB
 @pytest.mark.parametrize("inverted", [True, False])
 def test_until_the_sense_of_the_current_is_known_light_is_a_twentieth(made: MakesBench, inverted: bool) -> None:
     bench = made(led_inverted=inverted)
+    assert isinstance(bench, UsbBench)
     projector = bench.open(led_current_inverted=None, led_current=0.5)
     assert isinstance(projector, UnprovenLight)
     assert (projector.unproven, projector.info.plays) == (True, False)
@@ -243,8 +307,8 @@ def test_until_the_sense_of_the_current_is_known_light_is_a_twentieth(made: Make
         projector.show(0)
         exposure_us, period_us, periods = bench.held_us()
         assert periods * period_us <= 2_000_000
-        while not (lit := [each for each in bench.engine.shown if each is not None]):
-            os.sched_yield()
+        bench.clock.advance(0.1)
+        lit = next(each for each in bench.engine.shown if each is not None)
         most[share] = int(lit[0].max()) / 255
         assert most[share] * exposure_us / period_us <= 0.0501
     assert (most[0.6] > most[0.4]) is not inverted
@@ -256,16 +320,9 @@ def test_until_the_sense_of_the_current_is_known_light_is_a_twentieth(made: Make
     projector.close()
 
 
-@pytest.mark.parametrize(("turned", "rises", "option"), [(1, True, "true"), (1, False, "false"), (0, False, "true")])
-def test_the_polarity_register_turns_what_is_to_be_written(bench: Bench, turned: int, rises: bool, option: str) -> None:
-    bench.engine.registers[0x1A05] = bytes([turned])
-    projector = bench.open(led_current_inverted=None)
-    assert projector.option_for(rises=rises) == f"led_current_inverted = {option}"
-    projector.close()
-
-
-def test_a_current_whose_sense_is_known_is_not_tried(bench: Bench) -> None:
-    projector = bench.open()
+@USB
+def test_a_current_whose_sense_is_known_is_not_tried(usb_bench: UsbBench) -> None:
+    projector = usb_bench.open()
     assert not projector.unproven
     with pytest.raises(UnsupportedByDeviceError, match="asked to try"):
         projector.try_current(0.5)
