@@ -1,17 +1,46 @@
-"""Cameras that break the contract, each in one way, as drivers in the field do."""
+"""Drivers that break the contract, each in one way, as drivers in the field do: cameras, and then projectors.
+
+Each says which checks find it, and some words of what they say.
+"""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Trigger
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Shown, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError
-from slrig.model import CameraFormat, Frame, Size
-from tests.unit.conformance.model_rig import READ_OUT_NS, Exposure, ModelCamera
+from slrig.model import CameraFormat, Frame, PatternSequence, Pixels, Size
+from tests.unit.conformance.model_rig import (
+    ERROR_NS,
+    LATENCY_NS,
+    READ_OUT_NS,
+    Exposure,
+    ModelCamera,
+    ModelProjector,
+    World,
+    sequence,
+)
+
+Device = type[ModelCamera] | type[ModelProjector]
+DeviceT = TypeVar("DeviceT", bound=Device)
+
+BROKEN: list[tuple[Device, str, str]] = []
+"""A broken driver, the check that finds it, and words of the failure."""
+
+
+def breaks(check: str, words: str = "no error") -> Callable[[DeviceT], DeviceT]:
+    """Note what a driver breaks; "no error" is of a call that should have been refused."""
+
+    def noted(device: DeviceT) -> DeviceT:
+        BROKEN.append((device, check, words))
+        return device
+
+    return noted
 
 
 class RunsFreely(ModelCamera):
@@ -20,6 +49,8 @@ class RunsFreely(ModelCamera):
     triggers = frozenset({Trigger.FREE})
 
 
+@breaks("read_passes_over_stale_frames", "ms before")
+@breaks("stale_frames_never_come_back")
 class DeliversStale(ModelCamera):
     """Ignores how early a frame may begin."""
 
@@ -27,12 +58,14 @@ class DeliversStale(ModelCamera):
         return super().read(min(after_ns, 0), timeout_s)
 
 
+@breaks("read_passes_over_stale_frames", "free trigger")
 class DeliversStaleFreely(DeliversStale):
     """As above, running freely: what waits in the driver's buffers comes first."""
 
     triggers = RunsFreely.triggers
 
 
+@breaks("a_frame_lies_wholly_in_its_pattern", "of white's light")
 class FlushesOneFrame(RunsFreely):
     """Throws one frame away, and believes that the next one is new."""
 
@@ -44,6 +77,7 @@ class FlushesOneFrame(RunsFreely):
         return replace(frame, t_start_ns=frame.t_start_ns + late_ns, t_end_ns=frame.t_end_ns + late_ns)
 
 
+@breaks("stale_frames_never_come_back")
 class BringsBack(ModelCamera):
     """Keeps what it has passed over for the next read."""
 
@@ -56,6 +90,7 @@ class BringsBack(ModelCamera):
             raise
 
 
+@breaks("read_times_out_in_time")
 class NeverGivesUp(ModelCamera):
     """Returns its last frame once more where there is no other."""
 
@@ -80,6 +115,7 @@ class Hangs(ModelCamera):
         return super().read(after_ns, timeout_s)
 
 
+@breaks("trigger_and_read_need_an_armed_camera")
 class TriggersUnarmed(ModelCamera):
     """Ignores a trigger in the wrong state."""
 
@@ -88,6 +124,7 @@ class TriggersUnarmed(ModelCamera):
             super().trigger()
 
 
+@breaks("a_free_running_camera_needs_no_trigger")
 class TriggersWhileFree(ModelCamera):
     """Ignores a trigger that it does not need."""
 
@@ -96,6 +133,7 @@ class TriggersWhileFree(ModelCamera):
             super().trigger()
 
 
+@breaks("a_wire_without_pulses_gives_no_frame")
 class FiresWithoutPulse(ModelCamera):
     """Runs freely while it is armed for wire triggers."""
 
@@ -105,6 +143,7 @@ class FiresWithoutPulse(ModelCamera):
         return super().next_exposure(deadline_ns)
 
 
+@breaks("triggers_that_are_not_declared_are_refused")
 class ArmsAnyTrigger(ModelCamera):
     """Arms for what it does not declare."""
 
@@ -114,6 +153,7 @@ class ArmsAnyTrigger(ModelCamera):
         super().arm(count, Trigger.SOFTWARE if count > 0 else trigger)
 
 
+@breaks("triggers_that_are_not_declared_are_refused")
 class ArmsForNothing(ModelCamera):
     """Arms for no frames."""
 
@@ -121,6 +161,7 @@ class ArmsForNothing(ModelCamera):
         super().arm(max(count, 1), trigger)
 
 
+@breaks("arming_again_starts_afresh")
 class KeepsOldFrames(ModelCamera):
     """Does not throw away what waits, neither in disarm nor in arm."""
 
@@ -135,12 +176,14 @@ class KeepsOldFrames(ModelCamera):
         self.pending.extend(waiting)
 
 
+@breaks("arming_again_starts_afresh", "of white's light")
 class KeepsOldFramesFreely(KeepsOldFrames):
     """As above, running freely."""
 
     triggers = RunsFreely.triggers
 
 
+@breaks("an_armed_camera_refuses_to_be_set_or_armed")
 class SetWhileArmed(ModelCamera):
     """Takes settings while it is armed."""
 
@@ -151,6 +194,7 @@ class SetWhileArmed(ModelCamera):
         return applied
 
 
+@breaks("settings_out_of_range_are_refused")
 class TakesAnything(ModelCamera):
     """Takes every setting, and bends it into range."""
 
@@ -165,6 +209,7 @@ class TakesAnything(ModelCamera):
         return super().configure(CameraSettings(exposure_s, gain))
 
 
+@breaks("settings_out_of_range_are_refused", "0.0001 s")
 class RefusesTooLate(ModelCamera):
     """Refuses a setting once the device has it."""
 
@@ -178,6 +223,7 @@ class RefusesTooLate(ModelCamera):
             raise
 
 
+@breaks("settings_are_read_back", "0.02 s")
 class StepsCoarsely(ModelCamera):
     """Takes whole hundredths of a second, and does not say so."""
 
@@ -187,6 +233,7 @@ class StepsCoarsely(ModelCamera):
         return self.applied
 
 
+@breaks("a_longer_exposure_is_brighter", "DN above black")
 class ExposesAutomatically(ModelCamera):
     """Says that it uses what was set, and exposes as it sees fit."""
 
@@ -197,6 +244,7 @@ class ExposesAutomatically(ModelCamera):
         return replace(frame, exposure_s=said.exposure_s, gain=said.gain)
 
 
+@breaks("info_is_readable_in_every_state", "DeviceStateError")
 class ForgetsItself(ModelCamera):
     """Asks the device for its data, and has none after close."""
 
@@ -206,6 +254,7 @@ class ForgetsItself(ModelCamera):
         return super().info
 
 
+@breaks("declared_ranges_are_sound", "inf")
 class DeclaresNoLimit(ModelCamera):
     """Does not know its longest exposure."""
 
@@ -214,6 +263,7 @@ class DeclaresNoLimit(ModelCamera):
         return replace(super().info, exposure_range_s=(0.0, float("inf")))
 
 
+@breaks("frames_are_as_declared", "no sample is above 1023")
 class DeclaresTenBits(ModelCamera):
     """Sends samples of 16 bits, aligned to the left."""
 
@@ -227,6 +277,7 @@ class DeclaresTenBits(ModelCamera):
         return replace(frame, image=frame.image.astype(np.uint16) * np.uint16(256))
 
 
+@breaks("devices_implement_the_protocols", "'camera0'")
 class HasAnotherName(ModelCamera):
     """Calls itself as it likes."""
 
@@ -235,6 +286,7 @@ class HasAnotherName(ModelCamera):
         return replace(super().info, name="camera0")
 
 
+@breaks("nothing_works_after_close")
 class IgnoresClose(ModelCamera):
     """Goes on after close."""
 
@@ -242,6 +294,7 @@ class IgnoresClose(ModelCamera):
         self.disarm()
 
 
+@breaks("close_may_be_called_twice", "DeviceStateError")
 class ClosesOnce(ModelCamera):
     """Cannot be closed again."""
 
@@ -250,18 +303,7 @@ class ClosesOnce(ModelCamera):
         super().close()
 
 
-def delivering(change: Callable[[Frame], Frame]) -> type[ModelCamera]:
-    """A camera that does this to every frame."""
-
-    class Delivers(ModelCamera):
-        """Delivers frames that are not as they should be."""
-
-        def frame(self, exposure: Exposure) -> Frame:
-            return change(super().frame(exposure))
-
-    return Delivers
-
-
+@breaks("a_frame_keeps_its_pixels", "pixels changed")
 class ReusesItsBuffer(ModelCamera):
     """Hands out the same memory with every frame."""
 
@@ -275,6 +317,7 @@ class ReusesItsBuffer(ModelCamera):
         return replace(frame, image=self.buffer)
 
 
+@breaks("frames_come_in_colour_where_it_is_declared", "by 0.0, 0.0, 0.0 DN")
 class ColoursItsBuffer(ReusesItsBuffer):
     """Makes colour of the memory that the next frames are written to."""
 
@@ -283,6 +326,7 @@ class ColoursItsBuffer(ReusesItsBuffer):
         return replace(frame, image=frame.image.copy(), colour=lambda: np.dstack([frame.image] * 3))
 
 
+@breaks("frames_are_as_declared", "(80, 110)")
 class DeclaresAnotherSize(ModelCamera):
     """Declares what its data sheet says, and sends what its mode gives."""
 
@@ -291,6 +335,7 @@ class DeclaresAnotherSize(ModelCamera):
         return replace(super().info, format=CameraFormat(Size(1920, 1080), 8))
 
 
+@breaks("a_played_sequence_gives_every_frame_in_order", "pulses make")
 class MissesAPulse(ModelCamera):
     """Is still reading out when a pulse comes, now and then."""
 
@@ -302,3 +347,141 @@ class MissesAPulse(ModelCamera):
             super().pulsed(at_ns)
         elif self.armed is Trigger.HARDWARE:
             self.made += 1
+
+
+@breaks("every_end_of_a_capture_is_dark_and_leaves_the_rig_usable", "dark after")
+@breaks("the_projector_is_dark_unless_it_shows", "after blank")
+class StaysLit(ModelProjector):
+    """Does not go dark."""
+
+    def blank(self) -> None:
+        """Do nothing."""
+
+
+@breaks("the_projector_is_dark_unless_it_shows", "after load")
+class StaysLitWhileLoading(ModelProjector):
+    """Goes on showing the old sequence when it is given a new one."""
+
+    def load(self, sequence: PatternSequence) -> None:
+        changes = list(self.world.changes)
+        super().load(sequence)
+        self.world.changes = changes
+
+
+@breaks("the_projector_is_dark_after_opening_and_close", "after close")
+class StaysLitAfterClose(ModelProjector):
+    """Is let go while it shines."""
+
+    def close(self) -> None:
+        self.loaded, self.closed = None, True
+
+
+@breaks("the_projector_is_dark_after_opening_and_close", "after opening")
+class ShinesFromTheStart(ModelProjector):
+    """Shows its logo."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__(world)
+        world.change(0, sequence().profiles[0])
+
+
+@breaks("a_frame_lies_wholly_in_its_pattern", "of white's light")
+class LightsLate(ModelProjector):
+    """A display that is slower than its driver believes."""
+
+    def show(self, index: int) -> Shown:
+        profile = self.profile(index)
+        at_ns = self.world.at_ns + LATENCY_NS
+        self.world.change(at_ns + 40_000_000, profile)
+        self.world.at_ns = at_ns + ERROR_NS
+        return Shown(index, at_ns, ERROR_NS)
+
+
+@breaks("show_tells_which_pattern_is_lit_since_when", "ms after the return")
+class ReturnsEarly(ModelProjector):
+    """Returns from show a second before there is light, and declares less latency."""
+
+    def show(self, index: int) -> Shown:
+        shown = super().show(index)
+        return replace(shown, t_visible_ns=shown.t_visible_ns + 10**9)
+
+
+@breaks("show_tells_which_pattern_is_lit_since_when", "index=1")
+class TellsTheNextPattern(ModelProjector):
+    """Counts from 1."""
+
+    def show(self, index: int) -> Shown:
+        shown = super().show(index)
+        return Shown(index + 1, shown.t_visible_ns, shown.t_err_ns)
+
+
+@breaks("show_needs_a_loaded_sequence")
+class ShowsWithoutSequence(ModelProjector):
+    """Shows nothing where nothing is loaded, and does not say so."""
+
+    def show(self, index: int) -> Shown:
+        if self.loaded is None and not self.closed:
+            return Shown(index, self.world.at_ns, 0)
+        return super().show(index)
+
+
+@breaks("show_needs_a_loaded_sequence")
+class CountsFromTheEnd(ModelProjector):
+    """Takes index -1 for the last pattern, as lists do."""
+
+    def profile(self, index: int) -> Pixels:
+        return super().profile(index % len(self.loaded) if self.loaded is not None else index)
+
+
+@breaks("a_sequence_of_another_size_is_refused")
+class ScalesPatterns(ModelProjector):
+    """Takes sequences for any size."""
+
+    def load(self, sequence: PatternSequence) -> None:
+        super().load(PatternSequence(self.info.size, sequence.patterns, sequence.profiles))
+
+
+@breaks("a_projector_plays_only_if_it_says_so")
+class PlaysSilently(ModelProjector):
+    """Does as if it could play."""
+
+    plays = False
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        self.require()
+        assert exposure_s < period_s
+
+
+@breaks("a_projector_plays_only_if_it_says_so")
+class PlaysUnloaded(ModelProjector):
+    """Plays nothing where nothing is loaded."""
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        if self.loaded is not None or self.closed:
+            super().play(exposure_s, period_s)
+
+
+@breaks("a_played_sequence_gives_every_frame_in_order")
+class PulsesOnceMore(ModelProjector):
+    """Makes a pulse when it is ready, and so one more than there are patterns."""
+
+    def pulse(self, index: int, at_ns: int) -> None:
+        super().pulse(index, at_ns)
+        if self.loaded is not None and index + 1 == len(self.loaded):
+            super().pulse(index, at_ns + 1)
+
+
+@breaks("a_play_can_be_stopped", "frames")
+class PlaysOn(ModelProjector):
+    """Does not end a sequence that it plays."""
+
+    def stop(self) -> None:
+        self.blank()
+
+
+@breaks("a_whole_sequence_is_proven", "pattern")
+class SwapsPatterns(ModelProjector):
+    """Has two patterns in each other's place."""
+
+    def profile(self, index: int) -> Pixels:
+        return super().profile({6: 8, 8: 6}.get(index, index))
