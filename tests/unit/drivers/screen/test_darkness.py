@@ -1,4 +1,7 @@
-"""Dark: after opening, after every end, while nobody answers, and when the process is killed. The desktop is white."""
+"""Dark when the process is killed, its thread hangs or its guard is killed. The desktop is white.
+
+Dark after opening and after every end: `tests.contract.test_screen`.
+"""
 
 from __future__ import annotations
 
@@ -72,37 +75,6 @@ def is_black(pixels: OutputPixels) -> bool:
     return not pixels.colours().any()
 
 
-def test_dark_after_opening_and_after_every_end_while_the_desktop_shines(right: OutputPixels) -> None:
-    assert is_white(right)
-    projector = opened()
-    assert is_black(right)
-    ends: list[Callable[[], None]] = [projector.blank, projector.stop, lambda: projector.load(sequence(SIZE))]
-    for end in ends:
-        lit(projector)
-        assert is_white(right)
-        end()
-        assert is_black(right)
-    lit(projector).close()
-    assert is_black(right)
-    again = lit(opened())
-    assert is_white(right)
-    again.close()
-    assert is_black(right)
-    guarding.release(None, RIGHT)
-    assert until(lambda: is_white(right)) < FAR_S
-
-
-def test_nothing_is_shown_on_the_other_output(server: DummyServer, right: OutputPixels) -> None:
-    left = OutputPixels(server.display, (0, 0), SIZE)
-    projector = lit(opened())
-    projector.show(BLACK)
-    assert is_black(right)
-    assert is_white(left)
-    projector.close()
-    assert is_white(left)
-    left.close()
-
-
 def started(backend: str, dark_after_s: float, pattern: int = WHITE) -> subprocess.Popen[str]:
     child = subprocess.Popen(  # noqa: S603 - our own program
         [sys.executable, "-c", PROGRAM, backend, str(dark_after_s), str(pattern)],
@@ -115,8 +87,10 @@ def started(backend: str, dark_after_s: float, pattern: int = WHITE) -> subproce
     return child
 
 
-@pytest.mark.parametrize("backend", ["x11", "sdl"])
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    ("backend", "number"),
+    [("x11", signal.SIGKILL), ("x11", signal.SIGTERM), ("x11", signal.SIGINT), ("sdl", signal.SIGKILL)],
+)
 def test_dark_when_the_process_is_killed_and_never_lit_by_what_is_below(
     right: OutputPixels, backend: str, number: int
 ) -> None:

@@ -1,18 +1,22 @@
-"""Every reason to refuse an output, found in its description, with the command that mends it."""
+"""All that needs no X server: options, and every reason to refuse an output, with the command that mends it."""
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.display.edid import Edid
+from drivers.screen import open_projector, power
 from drivers.screen.connection import XScreen
+from drivers.screen.options import ScreenOptions
 from drivers.screen.randr import IDENTITY, UPRIGHT, Mode, Output, Picture
 from drivers.screen.refusals import chosen, require_exact, require_true_colour
-from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
+from slrig.errors import ConfigError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
 
 NATIVE = Mode(1, Size(1280, 800), 1 / 60)
@@ -25,135 +29,95 @@ DESKTOP = Output(
 )
 
 
-def refused(output: Output, *others: Output, native: Size | None = None, monitor: str | None = None) -> str:
-    with pytest.raises(UnsupportedByDeviceError) as caught:
-        require_exact(output, (output, *others), native=native, monitor=monitor)
-    return str(caught.value)
-
-
 def shown(**changes: Any) -> Output:
     return replace(OUTPUT, picture=replace(PICTURE, **changes))
 
 
-def test_an_exact_output_is_taken() -> None:
-    assert require_exact(OUTPUT, (DESKTOP, OUTPUT), native=None, monitor="PJ 720") is PICTURE
-    assert require_exact(OUTPUT, (DESKTOP, OUTPUT), native=NATIVE.size, monitor="EPS PJ 720") is PICTURE
+def ctm(*values: int) -> Output:
+    return replace(OUTPUT, properties={"CTM": values})
 
 
-def test_a_mode_that_the_projector_scales_is_refused() -> None:
-    said = refused(shown(mode=DESK, size=DESK.size))
-    assert "its mode is 1920 x 1080 at 60.00 Hz, the projector's own raster is 1280 x 800 (its EDID)" in said
-    assert "xrandr --output HDMI-1 --mode 1280x800" in said
-
-
-def test_the_data_sheet_counts_more_than_the_edid() -> None:
-    said = refused(OUTPUT, native=Size(854, 480))
-    assert "raster is 854 x 480 (the rig file's native_px)" in said
-    assert "--mode 854x480" in said
-
-
-def test_a_raster_that_nobody_tells_is_asked_for() -> None:
-    assert "write native_px = [width, height]" in refused(replace(OUTPUT, preferred=()))
-
-
-def test_an_interlaced_mode_is_refused() -> None:
-    assert "every other row is late" in refused(shown(mode=replace(NATIVE, interlaced=True)))
-
-
-def test_a_mode_without_a_rate_is_refused() -> None:
-    assert "does not tell the time of a frame" in refused(shown(mode=replace(NATIVE, refresh_s=None)))
+OFF = replace(OUTPUT, picture=None)
+BENT = (65535 * np.linspace(0, 1, 256) ** 0.9).astype(np.uint16)
+SHARED = "eDP-1 shows the same part of the screen; xrandr --output HDMI-1 --right-of eDP-1"
 
 
 @pytest.mark.parametrize(
-    ("rotation", "words"), [(2, "turned left"), (4, "turned upside down"), (1 | 16, "mirrored in x"), (8 | 32, "in y")]
-)
-def test_a_turned_or_mirrored_picture_is_refused(rotation: int, words: str) -> None:
-    said = refused(shown(rotation=rotation))
-    assert words in said
-    assert "--rotate normal --reflect normal" in said
-
-
-def test_a_transformed_picture_is_refused() -> None:
-    said = refused(shown(transform=(98304, 0, 0, 0, 98304, 0, 0, 0, 65536), size=Size(1920, 1200)))
-    assert "[1.5, 0, 0; 0, 1.5, 0; 0, 0, 1]" in said
-    assert "--transform none --scale 1x1" in said
-
-
-def test_a_panned_picture_is_refused() -> None:
-    said = refused(shown(panning=(1920, 0, 2560, 1600), size=Size(2560, 1600)), DESKTOP)
-    assert "--panning 1280x800+1920+0" in said
-    assert said.count("xrandr") == 1
-
-
-@pytest.mark.parametrize("power", [1 / 2.2, 0.9, 1.1])
-def test_a_gamma_ramp_is_refused(power: float) -> None:
-    bent = (65535 * np.linspace(0, 1, 256) ** power).astype(np.uint16)
-    said = refused(shown(gamma=np.stack([RAMP[0], RAMP[1], bent])))
-    assert "gamma ramp" in said
-    assert "xrandr --output HDMI-1 --gamma 1:1:1 --brightness 1" in said
-
-
-@pytest.mark.parametrize("entries", [256, 1024])
-def test_the_servers_own_ramps_are_straight(entries: int) -> None:
-    coarse = (np.arange(entries) * (65536 // entries)).astype(np.uint16)
-    output = shown(gamma=np.tile(coarse, (3, 1)))
-    assert require_exact(output, (), native=None, monitor=None) is output.picture
-
-
-def test_no_ramp_at_all_is_no_fault() -> None:
-    output = shown(gamma=np.zeros((3, 0), np.uint16))
-    assert require_exact(output, (), native=None, monitor=None) is output.picture
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "words"),
+    ("output", "wanted", "words"),
     [
-        ("Broadcast RGB", "Limited 16:235", '--set "Broadcast RGB" "Full"'),
-        ("underscan", "on", "--set underscan off"),
-        ("CTM", (0, 1, 0, 0, 0, 0, 0, 0, 0x80000000, 0, 0, 0, 0, 0, 0, 0, 0, 1), "--set CTM 0,1,0,0,0,0,0,0,0,1"),
+        (
+            shown(mode=DESK, size=DESK.size),
+            {},
+            (
+                "its mode is 1920 x 1080 at 60.00 Hz, the projector's own raster is 1280 x 800 (its EDID)",
+                "xrandr --output HDMI-1 --mode 1280x800",
+            ),
+        ),
+        # The data sheet counts more than the EDID.
+        (OUTPUT, {"native": Size(854, 480)}, ("raster is 854 x 480 (the rig file's native_px)", "--mode 854x480")),
+        (replace(OUTPUT, preferred=()), {}, ("write native_px = [width, height]",)),
+        (shown(mode=replace(NATIVE, interlaced=True)), {}, ("every other row is late",)),
+        (shown(mode=replace(NATIVE, refresh_s=None)), {}, ("does not tell the time of a frame",)),
+        (shown(rotation=2), {}, ("turned left", "--rotate normal --reflect normal")),
+        (shown(rotation=4), {}, ("turned upside down",)),
+        (shown(rotation=1 | 16), {}, ("mirrored in x",)),
+        (shown(rotation=8 | 32), {}, ("in y",)),
+        (
+            shown(transform=(98304, 0, 0, 0, 98304, 0, 0, 0, 65536), size=Size(1920, 1200)),
+            {},
+            ("[1.5, 0, 0; 0, 1.5, 0; 0, 0, 1]", "--transform none --scale 1x1"),
+        ),
+        (shown(panning=(1920, 0, 2560, 1600), size=Size(2560, 1600)), {}, ("--panning 1280x800+1920+0",)),
+        (
+            shown(gamma=np.stack([RAMP[0], RAMP[1], BENT])),
+            {},
+            ("gamma ramp", "xrandr --output HDMI-1 --gamma 1:1:1 --brightness 1"),
+        ),
+        (
+            replace(OUTPUT, properties={"Broadcast RGB": "Limited 16:235"}),
+            {},
+            ('--set "Broadcast RGB" "Full"',),
+        ),
+        (replace(OUTPUT, properties={"underscan": "on"}), {}, ("--set underscan off",)),
+        (
+            ctm(0, 1, 0, 0, 0, 0, 0, 0, 0x80000000, 0, 0, 0, 0, 0, 0, 0, 0, 1),
+            {},
+            ("--set CTM 0,1,0,0,0,0,0,0,0,1",),
+        ),
+        (shown(x=0, size=DESK.size), {}, (SHARED,)),
+        (shown(outputs=("HDMI-1", "eDP-1")), {}, ("eDP-1 shows the same",)),
+        (OFF, {}, ("it is switched off; xrandr --output HDMI-1 --preferred --right-of eDP-1",)),
+        (OFF, {"native": Size(854, 480)}, ("--mode 854x480 --right-of eDP-1",)),
+        (OUTPUT, {"monitor": "BNQ TH585"}, ("'BNQ TH585' is connected, found 'EPS PJ 720'",)),
+        # All faults come together.
+        (shown(mode=DESK, size=DESK.size, rotation=2, gamma=RAMP // 2), {}, ("raster", "turned left", "gamma")),
     ],
 )
-def test_properties_of_the_graphics_driver_that_change_levels_are_refused(
-    name: str, value: str | tuple[int, ...], words: str
+def test_what_would_change_a_picture_is_refused_with_the_command_that_mends_it(
+    output: Output, wanted: dict[str, Any], words: tuple[str, ...]
 ) -> None:
-    assert words in refused(replace(OUTPUT, properties={name: value}))
+    with pytest.raises(UnsupportedByDeviceError) as caught:
+        require_exact(output, (output, DESKTOP), **{"native": None, "monitor": None, **wanted})
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+    if "panning" in words[0]:
+        assert str(caught.value).count("xrandr") == 1
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    "output",
     [
-        ("Broadcast RGB", "Automatic"),
-        ("underscan", "off"),
-        ("CTM", (0, 1, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 1)),
-        ("CTM", (0,) * 18),
+        OUTPUT,
+        # The servers' own ramps, and none.
+        *(shown(gamma=np.tile((np.arange(n) * (65536 // n)).astype(np.uint16), (3, 1))) for n in (256, 1024)),
+        shown(gamma=np.zeros((3, 0), np.uint16)),
+        replace(OUTPUT, properties={"Broadcast RGB": "Automatic", "underscan": "off"}),
+        ctm(0, 1, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 1),
+        ctm(*(0,) * 18),
     ],
 )
-def test_properties_that_change_nothing_are_no_fault(name: str, value: str | tuple[int, ...]) -> None:
-    assert require_exact(replace(OUTPUT, properties={name: value}), (), native=None, monitor=None) is PICTURE
-
-
-def test_outputs_that_show_the_same_are_refused() -> None:
-    mirrored = replace(DESKTOP, picture=replace(DESKTOP.picture or PICTURE, x=1280))
-    assert "eDP-1 shows the same part of the screen; xrandr --output HDMI-1 --right-of eDP-1" in refused(
-        OUTPUT, mirrored
-    )
-    assert "eDP-1 shows the same" in refused(shown(outputs=("HDMI-1", "eDP-1")))
-
-
-def test_an_output_that_is_off_is_refused_with_the_command_that_puts_it_beside_the_other() -> None:
-    off = replace(OUTPUT, picture=None)
-    assert "it is switched off; xrandr --output HDMI-1 --preferred --right-of eDP-1" in refused(off, DESKTOP)
-    assert "--mode 854x480 --right-of eDP-1" in refused(off, DESKTOP, native=Size(854, 480))
-
-
-def test_another_display_than_the_rig_files_is_refused() -> None:
-    said = refused(OUTPUT, monitor="BNQ TH585")
-    assert "'BNQ TH585' is connected, found 'EPS PJ 720'" in said
-
-
-def test_all_faults_come_together() -> None:
-    said = refused(shown(mode=DESK, size=DESK.size, rotation=2, gamma=RAMP // 2))
-    assert all(word in said for word in ("raster", "turned left", "gamma"))
+@pytest.mark.parametrize(("native", "monitor"), [(None, "PJ 720"), (NATIVE.size, "EPS PJ 720"), (None, None)])
+def test_an_exact_output_is_taken(output: Output, native: Size | None, monitor: str | None) -> None:
+    assert require_exact(output, (DESKTOP, output), native=native, monitor=monitor) is output.picture
 
 
 def test_an_output_is_chosen_by_its_name_alone() -> None:
@@ -176,3 +140,58 @@ def test_a_screen_without_8_bits_per_colour_is_refused(changes: dict[str, Any]) 
         require_true_colour(replace(usual, **changes))
     with pytest.raises(UnsupportedByDeviceError, match="byte order"):
         require_true_colour(replace(usual, little_endian=False))
+
+
+def test_all_faults_of_a_table_come_in_one_message() -> None:
+    table = {"outputs": "HDMI-1", "backend": "kms", "native_px": [1280, 0], "latency_s": -1.0, "dark_after_s": 1e9}
+    with pytest.raises(ConfigError) as caught:
+        open_projector(table, Path())
+    for word in ("output: missing", "did you mean 'output'?", "backend", "native_px[1]", "latency_s", "dark_after_s"):
+        assert word in str(caught.value), word
+
+
+def test_a_table_needs_no_more_than_its_output() -> None:
+    options = ScreenOptions(output="HDMI-1")
+    assert (options.backend, options.native, options.latency_s) == ("auto", None, None)
+
+
+class PowerManaged:
+    """A server of which only the power of its displays is known, without a saver that can be suspended."""
+
+    def __init__(self, level: int) -> None:
+        self.level = level
+        self.enabled = True
+        self.timeout_s = 600
+
+    def has(self, extension: str) -> bool:
+        return extension == "DPMS"
+
+    def ask(self, opcode: int, body: bytes = b"", *, extension: str | None = None) -> bytes:
+        del body
+        if extension == "DPMS":
+            assert opcode == 7
+            return bytes(8) + struct.pack("<HB", self.level, self.enabled) + bytes(21)
+        assert opcode == 108
+        return bytes(8) + struct.pack("<HHBB", self.timeout_s, 600, 1, 1) + bytes(18)
+
+    def do(self, opcode: int, body: bytes = b"", *, data: int = 0, extension: str | None = None) -> None:
+        if extension == "DPMS" and opcode == 6:
+            (self.level,) = struct.unpack_from("<H", body)
+        elif extension == "DPMS":
+            self.enabled = opcode == 4
+        elif opcode == 107:
+            (self.timeout_s,) = struct.unpack_from("<h", body)
+        else:
+            assert (opcode, data) == (115, 0)
+
+
+def test_displays_that_sleep_are_woken_kept_awake_and_allowed_to_sleep_again() -> None:
+    server = PowerManaged(level=3)
+    waking = power.Waking(server)  # type: ignore[arg-type]
+    assert (server.level, server.enabled, server.timeout_s) == (0, False, 0)
+    waking.require_awake()
+    server.level = 2
+    with pytest.raises(UnsupportedByDeviceError, match=r"put to sleep \(suspended\)"):
+        waking.require_awake()
+    waking.end()
+    assert (server.enabled, server.timeout_s) == (True, 600)
