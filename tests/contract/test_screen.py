@@ -17,7 +17,7 @@ from tests.contract.screen_server import DummyServer, OutputPixels
 pytestmark = pytest.mark.slow
 
 OUTPUTS = ("DUMMY0", "DUMMY1")
-SHOWN = (("DUMMY0", Size(1280, 800)), ("DUMMY1", Size(854, 480)), ("DUMMY0", Size(102, 77)), ("DUMMY1", Size(102, 77)))
+SHOWN = (("DUMMY0", Size(854, 480)), ("DUMMY1", Size(102, 77)))
 
 
 @pytest.fixture(scope="module")
