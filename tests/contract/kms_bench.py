@@ -312,37 +312,6 @@ def the_guard_covers_a_thread_that_hangs(heads: Heads, notes: Notes) -> None:
         assert int(heads.first.grey().min()) == 255
 
 
-def opened_again_by_the_same_process_without_light(heads: Heads, _: Notes) -> None:
-    """The card stays ours between two openings; memory does not grow."""
-    for _time in range(2):
-        projector = kms.open_projector(options(), Path())
-        projector.load(sequence(HERE))
-        projector.show(WHITE)
-        with pytest.raises(DeviceBusyError, match="this process shows patterns"):
-            kms.open_projector(options(), Path())
-        projector.close()
-        assert is_dark(heads.first)
-    (held,) = holding._held.values()
-    assert len(held.stale) == 3
-    holding.release(held.path)
-
-
-def stamps_say_how_much_they_know(_: Heads, notes: Notes) -> None:
-    """This card counts no refreshes: the stated error holds the request, and a refresh."""
-    with opened() as projector:
-        projector.load(sequence(HERE))
-        asked_ns = time.monotonic_ns()
-        shown = projector.show(WHITE)
-        returned_ns = time.monotonic_ns()
-        assert projector.info.refresh_s is not None
-        refresh_ns = projector.info.refresh_s * 1e9
-        notes |= {"model": projector.info.model, "± ms": round(shown.t_err_ns / 1e6, 2)}
-        assert "does not tell when it refreshes" in projector.info.model
-        assert shown.t_err_ns >= refresh_ns / 2
-        assert shown.t_visible_ns <= returned_ns + projector.info.latency_s * 1e9
-        assert shown.t_visible_ns - shown.t_err_ns >= asked_ns + refresh_ns - 1_000_000
-
-
 class GuestCamera(ScreenCamera):
     """Looks twice during an exposure: a look takes QEMU longer than an exposure."""
 
@@ -361,8 +330,6 @@ CHECKS: tuple[Callable[[Heads, Notes], None], ...] = (
     the_next_process_takes_over_in_the_dark,
     a_card_that_another_program_has_is_busy,
     the_guard_covers_a_thread_that_hangs,
-    opened_again_by_the_same_process_without_light,
-    stamps_say_how_much_they_know,
 )
 
 

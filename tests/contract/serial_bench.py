@@ -14,9 +14,8 @@ from pathlib import Path
 from drivers.serial_projector import open_projector
 from drivers.serial_projector.pattern_set import crc32_of_each
 from slrig.devices import Projector
-from slrig.model import PatternSequence, Size
-from slrig.patterns.sequence import encode, scan_patterns
-from tests.contract.bench_head import BenchHead
+from slrig.model import PatternSequence
+from tests.contract.bench_head import BenchHead, whole_scan
 from tests.contract.stage import Stage
 from tests.contract.suite import Bench
 from tests.contract.wired_camera import WiredCamera
@@ -24,14 +23,6 @@ from tests.unit.capture.fake_rig import PROJECTOR
 from tests.unit.capture.fake_rig import Scene as World
 from tests.unit.drivers.serial_projector.engines import CoreEngine, Scene, description
 from tests.unit.drivers.serial_projector.line import Noise, SerialLine
-
-
-def sequence(projector: Size = PROJECTOR) -> PatternSequence:
-    """A whole scan for a projector of this size."""
-    patterns = scan_patterns(
-        projector, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
-    )
-    return encode(patterns, projector)
 
 
 @dataclass
@@ -66,7 +57,7 @@ class TriggerBox:
 
 def bench(folder: Path, *, noise: Noise | None = None, **options: object) -> Bench:  # noqa: ARG001 - as every bench
     """A box and two cameras as an instrument for the contract suite; `options` are the driver's."""
-    flashed = sequence()
+    flashed = whole_scan(PROJECTOR, period_px=8, line_width_px=1)
     stage = Stage(World(noise_dn=0.8))
     box = TriggerBox(stage, flashed, noise or Noise())
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Shown, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError
-from slrig.model import CameraFormat, Frame, PatternSequence, Pixels, Size
+from slrig.model import CameraFormat, Frame, PatternSequence, Pixels
 from tests.unit.conformance.model_rig import (
     ERROR_NS,
     LATENCY_NS,
@@ -254,15 +254,6 @@ class ForgetsItself(ModelCamera):
         return super().info
 
 
-@breaks("declared_ranges_are_sound", "inf")
-class DeclaresNoLimit(ModelCamera):
-    """Does not know its longest exposure."""
-
-    @property
-    def info(self) -> CameraInfo:
-        return replace(super().info, exposure_range_s=(0.0, float("inf")))
-
-
 @breaks("frames_are_as_declared", "no sample is above 1023")
 class DeclaresTenBits(ModelCamera):
     """Sends samples of 16 bits, aligned to the left."""
@@ -275,15 +266,6 @@ class DeclaresTenBits(ModelCamera):
     def frame(self, exposure: Exposure) -> Frame:
         frame = super().frame(exposure)
         return replace(frame, image=frame.image.astype(np.uint16) * np.uint16(256))
-
-
-@breaks("devices_implement_the_protocols", "'camera0'")
-class HasAnotherName(ModelCamera):
-    """Calls itself as it likes."""
-
-    @property
-    def info(self) -> CameraInfo:
-        return replace(super().info, name="camera0")
 
 
 @breaks("nothing_works_after_close")
@@ -324,15 +306,6 @@ class ColoursItsBuffer(ReusesItsBuffer):
     def frame(self, exposure: Exposure) -> Frame:
         frame = super().frame(exposure)
         return replace(frame, image=frame.image.copy(), colour=lambda: np.dstack([frame.image] * 3))
-
-
-@breaks("frames_are_as_declared", "(80, 110)")
-class DeclaresAnotherSize(ModelCamera):
-    """Declares what its data sheet says, and sends what its mode gives."""
-
-    @property
-    def info(self) -> CameraInfo:
-        return replace(super().info, format=CameraFormat(Size(1920, 1080), 8))
 
 
 @breaks("a_played_sequence_gives_every_frame_in_order", "pulses make")

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from slrig.conformance import CHECKS, Check, Examination, Outcome, Result, run
-from slrig.devices import Rig, Synchronisation, Trigger
+from slrig.devices import CameraInfo, Rig, Synchronisation, Trigger
 from slrig.errors import DeviceBusyError
-from slrig.model import Calibration, Frame, Pinhole, Size
+from slrig.model import Calibration, CameraFormat, Frame, Pinhole, Size
 from tests.unit.conformance import broken_drivers as drivers
 from tests.unit.conformance.model_rig import (
     ALL,
@@ -92,7 +93,23 @@ def changed(**how: Callable[[Frame], object]) -> type[ModelCamera]:
     return Delivers
 
 
+def declaring(**how: Any) -> type[ModelCamera]:
+    """A camera that declares something else."""
+
+    class Declares(ModelCamera):
+        """Declares what its data sheet says, not what it does."""
+
+        @property
+        def info(self) -> CameraInfo:
+            return replace(super().info, **how)
+
+    return Declares
+
+
 BROKEN: list[tuple[Maker, str, str]] = [
+    (Maker(declaring(exposure_range_s=(0.0, float("inf")))), "declared_ranges_are_sound", "inf"),
+    (Maker(declaring(name="camera0")), "devices_implement_the_protocols", "'camera0'"),
+    (Maker(declaring(format=CameraFormat(Size(1920, 1080), 8))), "frames_are_as_declared", "(80, 110)"),
     *(
         (Maker(device) if issubclass(device, ModelCamera) else Maker(projector=device), check, words)
         for device, check, words in drivers.BROKEN

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.display.edid import parse
 from drivers.display.pixels import coloured
-from drivers.display.timing import copied, flipped, queued, whole_light
+from drivers.display.timing import Presented, copied, flipped, queued, whole_light
 from drivers.display.working import OwnThread
 from slrig.errors import DeviceError, DeviceGoneError
 from slrig.model import Pattern, Primary, White
@@ -32,43 +32,37 @@ def edid(*, maker: str = "EPS", name: str = "PJ 720", serial: str = "X1234", num
     return bytes(block)
 
 
-def test_an_edid_names_its_display() -> None:
+def test_an_edid_names_its_display_and_a_damaged_one_none() -> None:
     found = parse(edid())
     assert found is not None
     assert (found.maker, found.name, found.serial, str(found)) == ("EPS", "PJ 720", "X1234", "EPS PJ 720")
+    # A number is a serial, too.
+    assert getattr(parse(edid(serial="", number=77)), "serial", None) == "77"
+    for at in (0, 9, 127):
+        block = bytearray(edid())
+        block[at] ^= 0x10
+        assert parse(bytes(block)) is None
 
 
-def test_a_number_is_a_serial_too() -> None:
-    found = parse(edid(serial="", number=77))
-    assert found is not None
-    assert found.serial == "77"
-
-
-@pytest.mark.parametrize("at", [0, 9, 127])
-def test_a_damaged_edid_names_none(at: int) -> None:
-    block = bytearray(edid())
-    block[at] ^= 0x10
-    assert parse(bytes(block)) is None
-
-
-def test_a_flip_lights_the_scene_one_refresh_later() -> None:
-    lit, err = whole_light(flipped(SECOND_NS), refresh_s=0.02, latency_s=0.03, latency_error_s=0.0)
-    assert lit == SECOND_NS + 50_000_000
-    assert err == 500_000
-
-
-def test_a_copy_may_miss_the_rows_that_were_scanned_out() -> None:
-    lit, err = whole_light(copied(SECOND_NS, 0.02), refresh_s=0.02, latency_s=0.0, latency_error_s=0.0)
-    # All rows were copied in time, or none of them.
-    assert lit - err <= SECOND_NS + 20_000_000
-    assert lit + err >= SECOND_NS + 40_000_000
-
-
-def test_a_call_that_returned_tells_of_a_span() -> None:
-    presented = queued(SECOND_NS, SECOND_NS + 7_000_000, 0.01)
-    lit, err = whole_light(presented, refresh_s=0.01, latency_s=0.0, latency_error_s=0.004)
-    assert lit - err <= SECOND_NS + 10_000_000 - 4_000_000
-    assert lit + err >= SECOND_NS + 7_000_000 + 30_000_000 + 4_000_000
+@pytest.mark.parametrize(
+    ("presented", "latency_s", "error_s", "earliest_ms", "latest_ms"),
+    [
+        # A flip lights the scene one refresh later.
+        (flipped(SECOND_NS), 0.03, 0.0, 49.5, 50.5),
+        # A copy may miss the rows that were scanned out: all of them were copied in time, or none.
+        (copied(SECOND_NS, 0.02), 0.0, 0.0, 20, 40),
+        # A call that returned tells of a span.
+        (queued(SECOND_NS, SECOND_NS + 7_000_000, 0.02), 0.0, 0.004, 20 - 4, 7 + 60 + 4),
+    ],
+    ids=["flipped", "copied", "queued"],
+)
+def test_when_light_is_whole(
+    presented: Presented, latency_s: float, error_s: float, earliest_ms: float, latest_ms: float
+) -> None:
+    lit, err = whole_light(presented, refresh_s=0.02, latency_s=latency_s, latency_error_s=error_s)
+    assert (lit - err - SECOND_NS) / 1e6 <= earliest_ms
+    assert (lit + err - SECOND_NS) / 1e6 >= latest_ms
+    assert err / 1e6 <= (latest_ms - earliest_ms) / 2 + 1
 
 
 def test_what_is_done_on_the_own_thread_is_done_there() -> None:

@@ -10,7 +10,7 @@ from drivers.pattern_engine.planes import plane_of
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, PatternSequence, Size, White
 from slrig.patterns.sequence import encode
-from tests.contract.dlpc900_bench import sequence
+from tests.contract.bench_head import whole_scan
 from tests.contract.dlpc900_device import unpacked
 
 
@@ -46,7 +46,7 @@ def test_any_picture_comes_out_as_it_went_in(seed: int) -> None:
 
 
 def test_patterns_lie_where_the_table_says_each_once() -> None:
-    shown = sequence(Size(480, 270), rows=True)
+    shown = whole_scan(Size(480, 270), rows=True)
     memory = memory_of(shown)
     for index in range(len(shown)):
         place = memory.places[index]

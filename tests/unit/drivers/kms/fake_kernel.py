@@ -31,6 +31,10 @@ ENCODERS = {11: 31, 12: 32}
 """Of each connector."""
 PRIMARY, CURSOR = 51, 52
 _PLANE = NAMES[1:12]
+_REQUESTS = {
+    value: f"_{name.lower()}" for name, value in vars(kernel).items() if isinstance(value, int) and value > 1 << 24
+}
+"""Names of the methods that answer, by request."""
 
 
 def mode(
@@ -103,13 +107,13 @@ class FakeKernel:
         if waiting:
             number = waiting.pop(0)
             raise OSError(number, os.strerror(number))
-        self._answers[request](self, told)
+        getattr(self, _REQUESTS[request])(told)
 
     def set_at_once(self, name: str, number: int = PRIMARY) -> int:
         """A property's value as it was set last."""
         return self.values[(number, name)]
 
-    def _resources(self, told: Any) -> None:
+    def _get_resources(self, told: Any) -> None:
         for pointer, count, numbers in (
             ("crtc_id_ptr", "count_crtcs", CONTROLLERS),
             ("connector_id_ptr", "count_connectors", tuple(ENCODERS)),
@@ -117,7 +121,7 @@ class FakeKernel:
             _fill(getattr(told, pointer), getattr(told, count), numbers, ctypes.c_uint32)
             setattr(told, count, len(numbers))
 
-    def _connector(self, told: Any) -> None:
+    def _get_connector(self, told: Any) -> None:
         number = told.connector_id
         modes = self.modes.get(number, []) if self.connected[number] else []
         if told.modes_ptr and told.count_modes >= len(modes):
@@ -128,20 +132,20 @@ class FakeKernel:
         told.connector_type, told.connector_type_id = 11, number - 10
         told.connection = kernel.CONNECTED if self.connected[number] else kernel.DISCONNECTED
 
-    def _encoder(self, told: Any) -> None:
+    def _get_encoder(self, told: Any) -> None:
         (number,) = (each for each, encoder in ENCODERS.items() if encoder == told.encoder_id)
         told.crtc_id, told.possible_crtcs = self.driven.get(number, 0), self.possible
 
-    def _planes(self, told: Any) -> None:
+    def _get_plane_resources(self, told: Any) -> None:
         _fill(told.plane_id_ptr, told.count_planes, (PRIMARY, CURSOR), ctypes.c_uint32)
         told.count_planes = 2
 
-    def _plane(self, told: Any) -> None:
+    def _get_plane(self, told: Any) -> None:
         told.possible_crtcs = 1
         # A cursor that some desktop has left there.
         told.crtc_id = self.values.get((told.plane_id, "CRTC_ID"), CONTROLLERS[0] if told.plane_id == CURSOR else 0)
 
-    def _properties(self, told: Any) -> None:
+    def _get_properties(self, told: Any) -> None:
         names: tuple[str, ...] = {
             kernel.OBJECT_PLANE: ("type", *_PLANE),
             kernel.OBJECT_CRTC: ("MODE_ID", "ACTIVE", "GAMMA_LUT", "CTM", "VRR_ENABLED"),
@@ -154,7 +158,7 @@ class FakeKernel:
         _fill(told.prop_values_ptr, told.count_props, values, ctypes.c_uint64)
         told.count_props = len(names)
 
-    def _property(self, told: Any) -> None:
+    def _get_property(self, told: Any) -> None:
         name = NAMES[told.prop_id - 1000]
         words = WORDS.get(name, {})
         told.name, told.flags = name.encode(), kernel.PROPERTY_ENUM if words else 0
@@ -165,30 +169,30 @@ class FakeKernel:
             ctypes.memmove(told.enum_blob_ptr, array, ctypes.sizeof(array))
         told.count_enum_blobs = len(words)
 
-    def _create(self, told: Any) -> None:
+    def _create_dumb(self, told: Any) -> None:
         # Rows of a real card are longer than their pixels.
         told.pitch = (told.width * 4 + 255) // 256 * 256
         told.size = -(-told.pitch * told.height // 4096) * 4096
         told.handle = self._number()
         self.memory[told.handle << 12] = mmap.mmap(-1, told.size)
 
-    def _map(self, told: Any) -> None:
+    def _map_dumb(self, told: Any) -> None:
         told.offset = told.handle << 12
 
-    def _add(self, told: Any) -> None:
+    def _add_fb(self, told: Any) -> None:
         told.fb_id = self._number()
         self.buffers[told.fb_id] = told.handle
 
-    def _remove(self, told: Any) -> None:
+    def _remove_fb(self, told: Any) -> None:
         del self.buffers[told.number]
 
-    def _destroy(self, told: Any) -> None:
+    def _destroy_dumb(self, told: Any) -> None:
         del self.memory[told.number << 12]
 
-    def _blob(self, told: Any) -> None:
+    def _create_blob(self, told: Any) -> None:
         told.blob_id = self._number()
 
-    def _commit(self, told: Any) -> None:
+    def _atomic(self, told: Any) -> None:
         if not self.atomic:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
         objects = _read(told.objs_ptr, told.count_objs, ctypes.c_uint32)
@@ -201,10 +205,10 @@ class FakeKernel:
         if told.flags & kernel.PAGE_FLIP_EVENT:
             self.flipped(told.user_data)
 
-    def _set_mode(self, told: Any) -> None:
+    def _set_crtc(self, told: Any) -> None:
         self.values[(PRIMARY, "FB_ID")] = told.fb_id
 
-    def _flip(self, told: Any) -> None:
+    def _page_flip(self, told: Any) -> None:
         self.values[(PRIMARY, "FB_ID")] = told.fb_id
         self.flipped(told.user_data)
 
@@ -215,61 +219,33 @@ class FakeKernel:
         event.tv_usec = stamp % 10**9 // 1000
         self.theirs.send(bytes(event))
 
-    def _controller(self, told: Any) -> None:
+    def _get_crtc(self, told: Any) -> None:
         told.fb_id, told.gamma_size = self.values.get((PRIMARY, "FB_ID"), 0), 256
 
-    def _set_property(self, told: Any) -> None:
+    def _set_object_property(self, told: Any) -> None:
         self.values[(told.obj_id, NAMES[told.prop_id - 1000])] = told.value
 
-    def _gamma(self, told: Any) -> None:
+    def _set_gamma(self, told: Any) -> None:
         self.gammas = list(_read(told.green, told.gamma_size, ctypes.c_uint16))
 
-    def _capability(self, told: Any) -> None:
+    def _set_client_cap(self, told: Any) -> None:
         if told.capability == kernel.CLIENT_CAP_ATOMIC and not self.atomic:
             raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
 
-    def _sequence(self, _told: Any) -> None:
+    def _crtc_get_sequence(self, _told: Any) -> None:
         if not self.counts:
             raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
 
-    def _magic(self, _told: Any) -> None:
+    def _auth_magic(self, _told: Any) -> None:
         number = errno.EINVAL if self.master else errno.EACCES
         raise OSError(number, os.strerror(number))
 
-    def _nothing(self, _told: Any) -> None:
+    def _set_cursor(self, _told: Any) -> None:
         pass
 
     def _number(self) -> int:
         self._numbers += 1
         return self._numbers
-
-    _answers: Mapping[int, Callable[[FakeKernel, Any], None]] = field(
-        default_factory=lambda: {
-            kernel.GET_RESOURCES: FakeKernel._resources,
-            kernel.GET_CONNECTOR: FakeKernel._connector,
-            kernel.GET_ENCODER: FakeKernel._encoder,
-            kernel.GET_PLANE_RESOURCES: FakeKernel._planes,
-            kernel.GET_PLANE: FakeKernel._plane,
-            kernel.GET_PROPERTIES: FakeKernel._properties,
-            kernel.GET_PROPERTY: FakeKernel._property,
-            kernel.GET_CRTC: FakeKernel._controller,
-            kernel.CREATE_DUMB: FakeKernel._create,
-            kernel.MAP_DUMB: FakeKernel._map,
-            kernel.DESTROY_DUMB: FakeKernel._destroy,
-            kernel.ADD_FB: FakeKernel._add,
-            kernel.REMOVE_FB: FakeKernel._remove,
-            kernel.CREATE_BLOB: FakeKernel._blob,
-            kernel.ATOMIC: FakeKernel._commit,
-            kernel.SET_CRTC: FakeKernel._set_mode,
-            kernel.PAGE_FLIP: FakeKernel._flip,
-            kernel.SET_OBJECT_PROPERTY: FakeKernel._set_property,
-            kernel.SET_GAMMA: FakeKernel._gamma,
-            kernel.SET_CURSOR: FakeKernel._nothing,
-            kernel.SET_CLIENT_CAP: FakeKernel._capability,
-            kernel.CRTC_GET_SEQUENCE: FakeKernel._sequence,
-            kernel.AUTH_MAGIC: FakeKernel._magic,
-        }
-    )
 
 
 def _fill(pointer: int, room: int, numbers: tuple[int, ...], kind: type[ctypes._SimpleCData[int]]) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import sys
 import types
 from collections.abc import Callable
+from unittest import mock
 
 import pytest
 
@@ -34,20 +36,12 @@ def pulses(pico: Pico, pin: int) -> int:
     return sum(what == f"{pin}=1" for _, what in pico.did)
 
 
-def test_it_starts_dark(pico: Pico, board: main.Board) -> None:
+def test_it_starts_dark_and_a_pattern_is_reached_by_steps_from_home(pico: Pico, board: main.Board) -> None:
     assert pico.levels[main.LAMP_PIN] == 0
     assert board.time_us() == 0
-
-
-def test_a_pattern_is_reached_by_steps_from_home(pico: Pico, board: main.Board) -> None:
-    board.select(3)
-    assert (pulses(pico, main.HOME_PIN), pulses(pico, main.STEP_PIN)) == (1, 3)
-    board.select(5)
-    assert (pulses(pico, main.HOME_PIN), pulses(pico, main.STEP_PIN)) == (1, 5)
-    board.select(5)
-    assert (pulses(pico, main.HOME_PIN), pulses(pico, main.STEP_PIN)) == (1, 5)
-    board.select(1)
-    assert (pulses(pico, main.HOME_PIN), pulses(pico, main.STEP_PIN)) == (2, 6)
+    for pattern, homed, stepped in ((3, 1, 3), (5, 1, 5), (5, 1, 5), (1, 2, 6)):
+        board.select(pattern)
+        assert (pulses(pico, main.HOME_PIN), pulses(pico, main.STEP_PIN)) == (homed, stepped)
     assert pico.levels[main.LAMP_PIN] == 0
 
 
@@ -102,11 +96,9 @@ def test_the_cameras_get_a_pulse_of_its_length(pico: Pico, board: main.Board) ->
 
 
 def test_its_time_never_wraps(pico: Pico, board: main.Board) -> None:
-    told = []
-    for _ in range(40):
+    for step in range(1, 41):
         pico.now_us += 200_000_000
-        told.append(board.time_us())
-    assert told == [200_000_000 * step for step in range(1, 41)]
+        assert board.time_us() == 200_000_000 * step
 
 
 def test_only_patterns_of_the_engines_extent_are_offered() -> None:
@@ -150,30 +142,18 @@ def test_the_program_answers_feeds_its_watchdog_and_tidies_in_the_dark(board: ma
 
 
 def test_the_usb_port_gives_what_is_there_and_does_not_wait() -> None:
-    waiting = bytearray(framed("1A2B 1 PING") * 10)
-    sent: list[bytes] = []
-    poll = types.SimpleNamespace(register=lambda *_: None, poll=lambda _: [1] if waiting else [])
-    select = types.SimpleNamespace(poll=lambda: poll, POLLIN=1)
-
-    def read(count: int) -> bytes:
-        data = bytes(waiting[:count])
-        del waiting[:count]
-        return data
-
-    stdin = types.SimpleNamespace(buffer=types.SimpleNamespace(read=read))
-    port = main.UsbPort(
-        select,
-        types.SimpleNamespace(
-            stdin=stdin, stdout=types.SimpleNamespace(buffer=types.SimpleNamespace(write=sent.append))
-        ),
-    )
+    sent, waiting = framed("1A2B 1 PING") * 10, io.BytesIO(framed("1A2B 1 PING") * 10)
+    poll = mock.Mock(poll=lambda _: [1] if waiting.tell() < len(sent) else [])
+    system = mock.Mock()
+    system.stdin.buffer = waiting
+    port = main.UsbPort(mock.Mock(poll=lambda: poll, POLLIN=1), system)
     taken = b""
     while data := port.read():
         assert len(data) <= 64
         taken += data
-    assert taken == framed("1A2B 1 PING") * 10
+    assert taken == sent
     port.write(b"x")
-    assert sent == [b"x"]
+    system.stdout.buffer.write.assert_called_once_with(b"x")
 
 
 @pytest.fixture
