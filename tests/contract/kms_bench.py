@@ -23,7 +23,6 @@ import numpy as np
 import pytest
 
 from drivers import kms
-from drivers.display.projector import DisplayProjector
 from drivers.kms import finding, holding
 from drivers.kms.card import Card
 from slrig.conformance import run
@@ -293,25 +292,6 @@ def a_card_that_another_program_has_is_busy(_: Heads, notes: Notes) -> None:
         pass
 
 
-def the_guard_covers_a_thread_that_hangs(heads: Heads, notes: Notes) -> None:
-    """Nothing answers but the guard."""
-    with opened() as projector:
-        assert isinstance(projector, DisplayProjector)
-        projector.load(sequence(HERE))
-        projector.show(WHITE)
-        hang = threading.Event()
-        stuck = threading.Thread(target=lambda: projector._thread.do(hang.wait, timeout_s=FAR_S))
-        stuck.start()
-        begun_s = time.monotonic()
-        projector.blank()
-        notes["dark after s"] = round(time.monotonic() - begun_s, 2)
-        assert is_dark(heads.first)
-        hang.set()
-        stuck.join(FAR_S)
-        projector.show(WHITE)
-        assert int(heads.first.grey().min()) == 255
-
-
 class GuestCamera(ScreenCamera):
     """Looks twice during an exposure: a look takes QEMU longer than an exposure."""
 
@@ -329,7 +309,6 @@ CHECKS: tuple[Callable[[Heads, Notes], None], ...] = (
     without_a_guard_the_console_is_lit,
     the_next_process_takes_over_in_the_dark,
     a_card_that_another_program_has_is_busy,
-    the_guard_covers_a_thread_that_hangs,
 )
 
 

@@ -299,13 +299,19 @@ class ReusesItsBuffer(ModelCamera):
         return replace(frame, image=self.buffer)
 
 
-@breaks("frames_come_in_colour_where_it_is_declared", "by 0.0, 0.0, 0.0 DN")
-class ColoursItsBuffer(ReusesItsBuffer):
-    """Makes colour of the memory that the next frames are written to."""
+@breaks("frames_come_in_colour_where_it_is_declared", "0.0 DN of blue, green and red")
+class ColoursItsBuffer(ModelCamera):
+    """Makes colour of memory that the fourth frame after it is written to."""
+
+    def __init__(self, world: World, name: str = "left") -> None:
+        super().__init__(world, name)
+        self.buffers: dict[int, Pixels] = {}
 
     def frame(self, exposure: Exposure) -> Frame:
         frame = super().frame(exposure)
-        return replace(frame, image=frame.image.copy(), colour=lambda: np.dstack([frame.image] * 3))
+        buffer = self.buffers.setdefault(exposure.number % 4, frame.image.copy())
+        buffer[:] = frame.image
+        return replace(frame, colour=lambda: np.dstack([buffer] * 3))
 
 
 @breaks("a_played_sequence_gives_every_frame_in_order", "pulses make")

@@ -22,7 +22,6 @@ from slrig.errors import (
     DeviceError,
     DeviceGoneError,
     DeviceStateError,
-    LibraryMissingError,
     UnsupportedByDeviceError,
 )
 from slrig.model import Size
@@ -95,20 +94,6 @@ def test_no_session_has_no_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
         opened(display=":2047")
 
 
-def test_a_missing_library_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    def lacking(name: str) -> object:
-        raise OSError(name)
-
-    from drivers.screen import connection
-
-    connection._library.cache_clear()
-    monkeypatch.setattr("ctypes.CDLL", lacking)
-    for attempt in (opened, find_devices):
-        with pytest.raises(LibraryMissingError) as caught:
-            attempt()
-        assert caught.value.install == "apt install libxcb1"
-
-
 @pytest.mark.parametrize(
     ("command", "words"),
     [
@@ -158,6 +143,13 @@ def test_what_the_graphics_driver_does_to_levels_is_read_from_its_properties(ser
             opened()
         output_property(connection, RIGHT, "Broadcast RGB", "Full")
     opened().close()
+
+
+def test_a_screen_of_another_depth_is_refused(tmp_path: Path) -> None:
+    with DummyServer(tmp_path, depth=16) as shallow:
+        shallow.arrange(**{LEFT: SIZE, RIGHT: SIZE})
+        with pytest.raises(UnsupportedByDeviceError, match="DefaultDepth 24"):
+            opened(display=shallow.display, backend="x11")
 
 
 def test_an_output_in_use_is_refused_with_the_process_that_holds_it(right: OutputPixels) -> None:

@@ -6,17 +6,18 @@ import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from drivers.display.edid import Edid
-from drivers.screen import open_projector, power
+from drivers.screen import connection, find_devices, open_projector, power
 from drivers.screen.connection import XScreen
 from drivers.screen.options import ScreenOptions
 from drivers.screen.randr import IDENTITY, UPRIGHT, Mode, Output, Picture
 from drivers.screen.refusals import chosen, require_exact, require_true_colour
-from slrig.errors import ConfigError, DeviceGoneError, UnsupportedByDeviceError
+from slrig.errors import ConfigError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import Size
 
 NATIVE = Mode(1, Size(1280, 800), 1 / 60)
@@ -195,3 +196,13 @@ def test_displays_that_sleep_are_woken_kept_awake_and_allowed_to_sleep_again() -
         waking.require_awake()
     waking.end()
     assert (server.enabled, server.timeout_s) == (True, 600)
+
+
+def test_a_missing_library_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":0")
+    connection._library.cache_clear()
+    monkeypatch.setattr("ctypes.CDLL", mock.Mock(side_effect=OSError))
+    for attempt in (lambda: open_projector({"output": "HDMI-1"}, Path()), find_devices):
+        with pytest.raises(LibraryMissingError) as caught:
+            attempt()
+        assert caught.value.install == "apt install libxcb1"

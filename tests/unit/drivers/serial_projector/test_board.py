@@ -131,14 +131,15 @@ def test_the_program_answers_feeds_its_watchdog_and_tidies_in_the_dark(board: ma
     alive: list[int] = []
     tidied: list[int] = []
     hello = framed("1A2B 1 HELLO 1 1000 5000 1000 1000")
-    pings = [framed(f"1A2B {2 + number} PING") for number in range(main.TIDY_AFTER)]
+    pings = [framed(f"1A2B {2 + number} PING") for number in range(2 * main.TIDY_AFTER)]
     usb = Usb(b"", hello[:9], hello[9:], *pings, b"")
     box = Device(board, main.described(PATTERNS), 1)
     with pytest.raises(Ended):
         main.serve(box, usb, lambda: alive.append(1), lambda: tidied.append(len(alive)))  # type: ignore[arg-type]
-    assert usb.sent.count(b" OK ") == 1 + main.TIDY_AFTER
-    assert len(alive) == 5 + main.TIDY_AFTER
-    assert len(tidied) == 1
+    assert usb.sent.count(b" OK ") == 1 + 2 * main.TIDY_AFTER
+    assert len(alive) == 5 + 2 * main.TIDY_AFTER
+    # The first answer is that to HELLO, in the third turn.
+    assert tidied == [2 + main.TIDY_AFTER, 2 + 2 * main.TIDY_AFTER]
 
 
 def test_the_usb_port_gives_what_is_there_and_does_not_wait() -> None:
