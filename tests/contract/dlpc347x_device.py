@@ -2,7 +2,7 @@
 
 It is as unhelpful as these allow: it wakes up with LEDs on and a pattern lit; a command of a wrong length, or with a
 value that it does not have, is passed over and told of by the communication error of the short status, which is cleared
-as it is read; a sequence that it does not have is told of by the sequence error; the last pattern of a sequence stays
+as it is read; a sequence that it does not have shows in the sequence error; the last pattern of a sequence stays
 on the mirrors; flash that was not erased is not written; a repeat comes after the first time, or is it
 (`counts_first`).
 """
@@ -101,7 +101,7 @@ class Fake347x:
         """See `Port`. The engine goes on."""
 
     def unplug(self) -> None:
-        """Without power, there is no light, and nobody answers."""
+        """Without power, there is no light, and no answer."""
         self.gone = True
         self._stop()
         self._mirrors = None

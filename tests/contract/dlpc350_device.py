@@ -69,7 +69,7 @@ class FakeEngine:
     pictures
         BMP files by their place in the flash.
     light, pulse
-        Told of every change of light (None: dark), and of every edge of the trigger output (ns).
+        Called at every change of light (None: dark), and at every edge of the trigger output (ns).
     load_s
         How long a picture takes from the flash.
     keeps

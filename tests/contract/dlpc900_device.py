@@ -145,7 +145,7 @@ class Fake900(FakeEngine):
                 half = 0 if command == 0x1A2A else 1
                 if number > 17:
                     return 17
-                # The last one comes first: any other order begins anew, and what there was is lost.
+                # The last one comes first: any other order begins at the start, and what there was is lost.
                 if (half, number + 1) not in self._halves or (half, number) in self._halves:
                     self._halves = {key: held for key, held in self._halves.items() if key[0] != half}
                 self._loading[half] = (number, size, bytearray())

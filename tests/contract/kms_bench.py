@@ -133,16 +133,6 @@ def exact_without_atomic_commits(heads: Heads, notes: Notes) -> None:
     every_pattern_is_exact(heads, notes, FIRST, legacy=True)
 
 
-def connectors_are_listed_and_no_card_is_opened(heads: Heads, notes: Notes) -> None:
-    before = heads.first.colours(), heads.second.colours()
-    with mock.patch("os.open", side_effect=AssertionError):
-        found = kms.find_devices()
-    notes["found"] = "; ".join(device.label for device in found)
-    assert [device.device for device in found] == [FIRST, SECOND]
-    assert np.array_equal(heads.first.colours(), before[0])
-    assert np.array_equal(heads.second.colours(), before[1])
-
-
 def what_is_not_there_is_refused(_: Heads, notes: Notes) -> None:
     with pytest.raises(DeviceGoneError, match=f"nothing is connected.*{FIRST}") as gone, opened(FORCED):
         pass
@@ -302,7 +292,6 @@ CHECKS: tuple[Callable[[Heads, Notes], None], ...] = (
     exact_on_the_first_card,
     exact_on_the_second_card,
     exact_without_atomic_commits,
-    connectors_are_listed_and_no_card_is_opened,
     what_is_not_there_is_refused,
     another_connector_of_the_same_card,
     dark_after_kill,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -14,13 +16,13 @@ from numpy.typing import NDArray
 
 from drivers import screen
 from drivers.screen import guarding
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
-from slrig.errors import FrameTimeoutError
+from slrig.devices import CameraSettings, SystemClock, Trigger
 from slrig.model import Frame, PatternSequence, Pixels, Size
-from slrig.patterns.sequence import encode, scan_patterns
-from tests.contract.bench_head import BenchHead
+from tests.contract.bench_head import BenchHead, whole_scan
 from tests.contract.screen_server import DummyServer, OutputPixels
+from tests.contract.stage import Stage
 from tests.contract.suite import Bench
+from tests.contract.wired_camera import Exposure, WiredCamera
 from tests.unit.capture.fake_rig import Scene
 
 PROJECTOR = Size(96, 72)
@@ -48,8 +50,8 @@ class ShownPixels(Protocol):
     def close(self) -> None: ...
 
 
-class ScreenCamera:
-    """Implements `slrig.devices.Camera` by photographing an output: software trigger, global shutter.
+class ScreenCamera(WiredCamera):
+    """A camera without a wire that photographs an output: software trigger, global shutter.
 
     It looks again and again during an exposure: if the picture changes meanwhile, its frame is a mixture.
     """
@@ -57,117 +59,42 @@ class ScreenCamera:
     LOOKS = 6
 
     def __init__(self, name: str, pixels: ShownPixels, scene: Scene) -> None:
+        exposures_s, gains = (0.002, 0.1), (1.0, 8.0)
+        super().__init__(name, Stage(scene), usual_s=REFERENCE_EXPOSURE_S, exposures_s=exposures_s, gains=gains)
+        self.info = replace(self.info, triggers=frozenset({Trigger.SOFTWARE}))
         self._pixels, self._scene = pixels, scene
         self._rng = np.random.default_rng(0)
-        triggers = frozenset({Trigger.SOFTWARE})
-        self._info = CameraInfo(name, "screen camera", "1", scene.format, triggers, (0.002, 0.1), (1.0, 8.0))
-        self._settings = CameraSettings(REFERENCE_EXPOSURE_S)
-        self._changed = threading.Condition()
-        self._triggers: list[CameraSettings] = []
-        self._frames: list[Frame] = []
-        self._state, self._count, self._turn = CameraState(name), 0, 0
         self._never = threading.Event()
-        self._thread = threading.Thread(target=self._expose_all, name=f"camera {name}", daemon=True)
-        self._thread.start()
-
-    @property
-    def info(self) -> CameraInfo:
-        """See `Camera`."""
-        return self._info
-
-    def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`."""
-        with self._changed:
-            self._state.check_settings(settings, self._info)
-            self._settings = settings
-            return AppliedSettings(settings.exposure_s, settings.gain)
-
-    def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`."""
-        with self._changed:
-            self._state.check_arming(count, trigger, self._info)
-            self._state.armed = trigger
-            self._turn += 1
-
-    def trigger(self) -> None:
-        """See `Camera`."""
-        with self._changed:
-            self._state.require_armed()
-            self._triggers.append(self._settings)
-            self._changed.notify_all()
-
-    def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`."""
-        until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
-        with self._changed:
-            self._state.require_armed()
-            while True:
-                while self._frames:
-                    frame = self._frames.pop(0)
-                    if frame.t_start_ns >= after_ns:
-                        return frame
-                left_s = (until_ns - time.monotonic_ns()) / 1e9
-                if left_s <= 0 or not self._changed.wait(left_s):
-                    message = f"no frame that begins after {after_ns} ns came in {timeout_s} s; trigger one"
-                    raise FrameTimeoutError(message)
-                self._state.require_armed()
-
-    def disarm(self) -> None:
-        """See `Camera`."""
-        with self._changed:
-            self._state.armed = None
-            self._triggers.clear()
-            self._frames.clear()
-            self._changed.notify_all()
+        self._sensor = ThreadPoolExecutor(1)
+        self._seen: dict[int, Future[tuple[NDArray[np.float64], int]]] = {}
 
     def close(self) -> None:
         """See `Camera`."""
-        self.disarm()
-        with self._changed:
-            self._state.close()
-            self._changed.notify_all()
-        self._thread.join(10)
+        super().close()
+        self._sensor.shutdown()
         self._pixels.close()
 
-    def _expose_all(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._triggers or self._state.closed.is_set())
-                if self._state.closed.is_set():
-                    return
-                settings, turn = self._triggers.pop(0), self._turn
-            frame = self._exposed(settings)
-            with self._changed:
-                if self._state.armed and turn == self._turn:
-                    self._frames.append(frame)
-                    self._changed.notify_all()
+    def _expose(self, begun_ns: int) -> None:
+        number = self._number
+        super()._expose(begun_ns)
+        if self._number > number:
+            self._seen[number] = self._sensor.submit(self._looked, begun_ns, self._settings)
 
-    def _exposed(self, settings: CameraSettings) -> Frame:
-        start_ns = time.monotonic_ns()
-        exposure_ns = round(settings.exposure_s * 1e9)
-        form, read = self._scene.format, np.zeros(self._scene.format.size.shape)
+    def _looked(self, begun_ns: int, settings: CameraSettings) -> tuple[NDArray[np.float64], int]:
+        """What the sensor reads, and how long after its exposure the last look was, ns."""
+        read, exposure_ns = np.zeros(self._scene.format.size.shape), round(settings.exposure_s * 1e9)
+        SystemClock().wait_until(begun_ns, self._never)
         for look in range(self.LOOKS):
-            part = photographed(
-                self._pixels.grey(), self._scene, exposure_s=settings.exposure_s / self.LOOKS, gain=settings.gain
-            )
-            read += part
-            left_ns = start_ns + exposure_ns * (look + 1) // self.LOOKS - time.monotonic_ns()
-            self._never.wait(max(left_ns, 0) / 1e9)
-        end_ns = time.monotonic_ns()
+            part_s = settings.exposure_s / self.LOOKS
+            read += photographed(self._pixels.grey(), self._scene, exposure_s=part_s, gain=settings.gain)
+            SystemClock().wait_until(begun_ns + exposure_ns * (look + 1) // self.LOOKS, self._never)
+        return read, max(time.monotonic_ns() - begun_ns - exposure_ns, 0)
+
+    def _frame(self, exposure: Exposure) -> Frame:
+        read, late_ns = self._seen.pop(exposure.number).result()
         read += self._scene.noise_dn * self._rng.standard_normal(read.shape)
-        image = np.clip(np.rint(read), 0, form.full_scale).astype(np.uint8)
-        self._count += 1
-        return Frame(
-            self._info.name,
-            image,
-            start_ns,
-            start_ns + exposure_ns,
-            max(end_ns - start_ns - exposure_ns, 0),
-            self._count,
-            0,
-            settings.exposure_s,
-            settings.gain,
-        )
+        image = np.clip(np.rint(read), 0, self._scene.format.full_scale).astype(np.uint8)
+        return replace(super()._frame(exposure), image=image, t_err_ns=late_ns)
 
 
 def scene() -> Scene:
@@ -175,10 +102,7 @@ def scene() -> Scene:
 
 
 def sequence(size: Size = PROJECTOR) -> PatternSequence:
-    patterns = scan_patterns(
-        size, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=True
-    )
-    return encode(patterns, size)
+    return whole_scan(size, period_px=8, line_width_px=1, rows=True)
 
 
 def rig_options(output: str, size: Size, **options: object) -> dict[str, object]:

@@ -158,7 +158,7 @@ class _Image(ctypes.Structure):
 
 
 _PASSES_OVER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _error: 0)
-"""Xlib ends the process where nobody else takes an error."""
+"""Xlib ends the process where no handler takes an error."""
 
 
 class OutputPixels:

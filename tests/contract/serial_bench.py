@@ -22,7 +22,7 @@ from tests.contract.wired_camera import WiredCamera
 from tests.unit.capture.fake_rig import PROJECTOR
 from tests.unit.capture.fake_rig import Scene as World
 from tests.unit.drivers.serial_projector.engines import CoreEngine, Scene, description
-from tests.unit.drivers.serial_projector.line import Noise, SerialLine
+from tests.unit.drivers.serial_projector.line import SerialLine
 
 
 @dataclass
@@ -31,7 +31,6 @@ class TriggerBox:
 
     stage: Stage
     flashed: PatternSequence
-    noise: Noise = field(default_factory=Noise)
     drift: float = 30e-6
     cameras: dict[str, WiredCamera] = field(default_factory=dict)
     line: SerialLine = field(init=False)
@@ -40,7 +39,7 @@ class TriggerBox:
         size = self.flashed.projector
         scene = Scene(watch=[self._lit], on_pulse=[self._pulsed])
         about = description(crc32_of_each(self.flashed), width_px=size.width_px, height_px=size.height_px)
-        self.line = SerialLine(CoreEngine(scene, about, drift=self.drift), noise=self.noise)
+        self.line = SerialLine(CoreEngine(scene, about, drift=self.drift))
         atexit.register(self.line.close)
 
     def projector(self, **options: object) -> Projector:
@@ -55,14 +54,14 @@ class TriggerBox:
             camera.pulse(time.monotonic_ns())
 
 
-def bench(folder: Path, *, noise: Noise | None = None, **options: object) -> Bench:  # noqa: ARG001 - as every bench
-    """A box and two cameras as an instrument for the contract suite; `options` are the driver's."""
+def bench(_: Path) -> Bench:
+    """A box and two cameras as an instrument for the contract suite."""
     flashed = whole_scan(PROJECTOR, period_px=8, line_width_px=1)
     stage = Stage(World(noise_dn=0.8))
-    box = TriggerBox(stage, flashed, noise or Noise())
+    box = TriggerBox(stage, flashed)
 
     def open_head() -> BenchHead:
-        projector = box.projector(**options)
+        projector = box.projector()
         box.cameras = {name: WiredCamera(name, stage) for name in ("left", "right")}
         return BenchHead(dict(box.cameras), projector)
 

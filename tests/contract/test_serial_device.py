@@ -17,9 +17,7 @@ import pytest
 
 from drivers.serial_projector import open_projector
 from drivers.serial_projector.projector import SerialProjector
-from slrig.conformance import Outcome, run
 from slrig.errors import DeviceGoneError
-from tests.contract.serial_bench import bench
 from tests.unit.drivers.serial_projector.conftest import SEQUENCE, Bench
 from tests.unit.drivers.serial_projector.line import Line, Noise
 
@@ -28,19 +26,6 @@ LOSS = CORRUPTION = 0.08
 LONG_S = 30.0
 SLACK_S = 0.2
 """How late a box's program may come to its watchdog on a machine that is busy with other tests."""
-
-
-@pytest.mark.slow
-def test_the_contract_holds_on_a_bad_line(tmp_path: Path) -> None:
-    examined = bench(tmp_path, noise=Noise(LOSS / 2, CORRUPTION / 2, seed=5), reply_s=0.06)
-    report = run(examined.open_rig, examined.sequence)
-    failed = [str(result.failure) for result in report.results if result.outcome is Outcome.FAILED]
-    assert not failed
-    passed = [result for result in report.results if result.outcome is Outcome.PASSED]
-    assert len(passed) >= 25, "a camera with software and wire trigger leaves few checks out"
-
-
-# Sessions.
 
 
 @dataclass

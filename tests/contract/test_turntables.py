@@ -91,7 +91,7 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
         yield made
 
 
-def test_it_stands_where_it_is_told_and_still_when_it_returns(bench: Bench) -> None:
+def test_it_stands_where_it_was_sent_and_still_when_it_returns(bench: Bench) -> None:
     table = bench.opened()
     assert isinstance(table, Turntable)
     assert len(table.poses) == len(table.angles_deg) == 8
@@ -107,7 +107,7 @@ def test_it_stands_where_it_is_told_and_still_when_it_returns(bench: Bench) -> N
         assert (bench.stands_deg() - angle_deg + 180) % 360 == pytest.approx(180.0, abs=0.01)
 
 
-def test_it_tells_the_axis_about_which_it_turns_or_none(bench: Bench) -> None:
+def test_it_knows_the_axis_about_which_it_turns_or_none(bench: Bench) -> None:
     axis = bench.opened().axis
     if axis is not None:
         np.testing.assert_allclose(np.cross(axis.point_mm - AXIS_POINT, AXIS), 0.0, atol=1e-9)

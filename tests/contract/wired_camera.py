@@ -16,7 +16,9 @@ _ERR_NS = 1_000
 
 
 @dataclass(frozen=True, slots=True)
-class _Exposure:
+class Exposure:
+    """One exposure of the sensor."""
+
     number: int
     t_start_ns: int
     t_end_ns: int
@@ -48,7 +50,7 @@ class WiredCamera:
         self._settings = CameraSettings(usual_s)
         self._state = CameraState(name)
         self._room = self._number = self._missed = self._busy_until_ns = 0
-        self._exposures: deque[_Exposure] = deque()
+        self._exposures: deque[Exposure] = deque()
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         with self._lock:
@@ -110,11 +112,11 @@ class WiredCamera:
         self._room -= 1
         end_ns = begun_ns + round(self._settings.exposure_s * 1e9)
         self._busy_until_ns = max(end_ns, begun_ns + round(self._readout_s * 1e9))
-        self._exposures.append(_Exposure(self._number, begun_ns, end_ns))
+        self._exposures.append(Exposure(self._number, begun_ns, end_ns))
         self._number += 1
         self._changed.set()
 
-    def _frame(self, exposure: _Exposure) -> Frame:
+    def _frame(self, exposure: Exposure) -> Frame:
         settings = self._settings
         image = self._stage.exposed(exposure.t_start_ns, exposure.t_end_ns, gain=settings.gain)
         return Frame(

@@ -237,7 +237,7 @@ def test_a_frame_that_a_busy_host_gets_late_was_not_passed_over() -> None:
     assert (result.outcome, str(result.failure)) == (Outcome.PASSED, "None")
 
 
-def test_a_frame_that_has_to_be_shot_again_is_told() -> None:
+def test_a_frame_that_has_to_be_shot_again_is_reported() -> None:
     class LosesOne(ModelCamera):
         """Loses one frame of twenty."""
 

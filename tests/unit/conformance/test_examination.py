@@ -97,7 +97,7 @@ def test_an_examination_that_is_interrupted_closes_the_rig() -> None:
     assert owners() <= before
 
 
-def test_progress_is_told_before_and_after_each_check() -> None:
+def test_progress_is_reported_before_and_after_each_check() -> None:
     told: list[tuple[str, float, str]] = []
     first, second = CHECKS[:2]
     run(Maker(), sequence(), checks=(first, second), progress=lambda *what: told.append(what))
@@ -222,7 +222,7 @@ def test_the_level_of_light_is_that_of_the_lit_pixels_whatever_the_room_and_the_
         assert light.level(images(level, noise_dn=4)[0]) == pytest.approx(expected, abs=0.05)
 
 
-def test_a_camera_that_does_not_see_the_projector_is_told_so() -> None:
+def test_a_camera_that_does_not_see_the_projector_is_reported() -> None:
     for white, black in ((31, 30), (30, 90)):
         with pytest.raises(ExpectationError, match="switch the lamp on"):
             learn_light(images(white, white, noise_dn=2), images(black, black, noise_dn=2), full_scale=255)

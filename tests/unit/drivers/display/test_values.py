@@ -73,7 +73,7 @@ def test_what_is_done_on_the_own_thread_is_done_there() -> None:
     thread.end(timeout_s=5)
 
 
-def test_a_hanging_thread_is_told_of_and_goes_on_later() -> None:
+def test_a_hanging_thread_is_reported_and_goes_on_later() -> None:
     thread, hang = OwnThread("the screen"), threading.Event()
     with pytest.raises(DeviceError, match=r"the screen did not answer in 0\.01 s"):
         thread.do(hang.wait, timeout_s=0.01)
@@ -82,7 +82,7 @@ def test_a_hanging_thread_is_told_of_and_goes_on_later() -> None:
         thread.do(lambda: skipped.append(1), timeout_s=0.01)
     hang.set()
     assert thread.do(lambda: "well", timeout_s=5) == "well"
-    # What nobody waits for any more is not done late.
+    # What was given up is not done late.
     assert not skipped
     thread.end(timeout_s=5)
 

@@ -118,6 +118,8 @@ def test_patterns_are_written_once_and_nothing_is_lit_meanwhile() -> None:
     projector = bench.open()
     assert "were written" in projector.write_patterns(BOTH)
     assert (bench.engine.erased, bench.engine.written_bytes) == (1, 20 + 28 + 12 + 2 * 8 + 4 * 160 + 3 * 96)
+    # The mode is chosen when it is opened, and again, for what was written may have ended it.
+    assert bench.sent(0x05) == ["04", "04"]
     assert "holds these 5 patterns already" in projector.write_patterns(BOTH)
     assert bench.engine.erased == 1
     assert "were written" in projector.write_patterns(COLUMNS)
@@ -148,7 +150,7 @@ class Worn(bytearray):
 
 
 @pytest.mark.parametrize("worn", [False, True])
-def test_a_flash_that_has_no_room_or_forgets_is_told_of(worn: bool) -> None:
+def test_a_flash_that_has_no_room_or_forgets_is_reported(worn: bool) -> None:
     bench = Bench(None, room=65536 if worn else 512)
     if worn:
         bench.engine.flash = Worn(bench.engine.flash)
@@ -171,7 +173,7 @@ def test_a_flash_that_has_no_room_or_forgets_is_told_of(worn: bool) -> None:
         ({}, {0xD0: b"\x89", 0xD1: b"\0\x10\4\0"}, DeviceError, "says: the green LED failed; its supply is low"),
     ],
 )
-def test_what_the_engine_does_not_take_or_gives_back_otherwise_is_told_and_it_is_dark(
+def test_what_the_engine_does_not_take_or_gives_back_otherwise_is_reported_and_it_is_dark(
     engine: dict[str, Any],
     bent: dict[int, bytes],
     error: type[DeviceError],
@@ -194,7 +196,7 @@ def test_other_controllers_are_refused_and_left_dark() -> None:
     assert bench.engine.lit is None
 
 
-def test_what_is_no_bus_is_told_of(tmp_path: Path) -> None:
+def test_what_is_no_bus_is_reported(tmp_path: Path) -> None:
     with pytest.raises(DeviceGoneError, match=r"No such file.*buses that are there: .*modprobe i2c-dev"):
         open_projector({"device": str(tmp_path / "i2c-9")}, tmp_path)
     (tmp_path / "file").touch()

@@ -85,14 +85,14 @@ def test_every_place_holds_its_pattern(tmp_path: Path, rows: bool, planes: list[
     for index, place in enumerate(places):
         picture = pictures[place.image]
         assert picture is not None
-        # What repeats along an axis is told by a row and a column.
+        # A row and a column show what repeats along an axis.
         for part in ((slice(0, 1), slice(None)), (slice(None), slice(0, 1))):
             channel = picture[part][..., (1, 2, 0)[place.plane // 8]]
             shown = (channel >> np.uint8(place.plane % 8) & np.uint8(1)).astype(np.bool_) ^ place.inverted
             assert np.array_equal(shown, sequence.image(index)[part] == 255), sequence.patterns[index]
 
 
-def test_what_is_missing_is_told_and_written_when_asked_for(tmp_path: Path) -> None:
+def test_what_is_missing_is_reported_and_written_on_request(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedByDeviceError) as refused:
         read_flash(tmp_path).places(scan())
     text = str(refused.value)
@@ -148,7 +148,7 @@ def test_a_picture_that_was_changed_is_refused(tmp_path: Path) -> None:
         read_flash(tmp_path)
 
 
-def test_faults_of_the_list_are_told_at_once(tmp_path: Path) -> None:
+def test_faults_of_the_list_are_reported_at_once(tmp_path: Path) -> None:
     flash = write_pictures(tmp_path, few(White()))
     listed = json.loads((tmp_path / LIST).read_text())
     listed["images"] *= 2

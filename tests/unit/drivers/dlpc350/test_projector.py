@@ -107,7 +107,7 @@ def test_a_flash_of_another_name_or_with_too_few_pictures_is_refused(tmp_path: P
         bench.open()
 
 
-def test_tables_that_the_engine_refuses_are_told_in_words_and_it_is_dark(bench: Bench) -> None:
+def test_tables_that_the_engine_refuses_are_reported_in_words_and_it_is_dark(bench: Bench) -> None:
     bench.engine._planes[7] = bench.engine._planes.pop(0)
     projector = bench.loaded()
     with pytest.raises(UnsupportedByDeviceError, match="a pattern number in the table is not one that it has"):

@@ -136,7 +136,7 @@ def test_each_change_of_picture_swaps_the_buffer(
     assert (list(tables.images), tables.counts, tables.length) == (images, counts, len(places))
 
 
-def test_all_faults_of_the_options_are_told_at_once() -> None:
+def test_all_faults_of_the_options_are_reported_at_once() -> None:
     options: dict[str, Any] = {"patern": "p", "led": "ultraviolet", "hold_s": 1.0, "trigger_delay_us": 5.0}
     with pytest.raises(ConfigError) as refused:
         checked(EngineOptions, options, "the table")

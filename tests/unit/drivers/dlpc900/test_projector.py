@@ -91,7 +91,7 @@ def test_what_is_not_known_is_refused_and_left_dark(version: tuple[int, int], mi
     assert bench.engine.lit is None
 
 
-def test_a_mode_that_the_engine_tells_of_later_is_waited_for(bench: Bench) -> None:
+def test_a_mode_that_the_engine_reports_later_is_waited_for(bench: Bench) -> None:
     class Late(dict[int, bytes]):
         """Says for a while that it is in the mode before."""
 
@@ -106,7 +106,7 @@ def test_a_mode_that_the_engine_tells_of_later_is_waited_for(bench: Bench) -> No
     assert late.asked == 4
 
 
-def test_what_the_engine_refuses_is_told_in_its_words_and_it_is_dark(bench: Bench) -> None:
+def test_what_the_engine_refuses_is_reported_in_its_words_and_it_is_dark(bench: Bench) -> None:
     projector = bench.open()
     bench.engine.refusing = {0x1A34: 8}
     with pytest.raises(UnsupportedByDeviceError, match=r"take definition .*its memory is full"):
@@ -143,7 +143,7 @@ def test_a_piece_of_a_picture_that_went_wrong_is_not_hidden_by_the_next(
     projector.close()
 
 
-def test_an_engine_in_standby_is_told_nothing_before_it_is_woken() -> None:
+def test_an_engine_in_standby_gets_no_command_before_it_is_woken() -> None:
     bench = Bench(standby=True)
     bench.open().close()
     assert bench.engine.commands[0] == (0x0200, b"\0")

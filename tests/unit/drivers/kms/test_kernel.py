@@ -83,12 +83,12 @@ def test_a_request_has_the_kernels_number(name: str) -> None:
         (kernel.MODE_DOUBLE_CLOCK, 0.02, False),
     ],
 )
-def test_a_mode_tells_the_time_of_a_frame(flags: int, refresh_s: float, plain: bool) -> None:
+def test_a_mode_has_the_time_of_a_frame(flags: int, refresh_s: float, plain: bool) -> None:
     found = Mode.of(mode(1000, 500, rate=50, flags=flags))
     assert (found.size, found.plain) == (Size(1000, 500), plain)
     assert found.refresh_s == pytest.approx(refresh_s)
     assert bytes(found.info) == found.content
 
 
-def test_a_mode_without_a_clock_tells_none() -> None:
+def test_a_mode_without_a_clock_has_none() -> None:
     assert Mode.of(mode(640, 480, clock=0)).refresh_s == 0

@@ -125,7 +125,7 @@ def test_a_flips_stamp_is_when_its_scan_out_began(install: Install) -> None:
 
 
 @pytest.mark.parametrize("state", [{"counts": False}, {"stamp": lambda: 0}], ids=["not counted", "zero"])
-def test_a_stamp_that_tells_nothing_is_not_believed(install: Install, state: dict[str, object]) -> None:
+def test_a_stamp_that_means_nothing_is_not_believed(install: Install, state: dict[str, object]) -> None:
     install(**state)
     projector = opened()
     projector.load(SEQUENCE)
@@ -148,7 +148,7 @@ def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
     projector.close()
 
 
-def test_a_display_that_makes_no_refresh_is_told_of(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_display_that_makes_no_refresh_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = install()
     projector = opened()
     projector.load(SEQUENCE)
@@ -159,7 +159,7 @@ def test_a_display_that_makes_no_refresh_is_told_of(install: Install, monkeypatc
     projector.close()
 
 
-def test_a_display_that_is_pulled_or_exchanged_is_told_of(install: Install) -> None:
+def test_a_display_that_is_pulled_or_exchanged_is_reported(install: Install) -> None:
     fake = install()
     projector = opened()
     projector.load(SEQUENCE)
@@ -174,7 +174,7 @@ def test_a_display_that_is_pulled_or_exchanged_is_told_of(install: Install) -> N
     projector.close()
 
 
-def test_what_the_frame_buffer_does_not_hold_is_told_of(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_frame_buffer_does_not_hold_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = install()
     projector = opened()
     projector.load(SEQUENCE)
@@ -225,7 +225,7 @@ def test_of_equal_sizes_the_rate_may_be_chosen(install: Install) -> None:
     projector.close()
 
 
-def test_a_machine_without_a_graphics_driver_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_without_a_graphics_driver_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(finding, "SYSTEM", tmp_path)
     assert find_devices() == ()
     with pytest.raises(UnsupportedByDeviceError, match="nomodeset"):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,7 +13,10 @@ from drivers import dlpc350, dlpc900
 from drivers.dlpc350.projector import DLPC350
 from drivers.dlpc900.projector import DLPC900
 from drivers.pattern_engine.finding import engines, found_devices, resolved
+from drivers.pattern_engine.link import Kind, Link
 from slrig.errors import ConfigError, DeviceGoneError, WrongSystemError
+from tests.contract.dlpc350_device import Cable, FakeEngine
+from tests.contract.dlpc900_device import Fake900
 
 ENGINE = "0003:00000451:00006401"
 MOUSE = "0003:0000046D:0000C077"
@@ -25,7 +30,7 @@ def plug(sysfs: Path, number: int, *, hid: str = ENGINE, serial: str = "", port:
     )
 
 
-def test_engines_are_told_from_other_devices(tmp_path: Path) -> None:
+def test_engines_are_distinguished_from_other_devices(tmp_path: Path) -> None:
     plug(tmp_path, 0, hid=MOUSE, serial="M")
     plug(tmp_path, 10, serial="B")
     plug(tmp_path, 2, serial="A")
@@ -71,6 +76,36 @@ def test_none_is_no_error_for_the_finder_and_one_for_a_rig(tmp_path: Path) -> No
     assert dlpc900.find_devices() == ()
     with pytest.raises(DeviceGoneError, match="asked for a light engine, plugged in: none"):
         dlpc900.open_projector({}, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("driver", "hid", "engine", "options"),
+    [
+        (dlpc350, ENGINE, FakeEngine({}), {"patterns": "p"}),
+        (dlpc900, "0003:00000451:0000C900", Fake900(), {}),
+    ],
+)
+def test_a_rig_opens_the_engine_that_it_means(
+    driver: Any,
+    hid: str,
+    engine: FakeEngine,
+    options: dict[str, object],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for number, serial in enumerate("AB"):
+        plug(tmp_path, number, hid=hid, serial=serial)
+    opened: list[Path] = []
+
+    def open_link(path: Path, kind: Kind) -> Link:
+        opened.append(path)
+        return Link(Cable(engine).host, "light engine", kind)
+
+    monkeypatch.setattr("drivers.pattern_engine.finding.engines", partial(engines, sysfs=tmp_path))
+    monkeypatch.setattr("drivers.pattern_engine.link.open_link", open_link)
+    projector = driver.open_projector({"device": "B", **options}, tmp_path)
+    assert (projector.info.serial, opened) == ("B", [Path("/dev/hidraw1")])
+    projector.close()
 
 
 def test_other_systems_have_no_hidraw(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_what_another_program_left_unread_is_forgotten() -> None:
         link.close()
 
 
-def test_a_refusal_and_a_silent_engine_are_told_and_it_may_come_back(engine: FakeEngine) -> None:
+def test_a_refusal_and_a_silent_engine_are_reported_and_it_may_come_back(engine: FakeEngine) -> None:
     engine.faults.refused.add(0x1A24)
     engine.faults.silent.add(0x1A0C)
     link = linked(engine)

@@ -61,7 +61,9 @@ def test_an_engine_that_shines_is_dark_once_it_is_open(made: MakesBench, size: S
     assert bench.engine.shown[-1] is None
     assert bench.engine.commands[0] == bench.leds[:2], "the first thing that it was told"
     assert {key: bench.engine.registers[key][0] for key in registers} == registers
-    assert (projector.info.size, projector.info.plays) == (size, True)
+    info, options = projector.info, projector._light
+    assert (info.size, info.plays, info.lights) == (size, True, options.led == "white")
+    assert (info.gap_s >= options.light_margin_s, info.duty) == (True, options.duty_limit)
     projector.close()
 
 
@@ -145,7 +147,7 @@ def test_an_unplugged_engine_is_gone_and_can_be_closed(bench: Bench) -> None:
 # How long a pattern is held.
 
 
-def test_a_pattern_is_held_for_as_long_as_asked_and_goes_dark_by_itself(bench: Bench) -> None:
+def test_a_pattern_is_held_for_as_long_as_set_and_goes_dark_by_itself(bench: Bench) -> None:
     projector = bench.loaded(hold_s=3.0)
     shown = projector.show(0)
     bench.clock.advance(2.9)
@@ -205,7 +207,7 @@ def test_closing_from_another_thread_ends_a_wait_for_light(bench: Bench, monkeyp
 
 
 @USB
-def test_one_way_to_go_dark_is_enough_and_the_other_is_told(usb_bench: UsbBench) -> None:
+def test_one_way_to_go_dark_is_enough_and_the_other_is_reported(usb_bench: UsbBench) -> None:
     projector = usb_bench.loaded()
     projector.show(0)
     usb_bench.engine.faults.refused.add(START_STOP)

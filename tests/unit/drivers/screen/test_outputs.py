@@ -105,7 +105,7 @@ def test_no_session_has_no_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else "",
 )
-def test_an_output_that_is_set_otherwise_is_refused_and_mended_by_the_command_told(
+def test_an_output_that_is_set_otherwise_is_refused_and_mended_by_the_command_in_the_message(
     server: DummyServer, right: OutputPixels, command: tuple[str, str], words: str
 ) -> None:
     server.mode(RIGHT, Size(160, 120))
@@ -123,7 +123,7 @@ def test_an_output_that_is_set_otherwise_is_refused_and_mended_by_the_command_to
     opened().close()
 
 
-def test_an_output_that_is_panned_is_refused_and_mended_by_the_command_told(tmp_path: Path) -> None:
+def test_an_output_that_is_panned_is_refused_and_mended_by_the_command_in_the_message(tmp_path: Path) -> None:
     # On a server of its own: some of it stays.
     with DummyServer(tmp_path) as panning, pytest.MonkeyPatch.context() as patch:
         patch.setenv("DISPLAY", panning.display)
@@ -228,7 +228,7 @@ def test_a_compositor_that_does_not_let_go_is_refused_unless_trusted(server: Dum
             projector.show(0)
 
 
-def test_the_server_is_told_not_to_blank_its_displays_for_as_long(server: DummyServer) -> None:
+def test_the_server_does_not_blank_its_displays_meanwhile(server: DummyServer) -> None:
     def is_saving(connection: Connection) -> bool:
         reply = connection.ask(1, struct.pack("<I", connection.screen.root), extension="MIT-SCREEN-SAVER")
         return reply[1] == 1
@@ -247,7 +247,7 @@ def test_the_server_is_told_not_to_blank_its_displays_for_as_long(server: DummyS
 
 
 @pytest.mark.parametrize("backend", ["x11", "sdl"])
-def test_the_end_of_the_server_is_told_of_and_survived(tmp_path: Path, backend: str) -> None:
+def test_the_end_of_the_server_is_reported_and_survived(tmp_path: Path, backend: str) -> None:
     # In a process of its own: Xlib may end it.
     program = f"""
 import sys

@@ -33,7 +33,7 @@ def table(output: str, **options: object) -> dict[str, object]:
 
 
 @pytest.mark.usefixtures("wayland")
-def test_a_compositor_that_tells_nothing_is_refused_unless_trusted() -> None:
+def test_a_compositor_that_reports_nothing_is_refused_unless_trusted() -> None:
     (found,) = find_devices()
     with pytest.raises(UnsupportedByDeviceError, match=r"session without X .* trust_compositor = true"):
         open_projector(table(found.device, trust_compositor=False), Path())

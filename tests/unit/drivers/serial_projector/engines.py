@@ -26,7 +26,7 @@ class Change:
 class Scene:
     """Everything that a box did to the light and the cameras, over all its starts. `watch` is called at each change.
 
-    at_ns : the box's time, where it is not CLOCK_MONOTONIC: whoever runs the box sets it.
+    at_ns : the box's time, where it is not CLOCK_MONOTONIC: set by what runs the box.
     """
 
     changes: list[Change] = field(default_factory=list)

@@ -60,7 +60,7 @@ def test_host_and_box_write_the_same_lines_and_have_the_same_numbers() -> None:
         ("hello", None),
     ],
 )
-def test_lines_are_told_apart(text: str, line: object) -> None:
+def test_lines_are_distinguished(text: str, line: object) -> None:
     assert parsed(framed(text)) == line
     assert parsed(framed(text)[:-1] + b"\r\n") == line
 
@@ -211,7 +211,7 @@ def test_a_refusal_keeps_its_code_and_words() -> None:
         link(lambda data, _count: answer(data, "ERR 77 new")).ask("SHOW", 1)
 
 
-def test_a_wait_ends_when_the_projector_is_closed_and_a_port_that_is_gone_is_told() -> None:
+def test_a_wait_ends_when_the_projector_is_closed_and_a_port_that_is_gone_is_reported() -> None:
     asked = link(silence, reply_s=60.0, deadline_s=600.0)
     asked.closing.set()
     with pytest.raises(DeviceStateError):

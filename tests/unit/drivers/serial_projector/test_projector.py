@@ -66,7 +66,7 @@ def calls(projector: SerialProjector) -> dict[str, Callable[[], object]]:
     }
 
 
-def test_the_box_tells_what_it_is(bench: Bench) -> None:
+def test_the_box_describes_itself(bench: Bench) -> None:
     projector = bench.open()
     status = projector.client.status()
     assert (status.state, status.index, status.shows) == ("idle", None, 0)
@@ -75,7 +75,7 @@ def test_the_box_tells_what_it_is(bench: Bench) -> None:
     assert (info.latency_s, info.gap_s, info.duty) == (LIGHT_US / 1e6, GAP_US / 1e6, 1.0)
 
 
-def test_show_tells_when_its_light_came(make_bench: Callable[..., Bench]) -> None:
+def test_show_returns_when_its_light_came(make_bench: Callable[..., Bench]) -> None:
     bench = make_bench(drift=80e-6)
     projector = bench.loaded()
     for index in ALL:
@@ -138,7 +138,7 @@ def test_patterns_can_be_stepped_by_trigger(bench: Bench) -> None:
     ],
     ids=["a run", "the last two", "backwards, twice"],
 )
-def test_what_is_flashed_is_shown_in_any_order_and_as_often_as_asked_for(
+def test_what_is_flashed_is_shown_in_any_order_and_as_often_as_wanted(
     bench: Bench, sequence: PatternSequence, indices: tuple[int, ...], lit: list[int]
 ) -> None:
     projector = bench.open()
@@ -469,6 +469,6 @@ def test_bytes_that_another_program_took_first_are_no_unplug(terminal: SerialLin
         ("nonsense://x", DeviceError, "does not open"),
     ],
 )
-def test_what_is_no_port_is_told(port: str, error: type[DeviceError], words: str) -> None:
+def test_what_is_no_port_is_reported(port: str, error: type[DeviceError], words: str) -> None:
     with pytest.raises(error, match=words):
         open_projector({"port": port}, Path())

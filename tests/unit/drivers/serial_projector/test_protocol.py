@@ -28,7 +28,7 @@ HELLO = "HELLO 1 1000 5000 1000 1000"
 
 @dataclass
 class Light(Hardware):
-    """A light engine whose clock stands still; `did` is what it was told."""
+    """A light engine whose clock stands still; `did` : the calls that it got."""
 
     now_us: int = 1_000
     did: list[str] = field(default_factory=list)
@@ -175,7 +175,7 @@ def test_an_old_number_is_not_obeyed_and_numbers_wrap(host: Host) -> None:
     assert host.number == 10
 
 
-def test_damaged_and_strange_lines_are_told(host: Host) -> None:
+def test_damaged_and_strange_lines_are_reported(host: Host) -> None:
     whole = framed("1A2B 9 SHOW 1")
     strange = ("1A2B", "1A2B 9", "1A2B nine PING", "1A2B 10000 PING", "A 9 PING")
     for data in (whole.replace(b"1*", b"2*"), b"rubbish\n", b"\xff\xfe\n", *map(framed, strange)):
@@ -480,7 +480,7 @@ def test_patterns_are_picked_from_anywhere_in_the_flash() -> None:
     assert run == ("2", "0", "3000"), "what was picked is used up"
 
 
-def test_patterns_that_the_flash_lacks_are_told_and_not_loaded(host: Host) -> None:
+def test_patterns_that_the_flash_lacks_are_reported_and_not_loaded(host: Host) -> None:
     assert host.ok(f"PICK 0 {CRC32[4]:08X} 12345678 {CRC32[2]:08X} 0") == ("4", "1", "3")
     assert host.ok(f"PICK 4 {CRC32[0]:08X} 1") == ("6", "5")
     assert host.refused("LOAD 6 00000000") == Refused.PATTERNS
@@ -510,7 +510,7 @@ def test_limits_are_granted_in_part_and_never_exceeded() -> None:
     host.ok(HELLO)
 
 
-def test_status_tells_everything(host: Host) -> None:
+def test_status_reports_everything(host: Host) -> None:
     words = dict(word.split("=") for word in host.ok("STATUS"))
     assert "index" not in words, "nothing was lit yet"
     host.ok("SHOW 5")

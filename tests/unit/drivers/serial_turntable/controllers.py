@@ -190,7 +190,7 @@ class LineBoard(Board):
     off_deg: float = 0.0
     """How far beyond what was asked for it stops."""
     turning: bool = False
-    """In a turn that nobody waits for: it heeds STOP alone."""
+    """In a turn of a host before: it heeds STOP alone."""
 
     def obey(self, line: str) -> bytes:
         verb, _, rest = line.partition(" ")

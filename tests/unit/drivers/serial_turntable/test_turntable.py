@@ -99,7 +99,7 @@ def test_marlin_is_named_and_not_served() -> None:
         (BOOT, "restarted by itself.*no longer knows where it stands"),
     ],
 )
-def test_what_the_controller_refuses_is_told_in_words_and_ends_all_turning(answer: bytes, words: str) -> None:
+def test_what_the_controller_refuses_is_reported_in_words_and_ends_all_turning(answer: bytes, words: str) -> None:
     board = GrblBoard()
     table = board.opened(**X)
     board.on_line = lambda line: answer if line.startswith("G") else None
@@ -121,7 +121,7 @@ def test_what_the_controller_refuses_is_told_in_words_and_ends_all_turning(answe
         (b"<Idle|MPos:x,0.000,0.000>\r\n", "holds no place"),
     ],
 )
-def test_what_happens_in_the_middle_of_a_turn_is_told(report: bytes, words: str) -> None:
+def test_what_happens_in_the_middle_of_a_turn_is_reported(report: bytes, words: str) -> None:
     board = GrblBoard(slow=50)
     table = board.opened(**X)
     begun = board.reports
@@ -196,7 +196,7 @@ def test_a_board_that_was_left_turning_is_stopped_and_angles_count_from_there() 
         ({}, b"OK 90\xff\n", "did not answer 'TURN 90.000' in time, and was told to stop"),
     ],
 )
-def test_what_a_board_says_instead_is_told(board: dict[str, Any], answer: bytes | None, words: str) -> None:
+def test_what_a_board_says_instead_is_reported(board: dict[str, Any], answer: bytes | None, words: str) -> None:
     made = LineBoard(**board)
     table = made.opened()
     made.on_line = lambda line: answer if line.startswith("TURN") else None
@@ -249,7 +249,7 @@ def test_an_angle_that_is_no_number_is_refused_before_anything_moves(angle_deg: 
     table.turn(5.0)
 
 
-def test_wrong_options_are_told_together() -> None:
+def test_wrong_options_are_reported_together() -> None:
     with pytest.raises(ConfigError) as caught:
         open_grbl({"axis": "W", "sped_deg_s": 3.0, "units_per_deg": 0.0}, Path())
     assert all(key in str(caught.value) for key in ("port", "axis", "sped_deg_s", "units_per_deg"))
