@@ -135,6 +135,11 @@ BROKEN: list[tuple[Maker, str, str]] = [
             ({"t_start_ns": lambda _: 0}, "frame_times_lie_on_the_projectors_clock", "0 ns"),
             ({"colour": lambda _: None}, "frames_come_in_colour_where_it_is_declared", "CameraInfo.colour is True"),
             (
+                {"colour": lambda frame: lambda: np.dstack([255 - frame.image, frame.image, frame.image])},
+                "frames_come_in_colour_where_it_is_declared",
+                "DN of blue, green and red",
+            ),
+            (
                 {"colour": lambda frame: lambda: frame.image},
                 "frames_come_in_colour_where_it_is_declared",
                 "(80, 110)",
