@@ -49,7 +49,7 @@ class Bench(ABC):
 
     def __init__(self) -> None:
         self.pulses: list[int] = []
-        self.clock = VirtualClock(beside=["light engine", SEQUENCER])
+        self.clock = VirtualClock(threads=["light engine", SEQUENCER])
 
     @abstractmethod
     def open(self, **options: Any) -> LightEngine347x | LightEngine350 | LightEngine900:

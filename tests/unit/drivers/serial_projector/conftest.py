@@ -36,7 +36,7 @@ class Bench:
     """A box with SEQUENCE in its flash, on a line: what it did, and how to open it. `line` : options of `Line`."""
 
     def __init__(self, *, drift: float = 0.0, **line: Any) -> None:
-        self.clock = VirtualClock(beside=["serial projector"])
+        self.clock = VirtualClock(threads=["serial projector"])
         self.scene = Scene(at_ns=self.clock.now_ns())
         self.engine = CoreEngine(self.scene, description(CRC32), drift=drift)
         self.line = MemoryLine(self.engine, self.clock, **line)
