@@ -1,13 +1,13 @@
-"""`slrig import`: images of other programs give the mesh that slrig's own bundle of them gives, or a refusal.
+"""`slrig import`: images of other programs become a bundle that gives the mesh of slrig's own, or are refused.
 
-A rendered rig plays the patterns of each program, as that program is documented to make them, written down here anew;
-its frames are laid out as the program lays them out. Real captures of two of them are imported where they are at hand.
+A rig plays the patterns of each program as that program is documented to make them, written down here a second time.
+Frames are laid out as the program lays them out. Real captures of two of them are imported where they are at hand.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from slrig.bundle import read_bundle, write_bundle
 from slrig.cli.commands import app
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.model import Axis, Black, Gray, Pattern, PatternSequence, Pixels, Shot, Size, White
+from slrig.model import Axis, Black, Gray, Pattern, Pixels, Size, White
 from slrig.patterns.sequence import encode
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
@@ -45,6 +45,7 @@ def profiles(columns: Sequence[Pixels], rows: Sequence[Pixels], *, inverses: boo
 
 
 WHITE, BLACK = np.full((1, 1), 255, np.uint8), np.zeros((1, 1), np.uint8)
+BOTH = (False, True)
 SHOWN = {
     "opencv": [*profiles(gray(200, 8), gray(160, 8), inverses=True), WHITE, BLACK],
     # Both codes have as many bits, the projector is in the middle of them, and the finest bit is not shown.
@@ -55,23 +56,24 @@ SHOWN = {
     ],
     "slstudio": [WHITE, BLACK, *profiles(gray(200, 8), [], inverses=False)],
 }
-
-
-def own_patterns(program: str) -> list[Pattern]:
-    """The same in slrig's words, written by hand."""
-    both = (False, True)
-    if program == "opencv":
-        return [*(Gray(axis, bit, 8, 1, 0, inv) for axis in Axis for bit in range(8) for inv in both), White(), Black()]
-    if program == "scan3d":
-        offsets = {Axis.COLUMN: 28, Axis.ROW: 48}
-        code = [Gray(axis, bit, 7, 2, offsets[axis], inv) for axis in Axis for bit in range(7) for inv in both]
-        return [White(), Black(), *code]
-    return [White(), Black(), *(Gray(Axis.COLUMN, bit, 8) for bit in range(8))]
+OWN: dict[str, list[Pattern]] = {
+    "opencv": [
+        *(Gray(axis, bit, 8, 1, 0, inverted) for axis in Axis for bit in range(8) for inverted in BOTH),
+        White(), Black(),
+    ],
+    "scan3d": [
+        White(), Black(),
+        *(Gray(axis, bit, 7, 2, offset, inverted) for axis, offset in ((Axis.COLUMN, 28), (Axis.ROW, 48))
+          for bit in range(7) for inverted in BOTH),
+    ],
+    "slstudio": [White(), Black(), *(Gray(Axis.COLUMN, bit, 8) for bit in range(8))],
+}  # fmt: skip
+"""The same in slrig's words, written by hand."""
 
 
 @pytest.mark.parametrize("program", SHOWN)
 def test_the_patterns_of_a_program_light_what_slrig_says(program: str) -> None:
-    ours = encode(own_patterns(program), PROJECTOR)
+    ours = encode(OWN[program], PROJECTOR)
     assert len(ours) == len(SHOWN[program])
     for index, theirs in enumerate(SHOWN[program]):
         assert (ours.image(index) == np.broadcast_to(theirs, PROJECTOR.shape)).all(), index
@@ -90,46 +92,13 @@ def test_opencv_itself_shows_these_patterns(size: Size) -> None:
         assert (ours.image(index) == image).all(), index
 
 
-class Recorded:
-    """A scan of a small rendered rig that plays a program's patterns: slrig's bundle, and its frames."""
-
-    def __init__(self, folder: Path, patterns: Sequence[Pattern], monkeypatch: pytest.MonkeyPatch) -> None:
-        rig = write_rig(folder)
-        text = rig.read_text().replace("[256, 192]", "[200, 160]").replace("[240, 192]", "[480, 384]")
-        for device in ("1100.0, 1101.0", "950.0, 951.0"):
-            x, y = map(float, device.split(", "))
-            factor = 0.8 if x > 1000 else 2
-            text = text.replace(device, f"{x * factor}, {y * factor}")
-        rig.write_text(text)
-        sequence: PatternSequence = encode(patterns, PROJECTOR)
-        monkeypatch.setattr("slrig.scan.acquisition.pattern_sequence", lambda *_, **__: sequence)
-        with open_rig(read_rig(rig)) as opened:
-            capture_frames(
-                opened, ScanPlan(), folder / "own", progress=lambda *_: None, cancelled=lambda: False
-            ).finish()
-        self.folder = folder / "own"
-        bundle = read_bundle(self.folder)
-        assert bundle.calibration is not None
-        self.capture, self.calibration = bundle.capture, bundle.calibration
-
-    def images(self) -> list[Pixels]:
-        return [shot.image for shot in self.capture.shots]
+def seen(program: str) -> list[Pixels]:
+    """Small images of a program's patterns, as a camera sees them that looks at the projector's picture."""
+    sequence = encode(OWN[program], PROJECTOR)
+    return [np.uint8(10) + sequence.image(index)[:32, :48] // np.uint8(2) for index in range(len(sequence))]
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Recorded]:
-    kept: dict[str, Recorded] = {}
-
-    def record(program: str) -> Recorded:
-        if program not in kept:
-            with pytest.MonkeyPatch.context() as patch:
-                kept[program] = Recorded(tmp_path_factory.mktemp(program), own_patterns(program), patch)
-        return kept[program]
-
-    return record
-
-
-def lay_out(folder: Path, images: Sequence[Pixels], name: str, *, first: int = 0) -> Path:
+def lay_out(folder: Path, images: Sequence[Pixels], name: str = "{:02}.png", *, first: int = 0) -> Path:
     folder.mkdir(parents=True)
     for number, image in enumerate(images, first):
         assert cv2.imwrite(str(folder / name.format(number)), image)
@@ -140,218 +109,190 @@ def run(*words: object) -> Result:
     return CliRunner().invoke(app, ["import", *map(str, words)])
 
 
-def imported(folder: Path, output: Path, *words: object, projector: str = "200x160") -> Result:
-    return run(folder, "--output", output, "--projector", projector, *words)
-
-
-def refused(result: Result, *words: str) -> None:
-    assert result.exit_code == 2, result.output
-    said = " ".join(result.stderr.split())
-    assert [word for word in words if word not in said] == [], said
-
-
-def opencv_file(
-    path: Path, names: Sequence[str], values: Sequence[object], numbers: dict[str, int] | None = None
-) -> None:
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in [*zip(names, values, strict=True), *(numbers or {}).items()]:
-        storage.write(name, value)
-    storage.release()
-
-
-def lenses(scan: Recorded) -> list[np.ndarray]:
-    """Two lenses and the pose of the second in the first, as other programs have them."""
-    camera, projector = scan.calibration.cameras["left"], scan.calibration.projector
-    assert projector is not None
-    turn = projector.rotation @ camera.rotation.T
-    move = projector.translation_mm - turn @ camera.translation_mm
-    return [
-        camera.matrix, camera.distortion[None], projector.matrix, projector.distortion[None], turn, move[:, None]
-    ]  # fmt: skip
-
-
-def same_mesh(one: Path, other: Path, scratch: Path) -> None:
-    reconstructed(one, scratch / "one")
-    reconstructed(other, scratch / "other")
-    assert (scratch / "one" / "mesh.ply").read_bytes() == (scratch / "other" / "mesh.ply").read_bytes()
-
-
-def in_the_cameras_frame(scan: Recorded, folder: Path) -> Path:
-    """A bundle of slrig's own with the camera's frame as world, as the calibrations of other programs have it."""
-    turn, move = lenses(scan)[-2:]
-    calibration = scan.calibration
-    assert calibration.projector is not None
-    left = replace(calibration.cameras["left"], rotation=np.eye(3), translation_mm=np.zeros(3))
-    there = replace(calibration.projector, rotation=turn, translation_mm=move.ravel())
-    capture = scan.capture
-    write_bundle(folder, capture, replace(calibration, cameras={"left": left}, projector=there, solved=None))
-    return folder
-
-
-@pytest.mark.slow
-def test_images_in_opencvs_order_give_the_mesh_of_slrigs_bundle(
-    recorded: Callable[[str], Recorded], tmp_path: Path
-) -> None:
-    scan = recorded("opencv")
-    folder = lay_out(tmp_path / "images", scan.images(), "pattern_cam1_im{}.png", first=1)
-    shutil.copy(scan.folder / "calibration.json", folder)
-    done = imported(folder, tmp_path / "bundle", "--camera", "left")
+def imported(folder: Path, output: Path, *words: object, projector: str = "200x160") -> Path:
+    done = run(folder, "--output", output, "--projector", projector, *words)
     assert done.exit_code == 0, done.output
-    bundle = read_bundle(tmp_path / "bundle")
-    assert list(bundle.capture.patterns) == own_patterns("opencv")
-    assert bundle.capture.cameras == scan.capture.cameras
-    same_mesh(scan.folder, tmp_path / "bundle", tmp_path)
-    assert reconstructed(scan.folder, tmp_path / "judged")["truth"]["rms_mm"] < 0.06
+    return output
 
 
 @pytest.mark.parametrize("ends", ["first", "swapped", "none"])
-def test_white_and_black_may_stand_first_or_last_or_be_absent(
-    recorded: Callable[[str], Recorded], tmp_path: Path, ends: str
-) -> None:
-    *images, white, black = recorded("opencv").images()
-    *code, _, _ = own_patterns("opencv")
+def test_white_and_black_may_stand_first_or_last_or_be_absent(tmp_path: Path, ends: str) -> None:
+    *images, white, black = seen("opencv")
+    *code, _, _ = OWN["opencv"]
     orders: dict[str, tuple[list[Pixels], list[Pattern]]] = {
         "first": ([white, black, *images], [White(), Black(), *code]),
         "swapped": ([*images, black, white], [*code, Black(), White()]),
         "none": (images, code),
     }
     shown, wanted = orders[ends]
-    folder = lay_out(tmp_path / "images", shown, "{:02}.png")
-    assert imported(folder, tmp_path / "bundle").exit_code == 0
-    assert list(read_bundle(tmp_path / "bundle").capture.patterns) == wanted
+    bundle = imported(lay_out(tmp_path / "images", shown), tmp_path / "bundle")
+    assert list(read_bundle(bundle).capture.patterns) == wanted
 
 
-@pytest.mark.slow
-def test_scan3ds_folder_gives_the_mesh_of_slrigs_bundle(recorded: Callable[[str], Recorded], tmp_path: Path) -> None:
-    scan = recorded("scan3d")
-    folder = lay_out(tmp_path / "images", scan.images(), "cam_{:02}.png", first=1)
-    values = lenses(scan)
-    # Its pixels are cells of two of the projector's columns and rows: x = 2 x' + 1/2.
-    values[2] = np.diag([0.5, 0.5, 1.0]) @ (values[2] - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    names = ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T")
-    opencv_file(folder / "calibration.yml", [*names, "E"], [*values, np.eye(3)])
-    done = imported(folder, tmp_path / "bundle", "--format", "scan3d", "--camera", "left")
-    assert done.exit_code == 0, done.output
-    bundle = read_bundle(tmp_path / "bundle")
-    assert list(bundle.capture.patterns) == own_patterns("scan3d")
-    own = read_bundle(in_the_cameras_frame(scan, tmp_path / "own"))
-    assert bundle.calibration is not None
-    assert bundle.calibration.projector is not None
-    assert own.calibration is not None
-    assert own.calibration.projector is not None
-    assert np.allclose(bundle.calibration.projector.matrix, own.calibration.projector.matrix, atol=1e-9)
-    same_mesh(tmp_path / "own", tmp_path / "bundle", tmp_path)
-
-
-def test_slstudios_folder_gives_the_mesh_of_slrigs_bundle(recorded: Callable[[str], Recorded], tmp_path: Path) -> None:
-    scan = recorded("slstudio")
-    folder = lay_out(tmp_path / "images", scan.images(), "frameSeq_{:02}.bmp")
-    extents = {"frameWidth": 480, "frameHeight": 384, "screenResX": 200, "screenResY": 160}
-    opencv_file(tmp_path / "rig.xml", ("Kc", "kc", "Kp", "kp", "Rp", "Tp"), lenses(scan), extents)
-    done = imported(
-        folder, tmp_path / "bundle", "--format", "slstudio", "--camera", "left", "--calibration", tmp_path / "rig.xml"
-    )
-    assert done.exit_code == 0, done.output
-    assert list(read_bundle(tmp_path / "bundle").capture.patterns) == own_patterns("slstudio")
-    same_mesh(in_the_cameras_frame(scan, tmp_path / "own"), tmp_path / "bundle", tmp_path)
-
-
-def test_a_capture_without_a_calibration_decodes(recorded: Callable[[str], Recorded], tmp_path: Path) -> None:
-    folder = lay_out(tmp_path / "images", recorded("opencv").images(), "{:02}.png")
-    assert imported(folder, tmp_path / "bundle").exit_code == 0
-    done = CliRunner().invoke(
-        app, ["reconstruct", str(tmp_path / "bundle"), "--decode-only", "--output", str(tmp_path / "decoded")]
-    )
-    assert done.exit_code == 0, done.output
-
-
-def test_names_by_a_template_and_by_a_list(recorded: Callable[[str], Recorded], tmp_path: Path) -> None:
-    scan = recorded("opencv")
+def test_names_by_a_template_and_by_a_list(tmp_path: Path) -> None:
     folder, lines = tmp_path / "images", ["file,pattern,camera"]
-    for camera in ("a", "b"):
-        (folder / camera).mkdir(parents=True)
-    for shot in scan.capture.shots:
-        pattern = scan.capture.patterns[shot.pattern]
+    shown = dict(zip(OWN["opencv"], seen("opencv"), strict=True))
+    for pattern, image in shown.items():
         if isinstance(pattern, Gray):
-            kind = "inv" if pattern.inverted else "n"
-            name = f"{pattern.axis.value[:3]}_{7 - pattern.bit:02}_{kind}.png"
+            name = f"{pattern.axis.value[:3]}_{7 - pattern.bit:02}_{'inv' if pattern.inverted else 'n'}.png"
             words = f"{pattern.axis.value} {pattern.bit}{' inverted' if pattern.inverted else ''}"
         else:
             name, words = f"{pattern.kind}.png", pattern.kind
         for camera in ("a", "b"):
-            cv2.imwrite(str(folder / camera / name), shot.image)
+            (folder / camera).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / camera / name), image)
             lines.append(f"{camera}/{name}, {words}, {camera}")
-    (folder / "a" / "preview.png").write_bytes((folder / "a" / "white.png").read_bytes())
+    shutil.copy(folder / "a" / "white.png", folder / "a" / "preview.png")
     (tmp_path / "list.csv").write_text("\n".join(lines))
     template = ("--names", "{camera}/{axis}_{power:02}_{inverted}.png", "--white", "{camera}/white.png")
-    done = imported(folder, tmp_path / "one", *template, "--black", "{camera}/black.png")
-    assert done.exit_code == 0, done.output
+    ends = (*template, "--black", "{camera}/black.png")
+    done = run(folder, "--output", tmp_path / "one", "--projector", "200x160", *ends)
     assert "1 images that no pattern is known of: a/preview.png" in done.stdout
-    assert imported(folder, tmp_path / "other", "--list", tmp_path / "list.csv").exit_code == 0
-    wanted = {shot.pattern: shot.image for shot in scan.capture.shots}
-    for bundle in ("one", "other"):
-        capture = read_bundle(tmp_path / bundle).capture
+    for bundle in (tmp_path / "one", imported(folder, tmp_path / "other", "--list", tmp_path / "list.csv")):
+        capture = read_bundle(bundle).capture
         assert set(capture.cameras) == {"a", "b"}
-        assert len(capture.shots) == 2 * len(scan.capture.shots)
-        for shot in capture.shots:
-            index = scan.capture.patterns.index(capture.patterns[shot.pattern])
-            assert (shot.image == wanted[index]).all()
+        assert len(capture.shots) == 2 * len(shown)
+        assert all((shot.image == shown[capture.patterns[shot.pattern]]).all() for shot in capture.shots)
 
 
-def test_what_does_not_fit_is_refused_in_words(recorded: Callable[[str], Recorded], tmp_path: Path) -> None:
-    images = recorded("opencv").images()
-    out = tmp_path / "bundle"
-    whole = lay_out(tmp_path / "whole", images, "{:02}.png")
-    refused(imported(whole, out, projector="1280x800"), "expected 42 images for a projector of 1280 x 800", "found 34")
-    refused(imported(whole, out, projector="200"), "expected columns x rows as 1024x768, found '200'")
-    refused(imported(whole, out, "--pattern", "white black columns"), "expected 18 images", "found 34")
-    refused(imported(whole, out, "--pattern", "white xor-02"), "'xor-02'", "XOR-02", "not read")
-    refused(imported(whole, out, "--pattern", "white, black, columns, rows"), "expected white, and 01.png black")
-    refused(imported(whole, out, "--format", "slstudio"), "expected 10, 8, 16 images", "phase shifts are not read")
-    refused(imported(whole, out, "--format", "scan3d", "--names", "{bit}.png"), "expected one of --format")
-    refused(imported(whole, out, "--camera", "a", "--camera", "b"), "expected 1 names of cameras (cam0), found 2")
-    refused(imported(whole, out, "--format", "scan3d", "--cell-px", 2), "expected no --cell-px and --offset-px")
-    refused(imported(tmp_path / "none", out), "expected a folder of images")
+def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
+    images, out = seen("opencv"), tmp_path / "bundle"
+    whole = lay_out(tmp_path / "whole", images)
+
+    def refused(folder: Path, *words: object, says: Sequence[str], projector: str = "200x160") -> None:
+        result = run(folder, "--output", out, "--projector", projector, *words)
+        assert result.exit_code == 2, result.output
+        said = " ".join(result.stderr.split())
+        assert [word for word in says if word not in said] == [], said
+
+    count = "expected 42 images for a projector of 1280 x 800"
+    refused(whole, projector="1280x800", says=[count, "found 34"])
+    refused(whole, projector="200", says=["expected columns x rows as 1024x768, found '200'"])
+    refused(whole, "--pattern", "white black columns", says=["expected 18 images", "found 34"])
+    refused(whole, "--pattern", "white xor-02", says=["'xor-02'", "XOR-02", "not read"])
+    refused(whole, "--pattern", "white, black, columns, rows", says=["expected white, and 01.png black"])
+    refused(whole, "--format", "slstudio", says=["expected 10, 8, 16 images", "phase shifts are not read"])
+    refused(whole, "--format", "scan3d", "--names", "{bit}.png", says=["expected one of --format"])
+    refused(whole, "--camera", "a", "--camera", "b", says=["expected 1 names of cameras (cam0), found 2"])
+    refused(whole, "--format", "scan3d", "--cell-px", 2, says=["expected no --cell-px and --offset-px"])
+    refused(tmp_path / "none", says=["expected a folder of images"])
     (whole / "07.png").unlink()
-    refused(imported(whole, out), "found 33 images")
-    refused(imported(whole, out, "--names", "{bit:02}.png"), "expected bits 0 to 7")
+    refused(whole, says=["found 33 images"])
+    refused(whole, "--names", "{bit:02}.png", says=["expected bits 0 to 7"])
     cv2.imwrite(str(whole / "07.png"), images[7][:-1])
-    refused(imported(whole, out), "07.png: expected 480 x 384 of 8 bits as 00.png, found 480 x 383")
+    refused(whole, says=["07.png: expected 48 x 32 of 8 bits as 00.png, found 48 x 31"])
     # Three steps of a phase instead of a code.
     phases = [np.tile(np.uint8(127 + 100 * np.cos(np.arange(64) / 5 + k)), (48, 1)) for k in (0, 2, 4)]
     three = lay_out(tmp_path / "three", phases, "frameSeq_{:02}.bmp")
-    refused(imported(three, out, "--format", "slstudio"), "found 3", "phase shifts are not read")
-    twelve = lay_out(tmp_path / "twelve", phases * 4, "{:02}.bmp")
-    (twelve / "10.bmp").unlink()
-    (twelve / "11.bmp").unlink()
-    refused(imported(twelve, out, "--format", "slstudio"), "These may be phase shifts")
+    refused(three, "--format", "slstudio", says=["found 3", "phase shifts are not read"])
+    ten = lay_out(tmp_path / "ten", (phases * 4)[:10], "{:02}.bmp")
+    refused(ten, "--format", "slstudio", says=["These may be phase shifts"])
+    # Samples of 12 bits in files of 16.
+    deep = lay_out(tmp_path / "deep", deep_images())
+    words = ("--pattern", "white black columns")
+    refused(deep, *words, projector="2x1", says=["--bit-depth 12"])
+    refused(deep, *words, "--bit-depth", 8, projector="2x1", says=["samples of 16 bits, found 8"])
     assert not out.exists()
     assert list(tmp_path.glob(".*")) == []
 
 
-def test_depth_and_colour_are_those_of_the_files(tmp_path: Path) -> None:
+def deep_images() -> list[Pixels]:
+    """White, black and one bit of columns, of 12 bits."""
     lit = np.random.default_rng(1).integers(2000, 4000, (30, 40)).astype(np.uint16)
-    code = [(lit * (np.arange(40) // 20 == side)).astype(np.uint16) for side in (1, 0)]
-    folder = lay_out(tmp_path / "deep", [lit, lit // 9, *code], "{}.png")
+    return [lit, lit // 9, *((lit * (np.arange(40) // 20 == side)).astype(np.uint16) for side in (1, 0))]
+
+
+def test_depth_and_colour_are_those_of_the_files(tmp_path: Path) -> None:
     words = ("--pattern", "white black columns")
-    refused(imported(folder, tmp_path / "no", *words, projector="2x1"), "--bit-depth 12")
-    assert imported(folder, tmp_path / "deep12", *words, "--bit-depth", 12, projector="2x1").exit_code == 0
-    assert read_bundle(tmp_path / "deep12").capture.cameras["cam0"].bit_depth == 12
-    refused(imported(folder, tmp_path / "no", *words, "--bit-depth", 8, projector="2x1"), "samples of 16 bits, found 8")
-    blue = np.dstack([lit // 16, lit // 64, lit // 32]).astype(np.uint8)
-    shown = [blue, blue // 9, *(np.where(each[..., None] > 0, blue, 0).astype(np.uint8) for each in code)]
-    assert (
-        imported(lay_out(tmp_path / "bgr", shown, "{}.png"), tmp_path / "colour", *words, projector="2x1").exit_code
-        == 0
-    )
-    shots: tuple[Shot, ...] = read_bundle(tmp_path / "colour").capture.shots
+    deep = imported(lay_out(tmp_path / "12", deep_images()), tmp_path / "a", *words, "--bit-depth", 12, projector="2x1")
+    assert read_bundle(deep).capture.cameras["cam0"].bit_depth == 12
+    coloured = [np.dstack([each // 16, each // 64, each // 32]).astype(np.uint8) for each in deep_images()]
+    bundle = imported(lay_out(tmp_path / "bgr", coloured), tmp_path / "b", *words, projector="2x1")
+    shots = read_bundle(bundle).capture.shots
     assert [shot.colour is not None for shot in shots] == [True, True, False, False]
     assert shots[0].colour is not None
-    assert (shots[0].colour == blue).all()
-    assert (shots[2].image == cv2.cvtColor(shown[2], cv2.COLOR_BGR2GRAY)).all()
+    assert (shots[0].colour == coloured[0]).all()
+    assert (shots[2].image == cv2.cvtColor(coloured[2], cv2.COLOR_BGR2GRAY)).all()
+
+
+class Recorded:
+    """A scan of a small rendered rig that plays a program's patterns: slrig's bundle, and its frames."""
+
+    def __init__(self, folder: Path, program: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        rig = write_rig(folder)
+        text = rig.read_text().replace("[256, 192]", "[200, 160]").replace("[240, 192]", "[480, 384]")
+        text = text.replace("[1100.0, 1101.0]", "[880.0, 880.8]").replace("[950.0, 951.0]", "[1900.0, 1902.0]")
+        rig.write_text(text)
+        sequence = encode(OWN[program], PROJECTOR)
+        monkeypatch.setattr("slrig.scan.acquisition.pattern_sequence", lambda *_, **__: sequence)
+        self.folder, ignored = folder / "own", {"progress": lambda *_: None, "cancelled": lambda: False}
+        with open_rig(read_rig(rig)) as opened:
+            capture_frames(opened, ScanPlan(), self.folder, **ignored).finish()
+        bundle = read_bundle(self.folder)
+        assert bundle.calibration is not None
+        self.capture, self.calibration = bundle.capture, bundle.calibration
+        self.images = [shot.image for shot in self.capture.shots]
+        camera, projector = self.calibration.cameras["left"], self.calibration.projector
+        assert projector is not None
+        turn = projector.rotation @ camera.rotation.T
+        move = projector.translation_mm - turn @ camera.translation_mm
+        # Two lenses and the pose of the second in the first, as other programs have them.
+        self.lenses = [
+            camera.matrix, camera.distortion[None], projector.matrix, projector.distortion[None], turn, move[:, None]
+        ]  # fmt: skip
+
+    def in_the_cameras_frame(self, folder: Path) -> Path:
+        """A bundle of slrig's own with the camera's frame as world, as the calibrations of other programs have it."""
+        calibration = self.calibration
+        assert calibration.projector is not None
+        left = replace(calibration.cameras["left"], rotation=np.eye(3), translation_mm=np.zeros(3))
+        there = replace(calibration.projector, rotation=self.lenses[4], translation_mm=self.lenses[5].ravel())
+        write_bundle(folder, self.capture, replace(calibration, cameras={"left": left}, projector=there, solved=None))
+        return folder
+
+
+def opencv_file(path: Path, names: Sequence[str], values: Sequence[object]) -> None:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in zip(names, values, strict=True):
+        storage.write(name, value)
+    storage.release()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", SHOWN)
+def test_the_images_of_a_program_give_the_mesh_of_slrigs_bundle(
+    program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scan = Recorded(tmp_path / "rig", program, monkeypatch)
+    words = ["--camera", "left"]
+    match program:
+        case "opencv":
+            folder, own = lay_out(tmp_path / "images", scan.images, "pattern_cam1_im{}.png", first=1), scan.folder
+            shutil.copy(scan.folder / "calibration.json", folder)
+        case "scan3d":
+            folder, own = lay_out(tmp_path / "images", scan.images, "cam_{:02}.png", first=1), None
+            values = [*scan.lenses, np.eye(3)]
+            # Its pixels are cells of two of the projector's columns and rows: x = 2 x' + 1/2.
+            values[2] = np.diag([0.5, 0.5, 1.0]) @ (values[2] - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+            opencv_file(folder / "calibration.yml", ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T", "E"), values)
+            words += ["--format", "scan3d"]
+        case _:
+            folder, own = lay_out(tmp_path / "images", scan.images, "frameSeq_{:02}.bmp"), None
+            names = ("Kc", "kc", "Kp", "kp", "Rp", "Tp", "frameWidth", "frameHeight", "screenResX", "screenResY")
+            opencv_file(tmp_path / "rig.xml", names, [*scan.lenses, 480, 384, 200, 160])
+            words += ["--format", "slstudio", "--calibration", str(tmp_path / "rig.xml")]
+    bundle = imported(folder, tmp_path / "bundle", *words)
+    assert list(read_bundle(bundle).capture.patterns) == OWN[program]
+    own = own or scan.in_the_cameras_frame(tmp_path / "own")
+    report = reconstructed(own, tmp_path / "one")
+    reconstructed(bundle, tmp_path / "other")
+    assert (tmp_path / "one" / "mesh.ply").read_bytes() == (tmp_path / "other" / "mesh.ply").read_bytes()
+    if program == "opencv":
+        assert report["truth"]["rms_mm"] < 0.06
 
 
 @pytest.mark.shared
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("capture", "words"),
     [
@@ -363,8 +304,8 @@ def test_real_captures_are_imported_as_they_were_by_hand(
     shared: Path, tmp_path: Path, capture: str, words: tuple[str, ...]
 ) -> None:
     folder = shared / "captures" / capture
-    told = [str(folder / word) if word.endswith(".json") else word for word in words]
-    done = run(folder / "frames", "--output", tmp_path / "bundle", *told)
+    given = [str(folder / word) if word.endswith(".json") else word for word in words]
+    done = run(folder / "frames", "--output", tmp_path / "bundle", *given)
     assert done.exit_code == 0, done.output
     by_hand, found = read_bundle(folder), read_bundle(tmp_path / "bundle")
     assert found.capture.patterns == by_hand.capture.patterns
