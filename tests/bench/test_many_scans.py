@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.conftest import ServiceProcess, Start, write_rig
-from tests.e2e.test_survival import ended
+from tests.e2e.conftest import ServiceProcess, Start, ended, write_rig
 
 SCANS = int(os.environ.get("SLRIG_SCANS") or 500)
 KEPT = 10
@@ -56,7 +55,7 @@ def _resident_mb(process: Path) -> float:
 
 def test_hundreds_of_scans_leave_nothing_behind(start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SLRIG_KEEP_SCANS", str(KEPT))
-    service = start(write_rig(tmp_path / "rig"), fresh=True)
+    service = start(write_rig(tmp_path / "rig"))
     figures: list[Held] = []
     with service.client() as client:
         pinned = ended(client, client.scans.start(label="pinned"))

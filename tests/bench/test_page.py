@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slrig.scan.artefacts import encode_mesh_ply
-from tests.e2e.conftest import Start, browser, write_rig
+from tests.e2e.conftest import Start, browser, scanned, write_rig
 from tests.e2e.page.conftest import Visit, visit
-from tests.e2e.test_browser import scanned
 from tests.unit.scan.test_view_format import sheet
 
 if TYPE_CHECKING:
@@ -38,7 +37,8 @@ def heap_mb(page: Page) -> float:
 
 def test_a_large_mesh_is_seen_at_once_and_whole_soon(start: Start, tmp_path: Path, visit: Visit) -> None:
     service = start(write_rig(tmp_path / "rig"))
-    scan = scanned(service)
+    with service.client() as client:
+        scan = scanned(client)["links"]["self"]
     mesh = sheet(ROWS, COLUMNS)
     (service.data / "scans" / scan.rpartition("/")[2] / "mesh.ply").write_bytes(encode_mesh_ply(mesh))
     seconds = []

@@ -122,7 +122,7 @@ def warmed(client: Client) -> None:
 
 
 def test_from_the_last_frame_to_each_file(start: Start, replayed: Path) -> None:
-    service = start(replayed, fresh=True)
+    service = start(replayed)
     with service.client() as client:
         warmed(client)
         before_s = processor_s(service)
@@ -146,7 +146,7 @@ def test_from_the_last_frame_to_each_file(start: Start, replayed: Path) -> None:
 
 
 def test_from_one_scan_to_the_next(start: Start, replayed: Path) -> None:
-    service = start(replayed, fresh=True)
+    service = start(replayed)
     with service.client() as client:
         warmed(client)
         followed = []
@@ -167,7 +167,7 @@ def test_from_one_scan_to_the_next(start: Start, replayed: Path) -> None:
 
 def test_viewers_do_not_slow_a_capture(start: Start, replayed: Path) -> None:
     """Twenty people look: each follows the scan and wants a picture, and their page asks after the rig each second."""
-    service = start(replayed, fresh=True)
+    service = start(replayed)
     over = threading.Event()
 
     def look(scan: Mapping[str, Any] | None) -> None:

@@ -8,14 +8,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from slrig.client import Client
-from tests.e2e.forking import ForkedCommand, worker_of
 from tests.e2e.pool_processes import Pool
 from tests.npm import lacking
 
@@ -25,6 +24,9 @@ if TYPE_CHECKING:
 KEY = "the key of the tests"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _BROWSER_OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
+SETTINGS_OF_TESTS = ("SLRIG_SHARED", "SLRIG_GOLDEN", "SLRIG_FUZZ_FILES", "SLRIG_FUZZ_SEED")
+SLOW = "realtime = true"
+"""For the head of a rendered rig: frames take as long as those of a real camera, so that a scan has a middle."""
 STOP_LIMIT_S = 30.0
 """How long a test waits for the service to end after SIGTERM: 1 to 2 s on a quiet machine, 4 beside six busy ones."""
 
@@ -74,35 +76,27 @@ def write_rig(folder: Path, *, scene: str = SCENE, head: str = "", faults: str =
 
 
 class ServiceProcess:
-    """A running `slrig serve`; `url` is where it said that it is.
+    """A running `slrig serve`; `url` is the address that it printed. port : any free one by default."""
 
-    fresh : in a Python of its own, for tests of what its start loads, and of limits that it inherits. port : any free
-    one unless one is named.
-    """
-
-    def __init__(self, rig: Path, data: Path, *, fresh: bool = False, port: int = 0) -> None:
+    def __init__(self, rig: Path, data: Path, *, port: int = 0, **settings: str) -> None:
         self.data = data
         self.log = data.with_suffix(".log")
-        command = ["serve", str(rig), "--port", str(port), "--data", str(data)]
         environment = {
-            # Tests ask as fast as they can.
+            # Tests send requests as fast as they can.
             "SLRIG_REQUESTS_PER_S": "100000",
             **os.environ,
             "SLRIG_API_KEY": KEY,
             "SLRIG_MIN_FREE_BYTES": "0",
             "PYTHONUNBUFFERED": "1",
+            **settings,
         }
-        # What a command does by itself about OpenBLAS's threads: the tests' own setting would hide it.
+        # A command limits OpenBLAS's threads by itself: the tests' own setting would hide that.
         environment.pop("OPENBLAS_NUM_THREADS", None)
-        self.process: subprocess.Popen[bytes] | ForkedCommand
-        # What is to be preloaded is read as a program begins.
-        if fresh or "LD_PRELOAD" in environment:
-            with self.log.open("ab") as log:
-                self.process = subprocess.Popen(  # noqa: S603 - our own command
-                    [sys.executable, "-m", "slrig.cli", *command], stdout=subprocess.PIPE, stderr=log, env=environment
-                )
-        else:
-            self.process = ForkedCommand(command, environment, self.log)
+        command = ["serve", str(rig), "--port", str(port), "--data", str(data)]
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(  # noqa: S603 - our own command
+                [sys.executable, "-m", "slrig.cli", *command], stdout=subprocess.PIPE, stderr=log, env=environment
+            )
         assert self.process.stdout is not None
         greeting = self.process.stdout.readline().decode()
         assert " at http://" in greeting, self.log.read_text()
@@ -113,8 +107,6 @@ class ServiceProcess:
 
     def worker_id(self) -> int:
         """The process id of the reconstruction process."""
-        if (forked := worker_of(self.process.pid)) is not None:
-            return forked
         for line in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
             for child in line.read_text().split():
                 if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
@@ -123,23 +115,73 @@ class ServiceProcess:
         raise AssertionError(message)
 
     def stop(self, how: signal.Signals = signal.SIGTERM) -> int:
-        """End it as a service manager would, or a terminal that is closed, and return its exit code."""
+        """End it as a service manager does, or a terminal that is closed, and return its exit code."""
         self.process.send_signal(how)
-        return self._gone(STOP_LIMIT_S)
+        return self.gone()
 
     def kill(self) -> None:
-        """End it as a power cut would."""
+        """End it as a power cut does. Does nothing where it has ended."""
         self.process.kill()
-        self._gone(STOP_LIMIT_S)
+        self.gone()
 
-    def _gone(self, limit_s: float) -> int:
-        code = self.process.wait(limit_s)
+    def gone(self) -> int:
+        """The exit code of a service that is about to end; if it does not end, its log has a trace of each thread."""
+        try:
+            code = self.process.wait(STOP_LIMIT_S)
+        except subprocess.TimeoutExpired as error:
+            self.process.send_signal(signal.SIGABRT)
+            self.process.wait()
+            message = f"the service did not end within {STOP_LIMIT_S:g} s:\n{self.log.read_text()}"
+            raise AssertionError(message) from error
         if self.process.stdout is not None:
             self.process.stdout.close()
         return code
 
 
+@contextmanager
+def serving(rig: Path, data: Path, **settings: str) -> Iterator[ServiceProcess]:
+    """A service within a block. It must end in good order, unless the block ended it."""
+    service = ServiceProcess(rig, data, **settings)
+    try:
+        yield service
+        if service.process.poll() is None:
+            assert service.stop() == 0
+    finally:
+        service.kill()
+
+
+def ended(client: Client, scan: dict[str, Any]) -> dict[str, Any]:
+    """The scan once it is over."""
+    for _ in client.follow(scan["links"]["events"]):
+        pass
+    return client.get(scan["links"]["self"])
+
+
+def scanned(client: Client, **request: Any) -> dict[str, Any]:
+    """A scan from its start to its end."""
+    return ended(client, client.scans.start(**{"if_busy": "queue", **request}))
+
+
+def followed_to(client: Client, scan: dict[str, Any], stage: str) -> None:
+    """Return once the scan has reported this stage or state."""
+    for event in client.follow(scan["links"]["events"]):
+        if stage in {getattr(event, "stage", None), getattr(event, "state", None)}:
+            return
+    message = f"the scan ended without {stage}"
+    raise AssertionError(message)
+
+
 Start = Callable[..., ServiceProcess]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_settings_of_a_person() -> Iterator[None]:
+    """Keep the settings of a person's shell from the services that tests start."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [each for each in os.environ if each.startswith(("NUMBA_", "SLRIG_", "XDG_"))]:
+            if name not in SETTINGS_OF_TESTS:
+                patch.delenv(name)
+        yield
 
 
 @pytest.fixture
@@ -147,15 +189,13 @@ def start(tmp_path: Path) -> Iterator[Start]:
     """Start a service on a rig and a data folder; whatever still runs at the end of the test is killed."""
     running: list[ServiceProcess] = []
 
-    def started(rig: Path, data: Path = tmp_path / "data", *, fresh: bool = False, port: int = 0) -> ServiceProcess:
-        service = ServiceProcess(rig, data, fresh=fresh, port=port)
-        running.append(service)
-        return service
+    def started(rig: Path, data: Path = tmp_path / "data", **settings: Any) -> ServiceProcess:
+        running.append(ServiceProcess(rig, data, **settings))
+        return running[-1]
 
     yield started
     for service in running:
-        if service.process.poll() is None:
-            service.kill()
+        service.kill()
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""An acceptance test over HTTP to its report, cut off, and by schedule, through the real service, on a rendered rig."""
+"""An acceptance test over HTTP to its report, and cut off, through the real service, on a rendered rig."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from slrig.accept.scene import SCENE, scripted_config
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from tests.e2e.conftest import Start, write_rig
-from tests.e2e.schedules import at_once, awaited, newest
+from tests.e2e.schedules import awaited
 from tests.e2e.test_calibration_walk import Caller
 
 REPEATS = 2
@@ -95,25 +95,4 @@ def test_acceptance_over_http_to_its_report_which_outlives_the_service(start: St
         assert cut_off["captures_done"] >= 1
         assert caller.post(f"/acceptance/{second['id']}/cancel", 202)["state"] == "cancelled"
         assert caller.http.delete(f"/acceptance/{second['id']}").status_code == 204
-    assert service.stop() == 0
-
-
-@pytest.mark.slow
-def test_acceptance_by_schedule_has_a_row_with_its_figures(start: Start, tmp_path: Path) -> None:
-    service = start(acceptance_rig(tmp_path / "rig"))
-    with Caller(service) as caller:
-        caller.ready()
-        options = {"repeats": 1, "notes": "monthly"}
-        made = caller.post("/schedule", 201, cron="* * * * *", task="acceptance", enabled=False, options=options)
-        at_once(caller, service, made)
-        name = awaited(lambda: caller.get("/rig")["holder"], "the run")
-        assert name.startswith(f"schedule {made['id'][:8]}, acceptance due ")
-        assert caller.post("/scan", 409)["holder"] == name
-        run = awaited(lambda: newest(caller, made, "succeeded", "failed"), "the end of the run")
-        assert run["state"] == "succeeded", run["reason"]
-        told = run["result"]
-        assert set(told["quantities"]) == {"PF", "PS", "SD", "F"}
-        test = caller.get(f"/acceptance/{told['acceptance']}")
-        assert (test["state"], test["decision"]) == ("finished", told["decision"])
-        assert caller.get(test["files"]["report.json"])["notes"] == "monthly"
     assert service.stop() == 0

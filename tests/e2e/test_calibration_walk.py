@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import resource
+import json
 import threading
 from pathlib import Path
 from typing import Any
 
 import httpx2
 import pytest
+from typer.testing import CliRunner
 
-from slrig.client import Client
-from tests.e2e.conftest import KEY, ServiceProcess, Start
+from slrig.bundle import read_calibration
+from slrig.cli.commands import app
+from tests.e2e.conftest import KEY, ServiceProcess, Start, scanned, serving
 
 SCENE = """
 name = "chessboard"
@@ -71,8 +73,8 @@ blur_px = 0.6
 """
 
 BOARD = {"kind": "chessboard", "corners": [8, 5], "square_mm": 20.0}
-SLOW = "realtime = true"
-"""Frames take as long as a real camera's, so that there is a middle to be stopped in."""
+TRUTH = {"fx": 475.0, "fy": 475.5, "cx": 160.6, "cy": 126.1}
+"""Of the camera."""
 
 
 class Caller:
@@ -120,15 +122,6 @@ class Caller:
             found = self.get(calibration["links"]["self"])
         return found
 
-    def followed_to(self, calibration: dict[str, Any], word: str) -> None:
-        """Return once the calibration has told of this stage or state."""
-        with self.http.sse(calibration["links"]["events"]) as source:
-            for event in source:
-                if word in event.data:
-                    return
-        message = f"the stream ended without {word}"
-        raise AssertionError(message)
-
 
 def write_rig(folder: Path, *, head: str = "", carries: str = "false") -> Path:
     """Write the rig and its scene."""
@@ -139,16 +132,8 @@ def write_rig(folder: Path, *, head: str = "", carries: str = "false") -> Path:
     return rig
 
 
-def scanned(service: ServiceProcess) -> dict[str, Any]:
-    """A scan once it is over."""
-    with service.client() as client:
-        scan = client.scans.start()
-        following(client, scan)
-        return client.get(scan["links"]["self"])
-
-
 @pytest.mark.slow
-def test_rig_is_calibrated_over_http_and_scans_with_it_after_a_restart(start: Start, tmp_path: Path) -> None:
+def test_a_rig_is_calibrated_over_http_and_scans_with_it_after_a_kill(start: Start, tmp_path: Path) -> None:
     rig = write_rig(tmp_path / "rig")
     service = start(rig)
     with Caller(service) as caller:
@@ -174,9 +159,7 @@ def test_rig_is_calibrated_over_http_and_scans_with_it_after_a_restart(start: St
         devices = solved["result"]["devices"]
         assert devices["left"]["rms_px"] < 0.1
         assert devices["projector"]["rms_px"] < 0.15
-        for name, truth in (("fx", 475.0), ("fy", 475.5), ("cx", 160.6), ("cy", 126.1)):
-            value, sigma = devices["left"]["values"][name]
-            assert abs(value - truth) < 5 * sigma, name
+        within_five_deviations(devices)
         assert "<html" in caller.http.get(solved["links"]["files"]["report.html"]).text
         for path in solved["links"]["coverage"].values():
             assert caller.http.get(path).content[:4] == b"\x89PNG"
@@ -190,64 +173,44 @@ def test_rig_is_calibrated_over_http_and_scans_with_it_after_a_restart(start: St
         used = caller.get("/rig")["calibration"]
         assert (used["id"], used["solve"], used["error"]) == (made["id"], made["id"], None)
         assert used["expected_error_mm"] == solved["result"]["expected"]["point_mm"]
-        scan = scanned(service)
+        with service.client() as client:
+            scan = scanned(client)
         assert scan["state"] == "succeeded", scan["error"]
     assert service.stop() == 0
 
 
-@pytest.mark.slow
-def test_pose_that_is_killed_is_swept_and_one_under_way_keeps_scans_out(start: Start, tmp_path: Path) -> None:
-    rig = write_rig(tmp_path / "rig", head=SLOW)
-    service = start(rig)
-    with Caller(service) as caller:
-        made = caller.opened()
-        pose = caller.post(made["links"]["pose"], 202, position=1)
-        caller.followed_to(made, '"capture"')
-        busy = caller.post("/scan", 409)
-        assert busy["holder"] == f"calibration {made['id']}, pose 1"
-        service.kill()
-    staged = service.data / ".incoming"
-    assert len(list(staged.iterdir())) == 1
-    service = start(rig)
-    with Caller(service) as caller:
-        assert list(staged.iterdir()) == []
-        found = caller.get(pose["links"]["self"])
-        assert (found["state"], found["error"]["type"]) == ("interrupted", "/problems/scan-interrupted")
-        assert "Start it again" in found["error"]["detail"]
-        caller.ready()
-        with service.client() as client:
-            scan = client.scans.start()
-            refused = caller.post(made["links"]["pose"], 409, position=1)
-            assert refused["holder"] == scan["id"]
-            client.post(scan["links"]["cancel"], None)
-            following(client, scan)
-    assert service.stop() == 0
+def within_five_deviations(devices: dict[str, Any]) -> None:
+    """The camera is calibrated to its own stated accuracy."""
+    for name, truth in TRUTH.items():
+        value, sigma = devices["left"]["values"][name]
+        assert abs(value - truth) < 5 * sigma, name
 
 
 @pytest.mark.slow
-def test_disk_that_is_full_during_a_pose_fails_it_and_no_other(start: Start, tmp_path: Path) -> None:
-    service = start(write_rig(tmp_path / "rig", head=SLOW))
-    with Caller(service) as caller:
-        made = caller.opened()
-        caller.post(made["links"]["pose"], 202, position=1)
-        caller.followed_to(made, '"capture"')
-        soft, hard = resource.prlimit(service.process.pid, resource.RLIMIT_FSIZE)
-        # As a full disk does, the kernel refuses whatever would make a file longer.
-        resource.prlimit(service.process.pid, resource.RLIMIT_FSIZE, (0, hard))
-        freed = threading.Event()
-        while caller.get("/rig")["holder"] is not None:
-            freed.wait(0.02)
-        resource.prlimit(service.process.pid, resource.RLIMIT_FSIZE, (soft, hard))
-        # The end of a pose goes on record as soon as the disk takes it.
-        (pose,) = caller.settled(made)["shot"]
-        assert (pose["state"], pose["error"]["type"]) == ("failed", "/problems/storage")
-        assert list((service.data / ".incoming").iterdir()) == []
-        caller.post(made["links"]["pose"], 202, position=2)
-        assert [each["state"] for each in caller.settled(made)["shot"]] == ["failed", "succeeded"]
-    assert service.stop() == 0
+def test_a_camera_is_calibrated_alone_by_command_and_again_from_the_poses_of_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board = ["--board", "chessboard", "--corners", "8x5", "--square-mm", "20"]
 
+    def calibrate(*arguments: str | Path, code: int = 0) -> str:
+        done = CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
+        assert done.exit_code == code, done.output
+        return done.stdout if code == 0 else " ".join(done.stderr.split())
 
-def following(client: Client, scan: dict[str, Any]) -> None:
-    """Wait until a scan is over."""
-    for _ in client.follow(scan["links"]["events"]):
-        pass
+    with serving(write_rig(tmp_path / "rig"), tmp_path / "data") as service:
+        with Caller(service) as call:
+            call.ready()
+        monkeypatch.setenv("SLRIG_API_KEY", KEY)
+        monkeypatch.setenv("SLRIG_URL", service.url)
+        refused = calibrate("run", *board, "--cameras-alone", "--scripted", "--activate", code=2)
+        assert "of camera 'left' alone, without a projector: it tells no depth, and cannot scan" in refused
+        (listed,) = json.loads(calibrate("list", "--json"))["calibrations"]
+        assert (listed["state"], listed["active"]) == ("solved", False)
+        shown = json.loads(calibrate("show", listed["id"][:8], "--json"))["result"]
+    assert set(shown["devices"]) == {"left"}
+    within_five_deviations(shown["devices"])
+    poses = service.data / "calibrations" / listed["id"] / "poses"
+    again = calibrate("solve", poses, *board, "--output", tmp_path / "camera.json", "--json")
+    assert json.loads(again)["expected"]["point_mm"] == pytest.approx(shown["expected"]["point_mm"], rel=1e-3)
+    found = read_calibration(tmp_path / "camera.json")
+    assert (list(found.cameras), found.projector) == (["left"], None)

@@ -1,27 +1,107 @@
-"""Every line that a service writes to its log is JSON with the same fields, whoever wrote it, and holds no key."""
+"""Every line that a service writes to its log is JSON with the same fields, whoever wrote it, and holds no key.
+
+Run as a program, `python -m tests.e2e.test_logs DATA`, this is a service in which everything that may log does.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import json
+import logging
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
+import warnings
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
+import pytest
+import structlog
+
 from slrig import KEY_VARIABLE
+from slrig.api import server
 from slrig.client import Client
-from slrig.client.events import StateChange
-from tests.e2e import talkative_service
-from tests.e2e.conftest import STOP_LIMIT_S
+from slrig.config import ServiceSettings, rig_of
+from slrig.jobs import worker_process
+from tests.e2e.conftest import STOP_LIMIT_S, ended
+from tests.unit.api.conftest import ServedBench
 
 KEY = "Zm9vYmFy-_x0.key~of+the/tests"
+LIBRARIES = ("sqlalchemy.pool", "alembic.runtime.migration", "sse_starlette.sse", "uvicorn.error", "asyncio")
+SAID = "Authorization: Bearer {key}, Cookie: session={key}; X-API-Key: {key}"
 
 
+class Unraisable:
+    """Fails where nobody can be told."""
+
+    def __del__(self) -> None:
+        message = "too late"
+        raise RuntimeError(message)
+
+
+def fail() -> None:
+    message = "nobody caught this"
+    raise ValueError(message)
+
+
+def speak() -> None:
+    """What a process says that is not made of our own calls to the log."""
+    warnings.warn("a library will change", stacklevel=1)
+    for name in LIBRARIES:
+        logging.getLogger(name).warning("%s complains", name)
+        logging.getLogger(name).info("%s chats", name)
+    thread = threading.Thread(target=fail, name="unlucky")
+    thread.start()
+    thread.join()
+    Unraisable()
+    gc.collect()
+
+
+class Server(server._Server):
+    """Speaks once it has started."""
+
+    async def startup(self, sockets: list[Any] | None = None) -> None:
+        await super().startup(sockets)
+        asyncio.get_running_loop().call_soon(fail)
+        asyncio.get_running_loop().create_task(asyncio.to_thread(fail))
+        logging.getLogger("uvicorn.error").error(SAID.format(key=os.environ[KEY_VARIABLE]))
+        await asyncio.to_thread(speak)
+
+
+def _called(task: worker_process.Task, given: dict[str, Any]) -> Any:
+    structlog.get_logger("worker").warning("told by the worker")
+    speak()
+    return _call(task, given)
+
+
+_call = worker_process._called
+if __name__ == "__mp_main__":
+    # In the worker, which loads the main module of its parent under this name.
+    worker_process._called = _called
+
+
+def main(data: Path) -> None:
+    """Serve from a data folder until SIGTERM, and end by an error that nobody catches."""
+    bench = ServedBench(data)
+    bench.gate.set()
+    server._Server = Server  # type: ignore[misc] # whoever serves makes one of these
+    server.open_service = lambda *_, **__: bench.service
+    settings = ServiceSettings(data_dir=data, port=0, log_format="json")
+    rig = rig_of({"name": "bench", "head": {"driver": "none"}}, data / "rig.toml")
+    try:
+        server.serve(settings, rig, say=lambda line: print(line, flush=True))  # noqa: T201 - as the command does
+    finally:
+        fail()
+
+
+@pytest.mark.slow
 def test_all_lines_have_one_form(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tests.e2e.talkative_service", str(tmp_path / "data")]
+    command = [sys.executable, "-m", "tests.e2e.test_logs", str(tmp_path / "data")]
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(  # noqa: S603 - our own interpreter and code
             command, stdout=subprocess.PIPE, stderr=log, env={**os.environ, KEY_VARIABLE: KEY}
@@ -37,9 +117,7 @@ def test_all_lines_have_one_form(tmp_path: Path) -> None:
             assert malformed.recv(100).startswith(b"HTTP/1.1 400")
         with Client(url, KEY) as client:
             scan = client.scans.start(label="one")
-            *_, last = client.follow(scan["links"]["events"])
-            assert isinstance(last, StateChange)
-            assert last.state == "succeeded"
+            assert ended(client, scan)["state"] == "succeeded"
         process.send_signal(signal.SIGTERM)
         assert process.wait(STOP_LIMIT_S) == 1
     finally:
@@ -52,7 +130,7 @@ def test_all_lines_have_one_form(tmp_path: Path) -> None:
     assert all({"event", "level", "logger", "timestamp"} <= set(line) for line in lines)
     assert all(isinstance(line["event"], str) and line["timestamp"].endswith("Z") for line in lines)
     loggers = {line["logger"] for line in lines}
-    assert loggers >= {*talkative_service.LIBRARIES, "py.warnings", "slrig.logs", "slrig.jobs.endings", "worker"}
+    assert loggers >= {*LIBRARIES, "py.warnings", "slrig.logs", "slrig.jobs.endings", "worker"}
     events = [line["event"] for line in lines]
     assert "Invalid HTTP request received." in events
     assert any("a library will change" in event for event in events)
@@ -73,3 +151,7 @@ def test_all_lines_have_one_form(tmp_path: Path) -> None:
         "alembic.runtime.migration",
     }
     assert next(line for line in lines if line["event"] == "job finished")["job"] == scan["id"]
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,9 +1,8 @@
-"""A recording as a rig: POST /scan on it gives the recording again, and from it the original mesh, byte for byte."""
+"""A recording as a rig: its scans are the recorded scan, byte for byte, and its service loads no mathematics."""
 
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,17 @@ import pytest
 
 from drivers.replay import open_head
 from slrig.bundle import read_capture
+from slrig.calibrate.records import USUAL_PATTERNS
+from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig
+from slrig.discovery import open_rig
 from slrig.model import Capture
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
-from tests.e2e.conftest import ServiceProcess, Start, write_rig
+from tests.e2e.conftest import ServiceProcess, scanned, serving, write_rig
+from tests.e2e.test_calibration_walk import BOARD, Caller
+from tests.e2e.test_calibration_walk import write_rig as write_board_rig
 
 SECOND_CAMERA = """
 [[head.camera]]
@@ -29,31 +33,27 @@ target_mm = [0.0, 0.0, 0.0]
 blur_px = 0.6
 bit_depth = 12
 """
-MESHES = ("mesh.ply", "points.ply")
+REPLAYED = 'name = "replayed"\n[head]\ndriver = "replay"\nbundle = "{bundle}"\nspeed = {speed}\n'
+MATHEMATICS = ("numba", "llvmlite", "scipy/optimize", "scipy/linalg", "scipy/sparse", "scipy/spatial")
 
 
-def scanned(start: Start, rig: Path, data: Path) -> Path:
-    """Serve a rig, POST one scan; the folder of its files."""
-    service = start(rig, data)
-    with service.client() as client:
-        scan = client.scans.start()
-        for _ in client.follow(scan["links"]["events"]):
-            pass
-        record = client.get(scan["links"]["self"])
-    assert record["state"] == "succeeded", record
-    assert service.stop() == 0
-    return data / "scans" / str(record["id"])
+def recorded(rig: Rig, bundle: Path, plan: ScanPlan) -> Path:
+    capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
+    return bundle
 
 
-def reconstructed(bundle: Path, output: Path) -> Path:
+def meshes(bundle: Path, output: Path) -> dict[str, bytes]:
     """What `slrig reconstruct` writes."""
     reconstruct_bundle(bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False)
-    return output
+    return written(output)
+
+
+def written(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in ("mesh.ply", "points.ply")}
 
 
 def frames(bundle: Path) -> list[dict[str, Any]]:
-    description: dict[str, Any] = json.loads((bundle / "bundle.json").read_text())
-    found: list[dict[str, Any]] = description["frames"]
+    found: list[dict[str, Any]] = json.loads((bundle / "bundle.json").read_text())["frames"]
     return found
 
 
@@ -61,52 +61,77 @@ def images(capture: Capture) -> dict[tuple[int, str], bytes]:
     return {(shot.pattern, shot.camera): shot.image.tobytes() for shot in capture.shots}
 
 
-def require_equal_meshes(first: Path, second: Path) -> None:
-    for name in MESHES:
-        assert (first / name).read_bytes() == (second / name).read_bytes(), name
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    """The bundle of a scan, the folder of that scan's other files, and what is reconstructed from the bundle."""
-    folder = tmp_path_factory.mktemp("recording")
-    with ExitStack() as leaving:
-
-        def start(rig: Path, data: Path) -> ServiceProcess:
-            service = ServiceProcess(rig, data)
-            leaving.callback(lambda: service.kill() if service.process.poll() is None else None)
-            return service
-
-        original = scanned(start, write_rig(folder / "rig", faults=SECOND_CAMERA), folder / "first")
-    bundle = folder / "bundle"
-    (original / "bundle").rename(bundle)
-    return bundle, original, reconstructed(bundle, folder / "reconstructed")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0, 20])
-def test_a_scan_of_a_recorded_scan_is_that_scan(
-    start: Start, tmp_path: Path, recording: tuple[Path, Path, Path], speed: int
-) -> None:
-    bundle, original, from_bundle = recording
+def test_a_scan_of_a_recorded_scan_is_that_scan(tmp_path: Path, speed: int) -> None:
+    with open_rig(read_rig(write_rig(tmp_path / "rig", faults=SECOND_CAMERA))) as opened:
+        bundle = recorded(opened, tmp_path / "bundle", ScanPlan())
     rig = tmp_path / "replayed.toml"
-    rig.write_text(f'name = "replayed"\n[head]\ndriver = "replay"\nbundle = "{bundle}"\nspeed = {speed}\n')
-    again = scanned(start, rig, tmp_path / "second")
+    rig.write_text(REPLAYED.format(bundle=bundle, speed=speed))
+    with serving(rig, tmp_path / "data") as service, service.client() as client:
+        scan = scanned(client)
+    assert scan["state"] == "succeeded", scan
+    again = service.data / "scans" / scan["id"]
     # Times and exposures to the last digit, every pixel, and therefore every byte of the mesh.
     assert frames(again / "bundle") == frames(bundle)
     assert images(read_capture(again / "bundle")) == images(read_capture(bundle))
-    require_equal_meshes(again, original)
-    require_equal_meshes(again, from_bundle)
+    assert written(again) == meshes(bundle, tmp_path / "reconstructed")
 
 
 @pytest.mark.shared
 @pytest.mark.slow
-def test_a_scan_of_somebody_elses_recording_gives_its_mesh(shared: Path, tmp_path: Path) -> None:
+def test_a_scan_of_another_programs_recording_gives_its_mesh(shared: Path, tmp_path: Path) -> None:
     bundle = shared / "bundles" / "gauge"
     head = open_head({"bundle": str(bundle)}, tmp_path)
     settings = {name: CameraSettings(camera.info.exposure_range_s[0]) for name, camera in head.cameras.items()}
-    plan = ScanPlan()
-    again = tmp_path / "again"
     with Rig("replayed", head.cameras, head.projector, settings, head.calibration, head) as rig:
-        capture_frames(rig, plan, again, progress=lambda *_: None, cancelled=lambda: False).finish()
-    require_equal_meshes(reconstructed(again, tmp_path / "new"), reconstructed(bundle, tmp_path / "old"))
+        again = recorded(rig, tmp_path / "again", ScanPlan())
+    assert meshes(again, tmp_path / "new") == meshes(bundle, tmp_path / "old")
+
+
+def libraries(process: int) -> set[str]:
+    """Which of `MATHEMATICS` a process has code of."""
+    mapped = Path(f"/proc/{process}/maps").read_text()
+    return {name for name in MATHEMATICS if f"/{name}/" in mapped}
+
+
+def work(service: ServiceProcess) -> None:
+    """All kinds of work, each to its end."""
+    with service.client() as client, Caller(service) as caller:
+        scan, other = scanned(client), scanned(client)
+        assert scan["state"] == "succeeded"
+        for name in (each for each in scan["links"]["files"] if each.startswith(("points-", "depth-", "mesh."))):
+            assert caller.http.get(scan["links"]["files"][name]).status_code == 200, name
+        assert caller.http.get("/calibration/board.pdf").content[:4] == b"%PDF"
+        still = [[float(row == column) for column in range(4)] for row in range(4)]
+        model = caller.post("/model", 202, scans=[scan["id"], other["id"]], poses=[still, still])
+        caller.http.get(model["links"]["events"])
+        assert caller.get(model["links"]["self"])["state"] == "succeeded", caller.get(model["links"]["self"])["error"]
+        made = caller.post("/calibration", 201, board=BOARD)
+        caller.post(made["links"]["pose"], 202)
+        (pose,) = caller.settled(made)["shot"]
+        assert pose["state"] == "succeeded", pose["error"]
+        caller.post(made["links"]["solve"], 202)
+        assert caller.settled(made)["error"]["type"] == "/problems/solve-refused"
+        assert caller.http.get(caller.settled(made)["links"]["coverage"]["left"]).content[:4] == b"\x89PNG"
+        known = json.loads((service.data / "scans" / scan["id"] / "bundle" / "calibration.json").read_text())
+        first, second = (caller.post("/calibration/import", 201, **known)["id"] for _ in range(2))
+        assert caller.get(f"/calibration/compare?first={first}&second={second}")["words"]
+        begun = caller.post("/rig/verification", 202, board=BOARD)
+        # The stream ends when the verification has.
+        assert '"succeeded"' in caller.http.get(begun["links"]["events"]).text, caller.get(begun["links"]["self"])
+
+
+@pytest.mark.slow
+def test_the_process_that_holds_the_rig_loads_no_mathematics(tmp_path: Path) -> None:
+    """A compiler or a solver, and whatever it may do to a process, belongs to the worker."""
+    with open_rig(read_rig(write_board_rig(tmp_path / "rendered", carries="true"))) as opened:
+        assert opened.positioner is not None
+        opened.positioner.move(1)
+        bundle = recorded(opened, tmp_path / "pose", ScanPlan(patterns=USUAL_PATTERNS))
+    rig = tmp_path / "replayed.toml"
+    rig.write_text(REPLAYED.format(bundle=bundle, speed=0))
+    with serving(rig, tmp_path / "data") as service:
+        work(service)
+        assert "numba" in libraries(service.worker_id())
+        assert libraries(service.process.pid) == set()

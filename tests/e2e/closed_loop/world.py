@@ -88,11 +88,6 @@ class World:
         """The sensor's."""
         return self._format
 
-    @property
-    def poses(self) -> int:
-        """How many poses its script has."""
-        return len(self._script.poses)
-
     def move(self, index: int) -> None:
         """Put what the script moves into a pose, as a person does: while nobody photographs it."""
         with self._lock:

@@ -91,32 +91,28 @@ class Handle:
 
     def step(self, step: str, number: int = 0) -> None:
         """Ask whether a step may be done, and meet the fault that it is to meet."""
-        if self._gone:
-            raise self._unplugged()
-        match self.line.told(device=self.name, step=step, number=number):
-            case "go":
-                return
-            case "unplug":
-                self._gone = True
-                raise self._unplugged()
-            case "busy" if step == "open":
-                message = f"{self.name} is held by another program; end that program, then scan again"
-                raise DeviceBusyError(message)
-            case "busy":
-                raise OSError(errno.EBUSY, os.strerror(errno.EBUSY), f"/dev/{self.name}")
-            case "time-out" if step == "read":
-                message = f"no frame from {self.name} in time"
-                raise FrameTimeoutError(message)
-            case "time-out":
-                message = f"{self.name} did not answer {step} within 0.15 s; check its cable and power"
-                raise DeviceError(message)
-            case "input/output error":
-                raise OSError(errno.EIO, os.strerror(errno.EIO))
-            case "defect":
-                message = "list index out of range"
-                raise IndexError(message)
-            case unknown:
-                raise AssertionError(unknown)
+        answer = "unplug" if self._gone else self.line.told(device=self.name, step=step, number=number)
+        self._gone = answer == "unplug"
+        if answer != "go":
+            raise self._fault(answer, step)
+
+    def _fault(self, what: str, step: str) -> Exception:
+        match what, step:
+            case "unplug", _:
+                return DeviceGoneError(f"{self.name} was unplugged; plug it in, then scan again")
+            case "busy", "open":
+                return DeviceBusyError(f"{self.name} is held by another program; end that program, then scan again")
+            case "busy", _:
+                return OSError(errno.EBUSY, os.strerror(errno.EBUSY), f"/dev/{self.name}")
+            case "time-out", "read":
+                return FrameTimeoutError(f"no frame from {self.name} in time")
+            case "time-out", _:
+                return DeviceError(f"{self.name} did not answer {step} within 0.15 s; check its cable and power")
+            case "input/output error", _:
+                return OSError(errno.EIO, os.strerror(errno.EIO))
+            case "defect", _:
+                return IndexError("list index out of range")
+        raise AssertionError(what)
 
     def require_open(self) -> None:
         """Raise DeviceStateError after `close`."""
@@ -133,10 +129,6 @@ class Handle:
         if not self._gone:
             self.step("close")
         return not self._gone
-
-    def _unplugged(self) -> DeviceGoneError:
-        message = f"{self.name} was unplugged; plug it in, then scan again"
-        return DeviceGoneError(message)
 
 
 class FaultyCamera:
@@ -155,14 +147,12 @@ class FaultyCamera:
         self.info = CameraInfo(name, "faulty camera", "c1", form, frozenset({self._way}), (0.001, 1.0), (1.0, 4.0))
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`."""
         self._handle.require_open()
         self._handle.step("configure")
         self._exposure_s = settings.exposure_s
         return AppliedSettings(settings.exposure_s, settings.gain)
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`."""
         self._handle.require_open()
         if self._armed or trigger is not self._way or count < 1:
             message = f"{self._handle.name} is {'armed' if self._armed else 'not armed'}, asked {count} by {trigger}"
@@ -171,7 +161,6 @@ class FaultyCamera:
         self._armed, self._read, self._triggered_ns = True, 0, None
 
     def trigger(self) -> None:
-        """See `Camera`."""
         self._handle.require_open()
         self._handle.step("trigger")
         self._triggered_ns = time.monotonic_ns()
@@ -203,13 +192,11 @@ class FaultyCamera:
         return Frame(self._handle.name, image, start_ns, end_ns, 0, self._count, 0, self._exposure_s, 1.0)
 
     def disarm(self) -> None:
-        """See `Camera`."""
         if self._armed and not self._handle.closed:
             self._handle.step("disarm")
         self._armed = False
 
     def close(self) -> None:
-        """See `Camera`."""
         self._armed = False
         self._pace.set()
         self._handle.close()
@@ -234,7 +221,6 @@ class FaultyProjector:
         self._light(None, "open")
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`."""
         self._handle.require_open()
         self._handle.step("load")
         self._light(None, "load")
@@ -251,7 +237,6 @@ class FaultyProjector:
         return Shown(index, time.monotonic_ns(), 0)
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`."""
         self._handle.require_open()
         if not self.info.plays or self._sequence is None:
             message = "this projector does not play, or has nothing to"
@@ -261,15 +246,12 @@ class FaultyProjector:
         self._handle.step("play")
 
     def stop(self) -> None:
-        """See `Projector`."""
         self._dark("stop")
 
     def blank(self) -> None:
-        """See `Projector`."""
         self._dark("blank")
 
     def close(self) -> None:
-        """See `Projector`."""
         if self._handle.close():
             self._light(None, "close")
 

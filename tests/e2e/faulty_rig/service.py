@@ -1,22 +1,20 @@
-"""The real service on a faulty rig: its files, its process, and what a client finds."""
+"""The real service on a faulty rig: its files, its process, and a client that follows a scan to the end."""
 
 from __future__ import annotations
 
-import signal
+import os
 import sqlite3
-import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
+import threading
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from slrig.bundle import write_calibration
 from slrig.client import Client
-from tests.e2e.conftest import ServiceProcess
+from slrig.client.events import StateChange
+from slrig.errors import ServiceError
+from tests.e2e.conftest import KEY, ServiceProcess
 from tests.e2e.faulty_rig import scenery
-from tests.e2e.faulty_rig.desk import Desk
+from tests.e2e.faulty_rig.desk import WAIT_S, Desk
 
 CHECKOUT = Path(__file__).parents[3]
 SHUTDOWN_S = 1.0
@@ -45,44 +43,24 @@ faulty = {__package__}.driver:open_projector
 """
 
 
-@contextmanager
-def installed(folder: Path, *, shutdown_s: float = SHUTDOWN_S) -> Iterator[None]:
-    """Have the faulty driver installed for the services that are started within the block.
+def serve(
+    folder: Path, desk: Desk, trigger: str = "software", *, shutdown_s: float = SHUTDOWN_S, **settings: str
+) -> ServiceProcess:
+    """Start the service on a faulty rig, whose driver is installed for it; again on the same data in the same folder.
 
-    shutdown_s : how long they wait for a driver at their end.
+    With a hardware trigger its projector plays. shutdown_s : how long the service waits for a driver at its end.
     """
-    info = folder / "faulty_rig-1.0.dist-info"
-    info.mkdir(parents=True)
+    info = folder / "site" / "faulty_rig-1.0.dist-info"
+    info.mkdir(parents=True, exist_ok=True)
     (info / "METADATA").write_text(_METADATA)
     (info / "entry_points.txt").write_text(_ENTRIES)
-    with pytest.MonkeyPatch.context() as patch:
-        for path in (CHECKOUT, folder):
-            patch.setenv("PYTHONPATH", str(path), prepend=":")
-        patch.setenv("SLRIG_SHUTDOWN_S", str(shutdown_s))
-        patch.setenv("PYTHONFAULTHANDLER", "1")
-        yield
-
-
-def write_rig(folder: Path, desk: Desk, trigger: str) -> Path:
-    """Write the rig file of a faulty rig; with a hardware trigger its projector plays."""
-    folder.mkdir(parents=True, exist_ok=True)
     write_calibration(folder / "calibration.json", scenery.calibration())
-    rig = folder / f"{trigger}.toml"
+    rig = folder / "rig.toml"
     plays = "true" if trigger == "hardware" else "false"
     rig.write_text(_RIG.format(desk=desk.path, plays=plays, trigger=trigger, camera=scenery.CAMERA_NAME))
-    return rig
-
-
-def ended(client: Client, scan: dict[str, Any]) -> dict[str, Any]:
-    """The scan once it is over."""
-    for _ in client.follow(scan["links"]["events"]):
-        pass
-    return client.get(scan["links"]["self"])
-
-
-def scanned(client: Client) -> dict[str, Any]:
-    """A scan from its start to its end."""
-    return ended(client, client.scans.start(if_busy="queue"))
+    path = [str(info.parent), str(CHECKOUT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    driver = {"PYTHONPATH": os.pathsep.join(path), "PYTHONFAULTHANDLER": "1", "SLRIG_SHUTDOWN_S": str(shutdown_s)}
+    return ServiceProcess(rig, folder / "data", **driver, **settings)
 
 
 def half_written(data: Path) -> list[str]:
@@ -103,15 +81,35 @@ def half_written(data: Path) -> list[str]:
     return [str(path.relative_to(data)) for path in found]
 
 
-def gone(service: ServiceProcess, limit_s: float) -> int:
-    """The exit code of a service that is about to end; if it does not, its log tells where each thread is."""
-    try:
-        code = service.process.wait(limit_s)
-    except subprocess.TimeoutExpired as error:
-        service.process.send_signal(signal.SIGABRT)
-        service.process.wait()
-        message = f"the service did not end within {limit_s:g} s:\n{service.log.read_text()}"
-        raise AssertionError(message) from error
-    if service.process.stdout is not None:
-        service.process.stdout.close()
-    return code
+class Follower:
+    """Follows a scan by one event stream, on a thread of its own, and does not connect again. `states` : in order."""
+
+    def __init__(self, service: ServiceProcess, scan: dict[str, Any]) -> None:
+        self._url, self._scan = service.url, scan
+        self.states: list[str] = []
+        self._began = threading.Event()
+        self._thread = threading.Thread(target=self._follow, daemon=True)
+        self._thread.start()
+        assert self._began.wait(WAIT_S)
+
+    def last(self) -> str:
+        """The last state in its stream, once that has ended."""
+        self._thread.join(WAIT_S)
+        assert not self._thread.is_alive()
+        return self.states[-1]
+
+    def _follow(self) -> None:
+        with Client(self._url, KEY, pause=_give_up) as client:
+            try:
+                for event in client.follow(self._scan["links"]["events"]):
+                    if isinstance(event, StateChange):
+                        self.states.append(event.state)
+                    self._began.set()
+            except ServiceError:
+                # The stream broke off, or there is nothing more to connect to.
+                return
+
+
+def _give_up(_: float) -> None:
+    message = "the stream broke off"
+    raise ServiceError(message)

@@ -11,10 +11,10 @@ import pytest
 from slrig.api.keys import KeyRing
 from slrig.api.scopes import Scope
 from slrig.config import read_settings
-from tests.e2e.conftest import Start
+from tests.e2e.conftest import SLOW, Start
 from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
 from tests.e2e.page.golden import looks_as_kept
-from tests.e2e.test_calibration_walk import SLOW, Caller, write_rig
+from tests.e2e.test_calibration_walk import Caller, write_rig
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

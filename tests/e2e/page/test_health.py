@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.e2e.conftest import Start
+from tests.e2e.conftest import SLOW, Start
 from tests.e2e.page.conftest import Visit, count, disabled, violations
 from tests.e2e.page.golden import looks_as_kept
-from tests.e2e.test_calibration_walk import SLOW
 from tests.e2e.test_calibration_walk import write_rig as write_board_rig
 
 if TYPE_CHECKING:

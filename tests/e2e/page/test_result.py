@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,11 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray, Refusal
-from tests.e2e.conftest import Start, write_rig
+from tests.e2e.conftest import SLOW, ServiceProcess, scanned, serving, write_rig
 from tests.e2e.page.conftest import PHONE, Visit, count, violations
 from tests.e2e.page.golden import looks_as_kept
-from tests.e2e.test_browser import scanned
-from tests.e2e.test_survival import ended
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -30,6 +29,13 @@ pytestmark = pytest.mark.slow
 PLATE_NORMAL: FloatArray = Rotation.from_euler("xyz", (8.0, -12.0, 0.0), degrees=True).as_matrix()[:, 2]
 EYE_MM: FloatArray = np.array((-150.0, -12.0, -560.0))
 HALF_FIELD = np.tan(np.radians(15))
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
+    folder = tmp_path_factory.mktemp("results")
+    with serving(write_rig(folder / "rig", head=SLOW), folder / "data") as service:
+        yield service
 
 
 def on_plate(right: float, down: float) -> FloatArray:
@@ -64,9 +70,9 @@ def measured(page: Page, right: float, down: float) -> None:
     page.locator("canvas").click(position={"x": x, "y": y})
 
 
-def test_a_result_is_looked_at_measured_compared_and_downloaded(start: Start, tmp_path: Path, visit: Visit) -> None:
-    service = start(write_rig(tmp_path / "rig"))
-    first, scan = scanned(service), scanned(service)
+def test_a_result_is_looked_at_measured_compared_and_downloaded(service: ServiceProcess, visit: Visit) -> None:
+    with service.client() as client:
+        first, scan = (scanned(client)["links"]["self"] for _ in range(2))
     folder = service.data / "scans" / scan.rpartition("/")[2]
     report = json.loads((folder / "report.json").read_text())
     page = visit(service, scan[1:], size=(1280, 1100), ignored="404")
@@ -153,11 +159,10 @@ def test_a_result_is_looked_at_measured_compared_and_downloaded(start: Start, tm
     page.get_by_text("It was deleted, or the address is not right.").wait_for()
 
 
-def test_what_a_scan_was_limited_to_is_told_and_drawn(start: Start, tmp_path: Path, visit: Visit) -> None:
-    service = start(write_rig(tmp_path / "rig"))
+def test_what_a_scan_was_limited_to_is_told_and_drawn(service: ServiceProcess, visit: Visit) -> None:
     region = {"box_mm": [[-20, -25, -40], [20, 15, 40]], "least_contrast": 0.02}
     with service.client() as client:
-        scan = ended(client, client.scans.start(reconstruction={"region": region}))
+        scan = scanned(client, reconstruction={"region": region})
     assert scan["state"] == "succeeded", scan
     page = visit(service, scan["links"]["self"][1:], size=(1280, 1100), ignored="status of 4")
     page.get_by_text("a box, x -20 to 20, y -25 to 15, z -40 to 40 mm; contrasts above 2 %").wait_for()
@@ -196,8 +201,7 @@ def test_what_a_scan_was_limited_to_is_told_and_drawn(start: Start, tmp_path: Pa
     count(page.get_by_text("a box"), 0)
 
 
-def test_a_scan_without_a_mesh_says_why_and_what_next(start: Start, tmp_path: Path, visit: Visit) -> None:
-    service = start(write_rig(tmp_path / "rig", head="realtime = true"))
+def test_a_scan_without_a_mesh_says_why_and_what_next(service: ServiceProcess, visit: Visit) -> None:
     with service.client() as client:
         scan: str = client.scans.start(label="a wrong one")["links"]["self"]
     page = visit(service, scan[1:], size=PHONE, dark=True)

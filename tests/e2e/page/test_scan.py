@@ -9,7 +9,7 @@ import pytest
 from slrig.api.keys import KeyRing
 from slrig.api.scopes import Scope
 from slrig.config import ServiceSettings
-from tests.e2e.conftest import KEY, Start, write_rig
+from tests.e2e.conftest import KEY, SLOW, Start, write_rig
 from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
 from tests.e2e.page.golden import looks_as_kept
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit: Visit) -> None:
     # In real time, so that there is something to see of the progress.
-    service = start(write_rig(tmp_path / "rig", head="realtime = true"))
+    service = start(write_rig(tmp_path / "rig", head=SLOW))
     page = visit(service, key=None, ignored="401")
     page.get_by_label("Key").fill("not the key")
     page.get_by_role("button", name="Enter").click()
@@ -28,6 +28,8 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     page.keyboard.press("Enter")
     page.get_by_text("None yet.").wait_for()
     page.get_by_text("ready").wait_for()
+    # A rig alone has no fleet.
+    count(page.get_by_role("link", name="Fleet"), 0)
 
     page.get_by_role("group", name="Camera").get_by_role("button", name="left").click()
     page.get_by_role("img", name="Live picture of camera left").wait_for()

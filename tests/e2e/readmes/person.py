@@ -1,4 +1,4 @@
-"""Somebody with two terminals and a fresh folder: types commands in one, and has the service running in the other."""
+"""A person with two terminals and a fresh folder: types commands in one, and has the service running in the other."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -18,6 +17,7 @@ from types import TracebackType
 import httpx2
 
 from tests.e2e.readmes.commands import ROOT
+from tests.listening import free_port
 
 COMMAND_LIMIT_S = 600.0
 _START_LIMIT_S = 60.0
@@ -37,12 +37,9 @@ class Person:
         _lay_out_environment(folder / ".venv" / "bin")
         home = folder / "home"
         home.mkdir()
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.address = f"127.0.0.1:{free.getsockname()[1]}"
-        given = {name: text for name, text in os.environ.items() if not name.startswith(("SLRIG_", "XDG_"))}
+        self.address = f"127.0.0.1:{free_port()}"
         host, _, port = self.address.partition(":")
-        self._environment = given | {
+        self._environment = os.environ | {
             "HOME": str(home),
             "PYTHONPATH": str(ROOT),
             "SLRIG_HOST": host,
@@ -65,18 +62,12 @@ class Person:
         if command.startswith("slrig serve "):
             return self.serve(command)
         kept = self.folder / ".environment"
-        typed = subprocess.Popen(  # noqa: S603 - the commands of our own READMEs
+        typed = subprocess.run(  # noqa: S603 - the commands of our own READMEs
             ["bash", "-c", f"{command}\nstatus=$?\nenv -0 > {kept}\nexit $status"],  # noqa: S607
             cwd=self.folder, env=self._environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, start_new_session=True,
+            stderr=subprocess.STDOUT, timeout=COMMAND_LIMIT_S, check=False,
         )  # fmt: skip
-        try:
-            said = typed.communicate(timeout=COMMAND_LIMIT_S)[0].decode(errors="replace")
-        except subprocess.TimeoutExpired:
-            os.killpg(typed.pid, signal.SIGKILL)
-            said = typed.communicate()[0].decode(errors="replace")
-            message = f"it did not end in {COMMAND_LIMIT_S:g} s:\n{said[-3000:]}"
-            raise AssertionError(message) from None
+        said = typed.stdout.decode(errors="replace")
         assert typed.returncode == 0, f"it ended with exit code {typed.returncode}:\n{said[-3000:]}"
         self._environment = dict(each.split("=", 1) for each in kept.read_text().split("\0") if each)
         return said
@@ -117,11 +108,8 @@ class Person:
         service, self._service = self._service, None
         try:
             code = service.wait(_STOP_LIMIT_S)
-        except subprocess.TimeoutExpired:
+        finally:
             service.kill()
-            service.wait()
-            message = f"the service did not end in {_STOP_LIMIT_S:g} s after Ctrl-C"
-            raise AssertionError(message) from None
         assert code in {0, 130}, f"the service ended with {code}:\n{self._log.read_text(errors='replace')[-3000:]}"
 
     def _answers(self) -> bool:

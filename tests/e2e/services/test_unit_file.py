@@ -20,7 +20,7 @@ from tests.npm import lacking
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 DEPLOY = ROOT / "config" / "deploy"
 HERE = Path(__file__).parent / "unit_file"
 BOOT_LIMIT_S = 240.0

@@ -1,4 +1,4 @@
-"""The service in a real browser: what its own pages may do, and what the pages of others may not."""
+"""What pages of other sites may not do with the service, in a real browser."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.e2e.conftest import KEY, ServiceProcess, Start, write_rig
-from tests.e2e.test_survival import ended
+from tests.e2e.conftest import KEY, ServiceProcess, scanned, serving, write_rig
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, BrowserContext, Page
+    from playwright.sync_api import Browser, BrowserContext
 
 pytestmark = pytest.mark.slow
 
@@ -69,32 +68,9 @@ _ATTACK = """async ([service, scan]) => {
   return tried;
 }"""
 
-_OWN_PAGE = """async (scan) => {
-  const image = new Image();
-  const shown = await new Promise((resolve) => {
-    image.onload = () => resolve(image.naturalWidth); image.onerror = () => resolve(0);
-    image.src = scan + "/preview.png";
-  });
-  const preview = await new Promise((resolve) => {
-    const moving = new Image();
-    moving.onload = () => { const width = moving.naturalWidth; moving.src = ""; resolve(width); };
-    moving.onerror = () => resolve(0);
-    moving.src = "/preview/left?light=white";
-  });
-  const events = await new Promise((resolve) => {
-    const source = new EventSource(scan + "/events"), seen = [];
-    source.addEventListener("state", (event) => {
-      seen.push(JSON.parse(event.data).state);
-      if (seen.at(-1) === "succeeded") { source.close(); resolve(seen); }
-    });
-    source.onerror = () => { source.close(); resolve(seen); };
-  });
-  return {shown, preview, events, cookie: document.cookie};
-}"""
-
 
 class _Blank(BaseHTTPRequestHandler):
-    """An empty page of somebody else's."""
+    """An empty page of another site."""
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -119,70 +95,27 @@ def elsewhere() -> Iterator[int]:
             thread.join()
 
 
-@pytest.fixture
-def context(browser: Browser) -> Iterator[BrowserContext]:
-    """A browser with an empty profile."""
-    made = browser.new_context()
-    made.set_default_timeout(_LIMIT_MS)
-    yield made
-    made.close()
-
-
-def log_in(page: Page, service: ServiceProcess) -> None:
-    """Exchange the key for a cookie, as the page of the service does."""
-    page.goto(f"{service.url}/livez")
-    sent = "key => fetch('/session', {method: 'POST', headers: {Authorization: `Bearer ${key}`}}).then(r => r.status)"
-    assert page.evaluate(sent, KEY) == 201
-
-
-def scanned(service: ServiceProcess) -> str:
-    """The path of a scan that succeeded."""
-    with service.client() as client:
-        scan = ended(client, client.scans.start())
-    assert scan["state"] == "succeeded"
-    path: str = scan["links"]["self"]
-    return path
-
-
-def test_a_page_of_the_service_sees_pictures_events_and_files(
-    start: Start, tmp_path: Path, context: BrowserContext
-) -> None:
-    service = start(write_rig(tmp_path / "rig"))
-    scan = scanned(service)
-    page = context.new_page()
-    log_in(page, service)
-    complaints: list[str] = []
-    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
-    page.goto(f"{service.url}/docs")
-    page.get_by_text("/scan/{scan_id}/events").wait_for()
-    assert complaints == []
-    page.screenshot(path=str(tmp_path / "docs.png"))
-    found = page.evaluate(_OWN_PAGE, scan)
-    assert found["shown"] > 0
-    assert found["preview"] > 0
-    assert found["events"][-1] == "succeeded"
-    assert found["cookie"] == ""
-    with page.expect_download() as download:
-        page.evaluate(
-            "path => { const a = document.createElement('a'); a.href = path; a.click(); }", f"{scan}/bundle.zip"
-        )
-    download.value.save_as(tmp_path / "bundle.zip")
-    assert (tmp_path / "bundle.zip").read_bytes().startswith(b"PK")
-    assert page.evaluate("() => fetch('/session', {method: 'DELETE'}).then(r => r.status)") == 204
-    assert page.evaluate("() => fetch('/scan').then(r => r.status)") == 401
-
-
 @pytest.mark.parametrize("keyed", [True, False], ids=["cookie", "no key"])
-def test_pages_of_others_move_neither_light_nor_rig(
-    start: Start, tmp_path: Path, context: BrowserContext, monkeypatch: pytest.MonkeyPatch, keyed: bool
-) -> None:
-    if not keyed:
-        monkeypatch.setenv("SLRIG_REQUIRE_KEY", "false")
-    service = start(write_rig(tmp_path / "rig"))
-    scan = scanned(service)
+def test_pages_of_other_sites_move_neither_light_nor_rig(tmp_path: Path, browser: Browser, keyed: bool) -> None:
+    settings = {} if keyed else {"SLRIG_REQUIRE_KEY": "false"}
+    with serving(write_rig(tmp_path / "rig"), tmp_path / "data", **settings) as service:
+        context = browser.new_context()
+        context.set_default_timeout(_LIMIT_MS)
+        attack(service, context, keyed=keyed)
+        context.close()
+
+
+def attack(service: ServiceProcess, context: BrowserContext, *, keyed: bool) -> None:
+    with service.client() as client:
+        scan = scanned(client)["links"]["self"]
     page = context.new_page()
     if keyed:
-        log_in(page, service)
+        # As the page of the service does.
+        page.goto(f"{service.url}/livez")
+        sent = (
+            "key => fetch('/session', {method: 'POST', headers: {Authorization: `Bearer ${key}`}}).then(r => r.status)"
+        )
+        assert page.evaluate(sent, KEY) == 201
     answers: list[tuple[str, str, int]] = []
     context.on("response", lambda got: answers.append((got.request.method, urlsplit(got.url).path, got.status)))
     with elsewhere() as port:
@@ -199,7 +132,7 @@ def test_pages_of_others_move_neither_light_nor_rig(
             moved = [each for each in answers if each[0] not in {"GET", "OPTIONS"} or each[1].startswith("/preview/")]
             assert {each[1] for each in moved} >= {"/scan", "/preview/left"}, answers
             assert {status for _, _, status in moved} <= {401, 403, 415}, moved
-            # A link that somebody follows.
+            # A link that a person follows.
             page.goto(foreign)
             page.set_content(f"<a href='{service.url}/preview/left?light=white'>a picture</a>")
             with page.expect_response(f"{service.url}/preview/**") as linked:

@@ -16,7 +16,7 @@ from tests.npm import lacking
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 BUILD_LIMIT_S = 900.0
 DEBIAN = "localhost/debian"
 ANSWER = """

@@ -19,13 +19,13 @@ import pytest
 from slrig.api.calibration import MOST_IMPORT_BYTES
 from slrig.client import Client
 from slrig.client.events import Progress
-from tests.e2e.conftest import KEY, ServiceProcess, write_rig
-from tests.e2e.test_survival import SLOW, ended
+from tests.e2e.conftest import KEY, SLOW, ServiceProcess, ended, serving, write_rig
+from tests.listening import free_port
 from tests.npm import lacking
 
 pytestmark = pytest.mark.slow
 
-DEPLOY = Path(__file__).resolve().parents[2] / "config" / "deploy"
+DEPLOY = Path(__file__).resolve().parents[3] / "config" / "deploy"
 NAME = "scanner.example"
 START_LIMIT_S = 20.0
 WITH_KEY = {"X-API-Key": KEY}
@@ -82,18 +82,9 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceProcess]:
     folder = tmp_path_factory.mktemp("proxied")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SLRIG_ALLOWED_HOSTS", NAME)
-        service = ServiceProcess(write_rig(folder / "rig", head=SLOW), folder / "data")
-    yield service
-    assert service.stop() == 0
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port: int = found.getsockname()[1]
-        return port
+    rig = write_rig(folder / "rig", head=SLOW)
+    with serving(rig, folder / "data", SLRIG_ALLOWED_HOSTS=NAME) as service:
+        yield service
 
 
 def recipe(name: str, service: ServiceProcess, authority: Path, port: int, *changes: tuple[str, str]) -> str:
@@ -192,7 +183,7 @@ def test_pictures_of_a_preview_come_one_by_one(proxied: Proxied) -> None:
     assert came >= 2
 
 
-def test_nobody_is_let_in_by_what_he_says_of_himself(proxied: Proxied) -> None:
+def test_forged_headers_open_nothing(proxied: Proxied) -> None:
     forged = {
         "Forwarded": "for=127.0.0.1;host=localhost;proto=http",
         "X-Forwarded-For": "127.0.0.1",

@@ -1,0 +1,1 @@
+"""Faults, kills and ends of the real service, one after the other."""
