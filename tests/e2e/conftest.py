@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,11 +25,11 @@ if TYPE_CHECKING:
 KEY = "the key of the tests"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _BROWSER_OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
-SETTINGS_OF_TESTS = ("SLRIG_SHARED", "SLRIG_GOLDEN", "SLRIG_FUZZ_FILES", "SLRIG_FUZZ_SEED")
+SETTINGS_OF_TESTS = ("SLRIG_SHARED", "SLRIG_GOLDEN", "SLRIG_FUZZ_FILES", "SLRIG_FUZZ_SEED", "SLRIG_TEST_CACHE")
 SLOW = "realtime = true"
 """For the head of a rendered rig: frames take as long as those of a real camera, so that a scan has a middle."""
 STOP_LIMIT_S = 30.0
-"""How long a test waits for the service to end after SIGTERM: 1 to 2 s on a quiet machine, 4 beside six busy ones."""
+"""How long a test waits for the service to end after SIGTERM: 1 to 2 s on a quiet machine, 4 on a busy one."""
 
 SCENE = """
 name = "plate"
@@ -111,8 +112,7 @@ class ServiceProcess:
             for child in line.read_text().split():
                 if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
                     return int(child)
-        message = "the service has no reconstruction process"
-        raise AssertionError(message)
+        raise AssertionError("the service has no reconstruction process")
 
     def stop(self, how: signal.Signals = signal.SIGTERM) -> int:
         """End it as a service manager does, or a terminal that is closed, and return its exit code."""
@@ -139,7 +139,7 @@ class ServiceProcess:
 
 
 @contextmanager
-def serving(rig: Path, data: Path, **settings: str) -> Iterator[ServiceProcess]:
+def serving(rig: Path, data: Path, **settings: Any) -> Iterator[ServiceProcess]:
     """A service within a block. It must end in good order, unless the block ended it."""
     service = ServiceProcess(rig, data, **settings)
     try:
@@ -167,8 +167,7 @@ def followed_to(client: Client, scan: dict[str, Any], stage: str) -> None:
     for event in client.follow(scan["links"]["events"]):
         if stage in {getattr(event, "stage", None), getattr(event, "state", None)}:
             return
-    message = f"the scan ended without {stage}"
-    raise AssertionError(message)
+    raise AssertionError(f"the scan ended without {stage}")
 
 
 Start = Callable[..., ServiceProcess]
@@ -200,14 +199,14 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """Chromium. Playwright does not start twice at a time in a process, and others' event loops not beside it."""
+    """Chromium. A process can start Playwright only once at a time, and no other event loop with it."""
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
         lacking("needs Chromium: apt install chromium")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
+    if find_spec("playwright") is None:
         lacking("needs Playwright, to drive a browser: pip install -e '.[browser]'")
+    from playwright.sync_api import sync_playwright
+
     with sync_playwright() as driver:
         # Drawn by the processor, as on a laptop without a GPU.
         opened = driver.chromium.launch(executable_path=path, args=list(_BROWSER_OPTIONS))
@@ -217,13 +216,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def pool(tmp_path: Path) -> Iterator[Pool]:
-    try:
-        import distributed
-        import flask_cors
-        import moto
-        import obstore
-    except ImportError:
+    if not all(map(find_spec, ("distributed", "flask_cors", "moto", "obstore"))):
         lacking("needs a pool's libraries, and an S3 server: pip install -e '.[pool,s3]'")
-    del distributed, flask_cors, moto, obstore
     with ExitStack() as stack:
         yield Pool(tmp_path, stack)

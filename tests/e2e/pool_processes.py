@@ -78,7 +78,7 @@ class S3Server(Process):
 
 
 class Wire:
-    """Carries connections to a port of this machine until it is cut: then nothing passes, and nobody is told."""
+    """Carries connections to a port of this machine until it is cut: then nothing passes, without a word."""
 
     def __init__(self, port: int) -> None:
         self._to = port
@@ -125,7 +125,7 @@ class Pool:
     """A scheduler, two workers, which have what they compute in `scratch`, and a store.
 
     logs : of the store, the scheduler, and each worker. wires : which services reach scheduler and store by, if they
-    are told so.
+    are wired.
     """
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:

@@ -24,8 +24,7 @@ def awaited(look: Callable[[], Any], what: str, *, limit_s: float = LIMIT_S) -> 
         if found:
             return found
         pause.wait(0.05)
-    message = f"{what} did not happen within {limit_s:g} s"
-    raise AssertionError(message)
+    raise AssertionError(f"{what} did not happen within {limit_s:g} s")
 
 
 def newest(caller: Caller, schedule: dict[str, Any], *states: str) -> dict[str, Any] | None:

@@ -1,9 +1,9 @@
 """Real drivers around a rendered world: only the photons are simulated.
 
-The screen driver shows on an Xorg output, whose pixels light the world; the trigger box does so at the end of a serial
-line. What the world's camera sees of it comes through a V4L2 node and its driver, or by wire triggers. Such scans give
-the mesh that the simulator alone gives. A rig of a V4L2 camera and a trigger box goes through its first day: from an
-empty box to a verified calibration, with the commands and requests that a person gives.
+The screen driver shows on an Xorg output with pixels that light the world; the trigger box does so at the end of a
+serial line. What the world's camera sees of it comes through a V4L2 node and its driver, or by wire triggers. Such
+scans give the mesh that the simulator alone gives. A rig of a V4L2 camera and a trigger box goes through its first
+day: from an empty box to a verified calibration, with the commands and requests that a person gives.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ VERIFIED = 9
 
 
 class Box:
-    """A trigger box with an empty flash, whose light falls on a world."""
+    """A trigger box with an empty flash and a light that falls on a world."""
 
     def __init__(self, world: World) -> None:
         self._world = world

@@ -92,10 +92,10 @@ def test_opencv_itself_shows_these_patterns(size: Size) -> None:
         assert (ours.image(index) == image).all(), index
 
 
-def seen(program: str) -> list[Pixels]:
-    """Small images of a program's patterns, as a camera sees them that looks at the projector's picture."""
+def photographed(program: str) -> list[Pixels]:
+    """Small images of a program's patterns, as of a camera that looks at the projector's picture."""
     sequence = encode(OWN[program], PROJECTOR)
-    return [np.uint8(10) + sequence.image(index)[:32, :48] // np.uint8(2) for index in range(len(sequence))]
+    return [np.uint8(10) + sequence.image(index)[::4, ::4] // np.uint8(2) for index in range(len(sequence))]
 
 
 def lay_out(folder: Path, images: Sequence[Pixels], name: str = "{:02}.png", *, first: int = 0) -> Path:
@@ -117,7 +117,7 @@ def imported(folder: Path, output: Path, *words: object, projector: str = "200x1
 
 @pytest.mark.parametrize("ends", ["first", "swapped", "none"])
 def test_white_and_black_may_stand_first_or_last_or_be_absent(tmp_path: Path, ends: str) -> None:
-    *images, white, black = seen("opencv")
+    *images, white, black = photographed("opencv")
     *code, _, _ = OWN["opencv"]
     orders: dict[str, tuple[list[Pixels], list[Pattern]]] = {
         "first": ([white, black, *images], [White(), Black(), *code]),
@@ -131,7 +131,7 @@ def test_white_and_black_may_stand_first_or_last_or_be_absent(tmp_path: Path, en
 
 def test_names_by_a_template_and_by_a_list(tmp_path: Path) -> None:
     folder, lines = tmp_path / "images", ["file,pattern,camera"]
-    shown = dict(zip(OWN["opencv"], seen("opencv"), strict=True))
+    shown = dict(zip(OWN["opencv"], photographed("opencv"), strict=True))
     for pattern, image in shown.items():
         if isinstance(pattern, Gray):
             name = f"{pattern.axis.value[:3]}_{7 - pattern.bit:02}_{'inv' if pattern.inverted else 'n'}.png"
@@ -156,7 +156,7 @@ def test_names_by_a_template_and_by_a_list(tmp_path: Path) -> None:
 
 
 def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
-    images, out = seen("opencv"), tmp_path / "bundle"
+    images, out = photographed("opencv"), tmp_path / "bundle"
     whole = lay_out(tmp_path / "whole", images)
 
     def refused(folder: Path, *words: object, says: Sequence[str], projector: str = "200x160") -> None:
@@ -180,7 +180,7 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     refused(whole, says=["found 33 images"])
     refused(whole, "--names", "{bit:02}.png", says=["expected bits 0 to 7"])
     cv2.imwrite(str(whole / "07.png"), images[7][:-1])
-    refused(whole, says=["07.png: expected 48 x 32 of 8 bits as 00.png, found 48 x 31"])
+    refused(whole, says=["07.png: expected 50 x 40 of 8 bits as 00.png, found 50 x 39"])
     # Three steps of a phase instead of a code.
     phases = [np.tile(np.uint8(127 + 100 * np.cos(np.arange(64) / 5 + k)), (48, 1)) for k in (0, 2, 4)]
     three = lay_out(tmp_path / "three", phases, "frameSeq_{:02}.bmp")
@@ -225,9 +225,10 @@ class Recorded:
         rig.write_text(text)
         sequence = encode(OWN[program], PROJECTOR)
         monkeypatch.setattr("slrig.scan.acquisition.pattern_sequence", lambda *_, **__: sequence)
-        self.folder, ignored = folder / "own", {"progress": lambda *_: None, "cancelled": lambda: False}
+        self.folder = folder / "own"
         with open_rig(read_rig(rig)) as opened:
-            capture_frames(opened, ScanPlan(), self.folder, **ignored).finish()
+            plan = ScanPlan()
+            capture_frames(opened, plan, self.folder, progress=lambda *_: None, cancelled=lambda: False).finish()
         bundle = read_bundle(self.folder)
         assert bundle.calibration is not None
         self.capture, self.calibration = bundle.capture, bundle.calibration
@@ -267,23 +268,23 @@ def test_the_images_of_a_program_give_the_mesh_of_slrigs_bundle(
     words = ["--camera", "left"]
     match program:
         case "opencv":
-            folder, own = lay_out(tmp_path / "images", scan.images, "pattern_cam1_im{}.png", first=1), scan.folder
+            folder = lay_out(tmp_path / "images", scan.images, "pattern_cam1_im{}.png", first=1)
             shutil.copy(scan.folder / "calibration.json", folder)
         case "scan3d":
-            folder, own = lay_out(tmp_path / "images", scan.images, "cam_{:02}.png", first=1), None
+            folder = lay_out(tmp_path / "images", scan.images, "cam_{:02}.png", first=1)
             values = [*scan.lenses, np.eye(3)]
             # Its pixels are cells of two of the projector's columns and rows: x = 2 x' + 1/2.
             values[2] = np.diag([0.5, 0.5, 1.0]) @ (values[2] - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
             opencv_file(folder / "calibration.yml", ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T", "E"), values)
             words += ["--format", "scan3d"]
         case _:
-            folder, own = lay_out(tmp_path / "images", scan.images, "frameSeq_{:02}.bmp"), None
+            folder = lay_out(tmp_path / "images", scan.images, "frameSeq_{:02}.bmp")
             names = ("Kc", "kc", "Kp", "kp", "Rp", "Tp", "frameWidth", "frameHeight", "screenResX", "screenResY")
             opencv_file(tmp_path / "rig.xml", names, [*scan.lenses, 480, 384, 200, 160])
             words += ["--format", "slstudio", "--calibration", str(tmp_path / "rig.xml")]
     bundle = imported(folder, tmp_path / "bundle", *words)
     assert list(read_bundle(bundle).capture.patterns) == OWN[program]
-    own = own or scan.in_the_cameras_frame(tmp_path / "own")
+    own = scan.folder if program == "opencv" else scan.in_the_cameras_frame(tmp_path / "own")
     report = reconstructed(own, tmp_path / "one")
     reconstructed(bundle, tmp_path / "other")
     assert (tmp_path / "one" / "mesh.ply").read_bytes() == (tmp_path / "other" / "mesh.ply").read_bytes()

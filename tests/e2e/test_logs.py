@@ -1,4 +1,4 @@
-"""Every line that a service writes to its log is JSON with the same fields, whoever wrote it, and holds no key.
+"""Every line that a service writes to its log is JSON with the same fields and holds no key, whatever library wrote it.
 
 Run as a program, `python -m tests.e2e.test_logs DATA`, this is a service in which everything that may log does.
 """
@@ -37,16 +37,14 @@ SAID = "Authorization: Bearer {key}, Cookie: session={key}; X-API-Key: {key}"
 
 
 class Unraisable:
-    """Fails where nobody can be told."""
+    """Fails where no caller can catch it."""
 
     def __del__(self) -> None:
-        message = "too late"
-        raise RuntimeError(message)
+        raise RuntimeError("too late")
 
 
 def fail() -> None:
-    message = "nobody caught this"
-    raise ValueError(message)
+    raise ValueError("this was not caught")
 
 
 def speak() -> None:
@@ -74,7 +72,7 @@ class Server(server._Server):
 
 
 def _called(task: worker_process.Task, given: dict[str, Any]) -> Any:
-    structlog.get_logger("worker").warning("told by the worker")
+    structlog.get_logger("worker").warning("said by the worker")
     speak()
     return _call(task, given)
 
@@ -86,10 +84,10 @@ if __name__ == "__mp_main__":
 
 
 def main(data: Path) -> None:
-    """Serve from a data folder until SIGTERM, and end by an error that nobody catches."""
+    """Serve from a data folder until SIGTERM, and end by an error that is not caught."""
     bench = ServedBench(data)
     bench.gate.set()
-    server._Server = Server  # type: ignore[misc] # whoever serves makes one of these
+    server._Server = Server  # type: ignore[misc] # `serve` makes one of these
     server.open_service = lambda *_, **__: bench.service
     settings = ServiceSettings(data_dir=data, port=0, log_format="json")
     rig = rig_of({"name": "bench", "head": {"driver": "none"}}, data / "rig.toml")
@@ -137,13 +135,13 @@ def test_all_lines_have_one_form(tmp_path: Path) -> None:
     assert not any("chats" in event for event in events)
     assert KEY not in written
     assert "Bearer ***" in written
-    told = {line["event"]: line for line in lines if "exception" in line}
-    assert {"a thread ended by an error", "the process ended by an error"} <= set(told)
-    assert "nobody caught this" in told["a thread ended by an error"]["exception"]
+    errors = {line["event"]: line for line in lines if "exception" in line}
+    assert {"a thread ended by an error", "the process ended by an error"} <= set(errors)
+    assert "this was not caught" in errors["a thread ended by an error"]["exception"]
     assert any(line["logger"] == "asyncio" and "ValueError" in line.get("exception", "") for line in lines)
     assert any("Unraisable" in line.get("object", "") for line in lines)
-    # What the worker says carries the scan that it computes, whoever says it.
-    (ours,) = [line for line in lines if line["event"] == "told by the worker"]
+    # Each line of the worker carries the scan that it computes.
+    (ours,) = [line for line in lines if line["event"] == "said by the worker"]
     assert ours["job"] == scan["id"]
     assert {line["logger"] for line in lines if line.get("job") == scan["id"]} >= {
         "worker",

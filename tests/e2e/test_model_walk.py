@@ -66,9 +66,9 @@ def test_scans_become_a_model_over_http_and_a_kill_while_it_is_made_costs_nothin
         assert list(poses) == scans
         views = [decode_mesh_ply((data / "scans" / scan / "mesh.ply").read_bytes()) for scan in scans]
         report = json.loads((tmp_path / "report.json").read_bytes())
-        for view, pose, wanted, told in zip(views, poses.values(), true, report["views"], strict=True):
-            assert displacement_mm(view, pose, wanted) < 3 * told["sigma_mm"] + 1e-6
-            assert told["sigma_mm"] < 0.03
+        for view, pose, wanted, stated in zip(views, poses.values(), true, report["views"], strict=True):
+            assert displacement_mm(view, pose, wanted) < 3 * stated["sigma_mm"] + 1e-6
+            assert stated["sigma_mm"] < 0.03
         # Edges of 1.9 mm cut the bumps by so much.
         whole = decode_mesh_ply((tmp_path / "model.ply").read_bytes())
         assert np.sqrt(np.mean(off_surface_mm(bumpy, whole) ** 2)) < 0.06

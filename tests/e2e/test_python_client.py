@@ -1,4 +1,4 @@
-"""The service through `slrig.client`: as its README says, and as a program does that waits and one that awaits."""
+"""The service through `slrig.client`: as its README says, and as arrays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import pytest
 from slrig.client import Client
 from slrig.client.errors import NotFoundError
 from slrig.client.events import Captured, FileReady, Progress, StateChange
-from slrig.errors import ScanCancelledError
 from tests.e2e.conftest import KEY, ServiceProcess, serving, write_rig
 
 pytestmark = pytest.mark.slow
@@ -55,11 +54,11 @@ def test_the_examples_of_the_readme_run_in_their_order(service: ServiceProcess, 
 def test_a_scan_comes_as_arrays_that_say_what_its_files_say(service: ServiceProcess) -> None:
     with Client(service.url, KEY) as client:
         job = client.start_scan(label="arrays")
-        told = list(job)
-        assert [type(event) for event in told if not isinstance(event, Progress | FileReady)] == [
+        events = list(job)
+        assert [type(event) for event in events if not isinstance(event, Progress | FileReady)] == [
             StateChange, StateChange, Captured, StateChange, StateChange,
         ]  # fmt: skip
-        assert "mesh.ply" in [event.name for event in told if isinstance(event, FileReady)]
+        assert "mesh.ply" in [event.name for event in events if isinstance(event, FileReady)]
         result = job.result()
         assert "points-left.npz" in result.files
         points_mm, cause = result.points_mm, result.cause
@@ -83,14 +82,3 @@ def test_a_scan_comes_as_arrays_that_say_what_its_files_say(service: ServiceProc
         with pytest.raises(NotFoundError) as gone:
             client.scans.get(result.id)
         assert gone.value.code == "job-not-found"
-
-
-def test_one_of_two_scans_is_cancelled(service: ServiceProcess) -> None:
-    with Client(service.url, KEY) as client:
-        first, second = client.start_scan(label="first"), client.start_scan(label="second")
-        second.cancel()
-        with pytest.raises(ScanCancelledError):
-            second.result()
-        result = first.result()
-        assert len(result.mesh.faces) == result.report["mesh"]["figures"]["triangles"]
-        assert next(client.rig.pictures("left", light="white")).shape == SIZE

@@ -11,7 +11,6 @@ import json
 import os
 import resource
 import signal
-import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,10 +23,11 @@ import pytest
 
 from tests.e2e.campaigns.conftest import Stand
 from tests.e2e.conftest import KEY, ended, followed_to, scanned
-from tests.e2e.faulty_rig.desk import WAIT_S, Desk, Step
+from tests.e2e.faulty_rig.desk import Desk, Step
 from tests.e2e.faulty_rig.driver import PLAYER
 from tests.e2e.faulty_rig.scenery import CAMERA_NAME
 from tests.e2e.faulty_rig.service import half_written
+from tests.e2e.schedules import awaited
 
 pytestmark = pytest.mark.slow
 
@@ -143,9 +143,8 @@ def projector_is_dark(desk: Desk, case: Case) -> None:
 
 def rig_names(stand: Stand, device: str) -> None:
     """GET /rig names the device, at the latest once the service has tried to open the rig again."""
-    until_s = time.monotonic() + WAIT_S
-    while not any(words in (stand.client.get("/rig")["error"] or "") for words in (device, "driver 'faulty' failed")):
-        assert time.monotonic() < until_s
+    words = device, "driver 'faulty' failed"
+    awaited(lambda: any(each in (stand.client.get("/rig")["error"] or "") for each in words), "the fault")
 
 
 @contextmanager

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import resource
 import socket
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -22,19 +21,6 @@ pytestmark = pytest.mark.slow
 
 HALF_OPEN, SLOW_BODIES, STREAMS = 2000, 500, 1000
 MOST_LOG_BYTES = 2**20
-
-
-@contextmanager
-def many_descriptors() -> Iterator[None]:
-    """This process, the stranger, may have enough sockets open for the while."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if hard < HALF_OPEN + SLOW_BODIES + STREAMS + 256:
-        pytest.skip(f"this machine allows {hard} open files, too few to be the stranger")
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def request(service: ServiceProcess, path: str) -> HTTPConnection:
@@ -52,12 +38,15 @@ def answers(service: ServiceProcess) -> None:
 
 
 def test_a_scan_succeeds_beside_a_flood_of_connections(start: Start, tmp_path: Path) -> None:
-    with many_descriptors(), ExitStack() as held:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard < HALF_OPEN + SLOW_BODIES + STREAMS + 256:
+        pytest.skip(f"this machine allows {hard} open files, too few to be the stranger")
+    with ExitStack() as held:
+        held.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
         # The service starts with the limit that systems give.
-        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (1024, hard))
         service = start(write_rig(tmp_path / "rig", head=SLOW))
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
         address = (urlsplit(service.url).hostname, urlsplit(service.url).port)
         with service.client() as client:
             scan = client.scans.start()
@@ -82,7 +71,7 @@ def test_a_scan_succeeds_beside_a_flood_of_connections(start: Start, tmp_path: P
                     statuses.append(0)  # it made room for another
             answers(service)
             descriptors = len(list(Path(f"/proc/{service.process.pid}/fd").iterdir()))
-            # 503 is what a connection is told that makes room, if it still hears it.
+            # 503 is for a connection that makes room, if it still listens.
             assert set(statuses) <= {0, 200, 429, 503}
             final = ended(client, scan)
         assert final["state"] == "succeeded", final

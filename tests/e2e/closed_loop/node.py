@@ -1,4 +1,4 @@
-"""A V4L2 camera that any program can open, and whose sensor sees a world."""
+"""A V4L2 camera that any program can open, with a sensor that sees a world."""
 
 from __future__ import annotations
 
@@ -8,37 +8,22 @@ import subprocess
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, Self, cast
+from typing import TYPE_CHECKING, Self, cast
 
-import pytest
-
-from slrig.model import CameraFormat, Pixels
 from tests.contract.v4l2_bench import DEBIAN_PYTHON, ROOT, Faked, why_not
 from tests.contract.v4l2_sensor import SensorService
+from tests.e2e.closed_loop.output import WatchedOutput
+from tests.e2e.closed_loop.world import World
+from tests.npm import lacking
 
 if TYPE_CHECKING:
     from tests.contract.stage import Stage
 
 
-class Photographed(Protocol):
-    """What is before a sensor."""
-
-    @property
-    def format(self) -> CameraFormat:
-        """The sensor's."""
-        ...
-
-    def exposed(self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0) -> Pixels:
-        """What the sensor reads after an exposure."""
-        ...
-
-
 def require_umockdev() -> None:
     """Skip where a fake device cannot stand; fail instead where CI=true, which installs what it needs."""
     if why_not():
-        if os.environ.get("CI") == "true":
-            pytest.fail(why_not())
-        pytest.skip(why_not())
+        lacking(why_not())
 
 
 class VideoNode:
@@ -47,7 +32,7 @@ class VideoNode:
     environment : what a program needs in its environment to find the device. `sensor.asked` : every exposure read.
     """
 
-    def __init__(self, folder: Path, world: Photographed) -> None:
+    def __init__(self, folder: Path, world: World | WatchedOutput) -> None:
         require_umockdev()
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "faults").mkdir()

@@ -20,10 +20,10 @@ _LOOKS_AGAIN_IN_S = 10.0
 class WatchedOutput:
     """Looks at an output's pixels all the time and lights a world with them. A context manager.
 
-    Stands before a sensor as the world itself does. A frame is read out only once the output was seen after its
-    exposure, so whoever waits for the frame cannot have changed the picture unseen. That it changed is known to within
-    two looks, and it is taken to have done so right after the first of them. A picture that is no pattern ends the
-    watch, and is raised on leaving. `pictures` : each that was there, (H, W, 3). `gaps_s` : between two looks.
+    Stands before a sensor as the world itself does. A frame is read out only after a look at the output that follows
+    its exposure, so a program that waits for the frame cannot have changed the picture before. A change is known to
+    within two looks, and taken to have done so right after the first of them. A picture that is no pattern ends the
+    watch, and is raised on leaving. `pictures` : each that was there, (H, W, 3).
     """
 
     def __init__(self, pixels: OutputPixels, world: World) -> None:
@@ -32,7 +32,6 @@ class WatchedOutput:
         self._looked = threading.Condition()
         self._seen_until_ns = 0
         self._fault: Exception | None = None
-        self.gaps_s: list[float] = []
         self.pictures: list[NDArray[np.uint8]] = []
         self._thread = threading.Thread(target=self._watch, name="watched output", daemon=True)
 
@@ -60,7 +59,6 @@ class WatchedOutput:
                 if not self.pictures or not np.array_equal(picture, self.pictures[-1]):
                     self._world.changed(profile_of(picture), at_ns=last_ns)
                     self.pictures.append(picture)
-                self.gaps_s.append((now_ns - last_ns) / 1e9)
                 last_ns = now_ns
                 with self._looked:
                     self._seen_until_ns = now_ns

@@ -31,8 +31,7 @@ def profile_of(colours: NDArray[np.uint8]) -> Pixels:
     """
     grey = colours[..., 0]
     if (colours != grey[..., None]).any():
-        message = "expected a grey picture on the output, found colours"
-        raise ValueError(message)
+        raise ValueError("expected a grey picture on the output, found colours")
     along, down = bool((grey != grey[:, :1]).any()), bool((grey != grey[:1]).any())
     if along and down:
         message = "expected a picture that varies along one axis on the output, found one that varies along both"
@@ -43,7 +42,7 @@ def profile_of(colours: NDArray[np.uint8]) -> Pixels:
 class World:
     """The scene of a rendered rig's file, its projector's lens and lamp, and what its camera's sensor reads.
 
-    Stands where `tests.contract.stage.Stage` does: below drivers. Light is told by `show` and `changed`, in
+    Stands where `tests.contract.stage.Stage` does: below drivers. Light comes by `show` and `changed`, in
     CLOCK_MONOTONIC; `exposed` answers for any interval of the past, by a mixture where the light changed in it. Safe
     between threads. `seed` is of the sensor's noise.
     """
@@ -89,7 +88,7 @@ class World:
         return self._format
 
     def move(self, index: int) -> None:
-        """Put what the script moves into a pose, as a person does: while nobody photographs it."""
+        """Put what the script moves into a pose, as a person does: between photographs."""
         with self._lock:
             self._stage.change(surface=self._script.surface(index))
             self._images.clear()

@@ -1,1 +1,1 @@
-"""A rig that fails on demand, at a named step: its driver runs inside the service, its faults are told from outside."""
+"""A rig that fails on demand at a named step: its driver runs in the service, and a test decides its faults."""

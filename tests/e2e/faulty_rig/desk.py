@@ -1,4 +1,4 @@
-"""The desk: where a test decides what the faulty rig meets, holds it at a step, and reads what its projector was told.
+"""The desk: where a test decides what the faulty rig meets, holds it at a step, and reads the orders to its projector.
 
 It lives in the test's own process, so its records survive whatever becomes of the service.
 """
@@ -9,11 +9,10 @@ import json
 import socket
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 WAIT_S = 60.0
@@ -73,9 +72,7 @@ class Desk:
         threading.Thread(target=self._accept, name="desk", daemon=True).start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.lift()
         self._listener.close()
         self._folder.cleanup()
@@ -109,7 +106,7 @@ class Desk:
 
     @property
     def lit(self) -> bool:
-        """Whether the last thing that the projector was told, and did, leaves light on."""
+        """Whether the last order that the projector obeyed leaves light on."""
         with self._changed:
             return bool(self.light) and self.light[-1][1]
 
@@ -120,21 +117,22 @@ class Desk:
 
     def shines(self) -> bool:
         """Wait until the projector gives light; return whether it did."""
-        with self._changed:
-            return self._changed.wait_for(lambda: bool(self.light) and self.light[-1][1], WAIT_S)
+        return self._wait(lambda: self.light[-1:] and self.light[-1][1])
 
     def dark(self) -> bool:
         """Wait until the projector is dark; return whether it became so."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self.light or not self.light[-1][1], WAIT_S)
+        return self._wait(lambda: not (self.light[-1:] and self.light[-1][1]))
 
     def came(self, device: str, step: str) -> bool:
         """Wait until a device comes to a step; return whether it did."""
+        return self._wait(lambda: any(each[:2] == (device, step) for each in self.steps))
+
+    def _wait(self, condition: Callable[[], object]) -> bool:
         with self._changed:
-            return self._changed.wait_for(lambda: any(each[:2] == (device, step) for each in self.steps), WAIT_S)
+            return bool(self._changed.wait_for(condition, WAIT_S))
 
     def forget(self) -> None:
-        """Begin a new record. What the projector was told last stays."""
+        """Begin a new record. The last order to the projector stays."""
         with self._changed:
             del self.light[:-1]
             self.steps.clear()
@@ -146,21 +144,18 @@ class Desk:
                 threading.Thread(target=self._serve, args=(connection,), name="desk-line", daemon=True).start()
 
     def _serve(self, connection: socket.socket) -> None:
-        # A driver whose process is killed leaves in the middle of a word.
+        # A driver in a process that is killed leaves in the middle of a message.
         with suppress(OSError, ValueError), connection, connection.makefile("rwb", buffering=0) as stream:
-            self._converse(stream)
-
-    def _converse(self, stream: socket.SocketIO) -> None:
-        for line in stream:
-            message = json.loads(line)
-            if "light" in message:
-                with self._changed:
-                    self.light.append((message["command"], message["light"]))
-                    self._changed.notify_all()
-                answer = "go"
-            else:
-                answer = self._answer(message["device"], message["step"], message["number"])
-            stream.write(json.dumps(answer).encode() + b"\n")
+            for line in stream:
+                message = json.loads(line)
+                if "light" in message:
+                    with self._changed:
+                        self.light.append((message["command"], message["light"]))
+                        self._changed.notify_all()
+                    answer = "go"
+                else:
+                    answer = self._answer(message["device"], message["step"], message["number"])
+                stream.write(json.dumps(answer).encode() + b"\n")
 
     def _answer(self, device: str, step: str, number: int) -> str:
         with self._changed:

@@ -50,7 +50,7 @@ class Line:
         self._desk = desk
         self._local = threading.local()
 
-    def told(self, **message: Any) -> str:
+    def say(self, **message: Any) -> str:
         """Say something, wait for the answer, and return it."""
         stream = getattr(self._local, "stream", None)
         if stream is None:
@@ -72,7 +72,7 @@ class Wall:
 
 WALL = Wall()
 _OPEN: set[str] = set()
-"""The devices that are open, gone or not. Nobody can open one twice: not even the service, if it forgot one."""
+"""The devices that are open, gone or not. None can be opened twice, even by the service if it forgot one."""
 
 
 class Handle:
@@ -84,14 +84,13 @@ class Handle:
         self._gone = False
         self.closed = False
         if name in _OPEN:
-            message = f"{name} is held by this service itself"
-            raise DeviceBusyError(message)
+            raise DeviceBusyError(f"{name} is held by this service itself")
         self.step("open")
         _OPEN.add(name)
 
     def step(self, step: str, number: int = 0) -> None:
         """Ask whether a step may be done, and meet the fault that it is to meet."""
-        answer = "unplug" if self._gone else self.line.told(device=self.name, step=step, number=number)
+        answer = "unplug" if self._gone else self.line.say(device=self.name, step=step, number=number)
         self._gone = answer == "unplug"
         if answer != "go":
             raise self._fault(answer, step)
@@ -117,11 +116,10 @@ class Handle:
     def require_open(self) -> None:
         """Raise DeviceStateError after `close`."""
         if self.closed:
-            message = f"{self.name} is closed; open the rig again"
-            raise DeviceStateError(message)
+            raise DeviceStateError(f"{self.name} is closed; open the rig again")
 
     def close(self) -> bool:
-        """Ask to be closed, once; return whether it was to be done. A device that is gone has nothing to be asked."""
+        """Close, once; return whether there was a device to close. One that is gone has none."""
         if self.closed:
             return False
         self.closed = True
@@ -166,11 +164,10 @@ class FaultyCamera:
         self._triggered_ns = time.monotonic_ns()
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`. No frame to wait for is told at once: the time it takes is not what is tested."""
+        """Without a frame to wait for, fail at once: no test is about the time it takes."""
         self._handle.require_open()
         if not self._armed:
-            message = f"{self._handle.name} is not armed"
-            raise DeviceStateError(message)
+            raise DeviceStateError(f"{self._handle.name} is not armed")
         self._handle.step("read", self._read)
         start_ns = max(after_ns, time.monotonic_ns())
         if self._way is Trigger.SOFTWARE:
@@ -188,7 +185,7 @@ class FaultyCamera:
         self._handle.require_open()
         self._read += 1
         self._count += 1
-        image = scenery.seen(WALL.profile, self._noise)
+        image = scenery.photograph(WALL.profile, self._noise)
         return Frame(self._handle.name, image, start_ns, end_ns, 0, self._count, 0, self._exposure_s, 1.0)
 
     def disarm(self) -> None:
@@ -204,15 +201,14 @@ class FaultyCamera:
     def _pulse(self, timeout_s: float) -> int:
         """When the wire's next pulse came, and with it the next pattern of the play."""
         if WALL.play is None or self._read >= len(WALL.play[0]):
-            message = f"no pulse came to {self._handle.name} within {timeout_s:g} s"
-            raise FrameTimeoutError(message)
+            raise FrameTimeoutError(f"no pulse came to {self._handle.name} within {timeout_s:g} s")
         sequence, began_ns, _, period_s = WALL.play
         WALL.profile = sequence.profiles[self._read]
         return max(began_ns + round(self._read * period_s * 1e9), time.monotonic_ns())
 
 
 class FaultyProjector:
-    """Implements `slrig.devices.Projector`. It tells the desk of its light, and is told there what to meet."""
+    """Implements `slrig.devices.Projector`. It reports its light to the desk, which decides the faults."""
 
     def __init__(self, options: Options) -> None:
         self._handle = Handle(PLAYER, Line(options.desk))
@@ -230,8 +226,7 @@ class FaultyProjector:
         """See `Projector`. A fault comes when it has lit the pattern already: its answer is what is lost."""
         self._handle.require_open()
         if self._sequence is None:
-            message = f"asked to show pattern {index}, nothing is loaded"
-            raise DeviceStateError(message)
+            raise DeviceStateError(f"asked to show pattern {index}, nothing is loaded")
         self._light(self._sequence.profiles[index], f"show {index}")
         self._handle.step("show", index)
         return Shown(index, time.monotonic_ns(), 0)
@@ -239,8 +234,7 @@ class FaultyProjector:
     def play(self, exposure_s: float, period_s: float) -> None:
         self._handle.require_open()
         if not self.info.plays or self._sequence is None:
-            message = "this projector does not play, or has nothing to"
-            raise UnsupportedByDeviceError(message)
+            raise UnsupportedByDeviceError("this projector does not play, or has nothing to")
         WALL.play = (self._sequence, time.monotonic_ns(), exposure_s, period_s)
         self._light(self._sequence.profiles[0], "play")
         self._handle.step("play")
@@ -265,7 +259,7 @@ class FaultyProjector:
             WALL.play = None
         WALL.profile = profile
         lit = profile is not None and bool(profile.any())
-        self._handle.line.told(device=PLAYER, light=lit, command=command)
+        self._handle.line.say(device=PLAYER, light=lit, command=command)
 
 
 class DiskHook:
@@ -294,7 +288,7 @@ class DiskHook:
             return
         self._asking.now = True
         try:
-            answer = self._line.told(device="disk", step=step, number=0, path=path)
+            answer = self._line.say(device="disk", step=step, number=0, path=path)
         finally:
             self._asking.now = False
         if answer == "full":

@@ -1,4 +1,4 @@
-"""What the faulty rig looks at: a flat wall, half a metre away, and devices whose calibration is exact."""
+"""What the faulty rig looks at: a flat wall, half a metre away, and devices with an exact calibration."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def calibration() -> Calibration:
     )
 
 
-def seen(profile: Pixels | None, noise: np.random.Generator) -> Pixels:
+def photograph(profile: Pixels | None, noise: np.random.Generator) -> Pixels:
     """What the camera sees of a column pattern, or of the dark: (H, W) uint8."""
     light = np.zeros(CAMERA.width_px)
     if profile is not None:

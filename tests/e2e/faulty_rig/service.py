@@ -44,9 +44,9 @@ faulty = {__package__}.driver:open_projector
 
 
 def serve(
-    folder: Path, desk: Desk, trigger: str = "software", *, shutdown_s: float = SHUTDOWN_S, **settings: str
+    folder: Path, desk: Desk, trigger: str = "software", *, shutdown_s: float = SHUTDOWN_S, **settings: Any
 ) -> ServiceProcess:
-    """Start the service on a faulty rig, whose driver is installed for it; again on the same data in the same folder.
+    """Start the service on a faulty rig with its driver installed; again on the same data in the same folder.
 
     With a hardware trigger its projector plays. shutdown_s : how long the service waits for a driver at its end.
     """
@@ -59,7 +59,11 @@ def serve(
     plays = "true" if trigger == "hardware" else "false"
     rig.write_text(_RIG.format(desk=desk.path, plays=plays, trigger=trigger, camera=scenery.CAMERA_NAME))
     path = [str(info.parent), str(CHECKOUT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    driver = {"PYTHONPATH": os.pathsep.join(path), "PYTHONFAULTHANDLER": "1", "SLRIG_SHUTDOWN_S": str(shutdown_s)}
+    driver: dict[str, Any] = {
+        "PYTHONPATH": os.pathsep.join(path),
+        "PYTHONFAULTHANDLER": "1",
+        "SLRIG_SHUTDOWN_S": str(shutdown_s),
+    }
     return ServiceProcess(rig, folder / "data", **driver, **settings)
 
 
@@ -68,7 +72,7 @@ def half_written(data: Path) -> list[str]:
     with sqlite3.connect(data / "slrig.sqlite") as database:
         states = dict(database.execute("select id, state from job").fetchall())
     database.close()
-    # A scan whose frames are all there is completed at the next start, which clears its folder first.
+    # A scan with all its frames is completed at the next start, which clears its folder first.
     computing = [data / ".incoming" / scan for scan, state in states.items() if state == "computing"]
     found = [path for path in data.rglob("*.part") if not any(path.is_relative_to(folder) for folder in computing)]
     found += (path for path in (data / ".incoming").iterdir() if path not in computing)
@@ -111,5 +115,4 @@ class Follower:
 
 
 def _give_up(_: float) -> None:
-    message = "the stream broke off"
-    raise ServiceError(message)
+    raise ServiceError("the stream broke off")

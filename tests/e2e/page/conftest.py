@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from slrig.api.keys import KeyRing
+from slrig.api.scopes import Scope
+from slrig.config import ServiceSettings
 from tests.e2e.conftest import KEY, ServiceProcess
 from tests.npm import npm_package
 
@@ -76,6 +79,17 @@ def violations(page: Page) -> list[str]:
     page.evaluate(axe.read_text(encoding="utf-8"))
     found: list[dict[str, Any]] = page.evaluate("() => axe.run().then((found) => found.violations)")
     return [f"{each['id']}: {node['html'][:200]}" for each in found for node in each["nodes"]]
+
+
+def fits(page: Page) -> None:
+    """Nothing lies beyond the right edge of the window, and axe finds nothing wrong."""
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert violations(page) == []
+
+
+def looking(service: ServiceProcess) -> str:
+    """A key of Ann's, for looking only."""
+    return KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
 
 
 def count(found: Locator, number: int) -> None:

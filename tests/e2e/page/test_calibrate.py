@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from slrig.api.keys import KeyRing
-from slrig.api.scopes import Scope
-from slrig.config import read_settings
 from tests.e2e.conftest import SLOW, Start
-from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
+from tests.e2e.page.conftest import PHONE, Visit, count, disabled, fits, looking, violations
 from tests.e2e.page.golden import looks_as_kept
 from tests.e2e.test_calibration_walk import Caller, write_rig
 
@@ -122,8 +119,7 @@ def test_one_person_shoots_from_two_metres_away(start: Start, tmp_path: Path, vi
         page.get_by_text("You may move the board.").wait_for()
         page.get_by_text("✗ Pose 2 refused").wait_for()
         page.get_by_text("the same as pose 1").first.wait_for()
-        assert violations(page) == []
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        fits(page)
 
         page.get_by_role("button", name="Delete pose 1").click()
         page.get_by_text("0 poses accepted.").wait_for()
@@ -144,7 +140,7 @@ def test_one_person_shoots_from_two_metres_away(start: Start, tmp_path: Path, vi
         assert violations(page) == []
         assert [pose["number"] for pose in caller.settled(calibration)["shot"]] == [2, 3, 4]
 
-    key = KeyRing(read_settings(None, data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
+    key = looking(service)
     page = visit(service, f"calibrate/{calibration['id']}", key=key)
     page.get_by_text("Your key is for looking").wait_for()
     page.get_by_text("Pose 4 stopped").wait_for()

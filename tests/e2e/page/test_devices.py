@@ -7,9 +7,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from slrig.api.keys import KeyRing
-from slrig.api.scopes import Scope
-from slrig.config import ServiceSettings
 from slrig.conformance import Outcome, Report
 from slrig.conformance.expectation import Failure
 from slrig.conformance.running import Result
@@ -17,7 +14,7 @@ from slrig.doctor.doctor import Diagnosis
 from slrig.doctor.findings import fault, ok
 from slrig.jobs.examinations import keep
 from tests.e2e.conftest import Start, write_rig
-from tests.e2e.page.conftest import PHONE, Visit, count, violations
+from tests.e2e.page.conftest import PHONE, Visit, count, fits, looking, violations
 from tests.e2e.page.golden import looks_as_kept
 
 if TYPE_CHECKING:
@@ -84,7 +81,7 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
         *(Result(f"check {number}", "All is well", Outcome.PASSED, 0.1) for number in range(2)),
     )
     keep(service.data, "conform", Report("small", results, 1.2).document())
-    secret = KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
+    secret = looking(service)
     page = visit(service, "devices", key=secret, size=PHONE, dark=True)
     page.get_by_text("66 %").wait_for()
     page.get_by_text("2 of 3 checks that apply passed.").wait_for()
@@ -92,6 +89,5 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
     page.get_by_text("Logged in as Ann").wait_for()
     page.get_by_text("You may look.").wait_for()
     count(page.get_by_role("table", name="Who did what last"), 0)
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    assert violations(page) == []
+    fits(page)
     looks_as_elsewhere(page, "devices-phone-dark")

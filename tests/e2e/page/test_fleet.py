@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 
 def others(catalogue: Catalogue) -> None:
-    """Three more rigs: one works, one cannot, one was not seen for two days."""
+    """Three more rigs: one works, one cannot, one has been silent for two days."""
     now = datetime.now(UTC)
 
     def scans(rig: str, number: int, hours: float, **other: Any) -> list[dict[str, Any]]:

@@ -14,8 +14,7 @@ pytestmark = pytest.mark.slow
 
 RESULT, DEVICES = "result-stripe", "devices"
 EVERYTHING = (slice(None), slice(None))
-MESH = (slice(30, 190), slice(5, 195))
-"""Where the mesh is shown."""
+MESH, PANEL = (slice(30, 190), slice(5, 195)), (slice(20, 85), slice(80, 160))
 
 
 def moved(picture: Picture, right: float, down: float) -> Picture:
@@ -37,9 +36,7 @@ def noisy(picture: Picture) -> Picture:
         pytest.param(RESULT, MESH, lambda part: part[:, ::-1], False, id="mirrored"),
         pytest.param(RESULT, MESH, lambda part: part[..., ::-1], False, id="another map of colours"),
         pytest.param(RESULT, MESH, lambda part: np.full_like(part, 255), False, id="no mesh"),
-        pytest.param(
-            DEVICES, (slice(20, 85), slice(80, 160)), lambda part: np.full_like(part, 246), False, id="no panel"
-        ),
+        pytest.param(DEVICES, PANEL, lambda part: np.full_like(part, 246), False, id="no panel"),
         pytest.param(DEVICES, EVERYTHING, lambda part: moved(part, 0, 12), False, id="12 px below its place"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Health and schedule: the calibration verified by a person, and by the clock, and what is told of it."""
+"""Health and schedule: the calibration verified by a person and by the clock, and its results."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.slow
 
 BUMP = 'faults = {bump = [{device = "projector", pose = 3, turn_deg = [0.0, 0.06, 0.0]}]}'
-"""Whoever takes the board to pose 3 or beyond finds the projector turned."""
+"""From pose 3 on the projector is turned."""
 
 
-def tell_board(part: Locator, pose: str = "pose 1") -> None:
+def describe_board(part: Locator, pose: str = "pose 1") -> None:
     """Say what is printed on the board of the rendered rig, and where it is to stand."""
     part.get_by_label("Kind").select_option(label="Chessboard")
     for label, value in (("Corners across", 8), ("Corners down", 5), ("Square, mm", 20)):
@@ -35,11 +35,11 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     )
     verify = page.get_by_role("region", name="Verify")
     page.get_by_text("Nothing was verified yet.").wait_for()
-    tell_board(verify)
+    describe_board(verify)
     assert violations(page) == []
     verify.get_by_role("button", name="Verify now").click()
     verify.get_by_role("progressbar").wait_for()
-    # Loaded anew in the middle of it, the page goes on with it.
+    # After a reload in the middle of it, the page goes on with it.
     page.reload()
     verify.get_by_role("progressbar").wait_for()
     verify.get_by_text("Good", exact=True).wait_for()
@@ -55,7 +55,7 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     form = page.get_by_role("form", name="Add to the schedule")
     form.get_by_label("Minute, hour").fill("0 26 * * *")
     form.get_by_label("Name").fill("nights")
-    tell_board(form)
+    describe_board(form)
     form.get_by_role("button", name="Add").click()
     form.get_by_role("alert").get_by_text("cron: Bad hour").wait_for()
     form.get_by_label("Minute, hour").fill("30 2 * * *")
@@ -78,7 +78,7 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     page.get_by_role("alertdialog").get_by_role("button", name="Remove it").click()
     page.get_by_text("Nothing is done by the clock yet.").wait_for()
 
-    tell_board(verify, pose="pose 5")
+    describe_board(verify, pose="pose 5")
     verify.get_by_role("button", name="Verify now").click()
     verify.get_by_text("Likely cause: the projector turned by 0.06").wait_for()
     verify.get_by_text("What to do: check the projector's mount, and calibrate again.").wait_for()

@@ -1,4 +1,4 @@
-"""A scan's result as somebody looks at it: the mesh, what is measured on it, why pixels are missing, its files."""
+"""A scan's result as a person looks at it: the mesh, what is measured on it, why pixels are missing, its files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray, Refusal
 from tests.e2e.conftest import SLOW, ServiceProcess, scanned, serving, write_rig
-from tests.e2e.page.conftest import PHONE, Visit, count, violations
+from tests.e2e.page.conftest import PHONE, Visit, count, fits, violations
 from tests.e2e.page.golden import looks_as_kept
 
 if TYPE_CHECKING:
@@ -103,16 +103,16 @@ def test_a_result_is_looked_at_measured_compared_and_downloaded(service: Service
     page.keyboard.press("Enter")
     measured(page, 0.12, -0.1)
     page.get_by_text("Distances").wait_for()
-    told = page.locator(".distances tbody td").all_inner_texts()
-    points = np.array([[float(mm) for mm in line.split(", ")] for line in told[3].splitlines()])
+    cells = page.locator(".distances tbody td").all_inner_texts()
+    points = np.array([[float(mm) for mm in line.split(", ")] for line in cells[3].splitlines()])
     expected = np.array((on_plate(0.0, 0.0), on_plate(0.12, -0.1)))
     assert np.abs((points - expected) @ PLATE_NORMAL).max() < 0.1
     # A click is right to a pixel of the screen, half a millimetre of the plate.
     assert np.linalg.norm(points - expected, axis=1).max() < 0.6
     distance_mm = float(np.linalg.norm(points[1] - points[0]))
-    assert float(told[1].removesuffix(" mm")) == pytest.approx(distance_mm, abs=0.002)
+    assert float(cells[1].removesuffix(" mm")) == pytest.approx(distance_mm, abs=0.002)
     assert distance_mm == pytest.approx(np.linalg.norm(expected[1] - expected[0]), abs=0.8)
-    sigma = re.fullmatch(r"([\d.]+) µm", told[2])
+    sigma = re.fullmatch(r"([\d.]+) µm", cells[2])
     assert sigma is not None
     assert 1.0 < float(sigma[1]) / 1000 / report["mesh"]["sigma_mm"]["p50"] < 3.0
 
@@ -159,7 +159,7 @@ def test_a_result_is_looked_at_measured_compared_and_downloaded(service: Service
     page.get_by_text("It was deleted, or the address is not right.").wait_for()
 
 
-def test_what_a_scan_was_limited_to_is_told_and_drawn(service: ServiceProcess, visit: Visit) -> None:
+def test_the_region_of_a_scan_is_named_and_drawn(service: ServiceProcess, visit: Visit) -> None:
     region = {"box_mm": [[-20, -25, -40], [20, 15, 40]], "least_contrast": 0.02}
     with service.client() as client:
         scan = scanned(client, reconstruction={"region": region})
@@ -172,7 +172,7 @@ def test_what_a_scan_was_limited_to_is_told_and_drawn(service: ServiceProcess, v
     # The lines are blue, and a grey plate is not.
     assert ((shown[..., 0] - shown[..., 2]) > 100).sum() > 200
 
-    # What is seen of it is in the next scan's region, with what somebody types.
+    # The next scan's region is the part in view, with what the person types.
     page.get_by_role("button", name="Scan only what is seen here").click()
     page.get_by_label("Nearest depth, mm").fill("900")
     page.get_by_label("Farthest depth, mm").fill("300")
@@ -191,9 +191,13 @@ def test_what_a_scan_was_limited_to_is_told_and_drawn(service: ServiceProcess, v
     page.get_by_role("button", name="Scan", exact=True).click()
     page.wait_for_url("**/#/scan/*-*")
     with service.client() as client:
-        asked = client.get(page.url.rpartition("#")[2])["plan"]["reconstruction"]["region"]
-    least, most = asked["box_mm"]
-    assert (asked["depth_mm"], asked["least_contrast"], asked["most_sigma_mm"]) == ([100, 1000], 0.04, 0.5)
+        region_sent = client.get(page.url.rpartition("#")[2])["plan"]["reconstruction"]["region"]
+    least, most = region_sent["box_mm"]
+    assert (region_sent["depth_mm"], region_sent["least_contrast"], region_sent["most_sigma_mm"]) == (
+        [100, 1000],
+        0.04,
+        0.5,
+    )
     assert (least[:2], most[:2]) == ([-20, -25], [20, 15])
     assert -40 < least[2] < most[2] < 40, "no further than the surface"
     page.go_back()
@@ -208,16 +212,14 @@ def test_a_scan_without_a_mesh_says_why_and_what_next(service: ServiceProcess, v
     page.get_by_role("button", name="Stop it").click()
     page.get_by_text("The scan was stopped").wait_for()
     count(page.get_by_text("Download the mesh"), 0)
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    assert violations(page) == []
+    fits(page)
     page.get_by_role("button", name="Scan again").click()
     page.wait_for_url(re.compile(r"#/scan$"))
     # The result shows itself as soon as there is a mesh, while the rest is computed.
     page.wait_for_url(re.compile(r"#/scan/.+"))
     page.locator("canvas[data-level=full]").wait_for()
     page.get_by_text("Size").wait_for()
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    assert violations(page) == []
+    fits(page)
     page.get_by_role("button", name="Keep it for good").click()
     page.get_by_role("button", name="Kept for good").wait_for()
     page.get_by_role("button", name="Delete").click()

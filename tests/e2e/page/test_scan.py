@@ -1,4 +1,4 @@
-"""From the key to a scan: what somebody sees who has never used the service."""
+"""From the key to a scan: what a new user sees."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from slrig.api.keys import KeyRing
-from slrig.api.scopes import Scope
-from slrig.config import ServiceSettings
 from tests.e2e.conftest import KEY, SLOW, Start, write_rig
-from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
+from tests.e2e.page.conftest import PHONE, Visit, count, disabled, fits, looking, violations
 from tests.e2e.page.golden import looks_as_kept
 
 pytestmark = pytest.mark.slow
@@ -33,7 +30,7 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
 
     page.get_by_role("group", name="Camera").get_by_role("button", name="left").click()
     page.get_by_role("img", name="Live picture of camera left").wait_for()
-    # Told by the picture itself, so it is there.
+    # The picture itself has this figure, so it is there.
     page.get_by_text("% saturated").wait_for()
     assert violations(page) == []
     looks_as_kept(page, "scan")
@@ -43,7 +40,7 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     progress = page.get_by_role("progressbar")
     progress.wait_for()
     assert violations(page) == []
-    # A page that is loaded anew shows what is under way; it is still the one that asked for it, and is led to the mesh.
+    # After a reload the page shows what is under way; the scan is still its own, so it goes on to the mesh.
     page.reload()
     progress.wait_for()
     page.wait_for_url("**/#/scan/*-*")
@@ -55,12 +52,11 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     assert violations(page) == []
 
     # A phone, a dark room, and a key for looking.
-    secret = KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
+    secret = looking(service)
     page = visit(service, key=secret, size=PHONE, dark=True, ignored="401")
     page.get_by_text("Your key is for looking only.").wait_for()
     disabled(page.get_by_role("button", name="Scan", exact=True))
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    assert violations(page) == []
+    fits(page)
     page.get_by_role("banner").get_by_text("ready").wait_for()
     page.get_by_text("triangles, σ").wait_for()
     looks_as_kept(page, "scan-phone-dark")

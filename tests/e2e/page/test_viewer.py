@@ -5,14 +5,12 @@ from __future__ import annotations
 import base64
 import json
 import subprocess
-import threading
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -26,7 +24,7 @@ from tests.npm import npm_package
 from tests.unit.scan.test_mesh_formats import half_ball
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, Route
 
 pytestmark = pytest.mark.slow
 
@@ -58,13 +56,6 @@ CENTRE_MM = np.array([3.0, -4.0, 500.0])
 
 TO_GLTF = np.array([0.001, -0.001, -0.001])
 """Camera axes in mm (x right, y down, z away) to glTF's in m (x right, y up, z towards the viewer)."""
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    """Serves a folder."""
-
-    def log_message(self, *_: object) -> None:
-        """Say nothing for each request."""
 
 
 def two_shades() -> Mesh:
@@ -107,21 +98,18 @@ def test_three_js_shows_the_side_that_was_scanned_upright_and_in_metres(
     (tmp_path / "three").symlink_to(npm_package("three@0.187.0", "to show a GLB on a page"))
     (tmp_path / "index.html").write_text(PAGE, encoding="utf-8")
     (tmp_path / "mesh.glb").write_bytes(encode(mesh))
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path))) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        page = browser.new_page()
-        complaints: list[str] = []
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        try:
-            page.goto(f"http://127.0.0.1:{server.server_address[1]}/")
-            page.wait_for_function("window.found")
-            found: dict[str, Any] = page.evaluate("window.found")
-        finally:
-            page.close()
-            server.shutdown()
-            thread.join()
-    assert complaints == []
+
+    def answered(route: Route) -> None:
+        route.fulfill(path=tmp_path / (urlsplit(route.request.url).path.strip("/") or "index.html"))
+
+    page = browser.new_page()
+    try:
+        page.route("http://viewer.example/**", answered)
+        page.goto("http://viewer.example/")
+        page.wait_for_function("window.found")
+        found: dict[str, Any] = page.evaluate("window.found")
+    finally:
+        page.close()
     png = np.frombuffer(base64.b64decode(found["picture"].partition(",")[2]), dtype=np.uint8)
     assert_upright_and_from_the_front(np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED), dtype=np.uint8))
     placed_m = mesh.vertices_mm[np.unique(mesh.faces)] * TO_GLTF

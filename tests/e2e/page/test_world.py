@@ -14,7 +14,7 @@ from slrig.api.scopes import Scope
 from slrig.config import ServiceSettings
 from slrig.jobs.records import utc_now
 from tests.e2e.conftest import KEY, Start, write_rig
-from tests.e2e.page.conftest import PHONE, Visit, disabled, violations
+from tests.e2e.page.conftest import PHONE, Visit, disabled, fits, looking, violations
 from tests.e2e.page.golden import looks_as_kept
 
 pytestmark = pytest.mark.slow
@@ -28,8 +28,8 @@ def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, v
     page = visit(service, "scan")
     page.get_by_text("None yet.").wait_for()
     page.get_by_role("button", name="Scan", exact=True).click()
-    told = page.get_by_role("alert").filter(has_text="The last scan failed")
-    told.get_by_text("camera 'left' is gone (unplugged or powered off); plug it in").wait_for()
+    failed = page.get_by_role("alert").filter(has_text="The last scan failed")
+    failed.get_by_text("camera 'left' is gone (unplugged or powered off); plug it in").wait_for()
     page.get_by_role("listitem").get_by_text("failed").wait_for()
     assert violations(page) == []
 
@@ -57,14 +57,13 @@ def test_health_without_a_calibration_while_the_service_goes_and_comes_back(
 ) -> None:
     rig = write_rig(tmp_path / "rig", head="carries_calibration = false")
     service = start(rig)
-    secret = KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
+    secret = looking(service)
     page = visit(service, "health", key=secret, size=PHONE, dark=True, ignored=COMPLAINT)
     page.get_by_text("The rig has no calibration that could be verified.").wait_for()
     page.get_by_text("Your key is not for calibrations.").wait_for()
     page.get_by_text("Changing the schedule takes a key that may administer.").wait_for()
     disabled(page.get_by_role("button", name="Verify now"))
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    assert violations(page) == []
+    fits(page)
     page.get_by_role("banner").get_by_text("not calibrated").wait_for()
     looks_as_kept(page, "health-phone-dark")
     service.stop()

@@ -12,7 +12,6 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 
 import httpx2
 
@@ -24,7 +23,7 @@ _START_LIMIT_S = 60.0
 _STOP_LIMIT_S = 15.0
 _POLL_S = 0.1
 USUAL_ADDRESS = "127.0.0.1:8731"
-"""Where the READMEs have the service; here it takes a free port, so that it is in nobody's way."""
+"""Where the READMEs have the service; here it takes a free port, so that it is in no other program's way."""
 
 
 class Person:
@@ -54,7 +53,7 @@ class Person:
     def __enter__(self) -> Person:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop_service()
 
     def type(self, command: str) -> str:

@@ -104,6 +104,6 @@ def test_whatever_is_lost_a_scan_has_its_one_result(
         assert "store s3://scans/hall-3 failed" in right("store", pool.store.kill)["because"]
     finally:
         rig.worker.close()
-    told = "".join(log.read_text() for log in [*pool.logs, service.log])
-    assert SECRET not in told
+    logs = "".join(log.read_text() for log in [*pool.logs, service.log])
+    assert SECRET not in logs
     assert os.environ["AWS_SECRET_ACCESS_KEY"] == SECRET

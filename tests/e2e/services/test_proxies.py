@@ -65,7 +65,7 @@ class Proxied:
 
 @pytest.fixture(scope="module")
 def authority(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A certificate for the name, beside its key."""
+    """A certificate for the name, in the folder of its key."""
     if shutil.which("openssl") is None:
         lacking("needs openssl: apt install openssl")
     folder = tmp_path_factory.mktemp("tls")
@@ -161,7 +161,7 @@ def test_scan_is_followed_as_it_happens_and_its_files_come_whole(proxied: Proxie
                 assert direct.get(scan["links"]["self"])["state"] == "capturing"
                 break
         else:
-            pytest.fail("the scan told of no capture")
+            pytest.fail("the scan reported no capture")
         record = ended(direct, scan)
         assert record["state"] == "succeeded"
         for name in ("mesh.ply", "bundle.zip"):

@@ -49,7 +49,7 @@ COMPILED = """
 Environment=NUMBA_CACHE_DIR=
 ReadWritePaths=/opt/seen
 """
-"""For the kernels that this machine has compiled already: anew they take two minutes."""
+"""For the kernels that this machine has compiled already: a second compilation takes two minutes."""
 
 
 def cgroups() -> Path:
