@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -148,6 +148,16 @@ def serving(rig: Path, data: Path, **settings: Any) -> Iterator[ServiceProcess]:
             assert service.stop() == 0
     finally:
         service.kill()
+
+
+def slrig(*words: str | Path, codes: Container[int] = (0,), **settings: str) -> subprocess.CompletedProcess[str]:
+    """Run a command as a person does. codes : its exit codes that are right."""
+    command = [sys.executable, "-m", "slrig.cli", *map(str, words)]
+    done = subprocess.run(  # noqa: S603 - our own command
+        command, capture_output=True, text=True, timeout=120, check=False, env={**os.environ, **settings}
+    )
+    assert (done.returncode in codes, "Traceback" in done.stderr) == (True, False), done.stdout + done.stderr
+    return done
 
 
 def ended(client: Client, scan: dict[str, Any]) -> dict[str, Any]:

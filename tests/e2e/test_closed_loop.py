@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import subprocess
-import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,7 +40,7 @@ from tests.contract.wired_camera import WiredCamera
 from tests.e2e.closed_loop.node import VideoNode, require_umockdev
 from tests.e2e.closed_loop.output import WatchedOutput
 from tests.e2e.closed_loop.world import World, profile_of
-from tests.e2e.conftest import scanned, serving, write_rig
+from tests.e2e.conftest import scanned, serving, slrig, write_rig
 from tests.e2e.test_calibration_walk import BOARD, Caller
 from tests.e2e.test_calibration_walk import write_rig as write_board_rig
 from tests.unit.drivers.serial_projector.engines import CoreEngine, Scene, description
@@ -284,14 +282,6 @@ class Box:
         self._world.show(None if pattern is None else self._flash[pattern])
 
 
-def slrig(*words: str) -> str:
-    """Run a command as a person does, and return what it prints. The doctor ends with 1 where it finds a fault."""
-    command = [sys.executable, "-m", "slrig.cli", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - ours
-    assert done.returncode in {0, 1}, done.stdout + done.stderr
-    return done.stdout
-
-
 def shoot(caller: Caller, made: dict[str, Any]) -> None:
     """Shoot a pose, and once more where a refusal says so: a busy machine may delay a frame's light."""
     shot: dict[str, Any] = {}
@@ -339,13 +329,15 @@ def test_one_flash_of_the_box_serves_from_the_doctor_to_a_verification(
 
 def first_day(rig: Path, world: World, box: Box) -> None:
     """Everything from the empty box to the verdict."""
-    said = slrig("patterns", str(rig))
+    said = slrig("patterns", rig).stdout
     (folder,) = (rig.parent / "patterns").iterdir()
     assert str(folder) in said
     box.flash(folder)
 
     doctored = rig.with_name("doctored.toml")
-    found = json.loads(slrig("doctor", str(rig), "--output", str(doctored), "--search-s", "0.05", "--json"))
+    # It ends with 1 where it finds a fault.
+    done = slrig("doctor", rig, "--output", doctored, "--search-s", "0.05", "--json", codes=(0, 1))
+    found = json.loads(done.stdout)
     names = {finding["name"]: finding["severity"] for finding in found["findings"]}
     assert "patterns.own" not in names, "the doctor's own patterns are among those that were flashed"
     # It is the camera's stamps that are uncertain; the file that the doctor writes waits for that.

@@ -20,7 +20,7 @@ from slrig.bundle import read_bundle, write_bundle
 from slrig.cli.commands import app
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.model import Axis, Black, Gray, Pattern, Pixels, Size, White
+from slrig.model import Axis, Black, FloatArray, Gray, Pattern, Pixels, Size, White
 from slrig.patterns.sequence import encode
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
@@ -95,7 +95,7 @@ def test_opencv_itself_shows_these_patterns(size: Size) -> None:
 def photographed(program: str) -> list[Pixels]:
     """Small images of a program's patterns, as of a camera that looks at the projector's picture."""
     sequence = encode(OWN[program], PROJECTOR)
-    return [np.uint8(10) + sequence.image(index)[::4, ::4] // np.uint8(2) for index in range(len(sequence))]
+    return [np.uint8(10) + sequence.image(index)[::5, ::5] // np.uint8(2) for index in range(len(sequence))]
 
 
 def lay_out(folder: Path, images: Sequence[Pixels], name: str = "{:02}.png", *, first: int = 0) -> Path:
@@ -115,17 +115,18 @@ def imported(folder: Path, output: Path, *words: object, projector: str = "200x1
     return output
 
 
-@pytest.mark.parametrize("ends", ["first", "swapped", "none"])
-def test_white_and_black_may_stand_first_or_last_or_be_absent(tmp_path: Path, ends: str) -> None:
-    *images, white, black = photographed("opencv")
-    *code, _, _ = OWN["opencv"]
-    orders: dict[str, tuple[list[Pixels], list[Pattern]]] = {
-        "first": ([white, black, *images], [White(), Black(), *code]),
-        "swapped": ([*images, black, white], [*code, Black(), White()]),
-        "none": (images, code),
-    }
-    shown, wanted = orders[ends]
-    bundle = imported(lay_out(tmp_path / "images", shown), tmp_path / "bundle")
+@pytest.mark.parametrize("order", ["opencv", "white first", "black first", "without both", "scan3d", "slstudio"])
+def test_the_order_of_the_images_says_their_patterns(tmp_path: Path, order: str) -> None:
+    program = order if order in SHOWN else "opencv"
+    shown, wanted = photographed(program), OWN[program]
+    match order:
+        case "white first":
+            shown, wanted = [*shown[-2:], *shown[:-2]], [*wanted[-2:], *wanted[:-2]]
+        case "black first":
+            shown, wanted = [*shown[:-2], shown[-1], shown[-2]], [*wanted[:-2], Black(), White()]
+        case "without both":
+            shown, wanted = shown[:-2], wanted[:-2]
+    bundle = imported(lay_out(tmp_path / "images", shown), tmp_path / "bundle", "--format", program)
     assert list(read_bundle(bundle).capture.patterns) == wanted
 
 
@@ -180,7 +181,7 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     refused(whole, says=["found 33 images"])
     refused(whole, "--names", "{bit:02}.png", says=["expected bits 0 to 7"])
     cv2.imwrite(str(whole / "07.png"), images[7][:-1])
-    refused(whole, says=["07.png: expected 50 x 40 of 8 bits as 00.png, found 50 x 39"])
+    refused(whole, says=["07.png: expected 40 x 32 of 8 bits as 00.png, found 40 x 31"])
     # Three steps of a phase instead of a code.
     phases = [np.tile(np.uint8(127 + 100 * np.cos(np.arange(64) / 5 + k)), (48, 1)) for k in (0, 2, 4)]
     three = lay_out(tmp_path / "three", phases, "frameSeq_{:02}.bmp")
@@ -213,6 +214,32 @@ def test_depth_and_colour_are_those_of_the_files(tmp_path: Path) -> None:
     assert shots[0].colour is not None
     assert (shots[0].colour == coloured[0]).all()
     assert (shots[2].image == cv2.cvtColor(coloured[2], cv2.COLOR_BGR2GRAY)).all()
+
+
+def opencv_file(path: Path, names: Sequence[str], values: Sequence[object]) -> None:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in zip(names, values, strict=True):
+        storage.write(name, value)
+    storage.release()
+
+
+SCAN3D = ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T", "E")
+
+
+def of_cells(matrix: FloatArray) -> FloatArray:
+    """The projector's lens as scan3d has it: its pixels are cells of two columns and rows, x = 2 x' + 1/2."""
+    return np.asarray(np.diag([0.5, 0.5, 1.0]) @ (matrix - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))
+
+
+def test_scan3ds_lens_is_of_its_cells(tmp_path: Path) -> None:
+    folder = lay_out(tmp_path / "images", photographed("scan3d"), "cam_{:02}.png", first=1)
+    lens, straight = np.array([[400.0, 0, 99], [0, 400, 79], [0, 0, 1]]), np.zeros((1, 5))
+    values = [lens, straight, of_cells(lens), straight, np.eye(3), np.array([[-100.0], [0], [0]]), np.eye(3)]
+    opencv_file(folder / "calibration.yml", SCAN3D, values)
+    calibration = read_bundle(imported(folder, tmp_path / "bundle", "--format", "scan3d")).calibration
+    assert calibration is not None
+    assert calibration.projector is not None
+    np.testing.assert_allclose(calibration.projector.matrix, lens)
 
 
 class Recorded:
@@ -252,13 +279,6 @@ class Recorded:
         return folder
 
 
-def opencv_file(path: Path, names: Sequence[str], values: Sequence[object]) -> None:
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in zip(names, values, strict=True):
-        storage.write(name, value)
-    storage.release()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("program", SHOWN)
 def test_the_images_of_a_program_give_the_mesh_of_slrigs_bundle(
@@ -272,10 +292,8 @@ def test_the_images_of_a_program_give_the_mesh_of_slrigs_bundle(
             shutil.copy(scan.folder / "calibration.json", folder)
         case "scan3d":
             folder = lay_out(tmp_path / "images", scan.images, "cam_{:02}.png", first=1)
-            values = [*scan.lenses, np.eye(3)]
-            # Its pixels are cells of two of the projector's columns and rows: x = 2 x' + 1/2.
-            values[2] = np.diag([0.5, 0.5, 1.0]) @ (values[2] - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-            opencv_file(folder / "calibration.yml", ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T", "E"), values)
+            values = [*scan.lenses[:2], of_cells(scan.lenses[2]), *scan.lenses[3:], np.eye(3)]
+            opencv_file(folder / "calibration.yml", SCAN3D, values)
             words += ["--format", "scan3d"]
         case _:
             folder = lay_out(tmp_path / "images", scan.images, "frameSeq_{:02}.bmp")

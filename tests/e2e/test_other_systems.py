@@ -9,10 +9,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.e2e.conftest import scanned, serving, write_rig
+from tests.e2e.conftest import scanned, serving, slrig, write_rig
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -43,24 +44,17 @@ print(len([importlib.import_module(name) for name in own]))
 """
 
 
-def run(environment: dict[str, str], *arguments: str) -> str:
-    command = [sys.executable, *arguments]
-    done = subprocess.run(  # noqa: S603 - ours
-        command, capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, **environment}
-    )
-    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
-    return done.stdout
-
-
 @pytest.mark.slow
 def test_everything_loads_and_serves_where_less_is_there_than_linux_has(tmp_path: Path) -> None:
     site = tmp_path / "site"
     site.mkdir()
     (site / "sitecustomize.py").write_text(HIDING)
-    less = {"PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
-    assert int(run(less, "-c", EVERY_MODULE)) > 300
+    less: dict[str, Any] = {"PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
+    environment = {**os.environ, **less}
+    loaded = subprocess.check_output([sys.executable, "-c", EVERY_MODULE], cwd=ROOT, env=environment)  # noqa: S603 - ours
+    assert int(loaded) > 300
 
-    shown = run(less, "-m", "slrig.cli", "devices")
+    shown = slrig("devices", **less).stdout
     assert "v4l2: Linux only: it needs the kernel's video interface, and this is" in shown
     assert "use the driver 'opencv'" in shown
     assert "dlpc350: Linux only: it needs the kernel's /dev/hidraw*" in shown

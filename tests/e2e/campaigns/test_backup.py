@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from tests.e2e.campaigns.test_faults import READ
-from tests.e2e.conftest import ServiceProcess, scanned
+from tests.e2e.conftest import ServiceProcess, scanned, slrig
 from tests.e2e.faulty_rig.desk import Desk
 
 pytestmark = pytest.mark.slow
-
-
-def slrig(*arguments: str | Path) -> str:
-    command = [sys.executable, "-m", "slrig.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout  # noqa: S603
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -38,7 +31,7 @@ def test_a_backup_while_scans_run_restores_every_finished_scan(
             shot, waits = (client.scans.start(if_busy="queue")["id"] for _ in range(2))
             hold.until_reached()
             linked = ("--link-previous", tmp_path / "earlier")
-            made = slrig("backup", tmp_path / "backup", "--data", first.data, "--json", *linked)
+            made = slrig("backup", tmp_path / "backup", "--data", first.data, "--json", *linked).stdout
     assert json.loads(made)["scans"] == 2
     assert first.stop() == 0
     kept = {scan: contents(first.data / "scans" / scan) for scan in done}

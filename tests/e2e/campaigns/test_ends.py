@@ -25,7 +25,7 @@ import pytest
 from slrig.client import Client
 from tests.e2e.campaigns.conftest import Stand
 from tests.e2e.campaigns.test_faults import READ, preview
-from tests.e2e.conftest import KEY, STOP_LIMIT_S, ServiceProcess, ended, followed_to, scanned, serving, write_rig
+from tests.e2e.conftest import KEY, STOP_LIMIT_S, ServiceProcess, ended, followed_to, scanned, serving, slrig, write_rig
 from tests.e2e.faulty_rig.desk import Desk, Step
 from tests.e2e.faulty_rig.driver import PLAYER
 from tests.e2e.faulty_rig.scenery import CAMERA_NAME
@@ -188,12 +188,8 @@ def test_a_service_that_may_drain_finishes_its_scan_and_keeps_the_queue(desk: De
 
 
 def refused(rig: Path, data: Path, port: str = "0") -> str:
-    """What a service prints that ends with exit code 2 at its start."""
-    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", port, "--data", str(data)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)  # noqa: S603 - ours
-    assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
-    assert not (data / "service.json").exists() or "process id" in done.stderr
-    return done.stderr
+    """What a service prints that cannot start."""
+    return slrig("serve", rig, "--port", port, "--data", data, codes=(2,)).stderr
 
 
 def test_a_service_that_cannot_start_says_why(tmp_path: Path) -> None:

@@ -57,17 +57,13 @@ class VideoNode:
         loaded = ["libumockdev-preload.so.0", *filter(None, [os.environ.get("LD_PRELOAD")])]
         self.environment = {"UMOCKDEV_DIR": root.strip(), "LD_PRELOAD": ":".join(loaded)}
 
-    def close(self) -> None:
-        """Unplug it."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         with suppress(OSError, subprocess.TimeoutExpired):
             self._server.communicate(timeout=10)
         self._server.kill()
         self._server.wait(10)
         self.sensor.close()
         self._short.cleanup()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
