@@ -60,7 +60,8 @@ class Rendered:
 
     def rig_text(self) -> str:
         """A rig file."""
-        head = f'name = "sphere"\n[head]\ndriver = "simulated"\nscene = "{SCENES / "sphere.toml"}"\nseed = {self.seed}\n'
+        scene = SCENES / "sphere.toml"
+        head = f'name = "sphere"\n[head]\ndriver = "simulated"\nscene = "{scene}"\nseed = {self.seed}\n'
         cameras = (_CAMERA.format(name=name, position_mm=place) for name, place in self.cameras_mm.items())
         return "".join((
             head, "samples_per_axis = 2\nambient = 0.01\n", _DEVICES.format(projector_mm=self.projector_mm), *cameras

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 KEY = "the key of the tests"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _BROWSER_OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
-SETTINGS_OF_TESTS = ("SLRIG_SHARED", "SLRIG_GOLDEN", "SLRIG_FUZZ_FILES", "SLRIG_FUZZ_SEED", "SLRIG_TEST_CACHE")
 SLOW = "realtime = true"
 """For the head of a rendered rig: frames take as long as those of a real camera, so that a scan has a middle."""
 STOP_LIMIT_S = 30.0
@@ -181,16 +180,6 @@ def followed_to(client: Client, scan: dict[str, Any], stage: str) -> None:
 
 
 Start = Callable[..., ServiceProcess]
-
-
-@pytest.fixture(scope="session", autouse=True)
-def no_settings_of_a_person() -> Iterator[None]:
-    """Keep the settings of a person's shell from the services that tests start."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name in [each for each in os.environ if each.startswith(("NUMBA_", "SLRIG_", "XDG_"))]:
-            if name not in SETTINGS_OF_TESTS:
-                patch.delenv(name)
-        yield
 
 
 @pytest.fixture
