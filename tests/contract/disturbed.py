@@ -43,6 +43,8 @@ from tests.unit.drivers.picamera2.fake_picamera2 import Pi
 from tests.virtual_clock import VirtualClock
 
 SLOW = pytest.mark.slow
+# The tables of these promise how late a frame comes at most.
+PROMISED = pytest.mark.realtime
 
 
 @dataclass(frozen=True)
@@ -227,11 +229,11 @@ DISTURBED: Mapping[str, tuple[Opens, tuple[pytest.MarkDecorator, ...]]] = {
         f"opencv, stamps: {stamp}": (partial(opencv_device, stamp=stamp), (SLOW,))
         for stamp in ("start", "first packet", "end")
     },
-    "opencv, network": (opencv_network, (SLOW,)),
+    "opencv, network": (opencv_network, (PROMISED,)),
     "depthai": (oak, ()),
     "genicam, software trigger": (partial(genicam, free=False, latched=False), (SLOW,)),
     "genicam, free": (partial(genicam, free=True), (SLOW,)),
-    "genicam, free, no clock": (partial(genicam, free=True, latched=False), (SLOW,)),
+    "genicam, free, no clock": (partial(genicam, free=True, latched=False), (PROMISED,)),
     "gentl, software trigger": (partial(gentl, free=False), (SLOW,)),
     "gentl, free": (partial(gentl, free=True), (SLOW,)),
 }

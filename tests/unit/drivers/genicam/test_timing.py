@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,13 @@ class Host:
         return begun_ns, self.stamp(begun_ns + out_ns), begun_ns + out_ns + back_ns
 
 
+def tied(host: Host, lag_ns: Interval = AT_START) -> StartClock:
+    """A clock that was looked at five times."""
+    clock = StartClock(lag_ns)
+    assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
+    return clock
+
+
 def test_a_latched_clock_is_as_good_as_its_quickest_look() -> None:
     host = Host()
     clock = StartClock(AT_START)
@@ -96,17 +105,14 @@ def test_a_clock_that_stands_is_not_used(looks: list[tuple[int, int, int]]) -> N
 def test_a_stamp_somewhere_within_the_exposure_leaves_its_length_open() -> None:
     host = Host()
     for lag_ns in (0, EXPOSURE // 2, EXPOSURE):
-        clock = StartClock(ANYWHERE)
-        assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
-        start = clock.start(host.stamp(100 * MS + lag_ns))
+        start = tied(host, ANYWHERE).start(host.stamp(100 * MS + lag_ns))
         assert start.least_ns <= 100 * MS <= start.most_ns
 
 
 @pytest.mark.parametrize("drift", [-5e-5, 5e-5])
 def test_a_drifting_clock_stays_within_what_is_said(drift: float) -> None:
     host = Host(drift=drift)
-    clock = StartClock(AT_START)
-    assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
+    clock = tied(host)
     for seconds in (1, 10, 100):
         start = clock.start(host.stamp(seconds * 1000 * MS))
         assert start.least_ns <= seconds * 1000 * MS <= start.most_ns
@@ -135,9 +141,7 @@ def test_starts_that_nobody_asked_for_hold_the_truth(latched: bool, stamped: boo
 
 def test_a_frame_that_lay_in_the_camera_is_dated_by_the_clock() -> None:
     host = Host()
-    clock = StartClock(AT_START)
-    assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
-    starts = UntriggeredStarts(EXPOSURE, TRANSFER, clock)
+    starts = UntriggeredStarts(EXPOSURE, TRANSFER, tied(host))
     start = starts.start(Arrival(0, host.stamp(100 * MS), 100 * MS + EXPOSURE + 900 * MS))
     assert start is not None
     assert start.least_ns <= 100 * MS <= start.most_ns < 101 * MS
@@ -145,74 +149,64 @@ def test_a_frame_that_lay_in_the_camera_is_dated_by_the_clock() -> None:
 
 def test_a_stamp_later_than_its_arrival_is_not_believed() -> None:
     host = Host()
-    clock = StartClock(AT_START)
-    assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
-    starts = UntriggeredStarts(EXPOSURE, TRANSFER, clock)
+    starts = UntriggeredStarts(EXPOSURE, TRANSFER, tied(host))
     assert starts.start(Arrival(0, host.stamp(500 * MS), 400 * MS)) is None
 
 
-def triggered(*begun_ms: int) -> TriggeredStarts:
+@dataclass(frozen=True)
+class Came:
+    """A frame: its number, when it came (ms), and when its exposure can have begun (ms); None if it answers nothing."""
+
+    number: int
+    at: int
+    began: tuple[int, int] | None
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        # A number is a trigger at that time, in ms; a frame that answers it comes later.
+        pytest.param([100, Came(0, 115, (100, 105))], id="a frame answers its trigger"),
+        pytest.param([Came(0, 115, None)], id="nothing asked for it"),
+        pytest.param([100, Came(0, 115, (100, 105)), Came(1, 117, None)], id="a second frame of one trigger"),
+        pytest.param([100, Came(0, 105, None)], id="its exposure would have begun before the trigger"),
+        pytest.param([100, Came(0, 400, None)], id="much longer ago than an answer takes"),
+        pytest.param([100, Came(0, 115, (100, 105)), 120, 130, Came(2, 145, (130, 135))], id="number 1 never came"),
+        pytest.param([100, 110, Came(0, 125, (100, 115))], id="of several triggers the earliest"),
+        pytest.param([100, 400, Came(0, 415, (400, 405))], id="a trigger that was ignored is given up"),
+        # It may be the answer to the first, very late; then that to the second has to come, which it does not.
+        pytest.param(
+            [100, 200, Came(0, 215, (100, 205)), 300, Came(1, 315, (300, 305))],
+            id="an ignored trigger makes the next frame doubtful and no other",
+        ),
+        # The first exposure began very late, after the second trigger; the second one followed at once.
+        pytest.param(
+            [100, 200, Came(0, 215, (100, 205)), Came(1, 226, (200, 216))],
+            id="the answer to a trigger does not pass for that to the next",
+        ),
+    ],
+)
+def test_a_frame_answers_a_trigger_that_it_can_be_of(steps: list[int | Came]) -> None:
     starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
-    for begun in begun_ms:
+    for step in steps:
+        if isinstance(step, int):
+            starts.triggered(step * MS, (step + 1) * MS)
+        else:
+            began = None if step.began is None else Interval(step.began[0] * MS, step.began[1] * MS)
+            assert starts.start(Arrival(step.number, None, step.at * MS)) == began
+
+
+def test_an_answer_is_owed_until_it_came_or_is_given_up() -> None:
+    starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
+    for begun in (100, 200):
         starts.triggered(begun * MS, (begun + 1) * MS)
-    return starts
-
-
-def test_a_frame_answers_its_trigger() -> None:
-    starts = triggered(100)
-    assert starts.start(Arrival(0, None, 115 * MS)) == Interval(100 * MS, 105 * MS)
-    assert starts.owed_ns(116 * MS) <= 0
-
-
-def test_a_frame_that_nothing_asked_for_is_nobodys() -> None:
-    assert triggered().start(Arrival(0, None, 115 * MS)) is None
-    # Answered already: a second frame of one trigger.
-    starts = triggered(100)
-    assert starts.start(Arrival(0, None, 115 * MS)) is not None
-    assert starts.start(Arrival(1, None, 117 * MS)) is None
-    # The exposure would have begun before the trigger.
-    assert triggered(100).start(Arrival(0, None, 105 * MS)) is None
-    # Much longer ago than an answer takes.
-    assert triggered(100).start(Arrival(0, None, 400 * MS)) is None
-
-
-def test_a_lost_frame_has_answered_a_trigger() -> None:
-    starts = triggered(100)
-    assert starts.start(Arrival(0, None, 115 * MS)) is not None
-    for begun in (120, 130):
-        starts.triggered(begun * MS, (begun + 1) * MS)
-    # Number 1 never came.
-    assert starts.start(Arrival(2, None, 145 * MS)) == Interval(130 * MS, 135 * MS)
-
-
-def test_where_several_triggers_fit_the_earliest_is_taken() -> None:
-    assert triggered(100, 110).start(Arrival(0, None, 125 * MS)) == Interval(100 * MS, 115 * MS)
-
-
-def test_a_trigger_that_was_ignored_is_given_up() -> None:
-    starts = triggered(100, 400)
-    assert starts.owed_ns(430 * MS) > 0
-    assert starts.start(Arrival(0, None, 415 * MS)) == Interval(400 * MS, 405 * MS)
-
-
-def test_a_trigger_that_was_ignored_makes_the_next_frame_doubtful_and_no_other() -> None:
-    starts = triggered(100, 200)
-    # It may be the answer to the first, very late.
-    assert starts.start(Arrival(0, None, 215 * MS)) == Interval(100 * MS, 205 * MS)
-    # In that case, that to the second has to come. It does not.
-    assert starts.owed_ns(230 * MS) > 0
-    starts.triggered(300 * MS, 301 * MS)
-    assert starts.start(Arrival(1, None, 315 * MS)) == Interval(300 * MS, 305 * MS)
-    assert starts.owed_ns(316 * MS) <= 0
-
-
-def test_the_answer_to_a_trigger_does_not_pass_for_that_to_the_next() -> None:
-    starts = triggered(100, 200)
-    # The first exposure began very late, after the second trigger; the second one followed at once.
-    assert starts.start(Arrival(0, None, 215 * MS)) == Interval(100 * MS, 205 * MS)
+    assert starts.start(Arrival(0, None, 215 * MS)) is not None
     assert starts.owed_ns(216 * MS) > 0
-    assert starts.start(Arrival(1, None, 226 * MS)) == Interval(200 * MS, 216 * MS)
+    assert starts.start(Arrival(1, None, 226 * MS)) is not None
     assert starts.owed_ns(227 * MS) <= 0
+    starts.triggered(400 * MS, 401 * MS)
+    assert starts.owed_ns(430 * MS) > 0
+    assert starts.owed_ns(600 * MS) <= 0
 
 
 def test_a_trigger_that_may_have_been_sent_twice_is_two() -> None:
