@@ -361,7 +361,7 @@ def test_a_known_read_out_narrows_the_claim(plugged: Plug) -> None:
     errors_ns = []
     options: dict[str, Any]
     for options in ({}, {"readout_s": 0.001}):
-        camera = armed(device, **options)
+        camera = armed(device, None, **options)
         errors_ns.append(camera.read(device.clock.now_ns(), 2).t_err_ns)
         camera.close()
     assert errors_ns[1] < errors_ns[0] / 4
