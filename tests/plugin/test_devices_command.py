@@ -57,7 +57,7 @@ def test_a_command_to_copy_is_neither_wrapped_nor_styled_away(monkeypatch: pytes
     assert "slrig demo" in shown.replace("\n", " ")
 
 
-def test_a_broken_package_is_told_once_with_its_cause_and_its_removal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_package_is_listed_once_with_its_cause_and_its_removal(monkeypatch: pytest.MonkeyPatch) -> None:
     faults = {kind: f"{kind} driver 'x' cannot be loaded: OSError: [/etc] is shut" for kind in ("camera", "finder")}
     drivers = tuple(driver("x", "x-package", kind=kind, fault=fault) for kind, fault in faults.items())
     fault = DriverBrokenError("finder driver 'y' failed: OSError: no bus")

@@ -112,7 +112,7 @@ def test_devices_lists_what_is_installed_found_broken_and_missing(
     assert "Vendor SDK" in runs[1].stderr
 
 
-def test_its_options_are_told_if_it_describes_them(example_site: Path, tmp_path: Path) -> None:
+def test_options_are_listed_if_a_driver_describes_them(example_site: Path, tmp_path: Path) -> None:
     path = path_with(example_site)
     done = slrig("devices", "--options", "example_chart", path=path, folder=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -190,7 +190,7 @@ def test_a_scan_with_the_example_beside_broken_plug_ins_is_a_plane_at_its_distan
         ("lacking", "run: pip install 'slrig-lacking-library[vendor]'"),
     ],
 )
-def test_a_rig_that_names_a_broken_driver_tells_why_and_the_service_lives(
+def test_a_rig_that_names_a_broken_driver_says_why_and_the_service_goes_on(
     start: Start,
     example_site: Path,
     broken_site: Path,

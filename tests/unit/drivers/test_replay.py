@@ -194,7 +194,7 @@ def test_options_are_checked(tmp_path: Path, options: dict[str, object], words: 
         open_head(options, tmp_path)
 
 
-def test_a_damaged_bundle_is_told(tmp_path: Path) -> None:
+def test_a_damaged_bundle_is_refused_with_the_name_of_the_file(tmp_path: Path) -> None:
     head_of(tmp_path, BASIC)
     frame = next((tmp_path / "rec" / "frames").rglob("*.png"))
     frame.write_bytes(frame.read_bytes()[:40])

@@ -104,7 +104,7 @@ def test_it_can_be_kept_as_a_file(tmp_path: Path) -> None:
     assert np.allclose(again.cameras["right"].translation_mm, np.array(RIGHT_CM) * 10, atol=1e-3)
 
 
-def test_every_calibrated_camera_is_read_unless_asked_otherwise() -> None:
+def test_every_calibrated_camera_is_read_by_default() -> None:
     stored = handler(cameras="C")
     stored.setLensPosition(dai.CameraBoardSocket.CAM_C, 130)
     oak = oak_with(stored, chips=[Chip("CAM_B"), Chip("CAM_C", autofocus=True)])

@@ -386,7 +386,7 @@ def test_an_unplugged_camera_is_gone_and_opens_again(device: Device) -> None:
 
 @pytest.mark.parametrize("device", [pytest.param("genicam", marks=pytest.mark.slow), "gentl"], indirect=True)
 @pytest.mark.parametrize(("trigger", "timeout_s"), [(Trigger.HARDWARE, 30.0), (Trigger.SOFTWARE, SHORT_S)])
-def test_a_reader_is_told_of_an_unplugged_camera(device: Device, trigger: Trigger, timeout_s: float) -> None:
+def test_a_read_ends_when_the_camera_is_unplugged(device: Device, trigger: Trigger, timeout_s: float) -> None:
     # Aravis takes seconds; who asks for less learns it when the frame is late.
     camera = device.open()
     camera.arm(1, trigger)

@@ -44,7 +44,7 @@ def test_frame_ids_are_unwrapped(ids: list[int], numbers: list[int | None]) -> N
     assert counter.made == 1 + max(number for number in numbers if number is not None)
 
 
-def test_all_ids_of_a_long_session_are_told_apart() -> None:
+def test_all_ids_of_a_long_session_have_numbers_of_their_own() -> None:
     counter = FrameNumbers()
     ids = [1 + index % 65535 for index in range(200_000)]
     assert [counter.next(block_id) for block_id in ids] == list(range(200_000))
@@ -121,7 +121,7 @@ def test_a_drifting_clock_stays_within_what_is_said(drift: float) -> None:
 
 @pytest.mark.parametrize("latched", [True, False])
 @pytest.mark.parametrize("stamped", [True, False])
-def test_starts_that_nobody_asked_for_hold_the_truth(latched: bool, stamped: bool) -> None:
+def test_starts_without_triggers_hold_the_truth(latched: bool, stamped: bool) -> None:
     rng = np.random.default_rng(5)
     host = Host(drift=4e-5)
     clock = StartClock(ANYWHERE)
@@ -220,7 +220,7 @@ def test_a_trigger_that_may_have_been_sent_twice_is_two() -> None:
     assert start.least_ns == 100 * MS
 
 
-def test_the_clock_tells_a_very_late_frame_from_that_of_the_next_trigger() -> None:
+def test_the_clock_separates_a_very_late_frame_from_that_of_the_next_trigger() -> None:
     host = Host()
     starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
     for number in range(3):
@@ -240,7 +240,7 @@ def test_the_clock_tells_a_very_late_frame_from_that_of_the_next_trigger() -> No
     assert start.least_ns >= 500 * MS
 
 
-def test_starts_that_were_asked_for_hold_the_truth_and_are_never_too_early() -> None:
+def test_triggered_starts_hold_the_truth_and_are_never_too_early() -> None:
     """A camera that ignores, loses and delays: whatever is said of a frame's start is so."""
     rng = np.random.default_rng(11)
     host = Host(drift=-3e-5)

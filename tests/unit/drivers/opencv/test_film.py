@@ -58,7 +58,7 @@ def test_frames_come_in_order_at_the_films_times(tmp_path: Path) -> None:
     camera.close()
 
 
-def test_arming_begins_the_film_anew(tmp_path: Path) -> None:
+def test_arming_begins_the_film_again(tmp_path: Path) -> None:
     write_film(tmp_path / "film.avi", ramp(10))
     camera = opened(tmp_path)
     for _ in range(2):

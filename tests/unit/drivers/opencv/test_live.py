@@ -103,7 +103,7 @@ def test_frames_that_piled_up_while_the_reader_was_held_up_are_passed_over(monke
         assert np.abs(frame.image.astype(int) - light.expected(BLACK)).max() <= 4
 
 
-def test_a_source_that_is_faster_than_told_gives_no_frame_and_says_why() -> None:
+def test_a_source_that_is_faster_than_its_table_gives_no_frame_and_says_why() -> None:
     with before(staged(), frame_rate_hz=5.0) as camera:
         camera.arm(1, Trigger.FREE)
         with pytest.raises(FrameTimeoutError, match=r"half a period of frame_rate_hz = 5 .*sends more frames"):
@@ -192,7 +192,7 @@ def test_a_pipe_that_falls_silent_can_be_closed(tmp_path: Path) -> None:
     thread.join(LONG_S)
 
 
-def test_a_pipe_that_nobody_writes_to_does_not_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pipe_without_a_writer_does_not_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drivers.opencv.feeds.OPEN_LIMIT_S", 0.2)
     os.mkfifo(tmp_path / "video.mjpeg")
     with pytest.raises(DeviceGoneError, match=r"video.mjpeg did not open within 0.2 s"):
@@ -201,7 +201,7 @@ def test_a_pipe_that_nobody_writes_to_does_not_open(tmp_path: Path, monkeypatch:
     os.close(os.open(tmp_path / "video.mjpeg", os.O_WRONLY))
 
 
-def test_no_camera_at_all_is_told(tmp_path: Path) -> None:
+def test_a_device_that_is_no_camera_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DeviceGoneError, match=r"/dev/video250: .*plug it in"):
         open_camera("eye", {"device": 250}, tmp_path)
     with pytest.raises(UnsupportedByDeviceError, match="/dev/null: asking for frames"):

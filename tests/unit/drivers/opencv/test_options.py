@@ -21,7 +21,7 @@ def test_a_camera_is_opened_through_the_kernels_interface_by_its_stamps(tmp_path
         assert source.label == "/dev/video0"
 
 
-def test_a_camera_whose_stamps_are_not_trusted_is_a_camera_still(tmp_path: Path) -> None:
+def test_a_camera_may_be_read_without_its_stamps(tmp_path: Path) -> None:
     source = source_of("eye", {"device": 0, "delay_s": 0.1, "frame_rate_hz": 30}, tmp_path)
     assert (source.kind, source.backend) == (Kind.DEVICE, cv2.CAP_V4L2)
 
@@ -31,7 +31,7 @@ def test_a_camera_of_another_back_end_is_a_live_source(tmp_path: Path) -> None:
     assert (source.kind, source.backend) == (Kind.LIVE, cv2.CAP_FFMPEG)
 
 
-def test_an_address_is_a_live_source_and_its_password_is_not_told(tmp_path: Path) -> None:
+def test_an_address_is_a_live_source_and_its_password_is_not_shown(tmp_path: Path) -> None:
     url = "rtsp://admin:secret@camera.local:554/stream?key=secret"
     source = source_of("eye", {"device": url, **LIVE}, tmp_path)
     assert (source.kind, source.backend, source.target) == (Kind.LIVE, cv2.CAP_FFMPEG, url)

@@ -74,7 +74,7 @@ def test_nothing_is_known_of_a_frame_before_the_first_wait() -> None:
     assert rule.exposed(waited(140, 155)) is not None
 
 
-def test_sleeping_is_told_from_working() -> None:
+def test_time_asleep_is_measured_without_time_at_work() -> None:
     sleep = Sleep()
     before_ns, awake_ns = time.monotonic_ns(), sleep.awake_ns()
     threading.Event().wait(0.05)

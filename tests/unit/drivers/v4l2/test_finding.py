@@ -85,13 +85,13 @@ def test_without_a_serial_number_the_port_gives_the_name(machine: Machine) -> No
     assert machine.names() == ["pci-usb-0:2:1.0-video-index0", "pci-usb-0:3:1.0-video-index0"]
 
 
-def test_cameras_that_share_a_serial_number_are_told_apart_by_port(machine: Machine) -> None:
+def test_cameras_that_share_a_serial_number_are_named_by_their_port(machine: Machine) -> None:
     machine.plug("video0", port="1-2", serial="0001", by_id="usb-x_0001-video-index0", by_path="pci-2-video-index0")
     machine.plug("video2", port="1-3", serial="0001", by_id="usb-x_0001-video-index0", by_path="pci-3-video-index0")
     assert machine.names() == ["pci-2-video-index0", "pci-3-video-index0"]
 
 
-def test_nodes_of_one_parent_are_told_apart(machine: Machine) -> None:
+def test_nodes_of_one_parent_have_names_of_their_own(machine: Machine) -> None:
     # Two nodes of one platform device get one by-path name; what their driver calls their bus differs.
     machine.plug("video0", port="vivid.0", by_path="platform-vivid.0-video-index0", bus="platform:vivid-000")
     machine.plug("video4", port="vivid.0/b", by_path="platform-vivid.0-video-index0", bus="platform:vivid-001")
@@ -124,7 +124,7 @@ def test_a_machine_without_cameras_has_none(tmp_path: Path) -> None:
     assert nodes(tmp_path / "none", tmp_path) == ()
 
 
-def test_a_camera_that_is_not_plugged_in_is_told_with_those_that_are(machine: Machine) -> None:
+def test_a_missing_camera_is_refused_with_a_list_of_those_that_are_there(machine: Machine) -> None:
     machine.plug("video0", by_path=BY_PATH)
     with pytest.raises(DeviceGoneError, match=f"usb-other.*{BY_PATH}"):
         machine.resolved("usb-other")

@@ -101,7 +101,7 @@ def test_a_repeated_frame_is_refused_and_counted() -> None:
     assert bare.period_ns() is None
 
 
-def test_a_counter_that_wraps_stands_still_or_starts_anew_is_no_loss() -> None:
+def test_a_counter_that_wraps_stands_still_or_starts_again_is_no_loss() -> None:
     tally = Tally()
     assert tally.is_new(frame(2**32 - 1, at=1))
     assert tally.is_new(frame(1, at=3))
