@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 
-from slrig.conformance import CHECKS as CONTRACT
-from slrig.conformance import Check, Examination, Outcome
+from slrig.conformance import Examination
 from slrig.conformance.bench import usual_settings
-from slrig.devices import Camera, CameraSettings, Head, KeepsTime, Rig, SystemClock
+from slrig.devices import Head, KeepsTime, Rig, SystemClock
 from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode
 from tests.unit.capture.fake_rig import patterns_for
@@ -40,8 +38,8 @@ class Bench:
     def open_rig(self) -> Rig:
         return rig_of(self.open_head())
 
-    def examination(self, *, limit_s: float | None = None) -> Examination:
-        return Examination(self.open_rig, self.sequence, limit_s=limit_s)
+    def examination(self) -> Examination:
+        return Examination(self.open_rig, self.sequence)
 
 
 def sequence_for(projector: Size) -> PatternSequence:
@@ -55,21 +53,7 @@ def close(head: Head) -> None:
         camera.close()
 
 
-def usual(camera: Camera) -> CameraSettings:
-    return usual_settings(camera)
-
-
 def rig_of(head: Head) -> Rig:
-    settings = {name: usual(camera) for name, camera in head.cameras.items()}
+    settings = {name: usual_settings(camera) for name, camera in head.cameras.items()}
     clock = head.clock if isinstance(head, KeepsTime) else SystemClock()
     return Rig("bench", head.cameras, head.projector, settings, head.calibration, head, clock=clock)
-
-
-def passes(check: Check, bench: Bench) -> None:
-    """Examine the bench by one check, on a rig of its own."""
-    with bench.examination() as examination:
-        result = examination.judge(check)
-    assert result.outcome in {Outcome.PASSED, Outcome.NOT_APPLICABLE}, str(result.failure)
-
-
-CHECKS: dict[str, Callable[[Bench], None]] = {check.name: partial(passes, check) for check in CONTRACT}

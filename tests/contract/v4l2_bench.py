@@ -36,20 +36,14 @@ def why_not() -> str:
     return ""
 
 
-def usb_camera(port: str, serial: str, *names: str) -> str:
-    """The device tree of a USB camera with these video nodes, as umockdev reads it."""
-    camera = f"/devices/pci0000:00/0000:00:14.0/usb1/1-{port}"
-    tree = f"P: {camera}\nE: SUBSYSTEM=usb\nE: DEVTYPE=usb_device\nA: idVendor=1234\\n\nA: idProduct=abcd\\n\n"
-    if serial:
-        tree += f"A: serial={serial}\\n\n"
-    for index, name in enumerate(names):
-        # "=00" makes a plain file, which can be mapped; without it, umockdev makes a terminal.
-        tree += (
-            f"\nP: {camera}/1-{port}:1.0/video4linux/{name}\nN: {name}=00\nE: DEVNAME=/dev/{name}\n"
-            f"E: SUBSYSTEM=video4linux\nA: dev=81:{name.removeprefix('video')}\\n\nA: index={index}\\n\n"
-            "A: name=Bench camera\\n\n"
-        )
-    return f"{tree}\n"
+_USB = "/devices/pci0000:00/0000:00:14.0/usb1/1-2"
+TREE = (
+    f"P: {_USB}\nE: SUBSYSTEM=usb\nE: DEVTYPE=usb_device\nA: idVendor=1234\\n\nA: idProduct=abcd\\n\n"
+    # "=00" makes a plain file, which can be mapped; without it, umockdev makes a terminal.
+    f"A: serial=S123\\n\n\nP: {_USB}/1-2:1.0/video4linux/video0\nN: video0=00\nE: DEVNAME=/dev/video0\n"
+    "E: SUBSYSTEM=video4linux\nA: dev=81:0\\n\nA: index=0\\n\nA: name=Bench camera\\n\n\n"
+)
+"""The device tree of a USB camera, as umockdev reads it."""
 
 
 def control(number: int, name: str, minimum: int, maximum: int, default: int, **more: object) -> dict[str, Any]:
@@ -105,21 +99,20 @@ class Faked:
     stretches: bool = True
     padding_bytes: int = 0
     seed: int = 0
-    tree: str = usb_camera("2", "S123", "video0")
     nodes: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {"video0": {}})
-    links: Mapping[str, str] = field(default_factory=dict)
 
     def config(self, light: Path, faults: Path) -> dict[str, Any]:
         keys = (
             *("rates_of", "driver", "line_s"),
             *("formats", "rates", "controls", "stamp", "readout_s", "jitter_s", "lag_frames", "lost", "corrupt"),
-            *("flags_corrupt", "tells_rate", "stretches", "padding_bytes", "seed", "tree", "links"),
+            *("flags_corrupt", "tells_rate", "stretches", "padding_bytes", "seed"),
         )
         most = max(width * height for sizes in self.formats.values() for width, height in sizes)
         usual = {"card": "Bench camera", "bus": "usb-0000:00:14.0-2", "capabilities": 0x04200001}
         room = {"most_bytes": 2 * most + 3 * 4096}
         return {
             **{key: getattr(self, key) for key in keys},
+            "tree": TREE,
             "light": str(light),
             "faults": str(faults),
             "nodes": {name: {**usual, **room, **own} for name, own in self.nodes.items()},

@@ -26,10 +26,6 @@ def serve(config: dict[str, Any]) -> None:
     bed = UMockdev.Testbed.new()
     bed.add_from_string(config["tree"])
     root = Path(bed.get_root_dir())
-    for link, target in config["links"].items():
-        path = root / "dev" / link
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.symlink_to(target)
     bases = []
     for name, own in config["nodes"].items():
         device = Device({**config, **own}, Light(config["light"]))
