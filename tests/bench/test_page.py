@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from slrig.scan.artefacts import encode_mesh_ply
 from tests.e2e.conftest import Start, browser, scanned, write_rig
 from tests.e2e.page.conftest import Visit, visit
-from tests.unit.scan.test_view_format import sheet
+from tests.unit.scan.test_mesh_formats import sheet
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

@@ -231,28 +231,27 @@ def test_a_manifest_cannot_reach_out_of_the_data_folder(
         restore(tmp_path / "backup", tmp_path / "elsewhere")
 
 
-def test_a_full_disk_leaves_no_half_backup(
-    tmp_path: Path, store: JobStore, folder: DataFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scanned(store, folder)
-
-    def full() -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "backup"))
-
-    while_copying(monkeypatch, "mesh.ply", full)
-    with pytest.raises(StorageError, match=r"No space left on device.*free some space"):
-        back_up(folder.root, tmp_path / "backup")
-    assert [path.name for path in tmp_path.iterdir()] == ["data"]
-
-
-def test_who_may_not_read_the_data_is_told_as_whom_to_come(
-    tmp_path: Path, store: JobStore, folder: DataFolder, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("refusal", "words"),
+    [
+        (errno.ENOSPC, r"No space left on device.*free some space"),
+        (errno.EACCES, r"mesh\.ply may not be read. Run this as the user"),
+    ],
+)
+def test_a_disk_that_refuses_leaves_no_half_backup(
+    tmp_path: Path,
+    store: JobStore,
+    folder: DataFolder,
+    monkeypatch: pytest.MonkeyPatch,
+    refusal: int,
+    words: str,
 ) -> None:
     scanned(store, folder)
 
     def refused() -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder.scans / "mesh.ply"))
+        raise OSError(refusal, os.strerror(refusal), str(folder.scans / "mesh.ply"))
 
     while_copying(monkeypatch, "mesh.ply", refused)
-    with pytest.raises(StorageError, match=r"mesh\.ply may not be read. Run this as the user"):
+    with pytest.raises(StorageError, match=words):
         back_up(folder.root, tmp_path / "backup")
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]

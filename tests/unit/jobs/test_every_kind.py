@@ -414,7 +414,7 @@ def test_mathematics_that_fails_fails_the_job_alone(service: Service, kind: Kind
 def test_the_end_of_the_service_interrupts_what_captures_and_leaves_what_waits(service: Service, kind: Kind) -> None:
     job_id = kind.capturing()
     waiting = service.scan(wait=True)
-    service.runner.close()
+    service.runner.close(timeout_s=WAIT_S)
     record = kind.over(job_id)
     assert (record.state, failure_code(record)) == (JobState.INTERRUPTED, "scan-interrupted")
     assert service.store.get(waiting.id).state is JobState.QUEUED

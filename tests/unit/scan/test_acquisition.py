@@ -5,17 +5,19 @@ they fail for good.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from slrig.bundle import read_bundle
+from slrig.bundle import BundleWriter, read_bundle
 from slrig.bundle.notes import read_notes
-from slrig.bundle.refused import read_refused
+from slrig.bundle.refused import Refused, read_refused
 from slrig.bundle.stage import StageAngle, read_stage
 from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.devices import CameraSettings, Projector, Synchronisation, Trigger
@@ -26,12 +28,13 @@ from slrig.errors import (
     ScanCancelledError,
     ScanEvidenceError,
     SlrigError,
+    StorageError,
     UnsupportedByDeviceError,
 )
 from slrig.jobs.frame_feed import Abandon, FrameFeed
-from slrig.model import Axis, Calibration, Shot
+from slrig.model import Axis, Black, Calibration, CameraFormat, Shot, Size, White
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_frames, exposed
+from slrig.scan.acquisition import Recorder, capture_frames, exposed
 from slrig.scan.plan import PatternPlan, PresetUse, ScanPlan
 from slrig.scan.report import capture_report
 from tests.contract.benches import simulated
@@ -323,3 +326,120 @@ class Refreshing:
 
     def __init__(self, projector: Projector, refresh_s: float) -> None:
         self.info = replace(projector.info, refresh_s=refresh_s)
+
+
+# A bundle is written beside the capture: in order, whole or not at all, and never holding more than it may
+
+FORMATS = {"cam0": CameraFormat(Size(64, 48), 8)}
+SHOTS = tuple(Shot(index, "cam0", np.full((48, 64), 10 * index, np.uint8)) for index in range(2))
+
+
+class Slow(BundleWriter):
+    """Writes when it is let; tells when it has begun."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, Size(64, 40), (White(), Black()), FORMATS)
+        self.gate = threading.Event()
+        self.begun = threading.Event()
+        self.error: Exception | None = None
+        self.written_by: set[str] = set()
+
+    def add(self, shot: Shot) -> None:
+        self.begun.set()
+        assert self.gate.wait(WAIT_S)
+        self.written_by.add(threading.current_thread().name)
+        if self.error is not None:
+            raise self.error
+        super().add(shot)
+
+
+def test_frames_are_written_in_order_by_a_thread_of_its_own(tmp_path: Path) -> None:
+    writer = Slow(tmp_path / "bundle")
+    with writer, Recorder(writer) as recorder:
+        for shot in SHOTS:
+            recorder.add(shot)
+        recorder.refuse(Refused(0, "cam0", 1, "it was stale", delivered=True))
+        recorder.add(SHOTS[0])
+        # All of this while the disk did nothing.
+        writer.gate.set()
+    assert writer.written_by == {"slrig-recorder"}
+    shots = read_bundle(tmp_path / "bundle").capture.shots
+    assert [(shot.pattern, int(shot.image[0, 0])) for shot in shots] == [(0, 0), (1, 10)]
+
+
+def test_a_disk_that_is_too_slow_holds_the_capture_up(tmp_path: Path) -> None:
+    writer = Slow(tmp_path / "bundle")
+    third_waits = threading.Event()
+    done = threading.Event()
+
+    def capture() -> None:
+        with writer, Recorder(writer, most_bytes=2 * SHOTS[0].image.nbytes) as recorder:
+            recorder.add(SHOTS[0])
+            assert writer.begun.wait(WAIT_S)
+            recorder.add(SHOTS[1])
+            third_waits.set()
+            recorder.add(SHOTS[1])
+        done.set()
+
+    thread = threading.Thread(target=capture, daemon=True)
+    thread.start()
+    assert third_waits.wait(WAIT_S)
+    assert not done.is_set()
+    writer.gate.set()
+    assert done.wait(WAIT_S)
+    thread.join()
+    assert len(read_bundle(tmp_path / "bundle").capture.shots) == 3
+
+
+def test_a_frame_larger_than_the_queue_is_written_all_the_same(tmp_path: Path) -> None:
+    writer = Slow(tmp_path / "bundle")
+    writer.gate.set()
+    with writer, Recorder(writer, most_bytes=1) as recorder:
+        for shot in SHOTS:
+            recorder.add(shot)
+    assert len(read_bundle(tmp_path / "bundle").capture.shots) == 2
+
+
+@pytest.mark.parametrize(
+    ("refusal", "shots", "words"),
+    [
+        (StorageError("the disk is full"), SHOTS[:1], "the disk is full"),
+        # It ends a capture that goes on.
+        (StorageError("the disk is full"), repeat(SHOTS[0]), "the disk is full"),
+        (None, [Shot(7, "cam0", SHOTS[0].image)], "pattern 7"),
+    ],
+    ids=["at the end", "in the middle", "no frame of the bundle"],
+)
+def test_what_cannot_be_written_is_told_and_leaves_nothing(
+    tmp_path: Path, refusal: Exception | None, shots: Iterable[Shot], words: str
+) -> None:
+    writer = Slow(tmp_path / "bundle")
+    writer.error = refusal
+    writer.gate.set()
+
+    def capture() -> None:
+        with writer, Recorder(writer, most_bytes=1) as recorder:
+            for shot in shots:
+                recorder.add(shot)
+            recorder.finish()
+
+    with pytest.raises(SlrigError, match=words):
+        capture()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_capture_that_fails_writes_no_more_and_leaves_nothing(tmp_path: Path) -> None:
+    writer = Slow(tmp_path / "bundle")
+
+    def capture() -> None:
+        with writer, Recorder(writer) as recorder:
+            for shot in SHOTS:
+                recorder.add(shot)
+            assert writer.begun.wait(WAIT_S)
+            threading.Timer(0, writer.gate.set).start()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        capture()
+    assert list(tmp_path.iterdir()) == []
+    assert not any(thread.name == "slrig-recorder" for thread in threading.enumerate())

@@ -197,11 +197,6 @@ def test_the_same_values_give_the_same_bytes_here_and_in_another_process() -> No
     assert digest() == digest() == other.stdout.strip()
 
 
-@pytest.mark.parametrize("encode", ENCODERS)
-def test_another_mesh_gives_other_bytes(encode: Any) -> None:
-    assert encode(example_mesh(0)) != encode(example_mesh(1))
-
-
 class _Kind(StrEnum):
     GRAY = "gray"
 

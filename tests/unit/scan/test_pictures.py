@@ -9,10 +9,13 @@ from numba import config
 from numpy.typing import NDArray
 
 from slrig.errors import StorageError
+from slrig.kernels import in_bands
 from slrig.meshing import rasteriser
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
-from slrig.scan import pictures
+from slrig.scan import pictures, placing, shading
 from slrig.scan.pictures import _CAUSES, described_causes, encode_png, preview, rejection_picture
+from slrig.scan.placing import placed_vertices, resampled
+from slrig.scan.shading import Picture, resized
 
 SIZE = Size(640, 480)
 PANEL = Size(520, 390)
@@ -260,3 +263,80 @@ def test_a_png_is_read_back_as_it_was_or_cannot_be_encoded(monkeypatch: pytest.M
     monkeypatch.setattr(cv2, "imencode", lambda *_: (False, None))
     with pytest.raises(StorageError, match="could not encode"):
         encode_png(picture)
+
+
+# The light on a mesh, against the same in plain numpy
+
+SHAPE = (30, 40)
+
+
+def plain_lit(face: NDArray[np.int32], normals: NDArray[np.float32], front: NDArray[np.bool_]) -> Picture:
+    """Each light's share of each pixel, at once over the whole picture."""
+    light = 0.12 + np.maximum(normals.astype(np.float64) @ LIGHTS.T, 0).sum(axis=2)
+    colour = np.where(front[..., None], (196, 209, 219), (92, 92, 176))
+    return np.where((face >= 0)[..., None], light[..., None] * colour, 7).astype(np.uint8)
+
+
+LIGHTS = np.array(((0.0, 0.0, -0.46), (0.25, -0.29, -0.22)))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_light_is_that_of_plain_arithmetic(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", threads)
+    random = np.random.default_rng(5)
+    normals = random.normal(size=(*SHAPE, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    face = random.integers(-1, 3, SHAPE).astype(np.int32)
+    front = random.random(SHAPE) < 0.5
+    picture = np.full((*SHAPE, 3), 7, dtype=np.uint8)
+    given = face, normals, front, LIGHTS, shading._COLOURS, picture
+    in_bands(shading._lit, SHAPE[0], *given, rows_at_least=1)
+    expected = plain_lit(face, normals, front)
+    # Where a product is a whole number but for rounding, either side of it may be found.
+    assert np.abs(picture.astype(int) - expected).max() <= 1
+    assert (picture == expected).mean() > 0.999
+
+
+def test_a_picture_of_the_size_asked_for_is_left_alone() -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
+    assert resized(picture, Size(40, 30)) is picture
+    assert np.array_equal(resized(picture, Size(80, 60))[::2, ::2], picture)
+    half = picture.reshape(15, 2, 20, 2, 3).mean(axis=(1, 3))
+    assert resized(picture, Size(20, 15)) == pytest.approx(half, abs=0.5)
+
+
+# Where vertices fall, against OpenCV's own projection
+
+ROTATION = np.asarray(cv2.Rodrigues(np.array((0.1, -0.2, 0.05)))[0], dtype=np.float64)
+TURNED = Pinhole(
+    Size(640, 480),
+    np.array([[500, 0.0, 310], [0, 510, 250], [0, 0, 1]], dtype=np.float64),
+    np.array((-0.2, 0.06, 0.001, -0.002, 0.01)),
+    ROTATION,
+    np.array((10.0, -20.0, 30.0)),
+)
+POINTS = np.random.default_rng(3).uniform((-100, -100, 300), (100, 100, 500), (1000, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("at_once", [64, 10_000])
+@pytest.mark.parametrize("per_px", [2.0, 0.4])
+def test_vertices_fall_where_opencv_has_them(monkeypatch: pytest.MonkeyPatch, at_once: int, per_px: float) -> None:
+    monkeypatch.setattr(placing, "_AT_ONCE", at_once)
+    pixels, _ = cv2.projectPoints(
+        POINTS.astype(np.float64), cv2.Rodrigues(ROTATION)[0], TURNED.translation_mm, TURNED.matrix, TURNED.distortion
+    )
+    device = resampled(TURNED, per_px, Size(round(640 * per_px), round(480 * per_px)))
+    placed = placed_vertices(POINTS, device)
+    # The left border of the first pixel, at -0.5, is one place in both.
+    assert placed[:, :2] == pytest.approx((pixels.reshape(-1, 2) + 0.5) * per_px - 0.5, abs=1e-3)
+    assert placed[:, 2] == pytest.approx((POINTS @ ROTATION.T + TURNED.translation_mm)[:, 2], rel=1e-6)
+    assert placed.dtype == np.float32
+
+
+def test_a_point_behind_the_camera_has_no_pixel_and_no_depth_before_it() -> None:
+    behind = (np.array([[0.0, 0.0, -50.0]]) - TURNED.translation_mm) @ ROTATION
+    (column, row, depth), *others = placed_vertices(behind, TURNED)
+    assert not others
+    assert np.isnan((column, row)).all()
+    assert depth == pytest.approx(-50)
+    assert placed_vertices(behind[:0], TURNED).shape == (0, 3)
