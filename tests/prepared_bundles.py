@@ -18,6 +18,16 @@ from slrig.scan.plan import PatternPlan, ScanPlan
 
 SCENES = Path(__file__).parents[1] / "config" / "scenes"
 
+_HEAD = """
+name = "sphere"
+[head]
+driver = "simulated"
+{scene}
+seed = 12
+samples_per_axis = 2
+ambient = 0.01
+"""
+
 _DEVICES = """
 [head.projector]
 size_px = [256, 192]
@@ -56,16 +66,12 @@ class Rendered:
     projector_mm: str = "105.0, -10.0, -590.0"
     plan: ScanPlan = ScanPlan()  # noqa: RUF009 - frozen
     truth: bool = False
-    seed: int = 12
 
     def rig_text(self) -> str:
         """A rig file."""
-        scene = SCENES / "sphere.toml"
-        head = f'name = "sphere"\n[head]\ndriver = "simulated"\nscene = "{scene}"\nseed = {self.seed}\n'
-        cameras = (_CAMERA.format(name=name, position_mm=place) for name, place in self.cameras_mm.items())
-        return "".join((
-            head, "samples_per_axis = 2\nambient = 0.01\n", _DEVICES.format(projector_mm=self.projector_mm), *cameras
-        ))  # fmt: skip
+        cameras = "".join(_CAMERA.format(name=name, position_mm=place) for name, place in self.cameras_mm.items())
+        scene = f'scene = "{SCENES / "sphere.toml"}"'
+        return _HEAD.format(scene=scene) + _DEVICES.format(projector_mm=self.projector_mm) + cameras
 
 
 _LEFT = {"left": "-150.0, -12.0, -560.0"}

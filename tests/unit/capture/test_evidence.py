@@ -200,7 +200,7 @@ EACH_KIND = {3: SPOILS, 10: (stale, garbled), FIRST_LINE: (stale, cut), FIRST_LI
     [
         pytest.param(
             spoil, index, marks=[] if spoil in EACH_KIND.get(index, ()) else pytest.mark.slow,
-            id=f"{spoil.__name__} {index}",  # type: ignore[attr-defined]
+            id=f"{spoil.__name__} {index}",
         )
         for index in range(2, len(PATTERNS) - 2)
         for spoil in SPOILS

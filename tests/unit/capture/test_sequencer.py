@@ -16,7 +16,7 @@ from slrig.bundle.refused import Refused
 from slrig.capture import sampling
 from slrig.capture.evidence import Evidence, EvidenceSummary
 from slrig.capture.hardware_trigger import frame_shift
-from slrig.capture.retry_policy import MOST_FAILURES
+from slrig.capture.retry_policy import MOST_FAILURES, RetryPolicy
 from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Synchronisation, Trigger
 from slrig.errors import (
@@ -450,6 +450,16 @@ def test_frames_that_are_lost_now_and_then_say_nothing_against_those_that_come()
     taken = Taken(faulty(drop=frozenset({15, 19}), garbled=frozenset({17, 21}))).run()
     taken.assert_right()
     assert [(r.pattern, r.attempt) for r in taken.refused] == [(15, 1), (15, 2), (15, 3), (15, 4)]
+
+
+def test_a_camera_is_not_exposed_for_ever() -> None:
+    policy = RetryPolicy(SHORT, Evidence(SHORT.patterns, {"left": Scene().format}), lambda _: None)
+    assert policy.most_shots == MOST_FAILURES * len(SHORT)
+    for number in range(policy.most_shots):
+        policy.begin("left", number % len(SHORT))
+    policy.begin("right", 0)
+    with pytest.raises(ScanEvidenceError, match=f"{policy.most_shots} exposures gave no {len(SHORT)} frames"):
+        policy.begin("left", 0)
 
 
 def test_a_projector_that_swapped_two_patterns_once_is_overcome() -> None:
