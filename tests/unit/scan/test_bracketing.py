@@ -273,6 +273,7 @@ def test_a_camera_that_sets_another_exposure_than_asked_is_refused(tmp_path: Pat
         captured(rig, tmp_path / "bundle")
 
 
+@pytest.mark.slow
 def test_a_recorded_capture_of_two_cameras_with_one_exposure_each_is_no_bracket(tmp_path: Path) -> None:
     rig = fake({"left": 0.6, "right": 0.5})
     capture_frames(rig.rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()

@@ -180,8 +180,9 @@ def test_obj_leaves_unknown_normals_out() -> None:
     np.testing.assert_allclose(in_mm(text.encode(), "obj").triangles, mesh.vertices_mm[mesh.faces], rtol=0, atol=6e-6)
 
 
-def test_obj_is_the_plain_text_that_formatting_gives() -> None:
-    mesh = half_ball(200, 200)
+def test_obj_is_the_plain_text_that_formatting_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mesh_formats, "_MOST_ROWS", 300)
+    mesh = half_ball(20, 25)
     lines = ["# slrig mesh, millimetres; v x y z red green blue", "o scan"]
     for point, colour in zip(mesh.vertices_mm.astype(np.float64), mesh.colour.tolist(), strict=True):
         x, y, z = (unsigned_zero(f"{value:.5f}") for value in np.rint(point * 1e5) / 1e5)
@@ -341,7 +342,7 @@ def test_points_nothing_and_unknown_normals(encode: Any) -> None:
     assert "NORMAL" not in read(encode(with_unknown_normal(mesh))).stored
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("axis", [0, *(pytest.param(each, marks=pytest.mark.slow) for each in (1, 2))])
 def test_a_coarse_mesh_has_vertices_of_the_mesh_and_its_orientation(axis: int) -> None:
     fine = sheet()
     fine = replace(fine, **{name: np.roll(getattr(fine, name), axis, axis=1) for name in ("vertices_mm", "normals")})
