@@ -209,13 +209,8 @@ def test_demo_waits_for_the_rig_and_for_nothing_else() -> None:
 
     with client_of(absent) as client:
         assert still_missing(client) == "the service is starting"
-
-
-def test_demo_tells_at_once_why_the_rig_cannot_be_opened() -> None:
-    with (
-        client_of(lambda _request: ready_answer(503, "scene 'tabel.toml': expected a readable file")) as client,
-        pytest.raises(ServiceError, match=r"The rig cannot be opened: scene 'tabel\.toml': expected a readable file"),
-    ):
+    fault = "scene 'tabel.toml': expected a readable file"
+    with client_of(lambda _: ready_answer(503, fault)) as client, pytest.raises(ServiceError, match="cannot be opened"):
         still_missing(client)
 
 

@@ -262,29 +262,6 @@ def test_board_that_is_not_named_is_the_usual_one(tmp_path: Path) -> None:
     assert f"measured on the print (default {USUAL_BOARD.square_mm:g})" in told
 
 
-@pytest.mark.slow
-@pytest.mark.shared
-def test_real_poses_are_solved_and_told(shared: Path, tmp_path: Path) -> None:
-    boards = shared / "captures" / "boards"
-    if not boards.is_dir():
-        pytest.skip(f"no captured boards in {boards}")
-    board = ["--board", "chessboard", "--corners", "7x9", "--square-mm", "75"]
-    output, report = tmp_path / "rig.json", tmp_path / "report.html"
-    result = run("solve", boards, *board, "--output", output, "--report", report, "--json")
-    assert result.exit_code == 0, result.output
-    document = json.loads(result.stdout)
-    assert document["poses"] == ["pose_0", "pose_1", "pose_2", "pose_3"]
-    assert document["refused"] == {}
-    # Four poses: the numbers are what its README asks for, and the verdict says what four poses are worth.
-    assert document["devices"]["cam0"]["rms_px"] <= 0.225
-    assert document["devices"]["projector"]["rms_px"] <= 0.16
-    assert document["verdict"]["grade"] != "good"
-    projector = read_calibration(output).projector
-    assert projector is not None
-    assert 768 < projector.matrix[1, 2] < 1000
-    assert report.read_text(encoding="utf-8").count("<img ") == 4
-
-
 def test_screen_fits_on_one_and_holds_the_figures() -> None:
     stream = io.StringIO()
     tell_result({**summary(solved_result()), "refused": {"pose_20": "no board"}}, Console(file=stream, width=100))

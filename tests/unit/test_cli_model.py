@@ -18,7 +18,7 @@ from slrig.meshing.topology import topology_counts
 from slrig.model import MeasuredAxis, PlaneKind, StagePlane
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.views import registration
-from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, off_surface_mm, seen, vase
+from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, seen, vase
 from tests.unit.command import slrig
 
 ANGLE = 40.0
@@ -70,10 +70,6 @@ def test_scans_of_a_stage_are_placed_and_their_poses_place_them_again(scans: Pat
     # The same surface once, and nothing where no scan has seen it.
     whole = decode_mesh_ply((tmp_path / "model" / "model.ply").read_bytes())
     assert report["model"]["triangles"] == len(whole.faces) < len(placed.faces)
-    assert sum(report["model"]["seen_by"].values()) == pytest.approx(1)
-    assert set(report["model"]["seen_by"]) == {"1", "2", "3"}
-    # Edges of 1.9 mm cut the bumps by so much.
-    assert np.sqrt(np.mean(off_surface_mm(bumpy, whole) ** 2)) < 0.06
     assert topology_counts(whole.faces).boundary_edges > 0
     assert any(line.startswith("mesh ") and "seen by one view only" in line for line in table)
     # Two of them, the other way round, from the poses that were written.

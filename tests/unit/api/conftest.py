@@ -7,19 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI
 from fastapi.testclient import TestClient
 
 from slrig.api.app import create_app
 from slrig.api.keys import KeyRing
-from slrig.api.service import Service
+from slrig.api.problems import install_problems
+from slrig.api.service import Service, _of_request
 from slrig.bundle.scan_options import ScanDefaults
 from slrig.config import ServiceSettings
 from slrig.jobs.copies import Copies
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Outbox
-from slrig.jobs.records import JobKind
+from slrig.jobs.records import JobKind, JobState
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.rig.session import RigSession
@@ -93,8 +94,9 @@ def client(session: TestClient, served: ServedBench) -> Iterator[TestClient]:
     yield session
     served.gate.set()
     for scan in session.get("/scan").json()["scans"]:
-        session.post(f"/scan/{scan['id']}/cancel")
-        ended(session, scan["id"])
+        if not JobState(scan["state"]).final:
+            session.post(f"/scan/{scan['id']}/cancel")
+            ended(session, scan["id"])
         session.delete(f"/scan/{scan['id']}")
 
 
@@ -102,6 +104,15 @@ def client_of(served: ServedBench, *, key: str | None = KEY) -> TestClient:
     """A client that holds the key of a service; within `with`, the service runs."""
     headers = {} if key is None else {"Authorization": f"Bearer {key}"}
     return TestClient(served.app, base_url=HERE, headers=headers, raise_server_exceptions=False)
+
+
+def app_of(router: APIRouter, service: object) -> FastAPI:
+    """An application with the routes of one router, over a stand-in for the service."""
+    app = FastAPI()
+    app.include_router(router)
+    install_problems(app)
+    app.dependency_overrides[_of_request] = lambda: service
+    return app
 
 
 def ended(client: TestClient, scan_id: str) -> dict[str, Any]:

@@ -6,16 +6,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.desk import AcceptanceDesk
 from slrig.api import acceptance as router_module
-from slrig.api.problems import install_problems
-from slrig.api.service import _of_request
 from slrig.jobs.keys import RequestKeys
 from tests.unit.accept.test_desk import PLAN, desk, desks, queue
+from tests.unit.api.conftest import app_of
 from tests.unit.jobs.tame_queue import TameQueue
 
 __all__ = ["desk", "desks", "queue"]
@@ -32,13 +30,9 @@ VOLUME = [[-100, -75, -40], [100, 75, 40]]
 
 @pytest.fixture
 def client(desk: AcceptanceDesk) -> TestClient:
-    app = FastAPI()
-    app.include_router(router_module.router)
-    install_problems(app)
-    app.dependency_overrides[_of_request] = lambda: SimpleNamespace(
-        acceptance=desk, keys=RequestKeys(desk.jobs.database), folder=SimpleNamespace(require_present=lambda: None)
-    )
-    return TestClient(app)
+    keys, folder = RequestKeys(desk.jobs.database), SimpleNamespace(require_present=lambda: None)
+    service = SimpleNamespace(acceptance=desk, keys=keys, folder=folder)
+    return TestClient(app_of(router_module.router, service))
 
 
 def test_positions_are_measured_to_the_end_and_the_report_is_fetched(

@@ -16,11 +16,12 @@ from starlette.types import Scope as ASGIScope
 
 from slrig.api import access
 from slrig.api.access import Access, Rates, Refused
-from slrig.api.app import bare_app, create_app
+from slrig.api.app import create_app
 from slrig.api.keys import KeyRing
 from slrig.api.scopes import READING, Scope, needed_scope
 from slrig.api.sessions import LINK_PATH, Sessions
 from tests.unit.api.conftest import HERE, KEY, ServedBench, client_of, ended
+from tests.unit.api.test_problems import PATHS
 
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin", "Origin": HERE, "Referer": f"{HERE}/docs"}
 
@@ -74,7 +75,7 @@ def test_each_key_does_what_it_is_for_and_nothing_else(served: ServedBench, ring
 
 
 def test_every_operation_has_a_scope_that_its_path_tells() -> None:
-    for path, operations in bare_app().openapi()["paths"].items():
+    for path, operations in PATHS.items():
         for method, operation in operations.items():
             scope = needed_scope(method.upper(), path)
             assert operation.get("x-scope", scope) == scope

@@ -8,12 +8,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from slrig.api import health
-from slrig.api.problems import install_problems
-from slrig.api.service import _of_request
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.keys import RequestKeys
@@ -21,6 +18,7 @@ from slrig.jobs.records import JobKind
 from slrig.jobs.store import JobStore
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
+from tests.unit.api.conftest import app_of
 from tests.unit.jobs.tame_queue import TameQueue
 from tests.unit.verify.test_verification import TAME, queue_of
 
@@ -41,11 +39,7 @@ def client(tmp_path: Path, queue: TameQueue) -> Iterator[TestClient]:
         folder=folder, verifications=desk, keys=RequestKeys(store.database), refuse_when_stale=True,
         calibrations=SimpleNamespace(active=None),
     )  # fmt: skip
-    app = FastAPI()
-    app.include_router(health.router)
-    install_problems(app)
-    app.dependency_overrides[_of_request] = lambda: service
-    with TestClient(app) as found:
+    with TestClient(app_of(health.router, service)) as found:
         yield found
     store.database.close()
     folder.release()

@@ -79,8 +79,6 @@ def planned(request: dict[str, Any], **defaults: Any) -> ScanPlan:
         ({"exposure_s": 0.02, "exposures_s": [0.02, 0.08]}, "exposures_s", "found both"),
         (in_region(box_mm=BOX[::-1]), "reconstruction.region", "x: expected two rising numbers"),
         (in_region(box_mm=[[0, 0], [1, 1]]), "reconstruction.region.box_mm.0.2", "required"),
-        (in_region(masks={"left": "A"}), "reconstruction.region", "masks.left: expected a PNG"),
-        (in_region(polygons_px={"left": [[0, 0], [1, 1]]}), "reconstruction.region", "three corners or more"),
         (in_region(least_contrast=2), "reconstruction.region.least_contrast", "less than 1"),
         (in_region(roi=1), "reconstruction.region.roi", "no such field"),
         ({"every_s": 5}, "every_s", "expected repeat above 1"),

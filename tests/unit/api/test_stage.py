@@ -9,12 +9,9 @@ from types import SimpleNamespace
 from uuid import UUID
 
 import pytest
-from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from slrig.api import stage
-from slrig.api.problems import install_problems
-from slrig.api.service import _of_request
 from slrig.calibrate.records import PoseRecord, SessionRecord
 from slrig.calibration.board import USUAL_BOARD
 from slrig.combine.stage import StageStore
@@ -22,6 +19,7 @@ from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import JobState
 from slrig.views.stage_axis import BoardAxis, board_axis
 from slrig.views.stage_planes import stage_planes
+from tests.unit.api.conftest import app_of
 from tests.unit.views.test_stage_axis import SIX_DEG, shot
 from tests.unit.views.test_stage_planes import AXIS, PLATE
 
@@ -55,11 +53,7 @@ def client(tmp_path: Path) -> Iterator[TestClient]:
         find_axis=found,
         find_planes=lambda _mesh, _axis: stage_planes(PLATE, AXIS),
     )
-    app = FastAPI()
-    app.include_router(stage.router)
-    install_problems(app)
-    app.dependency_overrides[_of_request] = lambda: service
-    with TestClient(app) as made:
+    with TestClient(app_of(stage.router, service)) as made:
         yield made
     folder.release()
 

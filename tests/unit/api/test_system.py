@@ -43,6 +43,7 @@ def test_rig_says_what_it_is_and_how_its_cameras_are_set(client: TestClient, ser
     assert "asked for an exposure of 20 ms, and uses 10 ms" in camera["notes"][0]
 
 
+@pytest.mark.slow
 def test_drivers_and_devices_are_listed(client: TestClient) -> None:
     found = client.get("/device").json()
     assert ("head", "simulated", None) in [(each["kind"], each["name"], each["fault"]) for each in found["drivers"]]

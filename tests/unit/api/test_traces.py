@@ -118,6 +118,7 @@ def test_job_is_a_trace_with_a_span_for_each_stage(collector: Collector, tmp_pat
     assert all(attributes(span)["slrig.job.id"] == str(job) for span in spans)
 
 
+@pytest.mark.slow
 def test_service_sends_each_of_its_jobs(collector: Collector, tmp_path: Path) -> None:
     served = ServedBench(tmp_path)
     served.gate.set()
