@@ -246,6 +246,7 @@ def test_board_is_written_to_be_printed(tmp_path: Path) -> None:
 
 def test_board_that_is_not_named_is_the_usual_one(tmp_path: Path) -> None:
     named = ["--board", "charuco", "--corners", "11x8"]
+    asked: tuple[tuple[list[str], str], ...]
     asked = ([], "12"), (["--board", "charuco"], "12"), (["--corners", "11 x 8"], "12"), (["--square-mm", "9.9"], "9.9")
     for number, (options, square_mm) in enumerate(asked):
         sheet, whole = tmp_path / f"{number}.svg", tmp_path / f"{number}-whole.svg"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import tomllib
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -61,6 +63,12 @@ class Sample(BaseModel):
 def run(*arguments: str) -> tuple[int, str]:
     result = slrig("devices", *arguments, COLUMNS="80")
     return result.exit_code, result.output
+
+
+@pytest.fixture(autouse=True)
+def _installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looking through all that is installed takes 20 ms, and a command does it for each driver and kind."""
+    monkeypatch.setattr("importlib.metadata.entry_points", cache(importlib.metadata.entry_points))
 
 
 @pytest.fixture(scope="module")

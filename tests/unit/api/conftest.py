@@ -64,7 +64,7 @@ class ServedBench(TameBench):
             combine=self.combining,
         )
         # The fake reconstruction reports no residuals: each scan would log the traceback of a defect.
-        self.service.verifications.note = lambda _report: None  # type: ignore[method-assign]
+        self.service.verifications.note = lambda report: None  # type: ignore[method-assign] # noqa: ARG005
         self.app: FastAPI = create_app(self.service, ring=KeyRing(root / "keys.json", given=KEY))
 
     def held(self, client: TestClient) -> dict[str, Any]:

@@ -229,7 +229,7 @@ class FaultyBench(ServedBench):
     def open_rig(self) -> Rig:
         return self.rig
 
-    def capture(self, rig: Rig, _plan: ScanPlan, folder: Path, /, **options: Any) -> Recording:  # type: ignore[override]
+    def capture(self, rig: Rig, _plan: ScanPlan, folder: Path, /, **options: Any) -> Recording:
         return capture_frames(rig, ScanPlan(PatternPlan()), folder, **options)
 
 

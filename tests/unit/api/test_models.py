@@ -66,11 +66,11 @@ def test_model_is_made_once_followed_and_fetched(client: TestClient, served: Ser
     ):
         others.append(over(client, client.post("/model", json={"scans": scans, **poses}).json()))
         assert isinstance(served.combining.asked[-1][1], kind)
-    second, found, marked = others
-    assert found["plan"]["poses"] == {"kind": "unknown"}
+    second, unknown, marked = others
+    assert unknown["plan"]["poses"] == {"kind": "unknown"}
     assert marked["plan"]["poses"] == {"kind": "markers", "dictionary": "DICT_4X4_50"}
     assert client.delete(marked["links"]["self"]).status_code == 204
-    assert client.delete(found["links"]["self"]).status_code == 204
+    assert client.delete(unknown["links"]["self"]).status_code == 204
     page = client.get("/model", params={"limit": 1}).json()
     assert [each["id"] for each in page["models"]] == [second["id"]]
     assert [each["id"] for each in client.get(page["next"]).json()["models"]] == [model["id"]]
