@@ -51,11 +51,9 @@ def client_of(handler: Handler) -> Client:
     return Client("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(handler))
 
 
-def printed(code: str, **env: str) -> str:
+def printed(code: str) -> str:
     """The last line that a process of its own prints."""
-    found = subprocess.run(  # noqa: S603 - our own interpreter
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, **env}
-    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
     return found.stdout.strip().splitlines()[-1]
 
 
@@ -97,38 +95,29 @@ def test_help_and_version_load_nothing_heavy() -> None:
     assert printed(code) == "[]"
 
 
-@pytest.mark.parametrize(
-    ("typed", "completed"),
-    [
-        ("slrig sc", {"scan", "schedule"}),
-        pytest.param("slrig calibrate so", {"solve"}, marks=pytest.mark.slow),
-        pytest.param("slrig scan --exp", {"--exposure-s"}, marks=pytest.mark.slow),
-    ],
-)
-def test_a_shell_completes_commands_and_options(typed: str, completed: set[str]) -> None:
-    words = {"_SLRIG_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+def test_shell_completes_commands() -> None:
+    words = {"_SLRIG_COMPLETE": "complete_bash", "COMP_WORDS": "slrig sc", "COMP_CWORD": "1"}
     found = subprocess.run(
         [sys.executable, "-m", "slrig.cli"], capture_output=True, text=True, check=False, env={**os.environ, **words}
     )
-    assert set(found.stdout.split()) == completed
+    assert found.stdout.split() == ["scan", "schedule"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in Linux's /proc")
-@pytest.mark.parametrize(("asked", "kept"), [("", "1"), pytest.param("2", "2", marks=pytest.mark.slow)])
-def test_command_has_no_threads_that_spin_beside_it(asked: str, kept: str) -> None:
+def test_command_has_no_threads_that_spin() -> None:
     # numpy and scipy bring an OpenBLAS each, with a thread per core beside the first, all started when it is loaded.
     code = (
-        f"import os, sys; sys.argv = ['slrig', '--version']; os.environ.pop('OPENBLAS_NUM_THREADS', None)\n"
-        f"os.environ |= {{'OPENBLAS_NUM_THREADS': '{asked}'}} if '{asked}' else {{}}\n"
+        "import os, sys; sys.argv = ['slrig', '--version']; os.environ.pop('OPENBLAS_NUM_THREADS', None)\n"
         "from slrig.cli import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
         "import numpy, scipy.linalg\n"
         "print(os.environ['OPENBLAS_NUM_THREADS'], len(os.listdir('/proc/self/task')))"
     )
-    setting, threads = printed(code).split()
-    assert setting == kept
-    assert threads == "1" or asked
+    assert printed(code) == "1 1"
+    # A person's own choice stays.
+    code = code.replace("os.environ.pop('OPENBLAS_NUM_THREADS', None)", "os.environ['OPENBLAS_NUM_THREADS'] = '2'")
+    assert printed(code.replace("import numpy, scipy.linalg\n", "")) == "2 1"
 
 
 def test_error_of_ours_is_one_screen_and_exit_code_2(tmp_path: Path) -> None:
@@ -459,7 +448,7 @@ def test_progress_off_a_terminal_is_one_line_per_stage() -> None:
     assert [line.split("%")[0].split()[-1] for line in lines] == ["0", "50", "100"]
 
 
-def test_a_stage_that_goes_on_without_a_word_is_told_again_off_a_terminal() -> None:
+def test_long_step_is_shown_again_off_a_terminal() -> None:
     class Lines(io.StringIO):
         third = threading.Event()
 
@@ -479,7 +468,7 @@ def test_a_stage_that_goes_on_without_a_word_is_told_again_off_a_terminal() -> N
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_an_error_beside_the_progress_stays_and_does_nothing_to_the_terminal(terminal: bool) -> None:
+def test_error_during_progress_stays_and_does_nothing_to_the_terminal(terminal: bool) -> None:
     class Stream(io.StringIO):
         def isatty(self) -> bool:
             return terminal

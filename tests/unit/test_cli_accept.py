@@ -68,7 +68,7 @@ def test_metal_needs_the_certificates(rig: Rig) -> None:
 
 
 @pytest.mark.slow
-def test_limits_follow_the_rig_file_unless_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_limits_follow_the_rig_file_unless_given(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     planned: list[Limits] = []
 
     def left(_rig: Rig, plan: AcceptancePlan, _output: Path, **_: object) -> AcceptanceResult:

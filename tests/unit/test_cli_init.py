@@ -82,7 +82,7 @@ def test_two_webcams_and_a_screen_lead_to_a_rig_file(bench: Bench) -> None:
         assert command in shown
 
 
-def test_a_person_is_asked_what_cannot_be_known(bench: Bench) -> None:
+def test_person_chooses_among_several_devices(bench: Bench) -> None:
     code, shown = bench.run(found=(LEFT, RIGHT, LAPTOP, HDMI), answers="2 1\nHDMI\n3\n2\n\n")
     assert code == 0, shown
     rig = bench.rig()
@@ -94,7 +94,7 @@ def test_a_person_is_asked_what_cannot_be_known(bench: Bench) -> None:
     assert "expected a number from 1 to 2, found '3'" in shown
 
 
-def test_what_a_driver_cannot_do_without_is_asked_until_it_takes_the_answer(bench: Bench) -> None:
+def test_person_is_asked_until_the_driver_takes_the_answer(bench: Bench) -> None:
     code, shown = bench.run(found=(OAK, HDMI), answers="1 1\n1\n0.0333\nleft\nCAM_B\nCAM_C\n")
     assert code == 0, shown
     assert "socket: input should be 'CAM_A', 'CAM_B'" in " ".join(shown.split())
@@ -106,7 +106,7 @@ def test_what_a_driver_cannot_do_without_is_asked_until_it_takes_the_answer(benc
     ]
 
 
-def test_with_nobody_to_ask_the_option_to_give_is_named(bench: Bench) -> None:
+def test_option_to_give_is_named_off_a_terminal(bench: Bench) -> None:
     code, shown = bench.run(found=(OAK, HDMI))
     assert code == 2
     assert "camera 'camera' (driver depthai) needs socket" in shown
@@ -189,7 +189,7 @@ def test_a_wrong_answer_is_named_and_nothing_is_written(bench: Bench, arguments:
     assert not bench.path.exists()
 
 
-def test_nothing_plugged_in_is_told_with_what_to_check(bench: Bench) -> None:
+def test_nothing_plugged_in_is_said_with_what_to_check(bench: Bench) -> None:
     install = "pip install 'slrig[depthai]'"
     fault = DriverBrokenError("finder 'x' failed: no bus")
     code, shown = bench.run_with(Findings((), (MissingLibrary("depthai", install, "…"),), (fault,)))

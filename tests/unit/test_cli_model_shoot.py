@@ -92,7 +92,7 @@ def test_a_person_turns_leaves_and_goes_on_in_the_same_folder(bench: Bench, tmp_
     )
 
 
-def test_a_table_turns_and_a_view_that_fails_is_told(bench: Bench, tmp_path: Path) -> None:
+def test_table_turns_and_a_view_that_fails_is_named(bench: Bench, tmp_path: Path) -> None:
     bench.table = FakeTurntable()
     bench.faults = {
         angle: DeviceGoneError("left was unplugged") for angle in (120.0, 160.0, 200.0, 240.0, 280.0, 320.0)
@@ -156,7 +156,7 @@ class Asked:
         self.fetch: Callable[[str, Path], None] = lambda link, path: self.fetched.append((link, path))
 
 
-def test_a_service_is_asked_and_the_person_answers(tmp_path: Path) -> None:
+def test_service_shoots_what_the_person_answers(tmp_path: Path) -> None:
     client, answers = Asked(), iter(["a", "q"])
     model_shoot.views_there(client, {"views": 3}, tmp_path / "out", ask=lambda _: next(answers))  # type: ignore[arg-type]
     wait = {"if_busy": "queue"}

@@ -106,7 +106,7 @@ def test_options_are_shown_by_type_unit_default_and_limits() -> None:
     assert sections(Sample.model_json_schema(), "camera")[0].heading == "[[camera]]"
 
 
-def test_people_are_told_in_80_columns() -> None:
+def test_options_fit_80_columns() -> None:
     for driver in ("v4l2", "genicam", "dlpc350", "serial_projector", "opencv", "replay"):
         code, shown = run("--options", driver)
         assert code == 0

@@ -63,7 +63,7 @@ def test_terminal_shows_text_and_pipe_carries_json_unless_a_form_is_chosen(monke
     assert json.loads(line(monkeypatch, "json", terminal=True))["rig"] == "bench"
 
 
-def test_an_error_is_told_with_its_trace_in_either_form(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_is_logged_with_its_trace_in_either_form(monkeypatch: pytest.MonkeyPatch) -> None:
     for form in ("text", "json"):
         stream = Stream(terminal=False)
         monkeypatch.setattr(sys, "stderr", stream)
@@ -77,7 +77,7 @@ def test_an_error_is_told_with_its_trace_in_either_form(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("command", ["conform", "latency", "doctor", "verify", "accept", "reconstruct", "calibrate"])
-def test_command_that_works_by_itself_logs_beside_its_output(tmp_path: Path, command: str) -> None:
+def test_command_that_works_by_itself_sets_up_logs(tmp_path: Path, command: str) -> None:
     solve = ["solve"] if command == "calibrate" else []
     output = [] if command in {"conform", "latency", "doctor", "verify"} else ["--output", tmp_path / "absent.json"]
     result = slrig(command, *solve, tmp_path / "absent", *output)
@@ -85,7 +85,7 @@ def test_command_that_works_by_itself_logs_beside_its_output(tmp_path: Path, com
     assert structlog.is_configured()
 
 
-def test_a_person_is_told_warnings_and_no_more(capsys: pytest.CaptureFixture[str]) -> None:
+def test_person_reads_warnings_and_no_more(capsys: pytest.CaptureFixture[str]) -> None:
     set_up_logs_for_a_person()
     structlog.get_logger().info("a frame was shot again")
     structlog.get_logger().warning("the projector may still be lit")
@@ -128,7 +128,7 @@ def test_text_moves_no_cursor(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stream.getvalue().count("u001b[2J") == 2
 
 
-def test_log_that_cannot_be_written_fails_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_that_cannot_be_written_raises_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     class Full(Stream):
         def write(self, _text: str) -> int:
             raise OSError(errno.ENOSPC, "No space left on device")

@@ -93,7 +93,7 @@ async def serving(deadlines: Deadlines, *, most: int = 100) -> AsyncIterator[Ser
 
 @pytest.mark.parametrize(("sent", "part"), [(b"", "head"), (HALF_HEAD, "head"), (HALF_BODY, "body")])
 @on_loop
-async def test_what_does_not_arrive_in_time_is_told_and_closed(sent: bytes, part: str) -> None:
+async def test_request_that_does_not_arrive_in_time_gets_408(sent: bytes, part: str) -> None:
     async with serving(SHORT) as served:
         reader, _ = await served.connect(sent)
         head, _, body = (await reader.read()).partition(b"\r\n\r\n")
@@ -205,7 +205,7 @@ async def test_answers_are_not_held_back() -> None:
 
 
 @on_loop
-async def test_a_refused_accept_is_told_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_refused_accept_is_logged_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     monkeypatch.setattr(connections._log, "error", lambda message, **_: told.append(message))
 

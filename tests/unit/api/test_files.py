@@ -96,6 +96,7 @@ def test_bundle_is_a_zip_of_stored_files_without_links(client: TestClient, serve
     assert answer.headers["content-disposition"] == f'attachment; filename="{scan["id"]}.zip"'
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
         assert archive.testzip() is None
+        assert answer.content.count(b"PK\x03\x04") == 3  # no piece is sent twice
         assert archive.namelist() == ["bundle.json", "frames/000.png", "order"]
         assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
         assert archive.read("frames/000.png") == (place / "bundle" / "frames" / "000.png").read_bytes()

@@ -81,7 +81,7 @@ def test_a_busy_rig_names_its_holder(client: TestClient, queue: TameQueue) -> No
     assert "schedule 'nightly'" in answer.json()["detail"]
 
 
-def test_what_is_missing_or_unknown_is_told(client: TestClient) -> None:
+def test_missing_board_and_unknown_verification_are_refused(client: TestClient) -> None:
     no_board = client.post("/rig/verification")
     assert no_board.status_code == 422
     assert 'send "board"' in no_board.json()["detail"]

@@ -24,7 +24,7 @@ def known(keys: KeyRing, key: str | None) -> Key:
     return found
 
 
-def test_a_key_is_seen_once_and_kept_as_its_digest(tmp_path: Path) -> None:
+def test_key_is_shown_once_and_kept_as_its_digest(tmp_path: Path) -> None:
     key = ring(tmp_path).add("Ann", [Scope.SCAN])
     path = tmp_path / "keys.json"
     assert key not in path.read_text()
@@ -50,7 +50,7 @@ def test_a_key_ends_when_it_was_said_to(tmp_path: Path) -> None:
     assert found.fault(NOW + timedelta(days=2)) == "expired on 2026-11-26"
 
 
-def test_names_are_told_apart(tmp_path: Path) -> None:
+def test_names_of_keys_are_unique_and_printable(tmp_path: Path) -> None:
     keys = ring(tmp_path, given="x" * 16)
     keys.add("Ann", [])
     for taken in ("Ann", GIVEN_NAME):

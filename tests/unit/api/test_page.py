@@ -20,7 +20,7 @@ _IMPORTED = re.compile(r"""(?:^|[\s;}])(?:import|export)\b[^"';]*?from\s*["']([^
 
 
 @pytest.mark.usefixtures("client")
-def test_the_page_and_its_files_need_no_key_and_tell_nothing(served: ServedBench) -> None:
+def test_page_and_its_files_need_no_key(served: ServedBench) -> None:
     visitor = stranger(served)
     page = visitor.get("/")
     assert (page.status_code, page.headers["content-type"]) == (200, "text/html; charset=utf-8")
@@ -46,7 +46,7 @@ def test_nothing_runs_but_what_the_service_sends(served: ServedBench) -> None:
 
 
 @pytest.mark.usefixtures("client")
-def test_files_are_packed_and_asked_for_once(served: ServedBench) -> None:
+def test_files_of_the_page_are_packed_and_cached(served: ServedBench) -> None:
     visitor = stranger(served)
     first = visitor.get("/page/vendor/three.core.js")
     assert first.headers["Content-Encoding"] == "gzip"

@@ -163,7 +163,7 @@ def test_every_kind_of_problem_is_explained(client: TestClient) -> None:
     assert {"invalid-request", "unauthorized", "not-found", "content-too-large"} <= set(explanations())
 
 
-def test_unexpected_error_tells_no_secrets(
+def test_unexpected_error_shows_no_secrets(
     client: TestClient, served: ServedBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object, **__: object) -> None:

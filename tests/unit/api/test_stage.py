@@ -85,7 +85,7 @@ def test_an_axis_and_planes_are_calibrated_kept_and_put_back(client: TestClient)
         ({"poses": [2, 3]}, "expected 3 poses or more"),
     ],
 )
-def test_poses_that_do_not_tell_an_axis_are_refused(client: TestClient, asked: dict[str, object], words: str) -> None:
+def test_poses_that_give_no_axis_are_refused(client: TestClient, asked: dict[str, object], words: str) -> None:
     answer = client.post("/rig/stage/axis", json={"calibration": str(SESSION)} | asked)
     assert answer.status_code == 422
     assert words in answer.json()["detail"]

@@ -131,14 +131,14 @@ def test_service_sends_each_of_its_jobs(collector: Collector, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("name", "value"), [("OTEL_SDK_DISABLED", "true"), ("OTEL_TRACES_EXPORTER", "none")])
-def test_nothing_is_sent_unless_it_is_asked_for(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+def test_nothing_is_sent_without_a_collector(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
     assert traces_by_environment() is None
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:1")
     monkeypatch.setenv(name, value)
     assert traces_by_environment() is None
 
 
-def test_library_that_is_missing_is_told_with_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_named_with_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, EXPORTER, None)
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "http://127.0.0.1:1/v1/traces")
     with pytest.raises(ConfigError, match=r"TRACES_ENDPOINT asks for traces.*pip install 'slrig\[telemetry\]'"):
@@ -146,7 +146,7 @@ def test_library_that_is_missing_is_told_with_its_command(monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-def test_nothing_is_loaded_unless_it_is_asked_for() -> None:
+def test_nothing_is_loaded_without_a_collector() -> None:
     code = "import sys, slrig.api.service as s; s.traces_by_environment(); print('opentelemetry.sdk' in sys.modules)"
     found = subprocess.run(  # noqa: S603 - our own interpreter and code
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60

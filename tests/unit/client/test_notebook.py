@@ -27,7 +27,7 @@ FULL: dict[str, Any] = {
 }
 
 
-def test_a_table_tells_the_figures_and_escapes_what_people_wrote() -> None:
+def test_table_shows_the_figures_and_escapes_labels() -> None:
     found = shown(FULL, None)
     text = unescape(re.sub(r"<[^>]*>", "|", found))
     for words in (
