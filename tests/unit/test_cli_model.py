@@ -45,6 +45,7 @@ def model(*words: object) -> Result:
     return slrig("model", *words, COLUMNS="120")
 
 
+@pytest.mark.slow
 def test_scans_of_a_stage_are_placed_and_their_poses_place_them_again(scans: Path, tmp_path: Path) -> None:
     done = model(scans / "all", "--output", tmp_path / "model", *STAGE)
     assert done.exit_code == 0, done.output
