@@ -118,7 +118,12 @@ def capture_of(pattern: int, camera: str, shape: tuple[int, int] = (3, 4)) -> Ca
         (capture_of, [(1, "left"), (-1, "left"), (0, "right")], BundleError, "which is not in the list"),
         (capture_of, [(0, "left", (4, 3))], BundleError, "3 x 4, the camera is 4 x 3"),
         (lambda: Shot(0, "left", np.zeros((3, 4, 3), np.uint8)), [()], ValueError, r"Shot\.image"),
-        (lambda: Frame("left", np.zeros((3, 4)), 0, 1, 0, 0, 0, 0.01, 1.0), [()], ValueError, r"Frame\.image"),
+        (
+            lambda image: Frame("left", image, 0, 1, 0, 0, 0, 0.01, 1.0),
+            [(np.zeros((3, 4)),)],
+            ValueError,
+            r"Frame\.image",
+        ),
         (
             lambda: CameraTruth(np.zeros((3, 4)), np.zeros((3, 5, 2)), np.zeros((0, 3))),
             [()],

@@ -168,14 +168,14 @@ def test_verdict_comes_first_and_in_words() -> None:
 
 def test_every_number_is_that_of_the_result_and_its_covariance() -> None:
     expected = result().expected
-    for figure, value in (
+    for name, value in (
         ("point_mm", expected.point_mm),
         ("odd_even_mm", 0.0171),
         ("noise_mm", expected.noise_mm),
         ("total_mm", expected.total_mm),
         ("length_mm_per_m", 1000 * expected.length_share),
     ):
-        assert page().number(figure) == pytest.approx(value, rel=5e-3)
+        assert page().number(name) == pytest.approx(value, rel=5e-3)
     assert "0.89 times what is stated for two halves" in " ".join(" ".join(page().words).split())
     flat = "The board is flat as far as the poses tell: 0.031 ± 0.012 mm from its lowest to its highest corner."
     assert flat in page().words
@@ -279,9 +279,8 @@ def test_figures_that_could_not_be_measured_are_named_so() -> None:
 def test_report_of_cameras_alone_needs_no_projector_and_keeps_their_capitals() -> None:
     whole, solution = result(), result().solution
     names = ("Nikon D5", "Canon")
-    cameras, residuals = (
-        dict.fromkeys(names, each) for each in (whole.calibration.cameras["left"], solution.residuals["left"])
-    )
+    cameras = dict.fromkeys(names, whole.calibration.cameras["left"])
+    residuals = dict.fromkeys(names, solution.residuals["left"])
     pinholes = replace(solution.calibration, cameras=cameras, projector=None)
     solution = replace(solution, calibration=pinholes, residuals=residuals)
     alone = replace(whole, solution=solution, calibration=replace(pinholes, solved=None))
