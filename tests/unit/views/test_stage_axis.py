@@ -61,7 +61,7 @@ def off(found: MeasuredAxis, covariance: FloatArray) -> float:
 
 def test_the_axis_is_off_by_what_is_stated() -> None:
     squares = []
-    for seed in range(40):
+    for seed in range(20):
         found = axis_found(SIX_DEG, seed).found
         squares.append(off(found.measured, found.covariance))
     assert 0.7 < np.mean(squares) < 1.5

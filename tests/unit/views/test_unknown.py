@@ -31,6 +31,7 @@ def test_views_come_to_where_they_belong_without_a_start(three: list[View]) -> N
         assert displacement_mm(view.mesh, pose, np.linalg.inv(three[0].pose) @ view.pose) < 0.03
 
 
+@pytest.mark.slow
 def test_a_vase_is_refused_with_what_to_do(three: list[View]) -> None:
     views = seen_from(OBJECTS["vase"](), FROM[:2])
     with pytest.raises(
