@@ -74,14 +74,3 @@ def test_without_its_line_frames_a_bundle_is_reconstructed_from_code_edges(
     assert report["truth"]["rms_mm"] <= 0.12
     assert report["truth"]["complete_0.3mm"] >= 0.70
     assert report["truth"]["nonmanifold_edges"] == 0
-
-
-@pytest.mark.slow
-def test_one_bundle_gives_the_same_bytes_of_mesh_twice(shared: Path, tmp_path: Path) -> None:
-    # To compare with the truth takes as long as all the rest, and the mesh knows nothing of it.
-    bundle = tmp_path / "vase"
-    shutil.copytree(shared / "bundles" / "vase", bundle, ignore=shutil.ignore_patterns("truth*", "visible_points.npy"))
-    for run in ("first", "second"):
-        reconstructed(bundle, tmp_path / run)
-    for name in ("mesh.ply", "mesh.glb", "points.ply"):
-        assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes(), name

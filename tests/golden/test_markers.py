@@ -41,7 +41,7 @@ rotation_deg = [-90.0, 0.0, 0.0]
 """
 
 
-FROM_ABOVE = {
+FROM_ABOVE: dict[str, dict[str, Any]] = {
     "head": {"samples_per_axis": 2},
     "projector": {"size_px": [448, 400], "principal_px": [223.5, 199.5], "position_mm": [105.0, -390.0, -440.0]},
     "camera": {"size_px": [384, 352], "principal_px": [191.5, 175.5], "position_mm": [-150.0, -400.0, -400.0]},

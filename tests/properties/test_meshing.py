@@ -11,8 +11,6 @@ from hypothesis.extra import numpy as arrays
 
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.flips import prefers_flip
-from slrig.meshing.initial import initial_mesh
-from slrig.meshing.normals import vertex_normals
 from slrig.meshing.optimisation import NO_FLIPS, optimised
 from slrig.meshing.runs import neighbouring_curves, whole_curves
 from slrig.meshing.strips import strips
@@ -52,43 +50,6 @@ def surface(lengths: list[int], seed: int) -> tuple[FloatArray, IntArray]:
     ]
     offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
     return np.concatenate([np.zeros((0, 3)), *curves]), offsets
-
-
-@unhurried
-@given(counts, seeds, st.booleans())
-def test_what_is_dropped_leaves_a_manifold_and_is_counted(lengths: list[int], seed: int, keep_holes: bool) -> None:
-    points, offsets = surface(lengths, seed)
-    rng = np.random.default_rng(seed)
-    bridge = np.asarray(rng.random(len(points)) < 0.2)
-    bridge[offsets[1:][np.diff(offsets) > 0] - 1] = False
-    before = points.copy(), bridge.copy()
-    mesh = initial_mesh(
-        points, offsets, np.arange(len(lengths), dtype=np.float64), bridge, np.full(len(points), 0.4),
-        np.array([3.0, 5.0, -500.0]),
-        widest_step_px=1.0, depth_edge_ratio=5.0, keep_holes=keep_holes,
-    )  # fmt: skip
-    assert mesh.strip_triangles == len(mesh.faces) + mesh.dropped_triangles
-    cut = mesh.dropped_triangles - mesh.dropped_as_dust
-    assert max(mesh.dropped_at_bridges, mesh.dropped_at_depth_edges) <= cut
-    assert cut <= mesh.dropped_at_bridges + mesh.dropped_at_depth_edges
-    found = topology_counts(mesh.faces)
-    assert found.nonmanifold_edges == found.misoriented_edges == found.duplicate_faces == 0
-    corners = points[mesh.faces]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0)
-    assert (longest <= 5.0 * 0.4 + 1e-9).all()
-    used = np.zeros(len(points), dtype=np.bool_)
-    used[mesh.faces] = True
-    # A normal where there is a triangle with an area, none where there is no triangle.
-    normals = vertex_normals(points, mesh.faces)
-    assert np.isnan(normals[~used]).all()
-    if keep_holes:
-        steps = {(int(k), int(k) + 1) for k in np.flatnonzero(bridge)}
-        sides = {tuple(sorted((int(f[k]), int(f[(k + 1) % 3])))) for f in mesh.faces for k in range(3)}
-        assert not steps & sides
-    else:
-        assert mesh.dropped_at_bridges == 0
-    np.testing.assert_array_equal(points, before[0])
-    np.testing.assert_array_equal(bridge, before[1])
 
 
 @unhurried

@@ -21,14 +21,6 @@ def parts(*along: list[float], widest_step_px: float = 2.0, widest_gap_px: float
     return runs
 
 
-def test_whole_curves_are_joined_as_ever() -> None:
-    places = [float(k) for k in range(6)]
-    assert parts(places, places, places) == [[0, 5, 6, 11], [6, 11, 12, 17]]
-    offsets = np.array([0, 6, 12, 18], dtype=np.int32)
-    whole = whole_curves(neighbouring_curves(np.arange(3.0), offsets, widest_step_px=1.0), offsets)
-    assert whole.tolist() == [[0, 5, 6, 11], [6, 11, 12, 17]]
-
-
 def test_where_a_curve_ends_its_neighbours_are_joined() -> None:
     places = [float(k) for k in range(6)]
     # The one in the middle is there from 0 to 2: beyond, the others meet, from the points that its strips end in.

@@ -366,7 +366,7 @@ def test_refined_points_are_no_worse_than_those_of_their_own_frame(slope: float)
     ],
     ids=["quiet", "loud", "steep", "dark"],
 )
-def test_steady_light_is_never_called_unsteady(slope: float, light: dict[str, float], seed: int) -> None:
+def test_steady_light_is_never_called_unsteady(slope: float, light: dict[str, Any], seed: int) -> None:
     curves, _ = walk(seen_tilted(slope, 0.3 * seed, seed=seed, **light))
     assert curves.refined
     assert len(curves.ensemble.points_px) > 500

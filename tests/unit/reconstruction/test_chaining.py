@@ -49,16 +49,6 @@ def line(start: tuple[float, float], end: tuple[float, float], *, strength: floa
     return Found(points, np.tile([along[1], -along[0]], (len(points), 1)), np.full(len(points), strength))
 
 
-def ring(centre: tuple[float, float], radius_px: float) -> Found:
-    """A closed circle, one point per pixel it passes through."""
-    angle = np.arange(0, 2 * math.pi, 0.4 / radius_px)
-    normals = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    points = np.array(centre) + radius_px * normals
-    _, first = np.unique(np.rint(points).astype(int), axis=0, return_index=True)
-    keep = np.sort(first)
-    return Found(points[keep], normals[keep], np.ones(len(keep)))
-
-
 @pytest.mark.parametrize("end", [(40.0, 50.0), (10.3, 50.0), (60.0, 22.0), (50.0, 49.0), (70.0, 10.2), (70.0, 3.0)])
 def test_a_straight_line_is_one_chain_from_end_to_end(end: tuple[float, float]) -> None:
     found = line((10.2, 10.3), end)
@@ -116,15 +106,6 @@ def test_a_curve_is_followed() -> None:
     chains = found.chained()
     assert [sorted(each) for each in chains] == [list(range(64))]
     assert np.abs(np.diff(chains[0])).max() == 1
-
-
-def test_a_closed_loop_is_one_chain_that_ends_beside_its_start() -> None:
-    found = ring((40.2, 30.1), 17.0)
-    chains = found.chained()
-    assert len(chains) == 1
-    assert len(chains[0]) >= 0.85 * len(found.points_px)
-    first, last = found.points_px[chains[0][0]], found.points_px[chains[0][-1]]
-    assert np.linalg.norm(first - last) <= _LONGEST_STEP_PX
 
 
 def test_at_a_crossing_the_stronger_line_goes_on_and_the_weaker_is_cut() -> None:

@@ -47,7 +47,7 @@ def noisy(kernel: Kernel, *, bits: int = BITS, rows: float = 0.0) -> AxisFrames:
     )
 
 
-def by_sums(kernel: Kernel, summed: PixelSum) -> float:
+def by_sums(kernel: FloatArray, summed: PixelSum) -> float:
     """Σ |w * k|² over Σ|w|² Σ k²: what noise of that kernel does to the sum."""
     reach = len(summed.weights) // 2
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]

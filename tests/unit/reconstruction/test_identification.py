@@ -78,7 +78,7 @@ def column(refusal: NDArray[np.uint8], count: int) -> list[Refusal]:
 
 
 NONE, STRAY = Refusal.NONE, Refusal.STRAY_CODE
-STRIPES: dict[str, tuple[list[Shown], list[tuple[float, list[int]]], list[Refusal]]] = {
+STRIPES: dict[str, tuple[Sequence[Shown], list[tuple[float, list[int]]], list[Refusal]]] = {
     "two cells of one line": ([2] * 6 + [3] * 6, [(11.5, [*range(12)])], [NONE] * 12),
     "a change of the line": ([1] * 7 + [2] * 8, [(3.5, [*range(7)]), (11.5, [*range(7, 15)])], [NONE] * 15),
     "intervals within one line and across two": (

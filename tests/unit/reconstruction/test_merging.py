@@ -128,15 +128,6 @@ def test_three_cameras_are_merged_one_after_the_other() -> None:
     assert all(len(cameras) == 1 for cameras in stripes.values())
 
 
-def test_a_camera_that_saw_nothing_changes_nothing() -> None:
-    first = seen(CAMERA, ROWS)
-    nothing = seen(OTHER_CAMERA, ROWS[:0], columns=[])
-    for parts in ([first, nothing], [nothing, first]):
-        result = merged(parts, PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
-        np.testing.assert_array_equal(result.curves.points_mm, first.points_mm)
-        assert result.curves.offsets.tolist() == first.offsets.tolist()
-
-
 CENTRE = np.array([0.0, 0.0, -600.0])
 
 

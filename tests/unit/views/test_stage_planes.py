@@ -10,6 +10,8 @@ from slrig.model import FloatArray, Mesh, PlaneKind, StageAxis
 from slrig.views.stage_planes import cut, stage_planes
 from tests.unit.meshing.plain import grid_faces, joined, mesh_of
 
+__all__ = ["AXIS", "PLATE", "WALL", "joined"]
+
 UP = np.array([0.0, -0.8, -0.6])
 """Of a stage that a camera in the origin looks down on."""
 STAGE_MM = np.array([5.0, 40.0, 500.0])
