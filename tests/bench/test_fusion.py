@@ -89,7 +89,7 @@ def figures(known: SearchTree, seen_mm: np.ndarray, made: Callable[[], Surface])
 
 @pytest.mark.parametrize("count", [8, 12])
 @pytest.mark.parametrize("name", OBJECTS)
-def test_fusion_beside_one_view_and_open3d(name: str, count: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fusion_against_one_view_and_open3d(name: str, count: int, capsys: pytest.CaptureFixture[str]) -> None:
     """Poisson smooths: on a surface without edges it may be a little better, at its best depth."""
     truth = OBJECTS[name]()
     views = views_of(truth, around(count), PIXEL_MM)

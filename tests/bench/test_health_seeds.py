@@ -67,7 +67,7 @@ def told(found: Verification, device: str) -> str:
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_planted_changes_are_stale_named_and_foretold(cameras: int) -> None:
+def test_planted_changes_make_stale_are_named_and_predict_their_error(cameras: int) -> None:
     rows: list[dict[str, Any]] = []
     for change in CHANGES:
         for number in range(RIGS):

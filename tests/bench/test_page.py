@@ -35,7 +35,7 @@ def heap_mb(page: Page) -> float:
     return float(used["usedSize"] + used["backingStorageSize"]) / 1e6
 
 
-def test_a_large_mesh_is_seen_at_once_and_whole_soon(start: Start, tmp_path: Path, visit: Visit) -> None:
+def test_a_large_mesh_shows_at_once_and_whole_soon(start: Start, tmp_path: Path, visit: Visit) -> None:
     service = start(write_rig(tmp_path / "rig"))
     with service.client() as client:
         scan = scanned(client)["links"]["self"]

@@ -131,7 +131,7 @@ def told(title: str, rows: Mapping[str, tuple[float, float | None]]) -> None:
     assert not missed
 
 
-def test_one_scan_beside_what_others_take(half_a_million: Path, tmp_path: Path) -> None:
+def test_one_scan_against_what_others_take(half_a_million: Path, tmp_path: Path) -> None:
     command = ours(tmp_path / "out", half_a_million)
     cost_of(command)
     mine = median([cost_of(command) for _ in range(RUNS)])
@@ -151,7 +151,7 @@ def test_one_scan_beside_what_others_take(half_a_million: Path, tmp_path: Path) 
     told(f"half a million points, medians of {RUNS}", rows)
 
 
-def test_beside_four_busy_processes(half_a_million: Path, tmp_path: Path) -> None:
+def test_with_four_busy_processes(half_a_million: Path, tmp_path: Path) -> None:
     command = ours(tmp_path / "out", half_a_million)
     cost_of(command)
     other = peer("gray_arrays", half_a_million, tmp_path / "out")

@@ -109,7 +109,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(StorageError, match=r"file/scan: the disk refused"):
         write_bundle(tmp_path / "file" / "scan", sample_capture())
@@ -261,7 +261,7 @@ def test_a_bundle_may_have_no_truth(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["truth.ply", "visible_points.npy", "truth-a.npz"])
 @pytest.mark.parametrize("kept", [0.0, 0.5])
-def test_cut_truth_is_told(tmp_path: Path, name: str, kept: float) -> None:
+def test_cut_truth_is_refused(tmp_path: Path, name: str, kept: float) -> None:
     write_truth(tmp_path, _truth())
     data = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(data[: int(kept * len(data))])

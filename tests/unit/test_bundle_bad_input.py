@@ -325,7 +325,7 @@ BAD_DESCRIPTIONS: dict[str, tuple[Edit, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("case", BAD_DESCRIPTIONS)
-def test_a_bad_description_is_told_with_its_path(folder: Path, case: str) -> None:
+def test_a_bad_description_is_refused_with_the_place_of_its_fault(folder: Path, case: str) -> None:
     change, parts = BAD_DESCRIPTIONS[case]
     _edit(folder / "bundle.json", change)
     _fault(folder, str(folder / "bundle.json"), *parts)
@@ -364,7 +364,7 @@ def test_very_many_faults_are_counted(folder: Path) -> None:
     ],
     ids=["empty", "text", "cut", "nan", "infinity", "overflow", "twice", "deep", "list", "long number"],
 )
-def test_what_is_no_description_is_told(folder: Path, text: str, parts: tuple[str, ...]) -> None:
+def test_what_is_no_description_is_refused(folder: Path, text: str, parts: tuple[str, ...]) -> None:
     (folder / "bundle.json").write_text(text)
     _fault(folder, "bundle.json", *parts)
 
@@ -375,12 +375,12 @@ def test_a_huge_description_is_not_read(folder: Path) -> None:
     _fault(folder, "bundle.json", "at most 16777216 bytes", "found a larger file")
 
 
-def test_a_description_that_is_not_text_is_told(folder: Path) -> None:
+def test_a_description_that_is_not_text_is_refused(folder: Path) -> None:
     (folder / "bundle.json").write_bytes(b'{"format": "\xff"}')
     _fault(folder, "expected UTF-8", "0xff at 12")
 
 
-def test_a_folder_without_description_is_told(tmp_path: Path) -> None:
+def test_a_folder_without_description_is_refused(tmp_path: Path) -> None:
     _fault(tmp_path, "bundle.json", "found a folder without it")
     _fault(tmp_path / "nowhere", "found no such folder", "give the folder that holds it")
 
@@ -403,7 +403,7 @@ def test_a_calibration_of_other_cameras_is_refused(folder: Path) -> None:
         read_bundle(folder)
 
 
-def test_a_bad_calibration_does_not_stop_who_only_needs_frames(folder: Path) -> None:
+def test_frames_are_read_without_a_bad_calibration(folder: Path) -> None:
     (folder / "calibration.json").write_text("{")
     assert len(read_capture(folder).shots) == 10
     with pytest.raises(CalibrationError, match=r"calibration\.json: expected JSON"):
@@ -415,7 +415,7 @@ def test_a_bundle_without_calibration_is_read(folder: Path) -> None:
     assert read_bundle(folder).calibration is None
 
 
-def test_what_opencv_refuses_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_opencv_refuses_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # libtiff is stricter than our check of the header in a tag or two; harmed files of the campaign met it.
     def refuse(*_: object) -> None:
         message = "OpenCV TIFF: failed TIFFGetField(tif, TIFFTAG_PHOTOMETRIC, &photometric)"

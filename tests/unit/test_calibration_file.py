@@ -82,7 +82,7 @@ BAD: dict[str, tuple[Edit, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_calibration_is_told_with_its_place(path: Path, case: str) -> None:
+def test_a_bad_calibration_is_refused_with_the_place_of_its_fault(path: Path, case: str) -> None:
     change, parts = BAD[case]
     data = json.loads(path.read_text())
     change(data)
@@ -100,7 +100,7 @@ def test_a_number_that_is_not_finite_is_refused(path: Path, number: str) -> None
         read_calibration(path)
 
 
-def test_a_cut_or_missing_calibration_is_told(path: Path) -> None:
+def test_a_cut_or_missing_calibration_is_refused(path: Path) -> None:
     text = path.read_text()
     path.write_text(text[: len(text) // 2])
     with pytest.raises(CalibrationError, match="expected JSON, found a fault at line"):
@@ -119,7 +119,7 @@ def test_a_calibration_for_these_devices_is_accepted() -> None:
     check_calibration(sample_calibration(), PROJECTOR, {"left": CAMERA}, "here")
 
 
-def test_every_device_of_another_size_is_told() -> None:
+def test_every_device_of_another_size_is_named() -> None:
     with pytest.raises(CalibrationError) as caught:
         check_calibration(sample_calibration(), Size(5, 6), {"left": Size(7, 8), "right": CAMERA}, "here")
     assert str(caught.value).splitlines()[1:] == [
@@ -171,7 +171,7 @@ def test_higher_distortion_terms_must_be_zero(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.usefixtures("capfd")
-def test_a_bad_opencv_file_is_told(tmp_path: Path, text: str, part: str) -> None:
+def test_a_bad_opencv_file_is_refused(tmp_path: Path, text: str, part: str) -> None:
     (tmp_path / "rig.yml").write_text(text)
     with pytest.raises(CalibrationError, match=part):
         read_calibration(tmp_path / "rig.yml")
@@ -217,7 +217,7 @@ def test_a_light_map_of_another_form_is_refused_with_its_place(path: Path) -> No
     assert "light.covered_px" in str(told.value)
 
 
-def test_light_is_told_in_the_channels_that_are_asked_for_and_no_further_than_it_was_measured() -> None:
+def test_light_is_given_in_the_wanted_channels_and_within_the_measured_area() -> None:
     end, middle_row = PROJECTOR.width_px - 1.0, (PROJECTOR.height_px - 1) / 2
     places = np.array([[end / 2, middle_row], [end, 0.0], [2 * end, middle_row]])
     whole = light_map(1.0, 2.0, 0.6).light(places, PROJECTOR, 3)
@@ -281,7 +281,7 @@ def test_another_program_reads_the_devices_all_the_same(tmp_path: Path) -> None:
         ("id: a1b2", "id: [ 1 ]", "text as id and solved_at"),
     ],
 )
-def test_a_fault_in_it_is_told_with_its_place(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_a_fault_of_what_is_solved_is_named_with_its_place(tmp_path: Path, old: str, new: str, words: str) -> None:
     path = tmp_path / "bench.yml"
     write_opencv_calibration(path, solved_calibration())
     text = path.read_text()

@@ -51,7 +51,7 @@ def coloured_capture(bit_depth: int = 8) -> Capture:
 
 
 @pytest.mark.parametrize("bit_depth", [8, 12])
-def test_colour_comes_back_beside_grey_files_that_stay_as_they_are(tmp_path: Path, bit_depth: int) -> None:
+def test_colour_comes_back_and_grey_files_stay_as_they_are(tmp_path: Path, bit_depth: int) -> None:
     write_bundle(tmp_path / "grey", sample_capture(bit_depth=bit_depth))
     write_bundle(tmp_path / "colour", capture := coloured_capture(bit_depth))
     for file in (tmp_path / "grey").rglob("*.png"):
@@ -101,7 +101,7 @@ def test_a_colour_file_that_is_a_link_out_of_the_bundle_is_refused(tmp_path: Pat
         (None, "expected a frame file"),
     ],
 )
-def test_a_colour_file_that_is_no_such_picture_is_told(tmp_path: Path, image: Pixels | None, told: str) -> None:
+def test_a_colour_file_that_is_no_such_picture_is_refused(tmp_path: Path, image: Pixels | None, told: str) -> None:
     write_bundle(tmp_path / "scan", sample_capture())
     if image is not None:
         assert cv2.imwrite(str(tmp_path / "scan" / "c.png"), image)
@@ -191,7 +191,7 @@ def test_colour_of_a_refused_frame_is_not_kept(tmp_path: Path) -> None:
     assert len(listed) == 4
 
 
-def test_colour_is_left_out_or_refused_as_was_asked(tmp_path: Path) -> None:
+def test_colour_is_left_out_or_refused_by_the_plan(tmp_path: Path) -> None:
     captured(fake := coloured_rig(), tmp_path / "grey", ScanPlan(colour=False))
     assert fake.cameras["left"].coloured == 0
     assert not list((tmp_path / "grey").rglob("*-colour.png"))

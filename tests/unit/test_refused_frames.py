@@ -92,7 +92,7 @@ def cut_short(folder: Path, *, keep: bool, taken: bool = True) -> None:
         raise ScanEvidenceError(message)
 
 
-def test_a_capture_that_was_cut_short_leaves_what_it_has_if_it_is_told_to(tmp_path: Path) -> None:
+def test_a_capture_that_was_cut_short_keeps_its_frames_on_request(tmp_path: Path) -> None:
     folder = tmp_path / "bundle"
     with pytest.raises(ScanEvidenceError):
         cut_short(folder, keep=True)
@@ -124,7 +124,7 @@ def test_other_errors_leave_nothing(tmp_path: Path) -> None:
         ("[", "expected JSON"),
     ],
 )
-def test_a_list_that_slrig_did_not_write_is_told(tmp_path: Path, text: str, words: str) -> None:
+def test_a_list_that_slrig_did_not_write_is_refused(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "refused").mkdir()
     (tmp_path / "refused" / "refused.json").write_text(text)
     with pytest.raises(BundleError, match=words):

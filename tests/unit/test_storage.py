@@ -52,7 +52,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
         write_file(tmp_path / "nowhere" / "a.bin", b"x")
 
 
-def test_windows_is_not_asked_to_open_folders_or_to_sync_what_it_may_not_write(
+def test_on_windows_no_folder_is_opened_and_files_are_synced_writable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[tuple[Path, int]] = []

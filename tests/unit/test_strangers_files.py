@@ -60,7 +60,7 @@ def test_every_good_frame_is_read(tmp_path: Path) -> None:
         assert read_pages(tmp_path / "frame", [0], CameraFormat(CAMERA, 8))[0].shape == CAMERA.shape
 
 
-def test_a_tiff_whose_pages_come_round_is_refused(tmp_path: Path) -> None:
+def test_a_tiff_with_a_circle_of_pages_is_refused(tmp_path: Path) -> None:
     # Longer than what the library for TIFF looks back over.
     count = 150
     pages = b"".join(struct.pack("<HI", 0, 8 + 6 * ((page + 1) % count)) for page in range(count))

@@ -160,7 +160,7 @@ def test_the_wall_is_found_behind_the_balls(tilt_deg: float) -> None:
     assert abs(fitted_plane(points[chosen]).normal @ true) > 1 - 1e-8
 
 
-def test_no_plane_is_told() -> None:
+def test_a_missing_plane_is_reported() -> None:
     points, normals = ball(400, 0.0, 1)
     with pytest.raises(NothingToReconstructError, match="expected a plane"):
         plane_points(points[:90], normals[:90], 240.0)

@@ -117,7 +117,7 @@ def test_the_options_of_a_command_describe_a_board() -> None:
         (("charuco", "11x8", 12.0, 9.0, "DICT_4X4_50"), "needs 54 markers and DICT_4X4_50 has 50"),
     ],
 )
-def test_options_that_describe_no_board_are_told(options: tuple[str, str, float], words: str) -> None:
+def test_options_that_describe_no_board_are_refused(options: tuple[str, str, float], words: str) -> None:
     with pytest.raises(CalibrationError, match=words):
         board_option(*options)
 

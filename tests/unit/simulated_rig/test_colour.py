@@ -77,7 +77,7 @@ def test_frames_of_a_coloured_plate_have_its_colour_and_grey_is_its_luma(tmp_pat
 
 
 @pytest.mark.parametrize(("blur_px", "defocus_px"), [(0.0, 0.0), (0.8, 3.0)])
-def test_a_coloured_texture_is_told_by_white_less_black(tmp_path: Path, blur_px: float, defocus_px: float) -> None:
+def test_white_less_black_has_the_colours_of_a_texture(tmp_path: Path, blur_px: float, defocus_px: float) -> None:
     eye = {"colour": SEES, "blur_px": blur_px, "defocus_px": defocus_px, "focus_mm": 400.0, **QUIET}
     head = small_head(tmp_path, CHECKED, camera=eye, ambient=0.2)
     light, truth = light_of(*frames_of(head, WHITE, BLACK)), reflectance(head)

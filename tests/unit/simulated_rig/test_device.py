@@ -154,7 +154,7 @@ def test_a_dropped_frame_is_missed_counted_and_leaves_a_gap(tmp_path: Path) -> N
     assert (again.sequence_number, again.dropped_count) == (2, 1)
 
 
-def test_frames_drop_by_chance_as_often_as_asked(tmp_path: Path) -> None:
+def test_frames_drop_with_the_configured_probability(tmp_path: Path) -> None:
     _, camera = armed(tmp_path, Trigger.FREE, faults={"drop_probability": 0.3})
     for _ in range(140):
         last = camera.read(0, 10.0)

@@ -181,7 +181,7 @@ def test_faults_of_what_is_not_there_are_refused(tmp_path: Path, options: dict[s
         head_of(tmp_path, **options)
 
 
-def test_nothing_is_disturbed_unless_asked(tmp_path: Path) -> None:
+def test_nothing_is_disturbed_by_default(tmp_path: Path) -> None:
     head = small_head(tmp_path)
     stage, eye = head._stage.setting, head._views["eye"].camera
     frames(head)

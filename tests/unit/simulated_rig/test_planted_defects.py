@@ -75,7 +75,7 @@ def test_rows_of_a_rolling_shutter_see_flicker_at_their_own_times(tmp_path: Path
         ("rotated", {Axis.COLUMN, Axis.ROW}),
     ],
 )
-def test_a_picture_lies_as_it_is_told(tmp_path: Path, picture: str, exchanged: set[Axis]) -> None:
+def test_a_picture_is_mirrored_or_turned_as_configured(tmp_path: Path, picture: str, exchanged: set[Axis]) -> None:
     head = small_head(tmp_path, faults={"picture": picture})
     for axis in Axis:
         image = taken(head, 2, half(axis))

@@ -74,7 +74,7 @@ def test_objects_may_be_named(tmp_path: Path) -> None:
     assert not np.array_equal(vertices(head)[-4:], before[-4:])
 
 
-def test_its_angle_errs_by_scale_and_at_random_as_asked(tmp_path: Path) -> None:
+def test_its_angle_errs_by_scale_and_at_random_as_configured(tmp_path: Path) -> None:
     def stops(seed: int, times: int) -> list[float]:
         head, table = head_of(tmp_path, seed=seed, scale_error=0.01, angle_sigma_deg=0.2)
         before = vertices(head)[:-4]
@@ -116,7 +116,7 @@ def test_its_axis_leans_twice_in_a_turn() -> None:
     np.testing.assert_allclose(sides[0] + sides[1], 0.0, atol=1e-4)
 
 
-def test_it_tells_its_axis_only_where_it_is_to(tmp_path: Path) -> None:
+def test_it_reports_its_axis_only_if_configured(tmp_path: Path) -> None:
     assert head_of(tmp_path)[1].axis is None
     told = head_of(tmp_path, knows_axis=True, direction=[0.0, -2.0, 0.0])[1].axis
     assert told is not None

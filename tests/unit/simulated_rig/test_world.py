@@ -20,7 +20,7 @@ def table(level: float) -> LightTable:
 DARK, RED, BLUE = table(0.0), table(0.5), table(1.0)
 
 
-def test_virtual_time_passes_only_when_somebody_waits() -> None:
+def test_virtual_time_passes_only_by_waiting() -> None:
     clock, stop = VirtualClock(100), threading.Event()
     assert clock.now_ns() == clock.now_ns() == 100
     clock.wait_until(5_000_000_000_000, stop)

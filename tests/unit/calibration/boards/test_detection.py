@@ -350,7 +350,7 @@ def light_to(towards_deg: float, squares: float) -> tuple[float, float, float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("towards", [(145.0, 1.1), (220.0, 0.6), (320.0, 0.6)])
-def test_light_that_ends_beside_the_print_makes_no_other_board(towards: tuple[float, float]) -> None:
+def test_light_that_ends_near_the_print_makes_no_other_board(towards: tuple[float, float]) -> None:
     """Lit and unlit paper alternate with the outermost squares there, as on a board with a line more."""
     seen_by = eye(CHESSBOARD)
     view = find_board(shot(CHESSBOARD, seen_by, look=Print(lit=light_to(*towards))), CHESSBOARD, full_scale=255)

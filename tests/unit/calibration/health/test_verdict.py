@@ -56,7 +56,7 @@ def test_residuals_that_double_are_watched() -> None:
     assert judged([*clean, *[figures(rms_px=0.25)] * 3]).state is HealthState.STALE
 
 
-def test_one_bad_look_is_no_alarm_and_two_are() -> None:
+def test_one_bad_verification_is_no_alarm_and_two_are() -> None:
     clean = [figures() for _ in range(5)]
     bad = figures(1.8, evidence=12)
     assert judged([*clean, bad]).state is HealthState.GOOD

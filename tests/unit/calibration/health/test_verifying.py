@@ -63,7 +63,9 @@ def looked(rig: Bench, devices: Mapping[str, Pinhole], seed: int = 0) -> Verific
         ("projector focal", PROJECTOR, Change.FOCAL, "the projector: its focal length changed by +0.0"),
     ],
 )
-def test_a_change_is_stale_named_and_foretold_in_mm(change: str, device: str, kind: Change, words: str) -> None:
+def test_a_change_makes_stale_is_named_and_predicts_its_error(
+    change: str, device: str, kind: Change, words: str
+) -> None:
     rig = bench()
     now = planted(rig.devices, change)
     found = looked(rig, now)
@@ -77,7 +79,7 @@ def test_a_change_is_stale_named_and_foretold_in_mm(change: str, device: str, ki
 
 
 @pytest.mark.parametrize("change", [slow("camera turned up"), slow("projector turned up"), "baseline"])
-def test_what_the_geometry_cannot_tell_is_said(change: str) -> None:
+def test_changes_that_the_geometry_cannot_distinguish_are_named_together(change: str) -> None:
     # A turn about the line between both devices is the same turn of the other, backwards; one that moved is the other
     # one moved the opposite way, or a board of another size.
     rig = bench()
@@ -101,7 +103,7 @@ def test_what_the_geometry_cannot_tell_is_said(change: str) -> None:
 @pytest.mark.parametrize(
     ("change", "device"), [("camera turned up", "left"), ("projector turned up", PROJECTOR), ("baseline", PROJECTOR)]
 )
-def test_a_second_camera_tells_them_apart(change: str, device: str) -> None:
+def test_a_second_camera_distinguishes_them(change: str, device: str) -> None:
     rig = bench(cameras=2)
     found = looked(rig, planted(rig.devices, change))
     assert judged([found]).state is HealthState.STALE
@@ -122,7 +124,7 @@ def test_a_rig_that_did_not_change_is_good() -> None:
 
 
 @pytest.mark.slow
-def test_a_device_that_takes_no_part_in_a_look_raises_no_alarm_and_is_told() -> None:
+def test_a_device_left_out_of_a_verification_raises_no_alarm_and_is_named() -> None:
     rig = bench(3, cameras=2)
     for absent, others in (("left", "right"), ("right", "left")):
         whole = look_of(rig.devices, 5)

@@ -105,7 +105,7 @@ def test_a_rebuilt_rig_is_not_taken_for_a_wrong_square_size() -> None:
     assert "camera 'left' to the projector" in words
 
 
-def test_devices_of_no_common_distance_tell_no_scale() -> None:
+def test_without_a_common_distance_the_scale_is_not_checked() -> None:
     solution = _solution()
     assert solution.calibration.projector is not None
     other = Calibration({"middle": solution.calibration.projector}, None)
@@ -128,7 +128,7 @@ def test_a_stretched_print_is_named(stretch: float, words: str) -> None:
     assert not [*judged_size(small, None), *judged_size(unsure, None)]
 
 
-def test_a_clock_puts_in_use_only_what_somebody_or_something_vouches_for() -> None:
+def test_a_schedule_puts_a_calibration_in_use_only_if_its_scale_is_vouched_for() -> None:
     solution, agrees = _solution(), ScaleCheck(True, 1e-4, 1e-4, ())
     assert unattended_faults(solution, CHESSBOARD, agrees) == ()
     (words,) = unattended_faults(solution, CHESSBOARD, None)

@@ -56,7 +56,7 @@ def test_calibration_is_the_same_as_itself() -> None:
     assert found.devices["left"].rotation_deg is None
 
 
-def test_longer_focal_length_is_told_in_percent_and_sigmas() -> None:
+def test_a_longer_focal_length_is_reported_in_percent_and_sigmas() -> None:
     matrix = rig().cameras["right"].matrix.copy()
     matrix[0, 0] *= 1.002
     matrix[1, 1] *= 1.002
@@ -68,7 +68,7 @@ def test_longer_focal_length_is_told_in_percent_and_sigmas() -> None:
     assert "camera 'right': the focal length differs by +0.2 %, 7.6 σ: a real change." in right.focal_percent.words
 
 
-def test_turn_and_baseline_are_told_with_their_deviations() -> None:
+def test_turn_and_baseline_are_reported_with_their_deviations() -> None:
     before = rig().cameras["right"]
     turn = Rotation.from_rotvec([0.0, np.radians(0.05), 0.0]).as_matrix()
     found = comparison(

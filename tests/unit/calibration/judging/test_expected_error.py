@@ -175,7 +175,7 @@ def test_the_error_of_one_camera_alone_is_across_its_rays() -> None:
     assert np.median(np.abs(np.sqrt(squares) / stated.grid_point_mm - 1)) < 0.06
 
 
-def test_what_one_camera_alone_cannot_tell_is_no_number() -> None:
+def test_what_one_camera_alone_cannot_measure_is_nan() -> None:
     solution, observations = solved({"left": left_camera()}, None)
     for noise_px in (None, 0.03):
         stated = expected_error(solution, observations, noise_px=noise_px)

@@ -103,7 +103,7 @@ def test_halves_that_are_moved_as_a_whole_do_not_differ() -> None:
     assert found.fits
 
 
-def test_a_difference_that_is_more_than_chance_is_told_and_keeps_from_good() -> None:
+def test_a_difference_beyond_chance_is_a_reason_against_good() -> None:
     spread = covariance()
     odd, even = draws(spread, 2, 3)
     plain, large = (odd_even(*halved(times * odd, times * even, spread)) for times in (1, 6))

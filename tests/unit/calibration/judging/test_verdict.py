@@ -111,7 +111,7 @@ def test_a_projector_has_its_own_limit() -> None:
     assert _says(found, "the projector has 5 px rms", "usual is 0.1–0.3", "refresh period")
 
 
-def test_a_lens_fitted_to_too_few_poses_is_told_by_the_held_out_ones() -> None:
+def test_held_out_poses_show_a_lens_fitted_to_too_few() -> None:
     bad = replace(_residuals(), held_out_rms_px=0.16)
     found = judged(_with(_solution(), "left", bad))
     assert _remarks(found, "camera 'left'", "2.00 × its own", "at most 1.3 ×", "add poses")
@@ -169,7 +169,7 @@ def test_few_poses_and_poses_left_out_are_named() -> None:
     assert judged(replace(solution, outliers=many)).grade is Grade.DO_NOT_USE
 
 
-def test_a_principal_point_that_is_not_known_is_told_with_its_axis() -> None:
+def test_an_unsure_principal_point_is_named_with_its_axis() -> None:
     covariance = _covariance()
     covariance[2 * EACH + 3, 2 * EACH + 3] = 9.0**2
     found = judged(replace(_solution(), covariance=covariance))
@@ -190,7 +190,7 @@ def test_light_that_is_worse_than_its_noise_points_to_the_cause() -> None:
     assert _remarks(judged(_with(_solution(), "left", bad)), "camera 'left' is 3.0 ×", "bent board")
 
 
-def test_outlying_observations_and_leaning_residuals_are_told_with_their_place() -> None:
+def test_outlying_observations_and_leaning_residuals_are_named_with_their_place() -> None:
     bad = replace(_residuals(), outlying=100)
     assert _remarks(judged(_with(_solution(), "left", bad)), "9.5% of 1056 observations are outlying")
     assert judged(_with(_solution(), "left", replace(bad, outlying=200))).grade is Grade.DO_NOT_USE
@@ -217,7 +217,7 @@ def test_a_border_that_no_corner_reached_leaves_the_distortion_open_there() -> N
     assert _remarks(found, *words)
 
 
-def test_a_bent_board_is_told() -> None:
+def test_a_bent_board_is_named() -> None:
     shape = np.zeros((88, 3))
     shape[:, 0] = 0.06
     bowed = replace(_solution(), board_shape_mm=shape, bow=Bow(0.412, 0.021, solved=True))
@@ -225,7 +225,7 @@ def test_a_bent_board_is_told() -> None:
     assert _remarks(judged(bowed), *words)
 
 
-def test_a_bow_that_chance_explains_is_told_and_held_against_nothing() -> None:
+def test_a_bow_within_chance_is_reported_and_lowers_no_grade() -> None:
     found = judged(replace(_solution(), bow=Bow(0.5, 0.4, solved=False)))
     assert found.remarks == ()
     (bend,) = (each for each in found.judged if each.figure == "bend_mm")

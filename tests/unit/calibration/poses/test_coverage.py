@@ -81,7 +81,7 @@ def test_a_turn_is_clockwise_in_the_picture() -> None:
     assert ends[1, 1] > ends[0, 1]
 
 
-def test_a_board_that_looks_the_same_after_half_a_turn_is_not_asked_to_be_turned_so() -> None:
+def test_a_board_that_looks_the_same_after_half_a_turn_needs_no_such_turn() -> None:
     alike = Board(BoardKind.CHESSBOARD, 9, 7, 12.0)
     assert full_turn_deg(alike) == 180
     assert full_turn_deg(CHESSBOARD) == full_turn_deg(Board(BoardKind.CHARUCO, 9, 7, 12.0)) == 360
@@ -156,7 +156,7 @@ def test_coverage_counts_cells_depths_tilts_and_turns() -> None:
     assert left.share == pytest.approx((left.cells > 0).mean())
 
 
-def test_a_projector_is_asked_only_for_what_a_camera_sees() -> None:
+def test_coverage_of_a_projector_counts_only_what_a_camera_sees() -> None:
     devices = two_cameras_and_projector()
     whole = devices[PROJECTOR]
     # Twice as wide a picture from the same place: the cameras see only the middle of it.

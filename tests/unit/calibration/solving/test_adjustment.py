@@ -104,7 +104,7 @@ def test_a_loss_is_a_square_where_it_is_small_and_grows_slowly_where_it_is_large
 
 
 @pytest.mark.slow
-def test_the_board_s_shape_is_found_where_it_is_asked_for() -> None:
+def test_the_board_s_shape_is_found_if_it_is_free() -> None:
     rng = np.random.default_rng(8)
     offsets = np.column_stack([rng.normal(0, 0.05, (88, 2)), np.zeros(88)])
     recipe = Recipe(poses=10, side=20, corner_px=0.02, match_px=0.02, alike_px=0.0, outlying=0.0, bow_mm=1.0)

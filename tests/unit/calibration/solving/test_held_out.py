@@ -38,9 +38,7 @@ def test_three_poses_are_too_few_to_hold_any_out() -> None:
     ("ratios", "factor"),
     [((1.02, 4.5), 4.5), ((0.98, 0.9), 1.0), ((np.nan, np.nan), 1.0), ((1.5, np.nan), 1.5)],
 )
-def test_deviations_allow_for_what_is_left_at_poses_that_were_not_seen(
-    ratios: tuple[float, float], factor: float
-) -> None:
+def test_deviations_allow_for_the_residuals_of_held_out_poses(ratios: tuple[float, float], factor: float) -> None:
     devices = 15 * len(ratios)
     random = np.random.default_rng(1).normal(size=(devices, devices))
     covariance = random @ random.T

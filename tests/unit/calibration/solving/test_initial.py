@@ -41,7 +41,7 @@ def test_views_that_are_counted_from_the_other_end_are_found() -> None:
     assert found == {1, 4, 6}, "the second camera's views that disagree with the first's"
 
 
-def test_a_board_whose_ends_differ_is_never_turned() -> None:
+def test_a_board_with_different_ends_is_never_turned() -> None:
     observations, _ = made(Recipe(poses=6, cameras=2, projector=False))
     assert not any(start_of(observations).flipped.values())
 

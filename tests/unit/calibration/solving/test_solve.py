@@ -327,7 +327,7 @@ def test_a_stretched_board_may_be_bowed_as_well() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.01, -0.005])
-def test_a_wrong_square_is_told_against_an_earlier_calibration_only(share: float) -> None:
+def test_a_wrong_square_shows_only_against_an_earlier_calibration(share: float) -> None:
     wrong, truth = solved(printed(1 / (1 + share), 1 / (1 + share)))
     assert not [*judged_size(wrong, None)]
     found = check_scale(wrong, solved(SMALL)[0].calibration, CHESSBOARD)
