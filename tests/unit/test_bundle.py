@@ -273,9 +273,9 @@ def test_cut_truth_is_refused(tmp_path: Path, name: str, kept: float) -> None:
 @pytest.mark.parametrize(
     ("name", "frames", "calibrated", "truth"),
     [
-        ("bundles/gauge", 60, True, True),
+        pytest.param("bundles/gauge", 60, True, True, marks=pytest.mark.slow),
         ("captures/skull", 12, True, False),
-        ("captures/boards/pose_0", 42, False, False),
+        pytest.param("captures/boards/pose_0", 42, False, False, marks=pytest.mark.slow),
     ],
 )
 def test_bundles_of_others_are_read(shared: Path, name: str, frames: int, calibrated: bool, truth: bool) -> None:

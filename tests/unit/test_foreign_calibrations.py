@@ -217,7 +217,7 @@ def test_a_harmed_file_is_read_or_refused(tmp_path: Path) -> None:
     chance = random.Random(3)
     good = [each.encode() for each in (CAMCHAIN, INFO, TRANSFORMS)]
     outcomes = {"read": 0, "refused": 0}
-    for _ in range(100):
+    for _ in range(60):
         folder = ros(tmp_path / "ros")
         number = chance.randrange(3)
         data = harmed(good[number], good, chance)
@@ -228,7 +228,7 @@ def test_a_harmed_file_is_read_or_refused(tmp_path: Path) -> None:
             outcomes["read"] += 1
         except CalibrationError:
             outcomes["refused"] += 1
-    assert min(outcomes.values()) > 3
+    assert min(outcomes.values()) > 2
 
 
 def test_a_lens_that_kalibr_lacks_is_not_written(tmp_path: Path) -> None:

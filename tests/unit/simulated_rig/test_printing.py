@@ -171,7 +171,8 @@ def test_discs_have_their_area_and_centroid() -> None:
         np.testing.assert_allclose(found, centroid, atol=0.003)
 
 
-@pytest.mark.parametrize("bow_mm", [slow(0.0), 2.5])
+@pytest.mark.slow
+@pytest.mark.parametrize("bow_mm", [0.0, 2.5])
 def test_opencv_finds_a_chessboard_where_it_stands(bow_mm: float) -> None:
     each = board("chessboard", bow_mm=bow_mm)
     image = grey(picture(each))

@@ -258,13 +258,12 @@ def test_the_volume_is_where_the_board_was_and_the_devices_see_it() -> None:
         assert ((seen > -0.5) & (seen < [device.size.width_px - 0.5, device.size.height_px - 0.5])).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lamp", "words"),
     [
         (light_source(), r"sees together with the projector, found 0 of .*hold the board where"),
-        pytest.param(
-            None, r"that the first camera sees, found 0 of .*hold the board where all of it", marks=pytest.mark.slow
-        ),
+        (None, r"that the first camera sees, found 0 of .*hold the board where all of it"),
     ],
     ids=["projector", "camera alone"],
 )

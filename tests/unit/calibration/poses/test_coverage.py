@@ -279,15 +279,13 @@ def test_the_stated_uncertainty_is_that_of_repeated_solves() -> None:
 ALL = tuple(two_cameras_and_projector())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("board", "only"),
     [
-        pytest.param(CHESSBOARD, ALL, id="chessboard, all", marks=pytest.mark.slow),
-        pytest.param(CHARUCO, ALL, id="charuco, all", marks=pytest.mark.slow),
-        pytest.param(CHESSBOARD, ("left",), id="chessboard, one camera", marks=pytest.mark.slow),
-        pytest.param(CHARUCO, ("left",), id="charuco, one camera"),
-        pytest.param(CHESSBOARD, ("left", PROJECTOR), id="chessboard, camera and projector", marks=pytest.mark.slow),
-        pytest.param(CHARUCO, ("left", PROJECTOR), id="charuco, camera and projector", marks=pytest.mark.slow),
+        pytest.param(board, only, id=f"{board.kind}, {', '.join(only)}")
+        for board in (CHESSBOARD, CHARUCO)
+        for only in (ALL, ("left",), ("left", PROJECTOR))
     ],
 )
 def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Board, only: tuple[str, ...]) -> None:

@@ -43,7 +43,7 @@ def solved(recipe: Recipe) -> tuple[Solution, Calibration]:
         pytest.param(replace(SMALL, lens_shift=False, seed=1), marks=pytest.mark.slow),
         pytest.param(replace(SMALL, cameras=2, seed=2), marks=pytest.mark.slow),
         pytest.param(replace(SMALL, cameras=2, projector=False, seed=3), marks=pytest.mark.slow),
-        replace(SMALL, projector=False, seed=4),
+        pytest.param(replace(SMALL, projector=False, seed=4), marks=pytest.mark.slow),
     ],
     ids=["shifted lens", "straight lens", "two cameras", "cameras alone", "one camera alone"],
 )
