@@ -277,6 +277,17 @@ def test_another_board_is_refused_and_named(asked: Board, there: Board, words: s
     refused(shot(there, eye(there, **FINE)), asked, words)
 
 
+@pytest.mark.parametrize(("count", "words"), [(15, "another board.*found 15 of DICT_4X4"), slow(8, "not in view")])
+def test_markers_in_no_board_s_order_are_named_if_they_are_a_dozen(count: int, words: str) -> None:
+    """Single markers are read into anything."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image = np.full((320, 400), 190, np.uint8)
+    for place, number in enumerate(np.random.default_rng(7).permutation(50)[:count].tolist()):
+        top, left = 20 + 100 * (place // 5), 15 + 76 * (place % 5)
+        image[top : top + 60, left : left + 60] = cv2.aruco.generateImageMarker(dictionary, number, 60)
+    refused(image, CHARUCO, words)
+
+
 @pytest.mark.parametrize("there", [CHARUCO, slow(CIRCLES)], ids=title)
 def test_corners_that_were_given_the_wrong_way_round_are_named(there: Board) -> None:
     asked = Board(there.kind, there.rows, there.columns, there.square_mm)
