@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -250,7 +250,7 @@ class ForgetsItself(ModelCamera):
 
     @property
     def info(self) -> CameraInfo:
-        self.require()
+        self.require_open()
         return super().info
 
 
@@ -272,7 +272,7 @@ class DeclaresTenBits(ModelCamera):
 class IgnoresClose(ModelCamera):
     """Goes on after close."""
 
-    def close(self) -> None:
+    def close(self) -> Any:
         self.disarm()
 
 
@@ -280,8 +280,8 @@ class IgnoresClose(ModelCamera):
 class ClosesOnce(ModelCamera):
     """Cannot be closed again."""
 
-    def close(self) -> None:
-        self.require()
+    def close(self) -> Any:
+        self.require_open()
         super().close()
 
 
@@ -352,7 +352,8 @@ class StaysLitAfterClose(ModelProjector):
     """Is let go while it shines."""
 
     def close(self) -> None:
-        self.loaded, self.closed = None, True
+        self.loaded = None
+        self.closed.set()
 
 
 @breaks("the_projector_is_dark_after_opening_and_close", "after opening")
@@ -399,7 +400,7 @@ class ShowsWithoutSequence(ModelProjector):
     """Shows nothing where nothing is loaded, and does not say so."""
 
     def show(self, index: int) -> Shown:
-        if self.loaded is None and not self.closed:
+        if self.loaded is None and not self.closed.is_set():
             return Shown(index, self.world.at_ns, 0)
         return super().show(index)
 
@@ -427,7 +428,7 @@ class PlaysSilently(ModelProjector):
     plays = False
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        self.require()
+        self.require_open()
         assert exposure_s < period_s
 
 
@@ -436,7 +437,7 @@ class PlaysUnloaded(ModelProjector):
     """Plays nothing where nothing is loaded."""
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        if self.loaded is not None or self.closed:
+        if self.loaded is not None or self.closed.is_set():
             super().play(exposure_s, period_s)
 
 

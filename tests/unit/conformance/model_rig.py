@@ -9,6 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +18,14 @@ from slrig.devices import (
     AppliedSettings,
     CameraInfo,
     CameraSettings,
+    CameraState,
     ProjectorInfo,
+    ProjectorState,
     Rig,
     Shown,
     Trigger,
 )
-from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.errors import FrameTimeoutError
 from slrig.model import Calibration, Frame, PatternSequence, Pixels, Size, Truth
 from slrig.patterns.sequence import encode
 from tests.unit.capture.fake_rig import Scene, patterns_for
@@ -95,21 +98,19 @@ class Exposure:
     end_ns: int
 
 
-class ModelCamera:
+class ModelCamera(CameraState):
     """Implements `slrig.devices.Camera`."""
 
     triggers = ALL
 
     def __init__(self, world: World, name: str = "left") -> None:
+        super().__init__(name)
         self.world = world
-        self.name = name
         self.applied = AppliedSettings(EXPOSURE_S, 1.0)
-        self.armed: Trigger | None = None
         self.pending: deque[Exposure] = deque()
         self.made = 0
         self.next_free_ns = 0
         self.busy_ns = 0
-        self.closed = False
         world.on_wire.append(self.pulsed)
 
     @property
@@ -118,32 +119,18 @@ class ModelCamera:
         return CameraInfo(self.name, "model", "1", form, self.triggers, (1e-4, 0.5), (1.0, 8.0), colour=True)
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        self.require(unarmed=True)
-        info = self.info
-        for value, (low, high) in (
-            (settings.exposure_s, info.exposure_range_s),
-            (settings.gain, info.gain_range),
-        ):
-            if not low <= value <= high:
-                message = f"{value} is not within {low} to {high}"
-                raise UnsupportedByDeviceError(message)
+        self.check_settings(settings, self.info)
         self.applied = AppliedSettings(settings.exposure_s, settings.gain)
         return self.applied
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        self.require(unarmed=True)
-        if count < 1 or trigger not in self.triggers:
-            message = f"{count} frames by {trigger} trigger"
-            raise UnsupportedByDeviceError(message)
+        self.check_arming(count, trigger, self.info)
         self.pending.clear()
         self.armed = trigger
         self.next_free_ns = self.world.at_ns
 
     def trigger(self) -> None:
-        self.require()
-        if self.armed is not Trigger.SOFTWARE:
-            message = "not armed for software triggers"
-            raise DeviceStateError(message)
+        self.require_armed(Trigger.SOFTWARE)
         self.start(self.world.at_ns + 1_000)
 
     def pulsed(self, at_ns: int) -> None:
@@ -164,10 +151,7 @@ class ModelCamera:
         self.made += 1
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        self.require()
-        if self.armed is None:
-            message = "not armed"
-            raise DeviceStateError(message)
+        self.require_armed()
         deadline_ns = self.world.at_ns + round(timeout_s * 1e9)
         while (exposure := self.next_exposure(deadline_ns)) is not None:
             self.world.at_ns = max(self.world.at_ns, exposure.end_ns + READ_OUT_NS)
@@ -214,36 +198,27 @@ class ModelCamera:
         self.armed = None
         self.pending.clear()
 
-    def close(self) -> None:
+    def close(self) -> Any:
         self.disarm()
-        self.closed = True
-
-    def require(self, *, unarmed: bool = False) -> None:
-        if self.closed or (unarmed and self.armed is not None):
-            message = "closed" if self.closed else "armed"
-            raise DeviceStateError(message)
+        super().close()
 
 
-class ModelProjector:
+class ModelProjector(ProjectorState):
     """Implements `slrig.devices.Projector`."""
 
     plays = True
 
     def __init__(self, world: World) -> None:
+        super().__init__("the model")
         self.world = world
-        self.loaded: PatternSequence | None = None
-        self.pulses: list[int] = []
-        self.closed = False
 
     @property
     def info(self) -> ProjectorInfo:
         return ProjectorInfo("projector", "model", "1", PROJECTOR, self.plays, LATENCY_NS / 1e9)
 
     def load(self, sequence: PatternSequence) -> None:
-        self.require()
-        if sequence.projector != PROJECTOR:
-            message = f"{sequence.projector} is not {PROJECTOR}"
-            raise UnsupportedByDeviceError(message)
+        self.require_open()
+        self.require_size(sequence, PROJECTOR)
         self.blank()
         self.loaded = sequence
 
@@ -255,29 +230,19 @@ class ModelProjector:
         return Shown(index, at_ns, ERROR_NS)
 
     def profile(self, index: int) -> Pixels:
-        self.require()
-        if self.loaded is None:
-            message = "nothing is loaded"
-            raise DeviceStateError(message)
-        if not 0 <= index < len(self.loaded):
-            message = f"no pattern {index}"
-            raise UnsupportedByDeviceError(message)
-        return self.loaded.profiles[index]
+        return self.require_pattern(index).profiles[index]
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        self.require()
         if not self.plays:
-            message = "does not play"
-            raise UnsupportedByDeviceError(message)
+            self.refuse_to_play(exposure_s, period_s)
         assert exposure_s < period_s
-        self.profile(0)
-        assert self.loaded is not None
+        sequence = self.require_loaded("play")
         begin_ns = self.world.at_ns + LATENCY_NS
-        for index, profile in enumerate(self.loaded.profiles):
+        for index, profile in enumerate(sequence.profiles):
             at_ns = begin_ns + round(index * period_s * 1e9)
             self.world.change(at_ns, profile)
             self.pulse(index, at_ns)
-        self.world.change(begin_ns + round(len(self.loaded) * period_s * 1e9), None)
+        self.world.change(begin_ns + round(len(sequence) * period_s * 1e9), None)
 
     def pulse(self, _index: int, at_ns: int) -> None:
         for expose in self.world.on_wire:
@@ -294,17 +259,13 @@ class ModelProjector:
         return [camera for camera in owners if isinstance(camera, ModelCamera)]
 
     def blank(self) -> None:
-        if not self.closed:
+        if not self.closed.is_set():
             self.world.darken()
 
     def close(self) -> None:
         self.blank()
-        self.loaded, self.closed = None, True
-
-    def require(self) -> None:
-        if self.closed:
-            message = "closed"
-            raise DeviceStateError(message)
+        self.loaded = None
+        self.closed.set()
 
 
 @dataclass

@@ -207,7 +207,7 @@ def test_a_rig_that_keeps_the_contract_has_a_full_score(
     assert [str(result.failure) for result in report.results if result.outcome is Outcome.FAILED] == []
     assert (report.percent, report.conforms) == (100, True)
     assert report.count(Outcome.NOT_APPLICABLE) == not_applicable
-    assert all(rig.projector.closed for rig in maker.rigs)  # type: ignore[attr-defined]
+    assert all(rig.projector.closed.is_set() for rig in maker.rigs)  # type: ignore[attr-defined]
 
 
 def test_a_display_whose_latency_was_measured_is_waited_for() -> None:

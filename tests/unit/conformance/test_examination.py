@@ -54,7 +54,7 @@ def test_a_device_that_never_answers_ends_the_examination_and_not_the_program(ha
     for owner in owners() - before:
         owner.join(10)
         assert not owner.is_alive()
-    assert all(rig.projector.closed for rig in maker.rigs)  # type: ignore[attr-defined]
+    assert all(rig.projector.closed.is_set() for rig in maker.rigs)  # type: ignore[attr-defined]
 
 
 def test_a_rig_that_does_not_open_is_not_examined() -> None:
@@ -93,7 +93,7 @@ def test_an_examination_that_is_interrupted_closes_the_rig() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         run(maker, sequence(), progress=interrupt)
-    assert all(rig.projector.closed for rig in maker.rigs)  # type: ignore[attr-defined]
+    assert all(rig.projector.closed.is_set() for rig in maker.rigs)  # type: ignore[attr-defined]
     assert owners() <= before
 
 

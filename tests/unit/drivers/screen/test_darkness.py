@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -23,27 +21,12 @@ from slrig.errors import DeviceStateError
 from slrig.model import Size
 from tests.contract.screen_bench import rig_options, sequence
 from tests.contract.screen_server import DummyServer, OutputPixels
-from tests.unit.drivers.screen.conftest import LEFT, OPEN, RIGHT, SIZE
+from tests.unit.drivers.screen.conftest import LEFT, OPEN, RIGHT, SIZE, started
 
 FAR_S = 20.0
 WHITE, BLACK = 0, 1
 
 pytestmark = pytest.mark.realtime
-
-PROGRAM = """
-import sys
-from pathlib import Path
-from drivers.screen import open_projector
-from tests.contract.screen_bench import rig_options, sequence
-from tests.unit.drivers.screen.conftest import RIGHT, SIZE
-
-options = rig_options(RIGHT, SIZE, backend=sys.argv[1], dark_after_s=float(sys.argv[2]))
-projector = open_projector(options, Path())
-projector.load(sequence(SIZE))
-projector.show(int(sys.argv[3]))
-print("shown", flush=True)
-sys.stdin.readline()
-"""
 
 
 def opened(**options: object) -> DisplayProjector:
@@ -73,18 +56,6 @@ def is_white(pixels: OutputPixels) -> bool:
 
 def is_black(pixels: OutputPixels) -> bool:
     return not pixels.colours().any()
-
-
-def started(backend: str, dark_after_s: float, pattern: int = WHITE) -> subprocess.Popen[str]:
-    child = subprocess.Popen(  # noqa: S603 - our own program
-        [sys.executable, "-c", PROGRAM, backend, str(dark_after_s), str(pattern)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert child.stdout is not None
-    assert child.stdout.readline() == "shown\n"
-    return child
 
 
 @pytest.mark.parametrize(

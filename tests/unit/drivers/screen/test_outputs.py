@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,7 +25,7 @@ from slrig.errors import (
 from slrig.model import Size
 from tests.contract.screen_bench import let_go, rig_options, sequence
 from tests.contract.screen_server import DummyServer, OutputPixels
-from tests.unit.drivers.screen.conftest import LEFT, OPEN, RIGHT, SIZE
+from tests.unit.drivers.screen.conftest import LEFT, OPEN, RIGHT, SIZE, started
 
 FAR_S = 10.0
 _NEVER = "never shown"
@@ -249,38 +247,9 @@ def test_the_server_does_not_blank_its_displays_meanwhile(server: DummyServer) -
 @pytest.mark.parametrize("backend", ["x11", "sdl"])
 def test_the_end_of_the_server_is_reported_and_survived(tmp_path: Path, backend: str) -> None:
     # In a process of its own: Xlib may end it.
-    program = f"""
-import sys
-from pathlib import Path
-from drivers.screen import open_projector
-from slrig.errors import DeviceError
-from tests.contract.screen_bench import rig_options, sequence
-from tests.unit.drivers.screen.conftest import RIGHT, SIZE
-projector = open_projector(rig_options(RIGHT, SIZE, backend="{backend}"), Path())
-projector.load(sequence(SIZE))
-projector.show(0)
-print("lit", flush=True)
-sys.stdin.readline()
-for _ in range(2):
-    try:
-        projector.show(1)
-    except DeviceError as error:
-        print(type(error).__name__, flush=True)
-projector.close()
-print("closed", flush=True)
-"""
     with DummyServer(tmp_path) as mortal:
         mortal.arrange(**{LEFT: SIZE, RIGHT: SIZE})
-        child = subprocess.Popen(  # noqa: S603 - our own program
-            [sys.executable, "-c", program],
-            env={**os.environ, "DISPLAY": mortal.display},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        with child:
-            assert child.stdout is not None
-            assert child.stdout.readline() == "lit\n"
+        with started(backend, dark_after_s=0.0, display=mortal.display) as child:
             mortal.kill()
             said, _ = child.communicate("go on\n", timeout=60)
     assert said.split() == ["DeviceGoneError", "DeviceGoneError", "closed"]
