@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection
 from typing import ClassVar
 from weakref import WeakKeyDictionary
 
+_MOST_READINGS = 1_000_000
 _PATIENCE_S = 5.0
 """How long a thread may take to come to its next wait; one that hangs must not hang the test."""
 
@@ -25,8 +26,8 @@ class VirtualClock:
     _clocks: ClassVar[WeakKeyDictionary[threading.Thread, VirtualClock]] = WeakKeyDictionary()
     """The clock by which a thread sleeps: a thread of an earlier test may still end."""
 
-    def __init__(self, now_ns: int = 10**12, *, threads: Collection[str] = ()) -> None:
-        self._now_ns = now_ns
+    def __init__(self, now_ns: int = 10**9, *, threads: Collection[str] = ()) -> None:
+        self._now_ns, self._readings = now_ns, 0
         self._threads = frozenset(threads)
         self._changed = threading.Condition(threading.RLock())
         self._due_ns: dict[threading.Thread, int] = {}
@@ -34,7 +35,9 @@ class VirtualClock:
         self._order = itertools.count()
 
     def now_ns(self) -> int:
-        """See `Clock`."""
+        """See `Clock`. Fails in code that reads the time over and over without a wait: it would never end."""
+        readings = self._readings = self._readings + 1
+        assert readings < _MOST_READINGS, "time stands still, and the code under test waits for it to pass by itself"
         return self._now_ns
 
     def wait_until(self, t_ns: int, stop: threading.Event) -> None:
@@ -71,14 +74,18 @@ class VirtualClock:
                 thread_ns = t_ns + 1 if thread is None else self._due_ns[thread]
                 if self._calls and self._calls[0][0] <= min(t_ns, thread_ns):
                     due_ns, _, act = heapq.heappop(self._calls)
-                    self._now_ns = max(self._now_ns, due_ns)
+                    self._move(due_ns)
                     act()
                 elif thread is not None and thread_ns <= t_ns:
-                    self._now_ns = max(self._now_ns, self._due_ns.pop(thread))
+                    self._move(self._due_ns.pop(thread))
                     self._changed.notify_all()
                 else:
-                    self._now_ns = max(self._now_ns, t_ns)
+                    self._move(t_ns)
                     return
+
+    def _move(self, t_ns: int) -> None:
+        if t_ns > self._now_ns:
+            self._now_ns, self._readings = t_ns, 0
 
     def _await_threads(self) -> None:
         """Return when every named thread sleeps or has ended."""

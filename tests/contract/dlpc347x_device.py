@@ -63,7 +63,6 @@ class Fake347x:
     ) -> None:
         self.commands: list[tuple[int, bytes]] = []
         self.shown: list[Pixels | None] = []
-        self.pulses: list[int] = []
         self.bent: dict[int, bytes] = {}
         self.gone = self.unlocked = False
         self.registers = {0x05: b"\0", 0x50: b"\1", 0x52: b"\7", 0x54: struct.pack("<3H", 900, 900, 900), 0x90: b"\1"}
@@ -281,7 +280,6 @@ class Fake347x:
                     if not self._change(halt, at_ns, line, entry.leds):
                         return
                     if self.triggers[1][0] & 2:
-                        self.pulses.append(at_ns)
                         self._pulse(at_ns)
                     at_ns += entry.light_us * 1000
                     if not self._change(halt, at_ns, line, 0):
