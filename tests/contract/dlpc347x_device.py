@@ -64,7 +64,7 @@ class Fake347x:
         self.commands: list[tuple[int, bytes]] = []
         self.shown: list[Pixels | None] = []
         self.bent: dict[int, bytes] = {}
-        self.gone = self.unlocked = False
+        self.gone = False
         self.registers = {0x05: b"\0", 0x50: b"\1", 0x52: b"\7", 0x54: struct.pack("<3H", 900, 900, 900), 0x90: b"\1"}
         self.triggers = {0: struct.pack("<Bi", 1, 0), 1: struct.pack("<Bi", 0, 0)}
         self.order: list[bytes] = []

@@ -109,10 +109,6 @@ class FakeKernel:
             raise OSError(number, os.strerror(number))
         getattr(self, _REQUESTS[request])(told)
 
-    def set_at_once(self, name: str, number: int = PRIMARY) -> int:
-        """A property's value as it was set last."""
-        return self.values[(number, name)]
-
     def _get_resources(self, told: Any) -> None:
         for pointer, count, numbers in (
             ("crtc_id_ptr", "count_crtcs", CONTROLLERS),
