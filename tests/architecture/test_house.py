@@ -261,6 +261,12 @@ def test_links_in_readmes_lead_somewhere_and_the_first_links_to_all_others() -> 
     assert [path for path in READMES[1:] if path not in linked] == []
 
 
+def test_files_of_tests_that_are_named_exist() -> None:
+    texts = [path.read_text(encoding="utf-8") for path in [*READMES, *(ROOT / "tests").rglob("*.py")]]
+    named = {name for text in texts for name in re.findall(r"\btests/[\w/]+\.(?:py|png|md)", text)}
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
 def test_the_first_readme_is_short() -> None:
     assert len(READMES[0].read_text(encoding="utf-8").splitlines()) <= MOST_LINES_OF_THE_FIRST_README
 

@@ -4,7 +4,7 @@
 
 Ends: service and worker are killed or stopped during work of every kind. Refusals: the disk refuses the service's
 records during a scan, and five scans follow. Records that are read-only are refused within the process by
-`tests/unit/scan/test_refused_records.py`: a file that the kernel makes read-only under SQLite's shared memory ends the
+`tests/unit/scan/test_runner.py`: a file that the kernel makes read-only under SQLite's shared memory ends the
 process with SIGBUS, which no service can take.
 """
 

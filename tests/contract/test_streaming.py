@@ -1,7 +1,4 @@
-"""Captures in real time, by the timing rules of the drivers: no frame is paired wrongly, and none is waited for long.
-
-How fast they are: tests/bench/test_capture_pace.py.
-"""
+"""Captures in real time, by the timing rules of the drivers: no frame is paired wrongly, and none is waited for long."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from tests.samples import CAMERA
 from tests.strangers import good_bundle, good_frames, harm_bundle, harmed_calibrations
 
 CALIBRATIONS, BUNDLES = 150, 80
-"""`tests/e2e/test_strangers_files.py` sends more of them."""
+"""`tests/e2e/campaigns/test_harmed_calibrations.py` sends more of them."""
 
 
 def test_a_harmed_calibration_is_read_or_refused(tmp_path: Path) -> None:
