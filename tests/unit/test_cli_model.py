@@ -89,6 +89,7 @@ def test_error_of_a_start_is_stated_once() -> None:
     assert plan.START_ERROR_MM == registration.START_ERROR_MM
 
 
+@pytest.mark.slow
 def test_free_motion_of_a_vase_is_reported(scans: Path, tmp_path: Path) -> None:
     # What is known of the stage is in a file: its axis, and a plate that hides a part of the vase.
     views = [decode_mesh_ply((scans / f"vase-{number}.ply").read_bytes()) for number in (0, 1)]

@@ -92,6 +92,7 @@ def test_a_person_turns_leaves_and_goes_on_in_the_same_folder(bench: Bench, tmp_
     )
 
 
+@pytest.mark.slow
 def test_table_turns_and_a_view_that_fails_is_named(bench: Bench, tmp_path: Path) -> None:
     bench.table = FakeTurntable()
     bench.faults = {

@@ -292,6 +292,7 @@ def busy(served: ServedBench, tmp_path: Path) -> Iterator[Path]:
             assert done.result(WAIT_S) == gate.name
 
 
+@pytest.mark.slow
 def test_cloud_is_listed_made_on_request_and_kept(
     client: TestClient, served: ServedBench, scan: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -113,7 +113,7 @@ def test_a_sound_capture_is_a_bundle_and_each_frame_is_shown_to_the_reconstructi
 
 def test_a_rig_whose_latency_was_never_measured_says_so(tmp_path: Path) -> None:
     with small_rig(tmp_path) as rig:
-        free = replace(rig, cameras={"eye": OtherCamera(rig.cameras["eye"], frozenset({Trigger.FREE}))})
+        free = replace(rig, cameras={"eye": OtherCamera(rig.cameras["eye"], triggers=frozenset({Trigger.FREE}))})
         known = replace(free, synchronisation=Synchronisation(0.0, 0.001))
         for name, each in (("unmeasured", free), ("measured", known), ("triggered", rig)):
             plan = ScanPlan(PatternPlan(line_shift=False, gray_cell_px=16))
