@@ -1,4 +1,4 @@
-"""Captures in real time, by the timing rules of the drivers: no frame is paired wrongly, and none is waited for long."""
+"""Captures by the timing rules of the drivers: no frame is paired wrongly, and none is waited for long."""
 
 from __future__ import annotations
 

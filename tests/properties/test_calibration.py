@@ -19,6 +19,7 @@ from tests.unit.calibration.synthetic import Recipe, made
 QUICK = Recipe(poses=5, side=10)
 
 
+@pytest.mark.slow
 @settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 10_000), bend=st.lists(st.floats(-3, 3), min_size=7, max_size=7))
 def test_a_step_changes_residuals_by_its_derivative(seed: int, bend: list[float]) -> None:

@@ -45,6 +45,7 @@ def plan(rig: Rig) -> AcceptancePlan:
     return plan_for(AcceptanceOptions(), rig)
 
 
+@pytest.mark.slow
 def test_rendered_rig_needs_no_artefacts_and_states_exact_ones(rig: Rig, plan: AcceptancePlan) -> None:
     assert plan.rendered
     assert plan.artefacts.diameter.uncertainty_mm == 0

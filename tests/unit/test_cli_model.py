@@ -110,6 +110,7 @@ def test_free_motion_of_a_vase_is_reported(scans: Path, tmp_path: Path) -> None:
     assert (free["view"], free["motion"]) == ("vase-1", "turn")
 
 
+@pytest.mark.slow
 def test_scans_in_another_order_than_the_stage_turned_in_are_refused(scans: Path, tmp_path: Path) -> None:
     named = [scans / "all" / f"scan-{number}" for number in (9, 10, 11)]
     for number, folder in enumerate(named):

@@ -245,6 +245,7 @@ def test_ctrl_c_ends_all_and_shows_what_is_done(scans: Path, tmp_path: Path, wor
     assert "bundles   1 done, 2 not done" in result.stdout
 
 
+@pytest.mark.slow
 def test_nothing_of_a_bundle_is_kept_while_the_next_is_worked_on(
     scans: Path, tmp_path: Path, work: Reconstruction
 ) -> None:

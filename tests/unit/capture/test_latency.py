@@ -26,6 +26,7 @@ def rig(folder: Path, camera: Mapping[str, Any] | None = None, **head: Any) -> R
     return Rig("bench", made.cameras, made.projector, {"eye": CameraSettings(0.01)}, None, made, None, made.clock)
 
 
+@pytest.mark.slow
 def test_a_frame_after_the_measured_instant_shows_the_new_light_alone(tmp_path: Path) -> None:
     late = rig(tmp_path, faults={"light_delay_s": 0.03})
     found = measure_latency(late, trials=12)

@@ -162,6 +162,7 @@ def root(values: FloatArray) -> float:
     return float(real[np.argmin(np.abs(real - 0.5))])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("down", [False, True])
 def test_crossings_are_those_of_plain_numpy(down: bool) -> None:
     frames = Wall(blur_px=0.9).frames(noise=NOISE)

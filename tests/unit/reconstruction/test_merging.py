@@ -65,6 +65,7 @@ def test_one_camera_is_passed_through() -> None:
     assert len(result.residual_sigma) == len(result.residual_mm) == 0
 
 
+@pytest.mark.slow
 def test_the_fused_point_has_the_weighted_mean_depth_and_its_deviation() -> None:
     # The second camera is four times as sure, so it decides.
     first = seen(CAMERA, ROWS, noise_px=0.08, sigma_px=0.08, seed=1)

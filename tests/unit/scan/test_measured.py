@@ -54,6 +54,7 @@ def smeared(recorded: Path, folder: Path, axis: Axis, width: int, *, from_px: in
     return folder
 
 
+@pytest.mark.slow
 def test_the_axis_that_decodes_far_more_is_used_and_told(recorded: Path, tmp_path: Path) -> None:
     walked, _ = measured(recorded, None, None, lambda *_: None, axis=None)
     assert walked.axis is Axis.COLUMN

@@ -380,6 +380,7 @@ def test_frames_taken_live_that_are_not_those_of_the_bundle_are_passed_over(
 # Frames are read one after another: the same in whatever order they are listed, and few in memory
 
 
+@pytest.mark.slow
 def test_lines_before_the_code_and_black_before_white_change_nothing(both_axes: Path, tmp_path: Path) -> None:
     bundle = read_bundle(both_axes)
     capture = bundle.capture

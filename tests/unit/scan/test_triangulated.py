@@ -65,6 +65,7 @@ def seen(name: str, device: Pinhole, ensemble: StripeEnsemble) -> CameraResult:
 FEW, MANY = np.arange(100.0, 140.0, 1.5), np.arange(80.0, 160.0, 1.5)
 
 
+@pytest.mark.slow
 def test_a_pair_along_the_stripes_is_passed_over_however_many_points_it_gives() -> None:
     first = seen("first", CAMERA, curves_in(CAMERA, MANY))
     beside = seen("beside", OTHER_CAMERA, curves_in(OTHER_CAMERA, FEW))
@@ -108,6 +109,7 @@ def test_points_left_out_are_refused_pixels_with_their_own_cause() -> None:
     assert np.count_nonzero(refusal) == 1 + np.count_nonzero(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["above", "beside"])
 def test_a_camera_that_sees_the_sheets_edge_on_is_left_out(first: str) -> None:
     x, y, z = PROJECTOR.centre_mm

@@ -98,6 +98,7 @@ def test_a_printer_that_scales_moves_corners_and_print_alike() -> None:
     np.testing.assert_allclose(scaled.corners_mm, plain.corners_mm * [1.05, 0.98, 1.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bow_mm", [2.0, -3.0])
 def test_a_bent_board_keeps_its_length_along_the_bend(bow_mm: float) -> None:
     each = board(bow_mm=bow_mm)

@@ -62,6 +62,7 @@ def test_spread_grows_with_the_distance_from_the_focus() -> None:
     assert focus.spread_px(np.array([250.0, 500.0, 625.0, np.nan])) == pytest.approx([4.0, 0.0, 2.0, 0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("soft", ["lamp", pytest.param("lens", marks=pytest.mark.slow)])
 def test_a_plate_at_one_distance_is_as_soft_as_through_a_lens_of_that_blur(soft: str) -> None:
     # 125 mm beyond the focus a spread of 10 px far away is one of 2 px; aside of the axis it is a little more.

@@ -25,6 +25,7 @@ def three() -> list[View]:
     return seen_from(OBJECTS["figure"](), FROM)
 
 
+@pytest.mark.slow
 def test_views_come_to_where_they_belong_without_a_start(three: list[View]) -> None:
     found = found_starts([view.mesh for view in three])
     for view, pose in zip(three, found, strict=True):
