@@ -13,14 +13,17 @@ from weakref import WeakKeyDictionary
 _MOST_READINGS = 1_000_000
 _PATIENCE_S = 5.0
 """How long a thread may take to come to its next wait; one that hangs must not hang the test."""
+_BLOCKED_S = 1.0
+"""How long the clock may stand before it counts the thread under test as blocked by a lock that a sleeper holds."""
 
 
 class VirtualClock:
     """Implements `slrig.devices.Clock`. A wait for an instant moves the clock there.
 
     threads : names of threads that run next to the one under test: a driver's sign of life, a fake device's own
-    program. They do not make time pass. They sleep until another thread's wait has made it pass, and that wait goes on
-    when all of them sleep again or have ended. So what is due first is done first.
+    program. They do not make time pass, unless the thread under test is blocked. They sleep until another thread's wait
+    has made it pass, and that wait goes on when all of them sleep again or have ended. So what is due first is done
+    first.
     """
 
     _clocks: ClassVar[WeakKeyDictionary[threading.Thread, VirtualClock]] = WeakKeyDictionary()
@@ -61,9 +64,15 @@ class VirtualClock:
         with self._changed:
             self._clocks[me], self._due_ns[me] = self, t_ns
             self._changed.notify_all()
+            stands, since_s = self._now_ns, time.monotonic()
             while me in self._due_ns and not stop.is_set():
                 # The owner of `stop` does not notify this clock.
                 self._changed.wait(0.002)
+                if self._now_ns != stands:
+                    stands, since_s = self._now_ns, time.monotonic()
+                elif time.monotonic() - since_s > _BLOCKED_S and min(self._due_ns.values()) == t_ns:
+                    self._move(t_ns)
+                    break
             self._due_ns.pop(me, None)
 
     def _pass(self, t_ns: int, stop: threading.Event) -> None:
