@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -56,19 +56,26 @@ blur_px = 0.6
 
 @dataclass(frozen=True)
 class Rendered:
-    """What is rendered: a ball before a plate, as `config/rigs/sphere.toml` at half the size.
+    """A ball before a plate, as `config/rigs/sphere.toml` at half the size; without cameras, that rig itself.
 
     cameras_mm, projector_mm : where the devices stand. plan : of the scan. truth : whether what the rig knows of its
     scene stays in the bundle: a reconstruction is then compared with it, which takes longer than all the rest.
     """
 
-    cameras_mm: Mapping[str, str]
+    cameras_mm: Mapping[str, str] = field(default_factory=dict)
     projector_mm: str = "105.0, -10.0, -590.0"
     plan: ScanPlan = ScanPlan()  # noqa: RUF009 - frozen
     truth: bool = False
 
-    def rig_text(self) -> str:
-        """A rig file."""
+    def rig_file(self, folder: Path) -> Path:
+        """The rig file, written into `folder` where it is not one that is shipped."""
+        if not self.cameras_mm:
+            return SCENES.parent / "rigs" / "sphere.toml"
+        path = folder / "rig.toml"
+        path.write_text(self._text())
+        return path
+
+    def _text(self) -> str:
         cameras = "".join(_CAMERA.format(name=name, position_mm=place) for name, place in self.cameras_mm.items())
         scene = f'scene = "{SCENES / "sphere.toml"}"'
         return _HEAD.format(scene=scene) + _DEVICES.format(projector_mm=self.projector_mm) + cameras
@@ -79,6 +86,7 @@ _LEFT = {"left": "-150.0, -12.0, -560.0"}
 BUNDLES: Mapping[str, Rendered] = {
     "ball": Rendered(_LEFT),
     "ball with its truth": Rendered(_LEFT, truth=True),
+    "whole ball with its truth": Rendered(truth=True),
     "ball by both axes": Rendered(_LEFT, plan=ScanPlan(PatternPlan(rows=True))),
     # The camera stands above the projector: rows cross the baseline, columns do not.
     "ball from above": Rendered(
@@ -100,9 +108,8 @@ def prepared_bundle(folders: pytest.TempPathFactory, name: str) -> Path:
     with FileLock(kept / "lock"):
         if not bundle.exists():
             wanted = BUNDLES[name]
-            (kept / "rig.toml").write_text(wanted.rig_text())
             shutil.rmtree(kept / "part", ignore_errors=True)
-            with open_rig(read_rig(kept / "rig.toml")) as rig:
+            with open_rig(read_rig(wanted.rig_file(kept))) as rig:
                 capture_frames(
                     rig, wanted.plan, kept / "part", progress=lambda *_: None, cancelled=lambda: False
                 ).finish()
