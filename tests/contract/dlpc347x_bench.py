@@ -23,7 +23,9 @@ class Table(WiredTable):
     """A stage, and a fake engine that lights it."""
 
     def __init__(self, **engine: Any) -> None:
-        super().__init__(MIRRORS, columns_per_px=1.9, white=0.7, usual_s=0.005, exposures_s=(1e-4, 0.0055))
+        super().__init__(
+            MIRRORS, columns_per_px=1.9, rows_per_px=7.0, white=0.7, usual_s=0.005, exposures_s=(1e-4, 0.0055)
+        )
         self.engine = Fake347x(light=self._change, pulse=self.pulse, **engine)
 
     def opened(self) -> LightEngine:
