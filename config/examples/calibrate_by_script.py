@@ -8,7 +8,6 @@ import argparse
 from typing import Any
 
 from slrig.client import Client
-from slrig.client.events import PoseChange
 
 ONGOING = {"queued", "capturing", "computing", "solving"}
 
@@ -18,7 +17,9 @@ def main(board: dict[str, Any], most_error_mm: float) -> None:
     with Client() as client:
         session = client.calibration.open(board=board, label="by script")
         client.calibration.script(session["id"], if_busy="queue")
-        wait(client, session["id"])
+        for pose in wait(client, session["id"])["shot"]:
+            fault = f": {pose['error']['detail']}" if pose["error"] else ""
+            print(f"pose {pose['number']}: {pose['state']}{fault}")
         client.calibration.solve(session["id"])
         solved = wait(client, session["id"])
         if solved["result"] is None:
@@ -31,11 +32,10 @@ def main(board: dict[str, Any], most_error_mm: float) -> None:
 
 
 def wait(client: Client, calibration_id: str) -> dict[str, Any]:
-    """The calibration once no job of it is left; prints poses as they end."""
+    """The calibration once no job of it is left."""
     while True:
-        for event in client.calibration.follow(calibration_id):
-            if isinstance(event, PoseChange) and event.state not in ONGOING:
-                print(f"pose {event.pose}: {event.state}{': ' + event.error['detail'] if event.error else ''}")
+        for _ in client.calibration.follow(calibration_id):
+            pass
         found = client.calibration.get(calibration_id)
         if not found["script"] and not ONGOING & {found["state"], *(pose["state"] for pose in found["shot"])}:
             return found

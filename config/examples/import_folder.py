@@ -1,6 +1,6 @@
 """Reconstruct Gray-code images that another program took, with its OpenCV calibration; no service is needed.
 
-    python config/examples/import_folder.py images/ 1024x768 calibration.yml mesh/
+    python config/examples/import_folder.py images/ 1024x768 calibration.yml mesh/ cam0
 
 `images/` holds numbered images of one camera in the order of OpenCV's GrayCodePattern; `slrig import --help` lists
 other orders, and options for images that are named by their patterns.
@@ -13,13 +13,25 @@ import tempfile
 from pathlib import Path
 
 
-def main(images: str, projector: str, calibration: str, output: str) -> None:
-    """Write mesh.ply and report.json into `output`, and print the figures that matter."""
+def main(images: str, projector: str, calibration: str, output: str, camera: str = "cam0") -> None:
+    """Write mesh.ply and report.json into `output`, print figures. camera : its name in the calibration."""
     with tempfile.TemporaryDirectory() as scratch:
         bundle = str(Path(scratch) / "bundle")
         slrig = [sys.executable, "-m", "slrig.cli"]
         subprocess.run(
-            [*slrig, "import", images, "--projector", projector, "--calibration", calibration, "--output", bundle],
+            [
+                *slrig,
+                "import",
+                images,
+                "--projector",
+                projector,
+                "--calibration",
+                calibration,
+                "--camera",
+                camera,
+                "--output",
+                bundle,
+            ],
             check=True,
         )
         subprocess.run([*slrig, "reconstruct", bundle, "--output", output], check=True)
@@ -33,4 +45,4 @@ def main(images: str, projector: str, calibration: str, output: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:5])
+    main(*sys.argv[1:6])

@@ -10,10 +10,10 @@ from slrig.client import Client
 from slrig.client.events import Progress
 
 
-def main(views: int, output: str) -> None:
+def main(views: int, output: str, axis: dict[str, list[float]] | None) -> None:
     """Scan `views` views at equal angles, and write their model to `output`."""
     with Client() as client:
-        model = client.models.shoot(views=views, label=f"{views} views", if_busy="queue")
+        model = client.models.shoot(views=views, axis=axis, label=f"{views} views", if_busy="queue")
         for event in client.models.follow(model["id"]):
             if isinstance(event, Progress):
                 print(f"{event.fraction:4.0%} {event.stage} {event.detail}")
@@ -23,4 +23,5 @@ def main(views: int, output: str) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), sys.argv[2])
+    numbers = [float(word) for word in sys.argv[3:9]]
+    main(int(sys.argv[1]), sys.argv[2], {"point_mm": numbers[:3], "direction": numbers[3:]} if numbers else None)

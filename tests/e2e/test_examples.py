@@ -76,7 +76,7 @@ def test_region_and_preset(service: ServiceProcess, tmp_path: Path) -> None:
 
 
 def test_several_views(service: ServiceProcess, tmp_path: Path) -> None:
-    run("several_views.py", 3, "model.ply", folder=tmp_path, service=service)
+    run("several_views.py", 8, "model.ply", 2, 0, 1.5, 0.03, -1, -0.05, folder=tmp_path, service=service)
     assert (tmp_path / "model.ply").read_bytes().startswith(b"ply")
 
 
@@ -96,6 +96,6 @@ def test_import_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scan = Recorded(tmp_path / "rig", "opencv", monkeypatch)
     images = lay_out(tmp_path / "images", scan.images, "pattern_cam1_im{}.png", first=1)
     calibration = scan.folder / "calibration.json"
-    said = run("import_folder.py", images, "200x160", calibration, "mesh", folder=tmp_path)
+    said = run("import_folder.py", images, "200x160", calibration, "mesh", "left", folder=tmp_path)
     assert "vertices" in said
     assert (tmp_path / "mesh" / "mesh.ply").exists()
