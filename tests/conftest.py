@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -54,6 +55,10 @@ def pytest_configure(config: pytest.Config) -> None:
     """Take the variables of a person's shell away from tests and from what they start, before numba reads them."""
     for name in [name for name in os.environ if name.startswith(_OF_A_SHELL) and name not in _KEPT]:
         del os.environ[name]
+    # What runs in the background or under nohup ignores these signals, and so would every process of a test.
+    for number in (signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)
     # Where processes outnumber cores, threads of OpenBLAS wait for one another by spinning.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if folder := config.getoption("kernel_bounds"):

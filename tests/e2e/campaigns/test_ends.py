@@ -82,6 +82,8 @@ def test_an_end_at_any_step_loses_at_most_the_scan_of_that_step(
             follower = Follower(service, scan)
             service.process.send_signal(how)
             if how is not signal.SIGKILL:
+                while step is OPEN and "is ending" not in httpx2.get(f"{service.url}/readyz").text:
+                    pass  # Otherwise the driver may return before the signal arrives, and the scan begins.
                 desk.lift()
             assert service.gone() == (-how if how is signal.SIGKILL else 0)
         if how is signal.SIGKILL:
