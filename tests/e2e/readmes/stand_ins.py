@@ -92,7 +92,7 @@ STAND_INS = (
         ".ci/run makes an environment of its own by the same two commands, and this test runs in it",
     ),
     StandIn(
-        "python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]' && .venv/bin/pytest -q -n 2",
+        "python3 -m venv .venv && .venv/bin/pip install -q --no-compile -e '.[test]' && .venv/bin/pytest -q -n 2",
         None,
         "the test command: .ci/run runs it first of all, word for word",
     ),
