@@ -24,7 +24,6 @@ from tests.contract import (
     genicam_bench,
     gentl_bench,
     opencv_bench,
-    opencv_umockdev,
     v4l2_bench,
     v4l2_virtual,
 )
@@ -108,18 +107,6 @@ def picamera2(_: ExitStack, __: Path) -> Disturbed:
         return BenchHead({"left": pi.opened()}, StagedProjector(pi.stage), clock=pi.stage.clock)
 
     return Disturbed(open_head, pi.stage, sequence_for(PROJECTOR), 0.005)
-
-
-def opencv_device(leaving: ExitStack, folder: Path, *, stamp: str) -> Disturbed:
-    """By the kernel's stamps. Damaged buffers are not among the disturbances: OpenCV does not say which they are."""
-    faked = Faked(stamp=stamp, jitter_s=0.001, readout_s=0.001, bands=4, lost=0.1)
-    device = leaving.enter_context(opencv_umockdev.UmockdevDevice(folder, faked))
-
-    def open_head() -> BenchHead:
-        camera = device.open_camera(frame_rate_hz=200)
-        return BenchHead({"left": camera}, StagedProjector(device.stage))
-
-    return Disturbed(open_head, device.stage, sequence_for(v4l2_bench.PROJECTOR), 0.002)
 
 
 def opencv_network(
@@ -225,10 +212,6 @@ DISTURBED: Mapping[str, tuple[Opens, tuple[pytest.MarkDecorator, ...]]] = {
         for stamp in v4l2_bench.STAMPS
     },
     "picamera2": (picamera2, ()),
-    **{
-        f"opencv, stamps: {stamp}": (partial(opencv_device, stamp=stamp), (SLOW,))
-        for stamp in ("start", "first packet", "end")
-    },
     "opencv, network": (opencv_network, (PROMISED,)),
     "depthai": (oak, ()),
     "genicam, software trigger": (partial(genicam, free=False, latched=False), (SLOW,)),

@@ -1,4 +1,4 @@
-"""The OpenCV driver before staged light: a network camera on loopback, the same through a pipe, a kernel's fake device.
+"""The OpenCV driver before staged light: a network camera on loopback, and the same through a pipe.
 
 The network camera is a sensor that runs free, and a server that sends what it saw as JPEGs (multipart/x-mixed-replace,
 as network cameras do). OpenCV and everything above it are the real ones; what is not fetched waits in the buffers of

@@ -1,102 +1,127 @@
-"""A camera of the kernel's, by its stamps: real OpenCV over a fake device (umockdev).
+"""A camera of the kernel's, by its stamps: OpenCV's part is a stand-in, the kernel's that of `v4l2_virtual`.
 
-What every driver is asked, `tests/contract/test_contract.py` asks on the same device.
+OpenCV's own code, on a kernel's camera: `tests.contract.test_vivid`.
 """
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
-from slrig.devices import Camera, CameraSettings, Trigger
+from drivers.opencv import open_camera
+from drivers.opencv.camera import OpenCvCamera
+from slrig.devices import CameraSettings, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
-from tests.contract.opencv_umockdev import UmockdevDevice
 from tests.contract.v4l2_bench import CONTROLS, Faked, control
-
-pytestmark = pytest.mark.slow
+from tests.contract.v4l2_virtual import NODE, VirtualDevice, virtually
+from tests.unit.drivers.opencv.test_controls import Obstinate
 
 LONG_S = 10.0
-WHITE = np.full((1, 1), 255, np.uint8)
-Plug = Callable[..., UmockdevDevice]
+PERIOD_S = 0.002
+
+
+class Streaming(Obstinate):
+    """Gives a frame per period, its number in each pixel. flows : unset while it is silent. ahead_ns : of its stamps.
+
+    lost : frames that do not come.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.values |= {cv2.CAP_PROP_FPS: 1 / PERIOD_S, cv2.CAP_PROP_EXPOSURE: 3, cv2.CAP_PROP_BUFFERSIZE: 4}
+        self.flows, self.gone, self.ahead_ns, self.lost = threading.Event(), False, 0, 0
+        self.flows.set()
+        self.number, self._never = 0, threading.Event()
+
+    def isOpened(self) -> bool:  # noqa: N802 - OpenCV's names
+        return True
+
+    def release(self) -> None:
+        self.flows.set()
+
+    def read(self) -> tuple[bool, Any]:
+        assert self.flows.wait(LONG_S)
+        lost, self.lost = self.lost, 0
+        self._never.wait((1 + lost) * PERIOD_S)
+        self.number += 1
+        self.values[cv2.CAP_PROP_POS_MSEC] = (time.monotonic_ns() + self.ahead_ns) / 1e6
+        yuyv = np.full((480, 640, 2), self.number % 200, np.uint8)
+        return (False, None) if self.gone else (True, yuyv)
+
+
+Plug = Callable[..., tuple[Streaming, VirtualDevice]]
 
 
 @pytest.fixture
-def plugged(tmp_path: Path) -> Iterator[Plug]:
-    """Plug a fake camera in: `plugged(pixel format, **what it does)`."""
+def plugged(monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
+    """Plug a camera in: what OpenCV gives of it, and what the kernel says; `does` is what the kernel's side does."""
     with ExitStack() as leaving:
 
-        def plug(code: str = "GREY", **does: object) -> UmockdevDevice:
-            faked = Faked(formats={code: [(80, 60)]}, **does)  # type: ignore[arg-type]
-            return leaving.enter_context(UmockdevDevice(tmp_path, faked, code))
+        def plug(**does: Any) -> tuple[Streaming, VirtualDevice]:
+            capture = Streaming()
+            monkeypatch.setattr(cv2, "VideoCapture", lambda *_: capture)
+            return capture, leaving.enter_context(VirtualDevice(virtually(), Faked(**does)))
 
         yield plug
 
 
-def shows_white(camera: Camera, device: UmockdevDevice, *, most_dn: float = 8) -> None:
-    """Expect a frame of the light that is shown now."""
-    camera.configure(CameraSettings(0.01))
+def opened(**options: object) -> OpenCvCamera:
+    camera = open_camera("left", {"device": str(NODE), **options}, NODE.parent)
+    assert isinstance(camera, OpenCvCamera)
+    return camera
+
+
+def armed(**options: object) -> OpenCvCamera:
+    camera = opened(**options)
+    camera.configure(CameraSettings(0.001))
     camera.arm(1, Trigger.FREE)
-    frame = camera.read(device.stage.show(WHITE), LONG_S)
-    assert np.abs(frame.image.astype(int) - device.stage.expected(WHITE)).mean() < most_dn
-    camera.close()
+    return camera
 
 
-@pytest.mark.parametrize(("code", "bit_depth"), [("Y10 ", 10), ("Y16 ", 16), ("MJPG", 8)])
-def test_raw_formats_come_through_opencv(plugged: Plug, code: str, bit_depth: int) -> None:
-    device = plugged(code)
-    camera = device.open_camera(fourcc=code.strip())
-    assert camera.info.format.bit_depth == bit_depth
-    shows_white(camera, device, most_dn=0.05 * 2**bit_depth)
-
-
-def test_a_camera_declares_what_it_can_do_and_refuses_the_rest(plugged: Plug) -> None:
-    device = plugged()
-    for options, words in (
-        ({"fourcc": "MJPG"}, "asked for pixel format MJPG, the driver gives GREY"),
-        ({"size_px": [640, 480]}, "asked for 640 x 480, the driver gives 80 x 60"),
-        ({"focus": 251.0}, "focus 251, the driver"),
-    ):
-        with pytest.raises(UnsupportedByDeviceError, match=words):
-            device.open_camera(**options)
-    camera = device.open_camera()
+def test_a_camera_is_what_the_kernel_says_and_its_frames_are_those_of_its_stamps(plugged: Plug) -> None:
+    capture, _ = plugged()
+    camera = armed()
     info = camera.info
-    assert info.exposure_range_s == pytest.approx((0.0001, 0.04))
-    assert info.gain_range[0] == 1.0
+    assert (info.serial, set(info.triggers), str(info.format.size)) == (str(NODE), {Trigger.FREE}, "640 x 480")
+    assert info.exposure_range_s == pytest.approx((0.0003, 0.2047))
     assert "V4L2" in info.model
-    assert (info.serial, set(info.triggers)) == ("/dev/video0", {Trigger.FREE})
+    for _ in range(3):
+        after_ns = time.monotonic_ns()
+        frame = camera.read(after_ns, LONG_S)
+        assert after_ns <= frame.t_start_ns - frame.t_err_ns
+        assert frame.t_end_ns - frame.t_start_ns == 1_000_000
+        assert 0 <= capture.number - int(frame.image[0, 0]) <= 10, "one of the newest"
+    capture.lost = 50
+    assert camera.read(time.monotonic_ns() + 60_000_000, LONG_S).dropped_count > 5
     camera.close()
 
 
 def test_a_device_that_another_program_holds_is_busy(plugged: Plug) -> None:
-    device = plugged()
+    _, device = plugged()
     device.fault("busy")
     with pytest.raises(DeviceBusyError, match=r"/dev/video0: .*it is held"):
-        device.open_camera()
+        opened()
     device.fault("busy", on=False)
-    first = device.open_camera()
-    with pytest.raises(DeviceBusyError):
-        device.open_camera()
-    first.close()
-    device.open_camera().close()
+    opened().close()
 
 
 def test_a_camera_that_falls_silent_times_out_and_one_that_is_unplugged_is_gone(plugged: Plug) -> None:
-    device = plugged()
-    camera = device.open_camera()
-    camera.configure(CameraSettings(0.01))
-    camera.arm(1, Trigger.FREE)
-    camera.read(0, LONG_S)
-    device.fault("silent")
+    capture, device = plugged()
+    camera = armed()
+    capture.flows.clear()
     with pytest.raises(FrameTimeoutError, match="no frame that was exposed wholly after"):
-        camera.read(time.monotonic_ns(), 0.2)
-    device.fault("silent", on=False)
-    assert camera.read(time.monotonic_ns(), LONG_S).dropped_count > 0
+        camera.read(time.monotonic_ns() + 20_000_000, 0.05)
+    capture.flows.set()
+    assert camera.read(time.monotonic_ns(), LONG_S).image.size
     device.fault("unplugged")
+    capture.gone = True
     with pytest.raises(DeviceGoneError, match="/dev/video0 gives no more frames: it was unplugged"):
         camera.read(time.monotonic_ns() + 10**12, LONG_S)
     camera.disarm()
@@ -104,31 +129,29 @@ def test_a_camera_that_falls_silent_times_out_and_one_that_is_unplugged_is_gone(
         camera.arm(1, Trigger.FREE)
     camera.close()
     with pytest.raises(DeviceGoneError, match="the camera is gone: plug it in again"):
-        device.open_camera()
-    device.fault("unplugged", on=False)
-    device.open_camera().close()
+        opened()
 
 
 def test_stamps_of_another_clock_are_refused_unless_a_delay_is_given(plugged: Plug) -> None:
-    device = plugged(stamp="other clock")
-    camera = device.open_camera()
+    capture, _ = plugged()
+    capture.ahead_ns = 1_700_000_000 * 10**9
     with pytest.raises(UnsupportedByDeviceError, match=r"not of CLOCK_MONOTONIC.*write delay_s"):
-        camera.arm(1, Trigger.FREE)
+        armed()
+    camera = armed(delay_s=0.03, frame_rate_hz=1 / PERIOD_S)
+    assert camera.read(0, LONG_S).image.size
     camera.close()
-    shows_white(device.open_camera(delay_s=0.03), device)
 
 
 def test_image_processing_is_off_and_a_control_that_fails_is_noted(plugged: Plug) -> None:
     stuck = tuple({**each, "stalls": ["set"], "errno": 5} if each["name"] == "Contrast" else each for each in CONTROLS)
-    device = plugged(controls=(*stuck, control(0x00980912, "Gain, Automatic", 0, 1, 1)))
-    camera = device.open_camera(skip_controls=["backlight_compensation", "gain"])
+    _, device = plugged(controls=(*stuck, control(0x00980912, "Gain, Automatic", 0, 1, 1)))
+    camera = opened(skip_controls=["backlight_compensation", "gain"])
     [note] = camera.info.notes
     assert "asked contrast = 32, the driver refuses it" in note
     assert camera.info.gain_range == (1.0, 1.0)
-    known = device.controls_set()
+    known = device.kernel.controls_set
     assert (known["Sharpness"], known["Gamma"], known["Gain, Automatic"]) == (0, 100, 0)
     assert not known.keys() & {"Backlight Compensation", "Gain", "Contrast"}
-    assert camera.configure(CameraSettings(0.01)).least_period_s == pytest.approx(1 / 50)
     camera.close()
     with pytest.raises(UnsupportedByDeviceError, match="control 'gian', the device has: auto_exposure"):
-        device.open_camera(skip_controls=["gian"])
+        opened(skip_controls=["gian"])
