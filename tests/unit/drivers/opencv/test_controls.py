@@ -95,13 +95,10 @@ def test_what_the_driver_takes_is_agreed() -> None:
     capture = obstinate()
     negotiate(capture, options(fourcc="MJPG", size_px=(1280, 720), frame_rate_hz=29.97), "/dev/video0")
     # A pixel format first: it decides which extents and rates there are.
-    assert capture.order[1:] == [
-        cv2.CAP_PROP_FOURCC,
-        cv2.CAP_PROP_FRAME_WIDTH,
-        cv2.CAP_PROP_FRAME_HEIGHT,
+    assert capture.order == [
+        *(cv2.CAP_PROP_MODE, cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT),
         cv2.CAP_PROP_FPS,
     ]
-    assert capture.order[0] == cv2.CAP_PROP_MODE
 
 
 def test_every_automatic_is_switched_off_before_what_it_governs() -> None:

@@ -14,21 +14,22 @@ from slrig.errors import ConfigError
 LIVE = {"source_exposure_s": 0.01, "delay_s": 0.1, "frame_rate_hz": 30.0}
 
 
-def test_a_camera_is_opened_through_the_kernels_interface_by_its_stamps(tmp_path: Path) -> None:
-    for device in (0, "/dev/video0"):
-        source = source_of("eye", {"device": device}, tmp_path)
-        assert (source.kind, source.backend, source.target) == (Kind.DEVICE, cv2.CAP_V4L2, device)
-        assert source.label == "/dev/video0"
-
-
-def test_a_camera_may_be_read_without_its_stamps(tmp_path: Path) -> None:
-    source = source_of("eye", {"device": 0, "delay_s": 0.1, "frame_rate_hz": 30}, tmp_path)
-    assert (source.kind, source.backend) == (Kind.DEVICE, cv2.CAP_V4L2)
-
-
-def test_a_camera_of_another_back_end_is_a_live_source(tmp_path: Path) -> None:
-    source = source_of("eye", {"device": 0, "backend": "ffmpeg", **LIVE}, tmp_path)
-    assert (source.kind, source.backend) == (Kind.LIVE, cv2.CAP_FFMPEG)
+@pytest.mark.parametrize(
+    ("options", "kind", "backend"),
+    [
+        ({"device": 0}, Kind.DEVICE, cv2.CAP_V4L2),
+        ({"device": "/dev/video0"}, Kind.DEVICE, cv2.CAP_V4L2),
+        # Without its stamps, and through another back end.
+        ({"device": 0, "delay_s": 0.1, "frame_rate_hz": 30}, Kind.DEVICE, cv2.CAP_V4L2),
+        ({"device": 0, "backend": "ffmpeg", **LIVE}, Kind.LIVE, cv2.CAP_FFMPEG),
+    ],
+)
+def test_a_camera_is_opened_through_the_kernels_interface(
+    tmp_path: Path, options: dict[str, object], kind: Kind, backend: int
+) -> None:
+    source = source_of("eye", options, tmp_path)
+    assert (source.kind, source.backend, source.target) == (kind, backend, options["device"])
+    assert source.label == "/dev/video0"
 
 
 def test_an_address_is_a_live_source_and_its_password_is_not_shown(tmp_path: Path) -> None:

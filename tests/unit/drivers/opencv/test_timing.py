@@ -39,13 +39,6 @@ def test_a_stamp_of_another_clock_gives_itself_away() -> None:
     assert not is_of_this_clock(0, grabbed)
 
 
-def test_the_centre_is_claimed_and_both_ends_are_within_the_error() -> None:
-    start_ns, end_ns, error_ns = Exposure(100, 161).centred(20)
-    assert end_ns - start_ns == 20
-    assert start_ns - error_ns <= 100 <= start_ns + error_ns
-    assert end_ns + error_ns >= 161
-
-
 def test_a_frame_that_was_waited_for_arrived_after_the_wait_began() -> None:
     exposed = arrivals().exposed(waited(100, 118))
     assert exposed == Exposure((100 - 30 - 10) * MS, 118 * MS)

@@ -124,16 +124,14 @@ def test_without_options_the_best_format_that_is_fast_is_taken(
             camera.close()
 
 
-def test_a_slow_frame_rate_is_replaced_by_the_next_fast_one(plugged: Plug) -> None:
-    camera = plugged(Faked(rates=((1, 5), (1, 60), (1, 20), (1, 10)))).open_camera()
-    assert camera.configure(CameraSettings(0.01)).least_period_s == pytest.approx(1 / 20)
-    assert camera.info.notes == ()
-
-
 def test_the_least_period_is_that_of_the_frames_or_of_the_exposure(plugged: Plug) -> None:
     camera = plugged(Faked(stretches=True)).open_camera(**FAST)
     assert camera.configure(CameraSettings(0.002)).least_period_s == pytest.approx(0.005)
     assert camera.configure(CameraSettings(0.04)).least_period_s == pytest.approx(0.04)
+    # The usual rate is slow: the next fast one takes its place.
+    camera = plugged(Faked(rates=((1, 5), (1, 60), (1, 20), (1, 10)))).open_camera()
+    assert camera.configure(CameraSettings(0.01)).least_period_s == pytest.approx(1 / 20)
+    assert camera.info.notes == ()
 
 
 def test_a_device_without_controls_exposes_for_a_frame_period(plugged: Plug) -> None:
@@ -313,13 +311,7 @@ def test_every_pixel_format_gives_the_scene(plugged: Plug, code: str) -> None:
     assert camera.info.format == stage.format
     assert (frame.colour is not None) == camera.info.colour == (code in {"YUYV", "UYVY", "MJPG", "RG10"})
     if frame.colour is not None:
-        # The scene is grey, and later frames change nothing.
-        stage.show(np.zeros((1, 1), np.uint8))
-        for _ in range(8):
-            camera.read(stage.clock.now_ns(), 2)
-        colour = frame.colour()
-        assert colour.dtype == frame.image.dtype
-        assert np.abs(colour[2:-2, 2:-2].astype(float) - expected[2:-2, 2:-2, None]).max() <= 2 * tolerance + 1
+        assert frame.colour().dtype == frame.image.dtype
 
 
 def test_a_16_bit_format_may_have_fewer_bits(plugged: Plug) -> None:
@@ -339,21 +331,6 @@ def test_settings_have_taken_effect_when_the_camera_is_armed(plugged: Plug) -> N
         frame = camera.read(0, 2)
         np.testing.assert_array_equal(frame.image, stage.expected(WHITE, exposure_s=exposure_s * gain))
         camera.disarm()
-
-
-@pytest.mark.parametrize("stamp", ["start", "first packet", "end", "none", "other clock"])
-def test_the_claimed_interval_holds_the_exposure_of_every_row(plugged: Plug, stamp: str) -> None:
-    readout_s = 0.002
-    device = plugged(Faked(stamp=stamp, readout_s=readout_s, jitter_s=0.001, lost=0.1))
-    camera = armed(device)
-    for _ in range(40):
-        after_ns = device.clock.now_ns()
-        frame = camera.read(after_ns, 2)
-        shot = next(each for each in reversed(device.sensor.asked) if each["number"] == frame.sequence_number)
-        end_ns = shot["start_ns"] + shot["exposure_ns"] + round(readout_s * 1e9)
-        assert after_ns <= frame.t_start_ns - frame.t_err_ns <= shot["start_ns"]
-        assert end_ns <= frame.t_end_ns + frame.t_err_ns
-        assert frame.t_end_ns - frame.t_start_ns == round(frame.exposure_s * 1e9)
 
 
 def test_a_known_read_out_narrows_the_claim(plugged: Plug) -> None:

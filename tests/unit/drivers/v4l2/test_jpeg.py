@@ -85,16 +85,11 @@ def test_a_few_bytes_behind_the_last_block_are_usual_and_many_are_not() -> None:
         assert (jpeg.fault_of(frame) == "") is whole
 
 
-def test_restart_markers_out_of_turn_are_found() -> None:
+def test_restart_markers_out_of_turn_and_a_cut_are_found() -> None:
     data = bytearray(bytes(picture("restarts")))
-    at = data.index(b"\xff\xd3")
-    data[at + 1] = 0xD5
+    data[data.index(b"\xff\xd3") + 1] = 0xD5
     assert "restart" in jpeg.fault_of(np.frombuffer(bytes(data), np.uint8))
-
-
-@pytest.mark.parametrize("kept", [2, 30, 200, 600, 30_000])
-def test_a_jpeg_that_was_cut_is_found(kept: int) -> None:
-    assert "early" in jpeg.fault_of(picture()[:kept])
+    assert all("early" in jpeg.fault_of(picture()[:kept]) for kept in (2, 30, 200, 600, 30_000))
 
 
 def test_damage_anywhere_never_breaks_the_walk() -> None:
