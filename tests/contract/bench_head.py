@@ -27,7 +27,6 @@ class BenchHead:
         return None
 
     def truth(self) -> Truth | None:
-        """See `Head`."""
         return None
 
 

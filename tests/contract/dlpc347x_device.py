@@ -107,7 +107,6 @@ class Fake347x:
         self._relight()
 
     def write(self, data: bytes) -> None:
-        """See `Port`."""
         if self.gone:
             raise OSError(errno.EREMOTEIO, "Remote I/O error")
         with self._lock:

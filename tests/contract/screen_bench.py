@@ -69,7 +69,6 @@ class ScreenCamera(WiredCamera):
         self._seen: dict[int, Future[tuple[NDArray[np.float64], int]]] = {}
 
     def close(self) -> None:
-        """See `Camera`."""
         super().close()
         self._sensor.shutdown()
         self._pixels.close()

@@ -115,38 +115,31 @@ class StagedProjector:
 
     @property
     def info(self) -> ProjectorInfo:
-        """See `Projector`."""
         size = self._stage.scene.projector
         return ProjectorInfo("projector", "staged projector", "stage", size, False, self._stage.latency_s)
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`."""
         self._state.require_open()
         self._state.require_size(sequence, self._stage.scene.projector)
         self.blank()
         self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
-        """See `Projector`."""
         at_ns = self._stage.show(self._state.require_pattern(index).profiles[index])
         self._stage.clock.wait_until(at_ns + self._err_ns, self._state.closed)
         return Shown(index, at_ns, self._err_ns)
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`."""
         self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
-        """See `Projector`."""
         self.blank()
 
     def blank(self) -> None:
-        """See `Projector`."""
         if not self._state.closed.is_set():
             self._stage.show(None)
 
     def close(self) -> None:
-        """See `Projector`."""
         self.blank()
         self._state.loaded = None
         self._state.closed.set()

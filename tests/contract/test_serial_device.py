@@ -6,20 +6,18 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from itertools import groupby
 from pathlib import Path
-from typing import cast
 
 import pytest
 
-from drivers.serial_projector import open_projector
-from drivers.serial_projector.projector import SerialProjector
 from slrig.errors import DeviceGoneError
-from tests.unit.drivers.serial_projector.conftest import SEQUENCE, Bench
-from tests.unit.drivers.serial_projector.line import Line, Noise
+from tests.unit.drivers.serial_projector.conftest import CRC32, SEQUENCE, Bench
+from tests.unit.drivers.serial_projector.engines import CoreEngine, Scene, description
+from tests.unit.drivers.serial_projector.line import Line, Noise, SerialLine
 
 ROOT = Path(__file__).resolve().parents[2]
 LOSS = CORRUPTION = 0.08
@@ -94,48 +92,21 @@ def test_sessions_over_a_bad_line_are_exact(sessions: int) -> None:
     assert min(tallied.again, tallied.lost, tallied.damaged, tallied.reopened) > sessions / 4
 
 
-# Hosts that die, and boxes that measure how long that takes.
+# Hosts that die, in processes of their own.
 
+HOST = """
+import sys
+from pathlib import Path
+from drivers.serial_projector import open_projector
+from tests.unit.drivers.serial_projector.conftest import SEQUENCE
 
-@dataclass
-class BoxProcess:
-    """A box in a process of its own. `lights` : (pattern or None, CLOCK_MONOTONIC ns), as they come."""
-
-    process: subprocess.Popen[str]
-    port: str
-    hosts: list[subprocess.Popen[str]] = field(default_factory=list)
-
-    def next_light(self) -> tuple[int | None, int]:
-        assert self.process.stdout is not None
-        word, pattern, t_ns = self.process.stdout.readline().split()
-        assert word == "light"
-        return (None if pattern == "-" else int(pattern)), int(t_ns)
-
-    def host(self, doing: str, watchdog_s: float) -> subprocess.Popen[str]:
-        """A host that has lit it."""
-        self.hosts.append(_started(doing, self.port, str(watchdog_s)))
-        assert self.hosts[-1].stdout is not None
-        assert self.hosts[-1].stdout.readline() == "lit\n"
-        return self.hosts[-1]
-
-
-@pytest.fixture
-def box() -> Iterator[BoxProcess]:
-    process = _started("box")
-    assert process.stdout is not None
-    box = BoxProcess(process, process.stdout.readline().split()[1])
-    yield box
-    for host in box.hosts:
-        host.kill()
-        host.communicate(timeout=LONG_S)
-    process.communicate(timeout=LONG_S)
-
-
-def _started(*words: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "tests.unit.drivers.serial_projector.processes", *words]
-    return subprocess.Popen(  # noqa: S603 - our own module
-        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+projector = open_projector({"port": sys.argv[1], "watchdog_s": float(sys.argv[2])}, Path())
+projector.load(SEQUENCE)
+projector.show(3)
+print("lit", flush=True)
+sys.stdin.readline()
+raise RuntimeError("an error that is not caught")
+"""
 
 
 @pytest.mark.realtime
@@ -144,34 +115,28 @@ def _started(*words: str) -> subprocess.Popen[str]:
     [(signal.SIGKILL, 0.25), (signal.SIGKILL, 1.0), (signal.SIGTERM, 0.25), (signal.SIGSTOP, 0.25), (None, 0.25)],
 )
 def test_a_host_that_dies_leaves_darkness_within_the_watchdogs_time(
-    box: BoxProcess, end: signal.Signals | None, watchdog_s: float
+    end: signal.Signals | None, watchdog_s: float
 ) -> None:
-    host = box.host("show" if end else "crash", watchdog_s)
-    assert box.next_light()[0] == 3
-    ended_ns = time.monotonic_ns()
-    if end is not None:
-        host.send_signal(end)
-    pattern, dark_ns = box.next_light()
-    assert pattern is None
-    assert 0 < (dark_ns - ended_ns) / 1e9 <= watchdog_s + SLACK_S
-
-
-@pytest.mark.realtime
-def test_a_host_that_is_killed_ends_a_play(box: BoxProcess) -> None:
-    host = box.host("play", 0.25)
-    assert box.next_light()[0] == 0
-    ended_ns = time.monotonic_ns()
-    host.kill()
-    host.wait(LONG_S)
-    lights = [box.next_light()]
-    # A host that comes after it finds the box dark, and may have it.
-    again = cast("SerialProjector", open_projector({"port": box.port}, Path()))
-    again.load(SEQUENCE)
-    again.show(25)
-    while lights[-1][0] != 25:
-        lights.append(box.next_light())
-    again.close()
-    *played, _ = lights
-    assert played[-1][0] is None
-    assert (played[-1][1] - ended_ns) / 1e9 <= 0.25 + SLACK_S
-    assert max(pattern for pattern, _ in played if pattern is not None) <= 3
+    dark = threading.Event()
+    scene = Scene(watch=[lambda pattern: dark.set() if pattern is None else None])
+    line = SerialLine(CoreEngine(scene, description(CRC32)))
+    with subprocess.Popen(  # noqa: S603 - our own program
+        [sys.executable, "-c", HOST, line.path, str(watchdog_s)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        cwd=ROOT,
+    ) as host:
+        assert host.stdout is not None
+        assert host.stdin is not None
+        assert host.stdout.readline() == b"lit\n"
+        ended_ns = time.monotonic_ns()
+        if end is None:
+            host.stdin.close()
+        else:
+            host.send_signal(end)
+        assert dark.wait(LONG_S)
+        host.kill()
+    line.close()
+    assert [change.pattern for change in scene.changes] == [3, None]
+    assert 0 < (scene.changes[-1].t_ns - ended_ns) / 1e9 <= watchdog_s + SLACK_S

@@ -153,7 +153,6 @@ class MemoryLine(Line):
         self._rest, self._cut = b"", False
 
     def read(self, timeout_s: float) -> bytes:
-        """See `Port`."""
         until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while True:
             self.catch_up()
@@ -166,7 +165,6 @@ class MemoryLine(Line):
             self._clock.wait_until(until_ns if due_ns is None else min(due_ns, until_ns), self._never)
 
     def write(self, data: bytes) -> None:
-        """See `Port`."""
         self.catch_up()
         self._require_plugged()
         with self._lock:

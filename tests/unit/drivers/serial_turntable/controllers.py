@@ -57,7 +57,6 @@ class Board(ABC):
         self._sent = b""
 
     def read(self, timeout_s: float) -> bytes:
-        """See `Port`."""
         self._require_plugged()
         if not self._sent:
             self.clock.wait_until(self.clock.now_ns() + round(timeout_s * 1e9), self._never)
@@ -65,7 +64,6 @@ class Board(ABC):
         return data
 
     def write(self, data: bytes) -> None:
-        """See `Port`."""
         self._require_plugged()
         for value in data:
             byte = bytes([value])
