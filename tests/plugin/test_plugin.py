@@ -78,9 +78,12 @@ def test_devices_lists_what_is_installed_found_broken_and_missing(
     example_site: Path, broken_site: Path, tmp_path: Path
 ) -> None:
     path = path_with(example_site, broken_site)
-    runs = [slrig("devices", *arguments, path=path, folder=tmp_path) for arguments in (["--json"], [])]
-    assert all(done.returncode == 0 and "Traceback" not in done.stdout + done.stderr for done in runs)
-    document: dict[str, Any] = json.loads(runs[0].stdout)
+    done = slrig("devices", "--json", path=path, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    # What a plug-in prints is not part of our answer.
+    assert "Vendor SDK" in done.stderr
+    document: dict[str, Any] = json.loads(done.stdout)
     drivers = {(driver["kind"], driver["name"]): driver for driver in document["drivers"]}
     example = drivers["camera", "example_chart"]
     assert (example["package"], example["version"], example["fault"]) == ("example-slrig-camera", "1.0", None)
@@ -96,20 +99,6 @@ def test_devices_lists_what_is_installed_found_broken_and_missing(
     assert drivers["camera", "broken_factory"]["fault"] is None
     lacking = {library["driver"]: library["install"] for library in document["missing"]}
     assert lacking["lacking"] == "pip install 'slrig-lacking-library[vendor]'"
-
-    # For people: causes and commands whole, and columns as wide as what else is plugged in.
-    shown = runs[1].stdout
-    assert "chart-1 test chart, soft stripes" in " ".join(shown.split())
-    for words in (
-        "  lacking: pip install 'slrig-lacking-library[vendor]'\n",
-        "RuntimeError: built for firmware [2.x], found 3.1",
-        "  to remove it: pip uninstall slrig-broken-import\n",
-        "Not looked for: finder driver 'broken_finder' failed: OSError: [Errno 5] the bus does not answer",
-    ):
-        assert words in shown
-    # What a plug-in prints is not part of our answer.
-    assert "Vendor SDK" not in shown
-    assert "Vendor SDK" in runs[1].stderr
 
 
 def test_options_are_listed_if_a_driver_describes_them(example_site: Path, tmp_path: Path) -> None:
