@@ -75,13 +75,11 @@ class WiredTable:
         self._camera: WiredCamera | None = None
 
     def head(self, projector: Projector) -> BenchHead:
-        """The projector and a new camera."""
         self._camera = WiredCamera(
             "left", self.stage, usual_s=self._usual_s, exposures_s=self._exposures_s, gains=(1.0, 8.0)
         )
         return BenchHead({"left": self._camera}, projector)
 
     def pulse(self, t_ns: int) -> None:
-        """An edge of the engine's trigger output."""
         if self._camera is not None:
             self._camera.pulse(t_ns)

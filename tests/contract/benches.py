@@ -58,7 +58,6 @@ def eyes(**options: object) -> list[dict[str, object]]:
 
 
 def beamer(**options: object) -> dict[str, object]:
-    """The projector between them."""
     return {
         "size_px": [PROJECTOR.width_px, PROJECTOR.height_px],
         "focal_px": [440.0, 440.0],
@@ -71,7 +70,6 @@ def beamer(**options: object) -> dict[str, object]:
 
 
 def simulated(folder: Path, *, realtime: bool = False, **head: object) -> Bench:
-    """The rendered rig before a plate."""
     (folder / "plate.toml").write_text(PLATE)
     options: dict[str, object] = {
         "scene": "plate.toml",

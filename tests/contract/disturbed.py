@@ -86,7 +86,6 @@ Opens = Callable[[ExitStack, Path], Disturbed]
 
 
 def v4l2(leaving: ExitStack, _: Path, *, stamp: str) -> Disturbed:
-    """A rolling shutter."""
     faked = Faked(
         stamp=stamp, readout_s=0.0015, bands=4, jitter_s=0.001, lost=0.1, corrupt=0.05, noise_when_corrupt=False
     )
@@ -142,7 +141,6 @@ def opencv_network(
 
 
 def oak(_: ExitStack, __: Path) -> Disturbed:
-    """A pair of one device."""
     library = pytest.importorskip("tests.unit.drivers.depthai.fake_oak")
     small = Size(64, 48)
     scene = Scene(camera=small, projector=small, columns_per_px=0.8, noise_dn=0.3)

@@ -29,11 +29,9 @@ class Table(WiredTable):
         self.engine = Fake347x(light=self._change, pulse=self.pulse, **engine)
 
     def opened(self) -> LightEngine:
-        """The driver on a new bus."""
         return LightEngine(Bus(self.engine, "light engine"), EngineOptions.model_validate(_USUAL))
 
     def connected(self) -> BenchHead:
-        """The driver on a new bus, and a new camera."""
         return self.head(self.opened())
 
     def _change(self, lit: Pixels | None, at_ns: int) -> None:

@@ -88,12 +88,10 @@ class Fake347x:
 
     @property
     def running(self) -> bool:
-        """Whether a sequence is under way."""
         return self._halt is not None
 
     @property
     def lit(self) -> Pixels | None:
-        """What is on the scene; None: nothing."""
         return self._lit
 
     def close(self) -> None:

@@ -57,12 +57,10 @@ class Table(WiredTable):
         self.engine = FakeEngine(pictures, **options)
 
     def options(self, **more: object) -> dict[str, object]:
-        """The engine's table in a rig file."""
         usual = {"patterns": PICTURES, "image_load_s": _MOST_LOAD_S, "light_margin_s": 0.002}
         return {**usual, "led_current_inverted": True, **more}
 
     def connected(self, **more: object) -> BenchHead:
-        """The driver at the other end of a new cable."""
         link = Link(Cable(self.engine).host, "light engine", DLPC350)
         options = EngineOptions.model_validate(self.options(**more))
         return self.head(LightEngine(link, options, read_flash(self.folder / PICTURES), serial="LC4500-1"))
@@ -73,7 +71,6 @@ class Table(WiredTable):
 
 
 def bench(folder: Path) -> Bench:
-    """The contract suite's bench."""
     shown = whole_scan(MIRRORS)
     table = Table(folder, shown)
     return Bench(table.connected, shown)
@@ -155,7 +152,6 @@ def _await_node(find_devices: Callable[[], object]) -> None:
 
 
 def main(target: Path) -> None:
-    """Run the contract suite and the checks on the kernel's node, and write what came of each."""
     # Two pictures' worth of patterns.
     table = Table(target.parent, whole_scan(MIRRORS, rows=True))
     _PLUGGED[id(table)] = UhidEngine(table.engine)

@@ -123,12 +123,10 @@ class FakeEngine:
 
     @property
     def running(self) -> bool:
-        """Whether a sequence is under way."""
         return self._halt is not None
 
     @property
     def lit(self) -> Pixels | None:
-        """What is on the scene; None: nothing."""
         return self._lit
 
     def unplug(self) -> None:
@@ -347,7 +345,6 @@ class Cable:
         self._serving.start()
 
     def unplug(self) -> None:
-        """Pull it out."""
         self.engine.unplug()
         with suppress(OSError):
             self._far.shutdown(socket.SHUT_RDWR)
@@ -415,7 +412,6 @@ class UhidEngine:
         self._serving.start()
 
     def unplug(self) -> None:
-        """Pull it out."""
         if not self._gone.is_set():
             self._gone.set()
             self.engine.unplug()

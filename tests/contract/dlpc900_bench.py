@@ -28,7 +28,6 @@ class Table(WiredTable):
         self.engine = Fake900(light=self.stage.show, pulse=self.pulse, **engine)
 
     def connected(self, **more: object) -> BenchHead:
-        """The driver at the other end of a new cable, and a new camera."""
         link = Link(Cable(self.engine).host, "light engine", DLPC900, answer_s=5.0)
         return self.head(LightEngine(link, EngineOptions.model_validate(_USUAL | more), serial="LCR6500-1"))
 
@@ -38,5 +37,4 @@ class Table(WiredTable):
 
 
 def bench(_: Path) -> Bench:
-    """The contract suite's bench."""
     return Bench(Table().connected, whole_scan(MIRRORS))

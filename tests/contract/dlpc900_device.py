@@ -78,7 +78,6 @@ class Fake900(FakeEngine):
 
     @property
     def size(self) -> Size:
-        """Columns and rows."""
         return _SIZES[self.mirrors]
 
     def _told(self, command: int) -> bytes | None:

@@ -113,7 +113,6 @@ class FakeGigE:
         atexit.register(self.stop)
 
     def pulse(self) -> None:
-        """A pulse on the trigger line (sfnc)."""
         assert self._process is not None
         assert self._process.stdin is not None
         self._process.stdin.write("pulse\n")
@@ -165,18 +164,15 @@ class FakeGigE:
 
 
 def table(**options: object) -> dict[str, object]:
-    """The `[[camera]]` table of the fake camera."""
     region = {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px}
     return {"device": INTERFACE, "region": region, **options}
 
 
 def scene(**options: int | float) -> Scene:
-    """What the fake camera looks at."""
     return Scene(camera=CAMERA, projector=PROJECTOR, columns_per_px=0.5, rows_per_px=0.5, white=0.4, **options)  # type: ignore[arg-type]
 
 
 def opened(**options: object) -> GenicamCamera:
-    """The driver's camera."""
     camera = open_camera("left", table(**options), Path())
     assert isinstance(camera, GenicamCamera)
     return camera

@@ -45,7 +45,6 @@ def _producer() -> FakeProducer:
 
 @contextmanager
 def serving(camera: MemoryCamera) -> Iterator[FakeProducer]:
-    """The producer, with this camera plugged in."""
     require_harvesters()
     producer = _producer()
     producer.serve(camera)
@@ -54,7 +53,6 @@ def serving(camera: MemoryCamera) -> Iterator[FakeProducer]:
 
 
 def opened(served: FakeProducer, **options: object) -> GenicamCamera:
-    """The driver's camera."""
     region = {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px}
     device = f"slrig-memory-{served.camera.serial}"
     table = {"device": device, "producer": str(served.file), "region": region, **options}

@@ -151,7 +151,6 @@ class MemoryCamera:
         self._thread: threading.Thread | None = None
 
     def read(self, address: int, count: int) -> bytes:
-        """Bytes at an address. Raises KeyError: there is nothing."""
         if address >= XML_ADDRESS:
             at = address - XML_ADDRESS
             return self.xml[at : at + count]
@@ -181,12 +180,10 @@ class MemoryCamera:
                 self._values["TimestampLatchValue"] = time.monotonic_ns() + CLOCK_ZERO_NS
 
     def pulse(self) -> None:
-        """A pulse on Line1."""
         if not self._exposing and self._values["TriggerSource"] == 1:
             self._triggered.release()
 
     def stop(self) -> None:
-        """End the acquisition. Idempotent."""
         self._running.clear()
         self._triggered.release()
         if self._thread is not None:

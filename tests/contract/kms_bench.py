@@ -168,7 +168,6 @@ def another_connector_of_the_same_card(heads: Heads, notes: Notes) -> None:
 
 
 def spawned(index: int, *, dark_after_s: float) -> int:
-    """Another process that shows a pattern, and then does nothing."""
     told, tells = os.pipe()
     child = os.fork()
     if child == 0:
@@ -302,7 +301,6 @@ CHECKS: tuple[Callable[[Heads, Notes], None], ...] = (
 
 
 def main(target: Path, host_folder: str, chosen: list[str]) -> None:
-    """Run the checks and the contract suite, and write what came of each."""
     heads = Heads(Monitor(host_folder))
     told: dict[str, object] = {}
     for check in CHECKS:

@@ -211,7 +211,6 @@ class LiveCamera:
 
 
 def live_rig(stage: Stage, webcam: Webcam, *, refresh_hz: float) -> Rig:
-    """A display and one webcam, which exposes for a refresh."""
     camera = LiveCamera("eye", stage, webcam)
     return Rig(
         "live", {"eye": camera}, LiveDisplay(stage, refresh_hz=refresh_hz), {"eye": CameraSettings(1 / refresh_hz)}

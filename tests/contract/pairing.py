@@ -62,7 +62,6 @@ class Gaps:
     _never: threading.Event = field(default_factory=threading.Event)
 
     def idle(self) -> None:
-        """Let some time pass."""
         length_s = float(self.rng.choice([0.0, 0.1, 1.0], p=[0.6, 0.3, 0.1]) * self.rng.random()) * self.longest_s
         if length_s > 0:
             self.rig.clock.wait_until(self.rig.clock.now_ns() + round(length_s * 1e9), self._never)
@@ -89,7 +88,6 @@ class Unproven(Evidence):
     """Believes every frame: what is left is what the driver itself keeps away."""
 
     def contradictions(self, shot: Shot) -> tuple[Contradiction, ...]:
-        """Find nothing."""
         del shot
         return ()
 
@@ -158,7 +156,6 @@ class Truths:
 
     @classmethod
     def of(cls, camera: str, sequence: PatternSequence, expected: Expected) -> Truths:
-        """Ask for all of them."""
         images = np.stack([expected(camera, index) for index in range(len(sequence))]).astype(np.float32)
         contrast = float(np.percentile(images.max(axis=0) - images.min(axis=0), 95))
         return cls(camera, sequence.patterns, images, contrast)

@@ -130,12 +130,10 @@ class DummyServer:
         return name
 
     def kill(self) -> None:
-        """End the server as a crash does."""
         self._process.kill()
         self._process.wait(10)
 
     def close(self) -> None:
-        """End the server."""
         self._process.terminate()
         try:
             self._process.wait(10)
@@ -203,7 +201,6 @@ class OutputPixels:
         return self.colours()[..., 1]
 
     def close(self) -> None:
-        """Leave the server. Idempotent."""
         display, self._display = self._display, None
         if display:
             self._xlib.XCloseDisplay(display)

@@ -51,7 +51,6 @@ class Stage:
 
     @property
     def format(self) -> CameraFormat:
-        """The sensor's."""
         return self.scene.format
 
     def show(self, profile: Pixels | None, *, asked_ns: int | None = None) -> int:

@@ -73,7 +73,6 @@ def grbl(_folder: Path) -> Bench:
 
 
 def lines(_folder: Path) -> Bench:
-    """A board that counts left-handed."""
     board = LineBoard(steps=36000)
     return Bench(partial(board.opened, reversed=True), lambda: -board.at_deg)
 

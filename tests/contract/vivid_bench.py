@@ -31,7 +31,6 @@ _CUT_NS = 1_000
 
 @cache
 def stage() -> Stage:
-    """What the camera sees of a pattern."""
     return Stage(Scene(camera=CAMERA, projector=PROJECTOR))
 
 
@@ -59,7 +58,6 @@ def output(instance: int) -> Output:
 
 
 def expected(profile: Pixels | None) -> Pixels:
-    """(H, W) uint8: what the camera sees of a pattern."""
     return stage().expected(profile)
 
 
@@ -90,7 +88,6 @@ class LoopedProjector(StagedProjector):
 
 
 def options(instance: int, driver: str = "v4l2", /, **more: object) -> dict[str, object]:
-    """The camera's table in a rig file."""
     return {
         "device": str(camera_node(instance).path),
         "size_px": [CAMERA.width_px, CAMERA.height_px],
@@ -100,7 +97,6 @@ def options(instance: int, driver: str = "v4l2", /, **more: object) -> dict[str,
 
 
 def head(folder: Path, driver: str = "v4l2") -> BenchHead:
-    """A driver's camera before the looped projector."""
     projector = LoopedProjector(output(0))
     return BenchHead({"left": DRIVERS[driver]("left", options(0, driver), folder)}, projector)
 

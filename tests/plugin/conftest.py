@@ -56,7 +56,6 @@ def pip_fetch(requirement: str, work: Path) -> Path:
 
 
 def path_with(*sites: Path) -> str:
-    """PYTHONPATH with these folders first."""
     known = os.environ.get("PYTHONPATH")
     return os.pathsep.join([*map(str, sites), *([known] if known else [])])
 

@@ -28,7 +28,6 @@ RULE = "start_ns - STAMP_ERROR_NS >= after_ns"
 
 
 def fenced(marker: str, language: str) -> str:
-    """The fenced block of the README under a marker."""
     block = re.search(rf"<!-- {marker} -->\n```{language}\n(.*?)```\n", README.read_text(encoding="utf-8"), re.DOTALL)
     assert block is not None
     return block.group(1)

@@ -106,7 +106,6 @@ def run_in_guest(
 
 
 def machine_needs() -> None:
-    """Raise GuestUnavailableError if the guest cannot be run here."""
     _qemu()
     fetch_kernel()
 
@@ -178,7 +177,6 @@ def _killed(machine: subprocess.Popen[str]) -> str:
 
 
 def _escaped(path: Path) -> str:
-    """A path as QEMU's options want it."""
     return str(path).replace(",", ",,")
 
 

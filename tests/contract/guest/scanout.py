@@ -56,7 +56,6 @@ class Monitor:
                 self._heard += os.read(self._port, 4096)
 
     def dump(self, device: str, head: int, name: str) -> Path:
-        """Write what a display shows to a file, and return it."""
         self.ask("screendump", filename=f"{self._host_folder}/{name}", device=device, head=head)
         return Path(SHARE) / name
 

@@ -97,13 +97,11 @@ class Node:
         self._file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
 
     def close(self) -> None:
-        """Idempotent."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
 
     def set(self, control: int, value: int = 1) -> None:
-        """Set a control; a button is pressed by any value."""
         self._ask(kernel.S_CTRL, kernel.ControlValue(control, value))
 
     def set_named(self, name: str, value: int) -> None:

@@ -52,7 +52,6 @@ BLACK, WHITE = 5, 6
 
 @contextmanager
 def armed(camera: Camera) -> Iterator[Camera]:
-    """The camera, set and armed; closed afterwards."""
     try:
         camera.configure(usual_settings(camera))
         camera.arm(10_000, Trigger.FREE)

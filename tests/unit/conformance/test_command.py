@@ -21,7 +21,6 @@ LATE = "a_frame_lies_wholly_in_its_pattern"
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Path:
-    """A rig file; what it opens is the tests' own."""
     path = tmp_path / "rig.toml"
     path.write_text('name = "small"\n[head]\ndriver = "absent"\n')
     return path

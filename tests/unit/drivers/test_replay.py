@@ -75,7 +75,6 @@ def frames(head: Head, patterns: Sequence[Pattern], *, exposure_s: float = 0.02)
 
 
 def values(head: Head, patterns: Sequence[Pattern], *, exposure_s: float = 0.02) -> list[int]:
-    """Play a sequence; return the value of each frame."""
     return [int(frame.image[0, 0]) for _, frame in frames(head, patterns, exposure_s=exposure_s)]
 
 

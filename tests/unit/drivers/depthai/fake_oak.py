@@ -101,7 +101,6 @@ class FakeOak:
         return self.opened > self.closed
 
     def unplug(self) -> None:
-        """Pull the cable."""
         self.plugged_in = False
         self.unplugged.set()
 
@@ -113,7 +112,6 @@ class FakeOak:
 
     @contextmanager
     def connected(self) -> Iterator[None]:
-        """The library sees this device, and no other."""
         oak = self
 
         class Device(FakeDevice):

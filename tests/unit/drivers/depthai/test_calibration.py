@@ -32,7 +32,6 @@ RIGHT_CM = [-7.5, 0.1, -0.05]
 
 
 def handler(*, distortion: list[float] = BROWN, model: Any = None, cameras: str = "BC") -> Any:
-    """What a device has stored: the left camera, and the right one 75 mm beside it."""
     stored = dai.CalibrationHandler()
     for letter in cameras:
         socket = getattr(dai.CameraBoardSocket, f"CAM_{letter}")

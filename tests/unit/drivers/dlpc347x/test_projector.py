@@ -40,7 +40,6 @@ class Bench(Bench347x):
         super().__init__(flashed, **engine)
 
     def sent(self, command: int) -> list[str]:
-        """The data of a command, as often as it was sent."""
         return [data.hex() for each, data in self.engine.commands if each == command]
 
 

@@ -65,7 +65,6 @@ class Host:
 
 
 def tied(host: Host, lag_ns: Interval = AT_START) -> StartClock:
-    """A clock that was looked at five times."""
     clock = StartClock(lag_ns)
     assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
     return clock

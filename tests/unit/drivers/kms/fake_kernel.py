@@ -88,7 +88,6 @@ class FakeKernel:
             self.plug(number, self.connected[number])
 
     def plug(self, number: int, there: bool) -> None:
-        """Put a display in, or pull it."""
         self.connected[number] = there
         folder = self.system / f"card0-HDMI-A-{number - 10}"
         (folder / "status").write_text("connected\n" if there else "disconnected\n")
@@ -209,7 +208,6 @@ class FakeKernel:
         self.flipped(told.user_data)
 
     def flipped(self, number: int) -> None:
-        """Tell that a picture was flipped to."""
         stamp = self.stamp()
         event = kernel.FlipEvent(type=kernel.EVENT_FLIP_COMPLETE, length=32, user_data=number, tv_sec=stamp // 10**9)
         event.tv_usec = stamp % 10**9 // 1000

@@ -21,7 +21,6 @@ OPTIONS: dict[str, object] = {"device": "film.avi", "source_exposure_s": EXPOSUR
 
 
 def write_film(path: Path, images: list[Pixels]) -> None:
-    """Write a film without loss."""
     rows, columns = images[0].shape
     film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), RATE_HZ, (columns, rows), False)
     assert film.isOpened()

@@ -40,7 +40,6 @@ def before(light: Stage, *, network: NetworkCamera | None = None, **options: Any
 
 
 def read_on(camera: Camera, timeout_s: float = LONG_S) -> None:
-    """Read until it fails."""
     while True:
         camera.read(time.monotonic_ns(), timeout_s)
 

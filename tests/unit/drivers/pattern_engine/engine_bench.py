@@ -74,7 +74,6 @@ class Bench(ABC):
         return found
 
     def shows(self, profile: Pixels) -> bool:
-        """Whether a pattern is lit."""
         lit = self.engine.lit
         return lit is not None and np.array_equal(lit, profile)
 

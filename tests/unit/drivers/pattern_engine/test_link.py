@@ -41,7 +41,6 @@ def linked(engine: FakeEngine, *, answer_s: float = 5.0) -> Link:
 
 
 def answered(number: int, data: bytes, *, flags: int = 0xC0) -> bytes:
-    """An answer's reports, one after the other."""
     message = bytes([flags, number]) + len(data).to_bytes(2, "little") + data
     return message.ljust(-(-len(message) // 64) * 64, b"\0")
 

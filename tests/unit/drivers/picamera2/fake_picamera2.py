@@ -62,13 +62,11 @@ class Pi:
 
     @contextmanager
     def connected(self) -> Iterator[None]:
-        """Where `picamera2` is this."""
         library = types.SimpleNamespace(Picamera2=self._library())
         with mock.patch.dict(sys.modules, {"picamera2": library}):
             yield
 
     def opened(self, **options: object) -> PiCamera:
-        """The driver's camera, on the stage's time."""
         with self.connected():
             table = PiCameraOptions.model_validate({"device": self.identity, **options})
             return PiCamera("left", table, clock=self.stage.clock)

@@ -81,7 +81,6 @@ def server(running: DummyServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Du
 
 @pytest.fixture
 def right(server: DummyServer) -> Iterator[OutputPixels]:
-    """What the output on the right shows."""
     pixels = OutputPixels(server.display, (SIZE.width_px, 0), SIZE)
     yield pixels
     pixels.close()

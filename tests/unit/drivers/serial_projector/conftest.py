@@ -21,7 +21,6 @@ SIZE = Size(400, 300)
 
 
 def whole_sequence(size: Size = SIZE, *, line_width_px: int = 1) -> PatternSequence:
-    """The 26 patterns of a usual scan at 400 x 300."""
     patterns = scan_patterns(
         size, line_shift=True, period_px=8, line_width_px=line_width_px, gray_cell_px=None, gray_offset_px=0, rows=False
     )
@@ -43,32 +42,27 @@ class Bench:
         self._opened: list[SerialProjector] = []
 
     def open(self, folder: Path = Path(), **options: Any) -> SerialProjector:
-        """The driver at the other end of the line."""
         table = SerialProjectorOptions(port="the line", **options)
         projector = SerialProjector(self.line.opened, table, export_folder=folder / "patterns", clock=self.clock)
         self._opened.append(projector)
         return projector
 
     def loaded(self, **options: Any) -> SerialProjector:
-        """The same, with SEQUENCE."""
         projector = self.open(**options)
         projector.load(SEQUENCE)
         return projector
 
     def advance(self, seconds: float) -> None:
-        """Let time pass, for host and box."""
         self.clock.advance(seconds)
         self.line.catch_up()
 
     @property
     def lit(self) -> int | None:
-        """The pattern of the flash that is lit now."""
         self.line.catch_up()
         return self.scene.lit
 
     @property
     def patterns(self) -> list[int]:
-        """All that were lit, in order."""
         return [pattern for pattern, _boot in self.scene.shown]
 
     def close(self) -> None:

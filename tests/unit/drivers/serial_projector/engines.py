@@ -102,7 +102,6 @@ class FakeLight(Hardware):
 
 
 def description(crc32: Sequence[int], *, width_px: int = 400, height_px: int = 300) -> Description:
-    """A box with these patterns in its flash."""
     return Description(
         "test-box",
         "1.0.0",
@@ -143,5 +142,4 @@ class CoreEngine:
         return None if wait_us < 0 else wait_us / 1e6
 
     def close(self) -> None:
-        """Power it off."""
         self.scene.change(None, 0)

@@ -29,7 +29,6 @@ class Board:
                     self.value(value)
 
             def value(self, value: "int | None" = None) -> int:
-                """Set it, or tell it."""
                 if value is not None:
                     board.levels[self.number] = value
                     board.did.append((board.now_us, f"{self.number}={value}"))
@@ -43,7 +42,6 @@ class Board:
                 self.duty_u16(duty_u16)
 
             def duty_u16(self, level: int) -> None:
-                """Set it."""
                 self.pin.value(level)
 
         class StateMachine:
@@ -53,7 +51,6 @@ class Board:
                 self.us, self.pin, self.is_active = 1000000 // freq, set_base, 0
 
             def active(self, active: int) -> None:
-                """Start it."""
                 self.is_active = active
 
             def put(self, word: int) -> None:
@@ -118,9 +115,7 @@ class Board:
         return self.now_us % (1 << 30)
 
     def ticks_diff(self, later: int, earlier: int) -> int:
-        """As the real one."""
         return (later - earlier + (1 << 29)) % (1 << 30) - (1 << 29)
 
     def sleep_us(self, us: int) -> None:
-        """As the real one."""
         self.now_us += us

@@ -127,7 +127,6 @@ class MemoryLine(Line):
         self._lock = threading.RLock()
 
     def opened(self) -> MemoryLine:
-        """The host's end."""
         if self._cut:
             message = "asked to open the line, there is none such"
             raise DeviceGoneError(message)
@@ -135,7 +134,6 @@ class MemoryLine(Line):
         return self
 
     def catch_up(self) -> None:
-        """Let the box do what is due by now."""
         scene, now_ns = self.engine.scene, self._clock.now_ns()
         assert scene.at_ns is not None
         with self._lock:
@@ -149,7 +147,6 @@ class MemoryLine(Line):
         self._cut = True
 
     def plug_in(self) -> None:
-        """Plug the cable in again."""
         self._rest, self._cut = b"", False
 
     def read(self, timeout_s: float) -> bytes:

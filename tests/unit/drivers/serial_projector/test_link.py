@@ -124,7 +124,6 @@ class ScriptedPort:
 
 
 def answer(data: bytes, text: str) -> bytes:
-    """A good answer to a line."""
     session, number = data.decode().split()[:2]
     return framed(f"{session} {number} {text}")
 

@@ -68,7 +68,6 @@ class Light(Hardware):
 
     @property
     def shown(self) -> list[int]:
-        """The patterns that were lit, in order."""
         shown = []
         for index, each in enumerate(self.did):
             if each == "light":

@@ -49,7 +49,6 @@ class Board(ABC):
             self._sent += data
 
     def unplug(self) -> None:
-        """The cable is pulled."""
         self._unplugged = True
 
     def close(self) -> None:
