@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slrig.devices import Clock, SystemClock
+from slrig.devices import Clock
 from slrig.model import Pixels
-from tests.contract.dlpc350_device import SEQUENCER, WHITE
+from tests.contract.dlpc350_device import Sequencer
 
 _LENGTHS = {0x05: 1, 0x50: 1, 0x52: 1, 0x54: 6, 0x90: 1, 0x92: 5, 0x98: 25, 0x9E: 2, 0xDE: 4, 0xDF: 2, 0xE0: 4}
 _READS = bytes.fromhex("06 51 53 55 5d 91 93 99 9d 9f d0 d1 d2 d3 d4 dd e3 e4")
@@ -40,7 +40,7 @@ class _Entry:
     first: int
 
 
-class Fake347x:
+class Fake347x(Sequencer):
     """Implements `drivers.dlpc347x.bus.Port`.
 
     light, pulse : told of every change of light (None: dark), and of every edge of TRIG_OUT_2, and when (ns).
@@ -61,8 +61,7 @@ class Fake347x:
         room: int = 65536,
         clock: Clock | None = None,
     ) -> None:
-        self.commands: list[tuple[int, bytes]] = []
-        self.shown: list[Pixels | None] = []
+        super().__init__(clock)
         self.bent: dict[int, bytes] = {}
         self.gone = False
         self.registers = {0x05: b"\0", 0x50: b"\1", 0x52: b"\7", 0x54: struct.pack("<3H", 900, 900, 900), 0x90: b"\1"}
@@ -73,26 +72,13 @@ class Fake347x:
         self._light, self._pulse = light, pulse
         self._controller, self._entry_bytes, self._most_entries = controller, entry_bytes, most_entries
         self._counts_first = counts_first
-        self._clock = clock or SystemClock()
         self._communication = self._sequence = self._system = 0
         self._short = 0x81 & ~1
         self._length = self._at = 0
         self._kind = b""
         self._answer = b""
-        self._halt: threading.Event | None = None
-        self._mirrors: Pixels | None = WHITE
         self._leds = 7
-        self._lit: Pixels | None = None
-        self._lock = threading.RLock()
         self._relight()
-
-    @property
-    def running(self) -> bool:
-        return self._halt is not None
-
-    @property
-    def lit(self) -> Pixels | None:
-        return self._lit
 
     def close(self) -> None:
         """See `Port`. The engine goes on."""
@@ -100,9 +86,7 @@ class Fake347x:
     def unplug(self) -> None:
         """Without power, there is no light, and no answer."""
         self.gone = True
-        self._stop()
-        self._mirrors = None
-        self._relight()
+        super().unplug()
 
     def write(self, data: bytes) -> None:
         if self.gone:
@@ -239,9 +223,7 @@ class Fake347x:
         elif data[0] == 0 and self.registers[0x05] == b"\4" and self.order and not self.running:
             times = data[1] + (0 if self._counts_first else 1)
             steps = [(entry, self._lines(entry)) for entry in map(_unpacked, self.order)]
-            self._halt = threading.Event()
-            played = (self._halt, steps, 2**31 if data[1] == 255 else times)
-            threading.Thread(target=self._run, args=played, name=SEQUENCER, daemon=True).start()
+            self._play(self._run, steps, 2**31 if data[1] == 255 else times)
         else:
             self._refuse(2)
 
@@ -267,7 +249,7 @@ class Fake347x:
             )
         return lines
 
-    def _run(self, halt: threading.Event, steps: list[tuple[_Entry, list[Pixels]]], times: int) -> None:
+    def _run(self, halt: threading.Event, steps: list[tuple[_Entry, list[Pixels]]], times: int) -> bool:
         # By a clock of its own: a thread that comes late tells of what was, for an engine's times are even.
         at_ns = self._clock.now_ns()
         for _ in range(times):
@@ -275,17 +257,15 @@ class Fake347x:
                 for line in lines:
                     at_ns += entry.before_us * 1000
                     if not self._change(halt, at_ns, line, entry.leds):
-                        return
+                        return False
                     if self.triggers[1][0] & 2:
                         self._pulse(at_ns)
                     at_ns += entry.light_us * 1000
                     if not self._change(halt, at_ns, line, 0):
-                        return
+                        return False
                     at_ns += entry.after_us * 1000
         self._clock.wait_until(at_ns, halt)
-        with self._lock:
-            if self._halt is halt:
-                self._halt = None
+        return True
 
     def _change(self, halt: threading.Event, at_ns: int, mirrors: Pixels, leds: int) -> bool:
         self._clock.wait_until(at_ns, halt)
@@ -296,17 +276,9 @@ class Fake347x:
             self._relight(at_ns)
         return True
 
-    def _stop(self) -> None:
-        """What was lit stays lit: the LEDs are for their enables."""
-        halt, self._halt = self._halt, None
-        if halt is not None:
-            halt.set()
-
     def _relight(self, at_ns: int | None = None) -> None:
         lit = self._mirrors if self._leds & self.registers[0x52][0] else None
-        if lit is not self._lit:
-            self._lit = lit
-            self.shown.append(lit)
+        if self._is_fresh(lit):
             self._light(lit, self._clock.now_ns() if at_ns is None else at_ns)
 
 

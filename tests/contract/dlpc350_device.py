@@ -61,7 +61,57 @@ class Faults:
     stale_answer: bool = False
 
 
-class FakeEngine:
+class Sequencer:
+    """What fake engines have in common: a light, and a thread that plays. It wakes up with the light on."""
+
+    def __init__(self, clock: Clock | None) -> None:
+        self.commands: list[tuple[int, bytes]] = []
+        self.shown: list[Pixels | None] = []
+        self.lit: Pixels | None = None
+        self._clock = clock or SystemClock()
+        self._mirrors: Pixels | None = WHITE
+        self._halt: threading.Event | None = None
+        self._lock = threading.RLock()
+
+    @property
+    def running(self) -> bool:
+        return self._halt is not None
+
+    def unplug(self) -> None:
+        """Without power, there is no light."""
+        self._stop()
+        self._mirrors = None
+        self._relight()
+
+    def _play(self, run: Callable[..., object], *what: object) -> None:
+        """Play on a thread: `run` gets what ends it, and returns whether nothing did."""
+        self._halt = halt = threading.Event()
+
+        def play() -> None:
+            if run(halt, *what):
+                with self._lock:
+                    self._halt = None if self._halt is halt else self._halt
+
+        threading.Thread(target=play, name=SEQUENCER, daemon=True).start()
+
+    def _stop(self) -> None:
+        halt, self._halt = self._halt, None
+        if halt is not None:
+            halt.set()
+
+    def _relight(self) -> None:
+        raise NotImplementedError
+
+    def _is_fresh(self, lit: Pixels | None) -> bool:
+        """Take note of light; whether it has changed."""
+        if lit is self.lit:
+            return False
+        self.lit = lit
+        self.shown.append(lit)
+        return True
+
+
+class FakeEngine(Sequencer):
     """A controller with pictures in its flash.
 
     Parameters
@@ -94,9 +144,8 @@ class FakeEngine:
         led_inverted: bool | None = None,
         clock: Clock | None = None,
     ) -> None:
+        super().__init__(clock)
         self.faults = Faults()
-        self.commands: list[tuple[int, bytes]] = []
-        self.shown: list[Pixels | None] = []
         self.tag = tag
         self.registers: dict[int, bytes] = {
             **{command: bytes(length) for command, length in (_SETTINGS | _AT_ANY_TIME).items()},
@@ -108,31 +157,12 @@ class FakeEngine:
         self._planes = {index: _planes(picture) for index, picture in pictures.items()}
         self._light, self._pulse, self._load_s = light, pulse, load_s
         self._keeps, self._led_inverted = keeps, led_inverted
-        self._clock = clock or SystemClock()
         self._buffered: list[int] = []
         self._mailboxes = {1: bytearray(64), 2: bytearray(128 * 3)}
-        self._mirrors: Pixels | None = WHITE
-        self._lit: Pixels | None = None
         self._validated: int | None = None
         self._hardware = 1
         self._busy = 0
         self._pending: tuple[bytearray, int] | None = None
-        self._halt: threading.Event | None = None
-        self._lock = threading.RLock()
-        self._relight()
-
-    @property
-    def running(self) -> bool:
-        return self._halt is not None
-
-    @property
-    def lit(self) -> Pixels | None:
-        return self._lit
-
-    def unplug(self) -> None:
-        """Without power, there is no light."""
-        self._stop()
-        self._mirrors = None
         self._relight()
 
     def take(self, report: bytes) -> bytes | None:
@@ -206,8 +236,7 @@ class FakeEngine:
         if data == b"\0":
             self._stop()
         elif data == b"\2" and self._validated == 0 and self.registers[0x1A1B] == b"\1" and not self.running:
-            self._halt = threading.Event()
-            threading.Thread(target=self._run, args=(self._halt,), name=SEQUENCER, daemon=True).start()
+            self._play(self._run)
         else:
             return None
         return b""
@@ -239,7 +268,7 @@ class FakeEngine:
             found |= 16
         return found
 
-    def _run(self, halt: threading.Event) -> None:
+    def _run(self, halt: threading.Event) -> bool:
         entries, images = self._entries(), self._images()
         exposure_us, period_us = struct.unpack("<II", self.registers[0x1A29])
         swaps = -1
@@ -248,7 +277,7 @@ class FakeEngine:
         kept = self._keeps and self._buffered == images
         self._buffered = images
         if self._halted(halt, 0.0 if kept else self._load_s):
-            return
+            return False
         for entry in entries:
             if entry >> 18 & 1:
                 swaps += 1
@@ -258,14 +287,12 @@ class FakeEngine:
                         swaps -= 1
                     loaded_ns = self._clock.now_ns() + round(self._load_s * 1e9)
             if not self._step(halt, self._planes[images[swaps]], entry, exposure_us / 1e6):
-                return
+                return False
             if entry >> 17 & 1 and not self._change(halt, None):
-                return
+                return False
             if self._halted(halt, (period_us - exposure_us) / 1e6):
-                return
-        with self._lock:
-            if self._halt is halt:
-                self._halt = None
+                return False
+        return True
 
     def _step(self, halt: threading.Event, planes: tuple[Pixels, ...], entry: int, exposure_s: float) -> bool:
         plane = planes[entry >> 2 & 0x3F]
@@ -288,11 +315,6 @@ class FakeEngine:
             self._relight()
         return True
 
-    def _stop(self) -> None:
-        halt, self._halt = self._halt, None
-        if halt is not None:
-            halt.set()
-
     def _relight(self) -> None:
         """Light is what the mirrors send of the LEDs that are on."""
         awake = self.registers[0x0200] == b"\0"
@@ -301,9 +323,7 @@ class FakeEngine:
         if lit is not None and self._led_inverted is not None:
             share = max(self.registers[0x0B01]) / 255
             lit = np.rint(lit * (1 - share if self._led_inverted else share)).astype(np.uint8)
-        if lit is not self._lit:
-            self._lit = lit
-            self.shown.append(lit)
+        if self._is_fresh(lit):
             self._light(lit)
 
 

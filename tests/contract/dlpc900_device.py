@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from slrig.devices import Clock
 from slrig.model import Pixels, Size
-from tests.contract.dlpc350_device import SEQUENCER, FakeEngine, profile_of, repeated
+from tests.contract.dlpc350_device import FakeEngine, profile_of, repeated
 
 _SETTINGS = {0x0B01: 3, 0x1008: 1, 0x1009: 1, 0x1A05: 1, 0x1A1D: 5, 0x1A30: 1}
 _ANY_TIME = {0x0200: 1, 0x1A07: 1}
@@ -210,30 +210,27 @@ class Fake900(FakeEngine):
         steps = [self._effective[index] for index in self._order]
         for step in steps:
             self._profile(step)
-        self._halt = threading.Event()
-        threading.Thread(target=self._show, args=(self._halt, steps, shown), name=SEQUENCER, daemon=True).start()
+        self._play(self._show, steps, shown)
         return b""
 
-    def _show(self, halt: threading.Event, steps: list[_Entry], shown: int) -> None:
+    def _show(self, halt: threading.Event, steps: list[_Entry], shown: int) -> bool:
         triggered = False
         for number in range(shown):
             entry = steps[number % len(steps)]
             if not self._change(halt, self._profile(entry) if entry.leds else None):
-                return
+                return False
             if not triggered:
                 self._pulse(self._clock.now_ns())
             triggered = True
             if self._halted(halt, entry.exposure_us / 1e6):
-                return
+                return False
             if entry.cleared and entry.dark_us:
                 triggered = False
                 if not self._change(halt, None):
-                    return
+                    return False
             if self._halted(halt, entry.dark_us / 1e6):
-                return
-        with self._lock:
-            if self._halt is halt:
-                self._halt = None
+                return False
+        return True
 
 
 def unpacked(content: bytes, size: Size) -> NDArray[np.uint32] | None:
