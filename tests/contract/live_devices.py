@@ -7,7 +7,6 @@ runs by itself, stamps a frame when its first packet comes, delivers it later, a
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +27,6 @@ from slrig.devices import (
 from slrig.errors import FrameTimeoutError
 from slrig.model import Frame, Pixels
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.wired_camera import WiredCamera
 
 BUFFERS = 4
 
@@ -70,37 +68,6 @@ class LiveDisplay(StagedProjector):
         self._stage.show(profile, asked_ns=flip_ns)
         self._stage.clock.wait_until(flip_ns, self._state.closed)
         return flip_ns
-
-
-class LivePlayer(LiveDisplay):
-    """An engine that plays by itself, and sends a pulse to the cameras with each pattern."""
-
-    def __init__(self, stage: Stage, cameras: Sequence[WiredCamera]) -> None:
-        super().__init__(stage)
-        self._cameras = cameras
-        self.played_s = 0.0
-
-    @property
-    def info(self) -> ProjectorInfo:
-        return replace(super().info, plays=True, refresh_s=None)
-
-    def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. All of it is written down at once, and comes about by itself."""
-        sequence = self._state.require_loaded("play")
-        begun_ns = self._stage.clock.now_ns() + 5_000_000
-        self.played_s = len(sequence) * period_s
-        for index, profile in enumerate(sequence.profiles):
-            t_ns = begun_ns + round(index * period_s * 1e9)
-            self._stage.show(profile, asked_ns=t_ns)
-            self._stage.show(None, asked_ns=t_ns + round((exposure_s + self.info.gap_s / 2) * 1e9))
-            for camera in self._cameras:
-                camera.pulse(t_ns)
-
-    def stop(self) -> None:
-        """Nothing is left to be stopped."""
-
-    def blank(self) -> None:
-        self._stage.show(None)
 
 
 @dataclass(frozen=True, slots=True)

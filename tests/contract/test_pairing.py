@@ -11,17 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_rig.device import SimulatedHead
-from slrig.bundle.refused import Refused
-from slrig.capture.sequencer import capture
 from slrig.devices import Camera, Rig
-from slrig.errors import DeviceGoneError, FrameTimeoutError, ScanEvidenceError, SlrigError
 from slrig.model import Frame, Shot
 from tests.contract.benches import beamer, eyes, simulated
 from tests.contract.disturbed import DISTURBED, Opens, opencv_network
 from tests.contract.genicam_bench import FreeOnly
 from tests.contract.pairing import FRAMES, Expected, PairingResult, Truths, seen_by, wrong_pairings
-from tests.contract.suite import Bench, rig_of
+from tests.contract.suite import Bench
 
 FEW = 60
 """Frames that a test counts where a longer one counts FRAMES."""
@@ -166,68 +162,3 @@ def test_a_frame_is_wrong_when_it_is_nearer_to_another_pattern_or_damaged(sound:
     damaged = images[5].copy()
     damaged[40:50] = 255 - damaged[40:50]
     assert truths.wrong(Shot(5, "left", damaged)) == "camera 'left': the frame paired with pattern 5 is damaged"
-
-
-# ---- faults one by one, on the rendered rig
-
-LATER = list(range(4, 200))
-
-
-def captured(folder: Path, faults: dict[str, object], refused: list[Refused]) -> list[Shot]:
-    bench = simulated(folder, faults=faults)
-    with bench.head() as head:
-        assert isinstance(head, SimulatedHead)
-        try:
-            return list(capture(rig_of(head), bench.sequence, refused=refused.append))
-        finally:
-            assert not head.projector.lit
-
-
-@pytest.mark.parametrize(
-    ("faults", "kind", "words"),
-    [
-        (
-            {"drop_frames": LATER[1:], "cameras": ["left"]},
-            FrameTimeoutError,
-            r"'left', pattern 5 .*failed 3 times.*no frame came within",
-        ),
-        (
-            {"stale_frames": LATER, "cameras": ["right"]},
-            ScanEvidenceError,
-            r"'right', pattern 4 .*failed 3 times.*equals that of pattern 3",
-        ),
-        ({"corrupt_frames": LATER}, ScanEvidenceError, r"'left', pattern 4 .*failed 3 times"),
-        ({"corrupt_probability": 1.0}, ScanEvidenceError, r"'left', pattern 0 .*failed 3 times"),
-        ({"stale_probability": 1.0}, ScanEvidenceError, r"failed 3 times"),
-        ({"unplug_camera_at_frame": 3}, DeviceGoneError, "gone"),
-        ({"unplug_projector_at_show": 3}, DeviceGoneError, "gone"),
-        ({"lamp_off": True}, ScanEvidenceError, "is the lamp off"),
-        # Light that comes a whole exposure after the projector says so.
-        ({"light_delay_s": 0.05}, ScanEvidenceError, "pattern"),
-    ],
-)
-def test_a_fault_that_stays_ends_a_capture_in_the_dark(
-    tmp_path: Path, faults: dict[str, object], kind: type[SlrigError], words: str
-) -> None:
-    with pytest.raises(kind, match=words):
-        captured(tmp_path, faults, [])
-
-
-@pytest.mark.parametrize(
-    ("faults", "again"),
-    [
-        ({"drop_frames": [5, 7], "corrupt_frames": [0, 1, 10], "stale_frames": [16, 25], "cameras": ["left"]}, True),
-        ({"stale_frames": [4], "corrupt_frames": [16], "late_frames": [6], "cameras": ["right"]}, True),
-        ({"late_frames": [5], "jitter_s": 0.02}, False),
-    ],
-    ids=str,
-)
-def test_a_fault_that_passes_is_overcome(
-    tmp_path: Path, sound: Bench, truth: Expected, faults: dict[str, object], again: bool
-) -> None:
-    refused: list[Refused] = []
-    latest = {(shot.camera, shot.pattern): shot for shot in captured(tmp_path, faults, refused)}
-    assert len(latest) == 2 * len(sound.sequence)
-    assert bool(refused) == again
-    truths = {name: Truths.of(name, sound.sequence, truth) for name in ("left", "right")}
-    assert [words for shot in latest.values() if (words := truths[shot.camera].wrong(shot))] == []

@@ -8,16 +8,14 @@ import pytest
 
 from slrig.capture.latency import measure_latency
 from slrig.capture.sequencer import capture
-from slrig.devices import CameraSettings, Clock, Rig, Synchronisation, SystemClock
+from slrig.devices import Rig, Synchronisation, Trigger
 from slrig.errors import FrameTimeoutError
 from slrig.model import Pixels, Size
 from slrig.patterns.sequence import encode
-from tests.contract.live_devices import LivePlayer, Webcam, live_rig
+from tests.contract.live_devices import Webcam, live_rig
 from tests.contract.pairing import FRAMES, wrong_pairings
 from tests.contract.stage import REFERENCE_EXPOSURE_S, Stage
-from tests.contract.wired_camera import WiredCamera
-from tests.unit.capture.fake_rig import Scene, patterns_for
-from tests.virtual_clock import VirtualClock
+from tests.unit.capture.fake_rig import PROJECTOR, CameraFaults, Scene, fake_rig, patterns_for
 
 SIZE = Size(2048, 96)
 SEQUENCE = encode(patterns_for(SIZE), SIZE)
@@ -28,18 +26,11 @@ DISTURBED = {"lost": 0.1, "damaged": 0.05, "jitter_s": 0.002}
 HOLDS_S = 0.03
 
 
-def stage(
-    exposure_s: float,
-    size: Size = SIZE,
-    *,
-    latency_s: float = 0.03,
-    jitter_s: float = 0.001,
-    clock: Clock | None = None,
-) -> Stage:
+def stage(exposure_s: float, size: Size = SIZE) -> Stage:
     """A display whose light is late, now and then by 1 ms more; as bright at any exposure."""
     scene = Scene(noise_dn=1.0, white=0.6 * REFERENCE_EXPOSURE_S / exposure_s, projector=size)
     scene.column_px += (size.width_px - SMALL.width_px) / 2
-    return Stage(scene, latency_s=latency_s, jitter_s=jitter_s, clock=clock)
+    return Stage(scene, latency_s=0.03, jitter_s=0.001)
 
 
 @dataclass(frozen=True)
@@ -83,21 +74,18 @@ def test_no_frame_is_paired_wrongly(fps: float, disturbed: dict[str, float], pro
     assert result.refused_scans < result.scans / 2
 
 
-def wired(exposure_s: float, *, readout_s: float, tells: bool = True, clock: Clock | None = None) -> Rig:
-    clock = clock or SystemClock()
-    where = stage(exposure_s, latency_s=0.0, jitter_s=0.0, clock=clock)
-    camera = WiredCamera("eye", where, readout_s=readout_s, tells=tells, clock=clock)
-    settings = {"eye": CameraSettings(exposure_s)}
-    return Rig("wired", {"eye": camera}, LivePlayer(where, [camera]), settings, clock=clock)
-
-
 def test_a_camera_that_misses_every_second_pulse_is_played_to_more_slowly() -> None:
-    rig = wired(0.005, readout_s=1 / 60, tells=False, clock=VirtualClock())
+    missed = CameraFaults(drop=frozenset(range(1, 22, 2)))
+    wired = {"eye": frozenset({Trigger.HARDWARE})}
+    fake = fake_rig(cameras=["eye"], projector={"plays": True}, triggers=wired, faults={"eye": missed})
     causes: list[str] = []
-    frames = list(capture(rig, SEQUENCE, refused=lambda refused: causes.append(refused.cause)))
-    assert {shot.pattern for shot in frames} == set(range(len(SEQUENCE)))
+    sequence = encode(patterns_for(PROJECTOR), PROJECTOR)
+    frames = list(capture(fake.rig, sequence, refused=lambda refused: causes.append(refused.cause)))
+    assert {shot.pattern for shot in frames} == set(range(len(sequence)))
     assert causes
-    assert all("missed every second pulse" in cause and "trigger_period_s = 0.02 " in cause for cause in causes)
+    assert all("missed every second pulse" in cause and "trigger_period_s = " in cause for cause in causes)
+    (first_s, first_period_s), (second_s, second_period_s) = fake.world.periods_s
+    assert (first_s, second_period_s) == (second_s, pytest.approx(2 * first_period_s))
 
 
 def test_a_camera_that_gives_no_frame_ends_a_capture() -> None:
