@@ -47,13 +47,6 @@ class NetworkCamera:
     cut: float = 0.0
     seed: int = 0
     gone: threading.Event = field(default_factory=threading.Event)
-    _sent: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
-
-    def sends(self, count: int) -> bool:
-        """Wait until so many more frames were sent; False if they are not, for long."""
-        while self._sent.acquire(blocking=False):
-            pass
-        return all(self._sent.acquire(timeout=10) for _ in range(count))
 
     def parts(self) -> Iterator[bytes]:
         """What one client is sent, part by part, in time, until the camera is gone."""
@@ -77,7 +70,6 @@ class NetworkCamera:
                 end, again = rng.choice([(len(sent) // 2, len(sent)), (len(sent) - 300, len(sent) - 200)])
                 sent = sent[:end] + sent[again:]
             if not lost and time.monotonic_ns() < end_ns + self.delay_s * 1e9:
-                self._sent.release()
                 yield b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(sent) + sent + b"\r\n"
 
     def options(self, device: str) -> dict[str, object]:

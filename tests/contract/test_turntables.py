@@ -114,14 +114,11 @@ def test_it_knows_the_axis_about_which_it_turns_or_none(bench: Bench) -> None:
 
 
 def test_it_conforms(bench: Bench) -> None:
-    class Turned(Maker):
-        """Opens a rig with the turntable."""
-
-        def __call__(self) -> Rig:
-            return replace(super().__call__(), positioner=bench.opened())
+    def turned(rig: Rig) -> Rig:
+        return replace(rig, positioner=bench.opened())
 
     check = next(check for check in CHECKS if check.name == "a_positioner_takes_its_poses_and_no_others")
-    with Examination(Turned(), sequence()) as examination:
+    with Examination(Maker(change=turned), sequence()) as examination:
         result = examination.judge(check)
     assert result.outcome is Outcome.PASSED, str(result.failure)
 

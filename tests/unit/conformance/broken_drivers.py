@@ -59,9 +59,7 @@ class DeliversStale(ModelCamera):
 
 
 @breaks("read_passes_over_stale_frames", "free trigger")
-class DeliversStaleFreely(DeliversStale):
-    """As above, running freely: what waits in the driver's buffers comes first."""
-
+class _DeliversStaleFreely(DeliversStale):
     triggers = RunsFreely.triggers
 
 
@@ -116,27 +114,21 @@ class Hangs(ModelCamera):
 
 
 @breaks("trigger_and_read_need_an_armed_camera")
-class TriggersUnarmed(ModelCamera):
-    """Ignores a trigger in the wrong state."""
-
+class _TriggersUnarmed(ModelCamera):
     def trigger(self) -> None:
         if self.armed is Trigger.SOFTWARE:
             super().trigger()
 
 
 @breaks("a_free_running_camera_needs_no_trigger")
-class TriggersWhileFree(ModelCamera):
-    """Ignores a trigger that it does not need."""
-
+class _TriggersWhileFree(ModelCamera):
     def trigger(self) -> None:
         if self.armed is not Trigger.FREE:
             super().trigger()
 
 
 @breaks("a_wire_without_pulses_gives_no_frame")
-class FiresWithoutPulse(ModelCamera):
-    """Runs freely while it is armed for wire triggers."""
-
+class _FiresWithoutPulse(ModelCamera):
     def next_exposure(self, deadline_ns: int) -> Exposure | None:
         if self.armed is Trigger.HARDWARE:
             self.run_freely()
@@ -144,9 +136,7 @@ class FiresWithoutPulse(ModelCamera):
 
 
 @breaks("triggers_that_are_not_declared_are_refused")
-class ArmsAnyTrigger(ModelCamera):
-    """Arms for what it does not declare."""
-
+class _ArmsAnyTrigger(ModelCamera):
     triggers = frozenset({Trigger.SOFTWARE})
 
     def arm(self, count: int, trigger: Trigger) -> None:
@@ -154,9 +144,7 @@ class ArmsAnyTrigger(ModelCamera):
 
 
 @breaks("triggers_that_are_not_declared_are_refused")
-class ArmsForNothing(ModelCamera):
-    """Arms for no frames."""
-
+class _ArmsForNothing(ModelCamera):
     def arm(self, count: int, trigger: Trigger) -> None:
         super().arm(max(count, 1), trigger)
 
@@ -177,16 +165,12 @@ class KeepsOldFrames(ModelCamera):
 
 
 @breaks("arming_again_starts_afresh", "of white's light")
-class KeepsOldFramesFreely(KeepsOldFrames):
-    """As above, running freely."""
-
+class _KeepsOldFramesFreely(KeepsOldFrames):
     triggers = RunsFreely.triggers
 
 
 @breaks("an_armed_camera_refuses_to_be_set_or_armed")
-class SetWhileArmed(ModelCamera):
-    """Takes settings while it is armed."""
-
+class _SetWhileArmed(ModelCamera):
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         armed, self.armed = self.armed, None
         applied = super().configure(settings)
@@ -195,9 +179,7 @@ class SetWhileArmed(ModelCamera):
 
 
 @breaks("settings_out_of_range_are_refused")
-class TakesAnything(ModelCamera):
-    """Takes every setting, and bends it into range."""
-
+class _TakesAnything(ModelCamera):
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         exposure_s, gain = (
             float(np.clip(value, low, high))
@@ -224,9 +206,7 @@ class RefusesTooLate(ModelCamera):
 
 
 @breaks("settings_are_read_back", "0.02 s")
-class StepsCoarsely(ModelCamera):
-    """Takes whole hundredths of a second, and does not say so."""
-
+class _StepsCoarsely(ModelCamera):
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         super().configure(settings)
         self.applied = AppliedSettings(max(round(settings.exposure_s, 2), 1e-4), settings.gain)
@@ -255,9 +235,7 @@ class ForgetsItself(ModelCamera):
 
 
 @breaks("frames_are_as_declared", "no sample is above 1023")
-class DeclaresTenBits(ModelCamera):
-    """Sends samples of 16 bits, aligned to the left."""
-
+class _DeclaresTenBits(ModelCamera):
     @property
     def info(self) -> CameraInfo:
         info = super().info
@@ -269,26 +247,20 @@ class DeclaresTenBits(ModelCamera):
 
 
 @breaks("nothing_works_after_close")
-class IgnoresClose(ModelCamera):
-    """Goes on after close."""
-
+class _IgnoresClose(ModelCamera):
     def close(self) -> Any:
         self.disarm()
 
 
 @breaks("close_may_be_called_twice", "DeviceStateError")
-class ClosesOnce(ModelCamera):
-    """Cannot be closed again."""
-
+class _ClosesOnce(ModelCamera):
     def close(self) -> Any:
         self.require_open()
         super().close()
 
 
 @breaks("a_frame_keeps_its_pixels", "pixels changed")
-class ReusesItsBuffer(ModelCamera):
-    """Hands out the same memory with every frame."""
-
+class _ReusesItsBuffer(ModelCamera):
     buffer = np.zeros((1, 1), np.uint8)
 
     def frame(self, exposure: Exposure) -> Frame:
@@ -338,9 +310,7 @@ class StaysLit(ModelProjector):
 
 
 @breaks("the_projector_is_dark_unless_it_shows", "after load")
-class StaysLitWhileLoading(ModelProjector):
-    """Goes on showing the old sequence when it is given a new one."""
-
+class _StaysLitWhileLoading(ModelProjector):
     def load(self, sequence: PatternSequence) -> None:
         changes = list(self.world.changes)
         super().load(sequence)
@@ -348,18 +318,14 @@ class StaysLitWhileLoading(ModelProjector):
 
 
 @breaks("the_projector_is_dark_after_opening_and_close", "after close")
-class StaysLitAfterClose(ModelProjector):
-    """Is let go while it shines."""
-
+class _StaysLitAfterClose(ModelProjector):
     def close(self) -> None:
         self.loaded = None
         self.closed.set()
 
 
 @breaks("the_projector_is_dark_after_opening_and_close", "after opening")
-class ShinesFromTheStart(ModelProjector):
-    """Shows its logo."""
-
+class _ShinesFromTheStart(ModelProjector):
     def __init__(self, world: World) -> None:
         super().__init__(world)
         world.change(0, sequence().profiles[0])
@@ -378,27 +344,21 @@ class LightsLate(ModelProjector):
 
 
 @breaks("show_tells_which_pattern_is_lit_since_when", "ms after the return")
-class ReturnsEarly(ModelProjector):
-    """Returns from show a second before there is light, and declares less latency."""
-
+class _ReturnsEarly(ModelProjector):
     def show(self, index: int) -> Shown:
         shown = super().show(index)
         return replace(shown, t_visible_ns=shown.t_visible_ns + 10**9)
 
 
 @breaks("show_tells_which_pattern_is_lit_since_when", "index=1")
-class TellsTheNextPattern(ModelProjector):
-    """Counts from 1."""
-
+class _TellsTheNextPattern(ModelProjector):
     def show(self, index: int) -> Shown:
         shown = super().show(index)
         return Shown(index + 1, shown.t_visible_ns, shown.t_err_ns)
 
 
 @breaks("show_needs_a_loaded_sequence")
-class ShowsWithoutSequence(ModelProjector):
-    """Shows nothing where nothing is loaded, and does not say so."""
-
+class _ShowsWithoutSequence(ModelProjector):
     def show(self, index: int) -> Shown:
         if self.loaded is None and not self.closed.is_set():
             return Shown(index, self.world.at_ns, 0)
@@ -414,17 +374,13 @@ class CountsFromTheEnd(ModelProjector):
 
 
 @breaks("a_sequence_of_another_size_is_refused")
-class ScalesPatterns(ModelProjector):
-    """Takes sequences for any size."""
-
+class _ScalesPatterns(ModelProjector):
     def load(self, sequence: PatternSequence) -> None:
         super().load(PatternSequence(self.info.size, sequence.patterns, sequence.profiles))
 
 
 @breaks("a_projector_plays_only_if_it_says_so")
-class PlaysSilently(ModelProjector):
-    """Does as if it could play."""
-
+class _PlaysSilently(ModelProjector):
     plays = False
 
     def play(self, exposure_s: float, period_s: float) -> None:
@@ -452,16 +408,12 @@ class PulsesOnceMore(ModelProjector):
 
 
 @breaks("a_play_can_be_stopped", "frames")
-class PlaysOn(ModelProjector):
-    """Does not end a sequence that it plays."""
-
+class _PlaysOn(ModelProjector):
     def stop(self) -> None:
         self.blank()
 
 
 @breaks("a_whole_sequence_is_proven", "pattern")
-class SwapsPatterns(ModelProjector):
-    """Has two patterns in each other's place."""
-
+class _SwapsPatterns(ModelProjector):
     def profile(self, index: int) -> Pixels:
         return super().profile({6: 8, 8: 6}.get(index, index))

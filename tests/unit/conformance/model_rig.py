@@ -283,16 +283,21 @@ class ModelHead:
 
 @dataclass
 class Maker:
-    """Opens a rig of these classes, each time one in a world of its own; `rigs` are those that were opened."""
+    """Opens a rig of these classes, each time one in a world of its own; `rigs` are those that were opened.
+
+    change : what becomes of each.
+    """
 
     camera: type[ModelCamera] = ModelCamera
     projector: type[ModelProjector] = ModelProjector
     calibration: Calibration | None = None
     rigs: list[Rig] = field(default_factory=list)
+    change: Callable[[Rig], Rig] = field(default=lambda rig: rig)
 
     def __call__(self) -> Rig:
         world = World()
         head = ModelHead(world, self.projector(world), {"left": self.camera(world)}, self.calibration)
         settings = {"left": CameraSettings(EXPOSURE_S)}
-        self.rigs.append(Rig("model", head.cameras, head.projector, settings, self.calibration, head, clock=world))
+        rig = Rig("model", head.cameras, head.projector, settings, self.calibration, head, clock=world)
+        self.rigs.append(self.change(rig))
         return self.rigs[-1]

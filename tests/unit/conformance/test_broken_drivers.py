@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -44,40 +45,17 @@ class Hoarder(Maker):
         return super().__call__()
 
 
-class WithoutStop:
-    """A projector that lacks a method."""
-
-    def __init__(self, model: ModelProjector) -> None:
-        self.info, self.load, self.show, self.play = model.info, model.load, model.show, model.play
-        self.blank, self.close = model.blank, model.close
-
-
-class Incomplete(Maker):
-    """Its projector cannot stop."""
-
-    def __call__(self) -> Rig:
-        rig = super().__call__()
-        assert isinstance(rig.projector, ModelProjector)
-        return replace(rig, projector=WithoutStop(rig.projector), head=None)  # type: ignore[arg-type]
+def without_stop(rig: Rig) -> Rig:
+    """Its projector lacks a method."""
+    names = ("info", "load", "show", "play", "blank", "close")
+    projector = SimpleNamespace(**{name: getattr(rig.projector, name) for name in names})
+    return replace(rig, projector=projector, head=None)
 
 
-class TakesEveryPose:
-    """A positioner that has one pose and refuses no other."""
-
-    poses = ("home",)
-
-    def move(self, index: int) -> None:
-        del index
-
-    def close(self) -> None:
-        return
-
-
-class Moved(Maker):
-    """Its positioner is such a one."""
-
-    def __call__(self) -> Rig:
-        return replace(super().__call__(), positioner=TakesEveryPose())
+def with_every_pose(rig: Rig) -> Rig:
+    """It has a positioner with one pose, which refuses no other."""
+    positioner = SimpleNamespace(poses=("home",), move=lambda _: None, close=lambda: None)
+    return replace(rig, positioner=positioner)
 
 
 def changed(**how: Callable[[Frame], object]) -> type[ModelCamera]:
@@ -150,8 +128,8 @@ BROKEN: list[tuple[Maker, str, str]] = [
         (Maker(calibration=Calibration({"left": pinhole(camera)}, projector)), CALIBRATED, words)
         for camera, projector, words in ((Size(640, 480), None, "640 x 480"), (CAMERA, pinhole(CAMERA), "110 x 80"))
     ),
-    (Incomplete(), "devices_implement_the_protocols", "without stop"),
-    (Moved(), "a_positioner_takes_its_poses_and_no_others", "pose -1 of 1 is refused"),
+    (Maker(change=without_stop), "devices_implement_the_protocols", "without stop"),
+    (Maker(change=with_every_pose), "a_positioner_takes_its_poses_and_no_others", "pose -1 of 1 is refused"),
     (Hoarder(), "a_closed_rig_opens_again", "process 4711"),
 ]
 
@@ -211,15 +189,12 @@ def test_a_rig_that_keeps_the_contract_has_a_full_score(
 
 
 def test_a_display_whose_latency_was_measured_is_waited_for() -> None:
-    class Measured(Maker):
-        """Its rig file has what a flash test found."""
-
-        def __call__(self) -> Rig:
-            return replace(super().__call__(), synchronisation=Synchronisation(0.04, 0.001))
+    def measured(rig: Rig) -> Rig:
+        return replace(rig, synchronisation=Synchronisation(0.04, 0.001))
 
     camera = type("Camera", (ModelCamera,), {"triggers": frozenset({Trigger.SOFTWARE, Trigger.FREE})})
     projector = type("Projector", (drivers.LightsLate,), {"plays": False})
-    report = run(Measured(camera, projector), sequence())
+    report = run(Maker(camera, projector, change=measured), sequence())
     assert [str(result.failure) for result in report.results if result.outcome is Outcome.FAILED] == []
 
 

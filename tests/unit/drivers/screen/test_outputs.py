@@ -143,13 +143,6 @@ def test_what_the_graphics_driver_does_to_levels_is_read_from_its_properties(ser
     opened().close()
 
 
-def test_a_screen_of_another_depth_is_refused(tmp_path: Path) -> None:
-    with DummyServer(tmp_path, depth=16) as shallow:
-        shallow.arrange(**{LEFT: SIZE, RIGHT: SIZE})
-        with pytest.raises(UnsupportedByDeviceError, match="DefaultDepth 24"):
-            opened(display=shallow.display, backend="x11")
-
-
 def test_an_output_in_use_is_refused_with_the_process_that_holds_it(right: OutputPixels) -> None:
     with showing() as projector:
         projector.show(0)
