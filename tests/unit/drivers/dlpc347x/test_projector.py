@@ -72,7 +72,6 @@ def test_an_entry_is_25_bytes_as_the_guide_has_them(bench: Bench) -> None:
     assert bench.sent(0x98) == ["010001040000000000000000b01d0000ab0000001f00000002"]
     assert bench.sent(0x9E) == ["0100", "00fe"]
     assert bench.sent(0x52) == ["00", "07"]
-    projector.close()
 
 
 @pytest.mark.parametrize("counts_first", [False, True])
@@ -88,7 +87,6 @@ def test_a_sequence_is_ended_whichever_a_repeat_is(counts_first: bool) -> None:
     assert len(bench.pulses) == 4
     # Three patterns of one run, and the last one with a dark in which it is stopped.
     assert [data[2:6] + data[-2:] for data in bench.sent(0x98)] == ["000300", "000103"]
-    projector.close()
 
 
 def test_white_light_takes_600_µs_at_least_and_has_colours(bench: Bench) -> None:
@@ -98,7 +96,6 @@ def test_white_light_takes_600_µs_at_least_and_has_colours(bench: Bench) -> Non
     projector.play(0.0002, 0.01)
     entries = [struct.unpack("<BBBQI", bytes.fromhex(data)[1:16]) for data in bench.sent(0x98)]
     assert [(leds, light_us) for _, _, leds, _, light_us in entries] == [(7, 600), (1, 600), (7, 600)]
-    projector.close()
 
 
 def test_both_axes_are_shown_and_not_played(bench: Bench) -> None:
@@ -109,7 +106,6 @@ def test_both_axes_are_shown_and_not_played(bench: Bench) -> None:
     assert bench.engine.lit.shape == (720, 1)
     with pytest.raises(UnsupportedByDeviceError, match="scan one axis only, or without the wire"):
         projector.play(0.003, 0.01)
-    projector.close()
 
 
 def test_patterns_are_written_once_and_nothing_is_lit_meanwhile() -> None:
@@ -137,7 +133,6 @@ def test_a_mirrored_engine_is_written_again() -> None:
     projector.load(COLUMNS)
     projector.show(2)
     assert bench.shows(COLUMNS.profiles[2][:, ::-1])
-    projector.close()
 
 
 class Worn(bytearray):
@@ -157,7 +152,6 @@ def test_a_flash_that_has_no_room_or_forgets_is_reported(worn: bool) -> None:
     with pytest.raises(DeviceError, match="does not give back what was written" if worn else "its flash has no room"):
         projector.write_patterns(BOTH)
     assert bench.engine.erased == int(worn)
-    projector.close()
 
 
 @pytest.mark.parametrize(

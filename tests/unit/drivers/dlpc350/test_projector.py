@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,6 @@ def test_the_order_is_stop_set_validate_start(bench: Bench) -> None:
     # The next one has the same timing, and another pattern of the same picture.
     projector.show(0)
     assert bench.commands() == [LEDS, STOP, 0x1A33, 0x1A32, 0x1A34, 0x1A33, VALIDATE, LEDS, START]
-    projector.close()
 
 
 @pytest.mark.parametrize("image_kept_s", [None, 0.01])
@@ -59,7 +59,6 @@ def test_light_is_waited_for_as_long_as_a_picture_takes(image_kept_s: float | No
         assert shown.t_err_ns == round(load_s * 1e9 / 2)
     projector.blank()
     projector.play(0.01, 0.02)
-    projector.close()
 
 
 def test_a_played_sequence_is_of_one_timing_and_one_picture(bench: Bench) -> None:
@@ -67,7 +66,6 @@ def test_a_played_sequence_is_of_one_timing_and_one_picture(bench: Bench) -> Non
     projector.play(0.01, 0.03)
     assert bench.engine.registers[0x1A29] == (12_000).to_bytes(4, "little") + (30_000).to_bytes(4, "little")
     assert bench.engine.registers[0x1A31] == bytes([2, 0, 2, 0])
-    projector.close()
 
 
 def test_the_longest_table_takes_several_reports(bench: Bench) -> None:
@@ -81,16 +79,6 @@ def test_the_longest_table_takes_several_reports(bench: Bench) -> None:
     assert len(bench.pulses) == 128
     (data,) = (data for command, data in bench.engine.commands if command == 0x1A34 and len(data) > 64)
     assert len(data) == 384
-    projector.close()
-
-
-def test_a_timing_that_the_engine_bends_is_refused_and_it_is_dark(bench: Bench) -> None:
-    projector = bench.loaded()
-    bench.engine.faults.bent = {0x1A29: bytes(8)}
-    with pytest.raises(UnsupportedByDeviceError, match="asked for exposure period"):
-        projector.show(0)
-    assert bench.engine.lit is None
-    projector.close()
 
 
 def test_a_flash_of_another_name_or_with_too_few_pictures_is_refused(tmp_path: Path) -> None:
@@ -107,15 +95,6 @@ def test_a_flash_of_another_name_or_with_too_few_pictures_is_refused(tmp_path: P
         bench.open()
 
 
-def test_tables_that_the_engine_refuses_are_reported_in_words_and_it_is_dark(bench: Bench) -> None:
-    bench.engine._planes[7] = bench.engine._planes.pop(0)
-    projector = bench.loaded()
-    with pytest.raises(UnsupportedByDeviceError, match="a pattern number in the table is not one that it has"):
-        projector.show(0)
-    assert bench.engine.lit is None
-    projector.close()
-
-
 def test_a_flash_without_a_list_asks_for_pictures(bench: Bench, tmp_path: Path) -> None:
     bench.flash = Flash(tmp_path)
     projector = bench.open()
@@ -127,7 +106,6 @@ def test_a_flash_without_a_list_asks_for_pictures(bench: Bench, tmp_path: Path) 
     assert (tmp_path / "to_flash" / "images.json").is_file()
     with pytest.raises(DeviceStateError):
         projector.show(0)
-    projector.close()
 
 
 @pytest.mark.parametrize("command", [0x1A29, 0x1A34, 0x1A31, VALIDATE])
@@ -141,18 +119,39 @@ def test_whatever_is_refused_on_the_way_to_light_leaves_it_dark(bench: Bench, co
     assert not bench.engine.running
     bench.engine.faults.refused.clear()
     projector.show(2)
-    projector.close()
 
 
-def test_a_sequence_that_does_not_start_is_an_error_and_dark(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.dlpc350.projector.RUNNING_S", 0.01)
-    projector = bench.loaded()
+def bends_its_timing(bench: Bench) -> None:
+    bench.engine.faults.bent = {0x1A29: bytes(8)}
+
+
+def lacks_a_picture(bench: Bench) -> None:
+    bench.engine._planes[7] = bench.engine._planes.pop(0)
+
+
+def never_runs(bench: Bench) -> None:
     bench.engine.faults.never_runs = True
     bench.engine._hardware |= 8
-    with pytest.raises(DeviceError, match="did not start the sequence in time, and says: a picture was taken before"):
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (bends_its_timing, "asked for exposure period"),
+        (lacks_a_picture, "a pattern number in the table is not one that it has"),
+        (never_runs, "did not start the sequence in time, and says: a picture was taken before"),
+    ],
+)
+def test_what_keeps_a_sequence_from_its_light_is_an_error_and_dark(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, spoil: Callable[[Bench], None], words: str
+) -> None:
+    monkeypatch.setattr("drivers.dlpc350.projector.RUNNING_S", 0.01)
+    projector = bench.loaded()
+    spoil(bench)
+    with pytest.raises(DeviceError, match=words) as refused:
         projector.show(0)
+    assert isinstance(refused.value, UnsupportedByDeviceError) is (spoil is not never_runs)
     assert bench.engine.lit is None
-    projector.close()
 
 
 def test_an_engine_that_is_gone_while_it_is_opened_is_gone(bench: Bench) -> None:

@@ -28,7 +28,6 @@ def test_dark_between_is_declared_and_nothing_is_flashed(bench: Bench) -> None:
     projector = bench.open()
     assert projector.info.gap_s == pytest.approx(0.0005 + 105e-6)
     assert not isinstance(projector, FlashedProjector)
-    projector.close()
 
 
 def test_the_table_comes_before_the_pictures_and_these_last_one_first(bench: Bench) -> None:
@@ -46,7 +45,6 @@ def test_the_table_comes_before_the_pictures_and_these_last_one_first(bench: Ben
     assert bench.commands() == [LEDS, STOP, 0x1A34, 0x1A34, 0x1A31, 0x1A32, LEDS, START]
     projector.show(2)
     assert bench.commands() == [LEDS, STOP, 0x1A31, 0x1A32, LEDS, START]
-    projector.close()
 
 
 def test_two_controllers_share_the_columns() -> None:
@@ -73,7 +71,6 @@ def test_each_entry_of_a_played_sequence_has_its_light_and_the_dark_after_it(ben
     assert {(entry.exposure_us, entry.dark_us, entry.leds, entry.cleared) for entry in entries} == {
         (12_000, 18_000, 7, True)
     }
-    projector.close()
 
 
 @pytest.mark.parametrize(
@@ -125,7 +122,6 @@ def test_what_the_engine_refuses_is_reported_in_its_words_and_it_is_dark(bench: 
             use()
         assert bench.engine.lit is None
         assert not bench.engine.running
-    projector.close()
 
 
 def test_a_piece_of_a_picture_that_went_wrong_is_not_hidden_by_the_next(
@@ -140,7 +136,6 @@ def test_a_piece_of_a_picture_that_went_wrong_is_not_hidden_by_the_next(
     with pytest.raises(UnsupportedByDeviceError, match="take picture 0, and says: a parameter is not one that it has"):
         projector.load(SEQUENCE)
     assert bench.commands().count(0x1A2B) == 1
-    projector.close()
 
 
 def test_an_engine_in_standby_gets_no_command_before_it_is_woken() -> None:

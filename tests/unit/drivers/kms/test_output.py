@@ -16,6 +16,7 @@ from slrig.devices import Projector
 from slrig.errors import ConfigError, DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.unit.drivers.conftest import OPENED
 from tests.unit.drivers.kms.fake_kernel import CONTROLLERS, CURSOR, PRIMARY, FakeKernel, mode
 
 SIZE = Size(1280, 800)
@@ -56,6 +57,8 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         return fake
 
     yield installed
+    while OPENED:
+        OPENED.pop().close()
     holding.release(finding.DEVICES / "card0")
     for fake in fakes:
         fake.ours.close()
@@ -63,7 +66,9 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
 
 def opened(**more: object) -> Projector:
-    return open_projector({"output": "HDMI-A-1", "latency_s": 0.0, "latency_error_s": 0.0, **more}, Path())
+    projector = open_projector({"output": "HDMI-A-1", "latency_s": 0.0, "latency_error_s": 0.0, **more}, Path())
+    OPENED.append(projector)
+    return projector
 
 
 def scanned_out(fake: FakeKernel) -> np.ndarray[tuple[int, ...], np.dtype[np.uint32]]:
@@ -121,7 +126,6 @@ def test_a_flips_stamp_is_when_its_scan_out_began(install: Install) -> None:
     assert projector.info.refresh_s is not None
     assert shown.t_visible_ns == stamps[-1] + round(projector.info.refresh_s * 1e9)
     assert shown.t_err_ns == 500_000
-    projector.close()
 
 
 @pytest.mark.parametrize("state", [{"counts": False}, {"stamp": lambda: 0}], ids=["not counted", "zero"])
@@ -135,7 +139,6 @@ def test_a_stamp_that_means_nothing_is_not_believed(install: Install, state: dic
     assert shown.t_err_ns >= period_ns // 2
     assert shown.t_visible_ns + shown.t_err_ns >= asked_ns + 2 * period_ns
     assert ("does not tell" in projector.info.model) == ("counts" in state)
-    projector.close()
 
 
 def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
@@ -145,7 +148,6 @@ def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
     fake.flipped(5)
     fake.refusals[kernel.ATOMIC] = [errno.EBUSY]
     assert projector.show(1).index == 1
-    projector.close()
 
 
 def test_a_display_that_makes_no_refresh_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,7 +158,6 @@ def test_a_display_that_makes_no_refresh_is_reported(install: Install, monkeypat
     monkeypatch.setattr(fake, "flipped", lambda _: None)
     with pytest.raises(DeviceError, match="made no refresh"):
         projector.show(1)
-    projector.close()
 
 
 def test_a_display_that_is_pulled_or_exchanged_is_reported(install: Install) -> None:
@@ -171,7 +172,6 @@ def test_a_display_that_is_pulled_or_exchanged_is_reported(install: Install) -> 
     fake.plug(11, True)
     with pytest.raises(UnsupportedByDeviceError, match="open the rig again"):
         projector.load(SEQUENCE)
-    projector.close()
 
 
 def test_what_the_frame_buffer_does_not_hold_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,7 +188,6 @@ def test_what_the_frame_buffer_does_not_hold_is_reported(install: Install, monke
     with pytest.raises(UnsupportedByDeviceError, match=r"1 of 1024000 pixels .* \(row 3, column 5\)"):
         projector.show(0)
     monkeypatch.undo()
-    projector.close()
 
 
 @pytest.mark.parametrize(
@@ -222,7 +221,6 @@ def test_of_equal_sizes_the_rate_may_be_chosen(install: Install) -> None:
     fake.modes[11] = [mode(1280, 800, preferred=True), mode(1280, 800, rate=120)]
     projector = opened(refresh_hz=120)
     assert projector.info.refresh_s == pytest.approx(1 / 120, rel=1e-4)
-    projector.close()
 
 
 def test_a_machine_without_a_graphics_driver_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from drivers.opencv.camera import OpenCvCamera
 from slrig.devices import AppliedSettings, CameraSettings, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Pixels
+from tests.unit.drivers.conftest import OPENED
 
 RATE_HZ = 100.0
 EXPOSURE_S = 0.008
@@ -36,6 +37,7 @@ def ramp(count: int) -> list[Pixels]:
 def opened(folder: Path, **options: object) -> OpenCvCamera:
     camera = open_camera("eye", {**OPTIONS, **options}, folder)
     assert isinstance(camera, OpenCvCamera)
+    OPENED.append(camera)
     return camera
 
 
@@ -54,7 +56,6 @@ def test_frames_come_in_order_at_the_films_times(tmp_path: Path) -> None:
     assert {(frame.t_end_ns - frame.t_start_ns, frame.t_err_ns) for frame in frames} == {(8_000_000, 0)}
     with pytest.raises(FrameTimeoutError, match="the film is over after 10 frames; arm"):
         camera.read(0, 5)
-    camera.close()
 
 
 def test_arming_begins_the_film_again(tmp_path: Path) -> None:
@@ -70,7 +71,6 @@ def test_arming_begins_the_film_again(tmp_path: Path) -> None:
             camera.trigger()
         camera.disarm()
     camera.close()
-    camera.close()
 
 
 def test_a_series_of_deep_images_keeps_its_depth(tmp_path: Path) -> None:
@@ -80,7 +80,6 @@ def test_a_series_of_deep_images_keeps_its_depth(tmp_path: Path) -> None:
     assert camera.info.format.bit_depth == 12
     camera.arm(1, Trigger.FREE)
     assert [int(camera.read(0, 5).image[0, 0]) for _ in range(3)] == [0, 1000, 2000]
-    camera.close()
 
 
 def test_a_film_takes_the_exposure_it_was_made_with_and_a_rate_that_is_given(tmp_path: Path) -> None:
@@ -94,4 +93,3 @@ def test_a_film_takes_the_exposure_it_was_made_with_and_a_rate_that_is_given(tmp
     assert second.t_start_ns - first.t_start_ns == 25_000_000
     # Those that began too early are passed over.
     assert int(camera.read(first.t_start_ns + 80_500_000, 5).image[0, 0]) == 5 * 4
-    camera.close()

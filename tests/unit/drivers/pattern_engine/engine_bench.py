@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from tests.contract import dlpc347x_bench, dlpc900_bench
 from tests.contract.dlpc347x_device import Fake347x
 from tests.contract.dlpc350_device import SEQUENCER, Cable, FakeEngine
 from tests.contract.dlpc900_device import Fake900
+from tests.unit.drivers.conftest import OPENED
 from tests.virtual_clock import VirtualClock
 
 LINES = LineShift(Axis.COLUMN, 1, 8)
@@ -38,6 +39,14 @@ SEQUENCE_350 = encode(PATTERNS, planes.MIRRORS)
 SEQUENCE_900 = encode(PATTERNS, dlpc900_bench.MIRRORS)
 SEQUENCE_347X = encode(PATTERNS, dlpc347x_bench.MIRRORS)
 LEDS, START_STOP = 0x1A07, 0x1A24
+
+
+Engine = TypeVar("Engine", bound=LightEngine347x | LightEngine350 | LightEngine900)
+
+
+def opened(projector: Engine) -> Engine:
+    OPENED.append(projector)
+    return projector
 
 
 class Bench(ABC):
@@ -123,7 +132,7 @@ class Bench350(UsbBench):
         usual = {"patterns": "p", "image_load_s": 0.0, "led_current_inverted": True}
         table = Options350.model_validate({**usual, **options})
         link = Link(self.cable.host, "light engine", DLPC350, answer_s=5.0)
-        return LightEngine350(link, table, self.flash, serial="1", clock=self.clock)
+        return opened(LightEngine350(link, table, self.flash, serial="1", clock=self.clock))
 
     def held_us(self) -> tuple[int, int, int]:
         exposure_us, period_us = struct.unpack("<II", self.engine.registers[0x1A29])
@@ -144,7 +153,7 @@ class Bench900(UsbBench):
         self.cable = Cable(self.engine)
         table = Options900.model_validate({"start_s": 0.02, "led_current_inverted": False, **options})
         link = Link(self.cable.host, "light engine", DLPC900, answer_s=5.0)
-        return LightEngine900(link, table, serial="1", clock=self.clock)
+        return opened(LightEngine900(link, table, serial="1", clock=self.clock))
 
     def held_us(self) -> tuple[int, int, int]:
         pattern, end = self.engine.entries[0], self.engine.entries[len(self.sequence)]
@@ -170,9 +179,8 @@ class Bench347x(Bench):
 
     def open(self, **options: Any) -> LightEngine347x:
         usual = {"device": "/dev/i2c-1", "start_s": 0.02, "light_margin_s": 0.001, "led": "blue"}
-        return LightEngine347x(
-            Bus(self.engine, "light engine"), Options347x.model_validate({**usual, **options}), clock=self.clock
-        )
+        table = Options347x.model_validate({**usual, **options})
+        return opened(LightEngine347x(Bus(self.engine, "light engine"), table, clock=self.clock))
 
     def unplug(self) -> None:
         self.engine.unplug()

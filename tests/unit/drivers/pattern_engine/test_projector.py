@@ -64,7 +64,6 @@ def test_an_engine_that_shines_is_dark_once_it_is_open(made: MakesBench, size: S
     info, options = projector.info, projector._light
     assert (info.size, info.plays, info.lights) == (size, True, options.led == "white")
     assert (info.gap_s >= options.light_margin_s, info.duty) == (True, options.duty_limit)
-    projector.close()
 
 
 def test_each_pattern_is_shown_as_it_is(bench: Bench) -> None:
@@ -94,7 +93,6 @@ def test_a_sequence_is_played_once_with_a_pulse_each(bench: Bench) -> None:
     projector.play(0.003, 0.01)
     bench.clock.advance(5)
     assert [late - early for early, late in pairwise(bench.pulses)] == [10_000_000] * 2
-    projector.close()
 
 
 @pytest.mark.parametrize(
@@ -121,7 +119,6 @@ def test_a_timing_against_the_rules_never_reaches_the_engine(
     with pytest.raises(UnsupportedByDeviceError, match=rule):
         projector.play(exposure_s, period_s)
     assert bench.commands() == []
-    projector.close()
 
 
 def test_an_unplugged_engine_is_gone_and_can_be_closed(bench: Bench) -> None:
@@ -155,7 +152,6 @@ def test_a_pattern_is_held_for_as_long_as_set_and_goes_dark_by_itself(bench: Ben
     bench.clock.advance(2.1)
     assert bench.engine.lit is None
     assert bench.clock.now_ns() - shown.t_visible_ns < 5.1e9
-    projector.close()
 
 
 def test_two_seconds_after_its_host_has_died_it_is_dark(bench: Bench) -> None:
@@ -185,7 +181,6 @@ def test_what_is_dark_is_not_started_again(bench: Bench, call: str) -> None:
     bench.clock.advance(10)
     assert bench.commands() == []
     assert bench.engine.lit is None
-    projector.close()
 
 
 def test_closing_from_another_thread_ends_a_wait_for_light(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -214,7 +209,6 @@ def test_one_way_to_go_dark_is_enough_and_the_other_is_reported(usb_bench: UsbBe
     with pytest.raises(DeviceError, match="refused the command 0x1a24"):
         projector.blank()
     assert usb_bench.engine.lit is None
-    projector.close()
 
 
 @USB
@@ -231,7 +225,6 @@ def test_the_led_current_is_set_in_the_sense_of_the_board(
     # What it says to write into the rig file, once the doctor knows which way light goes.
     projector = usb_bench.open(led_current_inverted=None)
     assert projector.option_for(rises=inverted is bool(polarity)) == f"led_current_inverted = {str(inverted).lower()}"
-    projector.close()
 
 
 @pytest.mark.parametrize(
@@ -319,7 +312,6 @@ def test_until_the_sense_of_the_current_is_known_light_is_a_twentieth(made: Make
             projector.try_current(share)
     told = projector.option_for(rises=most[0.6] > most[0.4])
     assert told == f"led_current_inverted = {str(inverted).lower()}"
-    projector.close()
 
 
 @USB
@@ -328,4 +320,3 @@ def test_a_current_whose_sense_is_known_is_not_tried(usb_bench: UsbBench) -> Non
     assert not projector.unproven
     with pytest.raises(UnsupportedByDeviceError, match="asked to try"):
         projector.try_current(0.5)
-    projector.close()
