@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from drivers.depthai import Lens, open_camera, read_calibration, read_factory_calibration
 from drivers.depthai.calibration import brown_lens
-from slrig.bundle.calibration_file import read_calibration as read_file
-from slrig.bundle.calibration_file import write_calibration as write_file
 from slrig.devices import CameraSettings
-from slrig.errors import CalibrationError, DeviceGoneError
+from slrig.errors import CalibrationError
 from slrig.model import Size
 from tests.unit.drivers.depthai.conftest import small_stage
 from tests.unit.drivers.depthai.fake_oak import DEVICE, Chip, FakeOak, dai
@@ -95,14 +93,6 @@ def test_frames_of_another_size_have_their_own_matrix() -> None:
     assert np.allclose(matrix[:2], MATRIX[:2] / 2, atol=0.3)
 
 
-def test_it_can_be_kept_as_a_file(tmp_path: Path) -> None:
-    with oak_with(handler(distortion=MILD)).connected():
-        calibration = read_calibration(DEVICE, SIZED)
-    write_file(tmp_path / "calibration.json", calibration)
-    again = read_file(tmp_path / "calibration.json")
-    assert np.allclose(again.cameras["right"].translation_mm, np.array(RIGHT_CM) * 10, atol=1e-3)
-
-
 def test_every_calibrated_camera_is_read_by_default() -> None:
     stored = handler(cameras="C")
     stored.setLensPosition(dai.CameraBoardSocket.CAM_C, 130)
@@ -146,11 +136,6 @@ def test_what_cannot_be_used_is_refused(
     with oak.connected(), pytest.raises(CalibrationError, match=words):
         read_calibration(DEVICE, cameras)
     assert oak.opened == oak.closed == 1
-
-
-def test_nothing_is_read_from_a_device_that_is_not_there() -> None:
-    with oak_with(None, plugged_in=False).connected(), pytest.raises(DeviceGoneError):
-        read_calibration(DEVICE)
 
 
 def test_no_point_of_the_image_is_further_off_than_the_stated_residual() -> None:

@@ -66,18 +66,13 @@ def calls(projector: SerialProjector) -> dict[str, Callable[[], object]]:
     }
 
 
-def test_the_box_describes_itself(bench: Bench) -> None:
-    projector = bench.open()
-    status = projector.client.status()
-    assert (status.state, status.index, status.shows) == ("idle", None, 0)
-    info = projector.info
-    assert (info.size, info.plays, info.model, info.serial) == (SIZE, True, "test-box 1.0.0", "the line")
-    assert (info.latency_s, info.gap_s, info.duty) == (LIGHT_US / 1e6, GAP_US / 1e6, 1.0)
-
-
 def test_show_returns_when_its_light_came(make_bench: Callable[..., Bench]) -> None:
     bench = make_bench(drift=80e-6)
     projector = bench.loaded()
+    info, status = projector.info, projector.client.status()
+    assert (info.size, info.plays, info.model, info.serial) == (SIZE, True, "test-box 1.0.0", "the line")
+    assert (info.latency_s, info.gap_s, info.duty) == (LIGHT_US / 1e6, GAP_US / 1e6, 1.0)
+    assert (status.state, status.index, status.shows) == ("ready", None, 0)
     for index in ALL:
         shown = projector.show(index)
         change = bench.scene.changes[-1]
@@ -241,32 +236,38 @@ def test_the_light_stays_for_as_long_as_the_host_gives_signs_of_life(bench: Benc
     assert bench.lit == 2
 
 
-def test_a_pattern_that_is_not_changed_goes_out(bench: Bench) -> None:
-    projector = bench.loaded(max_on_s=0.1)
-    projector.show(1)
+def stays_on(bench: Bench, _projector: SerialProjector) -> None:
     bench.advance(0.2)
     assert bench.lit is None
-    with pytest.raises(DeviceError, match="max_on_s"):
-        projector.show(2)
 
 
-def test_an_engine_that_fails_is_an_error_and_dark(bench: Bench) -> None:
-    projector = bench.loaded()
-    projector.show(0)
+def fails(bench: Bench, _projector: SerialProjector) -> None:
     bench.engine.light.broken = {"select"}
-    with pytest.raises(DeviceError, match="select failed"):
+
+
+def plays(_bench: Bench, projector: SerialProjector) -> None:
+    projector.play(0.05, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("happens", "error", "words"),
+    [
+        (stays_on, DeviceError, "max_on_s"),
+        (fails, DeviceError, "select failed"),
+        (plays, DeviceStateError, "stop what it does first"),
+    ],
+)
+def test_a_pattern_that_the_box_cannot_show_is_an_error_and_dark(
+    bench: Bench, happens: Callable[[Bench, SerialProjector], None], error: type[DeviceError], words: str
+) -> None:
+    projector = bench.loaded(max_on_s=0.1)
+    projector.show(0)
+    happens(bench, projector)
+    with pytest.raises(error, match=words):
         projector.show(1)
     assert bench.lit is None
     bench.engine.light.broken = set()
     projector.show(1)
-
-
-def test_show_while_a_sequence_plays_is_refused_and_dark(bench: Bench) -> None:
-    projector = bench.loaded()
-    projector.play(0.05, 0.2)
-    with pytest.raises(DeviceStateError, match="stop what it does first"):
-        projector.show(1)
-    assert bench.lit is None
 
 
 # Restarts and cables.
