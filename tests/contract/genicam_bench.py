@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import importlib
-import os
 import socket
 import subprocess
 import sys
@@ -15,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
-import pytest
 from filelock import FileLock
 
 from drivers.genicam import GenicamCamera, open_camera
@@ -25,6 +23,7 @@ from tests.contract.bench_head import BenchHead
 from tests.contract.genicam_peer import ANSWERED, ASKED, BEGIN, DELAY, END, INTERFACE, PIXEL_FORMATS, read_exactly
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench, sequence_for
+from tests.npm import lacking
 from tests.unit.capture.fake_rig import Scene
 
 CAMERA, PROJECTOR = Size(120, 90), Size(64, 48)
@@ -32,24 +31,15 @@ ROOT = Path(__file__).resolve().parents[2]
 _LONG_S = 20.0
 
 
-def why_not() -> str:
-    """Why the fake camera cannot run here; "" if it can."""
+def require_aravis() -> None:
+    """Skip where Aravis is not installed; fail instead where CI=true, which has to install it."""
     try:
         importlib.import_module("gi").require_version("Aravis", "0.8")
     except (ImportError, ValueError) as missing:
-        return (
+        lacking(
             f"needs Aravis ({missing}): apt install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev gcc "
             "pkg-config python3-dev, then pip install 'PyGObject<3.51'"
         )
-    return ""
-
-
-def require_aravis() -> None:
-    """Skip where Aravis is not installed; fail instead where CI=true, which has to install it."""
-    if reason := why_not():
-        if os.environ.get("CI") == "true":
-            pytest.fail(reason)
-        pytest.skip(reason)
 
 
 @dataclass(frozen=True)

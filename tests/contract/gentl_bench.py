@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import atexit
 import importlib.util
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-
-import pytest
 
 from drivers.genicam import GenicamCamera, open_gentl_camera
 from tests.contract.bench_head import BenchHead
@@ -21,18 +18,14 @@ from tests.contract.gentl_camera import MemoryCamera
 from tests.contract.gentl_producer import FakeProducer, build
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench, sequence_for
+from tests.npm import lacking
 
 
 def require_harvesters() -> None:
-    """Skip where harvesters or a C compiler is not installed; fail instead where CI=true, which has to install them."""
+    """Skip where harvesters or a C compiler is not installed; fail instead where CI=true, which has to install it."""
     missing = [name for name in ("harvesters", "genicam") if importlib.util.find_spec(name) is None]
-    if shutil.which("gcc") is None:
-        missing.append("gcc")
-    if missing:
-        reason = f"needs {', '.join(missing)}: pip install 'slrig[gentl]', apt install gcc"
-        if os.environ.get("CI") == "true":
-            pytest.fail(reason)
-        pytest.skip(reason)
+    if missing or shutil.which("gcc") is None:
+        lacking(f"needs {', '.join(missing) or 'gcc'}: pip install 'slrig[gentl]', apt install gcc")
 
 
 @lru_cache(maxsize=1)

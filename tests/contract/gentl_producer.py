@@ -79,7 +79,7 @@ class FakeProducer:
         for index, call in enumerate(_CALLS):
             name, types = call.split(":")
             prototype = ctypes.CFUNCTYPE(c_int32, *(_TYPES[each] for each in types))
-            called = prototype(self._answering(getattr(self, f"_{name}", None)))
+            called = prototype(self._answering(getattr(self, f"_{name}", None) or _GIVEN.get(name)))
             self._called.append(called)
             self._library.call_on(c_int32(index), called)
         self._came = threading.Condition()
@@ -215,9 +215,6 @@ class FakeProducer:
 
     # ---- what is there
 
-    def _TLOpen(self, handle: int) -> None:
-        _put(handle, "<Q", TL)
-
     def _TLGetInfo(self, handle: int, what: int, *into: int) -> None:
         text = dict(enumerate(("SlrigTL", "Slrig", "Memory", "1.0", "Custom", self.file.name, str(self.file), "TL")))
         known: dict[int, tuple[int, Any]] = {each: (_TEXT, told) for each, told in text.items()}
@@ -227,23 +224,13 @@ class FakeProducer:
         if changed:
             _put(changed, "<B", 1)
 
-    def _TLGetNumInterfaces(self, handle: int, count: int) -> None:
-        _put(count, "<I", 1)
-
-    def _TLGetInterfaceID(self, handle: int, index: int, *into: int) -> None:
-        _give(_TEXT, "interface", 0, *into)
-
     def _TLGetInterfaceInfo(self, handle: int, name: bytes, what: int, *into: int) -> None:
         self._IFGetInfo(INTERFACE, what, *into)
-
-    def _TLOpenInterface(self, handle: int, name: bytes, opened: int) -> None:
-        _put(opened, "<Q", INTERFACE)
 
     def _IFGetInfo(self, handle: int, what: int, *into: int) -> None:
         _tell({0: (_TEXT, "interface"), 1: (_TEXT, "interface"), 2: (_TEXT, "Custom")}, what, into)
 
-    def _IFUpdateDeviceList(self, handle: int, changed: int, timeout_ms: int) -> None:
-        self._TLUpdateInterfaceList(handle, changed, timeout_ms)
+    _IFUpdateDeviceList = _TLUpdateInterfaceList
 
     def _IFGetNumDevices(self, handle: int, count: int) -> None:
         _put(count, "<I", int(self.camera.plugged))
@@ -266,21 +253,9 @@ class FakeProducer:
     def _identity(self) -> str:
         return f"slrig-memory-{self.camera.serial}"
 
-    def _DevGetPort(self, handle: int, port: int) -> None:
-        _put(port, "<Q", PORT)
-
     def _DevGetInfo(self, handle: int, what: int, *into: int) -> None:
         text = {0: self._identity, 1: "Slrig", 2: "Memory", 3: "Custom", 4: "Memory camera", 7: self.camera.serial}
         _tell({each: (_TEXT, told) for each, told in text.items()} | {5: (_I32, 1)}, what, into)
-
-    def _DevGetNumDataStreams(self, handle: int, count: int) -> None:
-        _put(count, "<I", 1)
-
-    def _DevGetDataStreamID(self, handle: int, index: int, *into: int) -> None:
-        _give(_TEXT, "stream", 0, *into)
-
-    def _DevOpenDataStream(self, handle: int, name: bytes, opened: int) -> None:
-        _put(opened, "<Q", STREAM)
 
     def _DevClose(self, handle: int) -> None:
         self.camera.stop()
@@ -334,6 +309,26 @@ class FakeProducer:
             raise GentlFaultError(BAD_HANDLE)
         if not self.camera.plugged:
             raise GentlFaultError(IO)
+
+
+def _handle(number: int) -> Callable[..., None]:
+    return lambda *arguments: _put(arguments[-1], "<Q", number)
+
+
+def _count(*arguments: int) -> None:
+    _put(arguments[-1], "<I", 1)
+
+
+def _name(name: str) -> Callable[..., None]:
+    return lambda *arguments: _give(_TEXT, name, 0, *arguments[-2:])
+
+
+_GIVEN: dict[str, Callable[..., None]] = {
+    **{"TLOpen": _handle(TL), "TLOpenInterface": _handle(INTERFACE), "TLGetNumInterfaces": _count},
+    **{"DevGetPort": _handle(PORT), "DevOpenDataStream": _handle(STREAM), "DevGetNumDataStreams": _count},
+    **{"TLGetInterfaceID": _name("interface"), "DevGetDataStreamID": _name("stream")},
+}
+"""Of each kind there is one: functions that always give the same."""
 
 
 def _put(address: int, code: str, *values: int) -> None:

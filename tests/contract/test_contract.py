@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -36,54 +36,40 @@ def test_contract(examination: Examination, check: Check) -> None:
     assert result.outcome is Outcome.PASSED, str(result.failure)
 
 
-def recording(target: object, protocol: type, asked: set[str]) -> Any:
-    """Stand in for `target`, noting which members of the protocol are used."""
-
-    def property_of(name: str) -> property:
-        def get(_: object) -> object:
-            asked.add(f"{protocol.__name__}.{name}")
-            return getattr(target, name)
-
-        return property(get)
-
-    return type("Recording", (), {name: property_of(name) for name in members(protocol)})()
-
-
 def members(protocol: type) -> list[str]:
     return [name for name in vars(protocol) if not name.startswith("_")]
 
 
-class RecordingHead:
-    """A head whose every use is noted."""
+def recording(target: object, protocol: type, asked: set[str], **instead: Callable[[Any], object]) -> Any:
+    """Stand in for `target`, and note which members of the protocol are used. instead : what is given of some."""
 
-    def __init__(self, head: Head, asked: set[str]) -> None:
-        assert isinstance(head, KeepsTime)
-        self.clock = head.clock
-        self._noted = cast("Head", recording(head, Head, asked))
-        self._asked = asked
+    def property_of(name: str) -> property:
+        def get(_: object) -> object:
+            asked.add(f"{protocol.__name__}.{name}")
+            found = getattr(target, name)
+            return instead[name](found) if name in instead else found
 
-    @property
-    def cameras(self) -> Mapping[str, Camera]:
-        return {name: recording(camera, Camera, self._asked) for name, camera in self._noted.cameras.items()}
+        return property(get)
 
-    @property
-    def projector(self) -> Projector:
-        return cast("Projector", recording(self._noted.projector, Projector, self._asked))
-
-    @property
-    def calibration(self) -> Any:
-        return self._noted.calibration
-
-    def truth(self) -> Any:
-        return self._noted.truth()
+    kept = {"clock": target.clock} if isinstance(target, KeepsTime) else {}
+    return type("Recording", (), {**kept, **{name: property_of(name) for name in members(protocol)}})()
 
 
 def test_the_suite_uses_every_member_of_the_protocols(tmp_path: Path) -> None:
     plain = picamera2_bench.bench(tmp_path)
     asked: set[str] = set()
-    with Bench(lambda: RecordingHead(plain.open_head(), asked), plain.sequence).examination() as examination:
+
+    def open_head() -> Head:
+        def noted(cameras: Mapping[str, Camera]) -> Mapping[str, Camera]:
+            return {name: recording(camera, Camera, asked) for name, camera in cameras.items()}
+
+        head = recording(
+            plain.open_head(), Head, asked, cameras=noted, projector=lambda found: recording(found, Projector, asked)
+        )
+        return cast("Head", head)
+
+    with Bench(open_head, plain.sequence).examination() as examination:
         for check in CHECKS:
             assert examination.judge(check).outcome in {Outcome.PASSED, Outcome.NOT_APPLICABLE}, check.name
-    assert asked == {
-        f"{protocol.__name__}.{name}" for protocol in (Camera, Projector, Head) for name in members(protocol)
-    }
+    protocols = (Camera, Projector, Head)
+    assert asked == {f"{protocol.__name__}.{name}" for protocol in protocols for name in members(protocol)}
