@@ -20,23 +20,17 @@ from slrig.model import Primary, White
 @pytest.mark.parametrize(
     ("exposure_us", "period_us", "rule"),
     [
-        (235, 235, None),
         (234, 500, "shortest exposure of a 1-bit pattern is 235 µs"),
         (1000, 1229, "shorter by 230 µs at least"),
-        (1000, 1230, None),
-        (1000, 1000, None),
         (1001, 1000, "shorter by 230 µs at least"),
-        (200_000_000, 200_000_000, None),
         (200_000_000, 200_000_300, "the longest is 200000000 µs"),
     ],
 )
-def test_a_timing_is_judged_by_rules_with_names(exposure_us: int, period_us: int, rule: str | None) -> None:
-    timing = Timing(exposure_us, period_us)
-    if rule is None:
-        check_timing(timing)
-    else:
-        with pytest.raises(UnsupportedByDeviceError, match=rule):
-            check_timing(timing)
+def test_a_timing_is_judged_by_rules_with_names(exposure_us: int, period_us: int, rule: str) -> None:
+    for sound in ((235, 235), (1000, 1230), (1000, 1000), (200_000_000, 200_000_000)):
+        check_timing(Timing(*sound))
+    with pytest.raises(UnsupportedByDeviceError, match=rule):
+        check_timing(Timing(exposure_us, period_us))
 
 
 @pytest.mark.parametrize("bit_depth", MINIMUM_US)
@@ -63,18 +57,18 @@ def test_light_covers_the_exposure_and_the_camera_s_start(
 
 
 @pytest.mark.parametrize(
-    ("exposure_s", "period_s", "margin_s", "duty_limit", "rule"),
+    ("timing", "margin_s", "duty_limit", "rule"),
     [
-        (0.010, 0.0104, 0.0005, 1.0, "light takes 10500 µs, the period is 10400 µs"),
-        (0.0, 0.01, 0.0, 1.0, "lengthen the period"),
-        (0.010, 0.020, 0.0, 0.4, r"light is on for 50% of the time, duty_limit .* 40%"),
+        ((0.010, 0.0104), 0.0005, 1.0, "light takes 10500 µs, the period is 10400 µs"),
+        ((0.0, 0.01), 0.0, 1.0, "lengthen the period"),
+        ((0.010, 0.020), 0.0, 0.4, r"light is on for 50% of the time, duty_limit .* 40%"),
     ],
 )
 def test_light_that_does_not_fit_is_refused(
-    exposure_s: float, period_s: float, margin_s: float, duty_limit: float, rule: str
+    timing: tuple[float, float], margin_s: float, duty_limit: float, rule: str
 ) -> None:
     with pytest.raises(UnsupportedByDeviceError, match=rule):
-        lit(exposure_s, period_s, margin_s=margin_s, duty_limit=duty_limit)
+        lit(*timing, margin_s=margin_s, duty_limit=duty_limit)
 
 
 def test_pictures_beyond_the_buffers_need_time() -> None:

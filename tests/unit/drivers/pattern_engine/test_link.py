@@ -9,6 +9,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -16,14 +17,17 @@ from drivers.dlpc350.projector import DLPC350
 from drivers.pattern_engine.link import Link, open_link
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError
 from tests.contract.dlpc350_device import Cable, FakeEngine
+from tests.unit.drivers.conftest import OPENED
 
 SHORT_S = 0.05
 
 
 @contextmanager
-def wired(*, answer_s: float = 5.0) -> Iterator[tuple[Link, socket.socket]]:
+def wired(*, before: bytes = b"") -> Iterator[tuple[Link, socket.socket]]:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    link = Link(near.detach(), "light engine", DLPC350, answer_s=answer_s)
+    if before:
+        far.send(before)
+    link = Link(near.detach(), "light engine", DLPC350, answer_s=SHORT_S if before else 5.0)
     try:
         with far:
             yield link, far
@@ -36,8 +40,9 @@ def engine() -> FakeEngine:
     return FakeEngine({})
 
 
-def linked(engine: FakeEngine, *, answer_s: float = 5.0) -> Link:
-    return Link(Cable(engine).host, "light engine", DLPC350, answer_s=answer_s)
+def linked(engine: FakeEngine) -> Link:
+    OPENED.append(Link(Cable(engine).host, "light engine", DLPC350, answer_s=5.0))
+    return OPENED[-1]
 
 
 def answered(number: int, data: bytes, *, flags: int = 0xC0) -> bytes:
@@ -67,6 +72,14 @@ def test_a_command_is_framed_as_the_manual_says() -> None:
         assert link.read(0x1A34, 100) == long[:100]
         with pytest.raises(DeviceError, match="asked to send 507 bytes at once, it takes 506"):
             link.write(0x1A34, bytes(507))
+        far.send(answered(5, b"\7"))
+        with pytest.raises(DeviceError, match="asked for 8 bytes of 0x1a29, it gave 1"):
+            link.read(0x1A29, 8)
+
+
+def test_what_another_program_left_unread_is_forgotten() -> None:
+    with wired(before=answered(1, b"\7")) as (link, _), pytest.raises(DeviceError, match="did not answer"):
+        link.read(0x1A0C, 1)
 
 
 def test_an_answer_to_an_earlier_command_is_passed_over(engine: FakeEngine) -> None:
@@ -74,17 +87,6 @@ def test_an_answer_to_an_earlier_command_is_passed_over(engine: FakeEngine) -> N
     engine.registers[0x1A29] = bytes(range(8))
     link = linked(engine)
     assert [link.read(0x1A29, 8) for _ in range(300)] == [bytes(range(8))] * 300
-    link.close()
-
-
-def test_what_another_program_left_unread_is_forgotten() -> None:
-    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with far:
-        far.send(answered(1, b"\7"))
-        link = Link(near.detach(), "light engine", DLPC350, answer_s=SHORT_S)
-        with pytest.raises(DeviceError, match="did not answer"):
-            link.read(0x1A0C, 1)
-        link.close()
 
 
 def test_a_refusal_and_a_silent_engine_are_reported_and_it_may_come_back(engine: FakeEngine) -> None:
@@ -99,14 +101,6 @@ def test_a_refusal_and_a_silent_engine_are_reported_and_it_may_come_back(engine:
     engine.faults.silent.clear()
     link._answer_s = 5.0
     assert link.read(0x1A0C, 1) == b"\0"
-    link.close()
-
-
-def test_an_answer_that_is_too_short_is_refused() -> None:
-    with wired() as (link, far):
-        far.send(answered(1, b"\7"))
-        with pytest.raises(DeviceError, match="asked for 8 bytes of 0x1a29, it gave 1"):
-            link.read(0x1A29, 8)
 
 
 def test_an_unplugged_engine_is_gone_and_a_closed_link_is_closed() -> None:
@@ -153,16 +147,15 @@ def test_a_number_that_was_given_to_another_device_is_noticed(
             open_link(path, DLPC350)
 
 
-@pytest.mark.parametrize(("number", "kind"), [(errno.EACCES, DeviceError), (errno.EBUSY, DeviceBusyError)])
+@pytest.mark.parametrize(
+    ("number", "kind", "words"),
+    [(errno.EACCES, DeviceError, 'ATTRS{idProduct}=="6401"'), (errno.EBUSY, DeviceBusyError, "")],
+)
 def test_a_node_that_may_not_be_opened_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, number: int, kind: type[DeviceError]
+    monkeypatch: pytest.MonkeyPatch, number: int, kind: type[DeviceError], words: str
 ) -> None:
-    def refuse(*_: object) -> int:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(os, "open", refuse)
+    monkeypatch.setattr(os, "open", mock.Mock(side_effect=OSError(number, os.strerror(number))))
     with pytest.raises(kind) as refused:
         open_link(Path("/dev/hidraw0"), DLPC350)
     assert type(refused.value) is kind
-    if number == errno.EACCES:
-        assert 'ATTRS{idProduct}=="6401"' in str(refused.value)
+    assert words in str(refused.value)
