@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
 import statistics
@@ -17,20 +16,14 @@ from typer.testing import CliRunner
 from slrig.cli import devices
 from slrig.cli.commands import app
 from slrig.devices import FoundDevice
-from slrig.discovery import GROUPS, Findings, InstalledDriver, MissingLibrary
+from slrig.discovery import Findings, InstalledDriver, MissingLibrary
 from slrig.errors import DriverBrokenError
-from tests.plugin.conftest import path_with
 
 LIMIT_S = 2.0
 LIBRARIES = ("depthai", "gi", "harvesters", "picamera2")
 """What the extras bring: the child is told that there is none of it."""
 
-FINDERS = {
-    "depthai": "drivers.depthai:find_devices",
-    "genicam": "drivers.genicam:find_devices",
-    "gentl": "drivers.genicam:find_gentl_devices",
-    "picamera2": "drivers.picamera2:find_devices",
-}
+FINDERS = ("depthai", "genicam", "gentl", "picamera2")
 NOTHING = Findings((), (), ())
 INSTALL = "pip install 'slrig[depthai]'"
 
@@ -101,19 +94,12 @@ def test_what_drivers_print_is_not_part_of_the_answer(
 
 @pytest.mark.realtime
 def test_with_nothing_plugged_in_and_no_library_it_answers_at_once_and_says_what_to_do(tmp_path: Path) -> None:
-    declared = {entry.name for entry in importlib.metadata.entry_points(group=GROUPS["finder"])}
-    metadata = tmp_path / "site" / "finders_of_the_tests-1.0.dist-info"
-    metadata.mkdir(parents=True)
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: finders-of-the-tests\nVersion: 1.0\n")
-    lines = [f"{name} = {target}" for name, target in FINDERS.items() if name not in declared]
-    (metadata / "entry_points.txt").write_text("\n".join([f"[{GROUPS['finder']}]", *lines, ""]))
     code = f"import sys\nsys.modules.update(dict.fromkeys({LIBRARIES}))\nfrom slrig.cli.commands import main\nmain()\n"
 
     def run(*arguments: str) -> tuple[str, float, float]:
         before, begun_s = os.times(), time.monotonic()
         done = subprocess.run(  # noqa: S603 - our own command
             [sys.executable, "-c", code, "devices", *arguments],
-            env={**os.environ, "PYTHONPATH": path_with(tmp_path / "site")},
             cwd=tmp_path,
             capture_output=True,
             text=True,

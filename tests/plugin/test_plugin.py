@@ -1,6 +1,4 @@
-"""Drivers of other people's packages, installed by pip: found, listed, examined, served and scanned with; and packages
-that fail, of which slrig tells and otherwise takes no notice.
-"""
+"""Drivers of other people's packages, installed by pip: found, examined, served and scanned with; some of them fail."""
 
 from __future__ import annotations
 
@@ -8,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from typer.testing import CliRunner
 from slrig.bundle import write_calibration
 from slrig.cli.commands import app
 from slrig.model import Calibration, Pinhole, Size
-from tests.e2e.conftest import KEY, Start, start
+from tests.e2e.conftest import KEY, ServiceProcess, Start, start
 from tests.plugin.conftest import path_with, slrig
 
 __all__ = ["start"]
@@ -72,6 +71,16 @@ def chart_rig(folder: Path, *, driver: str = "example_chart") -> Path:
     write_calibration(folder / "chart.json", Calibration({"left": devices[0]}, devices[1]))
     (folder / "rig.toml").write_text(RIG.format(driver=driver))
     return folder / "rig.toml"
+
+
+@pytest.fixture
+def serves(
+    start: Start, example_site: Path, broken_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], ServiceProcess]:
+    """Starts a service of a camera driver, next to broken plug-ins."""
+    monkeypatch.setenv("PYTHONPATH", path_with(example_site, broken_site))
+    monkeypatch.setenv("SLRIG_API_KEY", KEY)
+    return lambda driver: start(chart_rig(tmp_path / "rig", driver=driver))
 
 
 def test_devices_lists_what_is_installed_found_broken_and_missing(
@@ -142,11 +151,9 @@ def test_the_example_conforms(example_site: Path, tmp_path: Path) -> None:
 
 
 def test_a_scan_with_the_example_beside_broken_plug_ins_is_a_plane_at_its_distance(
-    start: Start, example_site: Path, broken_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    serves: Callable[[str], ServiceProcess], tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", path_with(example_site, broken_site))
-    monkeypatch.setenv("SLRIG_API_KEY", KEY)
-    service = start(chart_rig(tmp_path / "rig"))
+    service = serves("example_chart")
     output = tmp_path / "scan"
     result = CliRunner().invoke(app, ["scan", "--url", service.url, "--output", str(output)])
     assert result.exit_code == 0, result.output
@@ -180,17 +187,9 @@ def test_a_scan_with_the_example_beside_broken_plug_ins_is_a_plane_at_its_distan
     ],
 )
 def test_a_rig_that_names_a_broken_driver_says_why_and_the_service_goes_on(
-    start: Start,
-    example_site: Path,
-    broken_site: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    driver: str,
-    told: str,
+    serves: Callable[[str], ServiceProcess], tmp_path: Path, driver: str, told: str
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", path_with(example_site, broken_site))
-    monkeypatch.setenv("SLRIG_API_KEY", KEY)
-    service = start(chart_rig(tmp_path / "rig", driver=driver))
+    service = serves(driver)
     result = CliRunner().invoke(app, ["scan", "--url", service.url, "--output", str(tmp_path / "scan")])
     assert result.exit_code == 2
     assert told in result.stderr.replace("\n", " ")

@@ -1,7 +1,4 @@
-"""Drivers that break the contract, each in one way, as drivers in the field do: cameras, and then projectors.
-
-Each says which checks find it, and some words of what they say.
-"""
+"""Drivers that break the contract, each in one way, as drivers in the field do: cameras, and then projectors."""
 
 from __future__ import annotations
 

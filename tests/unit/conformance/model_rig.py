@@ -1,7 +1,4 @@
-"""A rig that keeps the contract, on virtual time: every trigger there is, and a projector that plays.
-
-Drivers that break the contract are made of it by overriding what they break.
-"""
+"""A rig that keeps the contract, on virtual time: every trigger there is, and a projector that plays."""
 
 from __future__ import annotations
 

@@ -1,11 +1,4 @@
-"""OAK devices without hardware: `depthai` itself, with the two classes that need a device replaced.
-
-What the driver gets is real: `Pipeline`, `Sync`, queues, `ImgFrame`, `CameraControl`, `CalibrationHandler`,
-`CameraFeatures`, `DeviceInfo`. Replaced are `Device` (nothing is plugged in here) and, in the pipeline, the node
-`Camera`: a host node plays the sensor before a `Stage`. It takes settings after some frames as a sensor does, tells in
-every frame what it used, stamps a frame with its exposure's end, and loses, damages, repeats and delays frames
-on demand.
-"""
+"""OAK devices without hardware: `depthai` itself, with the two classes that need a device replaced."""
 
 from __future__ import annotations
 

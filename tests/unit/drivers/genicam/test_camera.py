@@ -1,7 +1,4 @@
-"""The drivers genicam and gentl on their fake cameras: features, formats, triggers, clocks, and what goes wrong.
-
-What every driver is asked, `tests/contract/test_contract.py` asks of both.
-"""
+"""The drivers genicam and gentl on their fake cameras: features, formats, triggers, clocks, and what goes wrong."""
 
 from __future__ import annotations
 

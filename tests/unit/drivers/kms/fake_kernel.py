@@ -1,7 +1,4 @@
-"""A graphics card below the driver: what the kernel would do with its requests, in memory.
-
-A property's number is that of its place in `NAMES`, plus 1000. Flips are answered at once, by events on a socket.
-"""
+"""A graphics card below the driver: what the kernel would do with its requests, in memory."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A camera that says yes and does something else: every property is read back.
-
-`Obstinate` behaves as `cv2.VideoCapture` was measured to on a kernel's camera: `set` returns True whatever happened.
-"""
+"""A camera that says yes and does something else: every property is read back."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A camera of the kernel's, by its stamps: OpenCV's part is a stand-in, the kernel's that of `v4l2_virtual`.
-
-OpenCV's own code, on a kernel's camera: `tests.contract.test_vivid`.
-"""
+"""A camera of the kernel's, by its stamps: OpenCV's part is a stand-in, the kernel's that of `v4l2_virtual`."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""What the drivers of all pattern engines do alike, above peers that speak their protocols and are as unhelpful as
-allowed.
-
-What every projector promises is in the contract suite. What only one engine has (flash, tables, uploads) is tested in
-`tests.unit.drivers.dlpc347x`, `dlpc350` and `dlpc900`.
-"""
+"""What the drivers of all pattern engines do alike, above peers that speak their protocols."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""picamera2 without a Raspberry Pi: the calls that the driver makes, as version 0.3.38 answers them, before a stage.
-
-A sensor exposes back to back. Of the requests that are complete one is kept for who asks; a job that asks waits for the
-next one. Requests that are not released are missing to the camera, and `stop` waits for the jobs that came before it.
-Time is the stage's; frames come about when the driver waits for them.
-"""
+"""picamera2 without a Raspberry Pi: the calls that the driver makes, as version 0.3.38 answers them, before a stage."""
 
 from __future__ import annotations
 

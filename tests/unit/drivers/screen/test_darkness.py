@@ -1,7 +1,4 @@
-"""Dark when the process is killed, its thread hangs or its guard is killed. The desktop is white.
-
-Dark after opening and after every end: `tests.contract.test_screen`.
-"""
+"""Dark when the process is killed, its thread hangs or its guard is killed. The desktop is white."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The modules of MicroPython on an RP2040, for the pins of the reference box: everything that they do is noted.
-
-Runs in CPython and in MicroPython. `rp2.asm_pio` assembles as the real one does: by calling the program with its words
-as globals.
-"""
+"""The modules of MicroPython on an RP2040, for the pins of the reference box: everything that they do is noted."""
 
 # MicroPython has no `__future__`. What its modules take and a test does not look at is taken all the same.
 # ruff: noqa: ARG002

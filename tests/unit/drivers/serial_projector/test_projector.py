@@ -1,7 +1,4 @@
-"""The driver on a box at the end of a line: light, refusals, restarts, cables, other hosts.
-
-What every projector promises is in the contract suite; here is what only this one does.
-"""
+"""The driver on a box at the end of a line: light, refusals, restarts, cables, other hosts."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The reference core on a clock that the test moves: at most once, in one session, and dark when it must be.
-
-And the protocol's page: its example is what the core answers, and nothing that a box says is left out.
-"""
+"""The reference core on a clock that the test moves: at most once, in one session, and dark when it must be."""
 
 from __future__ import annotations
 

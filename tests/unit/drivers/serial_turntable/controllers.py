@@ -1,9 +1,4 @@
-"""Stand-ins for controllers of turntables, at the far end of a port in memory: written from the protocols' documents.
-
-`GrblBoard` follows what GRBL 1.1 publishes of its interface and commands: realtime bytes are obeyed as they come, lines
-are answered in order, a status report is made when it is asked for. `LineBoard` follows the docstring of
-drivers.serial_turntable. Motion is counted in reports, or in looks, not in time: `slow` says how many it takes.
-"""
+"""Stand-ins for controllers of turntables, written from the documents of GRBL 1.1 and of drivers.serial_turntable."""
 
 from __future__ import annotations
 

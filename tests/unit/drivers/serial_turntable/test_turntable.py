@@ -1,7 +1,4 @@
-"""Turntables on serial lines, before stand-ins for their controllers: what is sent, and everything that goes wrong.
-
-What every turntable promises is in `tests.contract.test_turntables`.
-"""
+"""Turntables on serial lines, before stand-ins for their controllers: what is sent, and everything that goes wrong."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The driver on a fake kernel: formats and rates that are taken otherwise, frames that are not given, and faults.
-
-What every driver is asked, `tests/contract/test_contract.py` asks of this one on the same kernel.
-"""
+"""The driver on a fake kernel: formats and rates that are taken otherwise, frames that are not given, and faults."""
 
 from __future__ import annotations
 

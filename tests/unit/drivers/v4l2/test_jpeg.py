@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.v4l2 import jpeg
-from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, grey_image
 from slrig.model import Size
 
 Bytes = NDArray[np.uint8]
@@ -53,16 +52,6 @@ def test_a_lost_packet_is_found(kind: str) -> None:
     # What a high-speed USB packet carries, and a scan of some sixty thousand bytes.
     found = [jpeg.fault_of(with_hole(data, rng, 1012)) != "" for _ in range(200)]
     assert sum(found) >= 198
-
-
-def test_a_decoder_paints_over_what_is_lost() -> None:
-    data = with_hole(picture(grey=True), np.random.default_rng(1), 1012)
-    # This is why the data are walked: the decoder gives an image of the right size.
-    decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-    assert decoded is not None
-    assert decoded.shape == SIZE.shape
-    with pytest.raises(CorruptFrameError, match="damaged"):
-        grey_image(data, LAYOUTS["MJPG"], SIZE, stride_bytes=0)
 
 
 def test_frames_without_tables_have_the_usual_ones() -> None:
