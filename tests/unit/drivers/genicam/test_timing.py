@@ -42,12 +42,8 @@ def test_frame_ids_are_unwrapped(ids: list[int], numbers: list[int | None]) -> N
     counter = FrameNumbers()
     assert [counter.next(block_id) for block_id in ids] == numbers
     assert counter.made == 1 + max(number for number in numbers if number is not None)
-
-
-def test_all_ids_of_a_long_session_have_numbers_of_their_own() -> None:
     counter = FrameNumbers()
-    ids = [1 + index % 65535 for index in range(200_000)]
-    assert [counter.next(block_id) for block_id in ids] == list(range(200_000))
+    assert [counter.next(1 + index % 65535) for index in range(70_000)] == list(range(70_000))
 
 
 class Host:
@@ -138,18 +134,13 @@ def test_starts_without_triggers_hold_the_truth(latched: bool, stamped: bool) ->
         assert start.most_ns - start.least_ns <= (EXPOSURE + 5 * MS if latched and stamped else TRANSFER)
 
 
-def test_a_frame_that_lay_in_the_camera_is_dated_by_the_clock() -> None:
+def test_a_frame_that_lay_in_the_camera_is_dated_by_the_clock_and_no_stamp_is_later_than_its_arrival() -> None:
     host = Host()
     starts = UntriggeredStarts(EXPOSURE, TRANSFER, tied(host))
     start = starts.start(Arrival(0, host.stamp(100 * MS), 100 * MS + EXPOSURE + 900 * MS))
     assert start is not None
     assert start.least_ns <= 100 * MS <= start.most_ns < 101 * MS
-
-
-def test_a_stamp_later_than_its_arrival_is_not_believed() -> None:
-    host = Host()
-    starts = UntriggeredStarts(EXPOSURE, TRANSFER, tied(host))
-    assert starts.start(Arrival(0, host.stamp(500 * MS), 400 * MS)) is None
+    assert starts.start(Arrival(1, host.stamp(500 * MS), 400 * MS)) is None
 
 
 @dataclass(frozen=True)
