@@ -1,8 +1,4 @@
-"""The OAK driver before a stage: a mono pair of one device, with the library's own messages, queues and Sync.
-
-The library must be installed, no device need be plugged in; what stands below the driver is in
-`tests.unit.drivers.depthai.fake_oak`. Without the library the bench skips, on CI it fails.
-"""
+"""The OAK driver before a stage: a mono pair of one device, with the library's own messages, queues and Sync."""
 
 from __future__ import annotations
 

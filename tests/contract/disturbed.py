@@ -1,8 +1,4 @@
-"""Every driver before a device that loses, damages, repeats and delays frames, as a bench for counting wrong frames.
-
-What is disturbed is what the device's own driver can notice. Damage that nothing marks is left to the evidence of a
-scan, and so is not among these.
-"""
+"""Every driver before a device that loses, damages, repeats and delays frames, as a bench for counting wrong frames."""
 
 from __future__ import annotations
 

@@ -1,11 +1,4 @@
-"""A DLPC3478 at an address of a bus: what it does with commands, as TI's guides and sources say, and strictly.
-
-It is as unhelpful as these allow: it wakes up with LEDs on and a pattern lit; a command of a wrong length, or with a
-value that it does not have, is passed over and told of by the communication error of the short status, which is cleared
-as it is read; a sequence that it does not have shows in the sequence error; the last pattern of a sequence stays
-on the mirrors; flash that was not erased is not written; a repeat comes after the first time, or is it
-(`counts_first`).
-"""
+"""A DLPC3478 at an address of a bus: what it does with commands, as TI's guides and sources say, and strictly."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
 """The light engine's driver before a camera on its trigger wire: a bench for the contract suite.
 
-Here the engine is at the other end of a pair of sockets. In the guest it is a HID device of the kernel, and the driver
-opens its hidraw node: `python -m tests.contract.dlpc350_bench FILE` runs the contract suite and the checks below on it,
-and writes what came of each to FILE, as JSON; `tests/contract/test_dlpc350_guest.py` asserts on that.
+`python -m tests.contract.dlpc350_bench FILE` runs it in the guest, on a HID device of the kernel, with more checks.
 """
 
 from __future__ import annotations

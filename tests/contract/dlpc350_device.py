@@ -1,9 +1,7 @@
 """A DLPC350 at the other end of the wire: what the controller does with reports, as TI's documents say, and strictly.
 
-It is as unhelpful as the documents allow: it wakes up in video mode with every LED on; a stop leaves the last pattern
-lit; settings are refused while a sequence runs, and a start before the tables were validated; light comes only when the
-picture was loaded, although the status says at once that the sequence runs. Its light goes to whoever asks
-(`Stage.show`), its trigger output too.
+It wakes up in video mode with every LED on; a stop leaves the last pattern lit; settings are refused while a sequence
+runs, and a start before the tables were validated; light comes only when the picture was loaded.
 """
 
 from __future__ import annotations
@@ -112,23 +110,12 @@ class Sequencer:
 
 
 class FakeEngine(Sequencer):
-    """A controller with pictures in its flash.
+    """A controller with pictures in its flash: BMP files by their place.
 
-    Parameters
-    ----------
-    pictures
-        BMP files by their place in the flash.
-    light, pulse
-        Called at every change of light (None: dark), and at every edge of the trigger output (ns).
-    load_s
-        How long a picture takes from the flash.
-    keeps
-        Whether a start takes it from the buffer where it is still there. TI's documents say that a sequence repeats
-        from there without a load (DLPU011, "Pattern Sequence Background"), and do not say it of another start.
-    clock
-        The one that its sequencer runs by, on a thread `SEQUENCER`.
-    led_inverted
-        Whether light falls as the registers of the currents rise; None: it is full unless all of them are 255.
+    light, pulse : called at every change of light (None: dark), and at every edge of the trigger output (ns). load_s :
+    how long a picture takes from the flash. keeps : whether a start takes it from the buffer where it is still there;
+    TI's documents say nothing of it. clock : the one that its sequencer runs by. led_inverted : whether light falls as
+    the registers of the currents rise; None: it is full unless all of them are 255.
     """
 
     def __init__(

@@ -1,12 +1,4 @@
-"""A DLPC900 at the other end of the wire: what the controller does with reports, as DLPU018 says, and strictly.
-
-It is as unhelpful as the guide allows, like `tests.contract.dlpc350_device`: it wakes up with a pattern lit; settings
-are refused while a sequence runs, and so are tables and pictures but in the mode for them; pictures that do not come
-with the last one first, or came before the table had its length, are lost; the last pattern of a sequence stays lit.
-TRIG_OUT_1 is on while a pattern is, so it has an edge only after dark. A pattern that is not to be cleared stays
-through its dark time. Data and orders are answered by nothing; what is wrong with them is only in the error code, which
-the next command replaces.
-"""
+"""A DLPC900 at the other end of the wire: what the controller does with reports, as DLPU018 says, and strictly."""
 
 from __future__ import annotations
 

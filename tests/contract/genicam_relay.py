@@ -1,7 +1,4 @@
-"""A relay before a GigE Vision camera's control port: it gives the camera a clock that can be latched, and faults.
-
-The stream goes past it. Registers as GigE Vision 1.2 numbers them: 0x0944 latches, 0x0948 and 0x094C hold the result.
-"""
+"""A relay before a GigE Vision camera's control port: it gives the camera a clock that can be latched, and faults."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""A GenICam camera in memory: a description of its features, the registers behind them, and a sensor before a stage.
-
-What it does is what cameras do: it exposes for as long as its register says, ignores triggers meanwhile, counts every
-frame that it made, and stamps its start by a clock of its own. It knows nothing of GenTL (`gentl_producer`).
-"""
+"""A GenICam camera in memory: a description of its features, the registers behind them, and a sensor before a stage."""
 
 from __future__ import annotations
 

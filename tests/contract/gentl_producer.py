@@ -1,7 +1,6 @@
 """A GenTL producer of our own: what a vendor's .cti file is to harvesters, before a camera in memory.
 
-GenTL is an interface in C. The functions of the shared library, which the C compiler makes here, only call on; what
-they do is done in Python, in this process. Names, numbers and meanings: EMVA's GenICam GenTL Standard, version 1.5.
+A shared library in C calls on what is done here. Names, numbers, meanings: EMVA's GenICam GenTL Standard, version 1.5.
 """
 
 # ruff: noqa: ARG002, N802 - methods have GenTL's names and arguments

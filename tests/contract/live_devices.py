@@ -1,8 +1,4 @@
-"""A display and webcams in real time on a stage, by the timing rules of the drivers `screen` and `v4l2`.
-
-The display takes a picture at its next refresh, says when that was, and lights it later by a delay of its own. A camera
-runs by itself, stamps a frame when its first packet comes, delivers it later, and keeps four.
-"""
+"""A display and webcams in real time on a stage, by the timing rules of the drivers `screen` and `v4l2`."""
 
 from __future__ import annotations
 

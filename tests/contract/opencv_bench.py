@@ -1,9 +1,4 @@
-"""The OpenCV driver before staged light: a network camera on loopback, and the same through a pipe.
-
-The network camera is a sensor that runs free, and a server that sends what it saw as JPEGs (multipart/x-mixed-replace,
-as network cameras do). OpenCV and everything above it are the real ones; what is not fetched waits in the buffers of
-sockets and pipes, also as it does with a camera.
-"""
+"""The OpenCV driver before staged light: a network camera on loopback, and the same through a pipe."""
 
 from __future__ import annotations
 
@@ -12,13 +7,14 @@ import random
 import select
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import cv2
 
@@ -82,8 +78,22 @@ class NetworkCamera:
         }
 
 
-class Served:
-    """The camera as a server on loopback. A context manager."""
+class Source(ABC):
+    """Where a camera's frames can be had. A context manager."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End it."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Served(Source):
+    """The camera as a server on loopback."""
 
     def __init__(self, camera: NetworkCamera) -> None:
         self.camera = camera
@@ -118,15 +128,9 @@ class Served:
         self._server.server_close()
         self._thread.join(10)
 
-    def __enter__(self) -> Served:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class Piped:
-    """The camera as a program that writes into a named pipe. A context manager."""
+class Piped(Source):
+    """The camera as a program that writes into a named pipe."""
 
     def __init__(self, camera: NetworkCamera, path: Path) -> None:
         self.camera = camera
@@ -156,17 +160,11 @@ class Piped:
         self.camera.gone.set()
         self._thread.join(10)
 
-    def __enter__(self) -> Piped:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def served_bench(folder: Path, *, through: str = "stream") -> Bench:
     """A network camera, or one that another program writes into a file as it goes: a named pipe."""
     light = staged(noise_dn=1.0)
-    source: Served | Piped
+    source: Source
     if through == "stream":
         source = Served(NetworkCamera(light))
         device = source.url

@@ -1,8 +1,4 @@
-"""How often a driver lets a frame pass that does not show the pattern it was paired with: for every driver, counted.
-
-Scans are made on a disturbed device, with idle gaps of random length wherever a real program has them, until enough
-frames were accepted; each is then compared with what the camera should have seen of every pattern of the sequence.
-"""
+"""How often a driver lets a frame pass that does not show the pattern it was paired with: for every driver, counted."""
 
 from __future__ import annotations
 

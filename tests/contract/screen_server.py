@@ -1,7 +1,6 @@
-"""Xorg without a graphics card: true RandR outputs, modes and gamma ramps, a white desktop, and no display behind them.
+"""Xorg without a graphics card: true RandR outputs, modes and gamma ramps, and a white desktop.
 
-What a display would show is read from the frame buffer, through libX11 and not through any of the driver's code. Needs
-the Debian packages `PACKAGES`.
+What a display would show is read from the frame buffer, through libX11 and through none of the driver's code.
 """
 
 from __future__ import annotations

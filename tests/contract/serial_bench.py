@@ -1,8 +1,4 @@
-"""The serial projector on a trigger box at the end of a pseudo-terminal, before cameras that the box triggers by wire.
-
-Everything above the wire is the real driver; below it is the reference core on a light engine in memory, whose light
-falls on a stage.
-"""
+"""The serial projector on a trigger box at the end of a pseudo-terminal, before cameras that the box triggers."""
 
 from __future__ import annotations
 

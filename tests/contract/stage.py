@@ -1,8 +1,4 @@
-"""Light in time, for fakes that stand below a camera driver: a projector, and what a sensor sees of it.
-
-A fake camera asks `Stage.exposed` what it saw from one instant to another. If the pattern changed in between, it saw a
-mixture of both, as a real one does: a driver that pairs frames with patterns wrongly cannot hide it.
-"""
+"""Light in time, for fakes that stand below a camera driver: a projector, and what a sensor sees of it."""
 
 from __future__ import annotations
 
@@ -46,8 +42,8 @@ class Stage:
         self._rng = np.random.default_rng(seed)
         self._lock = threading.Lock()
         self._light: dict[bytes, NDArray[np.float64]] = {}
-        self._dark: Pixels = np.zeros((1, 1), np.uint8)
-        self._changes: list[tuple[int, Pixels]] = [(0, self._dark)]
+        self.dark: Pixels = np.zeros((1, 1), np.uint8)
+        self.changes: list[tuple[int, Pixels]] = [(0, self.dark)]
 
     @property
     def format(self) -> CameraFormat:
@@ -58,16 +54,16 @@ class Stage:
         with self._lock:
             late_s = self.latency_s + self.jitter_s * float(self._rng.random())
             asked_ns = self.clock.now_ns() if asked_ns is None else asked_ns
-            at_ns = max(asked_ns + round(late_s * 1e9), self._changes[-1][0])
+            at_ns = max(asked_ns + round(late_s * 1e9), self.changes[-1][0])
             # No camera looks back so far.
-            del self._changes[:-_REMEMBERED]
-            self._changes.append((at_ns, self._dark if profile is None else profile))
+            del self.changes[:-_REMEMBERED]
+            self.changes.append((at_ns, self.dark if profile is None else profile))
             return at_ns
 
     def exposed(self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0) -> Pixels:
         """What the sensor read out after an exposure, (H, W), with the scene's noise."""
         with self._lock:
-            changes = list(self._changes)
+            changes = list(self.changes)
         exposure_s = (t_end_ns - t_start_ns) / 1e9
         seen = np.zeros(self.format.size.shape)
         for index, (at_ns, profile) in enumerate(changes):
@@ -81,7 +77,7 @@ class Stage:
 
     def expected(self, profile: Pixels | None, *, exposure_s: float = REFERENCE_EXPOSURE_S) -> Pixels:
         """What the sensor reads of a pattern without noise: the truth that a frame is compared with."""
-        return self._whole(self._level(self._seen(self._dark if profile is None else profile), exposure_s))
+        return self._whole(self._level(self._seen(self.dark if profile is None else profile), exposure_s))
 
     def _level(self, seen: NDArray[np.float64], exposure_s: float) -> NDArray[np.float64]:
         scene = self.scene

@@ -1,9 +1,7 @@
 """A fake of the kernel's side of a video device: it answers the requests as the kernel and a camera would.
 
-A sensor runs free from the start of the stream, fills buffers in order, and loses frames when none is free. What it saw
-comes over a socket from the test, which holds the light. Nothing here is shared with the driver: layouts are offsets as
-a C compiler gives them for `linux/videodev2.h` on a 64-bit machine. Needs no more than Python's own library, for it is
-run by Debian's Python (`v4l2_server`).
+Layouts are offsets as a C compiler gives them for `linux/videodev2.h` on a 64-bit machine. Needs no more than Python's
+own library, for it is run by Debian's Python (`v4l2_server`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The V4L2 driver on a fake kernel in this process, on virtual time: its requests are answered, not sent.
-
-What lies between, the request itself and the device file, is checked with `v4l2_bench`.
-"""
+"""The V4L2 driver on a fake kernel in this process, on virtual time: its requests are answered, not sent."""
 
 from __future__ import annotations
 

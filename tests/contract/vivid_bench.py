@@ -1,8 +1,4 @@
-"""The drivers v4l2 and opencv before vivid's looped video, in the guest: what the projector shows, the camera delivers.
-
-The picture that the output node is given is what a small camera would see of the pattern (`Scene`), so a frame is that
-of its pattern exactly, bit by bit, or it is not.
-"""
+"""The drivers v4l2 and opencv before vivid's looped video, in the guest: each frame is its pattern's, bit by bit."""
 
 from __future__ import annotations
 

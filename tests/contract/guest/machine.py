@@ -1,8 +1,4 @@
-"""A virtual machine that runs one command on a kernel with drivers of our choice, and brings back what it wrote.
-
-QEMU emulates the processor (no /dev/kvm is needed) and boots Debian's kernel on the host's own files, read-only, with a
-layer in memory above them: the command finds the same Python, the same packages and the same checkout as the host.
-"""
+"""A virtual machine that runs one command on a kernel with drivers of our choice, and brings back what it wrote."""
 
 from __future__ import annotations
 
@@ -12,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,7 +51,6 @@ def run_in_guest(
     folder: Path,
     modules: Sequence[Module] = (),
     devices: Sequence[str] = (),
-    environment: Mapping[str, str] | None = None,
     timeout_s: float = 300.0,
     memory_mib: int = 1536,
     cores: int = 2,
@@ -65,9 +60,8 @@ def run_in_guest(
 
     command : runs as root, sees /dev and /sys of the guest, has a loopback interface only, and may write anywhere: all
     but the files in `FILES` is forgotten. folder : an empty one. modules : loaded before, with what they depend on.
-    devices : QEMU's `-device` arguments. environment : added to the few variables that the guest is given. timeout_s :
-    the machine is killed then, and with this process in any case. monitor : whether the guest's second serial port is
-    QEMU's own monitor (QMP), by which it sees what its displays show.
+    devices : QEMU's `-device` arguments. timeout_s : the machine is killed then, and with this process in any case.
+    monitor : whether the guest's second serial port is QEMU's own monitor (QMP), which shows what its displays show.
 
     Raises GuestUnavailableError: QEMU or Debian's kernel cannot be had here; GuestError: it did not come up or finish.
     """
@@ -75,7 +69,7 @@ def run_in_guest(
     archive, console, share = folder / "initrd", folder / "console", folder / "share"
     (share / "files").mkdir(parents=True)
     archive.write_bytes(initrd(kernel, modules))
-    (share / "command").write_text(_script(command, environment or {}))
+    (share / "command").write_text(_script(command))
     arguments = [
         # A guard below this process: the machine ends even if this process is killed.
         *("timeout", "--kill-after=5", f"{timeout_s + 10:.0f}"),
@@ -140,7 +134,7 @@ def _qemu() -> str:
     return found
 
 
-def _script(command: Sequence[str], environment: Mapping[str, str]) -> str:
+def _script(command: Sequence[str]) -> str:
     variables = {
         "HOME": "/root",
         "LANG": "C.UTF-8",
@@ -150,7 +144,6 @@ def _script(command: Sequence[str], environment: Mapping[str, str]) -> str:
         "OPENBLAS_NUM_THREADS": "1",
         # The processor's own instructions for SHA-256, emulated, are nine times as slow as OpenSSL's plain code.
         "OPENSSL_ia32cap": "0:0",
-        **environment,
     }
     given = " ".join(shlex.quote(f"{name}={value}") for name, value in variables.items())
     return f"cd {shlex.quote(str(_CHECKOUT))} && exec env -i {given} {shlex.join(command)}\n"

@@ -1,11 +1,7 @@
-"""The kernel's virtual video device `vivid`, from its far side: controls that inject faults, and a video output whose
-picture its capture node sees.
+"""The kernel's virtual video device `vivid`, from its far side: controls that inject faults, and a video output.
 
-Each instance has a capture node, and those that we ask for an output node too. With "Loop Video" on, every frame that
-the capture node delivers is a copy of what the output shows at that instant (kernel documentation, "The Virtual Video
-Test Driver (vivid)"; both nodes must agree on format and timing; Linux 6.11 put another control in its place). So the
-output node is a projector with a flip time, and the capture node a camera before it, with the kernel's own buffers,
-time stamps and errors in between.
+With "Loop Video" on, every frame of a capture node is what the output beside it shows at that instant, where both agree
+on format and timing (kernel documentation, "The Virtual Video Test Driver"; Linux 6.11 has another control for it).
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """What is asked of the drivers v4l2 and opencv on the kernel's vivid, in the guest.
 
-`python -m tests.contract.guest.vivid_checks FILE [PART_OF_A_NAME ...]` writes what came of each check to FILE, as JSON;
-`tests/contract/test_vivid.py` boots the guest, runs this once, and asserts on each. A check raises what is wrong, and
-notes what it measured.
+`python -m tests.contract.guest.vivid_checks FILE [PART_OF_A_NAME ...]` writes what came of each check to FILE, as JSON.
 """
 
 from __future__ import annotations

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slrig.devices import (
     AppliedSettings,
@@ -23,8 +22,10 @@ from slrig.devices import (
     Trigger,
 )
 from slrig.errors import FrameTimeoutError
-from slrig.model import Calibration, Frame, PatternSequence, Pixels, Size, Truth
+from slrig.model import Calibration, Frame, PatternSequence, Pixels, Size
 from slrig.patterns.sequence import encode
+from tests.contract.bench_head import BenchHead
+from tests.contract.stage import REFERENCE_EXPOSURE_S, Stage
 from tests.unit.capture.fake_rig import Scene, patterns_for
 
 PROJECTOR = Size(64, 48)
@@ -41,15 +42,13 @@ def sequence() -> PatternSequence:
     return encode(patterns_for(PROJECTOR), PROJECTOR)
 
 
-class World:
+class World(Stage):
     """Time that passes when somebody waits, and the light in it. Implements `slrig.devices.Clock`."""
 
     def __init__(self) -> None:
-        self.scene = Scene(camera=CAMERA, projector=PROJECTOR, noise_dn=0.8)
         self.at_ns = 10**9
-        self.changes: list[tuple[int, Pixels | None]] = [(0, None)]
         self.on_wire: list[Callable[[int], None]] = []
-        self._seen: dict[bytes, NDArray[np.float64]] = {}
+        super().__init__(Scene(camera=CAMERA, projector=PROJECTOR, noise_dn=0.8), clock=self)
 
     def now_ns(self) -> int:
         return self.at_ns
@@ -59,31 +58,11 @@ class World:
             self.at_ns = max(self.at_ns, t_ns)
 
     def change(self, at_ns: int, profile: Pixels | None) -> None:
-        self.changes.append((at_ns, profile))
+        self.changes.append((at_ns, self.dark if profile is None else profile))
 
     def darken(self) -> None:
         self.changes = [change for change in self.changes if change[0] < self.at_ns]
         self.change(self.at_ns, None)
-
-    def exposed(self, start_ns: int, exposure_s: float, gain: float) -> Pixels:
-        end_ns = start_ns + round(exposure_s * 1e9)
-        seen = np.zeros(self.scene.format.size.shape)
-        for index, (at_ns, profile) in enumerate(self.changes):
-            until_ns = self.changes[index + 1][0] if index + 1 < len(self.changes) else end_ns
-            share = (min(until_ns, end_ns) - max(at_ns, start_ns)) / (end_ns - start_ns)
-            if share > 0 and profile is not None:
-                seen += share * self._light(profile)
-        scene = self.scene
-        level = scene.albedo * (scene.ambient + scene.white * seen) * gain * exposure_s / EXPOSURE_S
-        values = 255 * np.clip(level, 0, 1) + scene.noise_dn * scene.rng.standard_normal(seen.shape)
-        whole: Pixels = np.clip(np.rint(values), 0, 255).astype(np.uint8)
-        return whole
-
-    def _light(self, profile: Pixels) -> NDArray[np.float64]:
-        key = profile.tobytes()
-        if key not in self._seen:
-            self._seen[key] = self.scene.light(profile)
-        return self._seen[key]
 
 
 @dataclass(frozen=True)
@@ -177,7 +156,9 @@ class ModelCamera(CameraState):
             self.pending.popleft()
 
     def frame(self, exposure: Exposure) -> Frame:
-        image = self.world.exposed(exposure.start_ns, self.applied.exposure_s, self.applied.gain)
+        end_ns = exposure.start_ns + round(self.applied.exposure_s * 1e9)
+        gain = self.applied.gain * REFERENCE_EXPOSURE_S / EXPOSURE_S
+        image = self.world.exposed(exposure.start_ns, end_ns, gain=gain)
         return Frame(
             self.name,
             image,
@@ -266,19 +247,6 @@ class ModelProjector(ProjectorState):
 
 
 @dataclass
-class ModelHead:
-    """Implements `slrig.devices.Head`, and `KeepsTime`."""
-
-    clock: World
-    projector: ModelProjector
-    cameras: Mapping[str, ModelCamera]
-    calibration: Calibration | None = None
-
-    def truth(self) -> Truth | None:
-        return None
-
-
-@dataclass
 class Maker:
     """Opens a rig of these classes, each time one in a world of its own; `rigs` are those that were opened.
 
@@ -293,7 +261,7 @@ class Maker:
 
     def __call__(self) -> Rig:
         world = World()
-        head = ModelHead(world, self.projector(world), {"left": self.camera(world)}, self.calibration)
+        head = BenchHead({"left": self.camera(world)}, self.projector(world), clock=world)
         settings = {"left": CameraSettings(EXPOSURE_S)}
         rig = Rig("model", head.cameras, head.projector, settings, self.calibration, head, clock=world)
         self.rigs.append(self.change(rig))

@@ -97,8 +97,9 @@ def test_an_examination_that_is_interrupted_closes_the_rig() -> None:
     assert owners() <= before
 
 
-def test_progress_is_reported_before_and_after_each_check() -> None:
+def test_checks_have_names_and_progress_is_reported_before_and_after_each() -> None:
     told: list[tuple[str, float, str]] = []
+    assert len({each.name for each in CHECKS}) == len({each.title for each in CHECKS}) == len(CHECKS)
     first, second = CHECKS[:2]
     run(Maker(), sequence(), checks=(first, second), progress=lambda *what: told.append(what))
     assert told == [
@@ -197,10 +198,6 @@ def test_a_report_can_be_written_as_json() -> None:
     assert 0 < document["passed"] < document["applicable"] == len(examined) - 1
     failed = [each for each in document["checks"] if each["outcome"] == "failed"]
     assert {"asked", "found", "do", "where"} == set(failed[0]["failure"])
-
-
-def test_the_checks_are_named_once() -> None:
-    assert len({each.name for each in CHECKS}) == len({each.title for each in CHECKS}) == len(CHECKS)
 
 
 def images(*levels: float, noise_dn: float = 0.0) -> list[Pixels]:

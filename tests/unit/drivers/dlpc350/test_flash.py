@@ -50,19 +50,16 @@ def test_planes_fill_green_then_red_then_blue_from_the_lowest_bit_and_are_given_
     assert all(np.array_equal(a, b) for a, b in zip(planes_in(content, "made"), planes, strict=True))
 
 
-def test_a_picture_of_another_kind_or_that_is_cut_is_refused() -> None:
+def test_a_picture_of_another_kind_or_that_is_cut_and_shades_of_grey_are_refused() -> None:
     shapes = ((1140, 911, 3), (800, 1280, 3), (1140, 912))
     others = [cv2.imencode(".bmp", np.zeros(shape, np.uint8))[1].tobytes() for shape in shapes]
     whole = picture_of([])
     for content in (*others, whole[:10], whole[:60], whole[:-1]):
         with pytest.raises(ConfigError, match="expected a BMP file of 912 x 1140 pixels with 24 bits"):
             planes_in(content, "splash.bmp")
-
-
-def test_shades_of_grey_are_refused() -> None:
-    sequence = PatternSequence(MIRRORS, (White(),), (np.full((1, 1), 128, np.uint8),))
+    grey = PatternSequence(MIRRORS, (White(),), (np.full((1, 1), 128, np.uint8),))
     with pytest.raises(UnsupportedByDeviceError, match="a mirror is on or off"):
-        plane_of(sequence, 0)
+        plane_of(grey, 0)
 
 
 @pytest.mark.parametrize(

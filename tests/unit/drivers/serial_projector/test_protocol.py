@@ -389,15 +389,13 @@ def test_a_sequence_runs_on_its_own_clock_and_can_be_stopped(host: Host) -> None
         host.ok(verb)
 
 
-def test_a_pattern_of_a_sequence_is_lit_for_its_exposure_and_the_hold(host: Host) -> None:
+def test_a_pattern_is_lit_for_its_exposure_and_a_box_that_is_late_does_not_hurry(host: Host) -> None:
     host.ok("SEQ 0 1 4000 10000 0")
     host.pass_us(3_000 + 4_499)
-    assert host.light.is_lit()
+    assert host.light.is_lit(), "for its exposure and the hold"
     host.pass_us(1)
     assert not host.light.is_lit()
-
-
-def test_a_box_that_is_late_does_not_hurry(host: Host) -> None:
+    host.events.clear()
     host.ok("SEQ 0 3 4000 10000 0")
     host.pass_us(3_000)
     # The program stood still for 50 ms.
@@ -413,6 +411,9 @@ def test_a_sequence_waits_for_triggers(host: Host) -> None:
     host.ok("SEQ 4 3 4000 10000 1")
     host.pass_us(500_000)
     assert host.light.shown == []
+    # Nothing else is shown while it goes on.
+    assert host.refused("SHOW 1") == Refused.STATE
+    assert host.refused("SEQ 0 1 4000 10000 0") == Refused.STATE
     for index in (4, 5, 6):
         shown = host.ok("TRIG")
         assert shown == (str(index), str(host.light.now_us))
@@ -423,13 +424,6 @@ def test_a_sequence_waits_for_triggers(host: Host) -> None:
     assert host.refused("TRIG") == Refused.STATE
     assert host.light.shown == [4, 5, 6]
     assert host.light.did.count("pulse") == 3
-
-
-@pytest.mark.parametrize("busy", ["SEQ 0 26 4000 10000 0", "SEQ 0 26 4000 10000 1"])
-def test_nothing_else_is_shown_while_a_sequence_goes_on(host: Host, busy: str) -> None:
-    host.ok(busy)
-    assert host.refused("SHOW 1") == Refused.STATE
-    assert host.refused("SEQ 0 1 4000 10000 0") == Refused.STATE
 
 
 # What is loaded.
@@ -476,16 +470,13 @@ def test_patterns_are_picked_from_anywhere_in_the_flash() -> None:
     assert run == ("2", "0", "3000"), "what was picked is used up"
 
 
-def test_patterns_that_the_flash_lacks_are_reported_and_not_loaded(host: Host) -> None:
+def test_patterns_that_the_flash_lacks_are_reported_and_picking_ends_with_its_session(host: Host) -> None:
     assert host.ok(f"PICK 0 {CRC32[4]:08X} 12345678 {CRC32[2]:08X} 0") == ("4", "1", "3")
     assert host.ok(f"PICK 4 {CRC32[0]:08X} 1") == ("6", "5")
     assert host.refused("LOAD 6 00000000") == Refused.PATTERNS
-    host.ok(picked([3, 2])[0])
-    assert host.refused(f"LOAD 2 {crc32_of_all([CRC32[2], CRC32[4]]):08X}") == Refused.PATTERNS
-
-
-def test_picking_ends_with_its_session_and_is_done_once(host: Host) -> None:
     pick, load = picked([5, 4])
+    host.ok(pick)
+    assert host.refused(f"LOAD 2 {crc32_of_all([CRC32[2], CRC32[4]]):08X}") == Refused.PATTERNS
     host.ok(pick)
     assert host.ask(pick, number=host.number).words == ("2",)
     host.ok(HELLO)
