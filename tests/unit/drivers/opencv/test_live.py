@@ -1,4 +1,4 @@
-"""A network camera on loopback, and a pipe. What was in a queue is never given for new: test_timing, test_reader."""
+"""A network camera on loopback, and a pipe. What was in a queue is never given for new: test_reader."""
 
 from __future__ import annotations
 
