@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.bench.light_sweep import Light, lit_scene
+from tests.golden.lit_scenes import Light, lit_scene
 from tests.golden.test_bundles import SCENES
 from tests.golden.test_image_processing import scored
 

@@ -1,22 +1,19 @@
-"""What whole commands cost, from the shell to the prompt, beside what others take: CPU, wall, and peak memory.
+"""What whole commands cost, from the shell to the prompt: CPU, wall, and peak memory.
 
     pytest tests/bench/test_whole_commands.py -s
 
-Bundles are rendered without truth. Ball pivoting needs Open3D (see `test_peers`), and its row is left out without it.
-Medians; goals that are missed fail the test after its table is printed.
+Bundles are rendered without truth. Medians; goals that are missed fail the test after its table is printed.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +26,6 @@ from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.bench.test_pipeline_speed import RIG
 
 RUNS = 5
-BUSY = 4
 MANY = 10
 
 
@@ -67,7 +63,7 @@ def rendered(folder: Path, text: str, plan: ScanPlan) -> Path:
 
 @pytest.fixture(scope="module")
 def half_a_million(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scan of half a million points; its code is of single columns, as peers need it."""
+    """A scan of half a million points; its code is of single columns, four frames more than it would need."""
     text = scaled(RIG, "[[head.camera]]", 0.77)
     plan = ScanPlan(patterns=PatternPlan(gray_cell_px=1))
     return rendered(tmp_path_factory.mktemp("half") / "scan", text, plan)
@@ -100,27 +96,6 @@ def ours(output: Path, *bundles: Path) -> list[str]:
     return [sys.executable, "-m", "slrig.cli", "reconstruct", *map(str, bundles), "--output", str(output)]
 
 
-def peer(method: str, bundle: Path, ours: Path) -> list[str]:
-    made = str(ours.with_name(f"{method}.ply"))
-    return [sys.executable, "-m", "tests.bench.peers.whole", method, str(bundle), str(ours / "points.ply"), made]
-
-
-@contextmanager
-def busy(count: int) -> Iterator[None]:
-    """So many processes that compute."""
-    command = [sys.executable, "-c", "print('on', flush=True)\nwhile True: pass"]
-    others = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(count)]  # noqa: S603 - our own
-    try:
-        for each in others:
-            assert each.stdout is not None
-            each.stdout.readline()
-        yield
-    finally:
-        for each in others:
-            each.kill()
-            each.communicate()
-
-
 def told(title: str, rows: Mapping[str, tuple[float, float | None]]) -> None:
     """Print the table; fail where a value is beyond its goal."""
     sys.stdout.write(f"\n{title}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
@@ -131,44 +106,13 @@ def told(title: str, rows: Mapping[str, tuple[float, float | None]]) -> None:
     assert not missed
 
 
-def test_one_scan_against_what_others_take(half_a_million: Path, tmp_path: Path) -> None:
+def test_one_scan(half_a_million: Path, tmp_path: Path) -> None:
     command = ours(tmp_path / "out", half_a_million)
     cost_of(command)
     mine = median([cost_of(command) for _ in range(RUNS)])
-    gray = median([cost_of(peer("gray_arrays", half_a_million, tmp_path / "out")) for _ in range(RUNS)])
-    rows: dict[str, tuple[float, float | None]] = {
-        "slrig reconstruct: CPU s": (mine.cpu_s, 3.0),
-        "slrig reconstruct: wall s": (mine.wall_s, 2.2),
-        "slrig reconstruct: peak MB": (mine.peak_mb, None),
-        "Gray per pixel + grid: CPU s": (gray.cpu_s, None),
-        "Gray per pixel + grid: wall s": (gray.wall_s, None),
-    }
-    if importlib.util.find_spec("open3d"):
-        balls = cost_of(peer("ball_pivoting", half_a_million, tmp_path / "out"))
-        rows["Gray + ball pivoting: CPU s"] = balls.cpu_s, None
-        rows["Gray + ball pivoting: wall s"] = balls.wall_s, None
-        rows["slrig over ball pivoting, CPU"] = mine.cpu_s / balls.cpu_s, 1 / 5
-    told(f"half a million points, medians of {RUNS}", rows)
-
-
-def test_with_four_busy_processes(half_a_million: Path, tmp_path: Path) -> None:
-    command = ours(tmp_path / "out", half_a_million)
-    cost_of(command)
-    other = peer("gray_arrays", half_a_million, tmp_path / "out")
-    mine, gray = (median([cost_of(each) for _ in range(RUNS)]) for each in (command, other))
-    with busy(BUSY):
-        mine_busy, gray_busy = (median([cost_of(each) for _ in range(RUNS)]) for each in (command, other))
-    slower = gray_busy.wall_s / gray.wall_s
     told(
-        f"beside {BUSY} busy processes, medians of {RUNS}",
-        {
-            "slrig reconstruct, quiet: wall s": (mine.wall_s, None),
-            "slrig reconstruct, busy: wall s": (mine_busy.wall_s, None),
-            "Gray per pixel + grid, quiet: wall s": (gray.wall_s, None),
-            "Gray per pixel + grid, busy: wall s": (gray_busy.wall_s, None),
-            "slow-down of Gray per pixel": (slower, None),
-            "slow-down of slrig": (mine_busy.wall_s / mine.wall_s, slower),
-        },
+        f"half a million points, medians of {RUNS}",
+        {"CPU s": (mine.cpu_s, 3.0), "wall s": (mine.wall_s, 2.2), "peak MB": (mine.peak_mb, None)},
     )
 
 

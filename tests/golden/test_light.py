@@ -1,6 +1,6 @@
 """Worse light on a small scene costs at most half more error; presets and the exposure assistant against a small sweep.
 
-`tests/bench/test_light_sweep.py` and `python -m tests.bench.preset_sweep` have the whole sweeps.
+`python -m tests.bench.preset_sweep` has the whole sweep of exposures.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import pytest
 
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from tests.bench.light_sweep import Figures, Light, lit_scene
 from tests.bench.preset_sweep import best_within, by_assistant, by_preset, object_rig, swept
+from tests.golden.lit_scenes import Figures, Light, lit_scene
 
 pytestmark = pytest.mark.slow
 

@@ -1,36 +1,33 @@
-"""One scene under light that gets worse, one property at a time: what the tests of the light sweep measure.
+"""A relief before the rig of `config/rigs/relief.toml`, under light that is worse in one property than the best.
 
-A relief stands before the rig of `config/rigs/relief.toml`. Nothing changes but the named property, and the exposure,
-which is set as an operator or an automatic exposure sets it: white comes near full scale and nowhere clips.
+The exposure is set as an operator or an automatic exposure sets it: white comes near full scale and nowhere clips.
 """
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
-from numpy.typing import NDArray
 
 from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import SceneSurface, read_scene, surface_of
 from slrig.bundle import write_bundle, write_truth
-from slrig.model import Calibration, CameraFormat, Capture, LineShift, PatternSequence, Shot, Surface, Truth
+from slrig.model import Calibration, CameraFormat, Capture, PatternSequence, Shot, Surface, Truth
+from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.plan import PatternPlan, ReconstructionPlan
 from slrig.scan.plan_check import pattern_sequence
 from slrig.scan.reconstruct import reconstruct_bundle
-from tests.light_bound import ExposedView, stripe_bound
+from tests.light_bound import ExposedView
 
 CONFIG = Path(__file__).parents[2] / "config"
 ALBEDO = 0.85
 WHITE_LEVEL = 0.85
 BRIGHTEST_PERCENT = 99.9
-_ENDS_REPEATS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +37,7 @@ class Light:
     gamma : of the projector; signal_blur_px : see `simulated_rig.light.Response`. ambient : light of the room over the
     projector's white. texture_ratio : brightest over darkest albedo; texture : its kind, in grains of 5 mm.
     lobe : strength of a mirror lobe beside the diffuse albedo; lobe_exponent : how narrow it is.
-    bracket : exposures, each as a multiple of the one that white sets. camera_blur_px : of a camera out of focus.
+    camera_blur_px : of a camera out of focus.
     """
 
     gamma: float = 1.0
@@ -50,7 +47,6 @@ class Light:
     texture: str = "checker"
     lobe: float = 0.0
     lobe_exponent: float = 20.0
-    bracket: tuple[float, ...] = (1.0,)
     camera_blur_px: float | None = None
 
 
@@ -58,48 +54,25 @@ class Light:
 class Figures:
     """What one scan under one light gave.
 
-    rms_mm, p99_mm, complete_03, error_over_sigma : see `slrig.meshing.quality.TruthScore`.
-    sigma_rms_mm : of the standard deviations that the mesh states; clipped : share of the seen pixels that were
-    refused as saturated.
+    rms_mm, complete_03, error_over_sigma : see `slrig.meshing.quality.TruthScore`.
+    sigma_rms_mm : of the standard deviations that the mesh states.
     """
 
     rms_mm: float
-    p99_mm: float
     complete_03: float
     error_over_sigma: float
     sigma_rms_mm: float
-    clipped: float
 
 
 @dataclass(frozen=True)
 class LitScene:
     """The scene before the rig under one light, exposed. calibration, truth and sequence are those of every scan."""
 
-    light: Light
     exposed: ExposedView
     calibration: Calibration
     truth: Truth
     sequence: PatternSequence
     camera: str
-
-    @property
-    def white_level(self) -> float:
-        """Median of white over the lit pixels, as a fraction of full scale."""
-        lit = np.isfinite(self.truth.cameras[self.camera].projector_px[..., 0])
-        sensor = self.exposed.sensor
-        level = np.median(self.exposed.ends[0][lit]) * sensor.dn_per_electron(self.exposed.gain) + sensor.pedestal_dn
-        return float(level / sensor.full_scale)
-
-    @property
-    def bound_px(self) -> float:
-        """Cramér-Rao bound of a stripe's centre in one image row, rms over the scene: the renderer's word alone.
-
-        Noise of the white and black frames counts in. A bracket is not: this is the bound of its shortest exposure.
-        """
-        index, pattern = next((i, p) for i, p in enumerate(self.sequence.patterns) if isinstance(p, LineShift))
-        lines = np.arange(pattern.centre_px, self.sequence.projector.width_px, pattern.period_px)
-        told = stripe_bound(self.exposed, self.sequence.profiles[index], lines, ends_repeats=_ENDS_REPEATS)
-        return float(np.sqrt(np.mean(told.row_px**2)))
 
     def scanned(self, work: Path, *, seed: int) -> Figures:
         """Make one noisy capture of the scene in the folder `work`, and reconstruct it there."""
@@ -108,11 +81,10 @@ class LitScene:
             Shot(
                 index,
                 self.camera,
-                sensor.read_out(mean * np.float32(times), gain=self.exposed.gain, rng=rng),
-                exposure_s=self.exposed.exposure_s * times,
+                sensor.read_out(mean, gain=self.exposed.gain, rng=rng),
+                exposure_s=self.exposed.exposure_s,
             )
             for index, mean in enumerate(map(self.exposed.electrons, self.sequence.profiles))
-            for times in self.light.bracket
         )
         size = self.calibration.cameras[self.camera].size
         capture = Capture(
@@ -124,15 +96,13 @@ class LitScene:
         report: Any = reconstruct_bundle(
             bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
         )
-        truth, refused = report["truth"], report["cameras"][self.camera]["refused_pixels"]
-        sigma_mm = _stated_mm(output / "mesh.ply")
+        truth = report["truth"]
+        sigma_mm = decode_mesh_ply((output / "mesh.ply").read_bytes()).sigma_mm.astype(np.float64)
         return Figures(
             rms_mm=truth["rms_mm"],
-            p99_mm=truth["p99_mm"],
             complete_03=truth["complete_0.3mm"],
             error_over_sigma=truth["error_over_sigma_p68"],
             sigma_rms_mm=float(np.sqrt(np.nanmean(sigma_mm**2))),
-            clipped=refused["saturated"] / len(self.truth.cameras[self.camera].visible_points_mm),
         )
 
 
@@ -158,7 +128,6 @@ def lit_scene(light: Light, *, share: float = 1.0) -> LitScene:
     brightest_e = np.percentile(full.ends[0], BRIGHTEST_PERCENT)
     exposure_s = float(sensor.saturation_s * WHITE_LEVEL * sensor.full_well_e / brightest_e)
     return LitScene(
-        light=light,
         exposed=ExposedView(view, lamp.size, lamp.response(), sensor, exposure_s),
         calibration=Calibration({eye.name: eye.pinhole()}, lamp.pinhole()),
         truth=Truth(Surface(surface.vertices_mm, surface.faces), {eye.name: view.truth()}),
@@ -186,18 +155,3 @@ def _cut(device: Mapping[str, Any], share: float) -> dict[str, Any]:
     kept = [round(length * share) for length in lengths]
     centre = [at - (length - less) / 2 for at, length, less in zip(device["principal_px"], lengths, kept, strict=True)]
     return {**device, "size_px": kept, "principal_px": centre}
-
-
-def _stated_mm(mesh: Path) -> NDArray[np.float64]:
-    """(V,) float64: the standard deviations that a mesh file states."""
-    data = trimesh.load(mesh, process=False).metadata["_ply_raw"]["vertex"]["data"]
-    return np.asarray(data["sigma_mm"], dtype=np.float64)
-
-
-def median(figures: Sequence[Figures]) -> Figures:
-    """The median of each figure over several scans."""
-    return Figures(*(float(np.median(values)) for values in zip(*map(_values, figures), strict=True)))
-
-
-def _values(each: Figures) -> tuple[float, ...]:
-    return (each.rms_mm, each.p99_mm, each.complete_03, each.error_over_sigma, each.sigma_rms_mm, each.clipped)

@@ -1,1 +1,0 @@
-"""Tests of the figures that the benchmarks print."""
