@@ -33,7 +33,6 @@ PLANE: Mapping[str, object] = {"shape": "plane", "size_mm": [240.0, 240.0], "rot
 SPHERE: Mapping[str, object] = {"shape": "sphere", "radius_mm": 60.0, "position_mm": [0.0, 0.0, 40.0]}
 SHARP_PX, SOFT_PX = 0.6, 0.9
 
-_ENDS_REPEATS = 2.0
 _WHITE_LEVEL = 0.8
 _FINEST_SMOOTHING_PX = 1.0
 
@@ -120,23 +119,16 @@ class Points:
 
     error_px : (n,) float64, from the true line, across it, towards rising columns; cell : (n,) its cell.
     stated_px : (n,) the deviation that the reconstruction states.
-    snr, width_px, row_px, bound_px, frames_bound_px : (n,) of the stripe there: its signal to noise, its width, and its
-    bound in one row, along the stripe, and along the stripe with the noise of white and black counted in.
+    snr, bound_px : (n,) of the stripe there: its signal to noise, and its bound averaged along the stripe.
     pixel_px : (n,) the bound of the pixel that the point lies in, from its samples in all line frames.
-    scale_px : of the reconstruction's filter; smoothing_px : along which the bound is averaged.
     """
 
     error_px: FloatArray
     cell: NDArray[np.intp]
     stated_px: FloatArray
     snr: FloatArray
-    width_px: FloatArray
-    row_px: FloatArray
     bound_px: FloatArray
-    frames_bound_px: FloatArray
     pixel_px: FloatArray
-    scale_px: float
-    smoothing_px: float
 
     @property
     def _mean_px(self) -> FloatArray:
@@ -163,35 +155,15 @@ class Points:
         return math.sqrt(max(left, 0.0))
 
     @property
-    def bias_mean_px(self) -> float:
-        """The mean error."""
-        return float(self.error_px.mean())
-
-    @property
     def ratio(self) -> float:
         """Rms of the error over its bound: of the line frame alone, averaged along the stripe."""
         return rms(self.error_px / self.bound_px)
-
-    @property
-    def scatter_ratio(self) -> float:
-        """Rms of the scatter, the error without bias, over the bound."""
-        return rms(self.scatter_px / self.bound_px[self._freedom > 0])
-
-    @property
-    def frames_ratio(self) -> float:
-        """Rms of the error over the bound of line, white and black frames."""
-        return rms(self.error_px / self.frames_bound_px)
 
     @property
     def pixels_worth(self) -> float:
         """How many pixels' samples in all line frames, averaged without loss, would scatter as the points do."""
         scatter = self.scatter_px / self.pixel_px[self._freedom > 0]
         return float(1.0 / np.nanmean(scatter**2))
-
-    @property
-    def stated_ratio(self) -> float:
-        """Rms of the scatter over the deviation stated for it: 1 is honest."""
-        return rms(self.scatter_px / self.stated_px[self._freedom > 0])
 
 
 def rms(values: FloatArray) -> float:
@@ -206,7 +178,7 @@ def measured(rig: Rig, exposed: ExposedView, *, captures: int, seed: int = 1) ->
     means = [exposed.electrons(profile) for profile in rig.sequence.profiles]
     pixel_columns, _ = pixel_bound(exposed, [rig.sequence.profiles[index] for index, _ in rig.lines()])
     rng = np.random.default_rng(seed)
-    errors, pixels, stated, cells, scales = [], [], [], [], []
+    errors, pixels, stated, cells = [], [], [], []
     for _ in range(captures):
         curves = _curves(rig, exposed, means, rng)
         points = curves.ensemble.points_px
@@ -217,25 +189,11 @@ def measured(rig: Rig, exposed: ExposedView, *, captures: int, seed: int = 1) ->
         pixels.append(pixel_columns[at_row, at_column] / columns_per_px)
         cells.append(np.rint(line).astype(np.intp) * rows + np.rint(points[:, 1]).astype(np.intp))
         stated.append(curves.ensemble.sigma_px)
-        scales.append(curves.scale_px)
     error, pixel = np.concatenate(errors), np.concatenate(pixels)
     cell, deviation = np.concatenate(cells), np.concatenate(stated)
-    known = np.isfinite(error) & np.isfinite(bounds["frames_px"][cell])
+    known = np.isfinite(error) & np.isfinite(bounds["bound_px"][cell])
     error, pixel, cell, deviation = error[known], pixel[known], cell[known], deviation[known]
-    at = {name: values[cell] for name, values in bounds.items()}
-    return Points(
-        error_px=error,
-        cell=cell,
-        stated_px=deviation,
-        snr=at["snr"],
-        width_px=at["width_px"],
-        row_px=at["row_px"],
-        bound_px=at["alone_px"],
-        frames_bound_px=at["frames_px"],
-        pixel_px=pixel,
-        scale_px=float(np.median(scales)),
-        smoothing_px=float(at["smoothing_px"][0]),
-    )
+    return Points(error, cell, deviation, bounds["snr"][cell], bounds["bound_px"][cell], pixel)
 
 
 def _errors_px(rig: Rig, points_px: FloatArray, line_px: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -268,20 +226,11 @@ def _curves(rig: Rig, exposed: ExposedView, means: list[NDArray[np.float32]], rn
 def _bounds(rig: Rig, exposed: ExposedView) -> dict[str, FloatArray]:
     """What is known of each cell, (lines * rows,) float64, by name; NaN where there is no stripe."""
     rows, columns = rig.camera.size.height_px, rig.projector.size.width_px
-    told = {
-        name: np.full(rows * columns, np.nan)
-        for name in ("snr", "width_px", "row_px", "alone_px", "frames_px", "smoothing_px")
-    }
-    pairs = [
-        tuple(stripe_bound(exposed, rig.sequence.profiles[index], lines, ends_repeats=n) for n in (None, _ENDS_REPEATS))
-        for index, lines in rig.lines()
-    ]
-    width_px = float(np.median(np.concatenate([alone.width_px for alone, _ in pairs])))
-    smoothing_px = max(width_px, _FINEST_SMOOTHING_PX)
-    for alone, frames in pairs:
-        at, frames_at = (np.rint(each.line_px).astype(np.intp) * rows + each.row for each in (alone, frames))
-        told["snr"][at], told["width_px"][at], told["row_px"][at] = alone.snr, alone.width_px, alone.row_px
-        told["alone_px"][at] = alone.averaged_px(smoothing_px)
-        told["frames_px"][frames_at] = frames.averaged_px(smoothing_px)
-    told["smoothing_px"][:] = smoothing_px
+    told = {name: np.full(rows * columns, np.nan) for name in ("snr", "bound_px")}
+    stripes = [stripe_bound(exposed, rig.sequence.profiles[index], lines) for index, lines in rig.lines()]
+    width_px = float(np.median(np.concatenate([each.width_px for each in stripes])))
+    for each in stripes:
+        at = np.rint(each.line_px).astype(np.intp) * rows + each.row
+        told["snr"][at] = each.snr
+        told["bound_px"][at] = each.averaged_px(max(width_px, _FINEST_SMOOTHING_PX))
     return told
