@@ -32,8 +32,7 @@ from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.plan_check import pattern_sequence
 from slrig.scan.presets import SHIPPED
 from slrig.scan.reconstruct import reconstruct_bundle
-
-CONFIG = Path(__file__).parents[2] / "config"
+from tests.golden.shipped_rigs import PAINT, SMALL, rig_file
 
 OBJECTS = {
     "matt": """albedo = 0.85
@@ -88,15 +87,7 @@ class Row:
 
 def object_rig(folder: Path, kind: str) -> Path:
     """The rig file of a relief of one of `OBJECTS`, before a camera of 240 x 192 pixels."""
-    scene = (CONFIG / "scenes" / "relief.toml").read_text(encoding="utf-8").splitlines()
-    plain = [line for line in scene if not line.startswith(("albedo", "texture"))]
-    at = 1 + next(index for index, line in enumerate(plain) if line.startswith("step_mm"))
-    (folder / "object.toml").write_text("\n".join([*plain[:at], OBJECTS[kind], *plain[at:]]), encoding="utf-8")
-    rig = (CONFIG / "rigs" / "relief.toml").read_text(encoding="utf-8")
-    rig = rig.replace("../scenes/relief.toml", "object.toml").replace("size_px = [480, 384]", "size_px = [240, 192]")
-    path = folder / "rig.toml"
-    path.write_text(rig.replace("principal_px = [241.4, 189.7]", "principal_px = [121.4, 93.7]"), encoding="utf-8")
-    return path
+    return rig_file(folder, "relief", scene={PAINT: OBJECTS[kind]}, head=SMALL)
 
 
 def scanned(rig: Rig, plan: ScanPlan, name: str) -> Row:

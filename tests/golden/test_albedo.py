@@ -31,15 +31,11 @@ from slrig.model import AlbedoMark, Black, Capture, FloatArray, LightMap, Pinhol
 from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.light_board import with_light_map
 from slrig.scan.plan import ScanPlan
+from tests.golden.shipped_rigs import GRAINY, SMALL, replaced, rig_file
 from tests.golden.test_bracketing import captured
 from tests.golden.test_bundles import reconstructed
 
 pytestmark = pytest.mark.slow
-CONFIG = Path(__file__).parents[2] / "config"
-SMALL = {
-    "size_px = [480, 384]": "size_px = [240, 192]",
-    "principal_px = [241.4, 189.7]": "principal_px = [121.4, 93.7]",
-}
 
 
 @dataclass(frozen=True)
@@ -73,24 +69,6 @@ class Painted:
         """Found over true albedo, the median of the sound ones as 1."""
         usual = np.median(self.found[self.sound] / self.truth[self.sound])
         return np.asarray(self.found[where] / self.truth[where] / usual)
-
-
-def rig_file(folder: Path, rig: str, *, scene: Mapping[str, str], head: Mapping[str, str]) -> Path:
-    """A rig of `config` and its scene in a folder, each with some of its text replaced."""
-    text = (CONFIG / "rigs" / f"{rig}.toml").read_text(encoding="utf-8")
-    name = tomllib.loads(text)["head"]["scene"]
-    painted = (CONFIG / "rigs" / name).read_text(encoding="utf-8")
-    (folder / "scene.toml").write_text(replaced(painted, scene))
-    path = folder / "rig.toml"
-    path.write_text(replaced(text, {name: "scene.toml", **head}))
-    return path
-
-
-def replaced(text: str, changes: Mapping[str, str]) -> str:
-    for old, new in changes.items():
-        assert old in text
-        text = text.replace(old, new)
-    return text
 
 
 def painted(rig: Path, work: Path, plan: ScanPlan | None = None) -> Painted:
@@ -141,7 +119,6 @@ def white_frame(bundle: Path, camera: str) -> FloatArray:
     return next(shot.image for shot in capture.shots if shot.camera == camera and shot.pattern == white).astype(float)
 
 
-GRAINY = 'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0 }'
 MOTTLED = {GRAINY: 'texture = { kind = "noise", contrast = 0.99, scale_mm = 9.0 }'}
 TINTED = {
     GRAINY: "colour = [0.25, 0.6, 0.95]\n"

@@ -14,27 +14,17 @@ from slrig.model.header import CaptureHeader
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from slrig.scan.stream import LiveScan
+from tests.golden.shipped_rigs import PAINT, SMALL, rig_file
 from tests.golden.test_bundles import reconstructed
 
 pytestmark = pytest.mark.slow
-CONFIG = Path(__file__).parents[2] / "config"
-MATERIAL = """albedo = 0.3
+# The relief's darkest and brightest places are some thousand times apart.
+GLOSSY = {
+    PAINT: """albedo = 0.3
 texture = { kind = "noise", contrast = 0.995, scale_mm = 14.0 }
-specular = { strength = 8.0, exponent = 60.0 }
-"""
+specular = { strength = 8.0, exponent = 60.0 }"""
+}
 EXPOSURES_S = (0.003, 0.015, 0.075)
-
-
-def glossy_rig(folder: Path) -> Path:
-    """The rig file of a relief whose darkest and brightest places are some thousand times apart."""
-    scene = (CONFIG / "scenes" / "relief.toml").read_text(encoding="utf-8").splitlines()
-    plain = [line for line in scene if not line.startswith(("albedo", "texture"))]
-    at = next(index for index, line in enumerate(plain) if line.startswith("step_mm"))
-    (folder / "glossy.toml").write_text("\n".join([*plain[: at + 1], MATERIAL, *plain[at + 1 :]]))
-    rig = (CONFIG / "rigs" / "relief.toml").read_text(encoding="utf-8")
-    path = folder / "rig.toml"
-    path.write_text(rig.replace("../scenes/relief.toml", "glossy.toml"))
-    return path
 
 
 class Watching:
@@ -65,7 +55,7 @@ def captured(rig: Path, plan: ScanPlan, bundle: Path, watching: Watching | None 
 
 
 def test_a_bracket_is_more_complete_and_no_less_exact_than_any_of_its_exposures(tmp_path: Path) -> None:
-    rig = glossy_rig(tmp_path)
+    rig = rig_file(tmp_path, "relief", scene=GLOSSY, head={})
     singles = []
     for exposure_s in EXPOSURES_S:
         bundle = captured(rig, ScanPlan(exposure_s=exposure_s), tmp_path / f"{exposure_s}")
@@ -91,17 +81,10 @@ def test_a_bracket_is_more_complete_and_no_less_exact_than_any_of_its_exposures(
     assert "exposures_note" not in camera
 
 
-def small_rig(folder: Path) -> Path:
-    """The same with a quarter of the camera's pixels, in its middle."""
-    path = glossy_rig(folder)
-    rig = path.read_text().replace("size_px = [480, 384]", "size_px = [240, 192]")
-    path.write_text(rig.replace("principal_px = [241.4, 189.7]", "principal_px = [121.4, 93.7]"))
-    return path
-
-
 def test_a_bracket_gives_the_same_bytes_live_and_from_disk(tmp_path: Path) -> None:
     watching = Watching()
-    bundle = captured(small_rig(tmp_path), ScanPlan(exposures_s=EXPOSURES_S), tmp_path / "bundle", watching)
+    rig = rig_file(tmp_path, "relief", scene=GLOSSY, head=SMALL)
+    bundle = captured(rig, ScanPlan(exposures_s=EXPOSURES_S), tmp_path / "bundle", watching)
     read = reconstructed(bundle, tmp_path / "read")
     live = reconstructed(bundle, tmp_path / "live", live=watching.live)
     for name in ("mesh.ply", "points.ply"):

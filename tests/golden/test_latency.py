@@ -19,6 +19,7 @@ from slrig.discovery import open_rig
 from slrig.errors import ScanEvidenceError
 from slrig.model import FloatArray, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.golden.test_light_axis import rig_file
 
 PLATE = """
 name = "plate"
@@ -29,38 +30,11 @@ size_mm = [400.0, 400.0]
 rotation_deg = [6.0, -10.0, 0.0]
 albedo = 0.8
 """
-
-RIG = """
-name = "bench"
-[head]
-driver = "simulated"
-scene = "plate.toml"
-seed = 1
-samples_per_axis = 1
-ambient = {ambient}
-exposure_s = {exposure_s}
-[head.projector]
-size_px = [96, 72]
-focal_px = [220.0, 220.0]
-position_mm = [90.0, 0.0, -500.0]
-target_mm = [0.0, 0.0, 0.0]
-latency_s = {stated_s}
-[head.faults]
-light_delay_s = {latency_s}
-"""
-
-CAMERA = """
-[[head.camera]]
-name = "{name}"
-size_px = [96, 240]
-focal_px = [600.0, 600.0]
-position_mm = [{x_mm}, 0.0, -500.0]
-target_mm = [0.0, 0.0, 0.0]
-saturation_s = {saturation_s}
-bit_depth = {bit_depth}
-read_noise_e = {noise_e}
-line_time_s = {line_s}
-"""
+LAMP = {
+    "size_px": (96, 72), "focal_px": (220.0, 220.0), "position_mm": (90.0, 0.0, -500.0), "target_mm": (0.0, 0.0, 0.0),
+    "latency_s": 0.02,
+}  # fmt: skip
+EYE = {"size_px": (96, 240), "focal_px": (600.0, 600.0), "target_mm": (0.0, 0.0, 0.0), "read_noise_e": 60.0}
 
 pytestmark = pytest.mark.slow
 PROJECTOR = Size(96, 72)
@@ -72,28 +46,28 @@ def written(
     *,
     latency_s: float,
     exposure_s: float,
-    line_s: float = 0.0,
+    line_s: float,
     bit_depth: int = 8,
-    stated_s: float = 0.02,
     ambient: float = 0.05,
-    twin_line_s: float | None = None,
+    twin: bool = False,
 ) -> Path:
-    """The path of a rig file: light comes `latency_s` later than the projector says it does."""
-    (folder / "plate.toml").write_text(PLATE)
-    text = RIG.format(ambient=ambient, exposure_s=exposure_s, stated_s=stated_s, latency_s=latency_s, line_s=line_s)
-    lines = [("left", -60.0, line_s), *([("right", 180.0, twin_line_s)] if twin_line_s is not None else [])]
-    for name, x_mm, line in lines:
-        text += CAMERA.format(
-            name=name, x_mm=x_mm, saturation_s=2 * exposure_s, bit_depth=bit_depth, noise_e=60.0, line_s=line
-        )
-    path = folder / "rig.toml"
-    path.write_text(text)
+    """The path of a rig file: light comes `latency_s` later than the projector says it does.
+
+    twin : whether there is a second camera, whose shutter is global.
+    """
+    seen = {**EYE, "saturation_s": 2 * exposure_s, "bit_depth": bit_depth}
+    cameras = [{**seen, "position_mm": (-60.0, 0.0, -500.0), "line_time_s": line_s}]
+    if twin:
+        cameras.append({**seen, "position_mm": (180.0, 0.0, -500.0), "line_time_s": 0.0})
+    options = {"seed": 1, "samples_per_axis": 1, "ambient": ambient, "exposure_s": exposure_s}
+    path = rig_file(folder, PLATE, LAMP, *cameras, **options)
+    path.write_text(f"{path.read_text()}[head.faults]\nlight_delay_s = {latency_s}\n")
     return path
 
 
 def found_on(path: Path, trigger: Trigger) -> CameraLatency:
     with open_rig(read_rig(path)) as rig:
-        return measure_latency(rig, trigger=trigger).cameras["left"]
+        return measure_latency(rig, trigger=trigger).cameras["camera0"]
 
 
 def require_truth(found: CameraLatency, *, latency_s: float, line_s: float) -> None:
@@ -121,18 +95,24 @@ def test_latency_and_shutter_are_those_of_the_rig_file(
     tmp_path: Path, exposure_s: float, line_s: float, latency_s: float, bit_depth: int, trigger: Trigger, ambient: float
 ) -> None:
     """In a dim and in a bright room."""
-    told = {"latency_s": latency_s, "exposure_s": exposure_s, "line_s": line_s}
-    path = written(tmp_path, **told, bit_depth=bit_depth, ambient=ambient)
+    path = written(
+        tmp_path / "rig",
+        latency_s=latency_s,
+        exposure_s=exposure_s,
+        line_s=line_s,
+        bit_depth=bit_depth,
+        ambient=ambient,
+    )
     require_truth(found_on(path, trigger), latency_s=latency_s, line_s=line_s)
 
 
 def test_the_command_prints_a_table_that_the_rig_file_takes(tmp_path: Path) -> None:
-    path = written(tmp_path, latency_s=0.031, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0)
+    path = written(tmp_path / "rig", latency_s=0.031, exposure_s=0.01, line_s=3e-5, twin=True)
     done = CliRunner().invoke(app, ["latency", str(path), "--flashes", "20"])
     assert done.exit_code == 0, done.output
-    assert "camera left" in done.stdout
+    assert "camera camera0" in done.stdout
     assert "rolling shutter: 30." in done.stdout or "rolling shutter: 29.9" in done.stdout
-    assert "global shutter" in done.stdout.partition("camera right")[2]
+    assert "global shutter" in done.stdout.partition("camera camera1")[2]
     table = done.stdout[done.stdout.index("[synchronisation]") :]
     path.write_text(path.read_text() + table)
     with open_rig(read_rig(path)) as rig:
@@ -140,7 +120,7 @@ def test_the_command_prints_a_table_that_the_rig_file_takes(tmp_path: Path) -> N
         assert kept is not None
         assert kept.latency_s == pytest.approx(0.031, abs=0.5e-3)
         assert 0 < kept.latency_error_s < 0.5e-3
-        assert kept.line_time_s == {"left": pytest.approx(3e-5, rel=0.02)}
+        assert kept.line_time_s == {"camera0": pytest.approx(3e-5, rel=0.02)}
 
 
 def images(path: Path, synchronisation: Synchronisation | None) -> dict[tuple[int, str], FloatArray]:
@@ -154,8 +134,8 @@ def images(path: Path, synchronisation: Synchronisation | None) -> dict[tuple[in
 
 
 def test_a_scan_with_a_late_projector_is_right_once_its_latency_is_known(tmp_path: Path) -> None:
-    honest = images(written(tmp_path, latency_s=0.0, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0), None)
-    path = written(tmp_path, latency_s=0.031, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0)
+    honest = images(written(tmp_path / "honest", latency_s=0.0, exposure_s=0.01, line_s=3e-5, twin=True), None)
+    path = written(tmp_path / "late", latency_s=0.031, exposure_s=0.01, line_s=3e-5, twin=True)
     with open_rig(read_rig(path)) as rig:
         measured = measure_latency(rig).synchronisation
     late = images(path, measured)

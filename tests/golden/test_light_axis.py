@@ -73,8 +73,8 @@ def exchanged(device: Device) -> Device:
     return other | {"position_mm": (y, x, z), "distortion": (k1, k2, p2, p1, k3)}
 
 
-def rig_file(folder: Path, scene: str, projector: Device, *cameras: Device, samples_per_axis: int = 2) -> Path:
-    """A rig of these devices before a scene."""
+def rig_file(folder: Path, scene: str, projector: Device, *cameras: Device, **head: float) -> Path:
+    """A rig of these devices before a scene; head : options in place of the usual."""
     folder.mkdir()
     (folder / "scene.toml").write_text(scene)
 
@@ -83,9 +83,9 @@ def rig_file(folder: Path, scene: str, projector: Device, *cameras: Device, samp
             f"{key} = {list(value) if isinstance(value, tuple) else value}" for key, value in device.items()
         )
 
-    head = 'name = "twins"\n[head]\ndriver = "simulated"\nscene = "scene.toml"\nseed = 5\nambient = 0.01\n'
-    head += f"samples_per_axis = {samples_per_axis}\n"
-    parts = [head, "[head.projector]", table(projector)]
+    usual = {"seed": 5, "ambient": 0.01, "samples_per_axis": 2}
+    parts = ['name = "twins"\n[head]\ndriver = "simulated"\nscene = "scene.toml"', table(usual | head)]
+    parts += ["[head.projector]", table(projector)]
     for number, camera in enumerate(cameras):
         parts += ["[[head.camera]]", f'name = "camera{number}"', table(camera)]
     (folder / "rig.toml").write_text("\n".join(parts) + "\n")
