@@ -12,8 +12,6 @@ from slrig.model import Axis, Gray, LineShift, Size
 from slrig.model.gray_code import gray_index, to_gray
 from slrig.patterns.gray import (
     cell_centre_px,
-    edge_indices,
-    edge_position_px,
     gray_bits,
     gray_profile,
 )
@@ -78,20 +76,6 @@ def test_neighbouring_positions_differ_in_at_most_one_bit_and_cells_in_exactly_o
     words = to_gray(cells)
     changed = np.array([int(word).bit_count() for word in words[1:] ^ words[:-1]], dtype=int)
     assert (changed == np.diff(cells)).all()
-
-
-@few
-@given(codes)
-def test_each_edge_lies_where_its_bit_changes(code: Code) -> None:
-    for bit in range(code.bits):
-        light = gray_profile(Gray(code.axis, bit, code.bits, code.cell_px, code.offset_px), code.size).ravel()
-        changes = np.flatnonzero(np.diff(light.astype(int))) + 0.5
-        first, spacing = edge_indices(bit, code.bits)
-        edges = edge_position_px(
-            np.arange(first, 2**code.bits, spacing), cell_px=code.cell_px, offset_px=code.offset_px
-        )
-        seen = edges[(edges > 0) & (edges < code.extent_px - 1)]
-        assert changes.tolist() == seen.tolist()
 
 
 @few

@@ -33,20 +33,6 @@ def points_between(ensemble: StripeEnsemble) -> list[tuple[list[float], list[flo
 UPPER, LOWER = down(10.0, range(0, 20)), down(10.0, range(30, 45))
 
 
-@pytest.mark.parametrize("upper", [UPPER, UPPER[::-1]], ids=["down", "up"])
-@pytest.mark.parametrize("lower", [LOWER, LOWER[::-1]], ids=["down", "up"])
-@pytest.mark.parametrize("swapped", [False, True])
-def test_two_stripes_are_joined_end_to_end_whichever_way_they_were_found(
-    upper: FloatArray, lower: FloatArray, *, swapped: bool
-) -> None:
-    ensemble = linked(*((lower, upper) if swapped else (upper, lower)))
-    np.testing.assert_array_equal(ensemble.points_px, np.concatenate([UPPER, LOWER]))
-    assert points_between(ensemble) == [([10.0, 19.0], [10.0, 30.0])]
-    assert ensemble.offsets.tolist() == [0, 35]
-    assert ensemble.position_px.tolist() == [7.0]
-    assert ensemble.stripe.tolist() == ([1] * 20 + [0] * 15 if swapped else [0] * 20 + [1] * 15)
-
-
 COLUMN = 150.0
 
 
@@ -94,17 +80,6 @@ def test_adjacent_pixels_of_two_stripes_may_be_far_apart_in_space_and_are_joined
     sheet, _ = camera_projector(linked(near, far, position_px=[COLUMN] * 2), CAMERA, PROJECTOR, Axis.COLUMN)
     (at,) = np.flatnonzero(sheet.bridge_after)
     assert np.linalg.norm(sheet.points_mm[at + 1] - sheet.points_mm[at]) > 59
-
-
-@pytest.mark.parametrize("gap", [0.0, 1e-9, 0.5, 1.0])
-@pytest.mark.parametrize("turned", [(), (0,), (1,), (0, 1)])
-def test_stripes_that_touch_are_joined_where_they_touch(gap: float, turned: tuple[int, ...]) -> None:
-    upper, lower = down(10.0, range(0, 20), lean=0.1), down(11.9, range(19, 34), lean=0.1)
-    lower[:, 1] += gap
-    stripes = [stripe[::-1].copy() if k in turned else stripe for k, stripe in enumerate((upper, lower))]
-    ensemble = linked(*stripes)
-    np.testing.assert_array_equal(ensemble.points_px, np.concatenate([upper, lower]))
-    assert points_between(ensemble) == [(upper[-1].tolist(), lower[0].tolist())]
 
 
 def test_codes_are_linked_apart_and_come_in_rising_order() -> None:

@@ -21,7 +21,12 @@ from tests.unit.reconstruction.builders import (
     opencv_rays,
 )
 
-DEVICES = pytest.mark.parametrize("device", [CAMERA, OTHER_CAMERA, PROJECTOR], ids=["camera", "other", "projector"])
+LENSES = ((0.3, 0.1, 3e-3, -3e-3, 0.0), (0.3, -0.1, -3e-3, 3e-3, 0.0), (-0.3, 0.1, -3e-3, -3e-3, 0.0))
+DEVICES = pytest.mark.parametrize(
+    "device",
+    [CAMERA, OTHER_CAMERA, PROJECTOR, *(replace(CAMERA, distortion=np.array(lens)) for lens in LENSES)],
+    ids=["camera", "other", "projector", "pincushion", "waved pincushion", "barrel"],
+)
 
 
 def pixels_of(size: Size, *, count: int = 400, margin_px: float = 30.0) -> FloatArray:

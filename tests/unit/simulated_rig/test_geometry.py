@@ -55,29 +55,6 @@ def test_a_ball_has_the_exact_depth_and_silhouette_of_a_sphere(tmp_path: Path) -
     np.testing.assert_allclose(depth[seen], expected[seen], atol=1e-8)
 
 
-def test_projector_coordinates_of_a_known_point_follow_from_a_projection_by_hand(tmp_path: Path) -> None:
-    distortion = [0.05, -0.03, 0.002, -0.001, 0.01]
-    head = small_head(tmp_path, projector={"distortion": distortion, "principal_px": [38.0, 31.0]})
-    truth = head.truth().cameras["eye"]
-    row, column = 30, 41
-    # The camera at (-60, 0, -500) looks at the origin: its axes in the world, and the ray of the pixel.
-    distance = np.hypot(60.0, 500.0)
-    forward, right, down = np.array([60, 0, 500]) / distance, np.array([500, 0, -60]) / distance, np.array([0.0, 1, 0])
-    ray = forward + right * (column - 31.5) / 400 + down * (row - 23.5) / 400
-    point = np.array([-60.0, 0, -500]) + ray * 500 / ray[2]
-    assert truth.depth_mm[row, column] == pytest.approx(500 / ray[2])
-    # The projector at (60, 0, -500) mirrors the camera.
-    forward, right = np.array([-60, 0, 500]) / distance, np.array([500, 0, 60]) / distance
-    from_lamp = point - np.array([60.0, 0, -500])
-    x, y = (from_lamp @ right) / (from_lamp @ forward), (from_lamp @ down) / (from_lamp @ forward)
-    k1, k2, p1, p2, k3 = distortion
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    u = 400 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + 38.0
-    v = 400 * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + 31.0
-    np.testing.assert_allclose(truth.projector_px[row, column], [u, v], atol=1e-9)
-
-
 def test_projector_coordinates_agree_with_opencv_for_every_visible_point(tmp_path: Path) -> None:
     scene = '[[object]]\nshape = "sphere"\nradius_mm = 30.0\n' + FACING_PLATE + "position_mm = [0.0, 0.0, 40.0]\n"
     head = small_head(tmp_path, scene, projector={"distortion": [-0.2, 0.1, 0.001, -0.002, 0.05]})
