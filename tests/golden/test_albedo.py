@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -27,13 +26,14 @@ from slrig.bundle import read_bundle, read_calibration, write_calibration
 from slrig.capture.evidence import check_capture
 from slrig.cli.commands import app
 from slrig.errors import CalibrationError
-from slrig.model import AlbedoMark, Black, Capture, FloatArray, LightMap, Pinhole, Primary, White
+from slrig.model import AlbedoMark, Black, Capture, FloatArray, LightMap, Primary, White
 from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.light_board import with_light_map
 from slrig.scan.plan import ScanPlan
 from tests.golden.shipped_rigs import GRAINY, SMALL, replaced, rig_file
 from tests.golden.test_bracketing import captured
 from tests.golden.test_bundles import reconstructed
+from tests.unit.reconstruction.builders import opencv_pixels
 
 pytestmark = pytest.mark.slow
 
@@ -105,12 +105,6 @@ def channels(rig: Path, work: Path, plan: ScanPlan | None = None, *, mapped: Lig
     light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     assert (truth > 0).mean() > 0.99
     return [Painted(light[:, each], truth[:, each], brightness, mesh.mark, report) for each in range(count)]
-
-
-def opencv_pixels(device: Pinhole, points_mm: FloatArray) -> FloatArray:
-    turn, _ = cv2.Rodrigues(device.rotation)
-    pixels, _ = cv2.projectPoints(points_mm, turn, device.translation_mm, device.matrix, device.distortion)
-    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
 def white_frame(bundle: Path, camera: str) -> FloatArray:

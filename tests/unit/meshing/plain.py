@@ -19,17 +19,6 @@ def boundary_edges(faces: IntArray) -> IntArray:
     return np.asarray(directed[uses[which] == 1])
 
 
-def smallest_angles_deg(corners_mm: FloatArray) -> FloatArray:
-    """(F,) float64: the smallest angle of each triangle, (F, 3, 3); 0 for a triangle that is a point."""
-    smallest = np.full(len(corners_mm), np.pi)
-    for corner in range(3):
-        u = corners_mm[:, (corner + 1) % 3] - corners_mm[:, corner]
-        v = corners_mm[:, (corner + 2) % 3] - corners_mm[:, corner]
-        across = np.linalg.norm(np.cross(u, v), axis=1)
-        smallest = np.minimum(smallest, np.arctan2(across, np.einsum("ij,ij->i", u, v)))
-    return np.asarray(np.degrees(smallest))
-
-
 def harmonic_indices(corners_mm: FloatArray) -> FloatArray:
     """(F,) float64: hrm = 4 (cot α + cot β + cot η) of each triangle, (F, 3, 3); infinite where it has no area.
 

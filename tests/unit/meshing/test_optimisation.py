@@ -1,4 +1,4 @@
-"""Global optimisation: against a plain one, against Delaunay, and on a face sampled unevenly."""
+"""Global optimisation: against a plain one, against Delaunay, and on meshes small enough to say what comes out."""
 
 from __future__ import annotations
 
@@ -26,39 +26,9 @@ def all_strips(points: FloatArray, offsets: IntArray) -> IntArray:
     return strips(points, whole_curves(np.stack([np.arange(count - 1), np.arange(1, count)], axis=1), offsets))
 
 
-def face_depth_mm(x: FloatArray, y: FloatArray) -> FloatArray:
-    """An analytic head with nose, eyes, brow and lips, away from the viewer; x, y in mm."""
-    head = np.sqrt(130**2 - 1.5 * x**2 - 0.7 * y**2)
-    nose = 32 * np.exp(-((x / 9) ** 2) - ((y + 2) / 16) ** 2) / (1 + np.exp((y - 14) / 2.5))
-    eyes = 9 * np.exp(-(((abs(x) - 28) / 11) ** 2) - ((y + 22) / 9) ** 2)
-    brow = 5 * np.exp(-(((abs(x) - 26) / 16) ** 2) - ((y + 36) / 5) ** 2)
-    lips = 6 * np.exp(-((x / 22) ** 2)) * (np.exp(-(((y - 34) / 4) ** 2)) + np.exp(-(((y - 45) / 5) ** 2)))
-    return np.asarray(600 - head - nose + eyes - brow - lips)
-
-
-def face_curves(stripes: int = 136, *, step_mm: float = 0.5, noise_mm: float = 0.02, seed: int = 1) -> list[FloatArray]:
-    """Stripes down the head, a point near each multiple of the step, noise along the line of sight."""
-    random = np.random.default_rng(seed)
-    curves = []
-    for x in np.linspace(-76, 76, stripes):
-        half = 95 * math.sqrt(1 - (x / 85) ** 2)
-        rows = np.arange(math.ceil(-half / step_mm), math.floor(half / step_mm) + 1)
-        y: FloatArray = (step_mm * (rows + np.clip(random.normal(0, 0.1, len(rows)), -0.4, 0.4))).astype(np.float64)
-        points = np.stack([np.full(len(y), x), y, face_depth_mm(np.full(len(y), x), y)], axis=1)
-        range_mm = np.linalg.norm(points, axis=1, keepdims=True)
-        curves.append(points * (1 + random.normal(0, noise_mm, (len(y), 1)) / range_mm))
-    return curves
-
-
 def joined(curves: list[FloatArray]) -> tuple[FloatArray, IntArray]:
     """Points and offsets of curves."""
     return np.concatenate(curves), np.concatenate([[0], np.cumsum([len(c) for c in curves])]).astype(np.int32)
-
-
-def uneven(curves: list[FloatArray], seed: int = 3) -> list[FloatArray]:
-    """35 % of the points of each third curve, 80 % of the others."""
-    random = np.random.default_rng(seed)
-    return [c[random.random(len(c)) < (0.35 if k % 3 == 0 else 0.8)] for k, c in enumerate(curves)]
 
 
 def bends_deg(points: FloatArray, faces: IntArray) -> FloatArray:

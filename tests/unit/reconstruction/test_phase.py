@@ -13,13 +13,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from slrig.kernels import in_bands
 from slrig.model import Axis, FloatArray, LineShift
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.phase import PositionMap, has_phase, position_map
+from slrig.reconstruction.phase import FittedPoints, PositionMap, has_phase, no_points, position_map, windows
+from slrig.reconstruction.surface_fit import POINTS, fit_kernel
 from tests.unit.reconstruction.builders import bars, cells_of, code_frames, grid, nearest_lines
-from tests.unit.reconstruction.refining import fitted_points
 
 SHAPE = (60, 80)
 QUIET = NoiseModel(1e-4, 0.0)
@@ -187,6 +188,18 @@ def test_without_all_line_frames_the_middle_of_the_code_interval_stands() -> Non
         assert np.isnan(found.sigma).all()
 
 
+def fitted_points(
+    seen: PositionMap, usable: NDArray[np.bool_], starts_px: FloatArray, targets_px: FloatArray
+) -> FittedPoints:
+    """Points of the image at which a local surface of the position map has the wanted positions."""
+    fitted = no_points(len(starts_px))
+    in_bands(
+        fit_kernel, len(starts_px), *windows(seen, usable), np.ascontiguousarray(starts_px),
+        np.asarray(targets_px, dtype=np.float64), fitted, rows_at_least=POINTS,
+    )  # fmt: skip
+    return fitted
+
+
 SLOPES = pytest.mark.parametrize(
     ("slope", "angle_rad"),
     [(0.3, 0.0), (1.0, math.pi / 6), (1.0, math.pi / 2), (-0.7, 0.2), (-1.0, 1.4), (2.0, 2.5), (5.0, 0.1)],
@@ -236,7 +249,7 @@ def test_the_crossing_of_a_curved_surface_is_exact(slope: float, angle_rad: floa
     np.testing.assert_allclose(np.sum(normals[found] * across, axis=1), 1, atol=1e-3)
 
 
-def windows(kind: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def usable_pixels(kind: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
     x, y = grid(shape)
     match kind:
         case "whole":
@@ -261,7 +274,7 @@ def test_the_stated_deviation_is_that_of_the_noise(kind: str, slope: float, angl
     rows, columns = (each.ravel() for each in np.mgrid[5:235:3, 5:315:3])
     starts = np.stack([columns, rows], axis=1) + np.random.default_rng(10).uniform(-0.49, 0.49, (len(rows), 2))
     targets = plane(slope, angle_rad, *starts.T)
-    points, _, sigma_px, found, _ = fitted_points(here, windows(kind, shape), starts, targets)
+    points, _, sigma_px, found, _ = fitted_points(here, usable_pixels(kind, shape), starts, targets)
     assert found.sum() > 1000
     errors = (plane(slope, angle_rad, *points[found].T) - targets[found]) / abs(slope)
     assert abs(errors.mean()) < 5 * errors.std() / math.sqrt(found.sum() / 10)

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.model import Axis, FloatArray, LineShift
+from slrig.model import Axis, FloatArray, IntArray, LineShift
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.edges import beside_steps_px
-from slrig.reconstruction.phase import PositionMap
-from slrig.reconstruction.refinement import Refinement, refined
+from slrig.reconstruction.phase import PositionMap, no_points
+from slrig.reconstruction.refinement import Refinement, _crossings, _nothing_taken, refined
 from slrig.reconstruction.stripes import LinePoints, chained
 from tests.unit.reconstruction.builders import cells_of, grid, nearest_lines
-from tests.unit.reconstruction.refining import line_crossings
 
 SHAPE = (60, 80)
 LINES = tuple(LineShift(Axis.COLUMN, shift, 8, 1) for shift in range(8))
@@ -47,6 +46,14 @@ def points_at(points_px: FloatArray) -> LinePoints:
         points_px, np.tile([1.0, 0.0], (count, 1)), np.linspace(0.5, 1.0, count), np.ones(count, dtype=np.bool_),
         np.full(count, 1.0),
     )  # fmt: skip
+
+
+def line_crossings(
+    seen: PositionMap, usable: NDArray[np.bool_], code: CodeMap, position_of: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Where lines cross pixels, by the position map alone: frame (n,) int32, starts_px (n, 2) and targets_px (n,)."""
+    begun = _nothing_taken(len(position_of), usable.shape)
+    return _crossings(seen, usable, code, position_of, *begun, no_points(0), np.zeros(0))
 
 
 NONE = points_at(np.zeros((0, 2)))

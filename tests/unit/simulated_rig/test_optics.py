@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
 from simulated_rig.optics import distorted, field_radius, lens_array, look_at, undistorted, world_directions
 from slrig.model import FloatArray, Pinhole, Size
+from tests.unit.reconstruction.builders import opencv_pixels
 
 STRONG = np.array([-0.21, 0.13, 0.0011, -0.0007, -0.04])
 
@@ -18,21 +18,12 @@ def device(distortion: FloatArray = STRONG) -> Pinhole:
     return Pinhole(Size(640, 480), matrix, distortion, rotation, translation)
 
 
-def projected(points_mm: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """OpenCV's projection, (n, 2)."""
-    rotation, _ = cv2.Rodrigues(pinhole.rotation)
-    pixels, _ = cv2.projectPoints(
-        points_mm.reshape(-1, 1, 3), rotation, pinhole.translation_mm, pinhole.matrix, pinhole.distortion
-    )
-    return np.asarray(pixels, np.float64).reshape(-1, 2)
-
-
 def test_a_ray_through_a_pixel_is_projected_back_to_it_by_opencv() -> None:
     pinhole = device()
     u, v = (a.ravel() for a in np.meshgrid(np.linspace(-0.5, 639.5, 23), np.linspace(-0.5, 479.5, 17)))
     rays = world_directions(u, v, lens_array(pinhole), pinhole.rotation)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, atol=1e-12)
-    back = projected(pinhole.centre_mm + 432.1 * rays, pinhole)
+    back = opencv_pixels(pinhole, pinhole.centre_mm + 432.1 * rays)
     np.testing.assert_allclose(back, np.column_stack([u, v]), atol=1e-8)
 
 
@@ -40,7 +31,7 @@ def test_distortion_is_that_of_opencv() -> None:
     lens = lens_array(device())
     points = np.random.default_rng(4).uniform(-0.35, 0.35, (50, 2))
     plain = Pinhole(Size(640, 480), device().matrix, STRONG, np.eye(3), np.zeros(3))
-    expected = projected(np.column_stack([points, np.ones(50)]), plain)
+    expected = opencv_pixels(plain, np.column_stack([points, np.ones(50)]))
     found = np.array([distorted(x, y, lens) for x, y in points])
     np.testing.assert_allclose(found * lens[:2] + lens[2:4], expected, atol=1e-9)
 

@@ -19,6 +19,7 @@ from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import Scene, SceneSurface, surface_of
 from simulated_rig.transport import Hits, trace
 from slrig.model import FloatArray, Pinhole, Size
+from tests.unit.reconstruction.builders import opencv_pixels, opencv_rays
 from tests.unit.simulated_rig.building import corners_in_world_mm
 from tests.unit.simulated_rig.test_boards import dark_at
 
@@ -73,19 +74,9 @@ def grey(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(image * 280, 0, 255)), np.uint8)
 
 
-def imaged(points_mm: FloatArray, camera: Pinhole = EYE) -> FloatArray:
-    """(n, 2): OpenCV's projection."""
-    turn, _ = cv2.Rodrigues(camera.rotation)
-    found, _ = cv2.projectPoints(points_mm, turn, camera.translation_mm, camera.matrix, camera.distortion)
-    return np.asarray(found.reshape(-1, 2), np.float64)
-
-
 def on_board(u: FloatArray, v: FloatArray) -> FloatArray:
     """(n, 2): where rays through pixels meet the plane of a board in POSITION, in its frame, by OpenCV's lens."""
-    pixels = np.column_stack([u, v])[:, None]
-    accurate = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
-    normalised = cv2.undistortPoints(pixels, EYE.matrix, EYE.distortion, criteria=accurate).reshape(-1, 2)
-    rays = np.column_stack([normalised, np.ones(len(u))]) @ EYE.rotation
+    rays = opencv_rays(EYE, np.column_stack([u, v]))
     turn = turned_by(ROTATION)
     eye, rays = turn.T @ (EYE.centre_mm - POSITION), rays @ turn
     return np.asarray((eye - rays * (eye[2] / rays[:, 2])[:, None])[:, :2], np.float64)
@@ -158,7 +149,7 @@ def test_discs_have_their_area_and_centroid() -> None:
     turn = np.linspace(0, 2 * np.pi, 720, endpoint=False)
     ring = 7.0 * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
     for corner in each.corners_mm:
-        outline = imaged((corner + ring) @ turned_by(ROTATION).T + POSITION)
+        outline = opencv_pixels(EYE, (corner + ring) @ turned_by(ROTATION).T + POSITION)
         after = np.roll(outline, -1, axis=0)
         cross = outline[:, 0] * after[:, 1] - after[:, 0] * outline[:, 1]
         area = cross.sum() / 2
@@ -176,12 +167,12 @@ def test_discs_have_their_area_and_centroid() -> None:
 def test_opencv_finds_a_chessboard_where_it_stands(bow_mm: float) -> None:
     each = board("chessboard", bow_mm=bow_mm)
     image = grey(picture(each))
-    expected = imaged(corners_in_world_mm(each, POSITION, ROTATION))
+    expected = opencv_pixels(EYE, corners_in_world_mm(each, POSITION, ROTATION))
     found = _refined(image, _chessboard(image, each), half_px=8)
     np.testing.assert_allclose(found.mean(axis=0), expected.mean(axis=0), atol=0.005)
     assert float(np.sqrt(((found - expected) ** 2).mean())) < 0.02
     if bow_mm:
-        flat = imaged(corners_in_world_mm(board("chessboard"), POSITION, ROTATION))
+        flat = opencv_pixels(EYE, corners_in_world_mm(board("chessboard"), POSITION, ROTATION))
         assert float(np.sqrt(((found - flat) ** 2).mean())) > 0.5
 
 
@@ -194,7 +185,7 @@ def test_opencv_finds_a_charuco_board_where_it_stands_and_no_mirrored_one() -> N
     corners, ids, _, markers = detector.detectBoard(image)
     assert len(markers) == 24
     assert ids.ravel().tolist() == list(range(35))
-    expected = imaged(corners_in_world_mm(each, POSITION, ROTATION))
+    expected = opencv_pixels(EYE, corners_in_world_mm(each, POSITION, ROTATION))
     error = _refined(image, corners.reshape(-1, 2), half_px=4) - expected
     np.testing.assert_allclose(error.mean(axis=0), 0, atol=0.005)
     assert float(np.sqrt((error**2).mean())) < 0.03
