@@ -13,7 +13,6 @@ from slrig.combine.plan import GivenPoses, MarkerPoses, StatedAxis, TurntablePos
 from slrig.errors import RegistrationRefusedError
 from tests.unit.api.conftest import ServedBench, ended
 from tests.unit.combine.model_bench import kept_scan, until_told
-from tests.unit.scan.fakes import WAIT_S
 
 AXIS = {"point_mm": [4.0, 45.0, 12.0], "direction": [0.0, -1.0, 0.0]}
 STILL = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -121,11 +120,8 @@ def test_model_is_shot_while_a_person_turns_the_object(client: TestClient, serve
     assert first["plan"]["reconstruction"]["region"]["depth_mm"] == [1, 900]
     until_told(served.service.models.jobs, UUID(model["id"]), "turn the object")
     here = client.get(f"/model/{model['id']}").json()
-    assert (here["state"], here["progress"]["stage"]) == ("capturing", "turn")
-    assert here["progress"]["detail"] == "turn the object by 120° for view 2 of 3"
-    assert here["plan"]["shoot"]["views"] == 3
-    early = client.post(f"/model/{model['id']}/combine")
-    assert (early.status_code, "it takes two" in early.json()["detail"]) == (409, True)
+    assert (here["state"], here["progress"]["stage"], here["plan"]["shoot"]["views"]) == ("capturing", "turn", 3)
+    assert client.post(f"/model/{model['id']}/combine").status_code == 409
     for _ in range(2):
         # Sent twice, it is shot once.
         assert client.post(f"/model/{model['id']}/view", headers=key).status_code == 202
@@ -133,48 +129,24 @@ def test_model_is_shot_while_a_person_turns_the_object(client: TestClient, serve
     assert client.post(f"/model/{model['id']}/view", json={"again": True}).status_code == 202
     assert [each["plan"]["turn_deg"] for each in views(client, model)] == [0.0, 120.0, 120.0]
     assert client.post(f"/model/{model['id']}/combine").status_code == 202
-    client.get(model["links"]["events"])
-    done = client.get(f"/model/{model['id']}").json()
-    assert done["state"] == "succeeded", done["error"]
-    assert done["summary"]["notes"] == ["view 3 of 3, at 240°, is not in it: it was not shot"]
+    assert over(client, model)["state"] == "succeeded"
     assert len(served.combining.asked[-1][0]) == 2
-    late = client.post(f"/model/{model['id']}/view")
-    assert (late.status_code, "is succeeded" in late.json()["detail"]) == (409, True)
-
-
-def test_cancelled_model_ends_its_views(client: TestClient, served: ServedBench) -> None:
-    served.began.clear()
-    served.gate.clear()
-    model = client.post("/model/shoot", json=BY_HAND).json()
-    assert served.began.wait(WAIT_S)
-    busy = client.post("/model/shoot", json={**BY_HAND, "if_busy": "reject"})
-    assert (busy.status_code, busy.json()["type"]) == (409, "/problems/rig-busy")
-    shooting = client.post(f"/model/{model['id']}/view")
-    assert "View 1 of model" in shooting.json()["detail"]
-    assert client.post(model["links"]["cancel"]).json()["state"] == "cancelled"
-    assert [each["state"] for each in views(client, model)] == ["cancelled"]
 
 
 @pytest.mark.parametrize(
     ("status", "words", "request_body"),
     [
-        (422, "twice", {"scans": [0, 1, 0], "axis": AXIS}),
         (404, "No scan", {"scans": [0, str(uuid4())], "axis": AXIS}),
         (422, "scans", {"scans": [0]}),
         (422, "axis: expected that of the stage", {"scans": [0, 1]}),
-        (422, "one for each of 2", {"scans": [0, 1], "axis": AXIS, "angles_deg": [1.0]}),
         (422, "expected a rotation", {"scans": [0, 1], "poses": [STILL, MIRROR]}),
         (422, "leave one of them out", {"scans": [0, 1], "poses": [STILL, STILL], "axis": AXIS}),
-        (422, "leave one of them out", {"scans": [0, 1], "poses": "unknown", "angles_deg": [0.0, 1.0]}),
         (422, "poses", {"scans": [0, 1], "poses": "somewhere"}),
         (422, "expected the frames of each scan", {"scans": [0, 1], "poses": "markers"}),
         (422, "dictionary", {"scans": [0, 1], "poses": "unknown", "dictionary": "DICT_4X4_50"}),
-        (422, "has no turntable. Turn it by hand", {"axis": AXIS}),
         (422, "axis: expected that of the stage", {"by_hand": True}),
         (422, "views", {**BY_HAND, "views": 1}),
-        (422, "views", {**BY_HAND, "views": 73}),
         (422, "one for each of 3 scans", {"by_hand": True, "views": 3, "poses": [STILL, STILL]}),
-        (422, "leave one of them out", {"by_hand": True, "views": 2, "poses": [STILL, STILL], "axis": AXIS}),
         (422, "repeat", {**BY_HAND, "scan": {"repeat": 2}}),
         (422, "turn_deg", {**BY_HAND, "scan": {"turn_deg": 2}}),
         (422, "one of", {**BY_HAND, "scan": {"exposure_s": 0.1, "exposures_s": [0.1, 0.2]}}),
