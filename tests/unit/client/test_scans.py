@@ -1,9 +1,16 @@
-"""Scans through the client: started, followed, and their results."""
+"""Scans through the client: followed, their results and what a notebook shows of them; and what the client loads."""
 
 from __future__ import annotations
 
 import io
+import json
+import re
+import subprocess
+import sys
+from base64 import b64encode
+from html import unescape
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -12,10 +19,11 @@ import pytest
 from slrig.client import Cloud
 from slrig.client.errors import ScanFailedError
 from slrig.client.events import Captured, Event, FileReady, Progress, StateChange
+from slrig.client.notebook import shown
 from slrig.errors import ScanCancelledError, ServiceError
 from slrig.model.srgb import light_of
 from slrig.scan.artefacts import encode_mesh_ply
-from tests.unit.client.service import HERE, Walk, client_of
+from tests.unit.client.service import HERE, SCAN, Walk, client_of
 from tests.unit.scan.test_mesh_formats import half_ball
 
 
@@ -150,3 +158,94 @@ def test_the_name_of_a_file_leads_out_of_no_folder(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "folder"
     folder.mkdir(parents=True)
     assert client_of(walk).result("5f").save("../../mesh.ply", folder) == folder / "mesh.ply"
+
+
+GLB = b"glTF of a scan"
+SUMMARY = {
+    "notes": ["camera 'left': <slow>"],
+    "mesh": {
+        "figures": {"vertices": 42734, "triangles": 84632, "area_mm2": 14241.6},
+        "sigma_mm": {"p50": 0.0171, "p95": 0.0183},
+        "covers_of_decoded": 0.978,
+    },
+}
+FULL: dict[str, Any] = {
+    **SCAN,
+    "label": "<b>cup</b>",
+    "summary": SUMMARY,
+    "links": {**SCAN["links"], "files": {"causes-left.png": "", "causes-right.png": ""}},
+}
+
+
+def test_table_shows_the_figures_and_escapes_labels() -> None:
+    found = shown(FULL, None)
+    text = unescape(re.sub(r"<[^>]*>", "|", found))
+    for words in (
+        "<b>cup</b> 5f",
+        "bench: left, right",
+        "42,734",
+        "84,632 on 142.4 cm²",
+        "0.0171 mm",
+        "97.8%",
+        "<slow>",
+    ):
+        assert words in text, words
+    assert "<b>" not in found
+
+
+def test_a_scan_of_which_little_is_known_is_shown_too() -> None:
+    assert "5f" in shown(SCAN, None)
+    unknown = {"notes": [], "mesh": {"sigma_mm": {"p50": None, "p95": None}}}
+    assert "deviation" not in shown({**FULL, "summary": unknown}, None)
+
+
+def test_the_view_is_whole_and_asks_for_nothing() -> None:
+    found = shown(FULL, GLB)
+    (page,) = re.findall(r"srcdoc='([^']*)'", found)
+    page = unescape(page)
+    assert b64encode(GLB).decode() in page
+    assert not re.findall(r"https?:|//|\bimport\b|\bfetch\b|src=", re.sub(r"^ *//.*$", "", page, flags=re.MULTILINE))
+    assert "sandbox='allow-scripts'" in found
+
+
+def test_a_result_is_shown_with_its_mesh() -> None:
+    assert "<iframe" in client_of(Walk(coarse_glb=GLB)).result("5f")._repr_html_()
+    assert "<iframe" not in client_of(Walk()).result("5f")._repr_html_()
+
+
+HEAVY = {
+    "numba",
+    "numpy",
+    "cv2",
+    "scipy",
+    "fastapi",
+    "starlette",
+    "pydantic",
+    "trimesh",
+    "sqlalchemy",
+    "PIL",
+    "asyncio",
+}
+MOST_S = 0.3
+_TOLD = """
+import sys, time
+begun_s = time.process_time()
+import slrig.client
+taken_s = time.process_time() - begun_s
+import json
+loaded = {name.partition(".")[0] for name in sys.modules}
+own = {name for name in sys.modules if name.startswith("slrig.")}
+print(json.dumps([taken_s, sorted(loaded), sorted(own)]))
+"""
+
+
+def test_the_client_loads_neither_mathematics_nor_the_service() -> None:
+    taken: list[float] = []
+    for _ in range(3):
+        told = subprocess.run([sys.executable, "-c", _TOLD], capture_output=True, text=True, check=True)  # noqa: S603
+        taken_s, loaded, own = json.loads(told.stdout)
+        taken.append(taken_s)
+    assert HEAVY & set(loaded) == set()
+    rooms = {name.split(".")[1] for name in own}
+    assert rooms == {"client", "disk", "errors", "printable"}
+    assert median(taken) <= MOST_S

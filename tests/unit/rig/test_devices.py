@@ -1,4 +1,4 @@
-"""Guarded devices: what they raise says where, in words to act on; a call that hangs is found out, once."""
+"""Devices of a rig: guarded calls, pictures while it is idle, and the count of a table that keeps its zero."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import errno
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from slrig.devices import AppliedSettings, CallLimits, CameraSettings, Rig, Trigger, progress_reporter
+from slrig.devices import AnyAngle, AppliedSettings, CallLimits, CameraSettings, Rig, Trigger, progress_reporter
 from slrig.errors import (
+    CameraNotFoundError,
     ConfigError,
     DeviceBusyError,
     DeviceError,
@@ -19,12 +22,19 @@ from slrig.errors import (
     DeviceStateError,
     DriverBrokenError,
     FrameTimeoutError,
+    RigBusyError,
     SlrigError,
+    StorageError,
     UnsupportedByDeviceError,
 )
+from slrig.model import StageAxis
+from slrig.rig.preview import Light, Picture, Previews, Watch
 from slrig.rig.session import RigSession
 from slrig.rig.settings import SettingsInUse
+from slrig.rig.turn_count import FROM_THE_START, CountedTurntable
 from slrig.rig.watchdog import MOVE_LIMIT_S, OPEN, Call, Calls, GuardedPositioner, GuardedTurntable, Watchdog, guarded
+from tests.unit.capture.fake_rig import CameraFaults, Scene, fake_rig
+from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S, TameBench, TameCamera, TameProjector
 
 
@@ -388,3 +398,227 @@ def test_positioner_is_watched_like_the_other_devices() -> None:
         stage.move(1)
     stage.close()
     assert seen[0] == ("the positioner", "move", MOVE_LIMIT_S)
+
+
+class Room:
+    """Previews of a rendered rig, on a thread of their own until the test ends."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.stopped = threading.Event()
+        self.previews = Previews(lambda: None)
+        self.error: Exception | None = None
+        self._thread: threading.Thread | None = None
+
+    def run(self) -> None:
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.previews.run(self.rig, stop=self.stopped.is_set)
+        except DeviceError as error:
+            self.error = error
+
+    def join(self) -> None:
+        assert self._thread is not None
+        self._thread.join(WAIT_S)
+        assert not self._thread.is_alive()
+
+
+def next_of(watch: Watch, after: int = 0) -> Picture:
+    picture = watch.picture(after, WAIT_S)
+    assert picture is not None
+    return picture
+
+
+def test_pictures_follow_one_another_and_the_light_that_is_asked_for() -> None:
+    fake = fake_rig()
+    # A camera of 12 bits is shown in eight.
+    fake.cameras["right"].scene = Scene(bit_depth=12)
+    room = Room(fake.rig)
+    with room.previews.watch("left", Light.OFF) as dark, room.previews.watch("right", Light.OFF) as other:
+        room.run()
+        first = next_of(dark)
+        assert (first.image.shape, first.image.dtype) == ((150, 200), np.dtype(np.uint8))
+        assert next_of(dark, first.number).number > first.number
+        assert next_of(other).image.dtype == np.uint8
+        with room.previews.watch("left", Light.WHITE) as lit:
+            now = next_of(dark).number
+            # One picture may have been under way when the light was asked for.
+            assert next_of(lit, now + 1).image.mean() > 4 * first.image.mean()
+            assert fake.projector.lit
+        now = next_of(dark).number
+        assert next_of(dark, now + 1).image.mean() < 1.5 * first.image.mean()
+    # When the last has left, it ends by itself.
+    room.join()
+    assert room.error is None
+    assert fake.at_rest
+
+
+def test_a_job_that_wants_the_rig_gets_it_dark_and_disarmed() -> None:
+    fake = fake_rig()
+    room = Room(fake.rig)
+    with room.previews.watch("left", Light.WHITE) as watch:
+        room.run()
+        next_of(watch)
+        room.stopped.set()
+        room.previews.interrupt()
+        room.join()
+        assert fake.at_rest
+        assert room.previews.wanted
+
+
+def test_a_device_that_goes_away_ends_the_looking_and_says_why() -> None:
+    room = Room(fake_rig(faults={"left": CameraFaults(unplug_at=2)}).rig)
+    with room.previews.watch("left", Light.OFF) as watch:
+        room.run()
+        room.join()
+        assert isinstance(room.error, DeviceGoneError)
+        room.previews.fail(room.error)
+        with pytest.raises(DeviceGoneError):
+            watch.picture(99, WAIT_S)
+    assert not room.previews.wanted
+
+
+def test_no_picture_comes_while_nobody_takes_any() -> None:
+    previews = Previews(lambda: None)
+    with previews.watch("left", Light.OFF) as watch:
+        assert watch.picture(0, 0.0) is None
+
+
+def test_a_scan_goes_first_and_pictures_go_on_after_it(tmp_path: Path) -> None:
+    """On the runner: looking is refused while a scan holds the rig, and yields to one that comes."""
+    bench = Bench(tmp_path)
+    # The tame capture asks nothing of these cameras, and lights the tame projector.
+    rig = replace(fake_rig().rig, projector=TameProjector())
+    bench.runner.queue.rig = RigSession("bench", lambda: rig)
+    bench.runner.start()
+    try:
+        bench.until(bench.scan().id)
+        with pytest.raises(CameraNotFoundError, match="left, right"):
+            bench.runner.queue.watch("middle", Light.OFF)
+        with bench.runner.queue.watch("left", Light.OFF) as watch:
+            seen = next_of(watch).number
+            held = bench.held()
+            with pytest.raises(RigBusyError, match=str(held.id)):
+                bench.runner.queue.watch("left", Light.OFF)
+            stood = next_of(watch).number
+            assert watch.picture(stood, 0.0) is None
+            bench.gate.set()
+            bench.until(held.id)
+            assert next_of(watch, max(seen, stood)).number > stood
+    finally:
+        bench.close()
+
+
+def test_before_the_rig_is_open_there_is_nothing_to_see(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    try:
+        with pytest.raises(DeviceBusyError, match="being opened"):
+            bench.runner.queue.watch("cam0", Light.OFF)
+    finally:
+        bench.close()
+
+
+class Motor:
+    """A table that outlives its openings. own_deg : its own count; at_deg : where it stands in the world."""
+
+    def __init__(self) -> None:
+        self.own_deg, self.at_deg = 12.0, 0.0
+        self.fails = False
+
+
+class Table(AnyAngle):
+    """One opening of it."""
+
+    def __init__(self, motor: Motor, *, homed: bool = False) -> None:
+        super().__init__(4)
+        self._motor = motor
+        self._opened_deg = motor.own_deg
+        self._homed = homed
+
+    @property
+    def axis(self) -> StageAxis | None:
+        return None
+
+    @property
+    def opened_at_deg(self) -> float | None:
+        return None if self._homed else self._opened_deg
+
+    def turn(self, angle_deg: float) -> None:
+        moved = self._opened_deg + angle_deg - self._motor.own_deg
+        if self._motor.fails:
+            self._motor.own_deg, self._motor.at_deg = self._motor.own_deg + moved / 2, self._motor.at_deg + moved / 2
+            message = "stuck"
+            raise DeviceError(message)
+        self._motor.own_deg, self._motor.at_deg = self._motor.own_deg + moved, self._motor.at_deg + moved
+
+    def close(self) -> None:
+        return
+
+
+@pytest.fixture
+def motor() -> Motor:
+    return Motor()
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "stage" / "table.json"
+
+
+def test_angles_go_on_where_the_table_kept_its_place(motor: Motor, path: Path) -> None:
+    first = CountedTurntable(Table(motor), path)
+    first.turn(90.0)
+    second = CountedTurntable(Table(motor), path)
+    assert second.count == first.count != FROM_THE_START
+    second.turn(135.0)
+    assert motor.at_deg == pytest.approx(135.0)
+    third = CountedTurntable(Table(motor), path)
+    third.move(2)
+    assert third.count == first.count
+    assert motor.at_deg == pytest.approx(180.0)
+    with pytest.raises(UnsupportedByDeviceError, match="pose 4"):
+        third.move(4)
+
+
+def test_a_table_that_restarted_or_was_moved_counts_anew(motor: Motor, path: Path) -> None:
+    first = CountedTurntable(Table(motor), path)
+    first.turn(90.0)
+    motor.own_deg = 0.0
+    second = CountedTurntable(Table(motor), path)
+    assert second.count != first.count
+    second.turn(45.0)
+    assert motor.at_deg == pytest.approx(135.0)
+
+
+def test_a_turn_that_did_not_end_leaves_no_count_to_go_on_with(motor: Motor, path: Path) -> None:
+    first = CountedTurntable(Table(motor), path)
+    motor.fails = True
+    with pytest.raises(DeviceError, match="stuck"):
+        first.turn(90.0)
+    motor.fails = False
+    assert CountedTurntable(Table(motor), path).count != first.count
+
+
+@pytest.mark.parametrize("what", ["{", '{"at_deg": 3}', "[]"])
+def test_a_file_that_is_damaged_is_not_believed(motor: Motor, path: Path, what: str) -> None:
+    first = CountedTurntable(Table(motor), path)
+    first.turn(90.0)
+    path.write_text(what)
+    assert CountedTurntable(Table(motor), path).count != first.count
+
+
+def test_a_disk_that_refuses_turns_nothing(motor: Motor, path: Path) -> None:
+    path.parent.write_text("a file in the folder's place")
+    with pytest.raises(StorageError):
+        CountedTurntable(Table(motor), path).turn(90.0)
+    assert motor.at_deg == 0.0
+
+
+def test_a_table_that_each_opening_brings_to_one_place_has_one_count(motor: Motor, path: Path) -> None:
+    table = CountedTurntable(Table(motor, homed=True), path)
+    table.turn(30.0)
+    assert (table.count, path.exists()) == (FROM_THE_START, False)
+    assert CountedTurntable(Table(motor, homed=True), path).count == FROM_THE_START

@@ -1,0 +1,335 @@
+"""Devices, health and schedule, models, the fleet; and what happens to a page that is open."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from sqlalchemy import update
+
+from slrig.api.keys import KeyRing
+from slrig.api.scopes import Scope
+from slrig.catalogue.store import Catalogue, open_catalogue
+from slrig.catalogue.tables import RigRow
+from slrig.config import ServiceSettings
+from slrig.conformance import Outcome, Report
+from slrig.conformance.expectation import Failure
+from slrig.conformance.running import Result
+from slrig.doctor.doctor import Diagnosis
+from slrig.doctor.findings import fault, ok
+from slrig.jobs.examinations import keep
+from slrig.jobs.records import utc_now
+from tests.e2e.conftest import KEY, SLOW, Start, write_rig
+from tests.e2e.page.conftest import PHONE, Visit, count, disabled, fits, looking, violations
+from tests.e2e.page.golden import looks_as_kept
+from tests.e2e.test_calibration_walk import write_rig as write_board_rig
+from tests.e2e.test_model_walk import ANGLES, STAGE, on_a_stage
+from tests.unit.catalogue.test_store import job, row
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Locator, Page, Route
+
+pytestmark = pytest.mark.slow
+
+PLUGGED_IN = {
+    "drivers": [], "missing": [], "elsewhere": [], "faults": [],
+    "devices": [{"driver": "v4l2", "device": "/dev/video0", "label": "a camera of no rig"}],
+}  # fmt: skip
+
+
+def looks_as_elsewhere(page: Page, name: str) -> None:
+    """`looks_as_kept` with one device, whatever is plugged in here, and without a path of this machine."""
+
+    def without_path(route: Route) -> None:
+        found = route.fetch()
+        commands = {name: f"slrig {name} RIG.toml --data DATA" for name in ("doctor", "conform")}
+        route.fulfill(response=found, json={**found.json(), "commands": commands})
+
+    page.route("**/device", lambda route: route.fulfill(json=PLUGGED_IN))
+    page.route("**/rig/examinations", without_path)
+    page.reload()
+    page.get_by_role("cell", name="a camera of no rig").wait_for()
+    page.get_by_text("slrig doctor RIG.toml --data DATA").wait_for()
+    page.get_by_role("banner").get_by_text("ready").wait_for()
+    looks_as_kept(page, name)
+    page.unroute_all(behavior="ignoreErrors")
+
+
+def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, visit: Visit) -> None:
+    rig = write_rig(tmp_path / "rig")
+    service = start(rig)
+    page = visit(service, "devices")
+    camera = page.get_by_role("listitem").filter(has=page.get_by_role("heading", name="Camera left"))
+    camera.get_by_text("not set yet").first.wait_for()
+    page.get_by_text("Not examined yet.").first.wait_for()
+    page.get_by_role("region", name="Plugged in").get_by_text("Installed drivers").wait_for()
+    assert violations(page) == []
+    with service.client() as client:
+        client.scans.start(exposure_s=0.012)
+    camera.get_by_text("12 ms", exact=True).wait_for()
+    page.get_by_role("row").filter(has_text="POST /scan").get_by_text("202").wait_for()
+    page.get_by_text("Logged in as environment").wait_for()
+
+    findings = (
+        fault("light.dark", "camera 'left'", "it is too dark", "open the iris"),
+        ok("focus.sharp", "camera 'left'", "it is sharp"),
+    )
+    keep(service.data, "doctor", Diagnosis("small", findings, {}, None, None, None, ()).document())
+    page.get_by_text("it is too dark").wait_for()
+    page.get_by_text("open the iris").wait_for()
+    page.get_by_text("What is well: 1").click()
+    page.get_by_text("it is sharp").wait_for()
+    assert violations(page) == []
+    looks_as_elsewhere(page, "devices")
+
+    # On a phone, by a key for looking.
+    failure = Failure("every frame shows its own pattern", "light of another one", "wait for it", "camera 'left'")
+    results = (
+        Result("frames", "Every frame shows its pattern", Outcome.FAILED, 1.0, failure),
+        Result("wires", "Wires trigger", Outcome.NOT_APPLICABLE, 0.0, None, "it needs a wire"),
+        *(Result(f"check {number}", "All is well", Outcome.PASSED, 0.1) for number in range(2)),
+    )
+    keep(service.data, "conform", Report("small", results, 1.2).document())
+    secret = looking(service)
+    page = visit(service, "devices", key=secret, size=PHONE, dark=True)
+    page.get_by_text("66 %").wait_for()
+    page.get_by_text("2 of 3 checks that apply passed.").wait_for()
+    page.get_by_text("Every frame shows its pattern").wait_for()
+    page.get_by_text("Logged in as Ann").wait_for()
+    page.get_by_text("You may look.").wait_for()
+    count(page.get_by_role("table", name="Who did what last"), 0)
+    fits(page)
+    looks_as_elsewhere(page, "devices-phone-dark")
+
+
+BUMP = 'faults = {bump = [{device = "projector", pose = 3, turn_deg = [0.0, 0.06, 0.0]}]}'
+"""From pose 3 on the projector is turned."""
+
+
+def describe_board(part: Locator, pose: str = "pose 1") -> None:
+    """Say what is printed on the board of the rendered rig, and where it is to stand."""
+    part.get_by_label("Kind").select_option(label="Chessboard")
+    for label, value in (("Corners across", 8), ("Corners down", 5), ("Square, mm", 20)):
+        part.get_by_label(label).fill(str(value))
+    part.get_by_label("Position of the board").select_option(label=pose)
+
+
+def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Path, visit: Visit) -> None:
+    page = visit(
+        start(write_board_rig(tmp_path / "rig", head=f"{SLOW}\n{BUMP}", carries="true")), "health", ignored="422"
+    )
+    verify = page.get_by_role("region", name="Verify")
+    page.get_by_text("Nothing was verified yet.").wait_for()
+    describe_board(verify)
+    assert violations(page) == []
+    verify.get_by_role("button", name="Verify now").click()
+    verify.get_by_role("progressbar").wait_for()
+    # After a reload in the middle of it, the page goes on with it.
+    page.reload()
+    verify.get_by_role("progressbar").wait_for()
+    verify.get_by_text("Good", exact=True).wait_for()
+    state = page.get_by_role("region", name="State")
+    state.get_by_role("status").get_by_text("Good").wait_for()
+    state.get_by_text("just now").wait_for()
+    count(page.get_by_role("table", name="Last verifications").get_by_role("row"), 2)
+    picture = page.get_by_role("img", name="Expected error of a scan")
+    assert picture.evaluate("(image) => image.decode().then(() => image.naturalWidth)") > 0
+    assert violations(page) == []
+    looks_as_kept(page, "health")
+
+    form = page.get_by_role("form", name="Add to the schedule")
+    form.get_by_label("Minute, hour").fill("0 26 * * *")
+    form.get_by_label("Name").fill("nights")
+    describe_board(form)
+    form.get_by_role("button", name="Add").click()
+    form.get_by_role("alert").get_by_text("cron: Bad hour").wait_for()
+    form.get_by_label("Minute, hour").fill("30 2 * * *")
+    form.get_by_label("Time zone").fill("Europe/Berlin")
+    form.get_by_role("button", name="Add").click()
+    added = form.get_by_text("Added. Next:").inner_text()
+    assert added.count("02:30") == 5
+    nights = page.get_by_role("region", name="nights", exact=True)
+    nights.get_by_text("Verification, next").wait_for()
+    nights.get_by_role("button", name="Pause").click()
+    nights.get_by_text("paused: nothing becomes due").wait_for()
+    nights.get_by_role("button", name="Run now").click()
+    nights.get_by_text("under way").first.wait_for()
+    disabled(nights.get_by_role("button", name="Run now"))
+    nights.get_by_text("The calibration is good").wait_for()
+    nights.get_by_text("asked for by a person, not by the clock").wait_for()
+    assert violations(page) == []
+    looks_as_kept(page, "schedule", part=nights)
+    nights.get_by_role("button", name="Remove").click()
+    page.get_by_role("alertdialog").get_by_role("button", name="Remove it").click()
+    page.get_by_text("Nothing is done by the clock yet.").wait_for()
+
+    describe_board(verify, pose="pose 5")
+    verify.get_by_role("button", name="Verify now").click()
+    verify.get_by_text("Likely cause: the projector turned by 0.06").wait_for()
+    verify.get_by_text("What to do: check the projector's mount, and calibrate again.").wait_for()
+    page.get_by_role("table", name="Last verifications").get_by_role("cell", name="Watch").wait_for()
+    assert violations(page) == []
+
+
+# As of a stage that was measured with a ruler.
+COVARIANCE = np.diag([0.25, 0.0, 0.25, 1e-4, 0.0, 1e-4]).tolist()
+
+
+def test_scans_are_joined_and_an_object_is_turned_by_hand(start: Start, tmp_path: Path, visit: Visit) -> None:
+    data = tmp_path / "data"
+    on_a_stage(data)
+    service = start(write_rig(tmp_path / "rig"), data)
+    page = visit(service, "models", size=(1280, 1100), ignored="4")
+    page.get_by_text("None yet.").wait_for()
+    page.get_by_text("This rig has no turntable.").wait_for()
+    boxes = page.get_by_role("region", name="Join scans").get_by_role("checkbox")
+    count(boxes, len(ANGLES))
+    # Listed from new to old; the first that is chosen gives the frame.
+    for number in reversed(range(len(ANGLES))):
+        boxes.nth(number).check()
+    page.get_by_role("button", name="Make one model of 3").click()
+    page.get_by_role("alert").get_by_text("axis: expected that of the stage").wait_for()
+    assert violations(page) == []
+
+    with service.client() as client:
+        axis = {**STAGE, "covariance": COVARIANCE}
+        client.stage.put({"format": "slrig-stage", "version": 1, "axis": axis})
+    page.get_by_role("button", name="Make one model of 3").click()
+    page.get_by_text("succeeded").wait_for()
+    page.get_by_role("img", name="The model from six sides").wait_for()
+    page.locator("canvas[data-level=full]").wait_for()
+    count(page.get_by_role("region", name="Figures").get_by_text("model.ply"), 1)
+    page.get_by_role("columnheader", name="Over σ").wait_for()
+    page.get_by_role("button", name="σ", exact=True).click()
+    assert page.get_by_role("button", name="Stripe").count() == 0
+    assert violations(page) == []
+    looks_as_kept(page, "model")
+
+    # By hand, on a phone: the page says when to turn and by how much.
+    page = visit(service, "models", size=PHONE, dark=True, ignored="4")
+    page.get_by_label("Views, evenly around").fill("3")
+    page.get_by_role("button", name="Shoot the views").click()
+    page.get_by_text("turn the object by 120° for view 2 of 3").wait_for()
+    fits(page)
+    page.get_by_role("button", name="I have turned it: next view").click()
+    page.get_by_text("turn the object by 120° for view 3 of 3").wait_for()
+    page.get_by_role("button", name="Stop it").click()
+    page.get_by_role("alert").get_by_text("cancelled while its views were shot").wait_for()
+    page.get_by_role("button", name="Delete").click()
+    page.get_by_role("button", name="Delete it").click()
+    page.get_by_text("3 views,").wait_for()
+
+
+def others(catalogue: Catalogue) -> None:
+    """Three more rigs: one works, one cannot, one has been silent for two days."""
+    now = datetime.now(UTC)
+
+    def scans(rig: str, number: int, hours: float, **other: Any) -> list[dict[str, Any]]:
+        at = (now - timedelta(hours=hours)).isoformat()
+        return [job(rig, finished_at=at, **other) for _ in range(number)]
+
+    catalogue.see(row("hall-1", words="scan 5f1c", health="good", uncopied=0))
+    why = "The camera 'left' does not answer. Plug it in again, then scan."
+    catalogue.see(row("hall-2", state="fault", words=why, waiting=0, computing=0, health="stale", uncopied=12,
+                      health_words="the projector has turned by 0.06°"))  # fmt: skip
+    catalogue.see(row("hall-3"))
+    too_dark = {"state": "failed", "fault_message": "The pictures are too dark: open the aperture."}
+    catalogue.copy([
+        *scans("hall-1", 41, 2, label="housing 17"), *scans("hall-2", 12, 5), *scans("hall-2", 1, 4, **too_dark),
+        *scans("hall-3", 1, 49),
+    ])  # fmt: skip
+    with catalogue._writer.begin() as connection:
+        gone = update(RigRow).where(RigRow.name == "hall-3")
+        connection.execute(gone.values(seen_at=now - timedelta(days=2)))
+
+
+def test_a_person_sees_many_rigs_at_once(start: Start, tmp_path: Path, visit: Visit) -> None:
+    address = f"sqlite:///{tmp_path}/fleet.sqlite"
+    catalogue = open_catalogue(address, None, None)
+    catalogue.open()
+    others(catalogue)
+    service = start(write_rig(tmp_path / "rig"), SLRIG_CATALOGUE=address)
+    with service.client() as client:
+        client.scan()
+    page = visit(service)
+    page.get_by_role("link", name="Fleet").click()
+    page.get_by_text("4 rigs, 1 not ready, 1 not seen for a minute or longer").wait_for()
+    rigs = page.get_by_role("region", name="Rigs").get_by_role("row")
+    count(rigs, 5)
+    for number, words in enumerate(["busy", "does not answer", "not seen", "this one"]):
+        rigs.nth(1 + number).get_by_text(words, exact=number == 2).first.wait_for()
+    assert rigs.nth(3).get_by_text("not known").count() == 2
+    assert violations(page) == []
+    looks_as_kept(page, "fleet")
+    phone = visit(service, "fleet", size=PHONE, dark=True)
+    count(phone.get_by_role("region", name="Rigs").get_by_role("row"), 5)
+    assert violations(phone) == []
+    looks_as_kept(phone, "fleet-phone-dark")
+    catalogue.close()
+
+
+COMPLAINT = "Failed to load resource"
+"""What Chromium itself says of a request that is refused, or not answered."""
+
+
+def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig", faults="[head.faults]\nunplug_camera_at_frame = 5"))
+    page = visit(service, "scan")
+    page.get_by_text("None yet.").wait_for()
+    page.get_by_role("button", name="Scan", exact=True).click()
+    failed = page.get_by_role("alert").filter(has_text="The last scan failed")
+    failed.get_by_text("camera 'left' is gone (unplugged or powered off); plug it in").wait_for()
+    page.get_by_role("listitem").get_by_text("failed").wait_for()
+    assert violations(page) == []
+
+    # The form, and back to the screen.
+    keys = ServiceSettings(data_dir=service.data).key_path
+    secret = KeyRing(keys).add("Ann", [Scope.SCAN], life=timedelta(hours=1))
+    page = visit(service, "devices", key=secret, ignored=COMPLAINT)
+    page.get_by_text("Logged in as Ann").wait_for()
+    kept = json.loads(keys.read_text())
+    kept["keys"][-1]["expires_at"] = (utc_now() - timedelta(seconds=1)).isoformat()
+    keys.write_text(json.dumps(kept))
+    page.get_by_role("alert").get_by_text("Your session is over").wait_for()
+    assert violations(page) == []
+    page.get_by_label("Key").fill(secret)
+    page.get_by_role("button", name="Enter").click()
+    page.get_by_role("alert").get_by_text("one that expired on").wait_for()
+    page.get_by_label("Key").fill(KEY)
+    page.get_by_role("button", name="Enter").click()
+    page.get_by_text("Logged in as environment").wait_for()
+    assert page.url.endswith("#/devices")
+
+
+def test_health_without_a_calibration_while_the_service_goes_and_comes_back(
+    start: Start, tmp_path: Path, visit: Visit
+) -> None:
+    rig = write_rig(tmp_path / "rig", head="carries_calibration = false")
+    service = start(rig)
+    secret = looking(service)
+    page = visit(service, "health", key=secret, size=PHONE, dark=True, ignored=COMPLAINT)
+    page.get_by_text("The rig has no calibration that could be verified.").wait_for()
+    page.get_by_text("Your key is not for calibrations.").wait_for()
+    page.get_by_text("Changing the schedule takes a key that may administer.").wait_for()
+    disabled(page.get_by_role("button", name="Verify now"))
+    fits(page)
+    page.get_by_role("banner").get_by_text("not calibrated").wait_for()
+    looks_as_kept(page, "health-phone-dark")
+    service.stop()
+    banner = page.get_by_role("alert").get_by_text("The service does not answer.")
+    banner.wait_for()
+    # What was known is still there to be read.
+    assert page.get_by_text("The rig has no calibration that could be verified.").is_visible()
+    assert violations(page) == []
+    start(rig, port=urlsplit(service.url).port)
+    # Sessions live as long as the service.
+    page.get_by_role("alert").get_by_text("Your session is over").wait_for()
+    banner.wait_for(state="detached")
+    page.get_by_label("Key").fill(KEY)
+    page.keyboard.press("Enter")
+    page.get_by_text("The rig has no calibration that could be verified.").wait_for()
