@@ -1,4 +1,4 @@
-"""The command line as a whole: help, exit codes, `slrig scan`, `slrig demo`, and what is shown on a terminal."""
+"""The command line as a whole: help, exit codes, `slrig scan`, `demo` and `accept`, and what a terminal shows."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import re
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,22 +21,33 @@ import httpx2
 import numpy as np
 import pytest
 import typer
+from rich.console import Console
 
+from slrig.accept.plan import AcceptancePlan, Limits
+from slrig.accept.running import run_acceptance
+from slrig.accept.scene import scripted_config
+from slrig.accept.verdicts import AcceptanceResult
 from slrig.api.schemas import ScanRequest
 from slrig.bundle.region_file import read_region
+from slrig.calibration.artefacts import Decision
+from slrig.cli import accept as accepting
+from slrig.cli.accept import moving, placed_by_hand, plan_for
 from slrig.cli.commands import INTERRUPTED, app
 from slrig.cli.demo import remove_earlier, still_missing
 from slrig.cli.display import ProgressDisplay, print_json, print_table
-from slrig.cli.options import Service
+from slrig.cli.options import AcceptanceOptions, Service
 from slrig.cli.quality import quality_lines
 from slrig.cli.scan import scan_with, series_with, tell_result
 from slrig.client import Client, ScanJob
-from slrig.errors import ScanCancelledError, ServiceError, SlrigError
+from slrig.config import read_rig
+from slrig.devices import Rig
+from slrig.discovery import open_rig
+from slrig.errors import InvalidInputError, ScanCancelledError, ServiceError, SlrigError, UnsupportedByDeviceError
 from slrig.model import Region
 from slrig.scan.offered import MEDIA_TYPES
 from slrig.scan.records import report_summary
 from tests.unit.capture.fake_rig import fake_rig
-from tests.unit.client.service import SCAN, Handler, Walk
+from tests.unit.client.service import SCAN, Walk, client_of
 from tests.unit.command import done, refused, slrig
 
 COLUMNS = 80
@@ -47,12 +60,7 @@ SUMMARY = {
 SERIES = "/scan/series/9"
 
 
-def client_of(handler: Handler) -> Client:
-    return Client("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(handler))
-
-
 def printed(code: str) -> str:
-    """The last line that a process of its own prints."""
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
     return found.stdout.strip().splitlines()[-1]
 
@@ -62,7 +70,6 @@ def ignore(_stage: str, _fraction: float, _detail: str) -> None:
 
 
 def commands() -> list[tuple[str, ...]]:
-    """Every command and group of commands, as it is typed."""
     found: list[tuple[str, ...]] = [()]
 
     def walk(group: object, words: tuple[str, ...]) -> None:
@@ -230,7 +237,6 @@ def scan_of(name: str, *, rig: str = "sphere", label: str = "demo") -> dict[str,
 
 @pytest.fixture
 def requests(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """What `slrig scan` asks the service for."""
     sent: list[dict[str, Any]] = []
 
     def scanned(_client: Client, request: dict[str, Any], _output: Path, **_: object) -> dict[str, Any]:
@@ -291,16 +297,17 @@ def test_region_is_read_from_a_file(tmp_path: Path, requests: list[dict[str, Any
     assert "did you mean 'depth_mm'?" in refused(slrig("reconstruct", tmp_path, *out, "--region", path))
 
 
-def test_scan_is_followed_and_fetched(tmp_path: Path) -> None:
+def test_scan_is_followed_and_fetched_or_says_which_files_it_has(tmp_path: Path) -> None:
     shown: list[tuple[str, float]] = []
+
+    def display(stage: str, fraction: float, _detail: str) -> None:
+        shown.append((stage, fraction))
+
     with client_of(Walk(mesh_ply=b"ply")) as client:
-        scan_with(
-            client,
-            {},
-            tmp_path / "out",
-            files=("mesh.ply",),
-            display=lambda stage, fraction, _detail: shown.append((stage, fraction)),
-        )
+        scan_with(client, {}, tmp_path / "out", files=("mesh.ply",), display=display)
+        with pytest.raises(ServiceError, match=r"no mesh\.obj\. It has: mesh\.ply"):
+            scan_with(client, {}, tmp_path / "none", files=("mesh.ply", "mesh.obj"), display=ignore)
+    assert not (tmp_path / "none").exists()
     assert (tmp_path / "out" / "mesh.ply").read_bytes() == b"ply"
     assert shown == [("waiting for the rig", 0.0), ("capture", 0.25), ("fetching mesh.ply", 1.0), ("done", 1.0)]
 
@@ -323,22 +330,6 @@ def test_result_is_shown_with_its_files_and_its_quality(tmp_path: Path, capsys: 
     ]
     # A summary of an earlier version.
     assert quality_lines({"method": "Gray-only"}) == []
-
-
-@pytest.mark.parametrize(
-    ("walk", "error", "words"),
-    [
-        (Walk("failed", {"detail": "No stripe was found."}), ServiceError, r"Scan 5f failed: No stripe was found\."),
-        (Walk("cancelled"), ScanCancelledError, "cancelled"),
-        (Walk(mesh_ply=b"ply"), ServiceError, r"no mesh\.obj\. It has: mesh\.ply"),
-    ],
-)
-def test_scan_without_its_files_raises_the_cause_and_fetches_nothing(
-    tmp_path: Path, walk: Walk, error: type[Exception], words: str
-) -> None:
-    with client_of(walk) as client, pytest.raises(error, match=words):
-        scan_with(client, {}, tmp_path / "out", files=("mesh.ply", "mesh.obj"), display=ignore)
-    assert not (tmp_path / "out").exists()
 
 
 def test_series_goes_on_after_a_failure_and_names_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -411,13 +402,9 @@ def test_ctrl_c_cancels_the_scan_or_the_whole_series(
         ),
         ("rejected-top.png", [], None),
         ("rejected-left.png", ["left"], None),
-        ("causes-left.png", ["left"], None),
-        ("causes-top.png", ["left"], "no causes-top.png"),
-        ("points-left.npz", ["left"], None),
         ("points-left.e57", ["left"], None),
         ("scan.mcap", ["left"], None),
         ("points-top.npz", ["left"], "no points-top.npz"),
-        ("bundle.zip", ["left"], None),
     ],
 )
 def test_name_that_no_scan_has_is_refused_before_one_is_shot(
@@ -495,3 +482,108 @@ def test_label_of_an_older_record_does_nothing_to_the_terminal(capsys: pytest.Ca
     for shown in (table, document):
         assert all(character == "\n" or character.isprintable() for character in shown)
     assert json.loads("{" + document) == {"label": label}
+
+
+RIGS = Path(__file__).parents[2] / "config" / "rigs"
+BALL_BAR = RIGS / "ball_bar.toml"
+
+
+@pytest.fixture(scope="module")
+def rig() -> Iterator[Rig]:
+    with open_rig(read_rig(BALL_BAR)) as rig:
+        yield rig
+
+
+@pytest.fixture(scope="module")
+def plan(rig: Rig) -> AcceptancePlan:
+    return plan_for(AcceptanceOptions(), rig)
+
+
+@pytest.mark.slow
+def test_rendered_rig_needs_no_artefacts_and_states_exact_ones(rig: Rig, plan: AcceptancePlan) -> None:
+    assert plan.rendered
+    assert plan.artefacts.diameter.uncertainty_mm == 0
+    assert plan.limits.spacing_mm == pytest.approx(plan.diagonal_mm / 5000)
+    assert len(plan.steps) == 23
+    given = plan_for(AcceptanceOptions(volume_mm=(-50, -40, -25, 50, 40, 25)), rig)
+    assert given.volume_mm.tolist() == [[-50, -40, -25], [50, 40, 25]]
+
+
+def test_metal_needs_the_certificates(rig: Rig) -> None:
+    metal = replace(rig, head=None)
+    with pytest.raises(InvalidInputError, match="needs --sphere DIAMETER U"):
+        plan_for(AcceptanceOptions(), metal)
+    given = AcceptanceOptions(sphere_mm=(17.5, 0.001), bar_mm=(64.0, 0.002), plane_mm=(95.0, 67.0))
+    with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not told"):
+        plan_for(given, metal)
+    certain = replace(given, sphere_form_mm=0.001, plane_form_mm=0.002, spacing_limit_mm=0.05)
+    wanted = plan_for(replace(certain, wanted_mm=0.03), metal).limits
+    assert wanted == Limits(form_mm=0.06, size_mm=0.03, spacing_mm=0.05, flatness_mm=0.06)
+    assert not plan_for(certain, metal).rendered
+
+
+@pytest.mark.slow
+def test_a_rig_whose_script_has_the_positions_moves_its_own_artefacts(tmp_path: Path) -> None:
+    config = read_rig(RIGS / "rendered-acceptance.toml")
+    assert moving(config, AcceptanceOptions(), tmp_path) is config
+    other = moving(read_rig(BALL_BAR), AcceptanceOptions(), tmp_path)
+    with open_rig(other) as rig:
+        assert rig.positioner is not None
+        assert len(rig.positioner.poses) == 23
+
+
+def test_a_rig_that_is_not_rendered_cannot_be_scripted(tmp_path: Path, plan: AcceptancePlan) -> None:
+    config = read_rig(BALL_BAR)
+    with pytest.raises(UnsupportedByDeviceError, match=r"leave scripted \(--scripted\) out"):
+        scripted_config(replace(config, head=None), plan, tmp_path)
+
+
+def test_person_reads_each_position_and_may_leave(plan: AcceptancePlan) -> None:
+    shown = io.StringIO()
+    answers = iter(["", "q"])
+
+    def ask(_: str) -> str:
+        if (answer := next(answers, None)) is None:
+            raise EOFError
+        return answer
+
+    place = placed_by_hand(plan, Console(file=shown, width=120), ask=ask)
+    rig = Rig("tame", {}, None, {})  # type: ignore[arg-type]
+    place(rig, plan.steps[0])
+    assert "1 of 23" in shown.getvalue()
+    assert "Put the sphere in the middle of the volume." in shown.getvalue()
+    for _ in ("q", "end of input"):
+        with pytest.raises(ScanCancelledError, match="left before sphere-2"):
+            place(rig, plan.steps[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("as_json", [False, True])
+def test_the_command_does_the_test_and_returns_the_decision(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, as_json: bool
+) -> None:
+    whole, limits_mm = run_acceptance, list[float]()
+
+    def shortened(rig: Rig, plan: AcceptancePlan, folder: Path, **options: object) -> AcceptanceResult:
+        limits_mm.append(plan.limits.spacing_mm)
+        steps = tuple(step for step in plan.steps if step.name == "bar-5")
+        return whole(rig, replace(plan, steps=steps, repeats=1), folder, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(accepting, "run_acceptance", shortened)
+    output, rig_file = tmp_path / "out", tmp_path / "rig.toml"
+    text = BALL_BAR.read_text(encoding="utf-8").replace('"../', f'"{RIGS.parent}/')
+    rig_file.write_text(f"{text}\n[accuracy]\nwanted_mm = 0.04\n", encoding="utf-8")
+    # Sphere spacing is right to a few µm: a limit of one tenth of a µm fails, that of the rig file passes.
+    more = ["--spacing-limit-mm", "0.0000001", "--json"] if as_json else []
+    ran = slrig("accept", rig_file, "--scripted", "--output", output, *more)
+    assert limits_mm == [0.0000001 if as_json else 0.04]
+    report = json.loads((output / "report.json").read_text())
+    assert report["quantities"][0]["quantity"] == "SD"
+    if as_json:
+        assert json.loads(ran.stdout) == report
+        assert report["decision"] == Decision.FAILS
+        assert ran.exit_code == 1
+    else:
+        assert "SD sphere spacing error" in ran.stdout
+        assert report["decision"] == Decision.PASSES
+        assert ran.exit_code == 0

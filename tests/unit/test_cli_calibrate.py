@@ -24,6 +24,7 @@ from slrig.cli.commands import INTERRUPTED
 from slrig.cli.options import Service
 from slrig.client import Client
 from slrig.errors import PoseRefusedError, SolveRefusedError
+from tests.unit import command
 from tests.unit.calibrate.solved import BOARD, BUMP, BUMPED, POSES, read_poses, solved_result
 from tests.unit.calibrate_command import refused, run
 from tests.unit.calibration_desk import ID, Desk, client_of
@@ -59,7 +60,6 @@ def bundle(folder: Path, name: str, *, size_px: tuple[int, int] = (1280, 1024), 
 
 @pytest.fixture
 def poses(tmp_path: Path) -> Path:
-    """A folder of four poses."""
     for name in GIVEN:
         bundle(tmp_path / "poses", name)
     return tmp_path / "poses"
@@ -99,6 +99,10 @@ def solving(monkeypatch: pytest.MonkeyPatch) -> Solving:
     return made
 
 
+def done(*arguments: object) -> str:
+    return command.done("calibrate", *arguments)
+
+
 def solve(folder: Path, output: Path, *options: object) -> Result:
     return run("solve", folder, *BOARD_OPTIONS, "--output", output, *options)
 
@@ -134,12 +138,11 @@ def test_solve_takes_all_its_options(poses: Path, solving: Solving, tmp_path: Pa
     write_calibration(tmp_path / "earlier.json", solved_result().calibration)
     output, report = tmp_path / f"rig{ending}", tmp_path / "report.html"
     more = ("--board-shape", "flat", "--earlier", tmp_path / "earlier.json", "--report", report, "--json")
-    result = solve(tmp_path / "kept", output, *more)
-    assert result.exit_code == 0, result.output
+    printed = done("solve", tmp_path / "kept", *BOARD_OPTIONS, "--output", output, *more)
     assert solving.asked["poses"] == list(GIVEN)
     assert solving.asked["board_shape"] is BoardShape.FLAT
     assert solving.asked["earlier"].cameras["left"].matrix[0, 0] == 1810.4
-    document = json.loads(result.stdout)
+    document = json.loads(printed)
     assert {name: document[name] for name in summary(solved_result())} == summary(solved_result())
     assert (list(document["refused"]), document["output"]) == (["pose_20"], str(output))
     written = read_opencv_calibration(output)
@@ -150,10 +153,9 @@ def test_solve_takes_all_its_options(poses: Path, solving: Solving, tmp_path: Pa
 
 
 def test_folder_of_poses_is_checked_without_writing_anything(poses: Path, solving: Solving, tmp_path: Path) -> None:
-    result = run("check", poses, *BOARD_OPTIONS, "--board-shape", "flat")
-    assert result.exit_code == 0, result.output
+    printed = done("check", poses, *BOARD_OPTIONS, "--board-shape", "flat")
     assert (solving.asked["poses"], solving.asked["board_shape"]) == (list(GIVEN), BoardShape.FLAT)
-    assert "0.89 × what is stated for two halves" in " ".join(result.stdout.split())
+    assert "0.89 × what is stated for two halves" in " ".join(printed.split())
     assert [path.name for path in tmp_path.iterdir()] == ["poses"]
 
 
@@ -161,10 +163,9 @@ def test_poses_that_cannot_be_used_are_named_and_left_out(poses: Path, solving: 
     (poses / "pose_01" / "bundle.json").write_text('{"format": "slrig-bundle", "vers')
     solving.known["pose_02"] = PoseRefusedError("pose 'pose_02': half a board: move it fully into view")
     solving.known["pose_03"] = solving.known["pose_00"]
-    result = solve(poses, tmp_path / "rig.json")
-    assert result.exit_code == 0, result.output
+    printed = done("solve", poses, *BOARD_OPTIONS, "--output", tmp_path / "rig.json")
     assert solving.asked["poses"] == ["pose_00"]
-    shown = "".join(result.stdout.partition("refused")[2].split())
+    shown = "".join(printed.partition("refused")[2].split())
     for words in ("pose_02halfaboard:moveitfullyintoview", "bundle.json:expectedJSON", "thesameaspose_00"):
         assert words in shown
 
@@ -236,12 +237,10 @@ def test_bad_folder_output_and_board_are_refused_before_the_work(poses: Path, so
 
 def test_board_is_written_to_be_printed(tmp_path: Path) -> None:
     options = ["--board", "charuco", "--corners", "9x6", "--square-mm", "15"]
-    result = run("board", *options, "--output", tmp_path / "board.svg")
-    assert result.exit_code == 0, result.output
+    printed = done("board", *options, "--output", tmp_path / "board.svg")
     assert (tmp_path / "board.svg").read_text(encoding="utf-8").startswith("<")
-    assert "slrig calibrate solve FOLDER --board charuco --corners 9x6 --square-mm 15" in result.stdout
-    ending = run("board", *options, "--output", tmp_path / "b.png")
-    assert "expected a name that ends in .pdf or .svg" in refused(ending)
+    assert "slrig calibrate solve FOLDER --board charuco --corners 9x6 --square-mm 15" in printed
+    assert "that ends in .pdf or .svg" in refused(run("board", *options, "--output", tmp_path / "b.png"))
 
 
 def test_board_that_is_not_named_is_the_usual_one(tmp_path: Path) -> None:
@@ -295,7 +294,6 @@ class Hand:
 
 @pytest.fixture
 def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
-    """A service that answers at once."""
     made = Desk()
     monkeypatch.setattr("slrig.cli.calibrate_walk.time.sleep", lambda _s: None)
     monkeypatch.setattr(Service, "client", lambda _self: client_of(made))
@@ -303,7 +301,6 @@ def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
 
 
 def walked(desk: Desk, *answers: str) -> tuple[str, Hand]:
-    """What was printed on a walk, and the person who walked."""
     stream, hand = io.StringIO(), Hand(*answers)
     with client_of(desk) as client:
         session = opened(client, BOARD, label=None)
@@ -387,14 +384,13 @@ def test_run_takes_up_a_session_or_opens_one_for_the_usual_board(desk: Desk) -> 
 
 def test_script_shoots_every_position_then_solves(desk: Desk) -> None:
     more = ("--position", "pose 1", "--activate", "--exposure-s", "0.02", "--board-shape", "bowed")
-    result = run("run", *BOARD_OPTIONS, "--scripted", *more)
-    assert result.exit_code == 0, result.output
+    printed = done("run", *BOARD_OPTIONS, "--scripted", *more)
     asked = {"positions": ["pose 1"], "exposure_s": 0.02, "if_busy": "queue"}
     assert desk.asked[1] == ("POST", f"/calibration/{ID}/script", asked)
     assert [path.rpartition("/")[2] for _, path, _ in desk.asked[2:]] == ["solve", "activate"]
     assert desk.asked[2][2] == {"board_shape": "bowed"}
     for number in (1, 2, 3):
-        assert f"pose {number} accepted" in result.stdout
+        assert f"pose {number} accepted" in printed
 
 
 @pytest.fixture
@@ -434,12 +430,6 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[httpx2.Request]:
     return requests
 
 
-def done(*arguments: object) -> str:
-    result = run(*arguments)
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
 def test_kept_calibrations_are_listed_shown_compared_and_used(kept: list[httpx2.Request]) -> None:
     rows = done("list").splitlines()
     assert [row.split()[0] for row in rows] == ["id", ID[:8], OTHER[:8]]
@@ -452,9 +442,9 @@ def test_kept_calibrations_are_listed_shown_compared_and_used(kept: list[httpx2.
     assert dict(kept[-1].url.params) == {"first": ID, "second": OTHER}
     for part in ("points move by 0.010 mm rms, 0.030 mm at most", "-0.0200 ± 0.0110 (1.8 σ)", "+0.5000"):
         assert part in words
-    for command in ("activate", "deactivate"):
-        done(command, OTHER[:4])
-        assert (kept[-1].method, kept[-1].url.path) == ("POST", f"/calibration/{OTHER}/{command}")
+    for word in ("activate", "deactivate"):
+        done(word, OTHER[:4])
+        assert (kept[-1].method, kept[-1].url.path) == ("POST", f"/calibration/{OTHER}/{word}")
 
 
 def test_check_shows_the_halves_of_a_kept_solve(kept: list[httpx2.Request], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,7 +92,6 @@ def run(*words: object) -> Result:
 
 
 def rows(result: Result) -> list[list[str]]:
-    """The words of the table's rows without its head."""
     return [line.split() for line in result.stdout.partition("\n\n")[0].splitlines()[1:]]
 
 
