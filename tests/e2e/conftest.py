@@ -67,7 +67,6 @@ blur_px = 0.6
 
 
 def write_rig(folder: Path, *, scene: str = SCENE, head: str = "", faults: str = "") -> Path:
-    """Write a small rendered rig and its scene into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scene.toml").write_text(scene)
     rig = folder / "rig.toml"
@@ -106,7 +105,6 @@ class ServiceProcess:
         return Client(self.url, key)
 
     def worker_id(self) -> int:
-        """The process id of the reconstruction process."""
         for line in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
             for child in line.read_text().split():
                 if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
@@ -160,19 +158,16 @@ def slrig(*words: str | Path, codes: Container[int] = (0,), **settings: str) -> 
 
 
 def ended(client: Client, scan: dict[str, Any]) -> dict[str, Any]:
-    """The scan once it is over."""
     for _ in client.follow(scan["links"]["events"]):
         pass
     return client.get(scan["links"]["self"])
 
 
 def scanned(client: Client, **request: Any) -> dict[str, Any]:
-    """A scan from its start to its end."""
     return ended(client, client.scans.start(**{"if_busy": "queue", **request}))
 
 
 def followed_to(client: Client, scan: dict[str, Any], stage: str) -> None:
-    """Return once the scan has reported this stage or state."""
     for event in client.follow(scan["links"]["events"]):
         if stage in {getattr(event, "stage", None), getattr(event, "state", None)}:
             return

@@ -55,7 +55,6 @@ class Process:
         self.process = self._started()
 
     def kill(self) -> None:
-        """End it as a power cut would."""
         self.process.kill()
         self.process.wait()
         if self.process.stdout is not None:

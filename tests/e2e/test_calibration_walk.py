@@ -114,7 +114,6 @@ class Caller:
         return self.post("/calibration", 201, board=BOARD, label="walk")
 
     def settled(self, calibration: dict[str, Any]) -> dict[str, Any]:
-        """The calibration once nothing is under way in it."""
         found = self.get(calibration["links"]["self"])
         busy = {"queued", "capturing", "computing", "solving"}
         while found["script"] or busy & {found["state"], *(each["state"] for each in found["shot"])}:
@@ -124,7 +123,6 @@ class Caller:
 
 
 def write_rig(folder: Path, *, head: str = "", carries: str = "false") -> Path:
-    """Write the rig and its scene."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scene.toml").write_text(SCENE)
     rig = folder / "rig.toml"
@@ -180,7 +178,6 @@ def test_a_rig_is_calibrated_over_http_and_scans_with_it_after_a_kill(start: Sta
 
 
 def within_five_deviations(devices: dict[str, Any]) -> None:
-    """The camera is calibrated to its own stated accuracy."""
     for name, truth in TRUTH.items():
         value, sigma = devices["left"]["values"][name]
         assert abs(value - truth) < 5 * sigma, name

@@ -46,7 +46,6 @@ def service(tmp_path_factory: pytest.TempPathFactory, receiver: subprocess.Popen
 
 
 def run(name: str, *words: object, folder: Path, service: ServiceProcess | None = None) -> str:
-    """The output of an example that is run in `folder`."""
     reached = {} if service is None else {"SLRIG_URL": service.url, "SLRIG_API_KEY": KEY}
     done = subprocess.run(  # noqa: S603 - our own program
         [sys.executable, EXAMPLES / name, *map(str, words)],

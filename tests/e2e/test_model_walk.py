@@ -48,7 +48,6 @@ def on_a_stage(data: Path) -> tuple[list[str], list[np.ndarray]]:
 
 
 def followed_to(client: Client, model: str, stage: str) -> None:
-    """Return once the model has reported this stage."""
     assert any(getattr(event, "stage", None) == stage for event in client.models.follow(model))
 
 

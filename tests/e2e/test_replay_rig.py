@@ -43,7 +43,6 @@ def recorded(rig: Rig, bundle: Path, plan: ScanPlan) -> Path:
 
 
 def meshes(bundle: Path, output: Path) -> dict[str, bytes]:
-    """What `slrig reconstruct` writes."""
     reconstruct_bundle(bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False)
     return written(output)
 
@@ -89,13 +88,11 @@ def test_a_scan_of_another_programs_recording_gives_its_mesh(shared: Path, tmp_p
 
 
 def libraries(process: int) -> set[str]:
-    """Which of `MATHEMATICS` a process has code of."""
     mapped = Path(f"/proc/{process}/maps").read_text()
     return {name for name in MATHEMATICS if f"/{name}/" in mapped}
 
 
 def work(service: ServiceProcess) -> None:
-    """All kinds of work, each to its end."""
     with service.client() as client, Caller(service) as caller:
         scan, other = scanned(client), scanned(client)
         assert scan["state"] == "succeeded"

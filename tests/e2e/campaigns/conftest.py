@@ -47,7 +47,6 @@ def stands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str],
 
 @pytest.fixture
 def stand(stands: Callable[[str], Stand]) -> Iterator[Stand]:
-    """The stand with a software trigger, without faults before and after the test."""
     yield stands("software")
     stands("software")
 
@@ -60,7 +59,6 @@ def desk() -> Iterator[Desk]:
 
 @pytest.fixture
 def serve_again(tmp_path: Path, desk: Desk) -> Iterator[Callable[..., ServiceProcess]]:
-    """Start the service on one faulty rig and its data, one after the other."""
     with ExitStack() as leaving:
 
         def served(**settings: Any) -> ServiceProcess:

@@ -188,7 +188,6 @@ def test_a_service_that_may_drain_finishes_its_scan_and_keeps_the_queue(desk: De
 
 
 def refused(rig: Path, data: Path, port: str = "0") -> str:
-    """What a service prints that cannot start."""
     return slrig("serve", rig, "--port", port, "--data", data, codes=(2,)).stderr
 
 

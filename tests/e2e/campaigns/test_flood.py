@@ -24,7 +24,6 @@ MOST_LOG_BYTES = 2**20
 
 
 def request(service: ServiceProcess, path: str) -> HTTPConnection:
-    """A connection with the answer to a GET on its way."""
     parts = urlsplit(service.url)
     connection = HTTPConnection(str(parts.hostname), parts.port, timeout=30)
     connection.request("GET", path, headers={"Authorization": f"Bearer {KEY}"})
@@ -32,7 +31,6 @@ def request(service: ServiceProcess, path: str) -> HTTPConnection:
 
 
 def answers(service: ServiceProcess) -> None:
-    """A probe is answered within its time-out."""
     with closing(request(service, "/livez")) as connection:
         assert connection.getresponse().status == 200
 

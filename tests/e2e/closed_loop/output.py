@@ -37,7 +37,6 @@ class WatchedOutput:
 
     @property
     def format(self) -> CameraFormat:
-        """The sensor's."""
         return self._world.format
 
     def exposed(self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0) -> Pixels:

@@ -84,7 +84,6 @@ class World:
 
     @property
     def format(self) -> CameraFormat:
-        """The sensor's."""
         return self._format
 
     def move(self, index: int) -> None:
@@ -96,7 +95,6 @@ class World:
 
     @property
     def profiles(self) -> list[Pixels]:
-        """Everything that was shown, in order."""
         with self._lock:
             return [profile for _, profile in self._changes]
 
@@ -107,7 +105,6 @@ class World:
         return at_ns
 
     def changed(self, profile: Pixels, *, at_ns: int) -> None:
-        """Take note that the light has changed."""
         with self._lock:
             self._changes.append((max(at_ns, self._changes[-1][0]), profile))
 

@@ -34,7 +34,6 @@ class Step:
         return f"{self.device} {self.name}" + (f" {self.number}" if self.number > 0 else "")
 
     def meets(self, device: str, name: str, number: int) -> bool:
-        """Whether a device is at this step."""
         return (self.device, self.name) == (device, name) and self.number in {ANY, number}
 
 
@@ -48,7 +47,6 @@ class Hold:
     go: threading.Event = field(default_factory=threading.Event)
 
     def until_reached(self) -> None:
-        """Return when the rig is there."""
         assert self.reached.wait(WAIT_S), f"the rig did not come to {self.step}, only to {self.steps}"
 
 
@@ -83,7 +81,6 @@ class Desk:
             self._faults[step] = what
 
     def lift(self) -> None:
-        """Put everything right, and let go what is held."""
         with self._changed:
             self._faults.clear()
             self._unplugged.clear()
@@ -106,7 +103,6 @@ class Desk:
 
     @property
     def lit(self) -> bool:
-        """Whether the last order that the projector obeyed leaves light on."""
         with self._changed:
             return bool(self.light) and self.light[-1][1]
 

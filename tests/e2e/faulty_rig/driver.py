@@ -51,7 +51,6 @@ class Line:
         self._local = threading.local()
 
     def say(self, **message: Any) -> str:
-        """Say something, wait for the answer, and return it."""
         stream = getattr(self._local, "stream", None)
         if stream is None:
             connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -114,7 +113,6 @@ class Handle:
         raise AssertionError(what)
 
     def require_open(self) -> None:
-        """Raise DeviceStateError after `close`."""
         if self.closed:
             raise DeviceStateError(f"{self.name} is closed; open the rig again")
 
@@ -274,7 +272,6 @@ class DiskHook:
         self._asking = threading.local()
 
     def __call__(self, event: str, given: tuple[Any, ...]) -> None:
-        """Look at an event of the interpreter."""
         if event not in {"open", "os.rename"} or getattr(self._asking, "now", False):
             return
         path = os.fsdecode(given[0]) if isinstance(given[0], (str, bytes, os.PathLike)) else ""
@@ -299,7 +296,6 @@ _HOOKED: set[str] = set()
 
 
 def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
-    """Open the camera."""
     del folder
     return FaultyCamera(name, Options.model_validate(dict(options)))
 

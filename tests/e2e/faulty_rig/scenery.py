@@ -26,7 +26,6 @@ def _device(size: Size, focal_px: float, shift_mm: float) -> Pinhole:
 
 
 def calibration() -> Calibration:
-    """The devices as they are."""
     return Calibration(
         {CAMERA_NAME: _device(CAMERA, _CAMERA_FOCAL_PX, 0.0)}, _device(PROJECTOR, _PROJECTOR_FOCAL_PX, _BASELINE_MM)
     )

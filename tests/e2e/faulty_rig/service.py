@@ -97,7 +97,6 @@ class Follower:
         assert self._began.wait(WAIT_S)
 
     def last(self) -> str:
-        """The last state in its stream, once that has ended."""
         self._thread.join(WAIT_S)
         assert not self._thread.is_alive()
         return self.states[-1]

@@ -69,7 +69,6 @@ def visit(browser: Browser) -> Iterator[Visit]:
 
 
 def foreign(url: str, service: str) -> bool:
-    """Whether a request leaves the service."""
     return not url.startswith((service, "blob:", "data:"))
 
 
@@ -88,7 +87,6 @@ def fits(page: Page) -> None:
 
 
 def looking(service: ServiceProcess) -> str:
-    """A key of Ann's, for looking only."""
     return KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
 
 

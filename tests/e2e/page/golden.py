@@ -75,7 +75,6 @@ def small(shot: bytes, factor: int) -> Picture:
 
 
 def kept(name: str) -> Picture:
-    """A golden picture, as `small` gives it."""
     found = cv2.imread(str(_FOLDER / f"{name}.png"))
     assert found is not None, f"there is no golden picture {name}"
     return np.asarray(found, dtype=np.uint8)

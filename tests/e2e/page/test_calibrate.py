@@ -22,7 +22,6 @@ _SOLVED_MS = 120_000
 
 
 def choose_board(page: Page) -> None:
-    """Describe the board of the rendered rig."""
     page.get_by_role("button", name="Chessboard").click()
     page.get_by_label("Inner corners across").fill("8")
     page.get_by_label("Inner corners down").fill("5")

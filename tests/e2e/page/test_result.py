@@ -58,7 +58,6 @@ def picture(page: Page) -> NDArray[np.uint8]:
 
 
 def orange(shown: NDArray[np.uint8]) -> float:
-    """The share of a picture that shows the other scan."""
     return float((shown[..., 2].astype(int) - shown[..., 0] > 60).mean())
 
 

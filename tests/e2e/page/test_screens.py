@@ -112,7 +112,6 @@ BUMP = 'faults = {bump = [{device = "projector", pose = 3, turn_deg = [0.0, 0.06
 
 
 def describe_board(part: Locator, pose: str = "pose 1") -> None:
-    """Say what is printed on the board of the rendered rig, and where it is to stand."""
     part.get_by_label("Kind").select_option(label="Chessboard")
     for label, value in (("Corners across", 8), ("Corners down", 5), ("Square, mm", 20)):
         part.get_by_label(label).fill(str(value))

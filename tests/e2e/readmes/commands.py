@@ -32,7 +32,6 @@ def readmes() -> list[Path]:
 
 
 def commands() -> list[Command]:
-    """All commands, in the order of reading."""
     return [command for readme in readmes() for command in _of(readme)]
 
 

@@ -44,7 +44,6 @@ class Builder:
             self.trust = tuple(f"--volume={each}" for each in volumes)
 
     def run(self, command: str, *arguments: str) -> str:
-        """What a command of buildah prints."""
         ended = subprocess.run(  # noqa: S603
             ["buildah", *self._stores, command, *arguments],  # noqa: S607
             cwd=ROOT, capture_output=True, text=True, timeout=BUILD_LIMIT_S, check=False,

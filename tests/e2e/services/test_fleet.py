@@ -12,7 +12,6 @@ from tests.postgres import LOGIN, PASSWORD, Postgres
 
 
 def scans(service: ServiceProcess, count: int) -> list[str]:
-    """The ids of so many scans, one after another."""
     with service.client() as client:
         return [str(client.scan().id) for _ in range(count)]
 

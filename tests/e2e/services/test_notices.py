@@ -17,7 +17,6 @@ pytestmark = pytest.mark.slow
 
 
 def waiting(client: Client) -> list[float]:
-    """How many notices wait for each receiver, by the service's metrics."""
     lines = client.system.metrics().splitlines()
     return [float(line.split()[1]) for line in lines if line.startswith("slrig_notices_waiting{")]
 

@@ -65,7 +65,6 @@ class Proxied:
 
 @pytest.fixture(scope="module")
 def authority(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A certificate for the name, in the folder of its key."""
     if shutil.which("openssl") is None:
         lacking("needs openssl: apt install openssl")
     folder = tmp_path_factory.mktemp("tls")
@@ -128,7 +127,6 @@ def proxied(
     service: ServiceProcess,
     authority: Path,
 ) -> Iterator[Proxied]:
-    """The service behind one of the proxies."""
     proxy: Callable[..., list[str]] = request.param
     if shutil.which(proxy.__name__) is None:
         lacking(f"needs {proxy.__name__}: apt install {proxy.__name__}")

@@ -65,7 +65,6 @@ def cgroups() -> Path:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of what was found by one boot."""
     folder = tmp_path_factory.mktemp("unit")
     added, out = folder / "added", folder / "out"
     out.mkdir()

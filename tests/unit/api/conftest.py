@@ -68,7 +68,6 @@ class ServedBench(TameBench):
         self.app: FastAPI = create_app(self.service, ring=KeyRing(root / "keys.json", given=KEY))
 
     def held(self, client: TestClient) -> dict[str, Any]:
-        """Start a scan that captures until `gate` is set."""
         self.began.clear()
         self.gate.clear()
         scan: dict[str, Any] = client.post("/scan").json()
@@ -101,7 +100,6 @@ def client(session: TestClient, served: ServedBench) -> Iterator[TestClient]:
 
 
 def client_of(served: ServedBench, *, key: str | None = KEY) -> TestClient:
-    """A client that holds the key of a service; within `with`, the service runs."""
     headers = {} if key is None else {"Authorization": f"Bearer {key}"}
     return TestClient(served.app, base_url=HERE, headers=headers, raise_server_exceptions=False)
 
@@ -116,7 +114,6 @@ def app_of(router: APIRouter, service: object) -> FastAPI:
 
 
 def ended(client: TestClient, scan_id: str) -> dict[str, Any]:
-    """The scan once its event stream has closed."""
     client.get(f"/scan/{scan_id}/events")
     scan: dict[str, Any] = client.get(f"/scan/{scan_id}").json()
     return scan

@@ -124,7 +124,6 @@ def sessions(served: ServedBench) -> Sessions:
 
 
 def logged_in(served: ServedBench) -> TestClient:
-    """A browser with a session and without the key."""
     browser = stranger(served)
     assert browser.post("/session", headers={"Authorization": f"Bearer {KEY}"}).status_code == 201
     return browser

@@ -42,7 +42,6 @@ def calibrating(client: TestClient, served: ServedBench) -> Iterator[TestClient]
 
 
 def settled(client: TestClient, calibration: str) -> dict[str, Any]:
-    """The calibration once nothing is under way in it."""
     client.get(f"/calibration/{calibration}/events")
     found: dict[str, Any] = client.get(f"/calibration/{calibration}").json()
     return found

@@ -47,7 +47,6 @@ async def application(scope: Scope, receive: Receive, send: Send) -> None:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Let the loop go round until something holds."""
     for _ in range(100_000):
         if condition():
             return

@@ -188,7 +188,6 @@ def test_mesh_can_be_fetched_before_the_scan_is_over(client: TestClient, served:
 
 
 def await_announcement(store: JobStore, scan_id: UUID) -> None:
-    """Wait until a file of a scan was announced."""
     announced = threading.Event()
 
     def look() -> None:
@@ -273,7 +272,6 @@ def scan(client: TestClient, served: ServedBench) -> str:
 
 @pytest.fixture
 def busy(served: ServedBench, tmp_path: Path) -> Iterator[Path]:
-    """Has the worker wait for this file."""
     gate = tmp_path / "gate"
     began = threading.Event()
     task = Task(f"{PIPELINE}:wait_for", (gate,), what="examination")

@@ -27,7 +27,6 @@ def scans(served: ServedBench) -> list[str]:
 
 
 def over(client: TestClient, model: dict[str, Any]) -> dict[str, Any]:
-    """The model once its event stream has closed."""
     assert "event: state" in client.get(model["links"]["events"]).text
     found: dict[str, Any] = client.get(model["links"]["self"]).json()
     return found
@@ -100,7 +99,6 @@ def test_scans_stay_while_a_model_needs_them(client: TestClient, served: ServedB
 
 
 def views(client: TestClient, model: dict[str, Any]) -> list[dict[str, Any]]:
-    """The scans of a model, all of them over."""
     scans = client.get(f"/scan/series/{model['id']}").json()["scans"]
     return [ended(client, each["id"]) for each in scans]
 

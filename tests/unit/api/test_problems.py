@@ -26,7 +26,6 @@ STREAMS = ("/events", "/preview/{camera}")
 
 
 def filled(path: str) -> str:
-    """A path of the description with something in its braces."""
     return "/".join(str(uuid4()) if part.startswith("{") else part for part in path.split("/")).replace("{camera}", "a")
 
 

@@ -35,7 +35,6 @@ RUBBER = {"description": "rubber", "exposure_factors": [2.0, 8.0], "line_width_p
 
 
 def mask_of(width_px: int, height_px: int) -> str:
-    """A mask as a request has it."""
     picture = np.full((height_px, width_px), 255, dtype=np.uint8)
     return base64.b64encode(cv2.imencode(".png", picture)[1].tobytes()).decode()
 

@@ -19,7 +19,6 @@ from tests.unit.scan.fakes import WAIT_S
 
 
 def events_of(text: str) -> list[dict[str, Any]]:
-    """The events of a stream: id, kind and data."""
     found = []
     for block in text.split("\n\n"):
         lines = dict(line.split(": ", 1) for line in block.splitlines() if line and not line.startswith(":"))

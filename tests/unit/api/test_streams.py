@@ -67,7 +67,6 @@ class Jobs:
         return job.id
 
     def follow(self, after: int = 0, *, most: int = 500) -> AsyncGenerator[ServerSentEvent]:
-        """All jobs."""
         stream = stream_of(self.streams, EVERY_JOB, self.followed(most=most), after)
         assert isinstance(stream, AsyncGenerator)
         return stream
@@ -76,7 +75,6 @@ class Jobs:
         return stream_of(self.streams, scan, followed_job(self.scans, scan), after)
 
     async def looked(self, count: int) -> None:
-        """Wait until so many looks began."""
         async with asyncio.timeout(WAIT_S):
             while len(self.looks) < count:
                 await asyncio.to_thread(int)
@@ -90,14 +88,12 @@ def jobs(tmp_path: Path) -> Iterator[Jobs]:
 
 
 async def some(stream: AsyncIterator[ServerSentEvent], count: int) -> list[dict[str, Any]]:
-    """So many events that come next, with their number and kind."""
     async with asyncio.timeout(WAIT_S):
         found = [await anext(stream) for _ in range(count)]
     return [{"number": int(each.id or 0), "event": each.event, **json.loads(each.data or "")} for each in found]
 
 
 async def rest(stream: AsyncIterator[ServerSentEvent]) -> list[str | None]:
-    """The ids of all events until the stream ends, which it must."""
     async with asyncio.timeout(WAIT_S):
         return [event.id async for event in stream]
 

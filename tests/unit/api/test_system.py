@@ -113,7 +113,6 @@ def test_service_whose_data_folder_is_gone_says_so(tmp_path: Path) -> None:
 
 
 def counted(text: str, name: str) -> dict[tuple[str, ...], float]:
-    """The number of observations of a histogram by its labels."""
     (family,) = [each for each in text_string_to_metric_families(text) if each.name == name]
     assert family.type == "histogram"
     return {tuple(sample.labels.values()): sample.value for sample in family.samples if sample.name == f"{name}_count"}

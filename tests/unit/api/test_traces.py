@@ -46,7 +46,6 @@ class Collector(HTTPServer):
         super().__init__(("127.0.0.1", 0), Handler)
 
     def spans(self) -> tuple[dict[str, Any], list[Any]]:
-        """The attributes of the service, and every span that came, by their beginning."""
         messages = pytest.importorskip("opentelemetry.proto.collector.trace.v1.trace_service_pb2", reason=WHY)
         found, service = [], {}
         for body in self.bodies:

@@ -14,7 +14,6 @@ from tests.postgres import LOGIN, Postgres
 
 @pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.slow)])
 def address(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """Where an empty database is."""
     if request.param == "sqlite":
         yield f"sqlite:///{tmp_path}/fleet.sqlite"
         return

@@ -31,7 +31,6 @@ def client_of(handler: Handler, *, pauses: list[float] | None = None) -> Client:
 
 
 def stream(*events: dict[str, Any]) -> bytes:
-    """Server-sent events as they travel."""
     blocks = []
     for event in events:
         data = {name: value for name, value in event.items() if name not in {"id", "kind"}}
@@ -40,7 +39,6 @@ def stream(*events: dict[str, Any]) -> bytes:
 
 
 def event_answer(content: bytes | Broken) -> httpx2.Response:
-    """A stream of events as an answer."""
     body: dict[str, Any] = {"stream" if isinstance(content, Broken) else "content": content}
     return httpx2.Response(200, headers={"Content-Type": "text/event-stream"}, **body)
 

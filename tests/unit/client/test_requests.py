@@ -64,7 +64,6 @@ class Operation:
 
     @property
     def properties(self) -> set[str]:
-        """The names in its JSON body."""
         content = self.about.get("requestBody", {}).get("content", {}).get("application/json")
         if content is None:
             return set()

@@ -79,7 +79,6 @@ def types() -> Any:
 
 @pytest.fixture
 def node(types: Any, monkeypatch: pytest.MonkeyPatch) -> FakeNode:
-    """A fake of ROS's Python packages, and its node."""
     made = FakeNode()
     modules: dict[str, dict[str, Any]] = {
         "rclpy": {"init": lambda **_: None, "create_node": lambda _: made, "try_shutdown": lambda: None},

@@ -150,7 +150,6 @@ class Pool:
 
 
 def lost(_order: Order) -> Answer | None:
-    """An act: the job is lost."""
     message = "the pool lost the job"
     raise PoolError(message)
 

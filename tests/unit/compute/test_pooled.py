@@ -176,7 +176,6 @@ def test_address_in_use_is_named() -> None:
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of this user's workers."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     found = tmp_path / f"slrig-workers-{os.getuid()}"

@@ -14,7 +14,6 @@ __all__ = ["frame_receiver", "reconstruct_into", "warm_kernels"]
 
 
 def warm_kernels(told: Callable[[Prepared], None]) -> None:
-    """Tell of 41 kernels, wait for the file, and tell of one more."""
     told(Prepared(41, 118))
     gate = Path(os.environ["PREPARING_GATE"])
     while not gate.exists():

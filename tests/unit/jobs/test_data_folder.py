@@ -81,7 +81,6 @@ def test_released_folder_may_be_taken_again(folder: DataFolder) -> None:
 
 
 def finished(folder: DataFolder, scan_id: UUID) -> None:
-    """The files of a scan that succeeded."""
     folder.scan(scan_id).mkdir()
     (folder.scan(scan_id) / "mesh.ply").write_bytes(b"ply")
     (folder.scan(scan_id) / "report.json").write_text(json.dumps({"truth": {"rms_mm": 0.01}, "stages": []}))
@@ -279,7 +278,6 @@ def test_other_users_of_the_machine_cannot_look_in(tmp_path: Path, monkeypatch: 
 
 @pytest.fixture
 def elsewhere(tmp_path: Path) -> Path:
-    """A folder of somebody else's that looks like a scan."""
     other = tmp_path / "elsewhere"
     other.mkdir()
     for name in ("mesh.ply", "report.json"):
@@ -376,7 +374,6 @@ def test_no_examination_is_kept_where_no_service_keeps_its_data_and_no_other_fil
 
 
 def scanned(store: JobStore, folder: DataFolder, state: JobState = JobState.SUCCEEDED) -> UUID:
-    """A scan in this state, with files in its place if it has succeeded."""
     scan = store.create(plan_json(ScanPlan()), rig="bench", label=None).id
     if state.final:
         store.finish(scan, state)

@@ -153,29 +153,24 @@ class Kind:
         """Do what comes before its first job."""
 
     def begin(self, *, wait: bool = False) -> UUID:
-        """Begin a job; return its id."""
         raise NotImplementedError
 
     def cancel(self, job_id: UUID) -> None:
-        """Ask it to end early."""
         raise NotImplementedError
 
     def capturing(self) -> UUID:
-        """A job that captures until the bench's gate is set."""
         self.service.gate.clear()
         job_id = self.begin()
         assert self.service.began.wait(WAIT_S)
         return job_id
 
     def computing(self) -> UUID:
-        """A job that computes until the gate of the mathematics is set."""
         self.service.computing.gate.clear()
         job_id = self.begin()
         assert self.service.computing.began.wait(WAIT_S)
         return job_id
 
     def over(self, job_id: UUID) -> JobRecord:
-        """The job when it has ended."""
         return self.service.until(job_id, jobs=self.jobs)
 
 

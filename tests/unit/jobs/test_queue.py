@@ -96,7 +96,6 @@ def job_of(work: Work, do: Callable[[Rig, Callable[[], bool]], None] | None = No
 
 
 def held(bench: Bench, work: Work) -> UUID:
-    """Work that has begun."""
     work_id = submitted(bench, work)
     assert work.began.wait(WAIT_S)
     return work_id

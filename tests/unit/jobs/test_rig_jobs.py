@@ -48,7 +48,6 @@ class Work:
     recording: TameRecording = field(default_factory=TameRecording)
 
     def parts(self, folder: DataFolder, job_id: UUID) -> Parts:
-        """Both of them."""
 
         def capture(held: RigSession, _job: Job, progress: ProgressRecorder) -> Recorded:
             held.open().projector.show(0)
@@ -96,7 +95,6 @@ class JobBench:
         return record.id
 
     def taken_up(self, job_id: UUID, work: Work, *, resumes: bool = False) -> None:
-        """As the next start of the service does."""
         parts = work.parts(self.folder, job_id)
         self.jobs.take_up(self.store.get(job_id), parts, holder=HOLDER, resumes=resumes)
 

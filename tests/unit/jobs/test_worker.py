@@ -417,7 +417,6 @@ def fed(feed: FrameFeed, *shots: Shot) -> None:
 
 
 def telling(order: int) -> Shot:
-    """A frame that makes the fake reconstruction die, raise or hang."""
     return replace(SHOTS[0], image=np.full((48, 64), order, dtype=np.uint8))
 
 

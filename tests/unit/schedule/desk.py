@@ -66,5 +66,4 @@ class Desk:
         return [(run.due.strftime("%d %H:%M"), run.state, run.count) for run in runs]
 
     def run(self, schedule: Schedule) -> Run:
-        """The newest run."""
         return self.store.runs(schedule.id, limit=1)[0]

@@ -69,7 +69,6 @@ class Hook:
         threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True).start()
 
     def next(self) -> dict[str, Any]:
-        """What came first of what was not looked at yet."""
         return self.came.get(timeout=WAIT_S)
 
     def close(self) -> None:

@@ -52,7 +52,6 @@ class Mosquitto:
         self._process: subprocess.Popen[str] | None = None
 
     def start(self) -> None:
-        """Listen, with what was kept."""
         self._process = subprocess.Popen(  # noqa: S603 - our own command
             ["mosquitto", "-c", self._config],  # noqa: S607 - whichever there is
             stderr=subprocess.PIPE, text=True,
@@ -99,7 +98,6 @@ class Subscriber:
         assert subscribed.wait(WAIT_S)
 
     def next(self) -> tuple[str, dict[str, Any]]:
-        """The topic and the body of what came first of what was not looked at yet."""
         return self.came.get(timeout=WAIT_S)
 
     def close(self) -> None:

@@ -52,7 +52,6 @@ def outbox(database: Database) -> Outbox:
 
 
 def told(outbox: Outbox) -> list[dict[str, Any]]:
-    """All that waits, which then waits no longer."""
     found = []
     while (notice := outbox.oldest("webhook")) is not None:
         found.append(dict(notice.body))
@@ -202,7 +201,6 @@ class Bench:
 
     @property
     def waiting(self) -> int:
-        """How many notices wait."""
         return self.outbox.waiting(self.sender.receiver)[0]
 
     def put(self, *names: str) -> None:

@@ -73,7 +73,6 @@ class TaskBench(CalibrationBench):
         )  # fmt: skip
 
     def do(self, task: TaskKind, *, cancelled: Callable[[], bool] = lambda: False, **options: Any) -> Mapping[str, Any]:
-        """One run."""
         return self.tasks(*scheduled(task, options), cancelled)
 
     def use_a_calibration(self) -> None:
@@ -81,7 +80,6 @@ class TaskBench(CalibrationBench):
         self.calibrations.activate(self.solved(poses=1))
 
     def open(self) -> None:
-        """Wait until the rig is open."""
         opened = threading.Event()
         job = Job(uuid4(), Holder("a", "b", "/c"), utc_now(), lambda rig, _: rig.open(), lambda _: opened.set())
         self.queue.submit(lambda: [job], wait=True)
