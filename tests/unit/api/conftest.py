@@ -117,3 +117,9 @@ def ended(client: TestClient, scan_id: str) -> dict[str, Any]:
     client.get(f"/scan/{scan_id}/events")
     scan: dict[str, Any] = client.get(f"/scan/{scan_id}").json()
     return scan
+
+
+def refusal(client: TestClient, method: str, path: str, **options: Any) -> tuple[int, str]:
+    """The status and the kind of the problem that a request gets."""
+    answer = client.request(method, path, **options)
+    return answer.status_code, answer.json()["type"]

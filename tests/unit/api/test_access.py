@@ -22,7 +22,7 @@ from slrig.api.keys import ALL_SCOPES, FIRST_NAME, GIVEN_NAME, Key, KeyRing, fir
 from slrig.api.scopes import READING, Scope, needed_scope
 from slrig.api.sessions import LINK_PATH, Sessions
 from slrig.errors import ConfigError, StorageError
-from tests.unit.api.conftest import HERE, KEY, ServedBench, client_of, ended
+from tests.unit.api.conftest import HERE, KEY, ServedBench, client_of, ended, refusal
 from tests.unit.api.test_problems import PATHS
 
 NOW = datetime(2026, 11, 24, 12, tzinfo=UTC)
@@ -282,8 +282,7 @@ def test_requests_of_a_foreign_page_move_nothing(client: TestClient, served: Ser
     before = client.get("/scan").json()
     for headers in FOREIGN_PAGES:
         for method, path in (("POST", "/scan"), ("POST", "/session"), ("GET", "/preview/cam0?light=white")):
-            response = browser.request(method, path, headers=headers)
-            assert (response.status_code, response.json()["type"]) == (403, "/problems/foreign-page"), (path, headers)
+            assert refusal(browser, method, path, headers=headers) == (403, "/problems/foreign-page"), (path, headers)
         # A link on another page may lead here; nothing else of it may read.
         assert browser.get("/scan", headers=headers).status_code == (200 if "Sec-Fetch-Mode" in headers else 403)
     assert client.get("/scan").json() == before
@@ -383,7 +382,6 @@ def test_damaged_file_of_keys_is_a_storage_problem(client: TestClient, served: S
     path = served.service.settings.key_path
     path.write_text("{}")
     try:
-        response = client.get("/scan")
-        assert (response.status_code, response.json()["type"]) == (507, "/problems/storage")
+        assert refusal(client, "GET", "/scan") == (507, "/problems/storage")
     finally:
         path.unlink()

@@ -16,7 +16,7 @@ from slrig.calibration.boards.printing import board_pdf
 from slrig.errors import SolveRefusedError
 from slrig.model import Size
 from slrig.scan.plan_check import pattern_sequence
-from tests.unit.api.conftest import ServedBench, ended
+from tests.unit.api.conftest import ServedBench, ended, refusal
 from tests.unit.api.test_scans import events_of
 from tests.unit.calibrate.calibration_bench import PNG, tame_calibration
 from tests.unit.scan.fakes import WAIT_S
@@ -57,11 +57,6 @@ def shot(client: TestClient, calibration: str) -> dict[str, Any]:
     settled(client, calibration)
     found: dict[str, Any] = client.get(pose["links"]["self"]).json()
     return found
-
-
-def refusal(client: TestClient, method: str, path: str, **options: Any) -> tuple[int, str]:
-    answer = client.request(method, path, **options)
-    return answer.status_code, answer.json()["type"]
 
 
 def test_calibration_is_opened_shot_solved_and_used(calibrating: TestClient, served: ServedBench) -> None:

@@ -37,7 +37,7 @@ from slrig.scan.artefacts import ON_REQUEST
 from slrig.scan.offered import BAG
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.ros_readers import library
-from tests.unit.api.conftest import ServedBench, client_of, ended
+from tests.unit.api.conftest import ServedBench, client_of, ended, refusal
 from tests.unit.api.test_scans import events_of
 from tests.unit.capture.fake_rig import CameraFaults, fake_rig
 from tests.unit.scan import fake_pipeline
@@ -57,11 +57,6 @@ def finished(client: TestClient) -> dict[str, Any]:
 
 def place_of(served: ServedBench, scan_id: str) -> Path:
     return served.service.folder.scan(UUID(scan_id))
-
-
-def refusal(client: TestClient, path: str) -> tuple[int, str]:
-    answer = client.get(path)
-    return answer.status_code, answer.json()["type"]
 
 
 @pytest.mark.parametrize("name", ["mesh.ply", "bundle.zip", "preview.png", "mesh.obj"])
@@ -107,7 +102,7 @@ def test_bundle_is_a_zip_of_stored_files_without_links(client: TestClient, serve
     files = client.get(scan["links"]["self"]).json()["links"]["files"]
     assert sorted(files) == ["bundle.zip", "mesh.glb", "points.ply"]
     for name in ("report.json", "preview.png", "mesh.obj", "mesh.stl", "view.glb", "mesh.ply"):
-        assert refusal(client, f"/scan/{scan['id']}/{name}") == NOT_READY, name
+        assert refusal(client, "GET", f"/scan/{scan['id']}/{name}") == NOT_READY, name
     assert client.delete(scan["links"]["self"]).status_code == 204
     assert (tmp_path / "secret").read_text() == "of another folder"
 
@@ -131,7 +126,7 @@ def test_pictures_go_by_camera(client: TestClient, served: ServedBench) -> None:
     for name in ("rejected-left.png", "causes-left.png"):
         (place_of(served, scan_id) / name).write_bytes(name.encode())
         assert client.get(f"/scan/{scan_id}/{name}").content == name.encode()
-    assert refusal(client, f"/scan/{scan_id}/rejected-right.png") == NOT_READY
+    assert refusal(client, "GET", f"/scan/{scan_id}/rejected-right.png") == NOT_READY
     for path in ("rejected-..%2Fmesh.png", "points-..%2Fleft.npz"):
         assert client.get(f"/scan/{scan_id}/{path}").status_code in {404, 422}, path
 
@@ -148,7 +143,7 @@ def test_failed_scan_names_its_cause_and_gives_its_bundle(client: TestClient, se
         never = client.get(f"/scan/{scan['id']}/{name}")
         assert never.status_code == 409
         assert "No stripe was found" in never.json()["detail"]
-    assert refusal(client, f"/scan/{scan['id']}/{NAME}") == NOT_READY
+    assert refusal(client, "GET", f"/scan/{scan['id']}/{NAME}") == NOT_READY
 
 
 def test_mesh_can_be_fetched_before_the_scan_is_over(client: TestClient, served: ServedBench) -> None:
@@ -175,7 +170,7 @@ def test_mesh_can_be_fetched_before_the_scan_is_over(client: TestClient, served:
     converted = {name: client.get(scan["links"]["files"][name]).content for name in ON_REQUEST}
     assert [path.name for path in served.service.folder.result(UUID(scan_id)).iterdir()] == ["mesh.ply"]
     for name in ("mesh.glb", "report.json", "bundle.zip"):
-        assert refusal(client, f"/scan/{scan_id}/{name}") == NOT_READY
+        assert refusal(client, "GET", f"/scan/{scan_id}/{name}") == NOT_READY
     (served.service.folder.staging(UUID(scan_id)) / "bundle" / "go-on").touch()
     lines = client.get(f"/scan/{scan_id}/events").text.splitlines()
     names = [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
@@ -297,13 +292,13 @@ def test_cloud_is_listed_made_on_request_and_kept(
     place = place_of(served, scan)
     path = client.get(f"/scan/{scan}").json()["links"]["files"][NAME]
     assert path == f"/scan/{scan}/{NAME}"
-    assert refusal(client, f"/scan/{scan}/points-top.npz") == NOT_READY
+    assert refusal(client, "GET", f"/scan/{scan}/points-top.npz") == NOT_READY
     assert not (place / NAME).exists()
     # Only so many requests may wait.
     places = threading.BoundedSemaphore(1)
     with places, monkeypatch.context() as patched:
         patched.setattr(clouds, "_places", places)
-        assert refusal(client, path) == (503, "/problems/worker-busy")
+        assert refusal(client, "GET", path) == (503, "/problems/worker-busy")
     first = client.get(path)
     assert first.status_code == 200, first.text
     assert first.content == (place / NAME).read_bytes()
@@ -414,7 +409,7 @@ def test_scan_that_is_deleted_meanwhile_is_not_found(
 def test_full_disk_leaves_nothing_behind(client: TestClient, served: ServedBench, scan: str) -> None:
     before = sorted(place_of(served, scan).iterdir())
     served.free_bytes = 10
-    assert refusal(client, f"/scan/{scan}/{NAME}") == (507, "/problems/storage")
+    assert refusal(client, "GET", f"/scan/{scan}/{NAME}") == (507, "/problems/storage")
     served.free_bytes = 10**12
     assert sorted(place_of(served, scan).iterdir()) == before
 

@@ -26,7 +26,7 @@ from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.plan_check import check_plan
 from slrig.scan.presets import SHIPPED, Presets
 from slrig.scan.records import plan_from_json, plan_json
-from tests.unit.api.conftest import ServedBench, ended
+from tests.unit.api.conftest import ServedBench, ended, refusal
 
 RIG = 'name = "bench"\n[head]\ndriver = "simulated"\n[scan]\n'
 BOX = [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]
@@ -139,8 +139,7 @@ def test_body_that_is_not_called_json_is_refused(client: TestClient, content: An
 
 def test_pattern_that_the_projector_cannot_show_is_refused(client: TestClient) -> None:
     ended(client, client.post("/scan").json()["id"])  # what the rig can do is known once it is open
-    response = client.post("/scan", json={"patterns": {"gray_cell_px": 64}})
-    assert (response.status_code, response.json()["type"]) == (422, "/problems/pattern")
+    assert refusal(client, "POST", "/scan", json={"patterns": {"gray_cell_px": 64}}) == (422, "/problems/pattern")
 
 
 def test_plan_is_the_request_over_the_rig_file_over_the_default(client: TestClient) -> None:

@@ -29,7 +29,7 @@ from slrig.verify.store import HealthStore
 from slrig.views.stage_axis import BoardAxis, board_axis
 from slrig.views.stage_planes import stage_planes
 from tests.unit.accept.test_desk import PLAN, desk, desks, queue
-from tests.unit.api.conftest import app_of
+from tests.unit.api.conftest import app_of, refusal
 from tests.unit.jobs.tame_queue import TameQueue
 from tests.unit.verify.test_verification import TAME, queue_of
 from tests.unit.views.test_stage_axis import SIX_DEG, shot
@@ -211,8 +211,7 @@ def test_positions_are_measured_to_the_end_and_the_report_is_fetched(
     assert len(body["positions"]) == 23
     test = desk.open(lambda *_: PLAN)
     path = f"/acceptance/{test.id}"
-    early = acceptance_client.get(f"{path}/report.json")
-    assert (early.status_code, early.json()["type"]) == (409, "/problems/artefact-not-ready")
+    assert refusal(acceptance_client, "GET", f"{path}/report.json") == (409, "/problems/artefact-not-ready")
     measured = acceptance_client.post(f"{path}/position").json()
     assert measured["captures_done"] == PLAN.repeats
     assert set(measured["readings"][0]["errors_mm"]) == {"PF", "PS"}
@@ -272,5 +271,4 @@ def test_repeated_request_opens_and_measures_nothing_new(
     assert (len(queue.holders), len(desk.latest())) == (1, 1)
     for where in ("/acceptance", f"{path}/position"):
         other = {"repeats": 2} if where == "/acceptance" else {"scripted": True}
-        answer = acceptance_client.post(where, headers=key, json=other)
-        assert (answer.status_code, answer.json()["type"]) == (422, "/problems/idempotency"), where
+        assert refusal(acceptance_client, "POST", where, headers=key, json=other) == (422, "/problems/idempotency")

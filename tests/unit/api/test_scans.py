@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 
 from slrig.api.idempotency import fingerprint, own_key
 from slrig.api.schemas import ScanRequest
-from tests.unit.api.conftest import ServedBench, client_of, ended
+from tests.unit.api.conftest import ServedBench, client_of, ended, refusal
 from tests.unit.calibrate.calibration_bench import BOARD
 from tests.unit.scan.fakes import WAIT_S
 
@@ -74,12 +74,10 @@ def test_repeated_request_gets_the_same_scan_and_the_same_answer(client: TestCli
     second = client.post("/scan", json={"label": "a"}, headers=headers)
     assert (second.status_code, second.headers["Location"]) == (202, first.headers["Location"])
     assert second.json() == first.json()
-    other = client.post("/scan", json={"label": "b"}, headers=headers)
-    assert (other.status_code, other.json()["type"]) == (422, "/problems/idempotency")
+    assert refusal(client, "POST", "/scan", json={"label": "b"}, headers=headers) == (422, "/problems/idempotency")
     assert len(client.get("/scan").json()["scans"]) == 1
     client.delete(first.json()["links"]["self"])
-    gone = client.post("/scan", json={"label": "a"}, headers=headers)
-    assert (gone.status_code, gone.json()["type"]) == (404, "/problems/job-not-found")
+    assert refusal(client, "POST", "/scan", json={"label": "a"}, headers=headers) == (404, "/problems/job-not-found")
     assert "404" in client.get("/openapi.json").json()["paths"]["/scan"]["post"]["responses"]
 
 
@@ -147,8 +145,7 @@ def test_series_that_waits_for_its_time_is_cancelled_as_one(client: TestClient) 
 def test_cancel_may_be_repeated_and_delete_waits_for_the_end(client: TestClient, served: ServedBench) -> None:
     scan = served.held(client)
     here = scan["links"]["self"]
-    refused = client.delete(here)
-    assert (refused.status_code, refused.json()["type"]) == (409, "/problems/scan-state")
+    assert refusal(client, "DELETE", here) == (409, "/problems/scan-state")
     assert client.post(scan["links"]["cancel"]).status_code == 202
     assert ended(client, scan["id"])["state"] == "cancelled"
     again = client.post(scan["links"]["cancel"])
@@ -158,8 +155,7 @@ def test_cancel_may_be_repeated_and_delete_waits_for_the_end(client: TestClient,
         ("GET", ""), ("GET", "/events"), ("GET", "/mesh.ply"), ("GET", "/bundle.zip"), ("POST", "/cancel"),
         ("PUT", "/pin"), ("DELETE", ""),
     ):  # fmt: skip
-        response = client.request(method, f"{here}{path}")
-        assert (response.status_code, response.json()["type"]) == (404, "/problems/job-not-found"), path
+        assert refusal(client, method, f"{here}{path}") == (404, "/problems/job-not-found"), path
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from slrig.cli.options import Service
 from slrig.client import Client
 from slrig.schedule.records import RunState
 from tests.unit import command
-from tests.unit.api.conftest import KEY, ServedBench
+from tests.unit.api.conftest import KEY, ServedBench, refusal
 from tests.unit.command import refused, slrig
 from tests.unit.scan.fakes import WAIT_S
 
@@ -102,8 +102,7 @@ def test_removed_schedule_is_not_found(client: TestClient) -> None:
         ("GET", ""), ("GET", "/runs"), ("POST", "/run"), ("POST", "/pause"), ("POST", "/resume"), ("POST", "/cancel"),
         ("DELETE", ""),
     ):  # fmt: skip
-        response = client.request(method, f"{here}{path}")
-        assert (response.status_code, response.json()["type"]) == (404, "/problems/schedule-not-found"), path
+        assert refusal(client, method, f"{here}{path}") == (404, "/problems/schedule-not-found"), path
 
 
 def test_runs_are_listed_on_pages_and_counted(client: TestClient, served: ServedBench) -> None:

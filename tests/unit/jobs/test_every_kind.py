@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 from uuid import UUID
 
 import pytest
@@ -16,7 +16,6 @@ import pytest
 from slrig.accept import running as acceptance
 from slrig.accept.desk import AcceptanceDesk
 from slrig.accept.evaluation import Reading
-from slrig.accept.plan import AcceptancePlan, Step
 from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibration.board import Board
@@ -88,18 +87,9 @@ class Service(Bench):
             computing(options["cancelled"])
             TameCombining()(*given, **options)
 
-        def evaluate(
-            _work: Path,
-            _folder: Path,
-            _plan: AcceptancePlan,
-            step: Step,
-            take: int,
-            /,
-            *,
-            cancelled: Cancelled,
-            **_: Any,
-        ) -> Reading:
+        def evaluate(*given: Any, cancelled: Cancelled, **_: Any) -> Reading:
             computing(cancelled)
+            *_paths, step, take = given
             return Reading(step.name, take, {}, 0.01, 0.01, 0.04, 900, 0, 0.0)
 
         monkeypatch.setattr(acceptance, "capture_frames", tools.capture)
@@ -142,7 +132,6 @@ class Kind:
     """
 
     captures, hears, holds, keeps = True, False, False, False
-    name: ClassVar[str]
     jobs: JobStore
 
     def __init__(self, service: Service) -> None:
@@ -177,7 +166,6 @@ class Kind:
 class Scan(Kind):
     """A scan."""
 
-    name = "scan"
     hears = keeps = True
 
     def prepare(self) -> None:
@@ -192,8 +180,6 @@ class Scan(Kind):
 
 class Pose(Kind):
     """A pose of a calibration."""
-
-    name = "pose"
 
     def prepare(self) -> None:
         self.jobs = self.service.of_calibrations
@@ -211,7 +197,6 @@ class Pose(Kind):
 class Solve(Pose):
     """A solve of a calibration that has one pose."""
 
-    name = "solve"
     captures = False
 
     def prepare(self) -> None:
@@ -232,8 +217,6 @@ class Solve(Pose):
 class Verification(Kind):
     """A verification."""
 
-    name = "verification"
-
     def prepare(self) -> None:
         self.jobs = self.service.verifications.jobs
 
@@ -247,7 +230,6 @@ class Verification(Kind):
 class Model(Kind):
     """A model of two scans."""
 
-    name = "model"
     captures, hears = False, True
 
     def prepare(self) -> None:
@@ -266,7 +248,6 @@ class Model(Kind):
 class Position(Kind):
     """One of an acceptance test, which is cancelled with it."""
 
-    name = "position"
     hears = holds = True
 
     def prepare(self) -> None:
@@ -305,7 +286,7 @@ def kind(request: pytest.FixtureRequest, service: Service) -> Kind:
 
 
 def parametrised(kinds: Sequence[type[Kind]]) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize("kind", kinds, indirect=True, ids=[kind.name for kind in kinds])
+    return pytest.mark.parametrize("kind", kinds, indirect=True, ids=[kind.__name__.lower() for kind in kinds])
 
 
 every = parametrised(KINDS)

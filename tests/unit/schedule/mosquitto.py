@@ -6,7 +6,6 @@ import json
 import os
 import queue
 import shutil
-import socket
 import subprocess
 import threading
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.listening import free_port
 from tests.npm import lacking
 from tests.unit.scan.fakes import WAIT_S
 
@@ -31,9 +31,7 @@ class Mosquitto:
         pytest.importorskip("paho.mqtt.client", reason="needs paho-mqtt: pip install 'slrig[mqtt]'")
         if shutil.which("mosquitto") is None:
             lacking("needs an MQTT broker: apt install mosquitto")
-        with socket.socket() as found:
-            found.bind(("127.0.0.1", 0))
-            self.port: int = found.getsockname()[1]
+        self.port = free_port()
         self.url = f"mqtt{'' if certificate is None else 's'}://127.0.0.1:{self.port}/{PREFIX}"
         self._config = folder / "mosquitto.conf"
         passwords, rights = folder / "passwords", folder / "rights"
