@@ -47,7 +47,7 @@ from slrig.model import Region
 from slrig.scan.offered import MEDIA_TYPES
 from slrig.scan.records import report_summary
 from tests.unit.capture.fake_rig import fake_rig
-from tests.unit.client.service import SCAN, Walk, client_of
+from tests.unit.client.service import SCAN, Walk, client_of, failing
 from tests.unit.command import done, refused, slrig
 
 COLUMNS = 80
@@ -198,12 +198,7 @@ def test_demo_waits_for_the_rig_and_for_nothing_else() -> None:
         assert still_missing(client) == "tracing light, 30 %; preparing kernels, first time only: 3 of 56"
     with client_of(lambda _request: ready_answer(503, "ok")) as client:
         assert still_missing(client) is None
-
-    def absent(_request: httpx2.Request) -> httpx2.Response:
-        message = "refused"
-        raise httpx2.ConnectError(message)
-
-    with client_of(absent) as client:
+    with client_of(failing(httpx2.ConnectError("refused"))) as client:
         assert still_missing(client) == "the service is starting"
     fault = "scene 'tabel.toml': expected a readable file"
     with client_of(lambda _: ready_answer(503, fault)) as client, pytest.raises(ServiceError, match="cannot be opened"):

@@ -35,6 +35,8 @@ from tests.unit.verify.test_verification import TAME, queue_of
 from tests.unit.views.test_stage_axis import SIX_DEG, shot
 from tests.unit.views.test_stage_planes import AXIS, PLATE
 
+__all__ = ["desk", "desks", "queue"]
+
 BOARD = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0}
 
 
@@ -180,8 +182,6 @@ def test_a_document_that_is_none_is_refused_with_its_faults(stage_client: TestCl
     assert answer.status_code == 422
     assert "covariance" in answer.text
 
-
-__all__ = ["desk", "desks", "queue"]
 
 EXACT = {
     "sphere": {"value_mm": 30, "uncertainty_mm": 0.001},

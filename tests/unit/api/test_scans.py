@@ -1,20 +1,48 @@
-"""Scans as jobs over HTTP: started, followed, listed, cancelled, deleted; keys of requests; series; old scans."""
+"""Scans over HTTP: started, followed, cancelled, kept; and their files, also those that are made on request."""
 
 from __future__ import annotations
 
+import importlib.util
+import io
 import json
+import shutil
 import threading
+import zipfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from uuid import UUID, uuid4
 
+import cv2
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
+from slrig.api import clouds
+from slrig.api.artefacts import _made_so_far, ready_files
 from slrig.api.idempotency import fingerprint, own_key
 from slrig.api.schemas import ScanRequest
+from slrig.bundle.calibration_file import write_calibration
+from slrig.bundle.writing import BundleWriter
+from slrig.devices import Rig
+from slrig.jobs import data_folder
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.records import JobState
+from slrig.jobs.store import JobStore
+from slrig.jobs.worker_process import Task
+from slrig.model import Calibration, CameraFormat, Pinhole, Shot, Size, White
+from slrig.scan.acquisition import Recording, capture_frames
+from slrig.scan.artefacts import ON_REQUEST
+from slrig.scan.offered import BAG
+from slrig.scan.plan import PatternPlan, ScanPlan
+from tests.ros_readers import library
 from tests.unit.api.conftest import ServedBench, client_of, ended, refusal
 from tests.unit.calibrate.calibration_bench import BOARD
+from tests.unit.capture.fake_rig import CameraFaults, fake_rig
+from tests.unit.scan import fake_pipeline
 from tests.unit.scan.fakes import WAIT_S
 
 
@@ -179,3 +207,388 @@ def test_old_scans_and_calibrations_are_removed_but_for_pinned_ones(tmp_path: Pa
         assert made[1] not in left or gone.wait(WAIT_S)
         assert [each["id"] for each in client.get("/scan").json()["scans"]] == [made[2], made[0]]
         assert client.delete(f"/scan/{made[0]}/pin").json()["pinned"] is False
+
+
+SIZE = Size(40, 30)
+NAME = "points-left.npz"
+PIPELINE = fake_pipeline.__name__
+NOT_READY = (409, "/problems/artefact-not-ready")
+
+
+def finished(client: TestClient) -> dict[str, Any]:
+    scan = ended(client, client.post("/scan").json()["id"])
+    assert scan["state"] == "succeeded"
+    return scan
+
+
+def place_of(served: ServedBench, scan_id: str) -> Path:
+    return served.service.folder.scan(UUID(scan_id))
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "bundle.zip", "preview.png", "mesh.obj"])
+def test_file_is_sent_whole_in_part_or_not_again(client: TestClient, name: str) -> None:
+    path = finished(client)["links"]["files"][name]
+    whole, head = client.get(path), client.head(path)
+    assert (head.status_code, head.content) == (200, b"")
+    for header in ("etag", "content-type", "cache-control", "content-length"):
+        assert head.headers.get(header) == whole.headers.get(header), header
+    assert client.get(path).content == whole.content
+    tag = whole.headers["ETag"]
+    for known in (tag, f'"other", W/{tag}', "*"):
+        again = client.get(path, headers={"If-None-Match": known})
+        assert (again.status_code, again.content, again.headers["ETag"]) == (304, b"", tag)
+    assert client.get(path, headers={"If-None-Match": '"other"'}).status_code == 200
+    if name != "bundle.zip":
+        part = client.get(path, headers={"Range": "bytes=3-5"})
+        assert (part.status_code, part.content) == (206, whole.content[3:6])
+        beyond = client.get(path, headers={"Range": "bytes=99999-"})
+        assert (beyond.status_code, beyond.headers["content-type"]) == (416, "application/problem+json")
+        assert beyond.headers["content-range"] == f"bytes */{len(whole.content)}"
+
+
+def test_bundle_is_a_zip_of_stored_files_without_links(client: TestClient, served: ServedBench, tmp_path: Path) -> None:
+    scan = finished(client)
+    place = place_of(served, scan["id"])
+    (tmp_path / "secret").write_text("of another folder")
+    (place / "bundle" / "frame.png").symlink_to(tmp_path / "secret")
+    (place / "bundle" / "more").symlink_to(tmp_path)
+    answer = client.get(scan["links"]["files"]["bundle.zip"])
+    assert answer.headers["content-type"] == "application/zip"
+    assert answer.headers["content-disposition"] == f'attachment; filename="{scan["id"]}.zip"'
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+        assert answer.content.count(b"PK\x03\x04") == 3  # no piece is sent twice
+        assert archive.namelist() == ["bundle.json", "frames/000.png", "order"]
+        assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+        assert archive.read("frames/000.png") == (place / "bundle" / "frames" / "000.png").read_bytes()
+    # Links in place of files that are sent alone are not followed, either.
+    for name in ("report.json", "preview.png", "mesh.obj", "mesh.ply"):
+        (place / name).unlink(missing_ok=True)
+        (place / name).symlink_to(tmp_path / "secret")
+    files = client.get(scan["links"]["self"]).json()["links"]["files"]
+    assert sorted(files) == ["bundle.zip", "mesh.glb", "points.ply"]
+    for name in ("report.json", "preview.png", "mesh.obj", "mesh.stl", "view.glb", "mesh.ply"):
+        assert refusal(client, "GET", f"/scan/{scan['id']}/{name}") == NOT_READY, name
+    assert client.delete(scan["links"]["self"]).status_code == 204
+    assert (tmp_path / "secret").read_text() == "of another folder"
+
+
+@pytest.mark.parametrize(("name", "kind"), [("mesh.stl", "model/stl"), ("coarse.glb", "model/gltf-binary")])
+def test_other_format_of_the_mesh_is_made_once(client: TestClient, served: ServedBench, name: str, kind: str) -> None:
+    scan_id = finished(client)["id"]
+    place = place_of(served, scan_id)
+    first = client.get(f"/scan/{scan_id}/{name}")
+    assert (first.headers["Content-Type"], first.content) == (kind, (place / name).read_bytes())
+    before = (place / name).stat()
+    assert client.get(f"/scan/{scan_id}/{name}").content == first.content
+    assert ((place / name).stat().st_ino, (place / name).stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    (place / "mesh.ply").write_bytes((place / "mesh.ply").read_bytes()[:-1])
+    damaged = client.get(f"/scan/{scan_id}/mesh.obj")
+    assert (damaged.status_code, "reconstruct the bundle again" in damaged.json()["detail"]) == (422, True)
+
+
+def test_pictures_go_by_camera(client: TestClient, served: ServedBench) -> None:
+    scan_id = finished(client)["id"]
+    for name in ("rejected-left.png", "causes-left.png"):
+        (place_of(served, scan_id) / name).write_bytes(name.encode())
+        assert client.get(f"/scan/{scan_id}/{name}").content == name.encode()
+    assert refusal(client, "GET", f"/scan/{scan_id}/rejected-right.png") == NOT_READY
+    for path in ("rejected-..%2Fmesh.png", "points-..%2Fleft.npz"):
+        assert client.get(f"/scan/{scan_id}/{path}").status_code in {404, 422}, path
+
+
+def test_failed_scan_names_its_cause_and_gives_its_bundle(client: TestClient, served: ServedBench) -> None:
+    served.order = "fail"
+    scan = ended(client, client.post("/scan").json()["id"])
+    assert scan["state"] == "failed"
+    assert scan["error"]["type"] == "/problems/nothing-to-reconstruct"
+    assert scan["error"]["detail"] == "No stripe was found in any frame."
+    assert list(scan["links"]["files"]) == ["bundle.zip"]
+    assert events_of(client.get(scan["links"]["events"]).text)[-1]["error"] == scan["error"]
+    for name in ("mesh.ply", "mesh.obj"):
+        never = client.get(f"/scan/{scan['id']}/{name}")
+        assert never.status_code == 409
+        assert "No stripe was found" in never.json()["detail"]
+    assert refusal(client, "GET", f"/scan/{scan['id']}/{NAME}") == NOT_READY
+
+
+def test_mesh_can_be_fetched_before_the_scan_is_over(client: TestClient, served: ServedBench) -> None:
+    capturing = served.held(client)["id"]
+    for name in ("mesh.ply", "bundle.zip", NAME):
+        early = client.get(f"/scan/{capturing}/{name}")
+        assert (early.status_code, "capturing" in early.json()["detail"]) == (409, True), name
+    served.gate.set()
+    ended(client, capturing)
+    served.order = "mesh-first"
+    scan_id = client.post("/scan").json()["id"]
+    await_announcement(served.service.store, UUID(scan_id))
+    scan = client.get(f"/scan/{scan_id}").json()
+    assert (scan["state"], list(scan["links"]["files"])) == (
+        "computing",
+        ["coarse.glb", "mesh.3mf", "mesh.obj", "mesh.ply", "mesh.stl", "view.glb"],
+    )
+    early = client.get(scan["links"]["files"]["mesh.ply"])
+    assert (early.status_code, early.headers["ETag"]) == (200, f'"{scan_id}/mesh.ply"')
+    # The rig is free of it, and says what it computes.
+    rig = client.get("/rig").json()
+    assert (rig["holder"], rig["computing"], rig["backlog_length"]) == (None, [scan_id], 16)
+    # What is made of the mesh is there with it, and kept when the scan is in its place.
+    converted = {name: client.get(scan["links"]["files"][name]).content for name in ON_REQUEST}
+    assert [path.name for path in served.service.folder.result(UUID(scan_id)).iterdir()] == ["mesh.ply"]
+    for name in ("mesh.glb", "report.json", "bundle.zip"):
+        assert refusal(client, "GET", f"/scan/{scan_id}/{name}") == NOT_READY
+    (served.service.folder.staging(UUID(scan_id)) / "bundle" / "go-on").touch()
+    lines = client.get(f"/scan/{scan_id}/events").text.splitlines()
+    names = [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
+    assert names.index("file") < len(names) - 1
+    scan = ended(client, scan_id)
+    assert (scan["state"], "report.json" in scan["links"]["files"]) == ("succeeded", True)
+    assert client.get(f"/scan/{scan_id}/mesh.ply").content == early.content
+    assert {name: client.get(f"/scan/{scan_id}/{name}").content for name in ON_REQUEST} == converted
+    assert {path.name for path in place_of(served, scan_id).iterdir()} > set(ON_REQUEST)
+
+
+def await_announcement(store: JobStore, scan_id: UUID) -> None:
+    announced = threading.Event()
+
+    def look() -> None:
+        if any(event.kind == "file" for event in store.events(scan_id, after=0)):
+            announced.set()
+
+    unwatch = store.watch(scan_id, look)
+    look()
+    assert announced.wait(WAIT_S)
+    unwatch()
+
+
+def test_file_stays_readable_while_its_scan_is_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, scan_id = DataFolder(tmp_path / "data"), uuid4()
+    record: Any = SimpleNamespace(id=scan_id, state=JobState.COMPUTING)
+    folder.stage(scan_id)
+    (folder.staging(scan_id) / "bundle").mkdir()
+    (folder.stage_result(scan_id) / "report.json").write_bytes(b"{}")
+    found = []
+
+    def look(*_: object, **__: object) -> None:
+        found.append((_made_so_far(folder, record, "report.json"), set(ready_files(folder, record))))
+
+    look()
+    monkeypatch.setattr(data_folder, "sync_tree", look)
+    folder.commit(scan_id)
+    look()
+    assert found == 3 * [(b"{}", {"report.json"})]
+    folder.release()
+
+
+class FaultyBench(ServedBench):
+    """Captures on a rig in memory, whose camera spoils every line frame."""
+
+    def __init__(self, root: Path) -> None:
+        self.rig = fake_rig(faults={"right": CameraFaults(garbled=frozenset(range(17, 1000)))}).rig
+        super().__init__(root)
+
+    def open_rig(self) -> Rig:
+        return self.rig
+
+    def capture(self, rig: Rig, _plan: ScanPlan, folder: Path, /, **options: Any) -> Recording:
+        return capture_frames(rig, ScanPlan(PatternPlan()), folder, **options)
+
+
+@pytest.mark.slow
+def test_scan_whose_frames_fail_gives_them_and_leaves_the_rig_free(tmp_path: Path) -> None:
+    with client_of(FaultyBench(tmp_path)) as client:
+        scan = ended(client, client.post("/scan").json()["id"])
+        assert (scan["state"], scan["error"]["type"]) == ("failed", "/problems/scan-evidence")
+        assert "camera 'right', pattern 17" in scan["error"]["detail"]
+        assert "The frames are kept" in scan["error"]["detail"]
+        assert list(scan["links"]["files"]) == ["bundle.zip"]
+        fetched = client.get(scan["links"]["files"]["bundle.zip"])
+        with zipfile.ZipFile(io.BytesIO(fetched.content)) as archive:
+            assert archive.testzip() is None
+            listed = json.loads(archive.read("refused/refused.json"))["frames"]
+            frames = json.loads(archive.read("bundle.json"))["frames"]
+            assert all(each["file"] in archive.namelist() for each in [*listed, *frames])
+        assert client.get("/rig").json()["holder"] is None
+
+
+def camera() -> Pinhole:
+    """Looks at the fake pipeline's triangle from 50 mm before it, a pixel for each millimetre."""
+    matrix = np.array([[50.0, 0, 12], [0, 50, 10], [0, 0, 1]])
+    return Pinhole(SIZE, matrix, np.zeros(5), np.eye(3), np.array([0.0, 0, 50]))
+
+
+@pytest.fixture
+def scan(client: TestClient, served: ServedBench) -> str:
+    """A scan of the fake pipeline, with what a real one has for its clouds."""
+    scan_id: str = finished(client)["id"]
+    place = place_of(served, scan_id)
+    write_calibration(place / "bundle" / "calibration.json", Calibration({"left": camera()}, camera()))
+    report = json.loads((place / "report.json").read_text())
+    (place / "report.json").write_text(json.dumps({**report, "causes": [{"name": "none"}, {"name": "not_lit"}]}))
+    refused = np.zeros(SIZE.shape, dtype=np.uint8)
+    refused[:12] = 1
+    (place / "causes-left.png").write_bytes(cv2.imencode(".png", refused)[1].tobytes())
+    return scan_id
+
+
+@pytest.fixture
+def busy(served: ServedBench, tmp_path: Path) -> Iterator[Path]:
+    gate = tmp_path / "gate"
+    began = threading.Event()
+    task = Task(f"{PIPELINE}:wait_for", (gate,), what="examination")
+
+    def began_and_goes_on() -> bool:
+        began.set()
+        return False
+
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(served.worker.run, task, cancelled=began_and_goes_on)
+        try:
+            assert began.wait(WAIT_S)
+            yield gate
+        finally:
+            gate.touch()
+            assert done.result(WAIT_S) == gate.name
+
+
+@pytest.mark.slow
+def test_cloud_is_listed_made_on_request_and_kept(
+    client: TestClient, served: ServedBench, scan: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = place_of(served, scan)
+    path = client.get(f"/scan/{scan}").json()["links"]["files"][NAME]
+    assert path == f"/scan/{scan}/{NAME}"
+    assert refusal(client, "GET", f"/scan/{scan}/points-top.npz") == NOT_READY
+    assert not (place / NAME).exists()
+    # Only so many requests may wait.
+    places = threading.BoundedSemaphore(1)
+    with places, monkeypatch.context() as patched:
+        patched.setattr(clouds, "_places", places)
+        assert refusal(client, "GET", path) == (503, "/problems/worker-busy")
+    first = client.get(path)
+    assert first.status_code == 200, first.text
+    assert first.content == (place / NAME).read_bytes()
+    with np.load(io.BytesIO(first.content)) as cloud:
+        assert (cloud["unit"], cloud["camera"]) == ("mm", "left")
+        assert cloud["causes"].tolist() == ["none", "not_lit", "no_surface"]
+        np.testing.assert_allclose(cloud["points_mm"][13, 15], (3, 3, 0), atol=1e-6)
+        assert [cloud["cause"][at] for at in ((11, 13), (13, 15), (29, 39))] == [1, 0, 2]
+    before = (place / NAME).stat()
+    assert client.get(path, headers={"If-None-Match": first.headers["ETag"]}).status_code == 304
+    part = client.get(path, headers={"Range": "bytes=5-9"})
+    assert (part.status_code, part.content) == (206, first.content[5:10])
+    assert (place / NAME).stat().st_ino == before.st_ino
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("causes-left.png", cv2.imencode(".png", np.zeros((5, 5), dtype=np.uint8))[1].tobytes()),
+        ("causes-left.png", b"no picture"),
+        ("report.json", b"{}"),
+        ("report.json", b"[]"),
+        ("mesh.ply", b"ply"),
+        ("bundle/calibration.json", b"{}"),
+    ],
+)
+def test_source_of_a_cloud_that_was_changed_is_named(
+    client: TestClient, served: ServedBench, scan: str, tmp_path: Path, name: str, content: bytes
+) -> None:
+    place = place_of(served, scan)
+    (place / name).write_bytes(content)
+    refused = client.get(f"/scan/{scan}/{NAME}")
+    assert refused.status_code == 422
+    assert Path(name).name in refused.json()["detail"]
+    assert not [each for each in place.iterdir() if NAME in each.name]
+    # Without one of its sources, or with a link for it, there is no cloud.
+    (place / name).rename(tmp_path / "moved")
+    (place / name).symlink_to(tmp_path / "moved")
+    assert NAME not in client.get(f"/scan/{scan}").json()["links"]["files"]
+    assert client.get(f"/scan/{scan}/{NAME}").status_code == 409
+
+
+def test_format_without_its_library_is_not_listed(
+    client: TestClient, scan: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clouds, "extra_of", lambda ending: "pip install" if ending in {".e57", ".mcap"} else None)
+    files = client.get(f"/scan/{scan}").json()["links"]["files"]
+    assert {"points-left.pcd", "depth-left.tiff", NAME} < set(files)
+    assert not {"points-left.e57", BAG} & set(files)
+    answer = client.get(f"/scan/{scan}/points-left.e57")
+    if importlib.util.find_spec("pye57") is None:
+        assert (answer.status_code, answer.json()["type"]) == (501, "/problems/extra-missing")
+        assert "pip install 'slrig[e57]'" in answer.json()["detail"]
+    else:
+        assert (answer.status_code, answer.headers["Content-Type"]) == (200, "model/e57")
+
+
+def test_scan_is_one_bag_of_all_its_cameras(client: TestClient, served: ServedBench, scan: str, tmp_path: Path) -> None:
+    library("rosbags.rosbag2")
+    bundle = place_of(served, scan) / "bundle"
+    (bundle / "bundle.json").unlink()
+    assert BAG not in client.get(f"/scan/{scan}").json()["links"]["files"]
+    assert client.get(f"/scan/{scan}/{BAG}").status_code == 409
+    forms, moment = {"left": CameraFormat(SIZE, 8)}, datetime(2026, 3, 4, tzinfo=UTC)
+    with BundleWriter(tmp_path / "bundle", SIZE, [White()], forms, captured_at=moment) as written:
+        written.add(Shot(0, "left", np.zeros(SIZE.shape, dtype=np.uint8)))
+    shutil.copytree(tmp_path / "bundle", bundle, dirs_exist_ok=True)
+    files = client.get(f"/scan/{scan}").json()["links"]["files"]
+    assert client.get(files["calibration.json"]).json()["cameras"]["left"]["size_px"] == [40, 30]
+    fetched = client.get(files[BAG])
+    assert fetched.status_code == 200, fetched.text
+    assert fetched.content == (bundle.parent / BAG).read_bytes()
+    with library("rosbags.highlevel").AnyReader([bundle.parent / BAG]) as reader:
+        assert {"/slrig/left/points", "/slrig/left/image_raw"} < set(reader.topics)
+
+
+def test_request_waits_for_its_turn_and_not_for_ever(
+    client: TestClient, scan: str, busy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clouds, "LONGEST_WAIT_S", 0.05)
+    refused = client.get(f"/scan/{scan}/{NAME}")
+    assert (refused.status_code, refused.json()["type"]) == (503, "/problems/worker-busy")
+    assert (refused.headers["Retry-After"], NAME in refused.json()["detail"]) == ("5", True)
+    monkeypatch.setattr(clouds, "LONGEST_WAIT_S", WAIT_S)
+    with ThreadPoolExecutor(2) as pool:
+        asked = [pool.submit(client.get, f"/scan/{scan}/{NAME}") for _ in range(2)]
+        assert not any(each.done() for each in asked)
+        busy.touch()
+        assert [each.result(WAIT_S).status_code for each in asked] == [200, 200]
+
+
+def test_scan_that_is_deleted_meanwhile_is_not_found(
+    client: TestClient, served: ServedBench, scan: str, busy: Path
+) -> None:
+    before = served.worker.jobs
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(client.get, f"/scan/{scan}/{NAME}")
+        while served.worker.jobs == before:
+            assert not asked.done()
+            threading.Event().wait(0.01)
+        assert client.delete(f"/scan/{scan}").status_code == 204
+        busy.touch()
+        gone = asked.result(WAIT_S)
+    assert (gone.status_code, gone.json()["type"]) == (404, "/problems/job-not-found")
+    assert not place_of(served, scan).exists()
+
+
+def test_full_disk_leaves_nothing_behind(client: TestClient, served: ServedBench, scan: str) -> None:
+    before = sorted(place_of(served, scan).iterdir())
+    served.free_bytes = 10
+    assert refusal(client, "GET", f"/scan/{scan}/{NAME}") == (507, "/problems/storage")
+    served.free_bytes = 10**12
+    assert sorted(place_of(served, scan).iterdir()) == before
+
+
+@pytest.mark.slow
+def test_lost_worker_leaves_nothing_behind(
+    client: TestClient, served: ServedBench, scan: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = sorted(place_of(served, scan).iterdir())
+    with monkeypatch.context() as patched:
+        patched.setattr(clouds, "MAKER", f"{PIPELINE}:crash")
+        lost = client.get(f"/scan/{scan}/{NAME}")
+        assert (lost.status_code, lost.json()["type"]) == (500, "/problems/worker-lost")
+        assert "Ask again." in lost.json()["detail"]
+    assert sorted(place_of(served, scan).iterdir()) == before
+    assert client.get(f"/scan/{scan}/{NAME}").status_code == 200

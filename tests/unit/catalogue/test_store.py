@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import ssl
 from collections.abc import Iterator
@@ -32,7 +33,27 @@ from slrig.jobs.records import JobKind, JobState
 from slrig.jobs.store import JobStore
 from tests.listening import free_port
 from tests.postgres import LOGIN, PASSWORD, Postgres
-from tests.unit.schedule.hook import own_certificate
+from tests.unit.schedule.receivers import own_certificate
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.slow)])
+def address(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    if request.param == "sqlite":
+        yield f"sqlite:///{tmp_path}/fleet.sqlite"
+        return
+    server: Postgres = request.getfixturevalue("postgres")
+    name = f"fleet_{os.urandom(4).hex()}"
+    server.execute(f"CREATE DATABASE {name}")
+    yield server.address(name)
+    server.execute(f"DROP DATABASE {name} WITH (FORCE)")
+
+
+@pytest.fixture
+def catalogue(address: str) -> Iterator[Catalogue]:
+    found = open_catalogue(address, LOGIN, None)
+    yield found
+    found.close()
+
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 

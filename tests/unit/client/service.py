@@ -51,8 +51,16 @@ class Broken(httpx2.SyncByteStream):
 
     def __iter__(self) -> Iterator[bytes]:
         yield self._piece
-        message = "the connection broke"
-        raise httpx2.ReadError(message)
+        raise httpx2.ReadError("the connection broke")
+
+
+def failing(error: Exception) -> Handler:
+    """A service that is not there."""
+
+    def handler(_request: httpx2.Request) -> httpx2.Response:
+        raise error
+
+    return handler
 
 
 class Walk:

@@ -31,7 +31,7 @@ from slrig.client.errors import (
 from slrig.client.events import Captured, Progress, StateChange
 from slrig.client.resources import ScanOptions
 from slrig.errors import ConfigError, ServiceError, StorageError
-from tests.unit.client.service import URL, Broken, client_of, event_answer, stream
+from tests.unit.client.service import URL, Broken, client_of, event_answer, failing, stream
 
 DOCUMENT = json.loads((Path(__file__).parents[3] / "config" / "openapi.json").read_text(encoding="utf-8"))
 NEVER_SENT = {"If-None-Match"}
@@ -92,8 +92,7 @@ def request_of(name: str, *, file: str = "the.name") -> httpx2.Request:
 
     def handler(request: httpx2.Request) -> httpx2.Response:
         sent.append(request)
-        message = "that is all"
-        raise httpx2.ConnectError(message)
+        raise httpx2.ConnectError("that is all")
 
     _, *parameters = inspect.signature(METHODS[name]).parameters.values()
     given: dict[str, Any] = {each.name: f"<{each.name}>" for each in parameters}
@@ -212,8 +211,7 @@ def test_a_request_that_moves_the_rig_is_repeated_once_with_the_same_key(
 
     def handler(request: httpx2.Request) -> httpx2.Response:
         sent.append(request)
-        message = "the connection broke"
-        raise httpx2.ReadError(message)
+        raise httpx2.ReadError("the connection broke")
 
     with pytest.raises(UnreachableError):
         call(client_of(handler))
@@ -265,12 +263,9 @@ def test_all_jobs_are_followed_from_where_the_stream_began() -> None:
 def test_a_client_gives_up_on_a_service_that_stays_away() -> None:
     pauses: list[float] = []
 
-    def handler(_request: httpx2.Request) -> httpx2.Response:
-        message = "refused"
-        raise httpx2.ConnectError(message)
-
+    away = failing(httpx2.ConnectError("refused"))
     with pytest.raises(UnreachableError, match="slrig serve RIG"):
-        next(client_of(handler, pauses=pauses).scans.follow("5f"))
+        next(client_of(away, pauses=pauses).scans.follow("5f"))
     assert sum(pauses) == pytest.approx(PATIENCE_S)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import hashlib
+import importlib
 import os
 import re
 import signal
@@ -13,23 +14,27 @@ import ssl
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import obstore
 import pytest
+
+pytest.importorskip("obstore", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+pytest.importorskip("cryptography", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+
+import obstore
 from distributed import Scheduler, Status
 from distributed.diskutils import DIR_LOCK_EXT
 from obstore.store import MemoryStore
-from typer.testing import CliRunner
 
-from slrig.cli.commands import app
 from slrig.compute.certificates import AUTHORITY_KEY, make_certificates
-from slrig.compute.cluster import DaskCluster
-from slrig.compute.host import BEAT_S, POOL_FAULT, TELL_S, Answer, Order, resource
-from slrig.compute.pooled import BEGIN_LIMIT_S, SILENCE_LIMIT_S, TRANSFER_LIMIT_S
+from slrig.compute.cluster import DaskCluster, Told
+from slrig.compute.host import BEAT_S, POOL_FAULT, TELL_S, Answer, Host, Order, resource
+from slrig.compute.pooled import BEGIN_LIMIT_S, SILENCE_LIMIT_S, TRANSFER_LIMIT_S, PooledWorker
 from slrig.compute.security import KEY, pool_security
 from slrig.compute.serving import KEPT_EVENTS, _scratch, serve_scheduler
 from slrig.compute.store import CHUNK_BYTES, PoolError, PoolStore, open_store
@@ -42,14 +47,140 @@ from slrig.errors import (
     StorageError,
     WorkerLostError,
 )
+from slrig.jobs.frame_feed import FrameFeed
 from slrig.jobs.versions import versions
+from slrig.jobs.worker import READY
 from slrig.jobs.worker_process import Task
+from slrig.model import Region
+from slrig.scan.job import reconstruction
+from slrig.scan.plan import ReconstructionPlan
 from tests.listening import listening_at
-from tests.unit.compute.tame_pool import Pool, job, lost
+from tests.unit.command import slrig
 
-pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
-pytest.importorskip("cryptography", reason="needs a pool's libraries: pip install 'slrig[pool]'")
-pytest.importorskip("obstore", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+PIPELINE = "tests.unit.scan.fake_pipeline"
+
+
+class TameWorker:
+    """`Compute` in this process. done : the tasks that it was given."""
+
+    module, condition, loading = PIPELINE, READY, False
+
+    def __init__(self) -> None:
+        self.done: list[Task] = []
+        self.feeds: list[FrameFeed] = []
+        self.closed = False
+
+    def start(self) -> None:
+        """Nothing to be done."""
+
+    def close(self) -> None:
+        self.closed = True
+
+    def feed(self, region: Region | None = None) -> FrameFeed:
+        self.feeds.append(FrameFeed(lambda _: True, receiver=self, region=region))
+        return self.feeds[-1]
+
+    def task(self, function: str, what: str) -> Callable[..., Any]:
+        return lambda *given: self.run(Task(function, given, what=what))
+
+    def run(
+        self,
+        task: Task,
+        *,
+        progress: Callable[[str, float, str], None] = lambda *_: None,
+        cancelled: Callable[[], bool] = lambda: False,
+        made: Callable[[str], None] = lambda _: None,
+        feed: FrameFeed | None = None,  # noqa: ARG002
+        within_s: float | None = None,  # noqa: ARG002
+    ) -> Any:
+        if self.closed:
+            raise ScanInterruptedError("closed")
+        self.done.append(task)
+        module, name = task.function.split(":")
+        told = {"progress": progress, "cancelled": cancelled, "made": made} if task.movable else {}
+        return getattr(importlib.import_module(module), name)(*task.given, **task.options, **told)
+
+
+class TameOrder(Future[Answer]):
+    """An order: `act` is asked for its answer."""
+
+    def __init__(self, act: Callable[[Order], Answer | None], order: Order, told: Told) -> None:
+        super().__init__()
+        self._act = act
+        self.order = order
+        self.told = told
+
+    def result(self, timeout: float | None = None) -> Answer:  # noqa: ARG002
+        if (answer := self._act(self.order)) is None:
+            raise TimeoutError
+        return answer
+
+
+class TameCluster:
+    """`Cluster`. acts : what becomes of the orders, one after another; without any, a machine does them."""
+
+    topic, fault = "rig", "the pool does not answer"
+
+    def __init__(self, host: Host) -> None:
+        self.host = host
+        self.there = True
+        self.acts: list[Callable[[Order], Answer | None]] = []
+        self.orders: list[TameOrder] = []
+        self.told: list[Mapping[str, Any]] = []
+
+    def start(self) -> None:
+        """Nothing to be done."""
+
+    def close(self) -> None:
+        """Nothing to be done."""
+
+    def usable(self, timeout_s: float = 0.0) -> bool:  # noqa: ARG002
+        return self.there
+
+    def submit(self, order: Order, told: Told) -> TameOrder:
+        act = self.acts.pop(0) if self.acts else lambda each: self.host.done(each, self.told.append)
+        self.orders.append(TameOrder(act, order, told))
+        return self.orders[-1]
+
+
+class Pool:
+    """A rig, a machine of a pool, and the store between them, whose objects are `objects`."""
+
+    def __init__(self) -> None:
+        self.objects = MemoryStore()
+        self.store = PoolStore("memory://", self.objects)
+        self.now_s = 0.0
+        self.local, self.remote = TameWorker(), TameWorker()
+        self.cluster = TameCluster(Host(self.store, self.remote, clock=lambda: self.now_s))
+        self.worker = PooledWorker(self.local, self.cluster, self.store, clock=lambda: self.now_s)
+
+    def passes(self, seconds: float) -> Callable[[Order], None]:
+        """An act: time passes without an answer."""
+
+        def act(_order: Order) -> None:
+            self.now_s += seconds
+
+        return act
+
+    def tidied(self) -> set[str]:
+        """What the store holds, once nothing more is to be removed."""
+        self.worker._tidying.shutdown(wait=True)
+        return {each["path"] for each in self.objects.list().collect()}
+
+
+def lost(_order: Order) -> Answer | None:
+    raise PoolError("the pool lost the job")
+
+
+def job(folder: Path, order: str = "finish") -> Task:
+    """The reconstruction of a bundle that says what is to be done: see `tests.unit.scan.fake_pipeline`."""
+    bundle, result = folder / "staged" / "bundle", folder / "staged" / "result"
+    (bundle / "frames").mkdir(parents=True)
+    result.mkdir()
+    (bundle / "order").write_text(order)
+    (bundle / "frames" / "0.png").write_bytes(bytes(range(256)) * 100)
+    return reconstruction(PIPELINE, bundle, result, ReconstructionPlan())
+
 
 ADDRESS = "tls://pool:8786"
 
@@ -78,7 +209,7 @@ def greet(client: ssl.SSLContext, server: ssl.SSLContext) -> None:
 
 def test_members_of_one_pool_accept_one_another_and_no_others(tmp_path: Path) -> None:
     ours, theirs = tmp_path / "ours", tmp_path / "theirs"
-    made = CliRunner().invoke(app, ["pool", "certificates", str(ours)])
+    made = slrig("pool", "certificates", ours)
     assert made.output.split() == [str(ours / name) for name in ("scheduler", "worker", "rig")]
     assert make_certificates(ours, ("rig", "rig-7")) == [ours / "rig-7"]
     make_certificates(theirs, ("rig",))
@@ -138,10 +269,10 @@ def test_certificates_are_made_in_folders_that_can_be_for_names_of_machines(tmp_
 
 def test_a_service_with_a_pool_needs_a_store(tmp_path: Path) -> None:
     for options in (["--compute", "tcp://127.0.0.1:1"], ["--store", "s3://scans"]):
-        rig = str(Path(__file__).parents[3] / "config" / "rigs" / "demo.toml")
-        told = CliRunner().invoke(app, ["serve", rig, "--data", str(tmp_path / "data"), "--port", "0", *options])
+        rig = Path(__file__).parents[3] / "config" / "rigs" / "demo.toml"
+        told = slrig("serve", rig, "--data", tmp_path / "data", "--port", "0", *options)
         assert (told.exit_code, "needs a store as well" in told.stderr) == (2, True), told.output
-    told = CliRunner().invoke(app, ["worker", "--scheduler", "tcp://127.0.0.1:1"])
+    told = slrig("worker", "--scheduler", "tcp://127.0.0.1:1")
     assert (told.exit_code, "--store" in told.stderr) == (2, True)
 
 
@@ -242,8 +373,8 @@ def never_begins(pool: Pool) -> None:
 
 def falls_silent(pool: Pool) -> None:
     def tells_once(order: Order) -> None:
-        begun = pool.clock.now_s > 0
-        pool.clock.now_s += SILENCE_LIMIT_S + 1 if begun else 1
+        begun = pool.now_s > 0
+        pool.now_s += SILENCE_LIMIT_S + 1 if begun else 1
         if not begun:
             pool.cluster.orders[-1].told({"job": order.job})
 
@@ -279,7 +410,7 @@ def names_a_file_elsewhere(pool: Pool) -> None:
 def is_slow(pool: Pool) -> None:
     class Slow(PoolStore):
         def _has(self, path: str) -> bool:
-            pool.clock.now_s += TRANSFER_LIMIT_S + 1
+            pool.now_s += TRANSFER_LIMIT_S + 1
             return super()._has(path)
 
     pool.worker._store = Slow("memory://", pool.objects)
@@ -337,7 +468,7 @@ def test_what_fails_by_itself_fails_here_in_its_own_words(pool: Pool, tmp_path: 
 def test_a_job_that_is_cancelled_is_stopped_where_it_is_computed(pool: Pool, tmp_path: Path) -> None:
     pool.cluster.acts = [pool.passes(0.1)]
     with pytest.raises(ScanCancelledError, match="reconstruction was cancelled"):
-        pool.worker.run(job(tmp_path), cancelled=lambda: pool.clock.now_s > 1)
+        pool.worker.run(job(tmp_path), cancelled=lambda: pool.now_s > 1)
     (pending,) = pool.cluster.orders
     assert pending.cancelled()
     assert pool.tidied() == {f"stops/{pending.order.job}"}
@@ -453,7 +584,7 @@ def test_progress_is_sent_at_intervals(pool: Pool, tmp_path: Path, monkeypatch: 
             return versions()
         for number in range(10):
             progress("read bundle", number / 10, "")
-            pool.clock.now_s += TELL_S / 3.9
+            pool.now_s += TELL_S / 3.9
         progress("decode", 1.0, "")
         return None
 
@@ -495,7 +626,7 @@ def test_a_job_that_its_rig_gave_up_is_stopped_in_the_middle(pool: Pool, tmp_pat
     heard: list[Mapping[str, Any]] = []
 
     def told(each: Mapping[str, Any]) -> None:
-        pool.clock.now_s += BEAT_S
+        pool.now_s += BEAT_S
         heard.append(each)
         if len(heard) == 4:
             pool.store.stop("job")

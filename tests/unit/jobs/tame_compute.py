@@ -71,8 +71,7 @@ class TameCompute:
             if self._closed.is_set():
                 raise interruption()
             if cancelled():
-                message = f"The {task.what} was cancelled."
-                raise ScanCancelledError(message)
+                raise ScanCancelledError(f"The {task.what} was cancelled.")
         try:
             self._before(cancelled)
             whole = feed is not None and feed.settled(WAIT_S) and feed.whole

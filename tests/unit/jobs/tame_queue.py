@@ -37,11 +37,9 @@ class TameQueue(JobQueue):
 
     def submit(self, make: Callable[[], Sequence[Job]], *, wait: bool) -> None:
         if self.full:
-            message = "As many wait as may."
-            raise QueueFullError(message)
+            raise QueueFullError("As many wait as may.")
         if self.busy is not None and not wait:
-            message = f"The rig is held by {self.busy}."
-            raise RigBusyError(message, holder=self.busy, since="")
+            raise RigBusyError(f"The rig is held by {self.busy}.", holder=self.busy, since="")
         self.add(make())
 
     def add(self, jobs: Sequence[Job]) -> None:

@@ -9,7 +9,8 @@ import stat
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from uuid import UUID, uuid4
@@ -31,6 +32,21 @@ from slrig.jobs.store import JobStore
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import KeptRecord, plan_from_json, plan_json, write_record
 from slrig.scan.sweep import sweep
+from tests.unit.scan.bench import failure_code
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[DataFolder]:
+    folder = DataFolder(tmp_path / "data")
+    yield folder
+    folder.release()
+
+
+@pytest.fixture
+def store(folder: DataFolder) -> Iterator[JobStore]:
+    store = JobStore(Database(folder.database), JobKind.SCAN)
+    yield store
+    store.database.close()
 
 
 def running(store: JobStore, state: JobState) -> UUID:
@@ -147,9 +163,7 @@ def test_sweep_records_a_cut_off_capture_as_interrupted_and_clears_its_files(
     swept = sweep(store, folder)
     assert swept.interrupted == (scan_id,)
     record = store.get(scan_id)
-    assert record.state is JobState.INTERRUPTED
-    assert record.fault is not None
-    assert record.fault.code == "scan-interrupted"
+    assert (record.state, failure_code(record)) == (JobState.INTERRUPTED, "scan-interrupted")
     assert not folder.scan(scan_id).exists()
     assert list(folder.incoming.iterdir()) == []
 
@@ -390,11 +404,15 @@ def contents(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
-def restored(tmp_path: Path, root: Path) -> tuple[DataFolder, JobStore]:
+@contextmanager
+def restored(tmp_path: Path) -> Iterator[tuple[DataFolder, JobStore]]:
     """The data folder of a restored backup, and its records, as a service opens them."""
-    restore(tmp_path / "backup", root)
-    folder = DataFolder(root)
-    return folder, JobStore(Database(folder.database), JobKind.SCAN)
+    restore(tmp_path / "backup", tmp_path / "elsewhere")
+    folder = DataFolder(tmp_path / "elsewhere")
+    records = JobStore(Database(folder.database), JobKind.SCAN)
+    yield folder, records
+    records.database.close()
+    folder.release()
 
 
 def while_copying(monkeypatch: pytest.MonkeyPatch, name: str, happens: Callable[[], object]) -> None:
@@ -421,8 +439,7 @@ def test_what_ended_comes_back_and_what_did_not_is_settled_as_cut_off(
     (folder.calibrations / "c1" / "poses").mkdir(parents=True)
     manifest = back_up(folder.root, tmp_path / "backup")
     assert (manifest.scans, manifest.left_out) == (2, ())
-    other, records = restored(tmp_path, tmp_path / "elsewhere")
-    try:
+    with restored(tmp_path) as (other, records):
         for scan in ended:
             assert contents(other.scan(scan)) == contents(folder.scan(scan))
         assert (other.root / "key.sha256").read_text() == "0123"
@@ -435,9 +452,6 @@ def test_what_ended_comes_back_and_what_did_not_is_settled_as_cut_off(
             failed: JobState.FAILED,
             **dict.fromkeys(open_, JobState.INTERRUPTED),
         }
-    finally:
-        records.database.close()
-        other.release()
 
 
 def test_nobody_else_may_read_it_and_nothing_of_the_running_service_is_in_it(
@@ -466,10 +480,8 @@ def test_a_scan_that_is_removed_meanwhile_is_left_out_and_said(
     manifest = back_up(folder.root, tmp_path / "backup")
     assert manifest.left_out == (f"scans/{gone}: was removed meanwhile",)
     assert not any(str(gone) in name for name in (*manifest.files, *manifest.folders))
-    other, records = restored(tmp_path, tmp_path / "elsewhere")
-    assert records.states() == {stays: JobState.SUCCEEDED}
-    records.database.close()
-    other.release()
+    with restored(tmp_path) as (_, records):
+        assert records.states() == {stays: JobState.SUCCEEDED}
 
 
 def test_calibrations_are_copied_again_where_one_is_removed_meanwhile(
@@ -502,11 +514,9 @@ def test_records_that_change_meanwhile_are_as_they_were_and_hold_up_nobody(
     ended = scanned(store, folder)
     while_copying(monkeypatch, "mesh.ply", lambda: scanned(store, folder))
     assert back_up(folder.root, tmp_path / "backup").scans == 1
-    other, records = restored(tmp_path, tmp_path / "elsewhere")
-    assert list(records.states()) == [ended]
-    assert sweep(records, other).put_aside == ()
-    records.database.close()
-    other.release()
+    with restored(tmp_path) as (other, records):
+        assert list(records.states()) == [ended]
+        assert sweep(records, other).put_aside == ()
 
 
 def test_unchanged_files_are_links_to_those_of_an_earlier_backup(

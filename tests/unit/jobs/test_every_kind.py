@@ -55,8 +55,7 @@ class Computing:
         self.began.set()
         while not self.gate.wait(0.01):
             if cancelled():
-                message = "It was cancelled."
-                raise ScanCancelledError(message)
+                raise ScanCancelledError("It was cancelled.")
         if self.error is not None:
             error, self.error = self.error, None
             raise error

@@ -37,14 +37,13 @@ from slrig.jobs.frame_feed import (
     FrameFeed,
     most_waiting_bytes,
 )
-from slrig.jobs.records import JobState
 from slrig.jobs.worker import LOADING, READY, WAITING, UnexpectedWorkerError, Worker, prepare_kernel_cache
 from slrig.jobs.worker_process import Done, Failed, FileMade, Progressed, Task, Unloadable, serve
 from slrig.jobs.worker_wait import JobWait
 from slrig.model import Shot
 from slrig.scan.job import reconstruction
 from slrig.scan.plan import ReconstructionPlan
-from tests.unit.scan.bench import PIPELINE, Bench, failure_code
+from tests.unit.scan.bench import PIPELINE
 from tests.unit.scan.fakes import CALIBRATION, EVIDENCE, OUTLINE, SHOTS, WAIT_S
 
 
@@ -86,13 +85,9 @@ def killed(worker: Worker) -> None:
     gone(worker)
 
 
-def never() -> bool:
-    return False
-
-
 def test_report_and_progress_come_back(worker: Worker, tmp_path: Path) -> None:
     told = Told()
-    report = worker.run(job(tmp_path, "finish"), progress=told, cancelled=never)
+    report = worker.run(job(tmp_path, "finish"), progress=told)
     assert report["truth"] == {"rms_mm": 0.01}
     assert json.loads((tmp_path / "result" / "report.json").read_text()) == report
     assert b"keep_holes=True" in (tmp_path / "result" / "points.ply").read_bytes()
@@ -101,12 +96,12 @@ def test_report_and_progress_come_back(worker: Worker, tmp_path: Path) -> None:
 
 def test_error_keeps_its_class_and_message(worker: Worker, tmp_path: Path) -> None:
     with pytest.raises(NothingToReconstructError, match="No stripe was found"):
-        worker.run(job(tmp_path, "fail"), progress=Told(), cancelled=never)
+        worker.run(job(tmp_path, "fail"), progress=Told())
 
 
 def test_defect_carries_its_traceback(worker: Worker, tmp_path: Path) -> None:
     with pytest.raises(UnexpectedWorkerError, match=r"fake_pipeline\.py[\s\S]*an index error, say"):
-        worker.run(job(tmp_path, "break"), progress=Told(), cancelled=never)
+        worker.run(job(tmp_path, "break"), progress=Told())
 
 
 def test_job_stops_when_asked_and_the_process_stays(worker: Worker, tmp_path: Path) -> None:
@@ -120,14 +115,14 @@ def test_job_stops_when_asked_and_the_process_stays(worker: Worker, tmp_path: Pa
 def test_killed_process_is_named_and_replaced(worker: Worker, tmp_path: Path) -> None:
     before = worker.process_id
     with pytest.raises(WorkerLostError, match=signal.Signals.SIGKILL.name):
-        worker.run(job(tmp_path, "die"), progress=Told(), cancelled=never)
-    assert worker.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)["seconds"] == 1.5
+        worker.run(job(tmp_path, "die"), progress=Told())
+    assert worker.run(job(tmp_path, "finish"), progress=Told())["seconds"] == 1.5
     assert worker.process_id != before
 
 
 def test_process_killed_while_idle_costs_nothing_but_a_new_one(worker: Worker, tmp_path: Path) -> None:
     killed(worker)
-    assert worker.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)["seconds"] == 1.5
+    assert worker.run(job(tmp_path, "finish"), progress=Told())["seconds"] == 1.5
 
 
 def test_deaf_job_loses_its_process(worker: Worker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,7 +163,7 @@ def test_an_answer_of_another_job_is_dropped() -> None:
     made: list[str] = []
     process = multiprocessing.get_context("spawn").Process(target=time.monotonic)
     process.start()
-    job = JobWait(task("process_id"), 7, process, near, stops, c_double(), Told(), never, made.append, lambda _: None)
+    job = JobWait(task("process_id"), 7, process, near, stops, c_double(), Told(), bool, made.append, lambda _: None)
     for answer in (
         Done(6, "of the job before"),
         Progressed(6, "mesh", 0.5, ""),
@@ -272,7 +267,7 @@ def test_process_that_ends_while_it_loads_is_told(tmp_path: Path) -> None:
     cause = "the reconstruction cannot be loaded: its process ended"
     assert cause in broken.condition
     with pytest.raises(WorkerLostError, match=cause):
-        broken.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)
+        broken.run(job(tmp_path, "finish"), progress=Told())
     assert cause in broken.condition
     broken.close()
 
@@ -321,7 +316,7 @@ def test_closed_worker_starts_no_process(tmp_path: Path) -> None:
     closed = Worker(PIPELINE)
     closed.close()
     with pytest.raises(ScanInterruptedError):
-        closed.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)
+        closed.run(job(tmp_path, "finish"), progress=Told())
     assert closed.process_id is None
 
 
@@ -518,7 +513,7 @@ Ran = Callable[..., object]
 def run(worker: Worker, tmp_path: Path) -> Ran:
     """Run a job after a capture; return what the reconstruction says of the frames that it was sent."""
 
-    def ran(feed: FrameFeed, cancelled: Callable[[], bool] = never) -> object:
+    def ran(feed: FrameFeed, cancelled: Callable[[], bool] = lambda: False) -> object:
         return worker.run(job(tmp_path, "finish"), cancelled=cancelled, feed=feed).get("live")
 
     return ran
@@ -575,28 +570,3 @@ def test_cancel_ends_a_process_that_is_stuck_in_a_frame(
     fed(again, *SHOTS)
     assert run(again) == [2, 2, True]
     assert worker.process_id != before
-
-
-def test_scans_outlive_their_worker(tmp_path: Path) -> None:
-    """Killed while a scan captures, it costs the head start; while one is reconstructed, that scan."""
-    worker = Worker(PIPELINE)
-    bench = Bench(tmp_path, worker=worker)
-    bench.runner.start()
-    scan = bench.held()
-    killed(worker)
-    bench.gate.set()
-    assert bench.until(scan.id).state is JobState.SUCCEEDED
-    assert '"live"' not in (bench.folder.scan(scan.id) / "report.json").read_text()
-    bench.order = "die"
-    record = bench.until(bench.scan().id)
-    assert (record.state, failure_code(record)) == (JobState.FAILED, "worker-lost")
-    assert [path.name for path in bench.folder.scan(record.id).iterdir()] == ["bundle"]
-    bench.order = "finish"
-    cancelled = bench.held()
-    bench.runner.cancel(cancelled.id)
-    assert bench.until(cancelled.id).state is JobState.CANCELLED
-    bench.gate.set()
-    # It sees its own frames only.
-    record = bench.until(bench.scan().id)
-    assert '"live": [2, 2, true]' in (bench.folder.scan(record.id) / "report.json").read_text()
-    bench.close()

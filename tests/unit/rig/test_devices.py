@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,16 +36,6 @@ from slrig.rig.watchdog import MOVE_LIMIT_S, OPEN, Call, Calls, GuardedPositione
 from tests.unit.capture.fake_rig import CameraFaults, Scene, fake_rig
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S, TameBench, TameCamera, TameProjector
-
-
-@dataclass
-class Time:
-    """A clock that a test moves."""
-
-    now_s: float = 100.0
-
-    def __call__(self) -> float:
-        return self.now_s
 
 
 def failing(error: Exception) -> Callable[[], None]:
@@ -106,13 +96,13 @@ def test_error_is_placed_once_and_not_where_the_call_that_opens_names_the_device
 
 
 def test_call_is_given_up_at_the_second_look_and_raises_when_it_returns() -> None:
-    time_s = Time()
-    calls = Calls(now_s=time_s)
+    now_s = [100.0]
+    calls = Calls(now_s=lambda: now_s[0])
     found: list[Call | None] = []
 
     def slow() -> int:
         found.append(calls.overdue())
-        time_s.now_s += 9.1
+        now_s[0] += 9.1
         # One look may find a process that was stopped for a while, and goes on now.
         found.extend(calls.overdue() for _ in range(3))
         assert calls.stuck is found[2]
@@ -127,15 +117,15 @@ def test_call_is_given_up_at_the_second_look_and_raises_when_it_returns() -> Non
 
 
 def test_a_call_that_tells_how_far_it_is_is_not_hung() -> None:
-    time_s = Time()
-    calls = Calls(now_s=time_s)
+    now_s = [100.0]
+    calls = Calls(now_s=lambda: now_s[0])
     shown: list[str] = []
     overdue: list[Call | None] = []
 
     def opening() -> None:
         tell = progress_reporter()
         for share in ("10 %", "60 %", "90 %"):
-            time_s.now_s += 50.0
+            now_s[0] += 50.0
             overdue.extend((calls.overdue(), calls.overdue()) if share == "90 %" else (calls.overdue(),))
             tell(f"tracing light, {share}")
             shown.append(calls.doing)
@@ -149,15 +139,15 @@ def test_a_call_that_tells_how_far_it_is_is_not_hung() -> None:
 
 
 def test_limits_are_those_that_a_device_declares_and_nothing_computed_is_unplugged() -> None:
-    time_s = Time()
-    calls = Calls(now_s=time_s)
+    now_s = [100.0]
+    calls = Calls(now_s=lambda: now_s[0])
     camera = TameCamera()
     camera.info = replace(camera.info, limits=CallLimits(call_s=200.0, read_slack_s=90.0, computed=True))
     found: list[Call | None] = []
 
     def slow(*_: object) -> None:
         for seconds in (91.0, 2.0):
-            time_s.now_s += seconds
+            now_s[0] += seconds
             found.append(calls.overdue())
             found.append(calls.overdue())
 
@@ -174,8 +164,8 @@ def test_limits_are_those_that_a_device_declares_and_nothing_computed_is_unplugg
 
 
 def test_watchdog_barks_once_for_each_call_that_hangs() -> None:
-    time_s = Time()
-    calls = Calls(now_s=time_s)
+    now_s = [100.0]
+    calls = Calls(now_s=lambda: now_s[0])
     barked: list[str] = []
     heard = threading.Event()
 
@@ -184,7 +174,7 @@ def test_watchdog_barks_once_for_each_call_that_hangs() -> None:
         heard.set()
 
     def hang() -> None:
-        time_s.now_s += 2.0
+        now_s[0] += 2.0
         assert heard.wait(WAIT_S)
 
     dog = Watchdog(calls, on_hang, look_s=0.001)
@@ -340,8 +330,8 @@ def test_calls_of_several_threads_are_looked_after_at_once() -> None:
 
 
 def test_a_turn_that_hangs_is_told_as_a_move_that_hangs() -> None:
-    time_s = Time()
-    calls = Calls(now_s=time_s)
+    now_s = [100.0]
+    calls = Calls(now_s=lambda: now_s[0])
     asked: list[float] = []
     found: list[Call | None] = []
 
@@ -354,7 +344,7 @@ def test_a_turn_that_hangs_is_told_as_a_move_that_hangs() -> None:
         def turn(self, angle_deg: float) -> None:
             asked.append(angle_deg)
             if angle_deg > 90:
-                time_s.now_s += MOVE_LIMIT_S + 1
+                now_s[0] += MOVE_LIMIT_S + 1
                 found.extend((calls.overdue(), calls.overdue()))
 
         def close(self) -> None:
@@ -550,8 +540,7 @@ class Table(AnyAngle):
         moved = self._opened_deg + angle_deg - self._motor.own_deg
         if self._motor.fails:
             self._motor.own_deg, self._motor.at_deg = self._motor.own_deg + moved / 2, self._motor.at_deg + moved / 2
-            message = "stuck"
-            raise DeviceError(message)
+            raise DeviceError("stuck")
         self._motor.own_deg, self._motor.at_deg = self._motor.own_deg + moved, self._motor.at_deg + moved
 
     def close(self) -> None:

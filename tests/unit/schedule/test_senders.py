@@ -31,8 +31,7 @@ from slrig.schedule.webhook import Webhook, signature, signing_key
 from tests.samples import put_database
 from tests.unit.jobs.tame_queue import PowerCut
 from tests.unit.scan.fakes import WAIT_S, SetClock
-from tests.unit.schedule.hook import PATH, SECRET, Hook, own_certificate, signed
-from tests.unit.schedule.mosquitto import LOGIN, Mosquitto
+from tests.unit.schedule.receivers import LOGIN, PATH, SECRET, Hook, Mosquitto, own_certificate, signed
 from tests.unit.verify.health_bench import a_verification, hours
 
 DUE = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
@@ -392,21 +391,16 @@ def test_redirect_is_not_followed(bench: Bench, hook: Hook) -> None:
     assert names(hook) == ["1"]
 
 
-def _refuses(hook: Hook) -> None:
-    hook.close()
+HOW: dict[str, Callable[[Hook], object]] = {
+    "refuses": Hook.close,
+    "hangs": lambda hook: hook.gate.clear(),
+    "drips": lambda hook: setattr(hook, "drips", True),
+}
 
 
-def _hangs(hook: Hook) -> None:
-    hook.gate.clear()
-
-
-def _drips(hook: Hook) -> None:
-    hook.drips = True
-
-
-@pytest.mark.parametrize("how", [_refuses, _hangs, _drips])
-def test_receiver_without_an_answer_costs_one_try(bench: Bench, hook: Hook, how: Callable[[Hook], None]) -> None:
-    how(hook)
+@pytest.mark.parametrize("how", HOW)
+def test_receiver_without_an_answer_costs_one_try(bench: Bench, hook: Hook, how: str) -> None:
+    HOW[how](hook)
     bench.put("1")
     # A receiver that hangs answers in the end, and so a sender that waited for it would succeed.
     bench.fails()
@@ -428,8 +422,7 @@ def test_notice_that_was_taken_is_not_sent_again_while_the_records_refuse(
     bench: Bench, hook: Hook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(_: Notice) -> None:
-        message = "the disk is full"
-        raise StorageError(message)
+        raise StorageError("the disk is full")
 
     bench.put("1", "2")
     with monkeypatch.context() as patch:
@@ -455,21 +448,21 @@ def test_thread_sends_what_waits_and_what_comes_and_ends_when_closed(bench: Benc
     assert bench.waiting == 0
 
 
-@pytest.mark.parametrize("how", [_refuses, _hangs])
+@pytest.mark.parametrize("how", ["refuses", "hangs"])
 def test_end_of_the_service_does_not_wait_for_a_receiver(
-    bench: Bench, hook: Hook, how: Callable[[Hook], None], monkeypatch: pytest.MonkeyPatch
+    bench: Bench, hook: Hook, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("slrig.schedule.sending._END_S", 0.01)
-    how(hook)
+    HOW[how](hook)
     bench.sender = Webhook(bench.outbox, hook.url, KEY, timeout_s=WAIT_S)
     bench.sender.start()
     bench.put("1")
-    if how is _hangs:
+    if how == "hangs":
         hook.next()
     bench.put("2")
     bench.sender.close()
     thread = bench.sender._thread
-    assert thread.is_alive() or how is _refuses, "it was closed while the receiver held it"
+    assert thread.is_alive() or how == "refuses", "it was closed while the receiver held it"
     assert bench.waiting == 2
     hook.close()
     thread.join(WAIT_S)
