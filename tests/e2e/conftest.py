@@ -7,8 +7,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Container, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Container, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from slrig.client import Client
-from tests.e2e.pool_processes import Pool
 from tests.npm import lacking
 
 if TYPE_CHECKING:
@@ -75,9 +74,12 @@ def write_rig(folder: Path, *, scene: str = SCENE, head: str = "", faults: str =
 
 
 class ServiceProcess:
-    """A running `slrig serve`; `url` is the address that it printed. port : any free one by default."""
+    """A running `slrig serve`; `url` is the address that it printed. port : any free one by default.
 
-    def __init__(self, rig: Path, data: Path, *, port: int = 0, **settings: str) -> None:
+    program : a module and its arguments, in place of that command.
+    """
+
+    def __init__(self, rig: Path, data: Path, *, port: int = 0, program: Sequence[str] = (), **settings: str) -> None:
         self.data = data
         self.log = data.with_suffix(".log")
         environment = {
@@ -91,10 +93,10 @@ class ServiceProcess:
         }
         # A command limits OpenBLAS's threads by itself: the tests' own setting would hide that.
         environment.pop("OPENBLAS_NUM_THREADS", None)
-        command = ["serve", str(rig), "--port", str(port), "--data", str(data)]
+        command = program or ["slrig.cli", "serve", str(rig), "--port", str(port), "--data", str(data)]
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(  # noqa: S603 - our own command
-                [sys.executable, "-m", "slrig.cli", *command], stdout=subprocess.PIPE, stderr=log, env=environment
+                [sys.executable, "-m", *command], stdout=subprocess.PIPE, stderr=log, env=environment
             )
         assert self.process.stdout is not None
         greeting = self.process.stdout.readline().decode()
@@ -147,13 +149,21 @@ def serving(rig: Path, data: Path, **settings: Any) -> Iterator[ServiceProcess]:
         service.kill()
 
 
-def slrig(*words: str | Path, codes: Container[int] = (0,), **settings: str) -> subprocess.CompletedProcess[str]:
-    """Run a command as a person does. codes : its exit codes that are right."""
-    command = [sys.executable, "-m", "slrig.cli", *map(str, words)]
-    done = subprocess.run(  # noqa: S603 - our own command
-        command, capture_output=True, text=True, timeout=120, check=False, env={**os.environ, **settings}
+def python(
+    *words: object, codes: Container[int] = (0,), folder: Path | None = None, **settings: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a program as a person does, in `folder`. codes : its exit codes that are right."""
+    command, environment = [sys.executable, *map(str, words)], {**os.environ, **settings}
+    done = subprocess.run(  # noqa: S603 - our own programs
+        command, capture_output=True, text=True, timeout=300, check=False, env=environment, cwd=folder
     )
-    assert (done.returncode in codes, "Traceback" in done.stderr) == (True, False), done.stdout + done.stderr
+    assert done.returncode in codes, done.stdout + done.stderr
+    return done
+
+
+def slrig(*words: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    done = python("-m", "slrig.cli", *words, **options)
+    assert "Traceback" not in done.stderr, done.stderr
     return done
 
 
@@ -206,11 +216,3 @@ def browser() -> Iterator[Browser]:
         opened = driver.chromium.launch(executable_path=path, args=list(_BROWSER_OPTIONS))
         yield opened
         opened.close()
-
-
-@pytest.fixture
-def pool(tmp_path: Path) -> Iterator[Pool]:
-    if not all(map(find_spec, ("distributed", "flask_cors", "moto", "obstore"))):
-        lacking("needs a pool's libraries, and an S3 server: pip install -e '.[pool,s3]'")
-    with ExitStack() as stack:
-        yield Pool(tmp_path, stack)

@@ -9,11 +9,10 @@ from typing import Any
 
 import httpx2
 import pytest
-from typer.testing import CliRunner
 
 from slrig.bundle import read_calibration
-from slrig.cli.commands import app
 from tests.e2e.conftest import KEY, ServiceProcess, Start, scanned, serving
+from tests.unit.command import slrig
 
 SCENE = """
 name = "chessboard"
@@ -190,7 +189,7 @@ def test_a_camera_is_calibrated_alone_by_command_and_again_from_the_poses_of_the
     board = ["--board", "chessboard", "--corners", "8x5", "--square-mm", "20"]
 
     def calibrate(*arguments: str | Path, code: int = 0) -> str:
-        done = CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
+        done = slrig("calibrate", *arguments)
         assert done.exit_code == code, done.output
         return done.stdout if code == 0 else " ".join(done.stderr.split())
 

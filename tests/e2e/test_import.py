@@ -14,10 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from slrig.bundle import read_bundle, write_bundle
-from slrig.cli.commands import app
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Axis, Black, FloatArray, Gray, Pattern, Pixels, Size, White
@@ -26,6 +25,7 @@ from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.e2e.conftest import write_rig
 from tests.golden.test_bundles import reconstructed
+from tests.unit.command import slrig
 
 PROJECTOR = Size(200, 160)
 
@@ -106,7 +106,7 @@ def lay_out(folder: Path, images: Sequence[Pixels], name: str = "{:02}.png", *, 
 
 
 def run(*words: object) -> Result:
-    return CliRunner().invoke(app, ["import", *map(str, words)])
+    return slrig("import", *words)
 
 
 def imported(folder: Path, output: Path, *words: object, projector: str = "200x160") -> Path:
@@ -168,9 +168,7 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
 
     count = "expected 42 images for a projector of 1280 x 800"
     refused(whole, projector="1280x800", says=[count, "found 34"])
-    refused(whole, projector="200", says=["expected columns x rows as 1024x768, found '200'"])
     refused(whole, "--pattern", "white black columns", says=["expected 18 images", "found 34"])
-    refused(whole, "--pattern", "white xor-02", says=["'xor-02'", "XOR-02", "not read"])
     refused(whole, "--pattern", "white, black, columns, rows", says=["expected white, and 01.png black"])
     refused(whole, "--format", "slstudio", says=["expected 10, 8, 16 images", "phase shifts are not read"])
     refused(whole, "--format", "scan3d", "--names", "{bit}.png", says=["expected one of --format"])
@@ -179,7 +177,6 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     refused(tmp_path / "none", says=["expected a folder of images"])
     (whole / "07.png").unlink()
     refused(whole, says=["found 33 images"])
-    refused(whole, "--names", "{bit:02}.png", says=["expected bits 0 to 7"])
     cv2.imwrite(str(whole / "07.png"), images[7][:-1])
     refused(whole, says=["07.png: expected 40 x 32 of 8 bits as 00.png, found 40 x 31"])
     # Three steps of a phase instead of a code.

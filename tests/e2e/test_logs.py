@@ -10,9 +10,7 @@ import gc
 import json
 import logging
 import os
-import signal
 import socket
-import subprocess
 import sys
 import threading
 import warnings
@@ -25,10 +23,9 @@ import structlog
 
 from slrig import KEY_VARIABLE
 from slrig.api import server
-from slrig.client import Client
 from slrig.config import ServiceSettings, rig_of
 from slrig.jobs import worker_process
-from tests.e2e.conftest import STOP_LIMIT_S, ended
+from tests.e2e.conftest import Start, ended
 from tests.unit.api.conftest import ServedBench
 
 KEY = "Zm9vYmFy-_x0.key~of+the/tests"
@@ -98,32 +95,18 @@ def main(data: Path) -> None:
 
 
 @pytest.mark.slow
-def test_all_lines_have_one_form(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tests.e2e.test_logs", str(tmp_path / "data")]
-    with (tmp_path / "log").open("wb") as log:
-        process = subprocess.Popen(  # noqa: S603 - our own interpreter and code
-            command, stdout=subprocess.PIPE, stderr=log, env={**os.environ, KEY_VARIABLE: KEY}
-        )
-    try:
-        assert process.stdout is not None
-        greeting = process.stdout.readline().decode()
-        assert " at http://" in greeting, (tmp_path / "log").read_text()
-        url = greeting.split(" at ")[1].split(",")[0]
-        address = urlsplit(url)
-        with socket.create_connection((address.hostname, address.port), timeout=10) as malformed:
-            malformed.sendall(f"GET\r\nAuthorization Bearer {KEY}\r\n\r\n".encode())
-            assert malformed.recv(100).startswith(b"HTTP/1.1 400")
-        with Client(url, KEY) as client:
-            scan = client.scans.start(label="one")
-            assert ended(client, scan)["state"] == "succeeded"
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(STOP_LIMIT_S) == 1
-    finally:
-        process.kill()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
-    written = (tmp_path / "log").read_text()
+def test_all_lines_have_one_form(start: Start, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    service = start(data, data, program=("tests.e2e.test_logs", str(data)), **{KEY_VARIABLE: KEY})
+    address = urlsplit(service.url)
+    with socket.create_connection((address.hostname, address.port), timeout=10) as malformed:
+        malformed.sendall(f"GET\r\nAuthorization Bearer {KEY}\r\n\r\n".encode())
+        assert malformed.recv(100).startswith(b"HTTP/1.1 400")
+    with service.client(KEY) as client:
+        scan = client.scans.start(label="one")
+        assert ended(client, scan)["state"] == "succeeded"
+    assert service.stop() == 1
+    written = service.log.read_text()
     lines = [json.loads(line) for line in written.splitlines()]
     assert all({"event", "level", "logger", "timestamp"} <= set(line) for line in lines)
     assert all(isinstance(line["event"], str) and line["timestamp"].endswith("Z") for line in lines)

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import httpx2
 import pytest
-from typer.testing import CliRunner
 
-from slrig.cli.commands import app
 from tests.e2e.conftest import KEY, serving, write_rig
+from tests.unit.command import done
 
 FILES = (
     "mesh.ply", "mesh.glb", "mesh.obj", "points.ply", "preview.png", "report.json", "rejected-left.png",
@@ -21,12 +20,6 @@ FILES = (
 
 FORMATS = ("mesh.ply", "mesh.glb", "mesh.obj", "points-left.npz")
 """Of these, those that `slrig reconstruct` writes, too."""
-
-
-def slrig(*words: str | Path) -> str:
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == 0, result.output
-    return result.stdout
 
 
 @pytest.mark.parametrize(
@@ -39,7 +32,7 @@ def test_a_scan_of_the_rendered_rig_gives_a_mesh_and_its_bundle_gives_it_again(
     with serving(write_rig(tmp_path / "rig"), tmp_path / "data") as service:
         monkeypatch.setenv("SLRIG_API_KEY", KEY)
         chosen = [word for name in files for word in ("--file", name)]
-        said = slrig("scan", "--url", service.url, "--output", output, "--label", "walk", *chosen)
+        said = done("scan", "--url", service.url, "--output", output, "--label", "walk", *chosen)
         with service.client() as client:
             (scan,) = client.get("/scan")["scans"]
         # The events of all jobs begin after the last one that a client has had.
@@ -56,6 +49,6 @@ def test_a_scan_of_the_rendered_rig_gives_a_mesh_and_its_bundle_gives_it_again(
     with zipfile.ZipFile(output / "bundle.zip") as archive:
         archive.extractall(tmp_path / "bundle")
     more = [word for name in ("mesh.obj", "points-left.npz") if name in files for word in ("--file", name)]
-    slrig("reconstruct", tmp_path / "bundle", "--output", again, *more)
+    done("reconstruct", tmp_path / "bundle", "--output", again, *more)
     for name in set(FORMATS) & set(files):
         assert (again / name).read_bytes() == (output / name).read_bytes()
