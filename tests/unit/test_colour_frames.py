@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from drivers.replay import ReplayHead
 from slrig.bundle import read_bundle, read_capture, write_bundle
 from slrig.bundle.reading import open_bundle
-from slrig.capture.evidence import EvidenceSummary
 from slrig.devices import ProjectorInfo
 from slrig.errors import BundleError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, CameraFormat, Capture, Gray, PatternSequence, Pixels, Primary, Shot, Size, White
@@ -24,12 +23,12 @@ from slrig.model.header import CaptureHeader
 from slrig.patterns.sequence import encode
 from slrig.reconstruction.fusion import FusedFrames, fused_colour
 from slrig.reconstruction.noise import NoiseModel
-from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import in_colour
 from slrig.scan.stream import CameraResult, ScanStream
 from tests.samples import CAMERA, noise, sample_calibration, sample_capture
 from tests.unit.capture.fake_rig import CameraFaults, FakeRig, fake_rig
+from tests.unit.scan.test_acquisition import Sink, captured
 
 ENDS = White | Black
 PROJECTOR = ProjectorInfo("projector", "plain", "1", Size(64, 48), plays=False, latency_s=0.0)
@@ -140,22 +139,6 @@ def test_a_writer_refuses_colour_of_another_type_or_beyond_full_scale(tmp_path: 
         replace(shot, colour=shot.colour[..., :2])
 
 
-class Sink:
-    """Hears what a reconstruction would."""
-
-    def __init__(self) -> None:
-        self.shots: list[Shot] = []
-
-    def begin(self, *_: object) -> None:
-        pass
-
-    def take(self, shot: Shot) -> None:
-        self.shots.append(shot)
-
-    def end(self, evidence: EvidenceSummary) -> None:
-        pass
-
-
 def coloured_rig(**faults: Any) -> FakeRig:
     """A rig whose left camera has colour."""
     fake = fake_rig(faults={"left": CameraFaults(**faults)})
@@ -163,18 +146,10 @@ def coloured_rig(**faults: Any) -> FakeRig:
     return fake
 
 
-def captured(fake: FakeRig, folder: Path, plan: ScanPlan | None = None) -> list[Shot]:
-    sink = Sink()
-    capture_frames(
-        fake.rig, plan or ScanPlan(), folder, progress=lambda *_: None, cancelled=lambda: False, frames=sink
-    ).finish()
-    return sink.shots
-
-
 def test_a_scan_keeps_colour_of_white_and_black_where_a_camera_has_it_and_makes_no_other(tmp_path: Path) -> None:
-    fed = captured(fake := coloured_rig(), tmp_path / "bundle")
+    captured(fake := coloured_rig(), tmp_path / "bundle", sink := Sink())
     capture = read_bundle(tmp_path / "bundle").capture
-    for shots in (fed, capture.shots):
+    for shots in (sink.shots, capture.shots):
         assert sum(shot.colour is not None for shot in shots) == fake.cameras["left"].coloured == 4
         for shot in shots:
             assert (shot.colour is not None) == (shot.camera == "left" and is_end(capture, shot))
@@ -192,11 +167,11 @@ def test_colour_of_a_refused_frame_is_not_kept(tmp_path: Path) -> None:
 
 
 def test_colour_is_left_out_or_refused_by_the_plan(tmp_path: Path) -> None:
-    captured(fake := coloured_rig(), tmp_path / "grey", ScanPlan(colour=False))
+    captured(fake := coloured_rig(), tmp_path / "grey", plan=ScanPlan(colour=False))
     assert fake.cameras["left"].coloured == 0
     assert not list((tmp_path / "grey").rglob("*-colour.png"))
     with pytest.raises(UnsupportedByDeviceError, match=r"colour \(--colour\): asked for, and camera 'right' has none"):
-        captured(coloured_rig(), tmp_path / "refused", ScanPlan(colour=True))
+        captured(coloured_rig(), tmp_path / "refused", plan=ScanPlan(colour=True))
     assert not (tmp_path / "refused").exists()
     infos = {name: camera.info for name, camera in coloured_rig().cameras.items() if name == "left"}
     assert in_colour(ScanPlan(colour=True), infos, PROJECTOR) == {"left"}
@@ -205,7 +180,7 @@ def test_colour_is_left_out_or_refused_by_the_plan(tmp_path: Path) -> None:
 def test_coloured_light_is_refused_in_words_before_there_is_any(tmp_path: Path) -> None:
     asked = ScanPlan(coloured_light=True)
     with pytest.raises(UnsupportedByDeviceError, match=r"coloured_light \(--coloured-light\): .* no lights of its own"):
-        captured(fake := fake_rig(), tmp_path / "refused", asked)
+        captured(fake := fake_rig(), tmp_path / "refused", plan=asked)
     assert fake.projector.shows == 0
     assert not (tmp_path / "refused").exists()
     cameras = {name: camera.info for name, camera in coloured_rig().cameras.items()}

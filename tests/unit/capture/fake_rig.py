@@ -25,7 +25,7 @@ from slrig.errors import (
 from slrig.model import CameraFormat, Frame, Pattern, PatternSequence, Pixels, Shot, Size, StageAxis
 from slrig.patterns.sequence import encode, scan_patterns
 
-EXPOSURE_NS = 10_000_000
+EXPOSURE_S = 0.01
 LATENCY_NS = 5_000_000
 PROJECTOR = Size(128, 96)
 CAMERA = Size(200, 150)
@@ -161,7 +161,7 @@ class FakeProjector:
     """Implements `Projector`. `swaps` shows another pattern than was asked for, and says nothing.
 
     missing_pulses, extra_pulses : indices of patterns that a wire trigger does not tell of, or before which it comes
-    once too often; in the first `spoilt_plays` plays.
+    once too often; in the first `spoilt_plays` plays. dark_from_show : the showing at which its lamp goes off.
     """
 
     world: World
@@ -171,6 +171,7 @@ class FakeProjector:
     lamp_off: bool = False
     swaps: Mapping[int, int] = field(default_factory=dict)
     gone_at_show: int | None = None
+    dark_from_show: int | None = None
     interrupt_at_show: int | None = None
     missing_pulses: frozenset[int] = frozenset()
     extra_pulses: frozenset[int] = frozenset()
@@ -206,6 +207,7 @@ class FakeProjector:
             raise DeviceGoneError(message)
         if self.shows == self.interrupt_at_show:
             raise KeyboardInterrupt
+        self.lamp_off = self.lamp_off or self.shows == self.dark_from_show
         self.shows += 1
         self._light(index)
         self.world.now_ns += LATENCY_NS
@@ -298,7 +300,11 @@ class CameraFaults:
 
 @dataclass
 class FakeCamera:
-    """Implements `Camera`. coloured : how often a frame was asked for its colour; None of a mono camera."""
+    """Implements `Camera`. coloured : how often a frame was asked for its colour; None of a mono camera.
+
+    white : light under the white pattern in 10 ms, over full scale: frames are brighter, the longer they are exposed.
+    None: as the scene has it. pushed_at : the setting of an exposure at which the camera is pushed aside.
+    """
 
     name: str
     world: World
@@ -312,6 +318,9 @@ class FakeCamera:
     dropped: int = 0
     gone: bool = False
     coloured: int | None = None
+    white: float | None = None
+    pushed_at: int | None = None
+    exposures_s: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.world.on_wire.append(self._on_wire)
@@ -327,6 +336,12 @@ class FakeCamera:
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         self.world.calls.append(f"configure {self.name}")
+        self.exposures_s.append(settings.exposure_s)
+        if self.white is not None:
+            times = settings.exposure_s / EXPOSURE_S
+            self.scene.white, self.scene.ambient = self.white * times, 0.02 * times
+        if len(self.exposures_s) == self.pushed_at:
+            self.scene.column_px = self.scene.column_px + 2 * self.scene.columns_per_px
         faults = self.faults
         return AppliedSettings(settings.exposure_s * faults.readback, settings.gain, faults.least_period_s)
 
@@ -359,17 +374,18 @@ class FakeCamera:
                 0, self.scene.format.full_scale, image[rows : 2 * rows].shape, image.dtype
             )
         self.last_image = image
+        exposure_s = self.exposures_s[-1] if self.exposures_s else EXPOSURE_S
         start_ns = self.world.now_ns - LATENCY_NS if number in self.faults.early else self.world.now_ns + 2_000
         self.pending.append(
             Frame(
                 camera=self.name,
                 image=image,
                 t_start_ns=start_ns,
-                t_end_ns=start_ns + EXPOSURE_NS,
+                t_end_ns=start_ns + round(exposure_s * 1e9),
                 t_err_ns=100,
                 sequence_number=number - 1 if number in self.faults.same_number else number,
                 dropped_count=self.dropped,
-                exposure_s=EXPOSURE_NS / 1e9 * (1.5 if number in self.faults.over_exposed else 1.0),
+                exposure_s=exposure_s * (1.5 if number in self.faults.over_exposed else 1.0),
                 gain=1.0,
                 colour=None if self.coloured is None else lambda: self._in_colour(image),
             )
@@ -429,9 +445,10 @@ def fake_rig(
     projector: Mapping[str, object] | None = None,
     faults: Mapping[str, CameraFaults] | None = None,
     triggers: Mapping[str, frozenset[Trigger]] | None = None,
-    cameras: Sequence[str] = ("left", "right"),
+    cameras: Sequence[str] | Mapping[str, float] = ("left", "right"),
     noise_dn: float = 0.8,
 ) -> FakeRig:
+    """A rig of these cameras. cameras : with the `white` of each, if exposures matter."""
     world = World()
     shown_by = FakeProjector(world, **(projector or {}))  # type: ignore[arg-type]
     fakes = {
@@ -441,8 +458,9 @@ def fake_rig(
             Scene(noise_dn=noise_dn, seed=index, first_column_px=4.0 + 3 * index),
             (triggers or {}).get(name, frozenset({Trigger.SOFTWARE})),
             (faults or {}).get(name, CameraFaults()),
+            white=cameras[name] if isinstance(cameras, Mapping) else None,
         )
         for index, name in enumerate(cameras)
     }
-    settings = {name: CameraSettings(EXPOSURE_NS / 1e9) for name in cameras}
+    settings = {name: CameraSettings(EXPOSURE_S) for name in cameras}
     return FakeRig(world, shown_by, fakes, Rig("fake", fakes, shown_by, settings, clock=WorldClock(world)))

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Projector
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FrameSink
 from slrig.jobs.rig_jobs import Recorded
-from slrig.model import Black, Calibration, CameraFormat, Frame, PatternSequence, Shot, Size, White
+from slrig.model import Black, Calibration, CameraFormat, Frame, Shot, Size, White
 from slrig.model.header import CaptureHeader
 from slrig.scan.plan import ScanPlan
 
@@ -45,8 +46,14 @@ class SetClock:
         self.now += timedelta(**by)
 
 
+def never(*given: Any, **options: Any) -> Any:
+    raise AssertionError(given, options)
+
+
 class TameCamera:
     """A camera that is never exposed: the fake capture reads none."""
+
+    arm = trigger = disarm = staticmethod(never)
 
     def __init__(self) -> None:
         self.closed = False
@@ -64,17 +71,8 @@ class TameCamera:
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         return AppliedSettings(settings.exposure_s, settings.gain)
 
-    def arm(self, count: int, trigger: Trigger) -> None:
-        raise AssertionError((count, trigger))
-
-    def trigger(self) -> None:
-        raise AssertionError
-
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         raise AssertionError((after_ns, timeout_s))
-
-    def disarm(self) -> None:
-        raise AssertionError
 
     def close(self) -> None:
         self.closed = True
@@ -85,21 +83,17 @@ class TameCamera:
 class TameProjector:
     """A projector that remembers whether it is dark."""
 
+    load = play = staticmethod(never)
+
     def __init__(self) -> None:
         self.dark = True
         self.closed = False
         self.blank_error: Exception | None = None
         self.info = ProjectorInfo("projector", "tame", "2", Size(64, 40), plays=False, latency_s=0.0)
 
-    def load(self, sequence: PatternSequence) -> None:
-        raise AssertionError(sequence)
-
     def show(self, index: int) -> Shown:
         self.dark = False
         return Shown(index, 0, 0)
-
-    def play(self, exposure_s: float, period_s: float) -> None:
-        raise AssertionError((exposure_s, period_s))
 
     def stop(self) -> None:
         self.dark = True

@@ -105,14 +105,6 @@ def test_it_says_what_to_change(
     assert any(words in advice for advice in found.advice), found
 
 
-def test_the_command_needs_no_calibration(tmp_path: Path) -> None:
-    bundle, out = recorded(tmp_path / "bundle"), tmp_path / "out"
-    told = CliRunner().invoke(app, ["reconstruct", str(bundle), "--output", str(out), "--decode-only"])
-    assert told.exit_code == 0
-    assert "camera 'sample', columns" in told.stdout
-    assert (out / "position-sample-column.png").exists()
-
-
 def test_frames_without_a_code_are_refused(tmp_path: Path) -> None:
     capture, _ = sample_scan()
     kept = [index for index, pattern in enumerate(capture.patterns) if not isinstance(pattern, Gray)]

@@ -16,13 +16,18 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
+from numpy.typing import NDArray
 
-from slrig.bundle import read_bundle, write_bundle
+from slrig.bundle import BundleWriter, read_bundle, read_calibration, write_bundle, write_calibration
+from slrig.bundle.description import read_description
 from slrig.bundle.images import read_with_colour as read_frame_pages
 from slrig.bundle.notes import write_notes
 from slrig.bundle.reading import MOST_READERS, open_bundle
 from slrig.bundle.stage import StageAngle, write_stage
 from slrig.capture.evidence import check_capture
+from slrig.config import read_rig
+from slrig.discovery import open_rig
 from slrig.errors import (
     BundleError,
     CalibrationError,
@@ -33,15 +38,19 @@ from slrig.errors import (
     SlrigError,
 )
 from slrig.jobs.versions import versions
-from slrig.model import Axis, Black, Capture, Gray, LineShift, Pixels, Refusal, Shot, Size, White
+from slrig.model import Axis, Black, Calibration, Capture, Gray, LineShift, Pixels, Refusal, Shot, Size, Solved, White
 from slrig.model.header import CaptureHeader
+from slrig.scan.acquisition import capture_frames
+from slrig.scan.artefacts import write_converted
 from slrig.scan.measured import measured
-from slrig.scan.plan import ReconstructionPlan
+from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle, reconstruct_into
+from slrig.scan.report import calibration_report
 from slrig.scan.stream import LiveScan, ScanStream
+from tests.golden.test_light_axis import BALL, Device, rig_file
 from tests.prepared_bundles import prepared_bundle
 
-Read = tuple[Path, dict[str, object]]
+Read = tuple[Path, dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
@@ -55,20 +64,24 @@ def both_axes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def from_above(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return prepared_bundle(tmp_path_factory, "ball from above")
-
-
-@pytest.fixture(scope="module")
 def read(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Read:
     """The folder of a mesh that was made of the bundle, and its report."""
     output = tmp_path_factory.mktemp("read") / "out"
     return output, run(recorded, output)
 
 
-def run(bundle: Path, output: Path, *, live: LiveScan | None = None, **options: object) -> dict[str, object]:
-    plan = ReconstructionPlan(**options)  # type: ignore[arg-type]
-    return reconstruct_bundle(bundle, output, plan=plan, progress=lambda *_: None, cancelled=lambda: False, live=live)
+def run(
+    bundle: Path, output: Path, *, live: LiveScan | None = None, calibration: Path | None = None, **options: Any
+) -> dict[str, Any]:
+    return reconstruct_bundle(
+        bundle,
+        output,
+        plan=ReconstructionPlan(**options),
+        calibration=calibration,
+        progress=lambda *_: None,
+        cancelled=lambda: False,
+        live=live,
+    )
 
 
 def changed(recorded: Path, folder: Path, change: Callable[[Shot, Capture], Shot | None]) -> Path:
@@ -109,7 +122,7 @@ def test_a_scan_of_the_rendered_rig_is_a_mesh_with_its_files(read: Read) -> None
         row, column = (each[len(each) // 2] for each in np.nonzero(causes == Refusal.NOT_LIT))
         at = (int((row + 0.5) / causes.shape[0] * height), int((column + 0.5) / causes.shape[1] * width))
         assert tuple(picture[at]) == (30, 26, 24)
-    assert written["mesh"]["initial"] == report["mesh"]["initial"]  # type: ignore[index]
+    assert written["mesh"]["initial"] == report["mesh"]["initial"]
     assert written["computed"] == {"where": "local", "host": platform.node(), "versions": dict(versions())}
     initial = written["mesh"]["initial"]
     assert initial["triangles"] == initial["strip_triangles"] - initial["dropped_triangles"]
@@ -134,8 +147,8 @@ def test_results_of_an_earlier_run_are_replaced_and_other_folders_are_not(record
 
 @pytest.mark.slow
 def test_holes_are_kept_on_request(recorded: Path, tmp_path: Path) -> None:
-    filled = run(recorded, tmp_path / "filled")["mesh"]["initial"]  # type: ignore[index]
-    kept = run(recorded, tmp_path / "kept", keep_holes=True)["mesh"]["initial"]  # type: ignore[index]
+    filled = run(recorded, tmp_path / "filled")["mesh"]["initial"]
+    kept = run(recorded, tmp_path / "kept", keep_holes=True)["mesh"]["initial"]
     assert kept["strip_triangles"] == filled["strip_triangles"]
     assert filled["dropped_at_bridges"] == 0
     assert kept["triangles"] <= filled["triangles"]
@@ -211,15 +224,9 @@ def test_lines_that_were_never_shown_are_made_up_for_by_code_edges_and_told(reco
     bundle = changed(recorded, tmp_path / "no-lines", no_lines)
     write_notes(bundle, ["what its capture told"])
     report = run(bundle, tmp_path / "out")
-    assert report["notes"][0] == "what its capture told"  # type: ignore[index]
-    assert any("does not resolve the shifted lines on 100%" in note for note in report["notes"])  # type: ignore[attr-defined]
-    assert all(camera["lit_without_lines"] > 0.99 for camera in report["cameras"].values())  # type: ignore[attr-defined]
-
-
-@pytest.mark.slow
-def test_without_white_and_black_the_inverses_do(recorded: Path, tmp_path: Path) -> None:
-    report = run(changed(recorded, tmp_path / "no-pair", without("white", "black")), tmp_path / "out")
-    assert report["mesh"]["points"] > 1000  # type: ignore[index]
+    assert report["notes"][0] == "what its capture told"
+    assert any("does not resolve the shifted lines on 100%" in note for note in report["notes"])
+    assert all(camera["lit_without_lines"] > 0.99 for camera in report["cameras"].values())
 
 
 def test_a_projector_smaller_than_the_code_is_refused(recorded: Path, tmp_path: Path) -> None:
@@ -247,27 +254,6 @@ def test_a_cancelled_reconstruction_leaves_nothing(recorded: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_the_axis_that_the_camera_stands_beside_is_used(from_above: Path, tmp_path: Path) -> None:
-    report = run(from_above, tmp_path / "out")
-    assert report["axis"] == "row"
-    assert report["truth"]["rms_mm"] < 0.05  # type: ignore[index]
-    assert report["truth"]["complete_0.3mm"] > 0.90  # type: ignore[index]
-
-
-@pytest.mark.slow
-def test_rows_alone_are_enough(from_above: Path, tmp_path: Path) -> None:
-    def rows(shot: Shot, capture: Capture) -> Shot | None:
-        return shot if getattr(capture.patterns[shot.pattern], "axis", Axis.ROW) is Axis.ROW else None
-
-    bundle = changed(from_above, tmp_path / "rows", rows)
-    for name in ("truth.ply", "visible_points.npy"):
-        shutil.copy(from_above / name, bundle / name)
-    report = run(bundle, tmp_path / "out")
-    assert report["axis"] == "row"
-    assert report["truth"]["rms_mm"] < 0.05  # type: ignore[index]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("shifts", [(0,), (0, 2, 4, 6), (0, 1, 2, 5)])
 def test_some_of_the_line_shifts_make_a_coarser_mesh(
     tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, shifts: tuple[int, ...]
@@ -282,8 +268,8 @@ def test_some_of_the_line_shifts_make_a_coarser_mesh(
     for name in ("truth.ply", "visible_points.npy"):
         shutil.copy(truthful / name, bundle / name)
     truth = run(bundle, tmp_path / "out")["truth"]
-    assert truth["rms_mm"] < 0.05  # type: ignore[index]
-    assert truth["complete_0.3mm"] > 0.90  # type: ignore[index]
+    assert truth["rms_mm"] < 0.05
+    assert truth["complete_0.3mm"] > 0.90
 
 
 def seen_live(bundle: Path, *, upside_down: bool = False, last_exposure_s: float | None = None) -> LiveScan:
@@ -310,7 +296,7 @@ def assert_alike(output: Path, report: dict[str, object], read: Read) -> None:
 
 def test_frames_taken_live_give_the_bytes_that_the_bundle_gives(recorded: Path, read: Read, tmp_path: Path) -> None:
     live = run(recorded, tmp_path / "live", live=seen_live(recorded))
-    assert "wait for frames" in live["stages_s"]  # type: ignore[operator]
+    assert "wait for frames" in live["stages_s"]
     assert_alike(tmp_path / "live", live, read)
 
 
@@ -347,7 +333,7 @@ def test_frames_that_were_judged_as_they_were_captured_are_not_judged_again(
     assert told[0] == "read bundle"
     assert sorted(set(told)) == sorted(told)
     assert "check frames" not in judged["stages_s"]  # type: ignore[operator]
-    assert "check frames" in read[1]["stages_s"]  # type: ignore[operator]
+    assert "check frames" in read[1]["stages_s"]
     assert_alike(tmp_path / "judged", dict(judged), read)
 
 
@@ -373,8 +359,8 @@ def test_frames_taken_live_that_are_not_those_of_the_bundle_are_passed_over(
         live.evidence = None
     report = run(bundle, tmp_path / "out", live=live)
     # Upside down there would be hardly anything.
-    assert report["mesh"]["points"] > 1000  # type: ignore[index]
-    assert "check frames" in report["stages_s"]  # type: ignore[operator]
+    assert report["mesh"]["points"] > 1000
+    assert "check frames" in report["stages_s"]
 
 
 # Frames are read one after another: the same in whatever order they are listed, and few in memory
@@ -451,7 +437,7 @@ def test_axes_of_two_exposures_wait_for_one_another(both_axes: Path, tmp_path: P
 
     shots = tuple(exposed(shot) for shot in capture.shots)
     write_bundle(tmp_path / "bundle", replace(capture, shots=shots), bundle.calibration)
-    assert run(tmp_path / "bundle", tmp_path / "out")["mesh"]["points"] > 1000  # type: ignore[index]
+    assert run(tmp_path / "bundle", tmp_path / "out")["mesh"]["points"] > 1000
 
 
 def test_frames_are_read_a_few_ahead(both_axes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -491,3 +477,173 @@ def test_the_first_frame_that_cannot_be_read_is_told(both_axes: Path, tmp_path: 
         (tmp_path / "bundle" / "frames" / bundle.capture.shots[0].camera / f"{number:03d}.png").write_bytes(b"")
     with pytest.raises(BundleError, match=r"004\.png"):
         list(open_bundle(tmp_path / "bundle").shots(range(len(bundle.capture.shots))))
+
+
+# ---- Which axis a recording of both is triangulated by: the calibration's, unless what the frames hold says otherwise
+
+
+# The baseline lies across columns a little more than across rows.
+CAMERA: Device = {
+    "size_px": (240, 200), "focal_px": (1100.0, 1100.0), "position_mm": (-130.0, -110.0, -560.0),
+    "target_mm": (0.0, 0.0, 0.0), "blur_px": 0.6, "saturation_s": 0.02,
+}  # fmt: skip
+PROJECTOR: Device = {
+    "size_px": (96, 96), "focal_px": (480.0, 480.0), "position_mm": (0.0, 0.0, -600.0),
+    "target_mm": (0.0, 0.0, 0.0), "blur_px": 0.3,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def slanted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("slanted")
+    with open_rig(read_rig(rig_file(folder / "rig", BALL, PROJECTOR, CAMERA))) as rig:
+        plan = ScanPlan(patterns=PatternPlan(rows=True, line_shift=False, gray_cell_px=1))
+        capture_frames(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
+    return folder / "bundle"
+
+
+def smeared(recorded: Path, folder: Path, axis: Axis, width: int, *, from_px: int = 60) -> Path:
+    """A copy whose code of an axis is smeared across its stripes from a column of the image on."""
+    bundle = read_bundle(recorded)
+
+    def change(shot: Shot) -> Shot:
+        pattern = bundle.capture.patterns[shot.pattern]
+        if not isinstance(pattern, Gray) or pattern.axis is not axis:
+            return shot
+        image = cv2.blur(shot.image, (width, 1) if axis is Axis.COLUMN else (1, width))
+        image[:, :from_px] = shot.image[:, :from_px]
+        return replace(shot, image=np.asarray(image, dtype=shot.image.dtype))
+
+    write_bundle(folder, replace(bundle.capture, shots=tuple(map(change, bundle.capture.shots))), bundle.calibration)
+    return folder
+
+
+@pytest.mark.slow
+def test_the_axis_that_decodes_far_more_is_used_and_told(slanted: Path, tmp_path: Path) -> None:
+    walked, _ = measured(slanted, None, None, lambda *_: None, axis=None)
+    assert walked.axis is Axis.COLUMN
+    assert not any("triangulated by" in note for note in walked.notes)
+    worse = smeared(slanted, tmp_path / "worse", Axis.COLUMN, 121)
+    walked, found = measured(worse, None, None, lambda *_: None, axis=None)
+    assert walked.axis is Axis.ROW
+    (note,) = (note for note in walked.notes if note.startswith("triangulated by rows"))
+    assert "the columns, which cross the baseline more steeply, decode" in note
+    assert len(found.joined.curves.points_mm) > 1000
+    asked, _ = measured(worse, None, None, lambda *_: None, axis=Axis.COLUMN)
+    assert asked.axis is Axis.COLUMN
+
+
+def test_both_axes_are_tried_and_the_first_kept_where_the_other_is_worse(slanted: Path, tmp_path: Path) -> None:
+    worse = smeared(
+        smeared(slanted, tmp_path / "worse", Axis.COLUMN, 121), tmp_path / "worst", Axis.ROW, 191, from_px=0
+    )
+    stages: list[str] = []
+    walked, _ = measured(worse, None, None, lambda stage, _fraction, _detail: stages.append(stage), axis=None)
+    assert stages.count("triangulate") == 2
+    assert walked.axis is Axis.COLUMN
+
+
+# ---- A scan carries its calibration: which one, how old, and its share of every vertex's standard deviation
+
+
+BOX = np.array([[-40.0, -40, -40], [40, 40, 40]])
+
+
+def stating(calibration: Calibration, scale: float = 1.0, solved_at: str = "2026-01-02T03:04:05+00:00") -> Calibration:
+    """The calibration with an error of its own: the projector's principal point and place, in px and mm."""
+    deviations = np.zeros(30)
+    deviations[[15 + 2, 15 + 12, 15 + 14]] = 0.05 * scale, 0.02 * scale, 0.03 * scale
+    return replace(calibration, solved=Solved("solve-7", solved_at, np.diag(deviations**2), BOX, 0.0123))
+
+
+def vertices(path: Path) -> dict[str, NDArray[Any]]:
+    data = trimesh.load(path, process=False).metadata["_ply_raw"]["vertex"]["data"]
+    return {name: data[name].ravel() for name in data.dtype.names}
+
+
+@pytest.fixture(scope="module")
+def solved(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Read:
+    folder = tmp_path_factory.mktemp("solved")
+    write_calibration(folder / "solved.json", stating(read_calibration(recorded / "calibration.json")))
+    return folder / "out", run(recorded, folder / "out", calibration=folder / "solved.json")
+
+
+@pytest.mark.slow
+def test_every_vertex_states_its_share(recorded: Path, read: Read, solved: Read) -> None:
+    output, report = solved
+    for name in ("mesh.ply", "points.ply"):
+        before, found = vertices(read[0] / name), vertices(output / name)
+        assert [key for key in found if key not in before] == ["sigma_calibration_mm"]
+        share = found["sigma_calibration_mm"]
+        assert np.isfinite(share).all()
+        assert (share > 0).all()
+        assert found["sigma_mm"] == pytest.approx(np.hypot(before["sigma_mm"], share), rel=1e-5)
+        for key in before:
+            # The points themselves are the same.
+            assert key == "sigma_mm" or np.array_equal(found[key], before[key], equal_nan=True)
+    data = vertices(output / "mesh.ply")
+    told = report["calibration"]
+    assert read[1]["calibration"]["absent"]
+    assert told["id"] == "solve-7"
+    assert told["solved_at"] == "2026-01-02T03:04:05+00:00"
+    assert told["expected_error_mm"] == 0.0123
+    assert told["sigma_share"] == pytest.approx(
+        np.median((data["sigma_calibration_mm"] / data["sigma_mm"]) ** 2), rel=1e-4
+    )
+    assert told["sigma_calibration_mm"] == pytest.approx(np.median(data["sigma_calibration_mm"]), rel=1e-4)
+    captured_at = read_description(recorded).captured_at
+    assert captured_at is not None
+    assert told["age_days"] == pytest.approx(captured_at.timestamp() / 86400 - 1767323045 / 86400, abs=1e-3)
+    write_converted(output, "mesh.stl")
+    write_converted(read[0], "mesh.stl")
+    assert (output / "mesh.stl").read_bytes() == (read[0] / "mesh.stl").read_bytes()
+
+
+@pytest.mark.slow
+def test_twice_the_error_has_twice_the_share(recorded: Path, solved: Read, tmp_path: Path) -> None:
+    write_calibration(tmp_path / "twice.json", stating(read_calibration(recorded / "calibration.json"), 2.0))
+    run(recorded, tmp_path / "out", calibration=tmp_path / "twice.json")
+    once, twice = (vertices(each / "mesh.ply")["sigma_calibration_mm"] for each in (solved[0], tmp_path / "out"))
+    assert twice == pytest.approx(2 * once, rel=1e-4)
+
+
+def test_a_calibration_that_says_nothing_of_its_error_has_an_id_and_words(recorded: Path) -> None:
+    calibration = read_calibration(recorded / "calibration.json")
+    told = calibration_report(calibration, recorded, np.ones(3, dtype=np.float32), None)
+    assert told.pop("id") == calibration.digest
+    assert "says nothing of its own error" in str(told.pop("absent"))
+    assert told == dict.fromkeys(("solved_at", "age_days", "expected_error_mm", "sigma_share"))
+
+
+@pytest.mark.parametrize(
+    ("solved_at", "words"),
+    [
+        ("2026-01-02T03:04:05", "without the offset from UTC"),
+        ("last week", "says 'last week' where the date of its solve should be"),
+    ],
+)
+def test_an_age_that_is_not_known_is_null_with_the_reason(recorded: Path, solved_at: str, words: str) -> None:
+    calibration = stating(read_calibration(recorded / "calibration.json"), solved_at=solved_at)
+    told = calibration_report(calibration, recorded, np.ones(3, dtype=np.float32), np.full(3, 0.5))
+    assert told["age_days"] is None
+    assert words in str(told["age_absent"])
+    assert told["sigma_share"] == 0.25
+
+
+def test_a_bundle_that_does_not_say_when_it_was_captured(recorded: Path, tmp_path: Path) -> None:
+    bundle = read_bundle(recorded)
+    capture = bundle.capture
+    with BundleWriter(tmp_path / "old", capture.projector, capture.patterns, capture.cameras) as writer:
+        writer.add(capture.shots[0])
+    assert "captured_at" not in (tmp_path / "old" / "bundle.json").read_text()
+    calibration = stating(read_calibration(recorded / "calibration.json"))
+    told = calibration_report(calibration, tmp_path / "old", np.ones(3, dtype=np.float32), np.full(3, np.nan))
+    assert told["age_absent"] == "the bundle does not say when it was captured"
+    assert told["sigma_share"] is None
+
+
+def test_a_time_of_capture_without_offset_is_refused(recorded: Path, tmp_path: Path) -> None:
+    data = json.loads((recorded / "bundle.json").read_text())
+    (tmp_path / "bundle.json").write_text(json.dumps({**data, "captured_at": "2026-11-22T06:00:00"}))
+    with pytest.raises(BundleError, match="captured_at"):
+        read_description(tmp_path)

@@ -265,14 +265,6 @@ def test_the_mesh_is_announced_before_the_scan_is_over(bench: Bench) -> None:
 # A restart
 
 
-def test_closing_leaves_all_that_are_reconstructed_to_the_next_start(bench: Bench) -> None:
-    first, second = computing(bench), bench.until(bench.scan().id, JobState.COMPUTING)
-    bench.runner.close()
-    assert {bench.store.get(each.id).state for each in (first, second)} == {JobState.COMPUTING}
-    assert sweep(bench.store, bench.folder).resumed == (first.id, second.id)
-    assert (bench.folder.staging(first.id) / "bundle" / "bundle.json").is_file()
-
-
 def test_scans_that_a_kill_left_are_taken_up_again(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     cut_off = bench.store.create(plan_json(ScanPlan()), rig="bench", label="cut off").id
