@@ -111,44 +111,6 @@ def test_corners_lie_where_they_are_within_what_they_state(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("board", [CHARUCO, CHESSBOARD], ids=title)
-def test_corners_are_placed_better_than_opencv_places_them(board: Board) -> None:
-    seen_by = eye(board, **FINE)
-    image = shot(board, seen_by)
-    ours = misses(find_board(image, board, full_scale=255), board, seen_by)
-    if board.kind is BoardKind.CHESSBOARD:
-        flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
-        _, found = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
-        theirs = found.reshape(-1, 2)
-        truth = seen_by.seen(board_points(board))
-        if np.hypot(*(theirs[0] - truth[0])) > 5:
-            theirs = theirs[::-1]
-        off = theirs - truth
-    else:
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
-        printed = cv2.aruco.CharucoBoard((board.columns + 1, board.rows + 1), 14.0, 10.5, dictionary)
-        found, numbers, *_ = cv2.aruco.CharucoDetector(printed).detectBoard(image)
-        off = found.reshape(-1, 2) - seen_by.seen(board_points(board)[numbers.ravel()])
-    assert np.sqrt((ours**2).mean()) < 0.6 * np.sqrt((off**2).mean())
-
-
-@pytest.mark.slow
-def test_the_centre_of_a_circle_is_not_the_centre_of_its_ellipse() -> None:
-    seen_by = eye(CIRCLES, tilt_deg=(40.0, 0.0), roll_deg=0.0, distance_mm=150.0, **FINE)
-    image = painted(CIRCLES, seen_by, samples=8)
-    view = find_board(image, CIRCLES, full_scale=1.0)
-    off = misses(view, CIRCLES, seen_by)
-    assert np.sqrt((off**2).mean()) < 0.01
-    # What would be wrong without the correction: the moment of each painted circle, found on its own.
-    dark = (image < 0.4).astype(np.uint8)
-    count, _, _, middles = cv2.connectedComponentsWithStats(dark)
-    truth = seen_by.seen(board_points(CIRCLES))
-    nearest = [middles[np.linalg.norm(middles - place, axis=1).argmin()] for place in truth]
-    assert count > CIRCLES.corner_count
-    assert np.abs(np.mean(np.array(nearest) - truth, axis=0)).max() > 10 * np.abs(off.mean(axis=0)).max()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.3, 0.4, 0.6])
 def test_circles_of_any_radius_are_found(radius: float) -> None:
     seen_by = eye(CIRCLES, **FINE)

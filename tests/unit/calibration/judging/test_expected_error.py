@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from slrig.calibration.board import Board, BoardKind, BoardShape
-from slrig.calibration.displacement import modes_of, moved_points, rigid_free
+from slrig.calibration.displacement import modes_of, moved_points, rigid_free, without_rigid_motion
+from slrig.calibration.judging.comparison import comparison
 from slrig.calibration.judging.expected_error import expected_error, volume_of
+from slrig.calibration.judging.grades import Grade
+from slrig.calibration.judging.odd_even import odd_even
+from slrig.calibration.judging.verdict import verdict
 from slrig.calibration.observations import COLUMN, ROW, Correspondences, Observations, PoseObservation
-from slrig.calibration.solution import BoardPose, Solution
+from slrig.calibration.solution import BoardPose, Half, Solution
 from slrig.calibration.solving.solve import solve
 from slrig.errors import CalibrationError
-from slrig.model import Calibration, FloatArray, Pinhole
+from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
 from slrig.reconstruction.surface_fit import stencils
+from tests.unit.calibration.judging.test_verdict import EXPECTED
 from tests.unit.calibration.perturbed import (
     aligned,
     changed,
@@ -280,3 +288,261 @@ def test_a_board_that_never_left_one_plane_is_refused_with_words() -> None:
     flat = {"only": BoardPose(np.eye(3), np.array([-45.0, -35, 600]))}
     with pytest.raises(CalibrationError, match=r"all corners of 1 poses in one plane.*tilt the board"):
         expected_error(replace(solution, poses=flat), observations)
+
+
+# ---- Two halves of a solve against each other: in millimetres, without their rigid motion, against what they state
+
+
+@cache
+def whole() -> tuple[Solution, FloatArray]:
+    """A solution of a camera and a projector, and some forty places in its volume."""
+    solution, observations = solved({"left": left_camera()}, light_source())
+    _, places = volume_of(solution, observations)
+    return solution, places[:: len(places) // 40]
+
+
+def halved(odd: FloatArray, even: FloatArray, covariance: FloatArray) -> tuple[Solution, FloatArray]:
+    """The same with halves that are off by so much."""
+    solution, places = whole()
+    names = tuple(solution.poses)
+    halves = (Half(names[::2], odd, covariance), Half(names[1::2], even, covariance))
+    return replace(solution, halves=halves), places
+
+
+def covariance() -> FloatArray:
+    return covariance_by_known_points([left_camera(), light_source()], 1, 0.05, 1)
+
+
+def test_halves_that_are_off_as_they_state_differ_by_what_is_stated() -> None:
+    spread = covariance()
+    off = draws(spread, 500, 5)
+    found = []
+    for odd, even in zip(off[::2], off[1::2], strict=True):
+        made = odd_even(*halved(odd, even, spread))
+        assert made is not None
+        found.append(made)
+    ratio = np.array([each.ratio for each in found])
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.09)
+    assert (ratio <= 1).mean() == pytest.approx(0.62, abs=0.08)
+    assert (ratio <= 2).mean() > 0.95
+    # The chance is one: as often below a share as that share says, five of a hundred below 5 %.
+    chance = np.array([each.chance for each in found])
+    assert (chance < 0.05).mean() == pytest.approx(0.05, abs=0.045)
+    assert (chance < 0.5).mean() == pytest.approx(0.5, abs=0.08)
+    assert np.mean([each.fits for each in found]) > 0.98
+
+
+def test_the_difference_is_how_far_apart_both_find_a_point() -> None:
+    """By an oracle that projects with OpenCV and finds depth by the secant method."""
+    camera, projector = left_camera(), light_source()
+    odd, even = 0.1 * draws(covariance(), 2, 9)
+    solution, places = halved(odd, even, covariance())
+    at, lit = pixels(camera, places), pixels(projector, places)[:, 0]
+    there = [
+        met_with_projector(changed(camera, each[:15]), changed(projector, each[15:]), at, lit, places, 0)
+        for each in (odd, even)
+    ]
+    apart = along_rays(aligned(there[0] - there[1] + places, places), places, camera)
+    found = odd_even(solution, places)
+    assert found is not None
+    assert found.difference_mm == pytest.approx(float(np.sqrt((apart**2).mean())), rel=0.005)
+    assert found.poses == (4, 4)
+
+
+def test_halves_that_are_moved_as_a_whole_do_not_differ() -> None:
+    """The world is turned by 2e-5 rad about z and shifted: each device's pose changes, and no measurement does."""
+    turn, shift = np.array([0.0, 0.0, 2e-5]), np.array([0.01, -0.02, 0.03])
+
+    def change(device: Pinhole) -> FloatArray:
+        rotation = device.rotation @ cv2.Rodrigues(turn)[0].T
+        own = cv2.Rodrigues(rotation @ device.rotation.T)[0][:, 0]
+        return np.concatenate([np.zeros(9), own, -(rotation @ shift)])
+
+    moved = np.concatenate([change(left_camera()), change(light_source())])
+    found = odd_even(*halved(moved, np.zeros(30), covariance()))
+    assert found is not None
+    assert found.difference_mm < 1e-6
+    assert found.motion.turn_deg == pytest.approx(np.degrees(2e-5), rel=1e-3)
+    assert found.motion.shift_mm == pytest.approx(np.linalg.norm(shift), rel=0.2)
+    assert found.fits
+
+
+def test_a_difference_beyond_chance_is_a_reason_against_good() -> None:
+    spread = covariance()
+    odd, even = draws(spread, 2, 3)
+    plain, large = (odd_even(*halved(times * odd, times * even, spread)) for times in (1, 6))
+    assert plain is not None
+    assert large is not None
+    assert large.stated_mm == pytest.approx(plain.stated_mm)
+    assert large.difference_mm == pytest.approx(6 * plain.difference_mm)
+    assert plain.fits
+    assert not large.fits
+    solution = halved(odd, even, spread)[0]
+    assert large.words in verdict(solution, EXPECTED, None, large, board=BOARD).reasons
+    assert plain.words not in verdict(solution, EXPECTED, None, plain, board=BOARD).reasons
+    judged = {each.figure: each for each in verdict(solution, EXPECTED, None, large, board=BOARD).judged}
+    assert judged["odd_even"].grade is Grade.USABLE
+    assert judged["odd_even"].value == large.ratio
+    assert f"reckon with {large.difference_mm / 2:.2g} mm for the error of a point" in large.words
+    assert "more than chance" in large.words
+
+
+def test_without_halves_nothing_is_said() -> None:
+    solution, places = halved(np.zeros(30), np.zeros(30), covariance())
+    assert odd_even(replace(solution, halves=()), places) is None
+    assert "odd_even" not in {each.figure for each in verdict(solution, EXPECTED, board=BOARD).judged}
+
+
+# ---- Two calibrations compared: a change that was made is found again, in its size and in its σ
+
+
+SIGMA = np.array([0.5, 0.5, 0.8, 0.8, *[1e-4] * 5, *[1e-4] * 3, *[0.02] * 3])
+
+
+def device(size: Size, focal_px: float, rotation: FloatArray, centre_mm: FloatArray) -> Pinhole:
+    matrix = np.array([[focal_px, 0, size.width_px / 2], [0, focal_px, size.height_px / 2], [0, 0, 1.0]])
+    distortion = np.array([-0.1, 0.05, 0.0, 0.0, 0.0])
+    return Pinhole(size, matrix, distortion, rotation, -rotation @ centre_mm)
+
+
+def rig(*, solved: bool = True) -> Calibration:
+    """Two cameras and a projector, converging on a volume about 600 mm away; the first camera's frame is the world."""
+    turn = [Rotation.from_euler("y", angle, degrees=True).as_matrix() for angle in (-15.0, -8.0)]
+    size = Size(1280, 1024)
+    cameras = {
+        "left": device(size, 1900.0, np.eye(3), np.zeros(3)),
+        "right": device(size, 1890.0, turn[0], np.array([160.0, 0.0, 0.0])),
+    }
+    projector = device(Size(1280, 800), 1600.0, turn[1], np.array([80.0, 60.0, 0.0]))
+    covariance = np.diag(np.concatenate([SIGMA, SIGMA, SIGMA]) ** 2)
+    covariance[9:15] = covariance[:, 9:15] = 0.0
+    volume = np.array([[-80.0, -60.0, 550.0], [80.0, 60.0, 650.0]])
+    found = Solved("a", "2026-11-22T10:00:00+00:00", covariance, volume, 0.01)
+    return Calibration(cameras, projector, found if solved else None)
+
+
+def with_right(calibration: Calibration, **changes: Any) -> Calibration:
+    cameras = {**calibration.cameras, "right": replace(calibration.cameras["right"], **changes)}
+    return replace(calibration, cameras=cameras)
+
+
+def test_calibration_is_the_same_as_itself() -> None:
+    found = comparison(rig(), rig())
+    assert found.missing == ()
+    assert found.moved_rms_mm == found.moved_most_mm == found.turn_deg == found.shift_mm == 0
+    assert found.words[0].startswith("Points in the working volume move by 0 mm rms, by 0 mm at most, besides a turn")
+    assert set(found.devices) == {"left", "right", "projector"}
+    for each in found.devices.values():
+        assert each.focal_percent.value == each.principal_px.value == 0
+        assert "no more than chance" in each.focal_percent.words
+    assert found.devices["left"].rotation_deg is None
+
+
+def test_a_longer_focal_length_is_reported_in_percent_and_sigmas() -> None:
+    matrix = rig().cameras["right"].matrix.copy()
+    matrix[0, 0] *= 1.002
+    matrix[1, 1] *= 1.002
+    right = comparison(rig(), with_right(rig(), matrix=matrix)).devices["right"]
+    assert right.focal_percent.value == pytest.approx(0.2)
+    # The mean of fx and fy, each known to 0.5 px in both solves.
+    assert right.focal_percent.sigma == pytest.approx(100 / 1890 * 0.5, rel=1e-3)
+    assert right.focal_percent.sigmas == pytest.approx(3.78 / 0.5, rel=1e-3)
+    assert "camera 'right': the focal length differs by +0.2 %, 7.6 σ: a real change." in right.focal_percent.words
+
+
+def test_turn_and_baseline_are_reported_with_their_deviations() -> None:
+    before = rig().cameras["right"]
+    turn = Rotation.from_rotvec([0.0, np.radians(0.05), 0.0]).as_matrix()
+    found = comparison(
+        rig(), with_right(rig(), rotation=turn @ before.rotation, translation_mm=turn @ before.translation_mm)
+    )
+    right = found.devices["right"]
+    assert right.rotation_deg is not None
+    assert right.baseline_mm is not None
+    assert right.rotation_deg.value == pytest.approx(0.05)
+    assert right.rotation_deg.sigma == pytest.approx(np.degrees(1e-4) * np.sqrt(2), rel=1e-6)
+    assert right.baseline_mm.value == pytest.approx(0.0, abs=1e-9)
+    moved = comparison(rig(), with_right(rig(), translation_mm=before.translation_mm * 1.001)).devices["right"]
+    assert moved.baseline_mm is not None
+    assert moved.baseline_mm.value == pytest.approx(0.16)
+    assert moved.baseline_mm.sigma == pytest.approx(0.02 * np.sqrt(2), rel=1e-6)
+
+
+def test_points_move_by_what_a_longer_baseline_makes_of_them() -> None:
+    """A baseline of every device longer by a share makes everything larger by it, and points move in proportion."""
+    share = 1.001
+    first = rig()
+    assert first.projector is not None
+    cameras = {name: replace(each, translation_mm=each.translation_mm * share) for name, each in first.cameras.items()}
+    second = Calibration(
+        cameras, replace(first.projector, translation_mm=first.projector.translation_mm * share), first.solved
+    )
+    found = comparison(first, second)
+    # The middle of the volume moves away, by 0.6 mm, and the rest about it: the farthest point is a corner.
+    assert found.shift_mm == pytest.approx((share - 1) * 600, rel=1e-4)
+    assert found.turn_deg < 1e-6
+    assert found.moved_most_mm == pytest.approx((share - 1) * np.linalg.norm([80, 60, 50]), rel=1e-4)
+    assert found.moved_rms_mm < found.moved_most_mm
+    assert f"by {found.moved_most_mm:.3g} mm at most, besides a turn of" in found.words[0]
+    assert "and a shift of 0.6 mm that all of them share" in found.words[0]
+
+
+def test_a_motion_of_all_points_is_no_change_of_shape_however_large() -> None:
+    random = np.random.default_rng(4)
+    places = random.uniform([-80, -60, 550], [80, 60, 650], (200, 3))
+    turn = Rotation.from_rotvec([0.2, -0.7, 0.4])
+    strain = np.array([0.01, 0.0, 0.0]) * ((places - places.mean(axis=0)) / 80) ** 2
+    moved = places.mean(axis=0) + turn.apply(places - places.mean(axis=0)) + [30.0, -20.0, 7.0]
+    left, motion = without_rigid_motion(places, moved)
+    assert np.abs(left).max() < 1e-10
+    assert motion.turn_deg == pytest.approx(np.degrees(turn.magnitude()))
+    assert motion.shift_mm == pytest.approx(np.linalg.norm([30.0, -20.0, 7.0]))
+    # What is left of a small strain is what the least squares of a small motion leaves of it.
+    small, _ = without_rigid_motion(places, places + strain)
+    assert small == pytest.approx(rigid_free(places, strain[:, :, None])[:, :, 0], abs=1e-6)
+
+
+def test_world_frame_makes_no_difference() -> None:
+    """An imported calibration may have its world anywhere."""
+    first = rig(solved=False)
+    assert first.projector is not None
+    turn = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix()
+    shift = np.array([5.0, -7.0, 300.0])
+
+    def moved(each: Pinhole) -> Pinhole:
+        rotation = each.rotation @ turn
+        return replace(each, rotation=rotation, translation_mm=each.translation_mm + rotation @ shift)
+
+    second = Calibration({name: moved(each) for name, each in first.cameras.items()}, moved(first.projector))
+    found = comparison(rig(), second)
+    assert found.moved_most_mm < 1e-6
+    right = found.devices["right"]
+    assert right.rotation_deg is not None
+    assert right.rotation_deg.value < 1e-5
+    assert np.isnan(right.rotation_deg.sigma)
+    assert "how sure that is, is not known" in right.rotation_deg.words
+    nowhere = comparison(first, second)
+    assert np.isnan(nowhere.moved_rms_mm)
+    assert "neither calibration names a working volume" in nowhere.words[0]
+
+
+def test_device_that_only_one_has_is_named() -> None:
+    first = rig()
+    second = Calibration({"left": first.cameras["left"]}, first.projector)
+    found = comparison(first, second)
+    assert found.missing == ("right",)
+    assert set(found.devices) == {"left", "projector"}
+    assert any("Only one of them has right" in words for words in found.words)
+
+
+def test_calibrations_of_two_rigs_are_refused() -> None:
+    first = rig()
+    other = Calibration({"top": first.cameras["left"]}, first.projector)
+    with pytest.raises(CalibrationError, match=r"one has left, right, the other top"):
+        comparison(first, other)
+    smaller = with_right(first)
+    smaller = replace(
+        smaller, cameras={**smaller.cameras, "right": replace(smaller.cameras["right"], size=Size(640, 512))}
+    )
+    with pytest.raises(CalibrationError, match="right has 1280 x 1024 pixels in one and 640 x 512 in the other"):
+        comparison(first, smaller)

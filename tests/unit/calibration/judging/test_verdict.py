@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from slrig.calibration.judging.board_size import ScaleCheck
+from slrig.calibration.judging.board_size import ScaleCheck, check_scale, judged_size, unattended_faults
 from slrig.calibration.judging.grades import Grade
 from slrig.calibration.judging.verdict import LIMITS, Verdict, verdict
 from slrig.calibration.poses.coverage import Coverage, coverage
@@ -16,10 +17,12 @@ from slrig.calibration.solution import (
     PARAMETERS,
     PROJECTOR,
     BoardPose,
+    BoardSize,
     Bow,
     DeviceResiduals,
     ExpectedError,
     Solution,
+    scale_mode,
 )
 from slrig.model import Calibration, FloatArray
 from tests.unit.calibration.posed_boards import CHESSBOARD, Shooting, held, two_cameras_and_projector
@@ -89,11 +92,59 @@ def test_a_sound_calibration_is_good_and_says_what_was_judged() -> None:
     assert all(each.words for each in found.judged)
 
 
-def test_a_camera_with_a_large_rms_names_the_pose_to_look_at_first() -> None:
-    residuals = _residuals(0.31)
-    bad = replace(residuals, pose_rms_px={**residuals.pose_rms_px, "pose_07": 0.9})
-    found = judged(_with(_solution(), "left", bad))
-    assert _remarks(found, "camera 'left' has 0.31 px rms", "usual is 0.05–0.2", "look at pose_07 first (0.9 px)")
+POSES = dict(list(_solution().poses.items())[:6])
+WORST = {**_residuals(0.31).pose_rms_px, "pose_07": 0.9}
+FAR_OFF = replace(_residuals(0.25), stated_rms_px=0.05)
+SHAPE = np.full((88, 3), [0.06, 0.0, 0.0])
+BENT = replace(_solution(), board_shape_mm=SHAPE, bow=Bow(0.412, 0.021, solved=True))
+
+
+def _known(parameter: int, sigma: float) -> Solution:
+    """A solution of which one parameter has this deviation."""
+    covariance = _covariance()
+    covariance[parameter, parameter] = sigma**2
+    return replace(_solution(), covariance=covariance)
+
+
+def _left(rms_px: float = 0.08, **changes: Any) -> Solution:
+    return _with(_solution(), "left", replace(_residuals(rms_px), **changes))
+
+
+@pytest.mark.parametrize(
+    ("solution", "words"),
+    [
+        (_left(0.31, pose_rms_px=WORST), r"'left' has 0.31 px rms.*usual is 0.05–0.2.*look at pose_07 first .0.9 px"),
+        (replace(_solution(), poses=POSES), "6 poses used.*20 to 30 are usual"),
+        (replace(_solution(), outliers={"pose_12": "it moved"}), r"1 of 13 poses left out \(pose_12: it moved\)"),
+        (_known(2 * EACH + 3, 9.0), "projector: the principal row is 860.0 ± 9 px.*about the horizontal axis"),
+        (_known(0, 12.0), "'left': the focal length is 2100.0 ± 12 px.*±0.1% is well.*other distances"),
+        (_with(_solution(), PROJECTOR, FAR_OFF), "the projector is 5.0 × as far off as the noise.*gamma"),
+        (_left(0.15, stated_rms_px=0.05), "camera 'left' is 3.0 ×.*bent board"),
+        (BENT, "bowed, 0.412 ± 0.021 mm.*0.06 mm off their printed places.*up to 0.2 mm is well.*glass"),
+        (_left(outlying=100), "9.5% of 1056 observations are outlying"),
+        (_left(held_out_rms_px=0.16), "camera 'left'.*2.00 × its own.*at most 1.3 ×.*add poses"),
+        # Poor beside the rest, and still no more than is usual.
+        (_left(0.05, held_out_rms_px=0.19), "3.80 × its own"),
+    ],
+)
+def test_what_is_not_as_usual_is_named_with_its_place(solution: Solution, words: str) -> None:
+    found = judged(solution)
+    assert found.grade is Grade.GOOD
+    assert any(re.search(words, remark) for remark in found.remarks), found.remarks
+
+
+@pytest.mark.parametrize(
+    "solution",
+    [
+        replace(_solution(), poses=dict(list(POSES.items())[:3])),
+        replace(_solution(), outliers={f"bad_{index}": "it moved" for index in range(5)}),
+        _left(held_out_rms_px=0.4),
+        _left(outlying=200),
+    ],
+    ids=["three poses", "five left out", "held out", "outlying"],
+)
+def test_what_is_far_from_usual_is_not_to_be_used(solution: Solution) -> None:
+    assert judged(solution).grade is Grade.DO_NOT_USE
 
 
 @pytest.mark.parametrize(("rms_px", "grade"), [(0.19, Grade.GOOD), (0.5, Grade.GOOD), (2.0, Grade.DO_NOT_USE)])
@@ -111,17 +162,8 @@ def test_a_projector_has_its_own_limit() -> None:
     assert _says(found, "the projector has 5 px rms", "usual is 0.1–0.3", "refresh period")
 
 
-def test_held_out_poses_show_a_lens_fitted_to_too_few() -> None:
-    bad = replace(_residuals(), held_out_rms_px=0.16)
-    found = judged(_with(_solution(), "left", bad))
-    assert _remarks(found, "camera 'left'", "2.00 × its own", "at most 1.3 ×", "add poses")
-    worse = replace(_residuals(), held_out_rms_px=0.4)
-    assert judged(_with(_solution(), "left", worse)).grade is Grade.DO_NOT_USE
-    # Poor beside the rest, and still no more than is usual.
-    small = replace(_residuals(0.05), held_out_rms_px=0.19)
-    assert _remarks(judged(_with(_solution(), "left", small)), "3.80 × its own")
-    unknown = replace(_residuals(), held_out_rms_px=float("nan"))
-    found = judged(_with(_solution(), "left", unknown))
+def test_without_held_out_poses_nobody_knows_the_lens() -> None:
+    found = judged(_left(held_out_rms_px=float("nan")))
     assert found.grade is Grade.USABLE
     assert _says(found, "too few poses to keep some from the solve")
 
@@ -158,52 +200,17 @@ def test_a_wrong_scale_keeps_a_calibration_from_being_good_and_from_the_clock() 
     assert (found.grade, found.reasons, found.unattended) == (Grade.USABLE, (words,), (words,))
 
 
-def test_few_poses_and_poses_left_out_are_named() -> None:
-    solution = _solution()
-    few = dict(list(solution.poses.items())[:6])
-    assert _remarks(judged(replace(solution, poses=few)), "6 poses used", "20 to 30 are usual")
-    assert judged(replace(solution, poses=dict(list(few.items())[:3]))).grade is Grade.DO_NOT_USE
-    out = judged(replace(solution, outliers={"pose_12": "the board moved by 3 px"}))
-    assert _remarks(out, "1 of 13 poses left out (pose_12: the board moved by 3 px)")
-    many = {f"bad_{index}": "it moved" for index in range(5)}
-    assert judged(replace(solution, outliers=many)).grade is Grade.DO_NOT_USE
-
-
-def test_an_unsure_principal_point_is_named_with_its_axis() -> None:
-    covariance = _covariance()
-    covariance[2 * EACH + 3, 2 * EACH + 3] = 9.0**2
-    found = judged(replace(_solution(), covariance=covariance))
-    assert _remarks(found, "the projector: the principal row is 860.0 ± 9 px", "about the horizontal axis")
-    covariance = _covariance()
-    covariance[0, 0] = 12.0**2
-    found = judged(replace(_solution(), covariance=covariance))
-    assert _remarks(found, "camera 'left': the focal length is 2100.0 ± 12 px", "±0.1% is well", "other distances")
-
-
-def test_light_that_is_worse_than_its_noise_points_to_the_cause() -> None:
-    bad = replace(_residuals(0.25), stated_rms_px=0.05)
-    found = judged(_with(_solution(), PROJECTOR, bad))
-    assert _remarks(found, "the projector is 5.0 × as far off as the noise", "gamma")
-    fine = replace(_residuals(0.09), stated_rms_px=0.005)  # far above the noise, and as good as any
-    assert judged(_with(_solution(), "left", fine)).remarks == ()
-    bad = replace(_residuals(0.15), stated_rms_px=0.05)
-    assert _remarks(judged(_with(_solution(), "left", bad)), "camera 'left' is 3.0 ×", "bent board")
-
-
-def test_outlying_observations_and_leaning_residuals_are_named_with_their_place() -> None:
-    bad = replace(_residuals(), outlying=100)
-    assert _remarks(judged(_with(_solution(), "left", bad)), "9.5% of 1056 observations are outlying")
-    assert judged(_with(_solution(), "left", replace(bad, outlying=200))).grade is Grade.DO_NOT_USE
+def test_leaning_residuals_are_named_with_their_place() -> None:
     residuals = _residuals()
-    mean = residuals.map_mean_px.copy()
+    mean, count = residuals.map_mean_px.copy(), residuals.map_count.copy()
     mean[5, 0] = (0.15, 0.0)
-    found = judged(_with(_solution(), "left", replace(residuals, map_mean_px=mean)))
+    found = judged(_left(map_mean_px=mean))
     assert _remarks(found, "in the lower left corner the residuals lean by 0.15 px", "add poses there")
     # Next to nothing was seen there: a mean of ten residuals tells nothing.
-    count = residuals.map_count.copy()
     count[5, 0] = 10
-    unseen = replace(residuals, map_mean_px=mean, map_count=count)
-    assert judged(_with(_solution(), "left", unseen)).remarks == ()
+    assert judged(_left(map_mean_px=mean, map_count=count)).remarks == ()
+    # Far above the noise, and as good as any.
+    assert judged(_left(0.09, stated_rms_px=0.005)).remarks == ()
 
 
 def test_a_border_that_no_corner_reached_leaves_the_distortion_open_there() -> None:
@@ -215,14 +222,6 @@ def test_a_border_that_no_corner_reached_leaves_the_distortion_open_there() -> N
     found = judged(_solution(), EXPECTED, coverage(poses, CHESSBOARD, shooting.sizes))
     words = "camera 'left': 100% of the cells along the image's border", "distortion is not determined there"
     assert _remarks(found, *words)
-
-
-def test_a_bent_board_is_named() -> None:
-    shape = np.zeros((88, 3))
-    shape[:, 0] = 0.06
-    bowed = replace(_solution(), board_shape_mm=shape, bow=Bow(0.412, 0.021, solved=True))
-    words = "bowed, 0.412 ± 0.021 mm", "0.06 mm off their printed places", "up to 0.2 mm is well", "glass"
-    assert _remarks(judged(bowed), *words)
 
 
 def test_a_bow_within_chance_is_reported_and_lowers_no_grade() -> None:
@@ -240,3 +239,135 @@ def test_every_limit_has_a_source_and_grades_in_order() -> None:
         assert limit.good < limit.most
         assert limit.grade(limit.good) is Grade.GOOD
         assert limit.grade(float("nan")) is Grade.USABLE
+
+
+# ---- What is said of a board's size: its scale against an earlier calibration, its stretch, and who may put it in use
+
+
+_SIGMA = np.tile([0.8, 0.8, 0.9, 0.9, 1e-3, 5e-3, 1e-4, 1e-4, 0.0, 4e-6, 4e-6, 4e-6, 0.01, 0.01, 0.01], 3)
+
+
+def _bare(covariance: FloatArray | None = None) -> Solution:
+    devices = two_cameras_and_projector()
+    calibration = Calibration({name: devices[name] for name in ("left", "right")}, devices[PROJECTOR])
+    return Solution(calibration, np.diag(_SIGMA**2) if covariance is None else covariance, {}, {}, {}, {})
+
+
+def _enlarged(calibration: Calibration, factor: float) -> Calibration:
+    cameras = {
+        name: replace(each, translation_mm=factor * each.translation_mm) for name, each in calibration.cameras.items()
+    }
+    assert calibration.projector is not None
+    projector = replace(calibration.projector, translation_mm=factor * calibration.projector.translation_mm)
+    return Calibration(cameras, projector)
+
+
+@pytest.mark.parametrize("factor", [1 / 0.96, 1.01, 0.991, 1.002])
+def test_a_wrong_square_size_is_named_with_the_size_that_the_squares_have(factor: float) -> None:
+    solution = _bare()
+    found = check_scale(
+        replace(solution, calibration=_enlarged(solution.calibration, factor)), solution.calibration, CHESSBOARD
+    )
+    assert found.share == pytest.approx(factor - 1, rel=1e-6)
+    (words,) = found.words
+    assert f"everything is {abs(factor - 1):.2%} {'larger' if factor > 1 else 'smaller'}" in words
+    assert f"squares measure {12 / factor:.5g} mm instead of 12 mm" in words
+    assert "measure both rulers" in words
+    (judged,) = judged_size(solution, found)
+    assert (judged.grade, judged.figure) == (Grade.USABLE, "scale")
+
+
+def test_a_tenth_of_a_per_cent_is_what_a_rig_may_do_by_itself() -> None:
+    solution = _bare()
+    slightly = replace(solution, calibration=_enlarged(solution.calibration, 1.0009))
+    found = check_scale(slightly, solution.calibration, CHESSBOARD)
+    assert (found.checked, found.words) == (True, ())
+    assert found.share == pytest.approx(9e-4, rel=1e-6)
+    assert 0 < found.sigma < 3e-4
+
+
+def test_a_scale_that_the_solve_itself_does_not_know_is_not_blamed_on_the_board() -> None:
+    solution = _bare()
+    wrong = replace(solution, calibration=_enlarged(solution.calibration, 1.01))
+    assert check_scale(wrong, solution.calibration, CHESSBOARD).words
+    unsure = replace(wrong, covariance=wrong.covariance * 60.0**2)
+    assert check_scale(unsure, solution.calibration, CHESSBOARD).words == ()
+
+
+def test_how_sure_a_board_s_size_is_hides_no_change_of_it() -> None:
+    # The deviation by the board's own size is in the covariance, and is as large as the change that is looked for.
+    solution = _bare()
+    wrong = replace(solution, calibration=_enlarged(solution.calibration, 1.01), size=BoardSize(0.01))
+    mode = 0.01 * scale_mode(wrong.calibration)
+    unsure = replace(wrong, covariance=wrong.covariance + np.outer(mode, mode))
+    found = check_scale(unsure, solution.calibration, CHESSBOARD)
+    assert found.words
+    assert found.sigma == pytest.approx(check_scale(wrong, solution.calibration, CHESSBOARD).sigma, abs=2e-4)
+
+
+def test_the_deviation_of_a_distance_is_that_of_drawn_devices() -> None:
+    random = np.random.default_rng(2)
+    root = random.normal(size=(45, 45)) * 1e-3
+    solution = _bare(root @ root.T)
+    found = check_scale(solution, solution.calibration, CHESSBOARD)
+    drawn = []
+    devices = [*solution.calibration.cameras.values(), solution.calibration.projector]
+    for _ in range(4000):
+        step = (root @ random.normal(size=45)).reshape(3, 15)
+        centres = []
+        for device, change in zip(devices, step, strict=True):
+            assert device is not None
+            x, y, z = change[9:12]
+            turn = np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+            centres.append(-(turn @ device.rotation).T @ (device.translation_mm + change[12:]))
+        drawn.append([np.linalg.norm(centres[a] - centres[b]) for a, b in ((0, 1), (0, 2), (1, 2))])
+    shares = np.std(drawn, axis=0) / np.mean(drawn, axis=0)
+    assert found.sigma == pytest.approx(shares.max(), rel=0.06)
+
+
+def test_a_rebuilt_rig_is_not_taken_for_a_wrong_square_size() -> None:
+    solution = _bare()
+    projector = solution.calibration.projector
+    assert projector is not None
+    moved = replace(projector, translation_mm=projector.translation_mm * 1.1)
+    rebuilt = Calibration(solution.calibration.cameras, moved)
+    (words,) = check_scale(replace(solution, calibration=rebuilt), solution.calibration, CHESSBOARD).words
+    assert "the rig was rebuilt, or a device was bumped" in words
+    assert "camera 'left' to the projector" in words
+
+
+def test_without_a_common_distance_the_scale_is_not_checked() -> None:
+    solution = _bare()
+    assert solution.calibration.projector is not None
+    other = Calibration({"middle": solution.calibration.projector}, None)
+    found = check_scale(solution, other, CHESSBOARD)
+    assert not found.checked
+    assert "the scale is not checked: that takes two devices which the earlier calibration has too, found no" in str(
+        found.words
+    )
+
+
+@pytest.mark.parametrize(("stretch", "words"), [(0.002, "0.20% ± 0.01% wider than it is high"), (-0.002, "higher")])
+def test_a_stretched_print_is_named(stretch: float, words: str) -> None:
+    solution = replace(_bare(), size=BoardSize(0.001, stretch, 1e-4))
+    (judged,) = judged_size(solution, None)
+    assert judged.grade is Grade.USABLE
+    assert words in judged.words
+    assert "measure both rulers" in judged.words
+    small = replace(solution, size=BoardSize(0.001, stretch / 2.1, 1e-4))
+    unsure = replace(solution, size=BoardSize(0.001, stretch, 5e-4))
+    assert not [*judged_size(small, None), *judged_size(unsure, None)]
+
+
+def test_a_schedule_puts_a_calibration_in_use_only_if_its_scale_is_vouched_for() -> None:
+    solution, agrees = _bare(), ScaleCheck(True, 1e-4, 1e-4, ())
+    assert unattended_faults(solution, CHESSBOARD, agrees) == ()
+    (words,) = unattended_faults(solution, CHESSBOARD, None)
+    assert "nothing vouches for the scale" in words
+    certified = replace(CHESSBOARD, square_sigma=1e-4)
+    assert unattended_faults(solution, certified, None) == ()
+    assert unattended_faults(solution, CHESSBOARD.as_read(*CHESSBOARD.rulers_mm), None) == ()
+    wrong = ScaleCheck(True, 0.009, 1e-4, ("everything is 0.90% larger",))
+    assert unattended_faults(solution, certified, wrong) == ("everything is 0.90% larger",)
+    stretched = replace(solution, size=BoardSize(0.001, 0.002, 1e-4))
+    assert "wider" in str(unattended_faults(stretched, certified, agrees))

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import PoseObservation
+from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
+from slrig.calibration.poses import checks
 from slrig.calibration.poses.candidates import board_rotation
-from slrig.calibration.poses.checks import judge_pose
+from slrig.calibration.poses.checks import PoseAnswer, check_same_devices, judge_pose
 from slrig.calibration.poses.coverage import GOALS, attitude, cells_of, coverage, full_turn_deg
 from slrig.calibration.poses.next_move import Advice, _cells, _reach, next_move
+from slrig.calibration.poses.pictures import coverage_picture, pose_picture
 from slrig.calibration.poses.rough import rig_guess
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose
+from slrig.errors import CalibrationError
 from slrig.model import FloatArray, Pinhole, Size
 from tests.unit.calibration.posed_boards import (
     CHARUCO,
@@ -28,13 +34,18 @@ from tests.unit.calibration.posed_boards import (
 )
 
 
-def _shooting(board: Board = CHESSBOARD, *, only: tuple[str, ...] | None = None, seed: int = 1) -> Shooting:
-    devices = {name: each for name, each in two_cameras_and_projector().items() if only is None or name in only}
-    return Shooting(board, devices, seed=seed)
+def rig_of(*devices: str, board: Board = CHESSBOARD) -> Shooting:
+    """A rig of these devices, or of two cameras and a projector."""
+    every = two_cameras_and_projector()
+    return Shooting(board, {name: every[name] for name in devices or every})
 
 
-def _first(shooting: Shooting) -> list[PoseObservation]:
-    return [shooting.shot(f"pose_{index:02d}", pose) for index, pose in enumerate(first_poses(shooting.board))]
+def shots(shooter: Shooting, poses: Sequence[BoardPose]) -> list[PoseObservation]:
+    return [shooter.shot(f"pose_{index:02d}", pose) for index, pose in enumerate(poses)]
+
+
+def _first(shooter: Shooting) -> list[PoseObservation]:
+    return shots(shooter, first_poses(shooter.board))
 
 
 def _followed(shooting: Shooting, advice: Advice) -> BoardPose:
@@ -86,14 +97,14 @@ def test_a_board_that_looks_the_same_after_half_a_turn_needs_no_such_turn() -> N
     assert full_turn_deg(alike) == 180
     assert full_turn_deg(CHESSBOARD) == full_turn_deg(Board(BoardKind.CHARUCO, 9, 7, 12.0)) == 360
     for board, turns in ((alike, 1), (Board(BoardKind.CHARUCO, 9, 7, 12.0), 2)):
-        shooting = _shooting(board, only=("left",))
+        shooting = rig_of("left", board=board)
         board_pose = [held(board, tilt=(20.0, 0.0)), held(board, tilt=(0.0, 20.0), in_plane_deg=180.0)]
-        poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(board_pose)]
+        poses = shots(shooting, board_pose)
         assert coverage(poses, board, shooting.sizes).devices["left"].turns == turns
 
 
 def test_the_guess_finds_the_devices_from_a_few_poses() -> None:
-    shooting = _shooting()
+    shooting = rig_of()
     poses = _first(shooting)
     poses.append(shooting.shot("pose_03", held(CHESSBOARD, tilt=(-30.0, 15.0), middle_mm=(60.0, 40.0, 540.0))))
     guess = rig_guess(poses, CHESSBOARD, shooting.sizes)
@@ -113,21 +124,15 @@ def test_a_wide_lens_is_guessed_too() -> None:
     wide = device(Size(1280, 1024), 500.0, (650.0, 500.0), (0.0,) * 5, BoardPose(np.eye(3), np.zeros(3)))
     shooting = Shooting(CHESSBOARD, {"left": wide})
     tilts = ((0.0, 0.0), (25.0, 0.0), (0.0, -25.0), (-30.0, 15.0))
-    poses = [
-        shooting.shot(f"pose_{index:02d}", held(CHESSBOARD, tilt=tilt, middle_mm=(0.0, 0.0, 200.0)))
-        for index, tilt in enumerate(tilts)
-    ]
+    poses = shots(shooting, [held(CHESSBOARD, tilt=tilt, middle_mm=(0.0, 0.0, 200.0)) for tilt in tilts])
     found = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert found.matrix[0, 0] == pytest.approx(500, rel=0.03)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_a_guess_holds_with_parallel_poses_and_with_none(count: int) -> None:
-    shooting = _shooting(only=("left",))
-    poses = [
-        shooting.shot(f"pose_{index:02d}", held(CHESSBOARD, middle_mm=(20.0 * index, 0.0, 600.0)))
-        for index in range(count)
-    ]
+    shooting = rig_of("left")
+    poses = shots(shooting, [held(CHESSBOARD, middle_mm=(20.0 * index, 0.0, 600.0)) for index in range(count)])
     guess = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert np.isfinite(guess.information).all()
     assert guess.focal_sigma > 0.15
@@ -137,7 +142,7 @@ def test_a_guess_holds_with_parallel_poses_and_with_none(count: int) -> None:
 
 
 def test_coverage_counts_cells_depths_tilts_and_turns() -> None:
-    shooting = _shooting()
+    shooting = rig_of()
     board_pose = [
         held(CHESSBOARD),
         held(CHESSBOARD, tilt=(30.0, 0.0), middle_mm=(0.0, 0.0, 540.0)),
@@ -145,7 +150,7 @@ def test_coverage_counts_cells_depths_tilts_and_turns() -> None:
         held(CHESSBOARD, tilt=(0.0, -20.0), in_plane_deg=35.0, middle_mm=(0.0, 20.0, 605.0)),
         held(CHESSBOARD, tilt=(50.0, 5.0)),
     ]
-    poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(board_pose)]
+    poses = shots(shooting, board_pose)
     left = coverage(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert left.depths == 3
     assert left.tilted == (2, 2)
@@ -169,7 +174,7 @@ def test_coverage_of_a_projector_counts_only_what_a_camera_sees() -> None:
 
 
 def test_open_goals_are_named() -> None:
-    shooting = _shooting()
+    shooting = rig_of()
     found = coverage(_first(shooting), CHESSBOARD, shooting.sizes)
     text = "\n".join(found.missing)
     assert "3 of at least 12 poses" in text
@@ -179,7 +184,7 @@ def test_open_goals_are_named() -> None:
 
 
 def test_nothing_shot_yet_says_how_to_begin() -> None:
-    shooting = _shooting()
+    shooting = rig_of()
     advice = next_move([], CHESSBOARD, shooting.sizes)
     assert "middle of the picture of camera 'left'" in advice.words
     assert "projector" in advice.words
@@ -187,7 +192,7 @@ def test_nothing_shot_yet_says_how_to_begin() -> None:
 
 
 def test_advice_names_place_tilt_and_reason_and_shows_the_outline() -> None:
-    shooting = _shooting()
+    shooting = rig_of()
     poses = _first(shooting)
     advice = next_move(poses, CHESSBOARD, shooting.sizes)
     assert "move the board to the" in advice.words
@@ -233,13 +238,13 @@ def _errors_px(shooting: Shooting, board_pose: list[BoardPose], seeds: range) ->
 
 
 def test_the_advised_pose_lowers_the_real_error_of_the_worst_cell_more_than_one_like_the_last() -> None:
-    shooting = _shooting(only=("left",))
+    shooting = rig_of("left")
     board_pose = [
         *first_poses(CHESSBOARD),
         held(CHESSBOARD, tilt=(-20.0, 10.0), middle_mm=(0.0, -20.0, 600.0)),
         held(CHESSBOARD, tilt=(15.0, 15.0), middle_mm=(15.0, 10.0, 605.0)),
     ]
-    poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(board_pose)]
+    poses = shots(shooting, board_pose)
     advice = next_move(poses, CHESSBOARD, shooting.sizes)
     seeds = range(100, 106)
     without = np.sqrt((_errors_px(shooting, board_pose, seeds) ** 2).mean())
@@ -254,7 +259,7 @@ def test_the_advised_pose_lowers_the_real_error_of_the_worst_cell_more_than_one_
 
 
 def test_the_stated_uncertainty_is_that_of_repeated_solves() -> None:
-    shooting = _shooting(only=("left",))
+    shooting = rig_of("left")
     random = np.random.default_rng(5)
     board_pose = [
         held(
@@ -264,7 +269,7 @@ def test_the_stated_uncertainty_is_that_of_repeated_solves() -> None:
         )
         for _ in range(8)
     ]
-    poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(board_pose)]
+    poses = shots(shooting, board_pose)
     poses = [pose for pose in poses if pose.views]
     guess = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
     stated = np.sqrt(2) * _cells(guess.information[None], _reach(guess)).max()
@@ -289,7 +294,7 @@ ALL = tuple(two_cameras_and_projector())
     ],
 )
 def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Board, only: tuple[str, ...]) -> None:
-    shooting = _shooting(board, only=only)
+    shooting = rig_of(*only, board=board)
     figures = {name: SHARP for name in only if name != PROJECTOR}
     random = np.random.default_rng(7)
     poses = _first(shooting)
@@ -316,3 +321,206 @@ def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Bo
     for each in found.devices.values():
         assert each.share >= 0.8
     assert worst[-1] <= GOALS.sigma_px < worst[0]
+
+
+# ---- What a person is told after a pose: each bad one is refused or warned of, with its cause and the cure
+
+
+GOOD = held(CHESSBOARD, tilt=(-30.0, 10.0), middle_mm=(-60.0, -40.0, 570.0))
+IN_PART = held(CHARUCO, tilt=(0.0, 25.0), middle_mm=(-60.0, 20.0, 580.0))
+NAN = float("nan")
+
+
+@pytest.fixture
+def without_advice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is said of the next pose, which takes longer than all checks."""
+    monkeypatch.setattr(checks, "next_move", lambda *_, **__: None)
+
+
+def judged(
+    pose: PoseObservation, shooter: Shooting, earlier: list[PoseObservation], figures: ViewFigures = SHARP
+) -> PoseAnswer:
+    """The answer to a pose; figures : of the left camera."""
+    return judge_pose(pose, {"left": figures, "right": SHARP}, earlier, shooter.board, shooter.sizes)
+
+
+def test_a_good_pose_is_accepted_and_measured() -> None:
+    shooter = rig_of("left", "right", PROJECTOR)
+    answer = judged(shooter.shot("pose_03", GOOD), shooter, _first(shooter))
+    assert answer.accepted
+    assert answer.refusals == answer.warnings == ()
+    assert answer.corners_found == {"left": 88, "right": 88}
+    assert answer.corners_expected == 88
+    sight = np.array([-60.0, -40.0, 570.0]) / np.linalg.norm([-60.0, -40.0, 570.0])
+    steep_deg = np.degrees(np.arccos(abs(GOOD.rotation[:, 2] @ sight)))
+    assert answer.tilt_deg["left"] == pytest.approx(steep_deg, abs=1.0)
+    assert answer.distance_mm["left"] == pytest.approx(570.0, rel=0.01)
+    assert answer.coverage.poses == ("pose_00", "pose_01", "pose_02", "pose_03")
+    assert "move the board" in answer.advice.words
+
+
+@pytest.mark.usefixtures("without_advice")
+def test_a_first_pose_has_a_tilt_and_no_distance_while_the_focal_length_is_unknown() -> None:
+    shooter = rig_of("left", "right", PROJECTOR)
+    facing = judged(shooter.shot("pose_00", held(CHESSBOARD)), shooter, [])
+    assert facing.accepted
+    assert np.isnan(facing.distance_mm["left"])
+    assert facing.tilt_deg["left"] < 12
+    steep = judged(shooter.shot("pose_00", held(CHESSBOARD, tilt=(68.0, 0.0))), shooter, [])
+    assert any("too steeply" in words for words in steep.refusals)
+
+
+@pytest.mark.usefixtures("without_advice")
+@pytest.mark.parametrize(
+    ("figures", "refusals", "warnings"),
+    [
+        (replace(SHARP, moved_px=1.3), ["saw the board move by 1.3 px", "let go of it"], []),
+        (replace(SHARP, moved_px=float("inf")), ["in the first frame and not in a later one", "shoot again"], []),
+        (replace(SHARP, sharpness_px=4.0), ["too blurred, 4.0 px", "focus"], []),
+        (replace(SHARP, saturated=0.2), ["20.0% of the board's pixels saturated", "shorter time"], []),
+        (replace(SHARP, contrast=0.04), ["too little light on the board, 4%", "longer time"], []),
+        (replace(SHARP, decoded=0.1), ["decoded light on only 10%", "dim the room's light"], []),
+        (replace(SHARP, moved_px=0.05), [], ["move by 0.05 px"]),
+        (replace(SHARP, sharpness_px=2.0), [], ["blurred"]),
+        (replace(SHARP, saturated=0.01), [], ["saturated"]),
+        (replace(SHARP, contrast=0.15), [], ["too little light"]),
+        (replace(SHARP, decoded=0.3), [], ["decoded light"]),
+        (ViewFigures(NAN, NAN, NAN, NAN, NAN), [], []),
+    ],
+)
+def test_how_a_pose_was_shot_refuses_or_warns_with_cause_and_cure(
+    figures: ViewFigures, refusals: list[str], warnings: list[str]
+) -> None:
+    shooter = rig_of("left")
+    answer = judged(shooter.shot("pose_03", GOOD), shooter, _first(shooter), figures)
+    assert answer.accepted is not bool(refusals)
+    for found, expected in ((answer.refusals, refusals), (answer.warnings, warnings)):
+        assert len(found) == bool(expected)
+        assert all(words in found[0] for words in expected)
+        assert all(each.startswith("camera 'left'") for each in found)
+    # What was refused is not counted as covered.
+    assert len(answer.coverage.poses) == 3 + answer.accepted
+
+
+@pytest.mark.usefixtures("without_advice")
+@pytest.mark.parametrize(
+    ("pose", "corners", "accepted", "words"),
+    [
+        (first_poses(CHESSBOARD)[1], 88, False, ["the same as pose_01"]),
+        (held(CHESSBOARD, tilt=(20.0, 0.0), middle_mm=(15.0, 5.0, 590.0)), 88, True, ["nearly the same as pose_01"]),
+        (held(CHESSBOARD, tilt=(66.0, 0.0)), 88, False, ["too steeply, 66°", "tilt it back"]),
+        (
+            held(CHESSBOARD, tilt=(20.0, 20.0), middle_mm=(0.0, 0.0, 1600.0)),
+            88,
+            False,
+            ["small", "bring it nearer"],
+        ),
+        (IN_PART, 9, False, ["sees 9 of the board's 88 corners, too few: show more"]),
+        (IN_PART, 33, True, ["33 of the board's 88"]),
+    ],
+    ids=["same", "near", "steep", "small", "few corners", "a part"],
+)
+def test_how_a_board_is_held_refuses_or_warns(pose: BoardPose, corners: int, accepted: bool, words: list[str]) -> None:
+    shooter = rig_of("left", board=CHESSBOARD if corners == 88 else CHARUCO)
+    shot = shooter.shot("pose_03", pose)
+    whole = shot.views["left"]
+    view = BoardView(whole.corner[:corners], whole.points_px[:corners], whole.sigma_px[:corners])
+    answer = judged(replace(shot, views={"left": view}), shooter, _first(shooter))
+    assert answer.accepted is accepted
+    told = answer.warnings if accepted else answer.refusals
+    assert any(all(part in each for part in words) for each in told), told
+
+
+@pytest.mark.usefixtures("without_advice")
+def test_a_board_that_not_every_device_sees_is_warned_of_or_refused() -> None:
+    shooter = rig_of("left", "right", PROJECTOR)
+    pose, earlier = shooter.shot("pose_03", GOOD), _first(shooter)
+    missed = judged(replace(pose, views={"left": pose.views["left"]}), shooter, earlier)
+    assert missed.accepted
+    assert any("camera 'right' does not see the board" in words for words in missed.warnings)
+    nowhere = judged(replace(pose, views={}), shooter, earlier)
+    assert not nowhere.accepted
+    assert any("no camera sees the board" in words for words in nowhere.refusals)
+    dark = replace(pose, correspondences={})
+    assert any("no light of the projector" in words for words in judged(dark, shooter, earlier).refusals)
+    # Where no projector is calibrated, none is needed.
+    assert judged(dark, rig_of("left", "right"), earlier).accepted
+
+
+@pytest.mark.usefixtures("without_advice")
+def test_a_board_parallel_to_all_earlier_ones_is_warned_of_and_a_tilted_one_is_not() -> None:
+    shooter = rig_of("left")
+    places = [(0.0, 0.0, 600.0), (50.0, 30.0, 560.0), (-50.0, -30.0, 640.0)]
+    poses = shots(shooter, [held(CHESSBOARD, middle_mm=each) for each in places])
+    answer = judged(poses[2], shooter, poses[:2])
+    assert answer.accepted
+    assert any("parallel to all 2 earlier poses" in words and "tilt" in words for words in answer.warnings)
+    tilted = shooter.shot("pose_03", held(CHESSBOARD, tilt=(25.0, 0.0)))
+    assert not any("parallel" in words for words in judged(tilted, shooter, poses).warnings)
+
+
+def test_a_capture_from_another_rig_is_named_with_all_its_differences() -> None:
+    rig = {"left": Size(1280, 1024), "right": Size(1280, 1024), PROJECTOR: Size(1024, 768)}
+    check_same_devices("pose_04", dict(rig), rig)
+    other = {"left": Size(1920, 1080), "middle": Size(1280, 1024), PROJECTOR: Size(1280, 800)}
+    with pytest.raises(CalibrationError, match="pose_04 was captured with another rig") as caught:
+        check_same_devices("pose_04", other, rig)
+    words = str(caught.value)
+    assert "camera 'left' has 1920 x 1080 pixels, expected 1280 x 1024" in words
+    assert "the projector has 1280 x 800 pixels" in words
+    assert "camera 'right' is missing" in words
+    assert "camera 'middle' is not one of the rig's" in words
+
+
+# ---- Pictures of a calibration: what is drawn lies where it should
+
+
+SIZE = Size(1280, 1024)
+
+
+def _cell(picture: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], row: int, column: int) -> list[int]:
+    """The colour of a cell: the most frequent one in it."""
+    height, width = 512 / 6, 640 / 6
+    part = picture[round(row * height) + 3 : round((row + 1) * height) - 3]
+    part = part[:, round(column * width) + 3 : round((column + 1) * width) - 3]
+    colours, counts = np.unique(part.reshape(-1, 3), axis=0, return_counts=True)
+    return [int(each) for each in colours[counts.argmax()]]
+
+
+def test_a_coverage_picture_fills_covered_cells_and_shows_where_to_go() -> None:
+    shooting = rig_of()
+    tilts = ((0.0, 0.0), (20.0, 0.0))
+    poses = shots(shooting, [held(CHESSBOARD, tilt=tilt, middle_mm=(-60.0, -50.0, 700.0)) for tilt in tilts])
+    found = coverage(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    points = [pose.views["left"].points_px for pose in poses]
+    plain = coverage_picture(found, points, SIZE)
+    assert plain.shape == (512, 640, 3)
+    assert plain.dtype == np.uint8
+    for row in range(6):
+        for column in range(6):
+            red, green, _ = _cell(plain, row, column)
+            assert (green - red > 10) == bool(found.cells[row, column]), (row, column)
+    outline = np.array([[900.0, 700.0], [1200.0, 700.0], [1200.0, 900.0], [900.0, 900.0]])
+    guided = coverage_picture(found, points, SIZE, outline_px=outline)
+    changed = np.argwhere((guided != plain).any(axis=2))
+    # Half as large as the image: the frame and its marked corner lie at half the coordinates.
+    assert changed[:, 1].min() == pytest.approx(450, abs=8)
+    assert changed[:, 1].max() == pytest.approx(600, abs=8)
+    assert changed[:, 0].min() == pytest.approx(350, abs=8)
+    assert changed[:, 0].max() == pytest.approx(450, abs=8)
+
+
+@pytest.mark.parametrize("colour", [False, True])
+def test_a_pose_picture_marks_the_corners_on_the_stretched_frame(colour: bool) -> None:
+    view = rig_of().shot("pose_00", held(CHESSBOARD)).views["left"]
+    frame = np.full(SIZE.shape, 400, dtype=np.uint16)  # of a 12-bit camera, dark
+    frame[500, 600] = 4000
+    image = np.repeat(frame[:, :, None], 3, axis=2) if colour else frame
+    bare = pose_picture(image, None, CHESSBOARD)
+    assert bare.shape == (512, 640, 3)
+    assert int(np.median(bare)) == 235
+    marked = pose_picture(image, view, CHESSBOARD)
+    changed = np.argwhere((marked != bare).any(axis=2))[:, ::-1]
+    for point in view.points_px / 2:
+        assert np.abs(changed - point).max(axis=1).min() < 5
+    assert changed[:, 0].min() > view.points_px[:, 0].min() / 2 - 12
