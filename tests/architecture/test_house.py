@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import doctest
+import importlib
 import inspect
 import json
 import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -271,19 +274,86 @@ def test_the_first_readme_is_short() -> None:
     assert len(READMES[0].read_text(encoding="utf-8").splitlines()) <= MOST_LINES_OF_THE_FIRST_README
 
 
-@pytest.mark.slow
-def test_the_wheel_holds_every_module_and_template(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of this checkout, built in a copy."""
+    folder = tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "README.md"):
-        shutil.copy(ROOT / name, tmp_path)
+        shutil.copy(ROOT / name, folder)
     for package in PACKAGES:
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
     command = [sys.executable, "-c", "from setuptools.build_meta import build_wheel; build_wheel('.')"]
-    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)  # noqa: S603
+    built = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False)  # noqa: S603
     assert built.returncode == 0, built.stderr
-    (wheel,) = tmp_path.glob("*.whl")
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_every_module_and_template(wheel: Path) -> None:
     held = set(ZipFile(wheel).namelist())
     kinds = {".py", ".html", ".css", ".js", ".svg"}
     needed = {path.relative_to(ROOT).as_posix() for package in PACKAGES for path in (ROOT / package).rglob("*.*")
               if path.suffix in kinds}  # fmt: skip
     assert "slrig/reports/templates/report.html" in needed
     assert needed - held == set()
+
+
+# ---- An installed wheel: its types reach the type checker of another project
+
+
+PROGRAM = """
+from slrig.client import Client
+from slrig.devices import Camera
+
+result = Client().scan(label="cup", exposure_s=0.01)
+reveal_type(result.points_mm)
+reveal_type(result.causes)
+Client().scan(exposure="bright")
+Client().scans.get(7)
+"""
+
+
+@pytest.mark.slow
+def test_a_scan_is_typed_in_another_project(wheel: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mypy", reason="needs mypy: pip install -e '.[lint]'")
+    environment = tmp_path / "environment"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)  # noqa: S603
+    site = next(environment.glob("lib/python*/site-packages"))
+    ZipFile(wheel).extractall(site)
+    # numpy and httpx2 come from where the tests run.
+    (site / "others.pth").write_text(sysconfig.get_paths()["purelib"])
+    (tmp_path / "program.py").write_text(PROGRAM)
+    checked = subprocess.run(  # noqa: S603
+        [sys.executable, "-m", "mypy", "--strict", "--python-executable", environment / "bin" / "python", "program.py"],
+        cwd=tmp_path,
+        env={"PATH": ""},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    lines = checked.stdout.splitlines()
+    revealed = [line for line in lines if "Revealed type" in line]
+    assert "ndarray" in revealed[0], checked.stdout
+    assert "float" in revealed[0]
+    assert "tuple[" in revealed[1]
+    faults = [line for line in lines if "error:" in line]
+    assert len(faults) == 2, checked.stdout
+    assert 'Unexpected keyword argument "exposure"' in faults[0]
+    assert 'expected "str"' in faults[1]
+
+
+# ---- The examples in docstrings
+
+EXAMPLES = sorted(
+    ".".join(Path(each.name).with_suffix("").parts).removesuffix(".__init__")
+    for each in SOURCES.values()
+    if ">>>" in each.text
+)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_examples(name: str) -> None:
+    result = doctest.testmod(importlib.import_module(name))
+    assert result.attempted > 0
+    assert result.failed == 0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import resource
 import signal
 from collections.abc import Iterable, Iterator
@@ -18,12 +20,15 @@ from slrig.bundle import (
     BundleWriter,
     read_bundle,
     read_truth,
+    storage,
     write_bundle,
     write_calibration,
     write_truth,
 )
-from slrig.errors import BundleError, ScanCancelledError, StorageError
-from slrig.model import CameraFormat, CameraTruth, Capture, Gray, LineShift, Shot, Surface, Truth
+from slrig.bundle.refused import Refused, read_refused
+from slrig.bundle.storage import write_file
+from slrig.errors import BundleError, ScanCancelledError, ScanEvidenceError, StorageError
+from slrig.model import Black, CameraFormat, CameraTruth, Capture, Gray, LineShift, Shot, Size, Surface, Truth, White
 from tests.samples import CAMERA, noise, pinhole, sample_calibration, sample_capture
 
 
@@ -296,3 +301,184 @@ def test_bundles_of_others_are_read(shared: Path, name: str, frames: int, calibr
         assert (found.visible_points_mm >= low - 0.01).all()
         assert (found.visible_points_mm <= high + 0.01).all()
         assert found.cameras == {}
+
+
+# ---- Frames that were refused lie beside a bundle and not in it; a capture that was cut short leaves what it has
+
+
+FORMATS = {"left": CameraFormat(Size(64, 48), 8), "right": CameraFormat(Size(64, 48), 8)}
+
+
+def shot(pattern: int, camera: str = "left", *, level: int = 0, time_s: float = 0.0) -> Shot:
+    return Shot(pattern, camera, np.full((48, 64), level, np.uint8), 0.01, time_s)
+
+
+def writer(folder: Path) -> BundleWriter:
+    return BundleWriter(folder, Size(64, 40), (White(), Black(), White()), FORMATS)
+
+
+def listed(folder: Path) -> list[tuple[int, str, int]]:
+    return [(each.pattern, each.camera, int(each.image[0, 0])) for each in read_bundle(folder).capture.shots]
+
+
+def test_a_frame_that_was_shot_again_takes_the_place_of_the_first(tmp_path: Path) -> None:
+    folder = tmp_path / "bundle"
+    with writer(folder) as bundle:
+        bundle.add(shot(0, level=10))
+        bundle.add(shot(1, level=11, time_s=0.1))
+        bundle.refuse(Refused(1, "left", 1, "it equals pattern 0", delivered=True))
+        bundle.add(shot(2, level=12))
+        bundle.add(shot(1, level=21, time_s=0.3))
+    assert listed(folder) == [(0, "left", 10), (1, "left", 21), (2, "left", 12)]
+    (entry,) = json.loads((folder / "refused" / "refused.json").read_text())["frames"]
+    assert entry == {
+        "pattern": 1, "camera": "left", "attempt": 1, "cause": "it equals pattern 0", "file": "refused/000.png",
+        "exposure_s": 0.01, "time_s": 0.1,
+    }  # fmt: skip
+    image = cv2.imread(str(folder / entry["file"]), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image[0, 0] == 11
+    assert read_refused(folder) == (Refused(1, "left", 1, "it equals pattern 0"),)
+
+
+def test_a_frame_that_failed_first_keeps_its_place(tmp_path: Path) -> None:
+    folder = tmp_path / "bundle"
+    with writer(folder) as bundle:
+        bundle.refuse(Refused(0, "left", 1, "damaged", shot(0, level=99)))
+        bundle.refuse(Refused(0, "right", 1, "no frame came"))
+        bundle.add(shot(1, level=11))
+        bundle.add(shot(0, "right", level=20))
+        bundle.add(shot(0, level=10))
+    assert listed(folder) == [(0, "left", 10), (0, "right", 20), (1, "left", 11)]
+    entries = json.loads((folder / "refused" / "refused.json").read_text())["frames"]
+    assert [each.get("file") for each in entries] == ["refused/000.png", None]
+    assert [path.name for path in sorted((folder / "refused").iterdir())] == ["000.png", "refused.json"]
+
+
+def test_only_what_is_taken_back_is_taken_back(tmp_path: Path) -> None:
+    # The same pattern at two exposures, as a bracket has it: a frame that did not come leaves the other one alone.
+    folder = tmp_path / "bundle"
+    with writer(folder) as bundle:
+        bundle.add(shot(0, level=10))
+        bundle.refuse(Refused(0, "left", 1, "no frame came"))
+        bundle.add(shot(0, level=40))
+    assert listed(folder) == [(0, "left", 10), (0, "left", 40)]
+
+
+def test_a_bundle_without_refused_frames_has_no_such_folder(tmp_path: Path) -> None:
+    with writer(tmp_path / "bundle") as bundle:
+        bundle.add(shot(0))
+    assert not (tmp_path / "bundle" / "refused").exists()
+    assert read_refused(tmp_path / "bundle") == ()
+
+
+def cut_short(folder: Path, *, keep: bool, taken: bool = True) -> None:
+    with writer(folder) as bundle:
+        if taken:
+            bundle.add(shot(0, level=10))
+            bundle.add(shot(1, level=11))
+        bundle.refuse(Refused(1, "left", 1, "stale", delivered=taken))
+        if keep:
+            bundle.keep("pattern 1 failed 3 times")
+        message = "pattern 1 failed 3 times"
+        raise ScanEvidenceError(message)
+
+
+def test_a_capture_that_was_cut_short_keeps_its_frames_on_request(tmp_path: Path) -> None:
+    folder = tmp_path / "bundle"
+    with pytest.raises(ScanEvidenceError):
+        cut_short(folder, keep=True)
+    assert listed(folder) == [(0, "left", 10)]
+    assert json.loads((folder / "refused" / "refused.json").read_text())["ended"] == "pattern 1 failed 3 times"
+    assert [path.name for path in tmp_path.iterdir()] == ["bundle"]
+
+
+def test_a_capture_that_failed_at_its_first_frame_leaves_the_cause(tmp_path: Path) -> None:
+    folder = tmp_path / "bundle"
+    with pytest.raises(ScanEvidenceError):
+        cut_short(folder, keep=True, taken=False)
+    with pytest.raises(BundleError, match="a folder without it"):
+        read_bundle(folder)
+    assert [each.cause for each in read_refused(folder)] == ["stale"]
+
+
+def test_other_errors_leave_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ScanEvidenceError):
+        cut_short(tmp_path / "bundle", keep=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"format": "slrig-refused", "version": 2, "frames": []}', "version"),
+        ('{"format": "slrig-refused", "frames": [{"pattern": -1}]}', "pattern"),
+        ("[", "expected JSON"),
+    ],
+)
+def test_a_list_that_slrig_did_not_write_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "refused").mkdir()
+    (tmp_path / "refused" / "refused.json").write_text(text)
+    with pytest.raises(BundleError, match=words):
+        read_refused(tmp_path)
+
+
+# ---- Files that are whole or absent
+
+
+def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    write_file(path, b"first, and longer")
+    write_file(path, b"second")
+    assert path.read_bytes() == b"second"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("cause", [errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EIO])
+def test_a_disk_that_refuses_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: int) -> None:
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(b"before")
+
+    def refuse(_: int) -> None:
+        raise OSError(cause, os.strerror(cause))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(StorageError, match=r"mesh\.ply: the disk refused") as caught:
+        write_file(path, b"after")
+    assert os.strerror(cause) in str(caught.value)
+    assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_interruption_leaves_no_partial_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_file(tmp_path / "a.bin", b"x")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match=r"nowhere.*create the folder first"):
+        write_file(tmp_path / "nowhere" / "a.bin", b"x")
+
+
+def test_on_windows_no_folder_is_opened_and_files_are_synced_writable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[tuple[Path, int]] = []
+    system_open = os.open
+
+    def as_windows(path: Path, flags: int) -> int:
+        assert not path.is_dir()
+        opened.append((path, flags))
+        return system_open(path, flags)
+
+    monkeypatch.setattr(storage, "_WINDOWS", True)
+    monkeypatch.setattr(os, "open", as_windows)
+    (tmp_path / "mesh.ply").write_bytes(b"ply")
+    storage.sync_file(tmp_path / "mesh.ply")
+    storage.sync_folder(tmp_path)
+    assert opened == [(tmp_path / "mesh.ply", os.O_RDWR)]

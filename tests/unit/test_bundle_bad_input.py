@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import resource
+import shutil
 import struct
 import zlib
 from collections.abc import Callable
@@ -17,10 +18,12 @@ import numpy as np
 import pytest
 import tifffile
 
-from slrig.bundle import images, read_bundle, read_capture, write_bundle
+from slrig.bundle import images, read_bundle, read_calibration, read_capture, write_bundle, write_calibration
+from slrig.bundle.images import read_pages
 from slrig.errors import BundleError, CalibrationError
-from slrig.model import Pixels
+from slrig.model import CameraFormat, Pixels
 from tests.samples import CAMERA, sample_calibration, sample_capture
+from tests.strangers import good_bundle, good_frames, harm_bundle, harmed_calibrations
 
 Edit = Callable[[dict[str, Any]], object]
 Spoil = Callable[[Path], object]
@@ -271,62 +274,53 @@ def test_a_tiff_that_unpacks_to_too_much_is_refused(folder: Path) -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 64 * 1024
 
 
-BAD_DESCRIPTIONS: dict[str, tuple[Edit, tuple[str, ...]]] = {
-    "unknown key": (lambda data: data.update(projektor={}), ("projektor: unknown key", "did you mean 'projector'?")),
-    "unknown key inside": (
-        lambda data: data["patterns"][2].update(cel_px=2),
-        ("patterns[2].cel_px: unknown key", "did you mean 'cell_px'?"),
-    ),
-    "missing key": (lambda data: data.pop("cameras"), ("cameras: missing; add it",)),
-    "missing key inside": (lambda data: data["patterns"][4].pop("period_px"), ("patterns[4].period_px: missing",)),
-    "other format": (lambda data: data.update(format="images"), ("format:", "'slrig-bundle'", "found 'images'")),
-    "other version": (lambda data: data.update(version=2), ("version:", "found 2")),
-    "text for a number": (lambda data: data["frames"][1].update(pattern="1"), ("frames[1].pattern:", "found '1'")),
-    "yes for a number": (lambda data: data["frames"][1].update(page=True), ("frames[1].page:", "found True")),
-    "no frames": (lambda data: data.update(frames=[]), ("frames:", "at least 1 item")),
-    "no patterns": (lambda data: data.update(patterns=[]), ("patterns:", "at least 1 item")),
-    "no cameras": (lambda data: data.update(cameras={}), ("cameras:", "at least 1 item")),
-    "unknown pattern kind": (lambda data: data["patterns"][0].update(kind="phase"), ("patterns[0]", "'phase'")),
-    "impossible pattern": (lambda data: data["patterns"][2].update(bit=9), ("patterns[2]", "bit 9 of 5")),
-    "impossible shift": (lambda data: data["patterns"][4].update(shift=8), ("patterns[4]", "shift 8")),
-    "pattern out of range": (
-        lambda data: data["frames"][3].update(pattern=5),
-        ("frames[3].pattern: expected 0 to 4, found 5", "number the patterns from 0"),
-    ),
-    "unknown camera": (
-        lambda data: data["frames"][3].update(camera="middle"),
-        ("frames[3].camera: expected one of left, right, found 'middle'",),
-    ),
-    "camera name with a slash": (
-        lambda data: data["cameras"].update({"../left": data["cameras"]["left"]}),
-        ("cameras", "../left"),
-    ),
-    "camera named as the projector": (
-        lambda data: data["cameras"].update(projector=data["cameras"]["left"]),
-        ("cameras", "expected a camera's own name, found 'projector'", "rename the camera"),
-    ),
-    "a file above the folder": (
-        lambda data: data["frames"][0].update(file="frames/../../secret.png"),
-        ("frames[0].file", "inside the bundle", "secret.png"),
-    ),
-    "an absolute file": (
-        lambda data: data["frames"][0].update(file="/etc/passwd"),
-        ("frames[0].file", "inside the bundle", "'/etc/passwd'"),
-    ),
-    "a file with backslashes": (
-        lambda data: data["frames"][0].update(file="frames\\left\\000.png"),
-        ("frames[0].file", "forward slashes"),
-    ),
-    "no exposure": (lambda data: data["frames"][0].update(exposure_s=0), ("frames[0].exposure_s", "found 0")),
-    "a thin camera": (lambda data: data["cameras"]["left"].update(size_px=[40]), ("cameras.left.size_px",)),
-    "a vast projector": (lambda data: data["projector"].update(size_px=[1, 10**6]), ("projector.size_px[1]",)),
-    "a deep camera": (lambda data: data["cameras"]["left"].update(bit_depth=17), ("cameras.left.bit_depth", "17")),
-}
+GONE = object()
+"""In place of a value: the key is removed."""
 
 
-@pytest.mark.parametrize("case", BAD_DESCRIPTIONS)
-def test_a_bad_description_is_refused_with_the_place_of_its_fault(folder: Path, case: str) -> None:
-    change, parts = BAD_DESCRIPTIONS[case]
+@pytest.mark.parametrize(
+    ("key", "value", "parts"),
+    [
+        ("projektor", {}, ("projektor: unknown key", "did you mean 'projector'?")),
+        ("patterns.2.cel_px", 2, ("patterns[2].cel_px: unknown key", "did you mean 'cell_px'?")),
+        ("cameras", GONE, ("cameras: missing; add it",)),
+        ("patterns.4.period_px", GONE, ("patterns[4].period_px: missing",)),
+        ("format", "images", ("format:", "'slrig-bundle'", "found 'images'")),
+        ("version", 2, ("version:", "found 2")),
+        ("frames.1.pattern", "1", ("frames[1].pattern:", "found '1'")),
+        ("frames.1.page", True, ("frames[1].page:", "found True")),
+        ("frames", [], ("frames:", "at least 1 item")),
+        ("patterns", [], ("patterns:", "at least 1 item")),
+        ("cameras", {}, ("cameras:", "at least 1 item")),
+        ("patterns.0.kind", "phase", ("patterns[0]", "'phase'")),
+        ("patterns.2.bit", 9, ("patterns[2]", "bit 9 of 5")),
+        ("patterns.4.shift", 8, ("patterns[4]", "shift 8")),
+        ("frames.3.pattern", 5, ("frames[3].pattern: expected 0 to 4, found 5", "number the patterns from 0")),
+        ("frames.3.camera", "middle", ("frames[3].camera: expected one of left, right, found 'middle'",)),
+        ("cameras.a/left", {}, ("cameras", "a/left")),
+        ("cameras.projector", {}, ("cameras", "expected a camera's own name, found 'projector'", "rename the camera")),
+        ("frames.0.file", "frames/../../secret.png", ("frames[0].file", "inside the bundle", "secret.png")),
+        ("frames.0.file", "/etc/passwd", ("frames[0].file", "inside the bundle", "'/etc/passwd'")),
+        ("frames.0.file", "frames\\left\\000.png", ("frames[0].file", "forward slashes")),
+        ("frames.0.exposure_s", 0, ("frames[0].exposure_s", "found 0")),
+        ("cameras.left.size_px", [40], ("cameras.left.size_px",)),
+        ("projector.size_px", [1, 10**6], ("projector.size_px[1]",)),
+        ("cameras.left.bit_depth", 17, ("cameras.left.bit_depth", "17")),
+    ],
+)
+def test_a_bad_description_is_refused_with_the_place_of_its_fault(
+    folder: Path, key: str, value: Any, parts: tuple[str, ...]
+) -> None:
+    *way, last = [int(step) if step.isdigit() else step for step in key.split(".")]
+
+    def change(data: Any) -> None:
+        for step in way:
+            data = data[step]
+        if value is GONE:
+            data.pop(last)
+        else:
+            data[last] = value
+
     _edit(folder / "bundle.json", change)
     _fault(folder, str(folder / "bundle.json"), *parts)
 
@@ -424,3 +418,68 @@ def test_what_opencv_refuses_is_refused(folder: Path, monkeypatch: pytest.Monkey
     with_tiff(0)(folder)
     monkeypatch.setattr(cv2, "imdecodemulti", refuse)
     _fault(folder, "data that cannot be decoded")
+
+
+# ---- Harmed files give a calibration or frames, or the one error that says what is wrong; never anything else
+
+
+CALIBRATIONS, BUNDLES = 150, 80
+"""`tests/e2e/campaigns/test_harmed_calibrations.py` sends more of them."""
+
+
+def test_a_harmed_calibration_is_read_or_refused(tmp_path: Path) -> None:
+    messages = []
+    for number, (ending, text) in enumerate(harmed_calibrations(CALIBRATIONS, seed=1)):
+        path = tmp_path / f"rig{ending}"
+        path.write_bytes(text)
+        try:
+            found = read_calibration(path)
+        except CalibrationError as cause:
+            messages.append(str(cause).removeprefix(str(path)))
+        else:
+            # What is read can be kept, and is the same then.
+            write_calibration(tmp_path / "kept.json", found)
+            assert read_calibration(tmp_path / "kept.json").digest == found.digest, number
+    assert CALIBRATIONS / 2 < len(messages) < CALIBRATIONS
+    assert max(map(len, messages)) < 4000
+    assert all(message.startswith((": ", " is not a valid calibration")) for message in messages)
+
+
+@pytest.mark.usefixtures("capfd")
+def test_a_harmed_bundle_is_read_or_refused(tmp_path: Path) -> None:
+    good, frames = good_bundle(tmp_path / "good"), good_frames()
+    messages = []
+    shutil.copytree(good, tmp_path / "scan")
+    for seed in range(BUNDLES):
+        name = harm_bundle(tmp_path / "scan", frames, seed)
+        try:
+            read_bundle(tmp_path / "scan")
+        except (BundleError, CalibrationError) as cause:
+            messages.append(str(cause))
+        shutil.copy(good / name, tmp_path / "scan" / name)
+    assert BUNDLES / 2 < len(messages) < BUNDLES
+    assert max(map(len, messages)) < 8000
+
+
+def test_every_good_frame_is_read(tmp_path: Path) -> None:
+    for data in good_frames():
+        (tmp_path / "frame").write_bytes(data)
+        assert read_pages(tmp_path / "frame", [0], CameraFormat(CAMERA, 8))[0].shape == CAMERA.shape
+
+
+def test_a_tiff_with_a_circle_of_pages_is_refused(tmp_path: Path) -> None:
+    # Longer than what the library for TIFF looks back over.
+    count = 150
+    pages = b"".join(struct.pack("<HI", 0, 8 + 6 * ((page + 1) % count)) for page in range(count))
+    (tmp_path / "frame.tif").write_bytes(b"II*\0" + struct.pack("<I", 8) + pages)
+    with pytest.raises(BundleError, match="chain of pages that does not end after 150"):
+        read_pages(tmp_path / "frame.tif", [0], CameraFormat(CAMERA, 8))
+
+
+def test_what_a_jpeg_remarks_is_not_for_the_decoder(tmp_path: Path) -> None:
+    data = next(each for each in good_frames() if each.startswith(b"\xff\xd8"))
+    (tmp_path / "frame.jpg").write_bytes(data)
+    plain = read_pages(tmp_path / "frame.jpg", [0], CameraFormat(CAMERA, 8))[0]
+    exif = b"\xff\xe1" + struct.pack(">H", 40) + b"Exif\0\0MM\0*" + b"\xff" * 28
+    (tmp_path / "frame.jpg").write_bytes(data[:2] + exif + data[2:])
+    np.testing.assert_array_equal(read_pages(tmp_path / "frame.jpg", [0], CameraFormat(CAMERA, 8))[0], plain)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -41,9 +40,10 @@ from slrig.jobs.records import JobKind, JobRecord
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
 from tests.unit.accept.test_plan import VOLUME
-from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, take_scans_from
+from tests.unit.accept.test_running import RIG, SHORT, take_scans_from
 from tests.unit.jobs.tame_queue import PowerCut, TameQueue
-from tests.unit.scan.fakes import WAIT_S, TameProjector
+from tests.unit.scan.bench import wait_for
+from tests.unit.scan.fakes import TamePositioner, TameProjector
 
 PLAN = replace(SHORT, rendered=False)
 
@@ -58,16 +58,8 @@ class Desk(AcceptanceDesk):
     """One whose measurements are over when they return."""
 
     def measure(self, test_id: UUID, **asked: Any) -> JobRecord:
-        job, over = super().measure(test_id, **asked), threading.Event()
-
-        def look() -> None:
-            if self.jobs.get(job.id).state.final:
-                over.set()
-
-        unwatch = self.jobs.watch(job.id, look)
-        look()
-        assert over.wait(WAIT_S)
-        unwatch()
+        job = super().measure(test_id, **asked)
+        wait_for(self.jobs, job.id, lambda: self.jobs.get(job.id).state.final)
         return job
 
 

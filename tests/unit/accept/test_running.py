@@ -41,7 +41,7 @@ from slrig.errors import (
 from slrig.model import Calibration, FloatArray, Mesh
 from slrig.scan.artefacts import encode_mesh_ply
 from tests.unit.accept.test_plan import GOOD, VOLUME, device
-from tests.unit.scan.fakes import TameRecording
+from tests.unit.scan.fakes import TamePositioner, TameRecording
 
 CAMERA = device()
 RIG = Calibration({"left": CAMERA}, CAMERA)
@@ -190,20 +190,6 @@ def test_an_error_within_its_uncertainty_of_the_limit_is_undecided(error: float,
     assert np.isnan(found.scatter_mm)
     assert found.uncertainty.expanded_mm == pytest.approx(0.002)
     assert found.decision is expected
-
-
-class TamePositioner:
-    """Stands where it was sent."""
-
-    def __init__(self, poses: tuple[str, ...]) -> None:
-        self.poses = poses
-        self.moves: list[int] = []
-
-    def move(self, index: int) -> None:
-        self.moves.append(index)
-
-    def close(self) -> None:
-        """Nothing to close."""
 
 
 def nothing_captured(rig: Rig, _plan: object, folder: Path, **_: object) -> TameRecording:

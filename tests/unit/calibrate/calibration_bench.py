@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
+from unittest.mock import Mock
 from uuid import UUID
 
 import numpy as np
@@ -21,15 +22,16 @@ from slrig.calibration.board import Board, BoardKind, BoardShape
 from slrig.calibration.judging.comparison import comparison
 from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
 from slrig.devices import Rig
-from slrig.errors import PoseRefusedError, ScanCancelledError
+from slrig.errors import PoseRefusedError
 from slrig.jobs.records import JobKind
+from slrig.jobs.rig_jobs import Recorded
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration, Pinhole, Size, Solved
 from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import Progress, ScanPlan
 from tests.samples import put_database
-from tests.unit.scan.bench import Bench
-from tests.unit.scan.fakes import WAIT_S, TameBench, TameRecording
+from tests.unit.scan.bench import Bench, wait_for
+from tests.unit.scan.fakes import WAIT_S, TameBench, TamePositioner
 
 BOARD = Board(BoardKind.CHESSBOARD, 4, 3, 10.0)
 PNG = b"\x89PNG tame"
@@ -57,23 +59,6 @@ class TameResult:
     """As much of a CalibrationResult as a session looks at."""
 
     calibration: Calibration
-
-
-class TamePositioner:
-    """A positioner that remembers where it was sent."""
-
-    def __init__(self, visited: list[int]) -> None:
-        self._visited = visited
-
-    @property
-    def poses(self) -> Sequence[str]:
-        return POSITIONS
-
-    def move(self, index: int) -> None:
-        self._visited.append(index)
-
-    def close(self) -> None:
-        return
 
 
 class TameCalibrating:
@@ -117,21 +102,9 @@ class TameCalibrating:
 
     def _capture(
         self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: Progress, cancelled: Callable[[], bool]
-    ) -> TameRecording:
+    ) -> Recorded:
         self.captured.append((rig, plan))
-        rig.projector.show(0)
-        progress("capture", 0.5, "frame 1 of 2")
-        self.bench.began.set()
-        while not self.bench.gate.wait(0.01):
-            if cancelled():
-                message = "The scan was cancelled."
-                raise ScanCancelledError(message)
-        if self.bench.error is not None:
-            error, self.bench.error = self.bench.error, None
-            raise error
-        folder.mkdir()
-        (folder / "bundle.json").write_text("{}")
-        return TameRecording()
+        return self.bench.capture(rig, plan, folder, progress=progress, cancelled=cancelled, frames=Mock())
 
     def _read(self, folder: Path, board: Board, name: str) -> ReadPose:
         assert (folder / "bundle.json").is_file()
@@ -197,7 +170,7 @@ class CalibrationBench(Bench):
 
     def open_rig(self) -> Rig:
         rig = super().open_rig()
-        return replace(rig, positioner=TamePositioner(self.tame.visited)) if self._positioner else rig
+        return replace(rig, positioner=TamePositioner(POSITIONS, self.tame.visited)) if self._positioner else rig
 
     def until_pose(self, session_id: UUID, number: int) -> PoseRecord:
         """The pose once it is in a final state."""
@@ -206,16 +179,8 @@ class CalibrationBench(Bench):
 
     def until_session(self, session_id: UUID, done: Callable[[SessionRecord], bool]) -> SessionRecord:
         """The session once `done` says so."""
-        register, reached = self.calibrations.register, threading.Event()
-
-        def look() -> None:
-            if done(register.get(session_id)):
-                reached.set()
-
-        unwatch = register.jobs.watch(session_id, look)
-        look()
-        assert reached.wait(WAIT_S)
-        unwatch()
+        register = self.calibrations.register
+        wait_for(register.jobs, session_id, lambda: done(register.get(session_id)))
         return register.get(session_id)
 
     def record(self, session_id: UUID) -> SessionRecord:

@@ -24,7 +24,6 @@ from slrig.errors import (
     CalibrationNotFoundError,
     CalibrationStateError,
     DeviceGoneError,
-    RigBusyError,
     SolveRefusedError,
     StorageError,
     UnsupportedByDeviceError,
@@ -126,28 +125,6 @@ def test_bad_pose_is_refused_with_its_cause_and_its_picture(bench: CalibrationBe
     assert bench.tame.judged[-1] == []
     bench.solve(session_id)
     assert bench.tame.solved == [["pose 3"]]
-
-
-def test_pose_and_scan_stand_in_one_line(bench: CalibrationBench) -> None:
-    session_id = bench.session()
-    pose = bench.held_pose(session_id)
-    with pytest.raises(RigBusyError, match=f"held by calibration {session_id}, pose 1 since .*POST .*/pose/1/cancel"):
-        bench.scan()
-    assert bench.runner.status().holder == f"calibration {session_id}, pose 1"
-    queued = bench.scan(wait=True)
-    bench.gate.set()
-    assert bench.until_pose(session_id, pose.number).state is JobState.SUCCEEDED
-    assert bench.until(queued.id).state is JobState.SUCCEEDED
-
-    scan = bench.held()
-    with pytest.raises(RigBusyError) as busy:
-        bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=False)
-    assert busy.value.holder == str(scan.id)
-    assert bench.record(session_id).latest_pose == 1
-    waiting = bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=True)
-    assert bench.calibrations.register.pose(session_id, waiting.number).state is JobState.QUEUED
-    bench.gate.set()
-    assert bench.until_pose(session_id, waiting.number).state is JobState.SUCCEEDED
 
 
 def test_end_that_the_disk_refuses_is_not_lost(bench: CalibrationBench, monkeypatch: pytest.MonkeyPatch) -> None:

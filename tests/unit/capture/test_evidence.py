@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from slrig.bundle.refused import Refused
+from slrig.capture.checks import NOISE_FLOOR_DN, Reference, Samples, noise_dn, reference, repeated
+from slrig.capture.code_checks import line_sum, rougher
 from slrig.capture.evidence import Evidence, EvidenceSummary, check_capture
+from slrig.capture.sampling import Sampler
 from slrig.errors import ScanEvidenceError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, add, patterns_for
 
 PATTERNS = patterns_for()
+COUNT = len(PATTERNS)
+SCENE = Scene(noise_dn=1.0)
+SHOTS = SCENE.shots(PATTERNS)
 FIRST_LINE = next(i for i, pattern in enumerate(PATTERNS) if isinstance(pattern, LineShift))
 
 
@@ -23,6 +32,10 @@ def judged(scene: Scene, shots: Sequence[Shot], patterns: Sequence[Pattern] = PA
     for shot in shots:
         add(evidence, shot)
     return evidence
+
+
+def recorded(shots: Sequence[Shot]) -> Capture:
+    return Capture(PROJECTOR, PATTERNS, {"left": SCENE.format}, tuple(shots))
 
 
 def with_image(shots: Sequence[Shot], index: int, image: Pixels) -> list[Shot]:
@@ -153,8 +166,7 @@ def test_white_and_black_that_cannot_be_used(scene: Scene, swap: bool, words: st
 
 def test_an_all_black_recording_is_told_once() -> None:
     scene = Scene(white=0.0, ambient=0.0)
-    capture = Capture(PROJECTOR, PATTERNS, {"left": scene.format}, tuple(scene.shots(PATTERNS)))
-    summary = check_capture(capture)
+    summary = check_capture(recorded(scene.shots(PATTERNS)))
     assert len(summary.faults) == 1
     assert summary.verified == 0
 
@@ -214,14 +226,37 @@ def test_a_frame_that_is_not_what_it_claims_is_refused(spoil: Spoil, index: int,
         judged(scene, with_image(shots, index, spoil(shots, index)))
 
 
-@pytest.mark.parametrize("bit", [0, 4])
-def test_a_bit_exchanged_with_its_inverse_is_refused(bit: int) -> None:
-    scene = Scene(noise_dn=1.0)
-    shots = scene.shots(PATTERNS)
-    i = PATTERNS.index(Gray(Axis.COLUMN, bit, 5, 4))
-    swapped = with_image(with_image(shots, i, shots[i + 1].image), i + 1, shots[i].image)
-    with pytest.raises(ScanEvidenceError, match="exchanged with its inverse"):
-        judged(scene, swapped)
+def exchanged(one: int, other: int) -> list[Shot]:
+    return with_image(with_image(SHOTS, one, SHOTS[other].image), other, SHOTS[one].image)
+
+
+BIT_0, BIT_4 = (PATTERNS.index(Gray(Axis.COLUMN, bit, 5, 4)) for bit in (0, 4))
+
+
+@pytest.mark.parametrize(
+    ("shots", "words"),
+    [
+        (exchanged(BIT_0, BIT_0 + 1), "exchanged with its inverse"),
+        (exchanged(BIT_4, BIT_4 + 1), "exchanged with its inverse"),
+        *((exchanged(FIRST_LINE, FIRST_LINE + other), "lines") for other in (1, 4, 7)),
+        (
+            with_image(SHOTS, FIRST_LINE + 3, SHOTS[FIRST_LINE + 2].image),
+            rf"lines, shift 3 of 8.*equals that of pattern {FIRST_LINE + 2} ",
+        ),
+        (
+            [*SHOTS[:-2], replace(SCENE, white=0.75).shots(PATTERNS)[-2]],
+            r"the light changed by \+25% of white",
+        ),
+        (
+            with_image(SHOTS, COUNT - 2, np.roll(SHOTS[-2].image, 25, axis=1)),
+            r"\d+% of the pixels changed.*moved",
+        ),
+    ],
+    ids=["bit 0", "bit 4", "lines 1", "lines 4", "lines 7", "twin", "light", "moved"],
+)
+def test_frames_that_contradict_one_another_are_refused_in_words(shots: list[Shot], words: str) -> None:
+    with pytest.raises(ScanEvidenceError, match=words):
+        judged(SCENE, shots)
 
 
 def test_a_coarse_bit_exchanged_with_its_inverse_is_refused_without_line_frames() -> None:
@@ -234,48 +269,9 @@ def test_a_coarse_bit_exchanged_with_its_inverse_is_refused_without_line_frames(
         judged(scene, swapped, patterns)
 
 
-@pytest.mark.parametrize("other", [1, 4, 7])
-def test_line_frames_out_of_order_are_refused(other: int) -> None:
-    scene = Scene(noise_dn=1.0)
-    shots = scene.shots(PATTERNS)
-    swapped = with_image(shots, FIRST_LINE, shots[FIRST_LINE + other].image)
-    swapped = with_image(swapped, FIRST_LINE + other, shots[FIRST_LINE].image)
-    with pytest.raises(ScanEvidenceError, match="lines"):
-        judged(scene, swapped)
-
-
-def test_the_message_names_the_twin_of_a_repeated_frame() -> None:
-    scene = Scene(noise_dn=1.0)
-    shots = scene.shots(PATTERNS)
-    late = with_image(shots, FIRST_LINE + 3, shots[FIRST_LINE + 2].image)
-    with pytest.raises(ScanEvidenceError, match=rf"lines, shift 3 of 8.*equals that of pattern {FIRST_LINE + 2} "):
-        judged(scene, late)
-
-
-# ---- the closing frames
-
-
-def test_light_that_changed_is_told_in_percent() -> None:
-    scene = Scene(noise_dn=1.0)
-    shots = scene.shots(PATTERNS)
-    brighter = replace(scene, white=0.75).shots(PATTERNS)[-2]
-    with pytest.raises(ScanEvidenceError, match=r"the light changed by \+25% of white"):
-        judged(scene, [*shots[:-2], brighter])
-
-
-def test_an_object_that_moved_is_told() -> None:
-    scene = Scene(noise_dn=1.0)
-    shots = scene.shots(PATTERNS)
-    moved = np.roll(shots[-2].image, 25, axis=1)
-    with pytest.raises(ScanEvidenceError, match=r"\d+% of the pixels changed.*moved"):
-        judged(scene, with_image(shots, len(PATTERNS) - 2, moved))
-
-
 def test_a_small_drift_is_measured_and_passes() -> None:
-    scene = Scene(noise_dn=1.0)
-    shots = scene.shots(PATTERNS)
-    closing = replace(scene, white=0.6 * 1.05).shots(PATTERNS)[-2]
-    summary = judged(scene, [*shots[:-2], closing, shots[-1]]).summary()
+    closing = replace(SCENE, white=0.6 * 1.05).shots(PATTERNS)[-2]
+    summary = judged(SCENE, [*SHOTS[:-2], closing, SHOTS[-1]]).summary()
     assert summary.light_drift["left"] == pytest.approx(0.05, abs=0.01)
 
 
@@ -300,9 +296,7 @@ def test_a_frame_of_another_format_is_refused(image: Pixels, words: str) -> None
 
 
 def test_a_recording_with_faults_is_judged_and_not_refused() -> None:
-    scene = Scene(noise_dn=1.0)
-    shots = with_image(shots := scene.shots(PATTERNS), 5, shots[4].image)
-    summary = check_capture(Capture(PROJECTOR, PATTERNS, {"left": scene.format}, tuple(shots)))
+    summary = check_capture(recorded(with_image(SHOTS, 5, SHOTS[4].image)))
     assert any("pattern 5 (column Gray bit 1 of 5, inverse)" in fault for fault in summary.faults)
     assert summary.verified < summary.patterns == len(PATTERNS)
 
@@ -318,19 +312,13 @@ def test_cameras_are_judged_apart_and_a_pattern_needs_both() -> None:
 
 
 def test_a_bracket_is_judged_at_the_exposure_most_patterns_have() -> None:
-    scene, brighter = Scene(noise_dn=1.0), Scene(noise_dn=1.0, white=0.9)
-    usual = [replace(shot, exposure_s=0.01) for shot in scene.shots(PATTERNS)]
-    long = [replace(shot, exposure_s=0.015) for shot in brighter.shots(PATTERNS)[:2]]
-    capture = Capture(PROJECTOR, PATTERNS, {"left": scene.format}, (*long, *usual))
-    summary = check_capture(capture)
+    usual = [replace(shot, exposure_s=0.01) for shot in SHOTS]
+    long = [replace(shot, exposure_s=0.015) for shot in replace(SCENE, white=0.9).shots(PATTERNS)[:2]]
+    summary = check_capture(recorded([*long, *usual]))
     assert (summary.verified, summary.faults) == (len(PATTERNS), ())
 
 
 # ---- frames that are taken back: what is left stands as if they had never come
-
-COUNT = len(PATTERNS)
-SCENE = Scene(noise_dn=1.0)
-SHOTS = SCENE.shots(PATTERNS)
 
 
 def evidence_of(patterns: Sequence[Pattern] = PATTERNS) -> Evidence:
@@ -481,8 +469,9 @@ def test_what_was_refused_stays_on_record_when_all_frames_are_forgotten() -> Non
 
 
 def test_a_recording_knows_what_was_shot_again() -> None:
-    capture = Capture(PROJECTOR, PATTERNS, {"left": SCENE.format}, tuple(SHOTS))
-    summary = check_capture(capture, [Refused(3, "left", 1, "stale"), Refused(99, "left", 1, "of another sequence")])
+    summary = check_capture(
+        recorded(SHOTS), [Refused(3, "left", 1, "stale"), Refused(99, "left", 1, "of another sequence")]
+    )
     assert str(summary) == "22/22 patterns verified, 1 frame shot again"
 
 
@@ -501,35 +490,127 @@ def bright_rows(shots: list[Shot], index: int) -> Pixels:
     return image
 
 
-@pytest.mark.parametrize("index", [0, 1, COUNT - 2, COUNT - 1])
-@pytest.mark.parametrize("damage", [garbled, black_rows, bright_rows], ids=lambda damage: damage.__name__)
-@pytest.mark.parametrize("white", [0.3, 0.6, 0.9])
-@pytest.mark.slow
-def test_damage_to_white_or_black_shows_by_the_end(index: int, damage: Spoil, white: float) -> None:
-    scene = Scene(noise_dn=1.0, white=white, ambient=0.08)
-    shots = scene.shots(PATTERNS)
-    spoilt = replace(shots[index], image=damage(shots, index))
-    capture = Capture(PROJECTOR, PATTERNS, {"left": scene.format}, (*shots[:index], spoilt, *shots[index + 1 :]))
-    black = index in {1, COUNT - 1}
-    # Black that is darker still shows nothing: it is as dark as the room in truth.
-    assert (check_capture(capture).faults == ()) == (black and damage is black_rows)
+SLOW = product((0, 1, COUNT - 2, COUNT - 1), (garbled, black_rows, bright_rows), (0.3, 0.6, 0.9))
+QUICK = [(0, garbled, 0.6), (1, bright_rows, 0.6), (1, black_rows, 0.6), (COUNT - 2, black_rows, 0.6)]
 
 
 @pytest.mark.parametrize(
-    ("index", "damage", "shows"),
-    # Black that is darker still shows nothing: it is as dark as the room in truth.
-    [(0, garbled, True), (1, bright_rows, True), (1, black_rows, False), (COUNT - 2, black_rows, True)],
+    ("index", "damage", "white"), [*QUICK, *(pytest.param(*each, marks=pytest.mark.slow) for each in SLOW)]
 )
-def test_damage_to_white_or_black_shows(index: int, damage: Spoil, shows: bool) -> None:
-    spoilt = replace(SHOTS[index], image=damage(SHOTS, index))
-    shots = (*SHOTS[:index], spoilt, *SHOTS[index + 1 :])
-    found = check_capture(Capture(PROJECTOR, PATTERNS, {"left": SCENE.format}, shots))
-    assert (found.faults != ()) is shows
+def test_damage_to_white_or_black_shows_by_the_end(index: int, damage: Spoil, white: float) -> None:
+    scene = Scene(noise_dn=1.0, white=white, ambient=0.08)
+    shots = scene.shots(PATTERNS)
+    found = check_capture(recorded(with_image(shots, index, damage(shots, index))))
+    # Black that is darker still shows nothing: it is as dark as the room in truth.
+    assert (found.faults == ()) == (index in {1, COUNT - 1} and damage is black_rows)
 
 
 def test_an_opening_frame_that_shows_half_of_white_is_found_by_the_closing_one() -> None:
     # A frame of the scan before: lit where a coarse bit was, and right wherever it is lit.
-    stale = replace(SHOTS[0], image=SHOTS[2].image)
-    capture = Capture(PROJECTOR, PATTERNS, {"left": SCENE.format}, (stale, *SHOTS[1:]))
-    summary = check_capture(capture)
+    summary = check_capture(recorded(with_image(SHOTS, 0, SHOTS[2].image)))
     assert any("pattern 20 (white)" in fault for fault in summary.faults)
+
+
+# ---- Damage that light alone does not contradict: by roughness, the sum of line frames, and the noise of pairs
+
+
+Image = NDArray[np.float64]
+SIZE = Size(200, 240)
+SAMPLER = Sampler.of(SIZE)
+NOISE_DN = 1.0
+PERIOD = 8
+RANDOM = np.random.default_rng(4)
+
+
+def seen(light: NDArray[np.floating[Any]]) -> Image:
+    """(H, W): what the camera sees of light that varies along the columns, 0 to 1, in a room that is not dark."""
+    values = 230 * (0.03 + 0.9 * np.broadcast_to(light, SIZE.shape)) ** 0.45
+    return np.asarray(values + RANDOM.normal(0, NOISE_DN, SIZE.shape))
+
+
+def sampled(image: Image) -> Samples:
+    return SAMPLER.take(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+
+
+def stripes(width_px: int, shift: float = 0.0, *, period_px: int = PERIOD, blur_px: float = 1.2) -> Samples:
+    """(W,): lit stripes of the projector, two of whose columns are five of the camera's, blurred."""
+    fine = (np.arange(0, 40 * SIZE.width_px) / 40 / 2.5 - shift) % period_px < width_px
+    reach = np.arange(-400, 401) / 40
+    kernel = np.exp(-0.5 * (reach / (2.5 * blur_px)) ** 2)
+    light = np.convolve(np.pad(fine.astype(float), 400, mode="wrap"), kernel / kernel.sum(), mode="valid")
+    return np.asarray(light[::40], dtype=np.float32)
+
+
+def noisy_band(
+    image: Image,
+) -> Image:
+    """A third of the rows are any bytes."""
+    out = image.copy()
+    out[80:160] = RANDOM.integers(0, 256, out[80:160].shape)
+    return out
+
+
+@pytest.fixture(scope="module")
+def ref() -> Reference:
+    one = np.ones(SIZE.width_px)
+    white, black = sampled(seen(one)), sampled(seen(0 * one))
+    return reference(white, black, threshold_dn=20, full_scale=255, row=SAMPLER.row)
+
+
+@pytest.mark.parametrize("period_px", [2, 4, 16, 64])
+def test_a_garbled_frame_is_rougher_than_its_inverse(ref: Reference, period_px: int) -> None:
+    bit = seen(stripes(period_px // 2, period_px=period_px))
+    inverse = sampled(seen(1 - stripes(period_px // 2, period_px=period_px)))
+    assert rougher(sampled(bit), [inverse], ref, noise=NOISE_DN) is None
+    assert rougher(inverse, [sampled(bit)], ref, noise=NOISE_DN) is None
+    told = rougher(sampled(noisy_band(bit)), [inverse], ref, noise=NOISE_DN)
+    assert told is not None
+    assert "damaged in transfer" in told
+    assert rougher(inverse, [sampled(noisy_band(bit))], ref, noise=NOISE_DN) is None
+
+
+def test_light_that_flickers_from_pixel_to_pixel_is_no_damage(ref: Reference) -> None:
+    """A projector that dithers: all is lit in one frame of a pair, and nothing in the other."""
+    lit = seen(np.ones(SIZE.width_px)) * (1 + RANDOM.normal(0, 0.13, SIZE.shape))
+    assert rougher(sampled(lit), [sampled(seen(np.zeros(SIZE.width_px)))], ref, noise=NOISE_DN) is None
+
+
+def lines(width_px: int = 1) -> list[Samples]:
+    return [sampled(seen(stripes(width_px, shift))) for shift in range(PERIOD)]
+
+
+@pytest.mark.parametrize("width_px", [1, 3])
+def test_line_frames_add_up_alike_everywhere_whatever_the_response(ref: Reference, width_px: int) -> None:
+    assert line_sum(lines(width_px), ref, noise=NOISE_DN) is None
+
+
+def test_a_garbled_line_frame_is_blamed_by_the_sum(ref: Reference) -> None:
+    frames = lines()
+    frames[3] = sampled(noisy_band(seen(stripes(1, 3))))
+    found = line_sum(frames, ref, noise=NOISE_DN)
+    assert found is not None
+    blamed, words = found
+    assert 3 in blamed
+    assert len(blamed) < PERIOD
+    assert "do not add up" in words
+
+
+def test_a_line_frame_that_shows_its_neighbours_lines_is_a_repetition_in_the_dark_too(ref: Reference) -> None:
+    """Two exposures of one pattern: in dark such a camera has several times the noise that bright pixels tell."""
+    again = sampled(seen(stripes(1, 2)) + RANDOM.normal(0, 3.0, SIZE.shape))
+    assert repeated(again, lines(), ref, noise=0.5, factor=40.0) == 2
+    assert repeated(sampled(seen(stripes(1, 2))), [sampled(seen(stripes(1, 3)))], ref, noise=0.5, factor=40.0) is None
+
+
+def test_a_damaged_white_frame_does_not_pass_for_noise(ref: Reference) -> None:
+    damaged = Reference(
+        RANDOM.uniform(120, 250, len(ref.white)).astype(np.float32), ref.black, ref.contrast, ref.lit, ref.judged,
+        ref.row, ref.band,
+    )  # fmt: skip
+    first, second = (
+        [sampled(seen(stripes(16, period_px=32))), sampled(seen(1 - stripes(16, period_px=32)))],
+        [sampled(seen(stripes(32, period_px=64))), sampled(seen(1 - stripes(32, period_px=64)))],
+    )
+    assert noise_dn(first[0], first[1], damaged) > 10 * NOISE_DN
+    by_pairs = noise_dn(second[0], second[1], damaged, sums=[first[0] + first[1]])
+    assert NOISE_FLOOR_DN < by_pairs < 3 * NOISE_DN

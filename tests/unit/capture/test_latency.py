@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,38 +13,18 @@ import numpy as np
 import pytest
 
 from slrig.capture.latency import LatencyMeasurement, measure_latency, shutter_skew_s, stable_from_ns
-from slrig.capture.latency_fit import Flash, FlashRows, RowLevels, rows_of
+from slrig.capture.latency_fit import CameraLatency, Flash, FlashRows, RowLevels, fitted, row_levels, rows_of
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig, Shown, Synchronisation, SystemClock, Trigger
 from slrig.discovery import open_rig
 from slrig.errors import ConfigError, ScanEvidenceError, UnsupportedByDeviceError
-from tests.unit.capture.test_latency_fit import STATED_NS, World, both_ways, step
+from slrig.model import FloatArray, Pixels
 from tests.unit.simulated_rig.building import small_head
 
 
 def rig(folder: Path, camera: Mapping[str, Any] | None = None, **head: Any) -> Rig:
     made = small_head(folder, camera={"line_time_s": 1e-4, **(camera or {})}, ambient=0.05, samples_per_axis=1, **head)
     return Rig("bench", made.cameras, made.projector, {"eye": CameraSettings(0.01)}, None, made, None, made.clock)
-
-
-@pytest.mark.slow
-def test_a_frame_after_the_measured_instant_shows_the_new_light_alone(tmp_path: Path) -> None:
-    late = rig(tmp_path, faults={"light_delay_s": 0.03})
-    found = measure_latency(late, trials=12)
-    camera, projector = late.cameras["eye"], late.projector
-    camera.arm(60, Trigger.FREE)
-    means: dict[tuple[bool, int], list[float]] = {}
-    for turn in range(40):
-        index = turn % 2
-        shown = projector.show(index)
-        waits = turn % 4 < 2
-        after_ns = stable_from_ns(shown, found.synchronisation if waits else None)
-        means.setdefault((waits, index), []).append(float(camera.read(after_ns, 1.0).image.mean()))
-        late.clock.wait_until(late.clock.now_ns() + 100_000_000 + turn * 1_300_000, threading.Event())
-    assert np.ptp(means[True, 0]) < 1
-    assert np.ptp(means[True, 1]) < 1
-    # Without the measurement, frames of the old light are taken for the new.
-    assert np.mean(means[False, 0]) < np.mean(means[True, 0]) - 5
 
 
 @pytest.mark.parametrize("trigger", [Trigger.FREE, Trigger.SOFTWARE])
@@ -195,3 +176,217 @@ def test_a_line_time_of_no_camera_is_refused(tmp_path: Path) -> None:
     path.write_text(f'name = "two"\n{table}[projector]\ndriver = "x"\n[[camera]]\ndriver = "y"\nname = "left"\n')
     with pytest.raises(ConfigError, match=r"cameras of this rig \(left\), found nose"):
         read_rig(path)
+
+
+# ---- Latency from flashes: projectors and cameras of many kinds, each described by its light and its shutter in time
+
+
+ROWS, COLUMNS = 60, 20
+STATED_NS = 5_000_000_000
+GRID_S = 2e-5
+
+Light = Callable[[FloatArray], FloatArray]
+"""Light at times since the instant that the projector stated, 0 to 1."""
+
+
+def step(at_s: float) -> Light:
+    return lambda t: (t >= at_s).astype(np.float64)
+
+
+def ramp(begin_s: float, length_s: float) -> Light:
+    return lambda t: np.clip((t - begin_s) / length_s, 0, 1)
+
+
+@dataclass(frozen=True)
+class World:
+    """A projector by its light, and a camera. `light(to_white, rng)` is a change of light; steady light is 0 or 1."""
+
+    light: Callable[[bool, np.random.Generator], Light]
+    exposure_s: float = 0.01
+    period_s: float = 0.012
+    line_s: float = 0.0
+    scan_s: float = 0.0
+    stamp_offset_s: float = 0.0
+    noise_dn: float = 0.7
+    ambient_dn: float = 20.0
+    white_dn: float = 150.0
+    steady: Light = lambda t: np.ones_like(t)
+    full_scale: int = 255
+
+    def shares(self, light: Light, start_s: float) -> FloatArray:
+        """(ROWS,) float64: the mean light on each row during its own exposure."""
+        t = np.arange(-0.1, 0.4, GRID_S)
+        gathered = np.concatenate([[0.0], np.cumsum(light(t[:-1]) * GRID_S)])
+        begin = start_s + np.arange(ROWS) * (self.line_s - self.scan_s)
+        return np.asarray(
+            (np.interp(begin + self.exposure_s, t, gathered) - np.interp(begin, t, gathered)) / self.exposure_s
+        )
+
+    def image(self, shares: FloatArray, rng: np.random.Generator) -> Pixels:
+        # Albedo differs between rows and between columns; the outer columns see no projector.
+        albedo = np.linspace(0.5, 1.0, ROWS)[:, None] * np.linspace(1.0, 0.7, COLUMNS)
+        albedo[:, :3] = 0
+        dn = (
+            self.ambient_dn
+            + self.white_dn * albedo * shares[:, None]
+            + self.noise_dn * rng.standard_normal(albedo.shape)
+        )
+        return np.clip(np.rint(dn), 0, self.full_scale).astype(np.uint16)
+
+    def levels(self, rng: np.random.Generator) -> RowLevels:
+        black = [self.image(np.zeros(ROWS), rng) for _ in range(8)]
+        white = [self.image(self.shares(self.steady, float(rng.uniform(0, 0.1))), rng) for _ in range(8)]
+        return row_levels("eye", black, white, full_scale=self.full_scale)
+
+    def flashes(self, count: int, levels: RowLevels, rng: np.random.Generator) -> list[Flash]:
+        made = []
+        for number in range(count):
+            to_white = number % 2 == 1
+            light = self.light(to_white, rng)
+            first_s = -2 * self.period_s + float(rng.uniform(0, self.period_s))
+            frames = []
+            for start_s in first_s + self.period_s * np.arange(10):
+                image = self.image(self.shares(light, start_s), rng)
+                stamp_ns = STATED_NS + round((start_s + self.stamp_offset_s) * 1e9)
+                frames.append((stamp_ns, self.exposure_s, levels.shares(image)))
+            made.append(Flash.of(to_white, Shown(0, STATED_NS, 500_000), frames))
+        return made
+
+    def measured(self, *, count: int = 60, seed: int = 0) -> CameraLatency:
+        rng = np.random.default_rng(seed)
+        levels = self.levels(rng)
+        return fitted("eye", self.flashes(count, levels, rng), levels)
+
+
+def both_ways(light: Light) -> Callable[[bool, np.random.Generator], Light]:
+    """The same to white and to black, and the same every time."""
+    return lambda to_white, _: light if to_white else (lambda t: 1 - light(t))
+
+
+# ---- the fit
+
+
+@pytest.mark.parametrize(("latency_s", "line_s"), [(0.012, 0.0), (-0.004, 1.5e-5), (0.012, 6e-5), (-0.004, 3e-4)])
+def test_latency_and_line_time_come_out_of_the_rows(latency_s: float, line_s: float) -> None:
+    found = World(both_ways(step(latency_s)), line_s=line_s, period_s=0.032).measured()
+    assert found.latency_s == pytest.approx(latency_s, abs=1e-4)
+    assert found.line_time_s == pytest.approx(line_s, rel=0.02, abs=5e-7)
+    assert abs(found.line_time_s - line_s) < 4 * found.line_time_error_s + 1e-9
+    assert found.rolling is (line_s > 0)
+    assert found.skew_s == pytest.approx((ROWS - 1) * line_s, rel=0.02)
+    assert found.jitter_s < 1e-4
+    assert found.settle_s == 0
+
+
+@pytest.mark.slow
+def test_the_stated_error_of_the_line_time_is_its_scatter_and_no_shutter_is_taken_for_another() -> None:
+    found = [World(both_ways(step(0.003)), line_s=3e-5, noise_dn=3.0).measured(count=30, seed=s) for s in range(30)]
+    scatter = np.std([each.line_time_s for each in found], ddof=1)
+    stated = np.median([each.line_time_error_s for each in found])
+    assert 0.6 < stated / scatter < 1.6
+    for seed in range(40):
+        still = World(both_ways(step(0.012)), noise_dn=2.0).measured(count=30, seed=seed)
+        assert not still.rolling
+        assert not still.scanned
+
+
+def test_a_constant_error_of_the_time_stamps_is_part_of_the_latency() -> None:
+    world = World(both_ways(step(0.012)), line_s=5e-5)
+    late = replace(world, stamp_offset_s=-0.009).measured()
+    assert late.latency_s == pytest.approx(0.003, abs=1e-4)
+    assert late.line_time_s == pytest.approx(5e-5, rel=0.02)
+
+
+def test_light_that_waits_for_the_refresh_is_told_as_jitter() -> None:
+    period_s = 1 / 60
+
+    def at_next_refresh(to_white: bool, rng: np.random.Generator) -> Light:
+        return both_ways(step(0.004 + float(rng.uniform(0, period_s))))(to_white, rng)
+
+    found = World(at_next_refresh).measured(count=120)
+    assert found.latency_s == pytest.approx(0.004 + period_s / 2, abs=4 * found.standard_error_s)
+    assert found.jitter_s == pytest.approx(period_s / 12**0.5, rel=0.2)
+    assert found.latency_s < found.latency_p95_s <= found.latest_s
+    assert found.earliest_s == pytest.approx(0.004 - 0.6e-3, abs=1e-3)
+    assert found.latest_s == pytest.approx(0.004 + period_s + 0.6e-3, abs=1e-3)
+
+
+def test_a_ramp_is_timed_at_its_middle_and_waited_for_to_its_end() -> None:
+    found = World(both_ways(ramp(0.010, 0.008)), exposure_s=0.02, period_s=0.022).measured()
+    assert found.latency_s == pytest.approx(0.014, abs=1e-3)
+    # Rows that begin from 2.5 ms before the ramp's end miss less than 2 %: stable by what counts as steady.
+    assert 0.0155 < found.latest_s < 0.019
+
+
+def test_darkening_more_slowly_than_brightening_is_told_and_waited_for() -> None:
+    found = World(lambda to_white, rng: both_ways(step(0.005 if to_white else 0.015))(to_white, rng)).measured()
+    assert (found.rise_s, found.fall_s) == pytest.approx((0.005, 0.015), abs=1e-4)
+    assert found.latest_s == pytest.approx(0.015, abs=3e-4)
+
+
+def test_a_colour_wheel_is_told_as_flicker_and_hardly_moves_the_latency() -> None:
+    # Three colours of unlike brightness, each lit for a third of a turn, 120 turns a second, not in step with show.
+    turn_s, colours = 1 / 120, np.array([1.5, 1.0, 0.5])
+
+    def wheel(t: FloatArray) -> FloatArray:
+        return np.asarray(colours[np.floor(3 * t / turn_s).astype(int) % 3])
+
+    def light(to_white: bool, rng: np.random.Generator) -> Light:
+        off_s = float(rng.uniform(0, turn_s))
+        change = both_ways(step(0.012))(to_white, rng)
+        return lambda t: change(t) * wheel(t + 1.0 + off_s)
+
+    found = World(light, exposure_s=0.0125, period_s=0.0141, steady=lambda t: wheel(t + 1.0)).measured()
+    assert found.flicker > 0.02
+    assert found.latency_s == pytest.approx(0.012, abs=turn_s / 8)
+    assert found.jitter_s < turn_s / 4
+    assert not found.rolling
+    # Exposures of whole turns see none of it.
+    whole = World(light, exposure_s=2 * turn_s, period_s=0.0181, steady=lambda t: wheel(t + 1.0)).measured()
+    assert whole.flicker < 0.005
+    assert whole.latency_s == pytest.approx(0.012, abs=turn_s / 8)
+
+
+def test_a_picture_built_up_row_by_row_is_waited_for_to_its_last_row() -> None:
+    found = World(both_ways(step(0.003)), scan_s=2e-4, period_s=0.024).measured()
+    assert found.scanned
+    assert not found.rolling
+    assert found.latency_s == pytest.approx(0.003, abs=2e-4)
+    assert found.latest_s == pytest.approx(0.003 + (ROWS - 1) * 2e-4, abs=5e-4)
+
+
+def test_saturated_and_unlit_pixels_do_not_count() -> None:
+    # The upper right of the picture saturates; a share read from it would be too great.
+    found = World(both_ways(step(0.012)), white_dn=300.0, line_s=6e-5).measured()
+    assert found.latency_s == pytest.approx(0.012, abs=1e-4)
+    assert found.line_time_s == pytest.approx(6e-5, rel=0.02)
+
+
+def test_levels_leave_out_rows_that_tell_nothing() -> None:
+    world, rng = World(both_ways(step(0.0))), np.random.default_rng(0)
+    shares = np.where(np.arange(ROWS) < 20, 0.0, 1.0)
+    black = [world.image(np.zeros(ROWS), rng) for _ in range(8)]
+    white = [world.image(shares, rng) for _ in range(8)]
+    levels = row_levels("eye", black, white, full_scale=255)
+    found = levels.shares(world.image(0.5 * shares, rng))
+    assert np.isnan(found[:20]).all()
+    assert found[20:] == pytest.approx(0.5, abs=0.03)
+
+
+# ---- what cannot be measured
+
+
+@pytest.mark.parametrize(
+    ("world", "words"),
+    [
+        ({"white_dn": 0.0}, r"sees no flash.*lamp is on"),
+        ({"white_dn": 3000.0}, r"saturated.*expose shorter"),
+        ({"white_dn": 60.0, "noise_dn": 15.0}, "rows tell white from black"),
+        ({"exposure_s": 5e-4, "period_s": 0.1}, r"between two exposures .* raise its frame rate"),
+        ({"light": both_ways(step(0.35))}, "did not change while it was watched"),
+    ],
+    ids=["lamp off", "too much light", "too noisy", "flashes between exposures", "light too late"],
+)
+def test_what_cannot_be_measured_is_said(world: dict[str, Any], words: str) -> None:
+    with pytest.raises(ScanEvidenceError, match=words):
+        World(**{"light": both_ways(step(0.012)), **world}).measured(count=20)

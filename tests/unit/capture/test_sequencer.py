@@ -122,12 +122,24 @@ def test_the_best_trigger_that_all_can_do_is_used(
     assert fake.at_rest
 
 
-def test_a_camera_for_wires_only_needs_a_projector_that_plays() -> None:
-    assert_refused(fake_rig(triggers={"right": HARDWARE}), UnsupportedByDeviceError, "camera 'right' can be trig.*wire")
-
-
-def test_a_rig_without_cameras_is_refused() -> None:
-    assert_refused(fake_rig(cameras=[]), UnsupportedByDeviceError, "has no camera")
+@pytest.mark.parametrize(
+    ("make", "kind", "words"),
+    [
+        (
+            lambda: fake_rig(triggers={"right": HARDWARE}),
+            UnsupportedByDeviceError,
+            "camera 'right' can be trig.*wire",
+        ),
+        (lambda: fake_rig(cameras=[]), UnsupportedByDeviceError, "has no camera"),
+        (lambda: faulty("left", unplug_at=9), DeviceGoneError, "camera 'right' is gone"),
+        (lambda: fake_rig(projector={"gone_at_show": 6}), DeviceGoneError, "the projector is gone"),
+    ],
+    ids=["wires only", "no camera", "camera unplugged", "projector unplugged"],
+)
+def test_a_rig_that_cannot_capture_is_refused(
+    make: Callable[[], FakeRig], kind: type[BaseException], words: str
+) -> None:
+    assert_refused(make(), kind, words)
 
 
 # ---- settings
@@ -167,16 +179,6 @@ def test_a_projector_that_shows_something_else_is_refused(projector: dict[str, o
     if "swaps" not in projector:
         # White and black three times, and each time the pattern that was shown while they were judged.
         assert sum(call.startswith("show") for call in fake.world.calls) == 3 * MOST_FAILURES
-
-
-def test_a_camera_unplugged_mid_sequence() -> None:
-    fake = faulty("left", unplug_at=9)
-    assert_refused(fake, DeviceGoneError, "camera 'right' is gone")
-    assert "disarm left" in fake.world.calls
-
-
-def test_a_projector_unplugged_mid_sequence() -> None:
-    assert_refused(fake_rig(cameras=["left"], projector={"gone_at_show": 6}), DeviceGoneError, "the projector is gone")
 
 
 def test_a_projector_that_is_gone_when_it_should_go_dark_is_no_success() -> None:

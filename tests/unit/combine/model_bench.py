@@ -23,8 +23,7 @@ from slrig.scan.plan import Progress, ScanPlan
 from slrig.scan.records import plan_json
 from slrig.scan.sweep import sweep
 from tests.samples import put_database
-from tests.unit.scan.bench import Bench
-from tests.unit.scan.fakes import WAIT_S
+from tests.unit.scan.bench import Bench, wait_for
 
 
 def kept_scan(store: JobStore, folder: DataFolder, *, angle_deg: float | None = None, mesh: bytes = b"ply") -> UUID:
@@ -142,16 +141,7 @@ class ModelBench(Bench):
 
 def until(models: JobStore, model_id: UUID, reached: Callable[[JobRecord], bool]) -> JobRecord:
     """A model once `reached` says so of it."""
-    found = threading.Event()
-
-    def look() -> None:
-        if reached(models.get(model_id)):
-            found.set()
-
-    unwatch = models.watch(model_id, look)
-    look()
-    assert found.wait(WAIT_S), models.get(model_id)
-    unwatch()
+    wait_for(models, model_id, lambda: reached(models.get(model_id)))
     return models.get(model_id)
 
 

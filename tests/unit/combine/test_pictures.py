@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
+import pytest
 import trimesh
 
+from slrig.calibration.boards.artwork import marker_dictionary
+from slrig.combine.markers import bundle_of, markers_in_view
 from slrig.combine.pictures import six_sides_png
+from slrig.errors import BundleError
 from slrig.meshing.normals import vertex_normals
-from slrig.model import Mesh
+from slrig.model import FloatArray, Mesh, Pinhole, Size
 
 PANEL_PX, GAP_PX, ROW_PX = 400, 10, 444
 SIDES = ("front", "right", "back", "left", "top", "bottom")
@@ -76,3 +82,57 @@ def test_open_surface_is_red_from_behind() -> None:
         for n, side in enumerate(SIDES)
     }
     assert [side for side, is_red in middles.items() if is_red] == ["top"]
+
+
+# ---- Corners of a painted marker, whose places are exactly known, put on a mesh of the plane that it is painted on
+
+
+MIDDLE, SIDE_MM = np.array([3.0, -2.0, 400.0]), 14.0
+TILT = cv2.Rodrigues(np.array([0.7, 0.1, 0.2]))[0]
+CAMERA = Pinhole(
+    Size(200, 160), np.array([[1200.0, 0, 99.5], [0, 1200.0, 79.5], [0, 0, 1]]), np.zeros(5), np.eye(3), np.zeros(3)
+)
+
+
+def painted() -> FloatArray:
+    """(160, 200): marker 7 on paper, each pixel the mean of 64 points in it."""
+    cells = cv2.aruco.generateImageMarker(marker_dictionary("DICT_4X4_50"), 7, 6) > 0
+    fine = (np.arange(200 * 8) + 0.5) / 8 - 0.5
+    x, y = np.meshgrid((fine - 99.5) / 1200, (fine[: 160 * 8] - 79.5) / 1200)
+    ways = np.stack([x, y, np.ones_like(x)], axis=-1)
+    on = ways * ((MIDDLE @ TILT[:, 2]) / (ways @ TILT[:, 2]))[..., None] - MIDDLE
+    column, row = (np.floor(on @ TILT[:, k] / SIDE_MM * 6 + 3).astype(int) for k in (0, 1))
+    inside = (np.minimum(column, row) >= 0) & (np.maximum(column, row) < 6)
+    light = np.where(inside, cells[np.clip(row, 0, 5), np.clip(column, 0, 5)], True)
+    return np.asarray(np.where(light, 0.8, 0.05).reshape(160, 8, 200, 8).mean(axis=(1, 3)))
+
+
+def test_corners_of_a_marker_lie_where_they_were_painted_within_what_is_stated() -> None:
+    random = np.random.default_rng(1)
+    image = cv2.GaussianBlur(painted(), (0, 0), 0.6) + random.normal(0, 0.005, (160, 200))
+    u, v = np.meshgrid(np.arange(-15, 15, 0.3), np.arange(-15, 15, 0.3))
+    flat = np.stack([u.ravel(), v.ravel(), random.normal(0, 0.02, u.size)], axis=1)
+    points = (flat @ TILT.T + MIDDLE).astype(np.float32)
+    nothing = np.zeros(len(points))
+    mesh = Mesh(
+        points, np.zeros((0, 3), np.int32), np.zeros_like(points), np.zeros((len(points), 3), np.uint8),
+        nothing.astype(np.uint8), nothing.astype(np.float32), nothing.astype(np.int32),
+    )  # fmt: skip
+    found = dict(markers_in_view(np.round(image * 65535).clip(0, 65535).astype(np.uint16), CAMERA, 65535, mesh,
+                                "DICT_4X4_50"))  # fmt: skip
+    assert list(found) == [7]
+    square = SIDE_MM / 2 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    off = found[7].corners_mm - (square @ TILT.T + MIDDLE)
+    assert np.abs(off).max() < 0.05
+    assert 0.002 < found[7].sigma_mm.max() < 0.03
+    assert np.sqrt(np.mean((off / found[7].sigma_mm[:, None]) ** 2)) < 2.5
+
+
+def test_frames_are_found_next_to_the_mesh_made_of_them(tmp_path: Path) -> None:
+    for mesh, bundle in (("a/mesh.ply", "a/bundle"), ("view-3/mesh.ply", "bundle-3"), ("b/mesh.ply", "b")):
+        (tmp_path / bundle).mkdir(parents=True)
+        (tmp_path / bundle / "bundle.json").write_text("{}")
+        assert bundle_of(tmp_path / mesh) == tmp_path / bundle
+    for lost in ("c/mesh.ply", "a/front.ply", "view-4/mesh.ply"):
+        with pytest.raises(BundleError, match="expected the frames that it was made of"):
+            bundle_of(tmp_path / lost)

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from slrig.config import read_rig
+from slrig.devices import Synchronisation
+from slrig.doctor.advice import ExposureAdvice, exposure_advice, unsnapped
+from slrig.doctor.doctor import Diagnosis
+from slrig.doctor.findings import Finding, Severity, fault, ok
+from slrig.doctor.flicker import Flicker
+from slrig.doctor.light import Seen
 from slrig.doctor.measures.frequencies import passed, refresh_hz, swings
-from slrig.doctor.measures.levels import camera_exponent, light_levels, response_curve
+from slrig.doctor.measures.levels import LightLevels, camera_exponent, light_levels, response_curve
 from slrig.doctor.measures.pictures import (
     apart_deg,
     bar_blur_px,
@@ -17,6 +28,8 @@ from slrig.doctor.measures.pictures import (
     expected_orientation,
     orientation,
 )
+from slrig.doctor.rig_file import write_rig_file
+from slrig.errors import ConfigError, StorageError
 from slrig.model import FloatArray, Pinhole, Pixels, Size
 
 SHAPE = (60, 80)
@@ -249,3 +262,212 @@ def test_without_edges_there_is_no_blur() -> None:
     # Texture too fine to have even sides.
     fine = squares(8, 3.0, 0.5)
     assert edge_blur(fine, np.ones((300, 300), np.bool_), noise_dn=0.5) is None
+
+
+# ---- Which exposure is proposed, for lights that are known
+
+
+def levels() -> LightLevels:
+    rng = np.random.default_rng(0)
+    images = [[rng.normal(mean, 1.0, (20, 20)).astype(np.uint8) for _ in range(3)] for mean in (120, 10)]
+    return light_levels(images[0], images[1], full_scale=255)
+
+
+def seen(own_exposure_s: float, *, shortest_s: float = 0.002, longest_s: float = 0.04) -> Seen:
+    return Seen("left", own_exposure_s, levels(), 0.02, levels(), shortest_s, longest_s, 0.0)
+
+
+LIMITS_S = (1e-5, 1.0)
+MAINS = Flicker("room", 100.0, 0.05)
+WHEEL = Flicker("projector", 180.0, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("own_s", "refresh_hz", "flickers", "expected_s"),
+    [
+        # A good exposure is kept.
+        (0.02, None, (), 0.02),
+        (1 / 60, 60.0, (), 1 / 60),
+        (0.02, None, (MAINS,), 0.02),
+        # One that saturates, or drowns in noise, gives way to the longest.
+        (0.08, None, (), 0.04),
+        (0.0005, None, (), 0.04),
+        # Whole periods: of the refresh, of a colour wheel, of the mains.
+        (0.02, 60.0, (), 2 / 60),
+        (0.019, None, (WHEEL,), 7 / 180),
+        (0.017, None, (MAINS,), 0.04),
+        # Refresh and mains together: 50 ms would serve both and saturates; 2/60 s leaves less than 1/60 s.
+        (0.02, 60.0, (MAINS,), 2 / 60),
+    ],
+)
+def test_an_exposure_is_kept_or_snapped(
+    own_s: float, refresh_hz: float | None, flickers: tuple[Flicker, ...], expected_s: float
+) -> None:
+    advice = exposure_advice(seen(own_s), LIMITS_S, refresh_hz=refresh_hz, flickers=flickers)
+    assert advice.exposure_s == pytest.approx(expected_s, rel=1e-6)
+    assert ("kept" in advice.reason) is (expected_s == own_s)
+
+
+def test_advice_gives_its_reason_and_keeps_to_the_limits() -> None:
+    def advised(
+        own_s: float, longest_s: float, limits_s: tuple[float, float] = LIMITS_S, **more: Any
+    ) -> ExposureAdvice:
+        return exposure_advice(
+            seen(own_s, longest_s=longest_s), limits_s, **{"refresh_hz": 60.0, "flickers": (), **more}
+        )
+
+    # Three refreshes serve the mains, too.
+    advice = advised(0.02, 0.06, flickers=(MAINS,))
+    assert advice.exposure_s == pytest.approx(0.05)
+    assert advice.reason == "3 × the refresh period (16.7 ms)"
+    # Light is too bright for one period.
+    advice = advised(0.02, 0.01)
+    assert advice.exposure_s == 0.01
+    assert "less than the refresh period (16.7 ms)" in advice.reason
+    advice = advised(0.08, 0.04, (1e-3, 0.03), refresh_hz=None)
+    assert (advice.exposure_s, advice.usable_s) == (0.03, (0.002, 0.03))
+
+
+def test_exposure_that_misses_the_refresh_is_noted() -> None:
+    assert unsnapped(seen(0.02), None) == []
+    assert unsnapped(seen(1 / 30), 60.0) == []
+    [told] = unsnapped(seen(0.02), 60.0)
+    assert (told.name, told.severity) == ("exposure.refresh", Severity.NOTE)
+
+
+def test_a_fault_needs_a_remedy_and_what_is_well_has_none() -> None:
+    assert ok("light.part", "camera 'left'", "all is lit").remedy == ""
+    with pytest.raises(ValueError, match="a remedy belongs to every note and fault"):
+        fault("light.none", "camera 'left'", "nothing is lit", "")
+    with pytest.raises(ValueError, match="a remedy belongs to every note and fault"):
+        Finding("light.part", "camera 'left'", Severity.OK, "all is lit", "do nothing")
+
+
+# ---- Rig files with the values of an examination: whole, readable, and otherwise what they were
+
+
+OLD = """
+# A comment that is not kept.
+name = "bench \\u007f \\"two\\""
+calibration = "calibrations/bench.json"
+
+[projector]
+driver = "screen"
+output = "DP-2"
+odd-key = {"a b" = [1, 2.5, true], when = 2026-02-03T04:05:06Z}
+nested = [[1, 2], ["x"]]
+[projector.timing]
+latency_s = 0.03
+
+[[camera]]
+name = "left"
+driver = "v4l2"
+device = "usb-1"
+exposure_s = 0.5
+[camera.controls]
+focus = 7
+[[camera.list]]
+value = 1
+[[camera.list]]
+value = 1e-07
+
+[[camera]]
+name = "right"
+driver = "v4l2"
+device = "usb-2"
+gain = 2.0
+
+[scan]
+line_shift_period_px = 12
+exposure_s = 0.25
+"""
+
+
+def diagnosis(*, synchronisation: Synchronisation | None = None, cameras: tuple[str, ...] = ("left",)) -> Diagnosis:
+    return Diagnosis(
+        rig="bench",
+        findings=(
+            fault("timing.late", "projector", "light comes late, by\nfar", "write it down"),
+            ok("light.part", "camera 'left'", "all is lit"),
+        ),
+        exposures={
+            name: ExposureAdvice(1 / 60 + index / 100, "1 × the refresh period", (0.002, 0.03))
+            for index, name in enumerate(cameras)
+        },
+        synchronisation=synchronisation,
+        refresh_hz=60.0,
+        response=None,
+        flickers=(),
+    )
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    (tmp_path / "calibrations").mkdir()
+    (tmp_path / "calibrations" / "bench.json").write_text("{}")
+    path = tmp_path / "old.toml"
+    path.write_text(OLD)
+    return path
+
+
+def test_the_new_file_is_the_old_one_with_what_was_measured(old: Path) -> None:
+    new = old.with_name("new.toml")
+    measured = Synchronisation(0.0412345678, 0.0031, {"left": 3.0004e-5})
+    write_rig_file(diagnosis(synchronisation=measured), old, new, force=False)
+    expected = tomllib.loads(OLD)
+    expected["camera"][0]["exposure_s"] = 0.0166667
+    # One exposure of all scans would hide that of the camera.
+    del expected["scan"]["exposure_s"]
+    expected["synchronisation"] = {
+        "latency_s": 0.041235,
+        "latency_error_s": 0.0031,
+        "line_time_s": {"left": 3.0004e-5},
+    }
+    assert tomllib.loads(new.read_text()) == expected
+    read = read_rig(new)
+    assert read.synchronisation is not None
+    assert read.cameras[0].exposure_s == 0.0166667
+    assert read.calibration == old.parent / "calibrations" / "bench.json"
+    # Every value has a comment that says why.
+    lines = new.read_text().splitlines()
+    for key, words in (
+        ("exposure_s = 0.0166667", "# 1 × the refresh period; usable are 2 ms to 30 ms"),
+        ("latency_s = 0.041235", "# measured by flashes"),
+        ("latency_error_s = 0.0031", "# and how much later"),
+    ):
+        assert lines[lines.index(key) - 1].startswith(words)
+    assert lines[0] == "# Written by slrig doctor, from old.toml."
+    assert "# Fault, projector: light comes late, by far. Do: write it down." in lines
+
+
+def test_paths_count_from_the_new_folder(old: Path) -> None:
+    folder = old.parent / "elsewhere"
+    folder.mkdir()
+    write_rig_file(diagnosis(), old, folder / "new.toml", force=False)
+    read = read_rig(folder / "new.toml")
+    assert read.calibration is not None
+    assert read.calibration.resolve() == (old.parent / "calibrations" / "bench.json").resolve()
+    # What names no file stays.
+    assert read.cameras[0].options["device"] == "usb-1"
+
+
+def test_a_head_has_one_exposure_the_shortest(tmp_path: Path) -> None:
+    old = tmp_path / "old.toml"
+    old.write_text('name = "head"\n[head]\ndriver = "simulated"\n')
+    write_rig_file(diagnosis(cameras=("left", "right")), old, tmp_path / "new.toml", force=False)
+    read = read_rig(tmp_path / "new.toml")
+    assert read.head is not None
+    assert read.head.exposure_s == 0.0166667
+
+
+def test_a_file_is_overwritten_only_by_force(old: Path) -> None:
+    new = old.with_name("new.toml")
+    new.write_text("precious")
+    with pytest.raises(ConfigError, match="exists, and is kept; choose another name"):
+        write_rig_file(diagnosis(), old, new, force=False)
+    assert new.read_text() == "precious"
+    write_rig_file(diagnosis(), old, new, force=True)
+    assert read_rig(new).cameras[0].exposure_s == 0.0166667
+    with pytest.raises(StorageError, match="create the folder first"):
+        write_rig_file(diagnosis(), old, old.parent / "absent" / "new.toml", force=False)
+    assert sorted(each.name for each in old.parent.iterdir()) == ["calibrations", "new.toml", "old.toml"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -105,6 +105,20 @@ class TameProjector:
 
     def close(self) -> None:
         self.dark = self.closed = True
+
+
+class TamePositioner:
+    """Stands where it was sent."""
+
+    def __init__(self, poses: Sequence[str], moves: list[int] | None = None) -> None:
+        self.poses = poses
+        self.moves: list[int] = [] if moves is None else moves
+
+    def move(self, index: int) -> None:
+        self.moves.append(index)
+
+    def close(self) -> None:
+        """Nothing to close."""
 
 
 class TameRecording:

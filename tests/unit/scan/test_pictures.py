@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+
 import cv2
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from slrig.scan import pictures, placing, shading
 from slrig.scan.pictures import _CAUSES, described_causes, encode_png, preview, rejection_picture
 from slrig.scan.placing import placed_vertices, resampled
 from slrig.scan.shading import Picture, resized
+from tests.unit.scan.test_mesh_formats import only
 
 SIZE = Size(640, 480)
 PANEL = Size(520, 390)
@@ -95,15 +98,9 @@ def test_the_mesh_lies_where_the_camera_sees_it(distortion: tuple[float, ...]) -
 
 
 def joined(first: Mesh, second: Mesh) -> Mesh:
-    return Mesh(
-        np.concatenate((first.vertices_mm, second.vertices_mm)),
-        np.concatenate((first.faces, second.faces + np.int32(len(first.vertices_mm)))),
-        np.concatenate((first.normals, second.normals)),
-        np.concatenate((first.colour, second.colour)),
-        np.concatenate((first.mark, second.mark)),
-        np.concatenate((first.sigma_mm, second.sigma_mm)),
-        np.concatenate((first.stripe, second.stripe)),
-    )
+    parts = {each.name: [getattr(first, each.name), getattr(second, each.name)] for each in fields(Mesh)}
+    parts["faces"][1] = parts["faces"][1] + np.int32(len(first.vertices_mm))
+    return Mesh(**{name: np.concatenate(pair) for name, pair in parts.items()})
 
 
 def test_light_falls_from_the_side_to_which_the_surface_leans() -> None:
@@ -143,15 +140,7 @@ def test_the_turned_view_shows_depth_that_the_camera_cannot_see() -> None:
 def test_stray_vertices_do_not_move_the_turned_view() -> None:
     mesh = patch((0, 0, 500), 40)
     stray = np.array([[4000, 4000, 600], [4000, 4001, 600], [4001, 4000, 600]], dtype=np.float32)
-    spoilt = Mesh(
-        np.concatenate((mesh.vertices_mm, stray)),
-        np.concatenate((mesh.faces, [[441, 442, 443]])).astype(np.int32),
-        np.concatenate((mesh.normals, mesh.normals[:3])),
-        np.zeros((444, 3), dtype=np.uint8),
-        np.zeros(444, dtype=np.uint8),
-        np.zeros(444, dtype=np.float32),
-        np.zeros(444, dtype=np.int32),
-    )
+    spoilt = joined(mesh, replace(only(mesh, 3), vertices_mm=stray, faces=np.array([[0, 1, 2]], dtype=np.int32)))
     one = bounds(covered(panel(preview(mesh, camera(), white(), 255), 2)))
     other = bounds(covered(panel(preview(spoilt, camera(), white(), 255), 2)))
     assert other == pytest.approx(one, abs=2)
@@ -190,15 +179,7 @@ def test_a_dark_white_image_is_brightened_and_a_deep_one_scaled() -> None:
 
 
 def test_a_mesh_without_triangles_gives_two_panels() -> None:
-    none = Mesh(
-        np.zeros((0, 3), dtype=np.float32),
-        np.zeros((0, 3), dtype=np.int32),
-        np.zeros((0, 3), dtype=np.float32),
-        np.zeros((0, 3), dtype=np.uint8),
-        np.zeros(0, dtype=np.uint8),
-        np.zeros(0, dtype=np.float32),
-        np.zeros(0, dtype=np.int32),
-    )
+    none = only(patch((0, 0, 500), 60), 0)
     picture = preview(none, camera(), white(), 255)
     assert picture.shape[1] == 2 * PANEL.width_px + 3 * LEFT
     assert not covered(panel(picture, 1)).any()

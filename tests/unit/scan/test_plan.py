@@ -4,13 +4,29 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from slrig.errors import ConfigError, PatternError
-from slrig.model import LEAST_SHARE, Axis, Calibration, CameraFormat, FlipRule, Gray, LineShift, Pinhole, Size
+from slrig.model import (
+    LEAST_SHARE,
+    Axis,
+    Calibration,
+    CameraFormat,
+    FlipRule,
+    FloatArray,
+    Gray,
+    LineShift,
+    Pinhole,
+    Size,
+    share_across,
+    told_depth,
+    triangulated_axis,
+)
 from slrig.rig.session import RigFacts
 from slrig.scan.light_axis import FAIR_SHARE, chosen_axis, left_out_notes, played_axes, weakness
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
@@ -131,22 +147,30 @@ def test_frames_take_as_many_bytes_as_they_have_samples(bit_depth: int, colour: 
 # What a plan refuses
 
 
-@pytest.mark.parametrize("ratio", [1.0, 0.0, -3.0, math.nan, math.inf])
-def test_depth_edge_ratio_is_above_one_and_finite(ratio: float) -> None:
-    with pytest.raises(ConfigError, match=f"depth_edge_ratio: expected a finite number above 1, found {ratio:g};"):
-        ReconstructionPlan(depth_edge_ratio=ratio)
+@pytest.mark.parametrize(
+    ("plan", "key", "values", "words"),
+    [
+        (ReconstructionPlan, "depth_edge_ratio", (1.0, 0.0, math.nan, math.inf), "a finite number above 1, found "),
+        (ReconstructionPlan, "max_code_gap", (0,), "1 or more, found 0;"),
+        (ReconstructionPlan, "flip_rule", ("dyer",), "constrained or delaunay, found 'dyer';"),
+        (ReconstructionPlan, "axis", ("diagonal",), "column or row, found 'diagonal'"),
+        (ScanPlan, "exposure_s", (0.0, -0.1, math.nan, math.inf), "a finite time above 0 s, found "),
+        (ScanPlan, "turn_deg", (math.nan, math.inf, 3600.1, -1e300), "an angle from -3600° to 3600°, found "),
+    ],
+)
+def test_value_that_cannot_be_is_refused(
+    plan: Callable[..., object], key: str, values: tuple[object, ...], words: str
+) -> None:
+    for value in values:
+        with pytest.raises(ConfigError, match=f"{key}.*: expected {words}"):
+            plan(**{key: value})
 
 
-def test_code_gap_is_at_least_one() -> None:
-    with pytest.raises(ConfigError, match="max_code_gap: expected 1 or more, found 0;"):
-        ReconstructionPlan(max_code_gap=0)
-
-
-def test_flip_rule_is_taken_by_its_value_and_another_is_refused() -> None:
-    assert ReconstructionPlan(flip_rule="delaunay").flip_rule is FlipRule.DELAUNAY  # type: ignore[arg-type]
+def test_least_plan_is_accepted_and_names_are_taken_by_their_values() -> None:
+    plan = ReconstructionPlan(depth_edge_ratio=1.001, max_code_gap=1, flip_rule="delaunay", axis="row")  # type: ignore[arg-type]
+    assert (plan.flip_rule, plan.axis) == (FlipRule.DELAUNAY, Axis.ROW)
     assert ReconstructionPlan().flip_rule is FlipRule.CONSTRAINED
-    with pytest.raises(ConfigError, match="flip_rule: expected constrained or delaunay, found 'dyer';"):
-        ReconstructionPlan(flip_rule="dyer")  # type: ignore[arg-type]
+    assert ScanPlan(exposure_s=1e-6).exposure_s == 1e-6
 
 
 def test_a_plan_of_earlier_days_has_the_usual_mesh_and_a_stored_one_comes_back() -> None:
@@ -157,31 +181,81 @@ def test_a_plan_of_earlier_days_has_the_usual_mesh_and_a_stored_one_comes_back()
     assert plan_from_json(document) == ScanPlan()
 
 
-@pytest.mark.parametrize("exposure_s", [0.0, -0.1, math.nan, math.inf])
-def test_exposure_is_positive_and_finite(exposure_s: float) -> None:
-    with pytest.raises(ConfigError, match=f"exposure_s: expected a finite time above 0 s, found {exposure_s:g} s"):
-        ScanPlan(exposure_s=exposure_s)
-
-
-def test_an_axis_is_a_column_or_a_row() -> None:
-    assert ReconstructionPlan(axis="row").axis is Axis.ROW  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="axis: expected column or row, found 'diagonal'"):
-        ReconstructionPlan(axis="diagonal")  # type: ignore[arg-type]
-
-
-def test_least_plan_is_accepted() -> None:
-    assert ReconstructionPlan(depth_edge_ratio=1.001, max_code_gap=1).max_code_gap == 1
-    assert ScanPlan(exposure_s=1e-6).exposure_s == 1e-6
-
-
-@pytest.mark.parametrize("turn_deg", [math.nan, math.inf, -math.inf, 3600.1, -1e300])
-def test_an_angle_of_the_stage_is_finite_and_not_huge(turn_deg: float) -> None:
-    with pytest.raises(ConfigError, match=r"turn_deg .*: expected an angle from -3600° to 3600°, found "):
-        ScanPlan(turn_deg=turn_deg)
-
-
 def test_the_angle_of_the_stage_and_who_turned_are_kept_and_a_hand_says_where() -> None:
     plan = ScanPlan(turn_deg=-45.0, turned_by="hand")
     assert plan_from_json(json.loads(json.dumps(plan_json(plan)))) == plan
     with pytest.raises(ConfigError, match=r"turn_deg .*found none; say it"):
         ScanPlan(turned_by="hand")
+
+
+# ---- The axis of light that tells depth, against how far a point's image moves when its depth changes
+
+
+MIDDLE_MM = np.array([0.0, 0.0, 600.0])
+
+
+def looking_from(
+    x_mm: float, y_mm: float, *, roll_deg: float = 0.0, focal_px: tuple[float, float] = (900.0, 900.0)
+) -> Pinhole:
+    """A device that looks along z from (x, y, 0), turned about its view."""
+    turn, _ = cv2.Rodrigues(np.array([0.0, 0.0, math.radians(roll_deg)]))
+    matrix = np.array([[focal_px[0], 0, 320], [0, focal_px[1], 240], [0, 0, 1.0]])
+    return Pinhole(Size(640, 480), matrix, np.zeros(5), turn, -turn @ np.array([x_mm, y_mm, 0.0]))
+
+
+def moved_px(seen_by: Pinhole, other: Pinhole) -> FloatArray:
+    """(2,): by how much the image of a point moves in a device when the point moves along the other device's ray."""
+
+    def pixel(point_mm: FloatArray) -> FloatArray:
+        x, y, z = seen_by.rotation @ point_mm + seen_by.translation_mm
+        return np.array([x / z, y / z])
+
+    return np.abs(pixel(MIDDLE_MM + 1e-3 * (MIDDLE_MM - other.centre_mm)) - pixel(MIDDLE_MM))
+
+
+@pytest.mark.parametrize(("projector_known", "roll_deg"), [(True, 0.0), (True, 30.0), (False, 90.0), (False, 200.0)])
+@pytest.mark.parametrize(("x_mm", "y_mm"), [(120.0, 0.0), (-110.0, 40.0), (10.0, 130.0), (0.0, -90.0), (-70.0, -75.0)])
+def test_the_axis_is_the_one_along_which_depth_shows(
+    x_mm: float, y_mm: float, roll_deg: float, *, projector_known: bool
+) -> None:
+    one, two = looking_from(0.0, 0.0, roll_deg=roll_deg), looking_from(x_mm, y_mm)
+    cameras, projector = ([two], one) if projector_known else ([one, two], None)
+    across, down = moved_px(one, two)
+    assert triangulated_axis(cameras, projector) is (Axis.COLUMN if across > down else Axis.ROW)
+    for axis, moved in ((Axis.COLUMN, across), (Axis.ROW, down)):
+        assert share_across(axis, cameras, projector) == pytest.approx(moved / math.hypot(across, down), abs=1e-9)
+
+
+def test_finer_rows_do_not_make_a_sheet_of_them_steeper() -> None:
+    diamond = looking_from(0.0, 0.0, focal_px=(900.0, 1800.0))
+    assert triangulated_axis([looking_from(100.0, 60.0)], diamond) is Axis.COLUMN
+    assert share_across(Axis.ROW, [looking_from(100.0, 60.0)], diamond) == pytest.approx(60 / math.hypot(100, 60))
+
+
+def test_with_a_projector_all_cameras_decide_by_what_they_resolve() -> None:
+    projector = looking_from(0.0, 0.0)
+    assert triangulated_axis([looking_from(0.0, 50.0), looking_from(300.0, 0.0)], projector) is Axis.COLUMN
+    # Seven times the resolution outweighs six times the baseline.
+    sharp = looking_from(0.0, 50.0, focal_px=(6300.0, 6300.0))
+    assert triangulated_axis([sharp, looking_from(300.0, 0.0)], projector) is Axis.ROW
+    two = [looking_from(0.0, 60.0), looking_from(80.0, 0.0)]
+    assert share_across(Axis.ROW, two, projector) == pytest.approx(0.6)
+
+
+def test_axis_gives_depth_to_cameras_with_a_baseline_across_it() -> None:
+    cameras, projector = (
+        [looking_from(10.0, 90.0), looking_from(80.0, 80.0), looking_from(120.0, 0.0)],
+        looking_from(0.0, 0.0),
+    )
+    assert told_depth(Axis.COLUMN, cameras, projector) == [False, True, True]
+    assert told_depth(Axis.ROW, cameras, projector) == [True, True, False]
+    assert told_depth(Axis.ROW, cameras[2:], projector) == [True]
+
+
+def test_of_several_cameras_the_longest_baseline_of_the_first_decides() -> None:
+    cameras = [looking_from(0.0, 0.0), looking_from(80.0, 0.0), looking_from(0.0, 120.0)]
+    assert triangulated_axis(cameras, None) is Axis.ROW
+    assert triangulated_axis(cameras[:2], None) is Axis.COLUMN
+    assert share_across(Axis.ROW, cameras, None) == 1.0
+    # Without a baseline columns are as good as rows.
+    assert triangulated_axis(cameras[:1], None) is triangulated_axis(cameras[:1] * 2, None) is Axis.COLUMN

@@ -599,14 +599,6 @@ def test_every_vertex_states_its_share(recorded: Path, read: Read, solved: Read)
     assert (output / "mesh.stl").read_bytes() == (read[0] / "mesh.stl").read_bytes()
 
 
-@pytest.mark.slow
-def test_twice_the_error_has_twice_the_share(recorded: Path, solved: Read, tmp_path: Path) -> None:
-    write_calibration(tmp_path / "twice.json", stating(read_calibration(recorded / "calibration.json"), 2.0))
-    run(recorded, tmp_path / "out", calibration=tmp_path / "twice.json")
-    once, twice = (vertices(each / "mesh.ply")["sigma_calibration_mm"] for each in (solved[0], tmp_path / "out"))
-    assert twice == pytest.approx(2 * once, rel=1e-4)
-
-
 def test_a_calibration_that_says_nothing_of_its_error_has_an_id_and_words(recorded: Path) -> None:
     calibration = read_calibration(recorded / "calibration.json")
     told = calibration_report(calibration, recorded, np.ones(3, dtype=np.float32), None)

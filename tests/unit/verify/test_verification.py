@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,6 @@ from slrig.devices import Rig
 from slrig.errors import (
     CalibrationStateError,
     PoseRefusedError,
-    RigBusyError,
 )
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
@@ -41,6 +39,7 @@ from slrig.verify.verification import (
 )
 from tests.unit.calibration.health.drifting import bench
 from tests.unit.jobs.tame_queue import TameQueue
+from tests.unit.scan.bench import wait_for
 from tests.unit.scan.fakes import TameProjector, TameRecording
 from tests.unit.verify.health_bench import a_verification, hours
 
@@ -98,13 +97,8 @@ def desk_of(folder: DataFolder, store: HealthStore, queue: TameQueue, **options:
 
 def over(desk: VerificationDesk, job_id: UUID) -> JobRecord:
     """A verification when it is over."""
-    changed = threading.Event()
-    unwatch = desk.jobs.watch(job_id, changed.set)
-    while not (record := desk.jobs.get(job_id)).state.final:
-        assert changed.wait(30)
-        changed.clear()
-    unwatch()
-    return record
+    wait_for(desk.jobs, job_id, lambda: desk.jobs.get(job_id).state.final)
+    return desk.jobs.get(job_id)
 
 
 def done(desk: VerificationDesk, **options: Any) -> JobRecord:
@@ -139,16 +133,6 @@ def test_a_verification_is_shot_judged_and_put_on_record(folder: DataFolder, sto
     assert kept.document() == latest.document()
     assert kept.found.document() == a_verification().document()
     again.database.close()
-
-
-def test_a_rig_that_is_held_names_its_holder(folder: DataFolder, store: HealthStore) -> None:
-    queue = queue_of()
-    queue.busy = "scan 7"
-    desk = desk_of(folder, store, queue)
-    with pytest.raises(RigBusyError, match="scan 7"):
-        desk.shoot(BOARD)
-    assert desk.jobs.page(before=None, limit=5) == []
-    assert done(desk, wait=True).state is JobState.SUCCEEDED
 
 
 def test_rig_without_a_calibration_fails_with_a_remedy(folder: DataFolder, store: HealthStore) -> None:
