@@ -7,7 +7,7 @@ import json
 import os
 import resource
 import signal
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,20 +16,12 @@ import numpy as np
 import pytest
 import tifffile
 
-from slrig.bundle import (
-    BundleWriter,
-    read_bundle,
-    read_truth,
-    storage,
-    write_bundle,
-    write_calibration,
-    write_truth,
-)
+from slrig.bundle import BundleWriter, read_bundle, read_truth, storage, write_bundle, write_calibration, write_truth
 from slrig.bundle.refused import Refused, read_refused
 from slrig.bundle.storage import write_file
-from slrig.errors import BundleError, ScanCancelledError, ScanEvidenceError, StorageError
+from slrig.errors import BundleError, ScanEvidenceError, StorageError
 from slrig.model import Black, CameraFormat, CameraTruth, Capture, Gray, LineShift, Shot, Size, Surface, Truth, White
-from tests.samples import CAMERA, noise, pinhole, sample_calibration, sample_capture
+from tests.samples import CAMERA, noise, sample_calibration, sample_capture
 
 
 @contextmanager
@@ -49,26 +41,6 @@ def _writer(folder: Path, capture: Capture) -> BundleWriter:
     return BundleWriter(folder, capture.projector, capture.patterns, capture.cameras, sample_calibration())
 
 
-def _write_all(folder: Path, capture: Capture, shots: Iterable[Shot]) -> None:
-    with _writer(folder, capture) as writer:
-        for shot in shots:
-            writer.add(shot)
-
-
-@pytest.mark.parametrize("bit_depth", [8, 10, 12, 16])
-def test_a_bundle_comes_back(tmp_path: Path, bit_depth: int) -> None:
-    capture = sample_capture(bit_depth=bit_depth)
-    write_bundle(tmp_path / "scan", capture, sample_calibration())
-    read = read_bundle(tmp_path / "scan")
-    assert read.folder == tmp_path / "scan"
-    assert read.capture.patterns == capture.patterns
-    for got, want in zip(read.capture.shots, capture.shots, strict=True):
-        assert got.image.dtype == want.image.dtype
-        np.testing.assert_array_equal(got.image, want.image)
-    assert read.calibration is not None
-    np.testing.assert_array_equal(read.calibration.cameras["left"].matrix, pinhole().matrix)
-
-
 def test_frames_are_on_disk_as_they_come(tmp_path: Path) -> None:
     capture = sample_capture()
     with _writer(tmp_path / "scan", capture) as writer:
@@ -79,39 +51,16 @@ def test_frames_are_on_disk_as_they_come(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["scan"]
 
 
-def test_an_error_leaves_nothing(tmp_path: Path) -> None:
-    capture = sample_capture()
-
-    def cancelled() -> Iterator[Shot]:
-        yield capture.shots[0]
-        message = "stop"
-        raise ScanCancelledError(message)
-
-    with pytest.raises(ScanCancelledError):
-        _write_all(tmp_path / "scan", capture, cancelled())
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("most_bytes", [500, 1800])
 def test_a_full_disk_leaves_nothing(tmp_path: Path, most_bytes: int) -> None:
     # A frame has some 1300 bytes and bundle.json more than 1800: the limit is met in a frame, or at the very end.
     capture = sample_capture()
-    with pytest.raises(StorageError, match="the disk refused"), _disk_that_refuses_more_than(most_bytes):
+    with (
+        pytest.raises(StorageError, match=r"disk refused.*free some space"),
+        _disk_that_refuses_more_than(most_bytes),
+    ):
         write_bundle(tmp_path / "scan", capture)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_full_disk_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "calibration.json"
-    write_calibration(path, sample_calibration())
-    before = path.read_bytes()
-    with (
-        pytest.raises(StorageError, match=r"calibration\.json: the disk refused.*free some space"),
-        _disk_that_refuses_more_than(100),
-    ):
-        write_calibration(path, sample_calibration(cameras=("other",)))
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
@@ -138,24 +87,20 @@ def test_a_bundle_holds_a_frame(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shot", "part"),
     [
-        (Shot(0, "middle", np.zeros(CAMERA.shape, np.uint8)), "camera 'middle'"),
-        (Shot(5, "left", np.zeros(CAMERA.shape, np.uint8)), "pattern 5"),
-        (Shot(0, "left", np.zeros((3, 4), np.uint8)), "found 4 x 3 uint8"),
-        (Shot(0, "left", np.zeros(CAMERA.shape, np.uint8), exposure_s=0.0), "exposure 0.0 s"),
-        (Shot(0, "left", np.zeros(CAMERA.shape, np.uint8), time_s=float("nan")), "time nan s"),
-        (Shot(0, "left", np.zeros(CAMERA.shape, np.uint16)), "uint16"),
+        (Shot(0, "middle", np.zeros(CAMERA.shape, np.uint16)), "camera 'middle'"),
+        (Shot(5, "left", np.zeros(CAMERA.shape, np.uint16)), "pattern 5"),
+        (Shot(0, "left", np.zeros((3, 4), np.uint16)), "found 4 x 3 uint16"),
+        (Shot(0, "left", np.zeros(CAMERA.shape, np.uint16), exposure_s=0.0), "exposure 0.0 s"),
+        (Shot(0, "left", np.zeros(CAMERA.shape, np.uint16), time_s=float("nan")), "time nan s"),
+        (Shot(0, "left", np.zeros(CAMERA.shape, np.uint8)), "uint8"),
+        (Shot(0, "left", np.full(CAMERA.shape, 1024, np.uint16)), r"up to 1023.*up to 1024"),
     ],
 )
 def test_a_frame_that_does_not_fit_is_refused(tmp_path: Path, shot: Shot, part: str) -> None:
-    with pytest.raises(BundleError, match=part), _writer(tmp_path / "scan", sample_capture()) as writer:
+    capture = sample_capture(bit_depth=10)
+    with pytest.raises(BundleError, match=part), _writer(tmp_path / "scan", capture) as writer:
         writer.add(shot)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_samples_beyond_full_scale_are_refused(tmp_path: Path) -> None:
-    capture = sample_capture(bit_depth=10)
-    with pytest.raises(BundleError, match=r"up to 1023.*up to 1024"), _writer(tmp_path / "scan", capture) as writer:
-        writer.add(Shot(0, "left", np.full(CAMERA.shape, 1024, np.uint16)))
 
 
 @pytest.mark.parametrize("name", ["", "../left", "a/b", "left\n", ".left", "é", "x" * 65, "projector"])
@@ -287,12 +232,10 @@ def test_bundles_of_others_are_read(shared: Path, name: str, frames: int, calibr
     bundle = read_bundle(shared / name)
     assert len(bundle.capture.shots) == frames
     assert (bundle.calibration is not None) == calibrated
-    whites = [
-        shot.image.mean() for shot in bundle.capture.shots if bundle.capture.patterns[shot.pattern].kind == "white"
-    ]
-    blacks = [
-        shot.image.mean() for shot in bundle.capture.shots if bundle.capture.patterns[shot.pattern].kind == "black"
-    ]
+    patterns, shots = bundle.capture.patterns, bundle.capture.shots
+    whites, blacks = (
+        [shot.image.mean() for shot in shots if patterns[shot.pattern].kind == kind] for kind in ("white", "black")
+    )
     assert min(whites) > max(blacks)
     found = read_truth(shared / name)
     assert (found is not None) == truth

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import random
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
-import httpx2
 import numpy as np
 import pytest
 import yaml
 
 from slrig.bundle import read_calibration, write_calibration
-from slrig.cli.options import Service
-from slrig.client import Client
 from slrig.errors import BundleError, CalibrationError, PatternError, SlrigError
 from slrig.foreign.calibrations import read_any_calibration, write_any_calibration
 from slrig.foreign.captures import Naming, import_capture, parse_size
@@ -27,7 +22,6 @@ from slrig.model import Axis, Black, Calibration, Gray, LineShift, Pattern, Pinh
 from tests.samples import sample_calibration
 from tests.strangers import harmed
 from tests.unit.calibrate_command import refused, run
-from tests.unit.calibration_desk import ID, Desk
 
 CAMCHAIN = """cam0:
   cam_overlaps: [1]
@@ -252,37 +246,6 @@ def test_the_command_converts_files(tmp_path: Path) -> None:
     assert "create the folder first" in refused(run("export", tmp_path / "rig", tmp_path / "no" / "x", "--to", "ros"))
     assert sorted(each.name for each in tmp_path.iterdir()) == ["back.json", "rig", "rig.json"]
     assert "expected a new folder" in refused(run("export", tmp_path / "rig.json", tmp_path / "rig", "--to", "ros"))
-
-
-def test_the_command_converts_what_a_service_keeps_and_gives_it_what_it_reads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_calibration(tmp_path / "kept.json", sample_calibration())
-    desk = Desk()
-    desk.state = "solved"
-    session: Mapping[str, Any] = desk.session()
-    given: list[Any] = []
-
-    def answer(request: httpx2.Request) -> httpx2.Response:
-        path = request.url.path
-        if path == "/calibration":
-            return httpx2.Response(200, json={"calibrations": [session], "active": None})
-        if path == "/calibration/import":
-            given.append(json.loads(request.content))
-        if path.endswith("/calibration.json"):
-            return httpx2.Response(200, content=(tmp_path / "kept.json").read_bytes())
-        return httpx2.Response(200, json=session)
-
-    monkeypatch.setattr(
-        Service,
-        "client",
-        lambda _self: Client("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(answer)),
-    )
-    assert run("export", ID[:8], tmp_path / "rig", "--to", "ros").exit_code == 0
-    assert set(devices(read_any_calibration(tmp_path / "rig"))) == {"left", "right", "projector"}
-    chain = written(tmp_path / "chain.yaml", CAMCHAIN)
-    assert run("import", chain).exit_code == 0
-    assert given[0]["projector"]["size_px"] == [1024, 768]
 
 
 # ---- Which pattern an image shows by words and by names: what is known, and what is refused

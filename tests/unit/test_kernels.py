@@ -63,23 +63,18 @@ def _square(first: int, last: int, values: Any, out: Any) -> int:
     return last - first
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, 1000])
-@pytest.mark.parametrize("rows_at_least", [1, 64])
-def test_bands_cover_every_row_once(count: int, rows_at_least: int) -> None:
-    values, out = np.arange(count, dtype=np.float64), np.full(count, np.nan)
-    answers = in_bands(_square, count, values, out, rows_at_least=rows_at_least)
-    assert sum(answers) == count
-    assert all(rows >= min(rows_at_least, count) for rows in answers[:-1])
-    np.testing.assert_array_equal(out, values**2)
-
-
 @pytest.mark.parametrize("threads", [1, 2])
-def test_bands_are_no_larger_than_asked(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("count", [0, 1, 5, 1000])
+@pytest.mark.parametrize(("least", "most"), [(1, 10**9), (64, 10**9), (1, 60)])
+def test_bands_cover_every_row_once(
+    monkeypatch: pytest.MonkeyPatch, count: int, least: int, most: int, threads: int
+) -> None:
     monkeypatch.setattr(config, "NUMBA_NUM_THREADS", threads)
-    values, out = np.arange(1000, dtype=np.float64), np.full(1000, np.nan)
-    answers = in_bands(_square, 1000, values, out, rows_at_most=60)
-    assert sum(answers) == 1000
-    assert max(answers) <= 60
+    values, out = np.arange(count, dtype=np.float64), np.full(count, np.nan)
+    answers = in_bands(_square, count, values, out, rows_at_least=least, rows_at_most=most)
+    assert sum(answers) == count
+    assert all(rows >= min(least, count) for rows in answers[:-1])
+    assert max(answers, default=0) <= most
     np.testing.assert_array_equal(out, values**2)
 
 

@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slrig.accept.plan import (
-    AcceptancePlan,
-    Artefact,
-    Artefacts,
-    Certified,
-    Limits,
-    Quantity,
-    usual_limits,
-)
+from slrig.accept.plan import AcceptancePlan, Artefact, Artefacts, Certified, Limits, Quantity, usual_limits
 from slrig.accept.positions import acceptance_plan, rig_volume_mm
 from slrig.accept.scene import turn_deg
 from slrig.accept.uncertainty import error_uncertainty

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
+from slrig.calibration.observations import PoseObservation, ViewFigures
 from slrig.calibration.solution import PROJECTOR, BoardPose
-from slrig.model import FloatArray, Pinhole, Size
+from slrig.model import Calibration, FloatArray, Pinhole, Size
 from tests.unit.calibration.synthetic import CHESSBOARD as CHESSBOARD
-from tests.unit.calibration.synthetic import inside, seen
+from tests.unit.calibration.synthetic import Recipe, observed
 
 CHARUCO = Board(BoardKind.CHARUCO, 11, 8, 12.0)
 SHARP = ViewFigures(moved_px=0.02, saturated=0.0, contrast=0.5, sharpness_px=0.8, decoded=0.9)
@@ -90,38 +90,14 @@ class Shooting:
         return {name: each.size for name, each in self.devices.items()}
 
     def shot(self, name: str, pose: BoardPose) -> PoseObservation:
-        points_mm = self.board.points_mm @ pose.rotation.T + pose.translation_mm
-        views, light = {}, {}
-        for camera, pinhole in self.devices.items():
-            if camera == PROJECTOR:
-                continue
-            points_px = seen(pinhole, points_mm)
-            corner = np.flatnonzero(inside(points_px, pinhole.size)).astype(np.int32)
-            if len(corner) < self.board.corner_count and (self.board.kind is not BoardKind.CHARUCO or len(corner) < 6):
-                continue
-            noisy = points_px[corner] + self.random.normal(0, self.sigma_px, (len(corner), 2))
-            views[camera] = BoardView(corner, noisy, np.full(len(corner), self.sigma_px))
-            if PROJECTOR in self.devices:
-                light[camera] = self._light(pinhole, pose)
+        cameras = {name: each for name, each in self.devices.items() if name != PROJECTOR}
+        recipe = Recipe(board=self.board, corner_px=self.sigma_px, match_px=0.1, alike_px=0.0, outlying=0.0, side=50)
+        rig = Calibration(cameras, self.devices.get(PROJECTOR))
+        found = observed(recipe, rig, (pose.rotation, pose.translation_mm), self.random)
+        count = 20 if self.board.kind is BoardKind.CHARUCO else self.board.corner_count
+        views = {camera: view for camera, view in found.views.items() if len(view.corner) >= count}
+        light = {camera: each for camera, each in found.correspondences.items() if camera in views}
         return PoseObservation(name, views, light)
-
-    def _light(self, camera: Pinhole, pose: BoardPose) -> Correspondences:
-        projector = self.devices[PROJECTOR]
-        (left, top), (right, bottom) = self.board.print_mm
-        across, down = np.meshgrid(np.linspace(left, right, 60), np.linspace(top, bottom, 45))
-        flat = np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
-        space = flat @ pose.rotation.T + pose.translation_mm
-        pixels_px, positions_px = seen(camera, space), seen(projector, space)
-        lit = inside(positions_px, projector.size) & inside(pixels_px, camera.size)
-        pixels_px, positions_px = pixels_px[lit], positions_px[lit]
-        count = len(pixels_px)
-        positions_px = positions_px + self.random.normal(0, 0.1, (count, 2))
-        return Correspondences(
-            np.concatenate([pixels_px, pixels_px]),
-            np.repeat(np.array([COLUMN, ROW], dtype=np.uint8), count),
-            np.concatenate([positions_px[:, 0], positions_px[:, 1]]),
-            np.full(2 * count, 0.1),
-        )
 
 
 def first_poses(board: Board) -> list[BoardPose]:

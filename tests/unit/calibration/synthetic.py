@@ -115,32 +115,38 @@ def made(recipe: Recipe, truth: Calibration | None = None) -> tuple[Observations
     """Observations of the true rig, and that rig: of the recipe, unless another one is given."""
     rng = np.random.default_rng(recipe.seed)
     truth = rig(recipe) if truth is None else truth
-    corners = recipe.board.points_mm * [*recipe.stretched, 1.0]
-    if recipe.offsets_mm is not None:
-        corners += recipe.offsets_mm
-    poses = []
-    for number, (rotation, shift) in enumerate(board_poses(recipe, rng)):
-        views, light = {}, {}
-        for name, camera in truth.cameras.items():
-            device = _after_bump(camera, recipe, name, number)
-            moved = np.array([0.4, 0.0, 0.0]) if recipe.moved_pose == number and name != "left" else np.zeros(3)
-            pixels = seen(device, _bowed(corners, recipe) @ rotation.T + shift + moved)
-            good = inside(pixels, camera.size)
-            if good.sum() < 20:
-                continue
-            corner = np.flatnonzero(good).astype(np.int32)
-            noisy = pixels[good] + rng.normal(0, recipe.corner_px, (len(corner), 2))
-            if (name, number) in recipe.flipped:
-                corner, noisy = (recipe.board.corner_count - 1 - corner)[::-1].copy(), noisy[::-1].copy()
-            sigma = np.full(len(corner), max(recipe.corner_px, 1e-4) * recipe.stated_share)
-            views[name] = BoardView(corner, noisy, sigma)
-            if truth.projector is not None:
-                lamp = _after_bump(truth.projector, recipe, PROJECTOR, number)
-                light[name] = _light(recipe, rng, device, lamp, rotation, shift)
-        poses.append(PoseObservation(f"pose {number}", views, light))
+    poses = [observed(recipe, truth, pose, rng, number) for number, pose in enumerate(board_poses(recipe, rng))]
     sizes = {name: camera.size for name, camera in truth.cameras.items()}
     beam = truth.projector.size if truth.projector is not None else None
     return Observations(recipe.board, sizes, beam, tuple(poses)), truth
+
+
+def observed(
+    recipe: Recipe, truth: Calibration, pose: tuple[FloatArray, FloatArray], rng: np.random.Generator, number: int = 0
+) -> PoseObservation:
+    """What the rig sees of the board in one pose, board to world."""
+    rotation, shift = pose
+    corners = recipe.board.points_mm * [*recipe.stretched, 1.0]
+    if recipe.offsets_mm is not None:
+        corners += recipe.offsets_mm
+    views, light = {}, {}
+    for name, camera in truth.cameras.items():
+        device = _after_bump(camera, recipe, name, number)
+        moved = np.array([0.4, 0.0, 0.0]) if recipe.moved_pose == number and name != "left" else np.zeros(3)
+        pixels = seen(device, _bowed(corners, recipe) @ rotation.T + shift + moved)
+        good = inside(pixels, camera.size)
+        if good.sum() < 20:
+            continue
+        corner = np.flatnonzero(good).astype(np.int32)
+        noisy = pixels[good] + rng.normal(0, recipe.corner_px, (len(corner), 2))
+        if (name, number) in recipe.flipped:
+            corner, noisy = (recipe.board.corner_count - 1 - corner)[::-1].copy(), noisy[::-1].copy()
+        sigma = np.full(len(corner), max(recipe.corner_px, 1e-4) * recipe.stated_share)
+        views[name] = BoardView(corner, noisy, sigma)
+        if truth.projector is not None:
+            lamp = _after_bump(truth.projector, recipe, PROJECTOR, number)
+            light[name] = _light(recipe, rng, device, lamp, rotation, shift)
+    return PoseObservation(f"pose {number}", views, light)
 
 
 def _bowed(points: FloatArray, recipe: Recipe) -> FloatArray:

@@ -126,20 +126,20 @@ def test_other_sequences_are_understood(
     assert judged(scene, order(scene.shots(patterns)), patterns).summary().verified == len(patterns)
 
 
-def test_without_inverse_frames_bits_are_not_proven() -> None:
-    scene = Scene(noise_dn=1.0)
-    patterns = tuple(p for p in PATTERNS if not (isinstance(p, Gray) and p.inverted))
-    summary = judged(scene, scene.shots(patterns), patterns).summary()
-    bits = sum(isinstance(pattern, Gray) for pattern in patterns)
-    assert summary.faults == ()
-    assert summary.verified == len(patterns) - bits
-
-
-def test_without_white_and_black_nothing_is_proven() -> None:
-    scene = Scene()
-    patterns = tuple(p for p in PATTERNS if isinstance(p, Gray))
-    summary = judged(scene, scene.shots(patterns), patterns).summary()
-    assert (summary.patterns, summary.verified, summary.faults) == (len(patterns), 0, ())
+@pytest.mark.parametrize(
+    ("patterns", "proven"),
+    [
+        (tuple(p for p in PATTERNS if not (isinstance(p, Gray) and p.inverted)), lambda p: not isinstance(p, Gray)),
+        (tuple(p for p in PATTERNS if isinstance(p, Gray)), lambda _: False),
+    ],
+    ids=["without inverses no bit", "without white and black nothing"],
+)
+def test_what_no_frame_speaks_for_is_not_proven(
+    patterns: tuple[Pattern, ...], proven: Callable[[Pattern], bool]
+) -> None:
+    summary = judged(SCENE, SCENE.shots(patterns), patterns).summary()
+    assert (summary.patterns, summary.faults) == (len(patterns), ())
+    assert summary.verified == sum(map(proven, patterns))
 
 
 # ---- white and black

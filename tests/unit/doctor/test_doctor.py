@@ -344,7 +344,7 @@ def pinhole(rotation: FloatArray, centre_mm: tuple[float, ...]) -> Pinhole:
     return Pinhole(Size(640, 480), matrix, np.zeros(5), rotation, -rotation @ np.array(centre_mm))
 
 
-# The fake engine is a thread: where a busy machine holds it for longer than `image_load_s`, the doctor is right to complain.
+# The fake engine is a thread: a busy machine may hold it for longer than `image_load_s`.
 @pytest.mark.realtime
 def test_the_sense_of_the_current_is_found_and_all_else_waits_for_it(tmp_path: Path) -> None:
     from drivers.dlpc350.planes import MIRRORS

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from slrig.errors import StorageError
 from slrig.kernels import in_bands
-from slrig.meshing import rasteriser
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
 from slrig.scan import pictures, placing, shading
 from slrig.scan.pictures import _CAUSES, described_causes, encode_png, preview, rejection_picture
@@ -190,17 +189,6 @@ def test_odd_cameras_give_a_picture_too(size: Size) -> None:
     picture = preview(patch((0, 0, 500), 20), camera(size=size), white(size), 255)
     assert picture.shape[1] <= 1600
     assert picture.shape[0] <= 700
-
-
-def test_pictures_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    mesh = joined(patch((0, 0, 500), 60, slope=0.3), patch((0, 0, 520), 60, slope=-0.3, turned=True))
-    monkeypatch.setattr(rasteriser, "_FACES_AT_LEAST", 1)
-
-    def drawn(threads: int) -> NDArray[np.uint8]:
-        monkeypatch.setattr(config, "NUMBA_NUM_THREADS", threads)
-        return preview(mesh, camera(), white(), 255)
-
-    assert np.array_equal(drawn(1), drawn(2))
 
 
 def test_every_cause_has_a_colour_of_its_own() -> None:

@@ -6,7 +6,6 @@ import importlib
 import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
 from numba import config
 
@@ -16,7 +15,7 @@ from slrig.scan import preparation
 from slrig.scan import reconstruct as pipeline
 from slrig.scan.job import PIPELINE, reconstruction
 from slrig.scan.plan import ReconstructionPlan
-from slrig.scan.preparation import prepare_kernels, sample_scan
+from slrig.scan.preparation import prepare_kernels
 
 
 def test_the_production_pipeline_has_all_that_the_worker_looks_up() -> None:
@@ -26,14 +25,6 @@ def test_the_production_pipeline_has_all_that_the_worker_looks_up() -> None:
     assert callable(getattr(loaded, task))
     assert callable(loaded.warm_kernels)
     assert callable(loaded.frame_receiver)
-
-
-def test_the_made_up_scan_is_a_surface() -> None:
-    capture, calibration = sample_scan()
-    assert len(capture.shots) == len(capture.patterns)
-    assert calibration.projector is not None
-    assert all(shot.image.std() > 5 for shot in capture.shots[2:-2])
-    assert np.ptp(capture.shots[0].image) > 100
 
 
 def test_every_kernel_of_a_usual_scan_is_prepared() -> None:

@@ -19,10 +19,7 @@ from slrig.calibration.health.verdict import Health, HealthState, judged
 from slrig.calibration.health.verification import Verification
 from slrig.calibration.observations import PoseObservation, ViewFigures
 from slrig.devices import Rig
-from slrig.errors import (
-    CalibrationStateError,
-    PoseRefusedError,
-)
+from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobRecord, JobState
@@ -31,12 +28,7 @@ from slrig.model import Calibration
 from slrig.verify.job import VerificationDesk
 from slrig.verify.plot import health_svg
 from slrig.verify.store import HealthStore, VerificationRecord
-from slrig.verify.verification import (
-    VerificationTools,
-    health_stamp,
-    require_healthy,
-    verify_bundle,
-)
+from slrig.verify.verification import VerificationTools, health_stamp, require_healthy, verify_bundle
 from tests.unit.calibration.health.drifting import bench
 from tests.unit.jobs.tame_queue import TameQueue
 from tests.unit.scan.bench import wait_for
