@@ -23,30 +23,35 @@ _ADDS = """
 from slrig.kernels import kernel, kernel_part
 
 @kernel_part
-def {part}(value):
+def more(value):
     return value + {added}
 
 @kernel(in_every_scan=False)
 def sums(values):
     total = values[0] * 0
     for i in range(len(values)):
-        total += {part}(values[i])
+        total += more(values[i])
     return total
 """
 
 
-def made(folder: Path, *, added: int, name: str = "adding") -> Any:
-    """The module of a kernel that sums values, each with `added` more, as its file says."""
-    path = folder / f"{name}.py"
-    path.write_text(_ADDS.format(added=added, part="more"))
-    # The file system may stamp two writes with one time.
-    os.utime(path, ns=(added, added))
-    spec = importlib.util.spec_from_file_location(name, path)
+def loaded(path: Path) -> Any:
+    """The module in a file."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def made(folder: Path, *, added: int, name: str = "adding") -> Any:
+    """The module of a kernel that sums values, each with `added` more, as its file says."""
+    path = folder / f"{name}.py"
+    path.write_text(_ADDS.format(added=added))
+    # The file system may stamp two writes with one time.
+    os.utime(path, ns=(added, added))
+    return loaded(path)
 
 
 def compiled_by(call: Callable[[], object]) -> list[str]:
@@ -128,11 +133,7 @@ def test_a_kernel_is_compiled_anew_where_only_a_part_in_another_file_changed(tmp
     )
     for added in (1, 10):
         part = made(tmp_path, added=added, name="part")
-        spec = importlib.util.spec_from_file_location("caller", tmp_path / "caller.py")
-        assert spec is not None
-        assert spec.loader is not None
-        caller = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(caller)
+        caller = loaded(tmp_path / "caller.py")
         caller.of(part.more)
         assert caller.sums(np.array([1.0])) == 1 + added
 

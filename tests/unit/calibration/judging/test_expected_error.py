@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slrig.calibration.board import Board, BoardKind, BoardShape
+from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.displacement import modes_of, moved_points, rigid_free, without_rigid_motion
 from slrig.calibration.judging.comparison import comparison
 from slrig.calibration.judging.expected_error import expected_error, volume_of
@@ -20,7 +20,6 @@ from slrig.calibration.judging.odd_even import odd_even
 from slrig.calibration.judging.verdict import verdict
 from slrig.calibration.observations import COLUMN, ROW, Correspondences, Observations, PoseObservation
 from slrig.calibration.solution import BoardPose, Half, Solution
-from slrig.calibration.solving.solve import solve
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
 from slrig.reconstruction.surface_fit import stencils
@@ -37,7 +36,6 @@ from tests.unit.calibration.perturbed import (
     ray_directions,
     right_camera,
 )
-from tests.unit.calibration.synthetic import Recipe, made
 
 FITTED = float(np.sqrt((stencils()[0][0].astype(np.float64) ** 2).sum()))
 """What the fit of a scan makes of the noise of one pixel."""
@@ -190,22 +188,6 @@ def test_what_one_camera_alone_cannot_measure_is_nan() -> None:
         assert stated.point_mm > 0
         assert np.isnan([stated.noise_mm, stated.total_mm, stated.length_share]).all()
     assert not expected_error(*solved({"left": left_camera()}, light_source())).across
-
-
-@pytest.mark.slow
-def test_solves_of_one_camera_are_as_far_off_as_they_state() -> None:
-    """The truth is a made-up camera that the solve does not know, and its noise another one each time."""
-    ratios = []
-    for seed in range(8):
-        observations, truth = made(Recipe(poses=12, projector=False, seed=seed))
-        solution = solve(observations, board_shape=BoardShape.FLAT)
-        stated = expected_error(solution, observations)
-        true, places = truth.cameras["left"], stated.grid_mm
-        found = held_at_its_distance(solution.calibration.cameras["left"], pixels(true, places), places)
-        off = across_rays(aligned(found, places), places, true)
-        ratios.append(np.sqrt((off**2).mean()) / stated.point_mm)
-    assert 0.7 <= np.sqrt(np.mean(np.square(ratios))) <= 1.4, ratios
-    assert max(ratios) < 3, ratios
 
 
 def test_several_cameras_are_better_than_each_of_them() -> None:
@@ -399,26 +381,14 @@ def test_without_halves_nothing_is_said() -> None:
 SIGMA = np.array([0.5, 0.5, 0.8, 0.8, *[1e-4] * 5, *[1e-4] * 3, *[0.02] * 3])
 
 
-def device(size: Size, focal_px: float, rotation: FloatArray, centre_mm: FloatArray) -> Pinhole:
-    matrix = np.array([[focal_px, 0, size.width_px / 2], [0, focal_px, size.height_px / 2], [0, 0, 1.0]])
-    distortion = np.array([-0.1, 0.05, 0.0, 0.0, 0.0])
-    return Pinhole(size, matrix, distortion, rotation, -rotation @ centre_mm)
-
-
 def rig(*, solved: bool = True) -> Calibration:
     """Two cameras and a projector, converging on a volume about 600 mm away; the first camera's frame is the world."""
-    turn = [Rotation.from_euler("y", angle, degrees=True).as_matrix() for angle in (-15.0, -8.0)]
-    size = Size(1280, 1024)
-    cameras = {
-        "left": device(size, 1900.0, np.eye(3), np.zeros(3)),
-        "right": device(size, 1890.0, turn[0], np.array([160.0, 0.0, 0.0])),
-    }
-    projector = device(Size(1280, 800), 1600.0, turn[1], np.array([80.0, 60.0, 0.0]))
     covariance = np.diag(np.concatenate([SIGMA, SIGMA, SIGMA]) ** 2)
     covariance[9:15] = covariance[:, 9:15] = 0.0
     volume = np.array([[-80.0, -60.0, 550.0], [80.0, 60.0, 650.0]])
     found = Solved("a", "2026-11-22T10:00:00+00:00", covariance, volume, 0.01)
-    return Calibration(cameras, projector, found if solved else None)
+    cameras = {"left": left_camera(), "right": right_camera()}
+    return Calibration(cameras, light_source(), found if solved else None)
 
 
 def with_right(calibration: Calibration, **changes: Any) -> Calibration:
@@ -445,9 +415,9 @@ def test_a_longer_focal_length_is_reported_in_percent_and_sigmas() -> None:
     right = comparison(rig(), with_right(rig(), matrix=matrix)).devices["right"]
     assert right.focal_percent.value == pytest.approx(0.2)
     # The mean of fx and fy, each known to 0.5 px in both solves.
-    assert right.focal_percent.sigma == pytest.approx(100 / 1890 * 0.5, rel=1e-3)
-    assert right.focal_percent.sigmas == pytest.approx(3.78 / 0.5, rel=1e-3)
-    assert "camera 'right': the focal length differs by +0.2 %, 7.6 σ: a real change." in right.focal_percent.words
+    assert right.focal_percent.sigma == pytest.approx(100 / 2202.2 * 0.5, rel=1e-3)
+    assert right.focal_percent.sigmas == pytest.approx(0.002 * 2202.2 / 0.5, rel=1e-3)
+    assert "camera 'right': the focal length differs by +0.2 %, 8.8 σ: a real change." in right.focal_percent.words
 
 
 def test_turn_and_baseline_are_reported_with_their_deviations() -> None:
@@ -464,7 +434,7 @@ def test_turn_and_baseline_are_reported_with_their_deviations() -> None:
     assert right.baseline_mm.value == pytest.approx(0.0, abs=1e-9)
     moved = comparison(rig(), with_right(rig(), translation_mm=before.translation_mm * 1.001)).devices["right"]
     assert moved.baseline_mm is not None
-    assert moved.baseline_mm.value == pytest.approx(0.16)
+    assert moved.baseline_mm.value == pytest.approx(1e-3 * np.linalg.norm([210.0, 8.0, 5.0]))
     assert moved.baseline_mm.sigma == pytest.approx(0.02 * np.sqrt(2), rel=1e-6)
 
 
@@ -544,5 +514,5 @@ def test_calibrations_of_two_rigs_are_refused() -> None:
     smaller = replace(
         smaller, cameras={**smaller.cameras, "right": replace(smaller.cameras["right"], size=Size(640, 512))}
     )
-    with pytest.raises(CalibrationError, match="right has 1280 x 1024 pixels in one and 640 x 512 in the other"):
+    with pytest.raises(CalibrationError, match="right has 1200 x 1000 pixels in one and 640 x 512 in the other"):
         comparison(first, smaller)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slrig.calibration.board import BoardShape
-from slrig.calibration.judging.board_size import check_scale, judged_size
+from slrig.calibration.judging.board_size import judged_size
 from slrig.calibration.judging.expected_error import expected_error
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import CELLS, LEAST_HALVED, PROJECTOR, DeviceResiduals, ExpectedError, Solution
@@ -308,17 +308,6 @@ def test_a_stretched_board_may_be_bowed_as_well() -> None:
     assert solution.bow.solved
     assert solution.size.stretch == pytest.approx(0.002, abs=3.5 * solution.size.stretch_sigma)
     assert max(np.abs(list(in_deviations(solution, truth, exact_board=False).values()))) < 3.5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [0.01, -0.005])
-def test_a_wrong_square_shows_only_against_an_earlier_calibration(share: float) -> None:
-    wrong, truth = solved(printed(1 / (1 + share), 1 / (1 + share)))
-    assert not [*judged_size(wrong, None)]
-    found = check_scale(wrong, solved(SMALL)[0].calibration, CHESSBOARD)
-    assert found.share == pytest.approx(share, abs=4 * found.sigma + 1e-4)
-    assert f"the board's squares measure {CHESSBOARD.square_mm / (1 + found.share):.5g} mm" in found.words[0]
-    assert not check_scale(solved(SMALL)[0], truth, CHESSBOARD).words
 
 
 @pytest.mark.slow
