@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from drivers.depthai import open_camera
-from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench, sequence_for
+from tests.contract.suite import Bench, BenchHead, sequence_for
 from tests.unit.capture.fake_rig import PROJECTOR, Scene
 
 FPS = 60.0

@@ -23,14 +23,12 @@ from tests.contract import (
     v4l2_bench,
     v4l2_virtual,
 )
-from tests.contract.bench_head import BenchHead
-from tests.contract.genicam_bench import Fate
+from tests.contract.genicam_bench import Fate, Relay
 from tests.contract.genicam_peer import INTERFACE
-from tests.contract.genicam_relay import Relay
 from tests.contract.gentl_camera import MemoryCamera
 from tests.contract.pairing import PairingResult, wrong_pairings
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import rig_of, sequence_for
+from tests.contract.suite import BenchHead, rig_of, sequence_for
 from tests.contract.v4l2_bench import Faked
 from tests.contract.v4l2_sensor import GAIN_UNITS
 from tests.unit.capture.fake_rig import PROJECTOR, Scene

@@ -10,9 +10,8 @@ from drivers.dlpc347x.options import EngineOptions
 from drivers.dlpc347x.projector import LightEngine
 from slrig.model import Pixels, Size
 from slrig.patterns.sequence import united
-from tests.contract.bench_head import BenchHead, WiredTable, whole_scan
 from tests.contract.dlpc347x_device import Fake347x
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, BenchHead, WiredTable, whole_scan
 
 MIRRORS = Size(1280, 720)
 # The fake is a thread, which a busy machine keeps waiting for a while.

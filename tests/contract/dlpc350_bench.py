@@ -31,10 +31,9 @@ from slrig.conformance import run
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.model import PatternSequence
 from tests.contract import dlpc900_bench
-from tests.contract.bench_head import BenchHead, WiredTable, whole_scan
 from tests.contract.dlpc350_device import Cable, FakeEngine, UhidEngine
 from tests.contract.guest.outcome import Notes, outcome
-from tests.contract.suite import Bench, rig_of
+from tests.contract.suite import Bench, BenchHead, WiredTable, rig_of, whole_scan
 
 PICTURES = "pictures"
 LOAD_S = 0.03

@@ -10,10 +10,9 @@ from drivers.dlpc900.options import EngineOptions
 from drivers.dlpc900.projector import DLPC900, LightEngine
 from drivers.pattern_engine.link import Link
 from slrig.model import Size
-from tests.contract.bench_head import BenchHead, WiredTable, whole_scan
 from tests.contract.dlpc350_device import Cable
 from tests.contract.dlpc900_device import Fake900
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, BenchHead, WiredTable, whole_scan
 
 MIRRORS = Size(1920, 1080)
 # The fake is a thread, which a busy machine keeps waiting for a while.

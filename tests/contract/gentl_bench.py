@@ -12,12 +12,11 @@ from functools import lru_cache
 from pathlib import Path
 
 from drivers.genicam import GenicamCamera, open_gentl_camera
-from tests.contract.bench_head import BenchHead
 from tests.contract.genicam_bench import CAMERA, PROJECTOR, scene
 from tests.contract.gentl_camera import MemoryCamera
 from tests.contract.gentl_producer import FakeProducer, build
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench, sequence_for
+from tests.contract.suite import Bench, BenchHead, sequence_for
 from tests.npm import lacking
 
 

@@ -27,11 +27,10 @@ from slrig.conformance import run
 from slrig.devices import Projector
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.model import Size
-from tests.contract.bench_head import BenchHead
 from tests.contract.guest.outcome import Notes, outcome
 from tests.contract.guest.scanout import HeadPixels, Monitor
 from tests.contract.screen_bench import CAMERA, ScreenCamera, sequence
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, BenchHead
 from tests.unit.capture.fake_rig import Scene
 
 FIRST, FORCED, SECOND = "Virtual-1", "Virtual-2", "Virtual-3"

@@ -19,9 +19,8 @@ from typing import Any, Self
 import cv2
 
 from drivers import opencv
-from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench, sequence_for
+from tests.contract.suite import Bench, BenchHead, sequence_for
 from tests.contract.v4l2_bench import PROJECTOR, staged
 
 

@@ -18,10 +18,9 @@ from drivers import screen
 from drivers.screen import guarding
 from slrig.devices import CameraSettings, SystemClock, Trigger
 from slrig.model import Frame, PatternSequence, Pixels, Size
-from tests.contract.bench_head import BenchHead, whole_scan
 from tests.contract.screen_server import DummyServer, OutputPixels
 from tests.contract.stage import Stage
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, BenchHead, whole_scan
 from tests.contract.wired_camera import Exposure, WiredCamera
 from tests.unit.capture.fake_rig import Scene
 

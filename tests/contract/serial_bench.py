@@ -11,9 +11,8 @@ from drivers.serial_projector import open_projector
 from drivers.serial_projector.pattern_set import crc32_of_each
 from slrig.devices import Projector
 from slrig.model import PatternSequence
-from tests.contract.bench_head import BenchHead, whole_scan
 from tests.contract.stage import Stage
-from tests.contract.suite import Bench
+from tests.contract.suite import Bench, BenchHead, whole_scan
 from tests.contract.wired_camera import WiredCamera
 from tests.unit.capture.fake_rig import PROJECTOR
 from tests.unit.capture.fake_rig import Scene as World

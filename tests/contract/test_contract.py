@@ -10,8 +10,7 @@ import pytest
 
 from slrig.conformance import CHECKS, Check, Examination, Outcome
 from slrig.devices import Camera, Head, KeepsTime, Projector
-from tests.contract import picamera2_bench
-from tests.contract.benches import BENCHES
+from tests.contract.benches import BENCHES, picamera2
 from tests.contract.suite import Bench
 
 QUICK = ("simulated", "replay", "v4l2 (fake kernel)", "picamera2 (a stand-in for the library)")
@@ -56,7 +55,7 @@ def recording(target: object, protocol: type, asked: set[str], **instead: Callab
 
 
 def test_the_suite_uses_every_member_of_the_protocols(tmp_path: Path) -> None:
-    plain = picamera2_bench.bench(tmp_path)
+    plain = picamera2(tmp_path)
     asked: set[str] = set()
 
     def open_head() -> Head:

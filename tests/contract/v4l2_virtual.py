@@ -16,9 +16,8 @@ from unittest import mock
 from drivers.v4l2 import kernel, open_camera
 from drivers.v4l2.camera import V4L2Camera
 from drivers.v4l2.finding import Node
-from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench, sequence_for
+from tests.contract.suite import Bench, BenchHead, sequence_for
 from tests.contract.v4l2_bench import PROJECTOR, Faked, staged
 from tests.contract.v4l2_kernel import MOST_BUFFERS, Device, Refused
 from tests.contract.v4l2_sensor import GAIN_UNITS, Sensor

@@ -11,10 +11,9 @@ from pathlib import Path
 from drivers import opencv, v4l2
 from slrig.devices import Camera, ProjectorInfo, Shown
 from slrig.model import Pixels, Size
-from tests.contract.bench_head import BenchHead
 from tests.contract.guest.vivid import Control, Node, Output, nodes
 from tests.contract.stage import Stage, StagedProjector
-from tests.contract.suite import Bench, sequence_for
+from tests.contract.suite import Bench, BenchHead, sequence_for
 from tests.unit.capture.fake_rig import Scene
 
 SIGNAL = (640, 480)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import Pixels
-from tests.contract.guest.initrd import SHARE
+from tests.contract.guest.machine import SHARE
 
 PORT = "/dev/ttyS1"
 _ANSWERS_IN_S = 20.0

@@ -24,8 +24,8 @@ from slrig.devices import (
 from slrig.errors import FrameTimeoutError
 from slrig.model import Calibration, Frame, PatternSequence, Pixels, Size
 from slrig.patterns.sequence import encode
-from tests.contract.bench_head import BenchHead
 from tests.contract.stage import REFERENCE_EXPOSURE_S, Stage
+from tests.contract.suite import BenchHead
 from tests.unit.capture.fake_rig import Scene, patterns_for
 
 PROJECTOR = Size(64, 48)

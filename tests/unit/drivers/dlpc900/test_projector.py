@@ -14,9 +14,9 @@ from slrig.devices import FlashedProjector
 from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, PatternSequence, Size, White
 from slrig.patterns.sequence import encode
-from tests.contract.bench_head import whole_scan
 from tests.contract.dlpc900_bench import MIRRORS
 from tests.contract.dlpc900_device import unpacked
+from tests.contract.suite import whole_scan
 from tests.unit.drivers.pattern_engine.engine_bench import LEDS, LINES, START_STOP
 from tests.unit.drivers.pattern_engine.engine_bench import SEQUENCE_900 as SEQUENCE
 from tests.unit.drivers.pattern_engine.engine_bench import Bench900 as Bench

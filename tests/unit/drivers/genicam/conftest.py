@@ -7,16 +7,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 
+import numpy as np
 import pytest
 
 from drivers.genicam import GenicamCamera
 from slrig.devices import CameraSettings
+from slrig.model import Pixels
 from tests.contract import genicam_bench, gentl_bench
 from tests.contract.genicam_bench import FakeGigE, Fate, require_aravis, scene
 from tests.contract.genicam_peer import PIXEL_FORMATS
 from tests.contract.gentl_camera import MemoryCamera
 from tests.contract.stage import Stage
-from tests.unit.drivers.genicam.encoding import encoded
 
 EXPOSURE_S = 0.005
 NO_LATCH = ("TimestampLatch", "TimestampLatchValue")
@@ -68,3 +69,26 @@ def device(request: pytest.FixtureRequest) -> Iterator[Device]:
             )
         leaving.enter_context(found.closing)
         yield found
+
+
+def encoded(image: Pixels, name: str) -> bytes:
+    """The bytes of an (H, W) image in a PFNC format."""
+    samples = [int(sample) for sample in image.ravel()]
+    if name.endswith("Packed"):
+        depth = 10 if "10" in name else 12
+        low_bits = depth - 8
+        if len(samples) % 2:
+            samples.append(0)
+        pairs = zip(samples[::2], samples[1::2], strict=True)
+        mask = (1 << low_bits) - 1
+        packed = b"".join(
+            bytes([one >> low_bits, (one & mask) | (other & mask) << 4, other >> low_bits]) for one, other in pairs
+        )
+        return packed[: -(-12 * image.size // 8)]
+    if name.endswith("p"):
+        depth = 10 if "10" in name else 12
+        stream = sum(sample << depth * index for index, sample in enumerate(samples))
+        return stream.to_bytes(-(-depth * len(samples) // 8), "little")
+    if name.endswith("8"):
+        return image.astype(np.uint8).tobytes()
+    return image.astype("<u2").tobytes()

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.genicam.pixels import FORMATS, Packing, PixelFormat, grey
 from slrig.model import Pixels, Size
-from tests.unit.drivers.genicam.encoding import encoded
+from tests.unit.drivers.genicam.conftest import encoded
 
 SIZES = [Size(12, 5), Size(7, 3), Size(5, 1)]
 
