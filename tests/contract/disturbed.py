@@ -102,20 +102,17 @@ def picamera2(_: ExitStack, __: Path) -> Disturbed:
     return Disturbed(open_head, pi.stage, sequence_for(PROJECTOR), 0.005)
 
 
-def opencv_network(
-    leaving: ExitStack, folder: Path, *, late_s: float = 0.002, told_s: float | None = None
-) -> Disturbed:
-    """Three network cameras, one of them through a pipe. told_s : the delay in their tables, if not the truth."""
+def opencv_network(leaving: ExitStack, folder: Path) -> Disturbed:
+    """Three network cameras, one of them through a pipe."""
     network = opencv_bench.NetworkCamera(
         v4l2_bench.staged(noise_dn=1.0),
         period_s=0.008,
         exposure_s=0.004,
-        delay_s=0.008 if told_s is None else 2 * late_s,
-        least_delay_s=late_s,
+        delay_s=0.008,
+        least_delay_s=0.002,
         lost=0.1,
         cut=0.05,
     )
-    told = {} if told_s is None else {"delay_s": told_s}
     tables = {}
     for index in range(3):
         own = replace(network, seed=index, gone=threading.Event())
@@ -123,7 +120,7 @@ def opencv_network(
             device = str(leaving.enter_context(opencv_bench.Piped(own, folder / "video.mjpeg")).path)
         else:
             device = leaving.enter_context(opencv_bench.Served(own)).url
-        tables[f"eye{index}"] = {**own.options(device), **told}
+        tables[f"eye{index}"] = own.options(device)
 
     def open_head() -> BenchHead:
         cameras: dict[str, Camera] = {name: open_opencv_camera(name, table, folder) for name, table in tables.items()}

@@ -1,4 +1,4 @@
-"""The guest itself: it ends in time, and CI must have one. What it runs, `test_vivid` and its like look at."""
+"""The guest itself ends in time. What it runs, `test_vivid` and its like look at."""
 
 from __future__ import annotations
 
@@ -8,23 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.contract.guest.kernel import GuestUnavailableError
 from tests.contract.guest.machine import GuestError, require_guest, run_in_guest
-
-
-@pytest.mark.parametrize(
-    ("in_ci", "fixable", "ends"),
-    [(True, True, pytest.fail.Exception), (True, False, pytest.skip.Exception), (False, True, pytest.skip.Exception)],
-)
-def test_no_guest_is_skipped_but_not_in_ci(
-    in_ci: bool, fixable: bool, ends: type[BaseException], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def lacking() -> None:
-        raise GuestUnavailableError("there is no machine", fixable=fixable)
-
-    monkeypatch.setenv("CI", "true" if in_ci else "")
-    with pytest.raises(ends, match="there is no machine"):
-        require_guest(lacking)
 
 
 def command_lines() -> Iterator[bytes]:

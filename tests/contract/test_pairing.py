@@ -14,7 +14,7 @@ import pytest
 from slrig.devices import Camera, Rig
 from slrig.model import Frame, Shot
 from tests.contract.benches import beamer, eyes, simulated
-from tests.contract.disturbed import DISTURBED, Opens, opencv_network
+from tests.contract.disturbed import DISTURBED, Opens
 from tests.contract.genicam_bench import FreeOnly
 from tests.contract.pairing import FRAMES, Expected, PairingResult, Truths, seen_by, wrong_pairings
 from tests.contract.suite import Bench
@@ -35,14 +35,6 @@ def test_a_driver_gives_no_frame_of_another_pattern(tmp_path: Path, opens: Opens
         result = opens(leaving, tmp_path).count(frames)
     assert result.frames >= frames
     assert (result.wrong, result.examples) == (0, ())
-
-
-@pytest.mark.slow
-def test_a_network_camera_with_a_delay_that_is_too_short_in_its_table_is_found(tmp_path: Path) -> None:
-    # The count must be able to fail: the frames of this network are older than its table says.
-    with ExitStack() as leaving:
-        result = opencv_network(leaving, tmp_path, late_s=0.05, told_s=0.0).count(100)
-    assert result.wrong > 0.5 * result.frames
 
 
 # ---- what the evidence of a scan lets pass, on the rendered rig

@@ -17,7 +17,7 @@ import pytest
 
 from drivers.depthai import find_devices, open_camera
 from drivers.depthai.board import Board, require_one_clock
-from slrig.devices import CameraSettings, FoundDevice, Trigger
+from slrig.devices import Camera, CameraSettings, FoundDevice, Trigger
 from slrig.errors import (
     ConfigError,
     DeviceBusyError,
@@ -36,6 +36,12 @@ Opens = Callable[..., OakHead]
 
 ROOT = Path(__file__).resolve().parents[4]
 LENSES = [Chip("CAM_B", autofocus=True), Chip("CAM_C", autofocus=True)]
+
+
+def armed(camera: Camera) -> Camera:
+    camera.configure(CameraSettings(0.005))
+    camera.arm(1, Trigger.FREE)
+    return camera
 
 
 @pytest.mark.parametrize(
@@ -77,8 +83,7 @@ def test_a_device_can_be_opened_after_a_failure_and_after_it_was_unplugged() -> 
         with pytest.raises(UnsupportedByDeviceError, match="fixed lens"):
             open_camera("left", {**options, "focus": 3}, Path())
         camera = open_camera("left", options, Path())
-        camera.configure(CameraSettings(0.005))
-        camera.arm(1, Trigger.FREE)
+        armed(camera)
         oak.unplug()
         with pytest.raises(DeviceGoneError):
             camera.read(10**18, 5.0)
@@ -89,8 +94,7 @@ def test_a_device_can_be_opened_after_a_failure_and_after_it_was_unplugged() -> 
         oak.plugged_in = True
         oak.unplugged.clear()
         camera = open_camera("left", options, Path())
-        camera.configure(CameraSettings(0.005))
-        camera.arm(1, Trigger.FREE)
+        armed(camera)
         assert camera.read(0, 2.0).image.size
         camera.close()
 
@@ -332,9 +336,7 @@ def test_settings_that_come_late_are_waited_for(head: Opens) -> None:
 
 def test_a_frame_that_was_taken_otherwise_is_passed_over(head: Opens) -> None:
     pair = head()
-    left = pair.cameras["left"]
-    left.configure(CameraSettings(0.005))
-    left.arm(1, Trigger.FREE)
+    left = armed(pair.cameras["left"])
     first = left.read(0, PATIENCE_S)
     pair.oak.fault.stuck_exposure_us = 9000
     with pytest.raises(FrameTimeoutError, match=r"[1-9]\d* taken otherwise than asked"):
@@ -372,9 +374,7 @@ def test_damaged_and_lost_frames_are_passed_over_and_counted(head: Opens) -> Non
 )
 def test_a_camera_that_gives_nothing_usable_says_what_it_saw(head: Opens, fault: Fault, words: str) -> None:
     pair = head()
-    left = pair.cameras["left"]
-    left.configure(CameraSettings(0.005))
-    left.arm(1, Trigger.FREE)
+    left = armed(pair.cameras["left"])
     pair.oak.fault = fault
     with pytest.raises(FrameTimeoutError, match=words):
         left.read(time.monotonic_ns() + 30_000_000, 0.3)
@@ -404,8 +404,7 @@ def test_the_rows_of_a_rolling_shutter_have_all_ended_at_the_frames_end(head: Op
     pair = head(chips=[Chip("CAM_B", "IMX378", colour=True), Chip("CAM_C")])
     for name, longest_skew_s in (("left", 1 / 240), ("right", 0.0)):
         camera = pair.cameras[name]
-        camera.configure(CameraSettings(0.005))
-        camera.arm(1, Trigger.FREE)
+        armed(camera)
         frame = camera.read(0, PATIENCE_S)
         camera.disarm()
         assert 0 <= frame.shutter_skew_s <= longest_skew_s + 1e-9  # clocks count whole nanoseconds
@@ -452,9 +451,7 @@ def test_a_wire_trigger_needs_a_sensor_that_waits_and_its_option(head: Opens) ->
 @pytest.mark.parametrize(("unplugged", "words"), [(True, "is gone"), (False, "was closed")])
 def test_a_read_ends_when_the_device_is_unplugged_or_closed(head: Opens, unplugged: bool, words: str) -> None:
     pair = head()
-    left = pair.cameras["left"]
-    left.configure(CameraSettings(0.005))
-    left.arm(1, Trigger.FREE)
+    left = armed(pair.cameras["left"])
     ending = threading.Timer(0.1, pair.oak.unplug if unplugged else pair.close)
     ending.start()
     with pytest.raises(DeviceGoneError, match=words):

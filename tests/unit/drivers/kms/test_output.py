@@ -74,6 +74,12 @@ def opened(**more: object) -> Projector:
     return projector
 
 
+def loaded() -> Projector:
+    projector = opened()
+    projector.load(SEQUENCE)
+    return projector
+
+
 def scanned_out(fake: FakeKernel) -> np.ndarray[tuple[int, ...], np.dtype[np.uint32]]:
     memory = fake.memory[fake.buffers[fake.values[(PRIMARY, "FB_ID")]] << 12]
     rows = np.frombuffer(memory, "<u4")
@@ -116,8 +122,7 @@ def test_everything_that_would_change_a_picture_is_off(install: Install, atomic:
 
 def test_a_flips_stamp_is_when_its_scan_out_began(install: Install) -> None:
     fake = install()
-    projector = opened()
-    projector.load(SEQUENCE)
+    projector = loaded()
     stamps: list[int] = []
 
     def stamped() -> int:
@@ -134,8 +139,7 @@ def test_a_flips_stamp_is_when_its_scan_out_began(install: Install) -> None:
 @pytest.mark.parametrize("state", [{"counts": False}, {"stamp": lambda: 0}], ids=["not counted", "zero"])
 def test_a_stamp_that_means_nothing_is_not_believed(install: Install, state: dict[str, object]) -> None:
     install(**state)
-    projector = opened()
-    projector.load(SEQUENCE)
+    projector = loaded()
     asked_ns = time.monotonic_ns()
     shown = projector.show(0)
     period_ns = round((projector.info.refresh_s or 0) * 1e9)
@@ -146,8 +150,7 @@ def test_a_stamp_that_means_nothing_is_not_believed(install: Install, state: dic
 
 def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
     fake = install()
-    projector = opened()
-    projector.load(SEQUENCE)
+    projector = loaded()
     fake.flipped(5)
     fake.refusals[kernel.ATOMIC] = [errno.EBUSY]
     assert projector.show(1).index == 1
@@ -155,8 +158,7 @@ def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
 
 def test_a_display_that_makes_no_refresh_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = install()
-    projector = opened()
-    projector.load(SEQUENCE)
+    projector = loaded()
     monkeypatch.setattr("drivers.kms.output._FLIPS_IN_S", 0.05)
     monkeypatch.setattr(fake, "flipped", lambda _: None)
     with pytest.raises(DeviceError, match="made no refresh"):
@@ -165,8 +167,7 @@ def test_a_display_that_makes_no_refresh_is_reported(install: Install, monkeypat
 
 def test_a_display_that_is_pulled_or_exchanged_is_reported(install: Install) -> None:
     fake = install()
-    projector = opened()
-    projector.load(SEQUENCE)
+    projector = loaded()
     fake.plug(11, False)
     for use in (lambda: projector.show(0), lambda: projector.load(SEQUENCE)):
         with pytest.raises(DeviceGoneError, match="nothing is connected to it"):
@@ -179,8 +180,7 @@ def test_a_display_that_is_pulled_or_exchanged_is_reported(install: Install) -> 
 
 def test_what_the_frame_buffer_does_not_hold_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = install()
-    projector = opened()
-    projector.load(SEQUENCE)
+    projector = loaded()
     send = fake.flipped
 
     def spoiled(number: int) -> None:
