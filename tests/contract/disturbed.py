@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -140,23 +140,19 @@ def oak(_: ExitStack, __: Path) -> Disturbed:
     return Disturbed(partial(depthai_bench.oak_head, stage, fps=200.0, fault=fault), stage, sequence_for(small), 0.003)
 
 
-@dataclass
-class Fates:
+def fates() -> Callable[[], Fate]:
     """Of all frames 10 % are lost, 5 % broken; all are exposed late by up to 3 ms, some by 40 ms, and some lie in the
     camera for 30 ms.
     """
+    rng = np.random.default_rng(7)
 
-    seed: int = 7
-    rng: np.random.Generator = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.rng = np.random.default_rng(self.seed)
-
-    def __call__(self) -> Fate:
-        luck = self.rng.random()
-        late_s = 0.04 if self.rng.random() < 0.005 else 0.003 * float(self.rng.random())
-        held_s = 0.03 if self.rng.random() < 0.01 else 0.0
+    def fate() -> Fate:
+        luck = rng.random()
+        late_s = 0.04 if rng.random() < 0.005 else 0.003 * float(rng.random())
+        held_s = 0.03 if rng.random() < 0.01 else 0.0
         return Fate(late_s, 1.0 if luck < 0.1 else 0.5 if luck < 0.15 else 0.0, held_s)
+
+    return fate
 
 
 def _by_genicam(stage: Stage, open_camera: Callable[..., Camera], *, free: bool, **options: object) -> Disturbed:
@@ -182,7 +178,7 @@ def _noisy() -> Stage:
 
 
 def genicam(leaving: ExitStack, _: Path, *, free: bool, latched: bool = True) -> Disturbed:
-    peer = leaving.enter_context(genicam_bench.FakeGigE(_noisy(), kind="sfnc", fate=Fates()))
+    peer = leaving.enter_context(genicam_bench.FakeGigE(_noisy(), kind="sfnc", fate=fates()))
     device = INTERFACE
     if latched:
         device = leaving.enter_context(Relay()).address
@@ -191,7 +187,7 @@ def genicam(leaving: ExitStack, _: Path, *, free: bool, latched: bool = True) ->
 
 
 def gentl(leaving: ExitStack, _: Path, *, free: bool) -> Disturbed:
-    producer = leaving.enter_context(gentl_bench.serving(MemoryCamera(_noisy(), fate=Fates())))
+    producer = leaving.enter_context(gentl_bench.serving(MemoryCamera(_noisy(), fate=fates())))
     return _by_genicam(producer.camera.stage, partial(gentl_bench.opened, producer), free=free, answer_s=0.02)
 
 

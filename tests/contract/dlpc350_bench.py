@@ -93,14 +93,6 @@ def a_dlpc900_beside_it_is_told_from_it_and_scans(_: Table, notes: Notes) -> Non
     other.unplug()
 
 
-def it_is_found_by_its_serial_number(table: Table, notes: Notes) -> None:
-    """Find it without opening it, and open it by the name found."""
-    (device,) = dlpc350.find_devices()
-    notes["label"] = device.label
-    assert (device.driver, device.device) == ("dlpc350", "LC4500-1")
-    table.opened(device=device.device).projector.close()
-
-
 def an_engine_that_another_program_holds_is_busy(table: Table, notes: Notes) -> None:
     """Hold it as another program does, and as this driver does."""
     path = engines(DLPC350)[0].path
@@ -135,7 +127,6 @@ def an_engine_that_is_unplugged_is_gone(table: Table, notes: Notes) -> None:
 _PLUGGED: dict[int, UhidEngine] = {}
 CHECKS: tuple[Callable[[Table, Notes], None], ...] = (
     a_dlpc900_beside_it_is_told_from_it_and_scans,
-    it_is_found_by_its_serial_number,
     an_engine_that_another_program_holds_is_busy,
     an_engine_that_is_unplugged_is_gone,
 )

@@ -23,6 +23,7 @@ from slrig.devices import (
 from slrig.errors import FrameTimeoutError
 from slrig.model import Frame, Pixels
 from tests.contract.stage import Stage, StagedProjector
+from tests.contract.wired_camera import Exposure as Exposed
 
 BUFFERS = 4
 
@@ -79,14 +80,6 @@ class Webcam:
     damaged: float = 0.0
 
 
-@dataclass(slots=True)
-class _Kept:
-    number: int
-    start_ns: int
-    end_ns: int
-    stamp_ns: int
-
-
 class LiveCamera:
     """Implements `Camera` on a stage: one thread uses it at a time."""
 
@@ -100,7 +93,7 @@ class LiveCamera:
         self._exposure_ns = 10_000_000
         self._period_ns = round(1e9 / webcam.fps)
         self._begun_ns = self._next = self._number = self._dropped = 0
-        self._kept: deque[_Kept] = deque()
+        self._kept: deque[tuple[Exposed, int]] = deque()
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         self._state.check_settings(settings, self.info)
@@ -124,10 +117,10 @@ class LiveCamera:
             self._state.require_armed()
             self._fill()
             while self._kept:
-                kept = self._kept.popleft()
+                kept, stamp_ns = self._kept.popleft()
                 self._dropped += kept.number - self._number - 1
                 self._number = kept.number
-                exposure = self._claimed(kept)
+                exposure = self._claimed(kept, stamp_ns)
                 if exposure.earliest_ns >= after_ns:
                     start_ns, end_ns, error_ns = exposure.centred(self._exposure_ns)
                     image = self._image(kept)
@@ -159,14 +152,14 @@ class LiveCamera:
             start_ns = self._begun_ns + number * self._period_ns
             end_ns = start_ns + self._exposure_ns
             stamp_ns = end_ns + round(self._webcam.jitter_s * float(self._rng.random()) * 1e9)
-            self._kept.append(_Kept(number, start_ns, end_ns, stamp_ns))
+            self._kept.append((Exposed(number, start_ns, end_ns), stamp_ns))
 
-    def _claimed(self, kept: _Kept) -> Exposure:
-        stamp = Stamp(StampSource.EXPOSURE_START, kept.stamp_ns, kept.start_ns, self._stage.clock.now_ns())
+    def _claimed(self, kept: Exposed, stamp_ns: int) -> Exposure:
+        stamp = Stamp(StampSource.EXPOSURE_START, stamp_ns, kept.t_start_ns, self._stage.clock.now_ns())
         return exposure_of(stamp, Durations(self._exposure_ns, self._period_ns))
 
-    def _image(self, kept: _Kept) -> Pixels:
-        image = self._stage.exposed(kept.start_ns, kept.end_ns)
+    def _image(self, kept: Exposed) -> Pixels:
+        image = self._stage.exposed(kept.t_start_ns, kept.t_end_ns)
         if self._rng.random() < self._webcam.damaged:
             rows = slice(image.shape[0] // 3, 2 * image.shape[0] // 3)
             image[rows] = self._rng.integers(0, self.info.format.full_scale, image[rows].shape, image.dtype)

@@ -125,12 +125,6 @@ def test_a_scan_believes_no_wrong_frame(tmp_path: Path, truth: Expected, driver:
     assert result.refused_scans < result.scans / 2
 
 
-def test_what_the_evidence_keeps_away_is_found_without_it(tmp_path: Path, truth: Expected) -> None:
-    result = counted(simulated(tmp_path, faults=DAMAGED, seed=3), truth, frames=FEW, proven=False)
-    assert 0.02 < result.wrong / result.frames < 0.2
-    assert result.refused_scans < result.scans
-
-
 def test_a_driver_that_delivers_old_frames_is_found(sound: Bench, truth: Expected) -> None:
     alone = counted(sound, truth, frames=1, driver=BrokenDriver, proven=False)
     assert alone.wrong > 5

@@ -19,6 +19,12 @@ LEAST_SETUPTOOLS = 77
 collect_ignore_glob = ["*_package/*"]
 
 
+def pip(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Have pip install something without what it requires."""
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    return subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)  # noqa: S603
+
+
 def pip_install(sources: Sequence[Path], work: Path) -> Path:
     """Build packages from copies of their sources and install them into a folder, offline; return that folder."""
     found = importlib.metadata.version("setuptools")
@@ -29,27 +35,15 @@ def pip_install(sources: Sequence[Path], work: Path) -> Path:
     # Building leaves folders beside the sources.
     copies = [str(shutil.copytree(source, work / "sources" / source.name)) for source in sources]
     target = work / "site"
-    options = ["--quiet", "--disable-pip-version-check", "--no-deps", "--no-build-isolation", "--no-index"]
-    done = subprocess.run(  # noqa: S603 - our own command
-        [sys.executable, "-m", "pip", "install", *options, "--target", str(target), *copies],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = pip("--no-build-isolation", "--no-index", "--target", str(target), *copies)
     assert done.returncode == 0, done.stderr
     return target
 
 
 def pip_fetch(requirement: str, work: Path) -> Path:
     """Install a package of an index into a folder, without what it requires; return that folder. Skips without one."""
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
     target = work / "fetched"
-    done = subprocess.run(  # noqa: S603 - our own command
-        [*command, "--only-binary=:all:", "--target", str(target), requirement],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = pip("--only-binary=:all:", "--target", str(target), requirement)
     if done.returncode:
         pytest.skip(f"needs {requirement}, which pip could not get: {done.stderr.strip().splitlines()[-1]}")
     return target
