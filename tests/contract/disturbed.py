@@ -25,7 +25,7 @@ from tests.contract import (
 )
 from tests.contract.genicam_bench import Fate, Relay
 from tests.contract.genicam_peer import INTERFACE
-from tests.contract.gentl_camera import MemoryCamera
+from tests.contract.gentl_producer import MemoryCamera
 from tests.contract.pairing import PairingResult, wrong_pairings
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import BenchHead, rig_of, sequence_for

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from drivers.genicam import GenicamCamera, open_gentl_camera
 from tests.contract.genicam_bench import CAMERA, PROJECTOR, scene
-from tests.contract.gentl_camera import MemoryCamera
-from tests.contract.gentl_producer import FakeProducer, build
+from tests.contract.gentl_producer import FakeProducer, MemoryCamera, build
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench, BenchHead, sequence_for
 from tests.npm import lacking

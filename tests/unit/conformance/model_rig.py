@@ -1,12 +1,12 @@
-"""A rig that keeps the contract, on virtual time: every trigger there is, and a projector that plays."""
+"""A rig that keeps the contract, on virtual time, and drivers that break it, each in one way."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from slrig.devices import (
     Shown,
     Trigger,
 )
-from slrig.errors import FrameTimeoutError
-from slrig.model import Calibration, Frame, PatternSequence, Pixels, Size
+from slrig.errors import DeviceStateError, FrameTimeoutError
+from slrig.model import Calibration, CameraFormat, Frame, PatternSequence, Pixels, Size
 from slrig.patterns.sequence import encode
 from tests.contract.stage import REFERENCE_EXPOSURE_S, Stage
 from tests.contract.suite import BenchHead
@@ -266,3 +266,396 @@ class Maker:
         rig = Rig("model", head.cameras, head.projector, settings, self.calibration, head, clock=world)
         self.rigs.append(self.change(rig))
         return self.rigs[-1]
+
+
+Device = type[ModelCamera] | type[ModelProjector]
+DeviceT = TypeVar("DeviceT", bound=Device)
+
+BROKEN: list[tuple[Device, str, str]] = []
+"""A broken driver, the check that finds it, and words of the failure."""
+
+
+def breaks(check: str, words: str = "no error") -> Callable[[DeviceT], DeviceT]:
+    """Note what a driver breaks; "no error" is of a call that should have been refused."""
+
+    def noted(device: DeviceT) -> DeviceT:
+        BROKEN.append((device, check, words))
+        return device
+
+    return noted
+
+
+class RunsFreely(ModelCamera):
+    """Breaks nothing: a camera that runs by itself only, as webcams do."""
+
+    triggers = frozenset({Trigger.FREE})
+
+
+@breaks("read_passes_over_stale_frames", "ms before")
+@breaks("stale_frames_never_come_back")
+class DeliversStale(ModelCamera):
+    """Ignores how early a frame may begin."""
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        return super().read(min(after_ns, 0), timeout_s)
+
+
+@breaks("read_passes_over_stale_frames", "free trigger")
+class _DeliversStaleFreely(DeliversStale):
+    triggers = RunsFreely.triggers
+
+
+@breaks("a_frame_lies_wholly_in_its_pattern", "of white's light")
+class FlushesOneFrame(RunsFreely):
+    """Throws one frame away, and believes that the next one is new."""
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        super().read(0, timeout_s)
+        frame = super().read(0, timeout_s)
+        # As it believes.
+        late_ns = max(after_ns - frame.t_start_ns, 0)
+        return replace(frame, t_start_ns=frame.t_start_ns + late_ns, t_end_ns=frame.t_end_ns + late_ns)
+
+
+@breaks("stale_frames_never_come_back")
+class BringsBack(ModelCamera):
+    """Keeps what it has passed over for the next read."""
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        waiting = list(self.pending)
+        try:
+            return super().read(after_ns, timeout_s)
+        except FrameTimeoutError:
+            self.pending.extend(waiting)
+            raise
+
+
+@breaks("read_times_out_in_time")
+class NeverGivesUp(ModelCamera):
+    """Returns its last frame once more where there is no other."""
+
+    last: Frame | None = None
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        try:
+            self.last = super().read(after_ns, timeout_s)
+        except FrameTimeoutError:
+            exposure = Exposure(self.made, self.world.at_ns, self.world.at_ns + READ_OUT_NS)
+            return self.last or self.frame(exposure)
+        return self.last
+
+
+class Hangs(ModelCamera):
+    """Does not return from a read until it is let go."""
+
+    let_go = threading.Event()
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        self.let_go.wait()
+        return super().read(after_ns, timeout_s)
+
+
+@breaks("trigger_and_read_need_an_armed_camera")
+class _TriggersUnarmed(ModelCamera):
+    def trigger(self) -> None:
+        if self.armed is Trigger.SOFTWARE:
+            super().trigger()
+
+
+@breaks("a_free_running_camera_needs_no_trigger")
+class _TriggersWhileFree(ModelCamera):
+    def trigger(self) -> None:
+        if self.armed is not Trigger.FREE:
+            super().trigger()
+
+
+@breaks("a_wire_without_pulses_gives_no_frame")
+class _FiresWithoutPulse(ModelCamera):
+    def next_exposure(self, deadline_ns: int) -> Exposure | None:
+        if self.armed is Trigger.HARDWARE:
+            self.run_freely()
+        return super().next_exposure(deadline_ns)
+
+
+@breaks("triggers_that_are_not_declared_are_refused")
+class _ArmsAnyTrigger(ModelCamera):
+    triggers = frozenset({Trigger.SOFTWARE})
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        super().arm(count, Trigger.SOFTWARE if count > 0 else trigger)
+
+
+@breaks("triggers_that_are_not_declared_are_refused")
+class _ArmsForNothing(ModelCamera):
+    def arm(self, count: int, trigger: Trigger) -> None:
+        super().arm(max(count, 1), trigger)
+
+
+@breaks("arming_again_starts_afresh")
+class KeepsOldFrames(ModelCamera):
+    """Does not throw away what waits, neither in disarm nor in arm."""
+
+    def disarm(self) -> None:
+        if self.armed is Trigger.FREE:
+            self.run_freely()
+        self.armed = None
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        waiting = list(self.pending)
+        super().arm(count, trigger)
+        self.pending.extend(waiting)
+
+
+@breaks("arming_again_starts_afresh", "of white's light")
+class _KeepsOldFramesFreely(KeepsOldFrames):
+    triggers = RunsFreely.triggers
+
+
+@breaks("an_armed_camera_refuses_to_be_set_or_armed")
+class _SetWhileArmed(ModelCamera):
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        armed, self.armed = self.armed, None
+        applied = super().configure(settings)
+        self.armed = armed
+        return applied
+
+
+@breaks("settings_out_of_range_are_refused")
+class _TakesAnything(ModelCamera):
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        exposure_s, gain = (
+            float(np.clip(value, low, high))
+            for value, (low, high) in (
+                (settings.exposure_s, self.info.exposure_range_s),
+                (settings.gain, self.info.gain_range),
+            )
+        )
+        return super().configure(CameraSettings(exposure_s, gain))
+
+
+@breaks("settings_out_of_range_are_refused", "0.0001 s")
+class RefusesTooLate(ModelCamera):
+    """Refuses a setting once the device has it."""
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        try:
+            return super().configure(settings)
+        except DeviceStateError:
+            raise
+        except Exception:
+            self.applied = AppliedSettings(1e-4, 1.0)
+            raise
+
+
+@breaks("settings_are_read_back", "0.02 s")
+class _StepsCoarsely(ModelCamera):
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        super().configure(settings)
+        self.applied = AppliedSettings(max(round(settings.exposure_s, 2), 1e-4), settings.gain)
+        return self.applied
+
+
+@breaks("a_longer_exposure_is_brighter", "DN above black")
+class ExposesAutomatically(ModelCamera):
+    """Says that it uses what was set, and exposes as it sees fit."""
+
+    def frame(self, exposure: Exposure) -> Frame:
+        said, self.applied = self.applied, AppliedSettings(1 / 60, 1.0)
+        frame = super().frame(exposure)
+        self.applied = said
+        return replace(frame, exposure_s=said.exposure_s, gain=said.gain)
+
+
+@breaks("info_is_readable_in_every_state", "DeviceStateError")
+class ForgetsItself(ModelCamera):
+    """Asks the device for its data, and has none after close."""
+
+    @property
+    def info(self) -> CameraInfo:
+        self.require_open()
+        return super().info
+
+
+@breaks("frames_are_as_declared", "no sample is above 1023")
+class _DeclaresTenBits(ModelCamera):
+    @property
+    def info(self) -> CameraInfo:
+        info = super().info
+        return replace(info, format=CameraFormat(info.format.size, 10))
+
+    def frame(self, exposure: Exposure) -> Frame:
+        frame = super().frame(exposure)
+        return replace(frame, image=frame.image.astype(np.uint16) * np.uint16(256))
+
+
+@breaks("nothing_works_after_close")
+class _IgnoresClose(ModelCamera):
+    def close(self) -> Any:
+        self.disarm()
+
+
+@breaks("close_may_be_called_twice", "DeviceStateError")
+class _ClosesOnce(ModelCamera):
+    def close(self) -> Any:
+        self.require_open()
+        super().close()
+
+
+@breaks("a_frame_keeps_its_pixels", "pixels changed")
+class _ReusesItsBuffer(ModelCamera):
+    buffer = np.zeros((1, 1), np.uint8)
+
+    def frame(self, exposure: Exposure) -> Frame:
+        frame = super().frame(exposure)
+        if self.buffer.shape != frame.image.shape:
+            self.buffer = frame.image.copy()
+        self.buffer[:] = frame.image
+        return replace(frame, image=self.buffer)
+
+
+@breaks("frames_come_in_colour_where_it_is_declared", "0.0 DN of blue, green and red")
+class ColoursItsBuffer(ModelCamera):
+    """Makes colour of memory that the fourth frame after it is written to."""
+
+    def __init__(self, world: World, name: str = "left") -> None:
+        super().__init__(world, name)
+        self.buffers: dict[int, Pixels] = {}
+
+    def frame(self, exposure: Exposure) -> Frame:
+        frame = super().frame(exposure)
+        buffer = self.buffers.setdefault(exposure.number % 4, frame.image.copy())
+        buffer[:] = frame.image
+        return replace(frame, colour=lambda: np.dstack([buffer] * 3))
+
+
+@breaks("a_played_sequence_gives_every_frame_in_order", "pulses make")
+class MissesAPulse(ModelCamera):
+    """Is still reading out when a pulse comes, now and then."""
+
+    pulses = 0
+
+    def pulsed(self, at_ns: int) -> None:
+        self.pulses += 1
+        if self.pulses % 5:
+            super().pulsed(at_ns)
+        elif self.armed is Trigger.HARDWARE:
+            self.made += 1
+
+
+@breaks("every_end_of_a_capture_is_dark_and_leaves_the_rig_usable", "dark after")
+@breaks("the_projector_is_dark_unless_it_shows", "after blank")
+class StaysLit(ModelProjector):
+    """Does not go dark."""
+
+    def blank(self) -> None:
+        """Do nothing."""
+
+
+@breaks("the_projector_is_dark_unless_it_shows", "after load")
+class _StaysLitWhileLoading(ModelProjector):
+    def load(self, sequence: PatternSequence) -> None:
+        changes = list(self.world.changes)
+        super().load(sequence)
+        self.world.changes = changes
+
+
+@breaks("the_projector_is_dark_after_opening_and_close", "after close")
+class _StaysLitAfterClose(ModelProjector):
+    def close(self) -> None:
+        self.loaded = None
+        self.closed.set()
+
+
+@breaks("the_projector_is_dark_after_opening_and_close", "after opening")
+class _ShinesFromTheStart(ModelProjector):
+    def __init__(self, world: World) -> None:
+        super().__init__(world)
+        world.change(0, sequence().profiles[0])
+
+
+@breaks("a_frame_lies_wholly_in_its_pattern", "of white's light")
+class LightsLate(ModelProjector):
+    """A display that is slower than its driver believes."""
+
+    def show(self, index: int) -> Shown:
+        profile = self.profile(index)
+        at_ns = self.world.at_ns + LATENCY_NS
+        self.world.change(at_ns + 40_000_000, profile)
+        self.world.at_ns = at_ns + ERROR_NS
+        return Shown(index, at_ns, ERROR_NS)
+
+
+@breaks("show_tells_which_pattern_is_lit_since_when", "ms after the return")
+class _ReturnsEarly(ModelProjector):
+    def show(self, index: int) -> Shown:
+        shown = super().show(index)
+        return replace(shown, t_visible_ns=shown.t_visible_ns + 10**9)
+
+
+@breaks("show_tells_which_pattern_is_lit_since_when", "index=1")
+class _TellsTheNextPattern(ModelProjector):
+    def show(self, index: int) -> Shown:
+        shown = super().show(index)
+        return Shown(index + 1, shown.t_visible_ns, shown.t_err_ns)
+
+
+@breaks("show_needs_a_loaded_sequence")
+class _ShowsWithoutSequence(ModelProjector):
+    def show(self, index: int) -> Shown:
+        if self.loaded is None and not self.closed.is_set():
+            return Shown(index, self.world.at_ns, 0)
+        return super().show(index)
+
+
+@breaks("show_needs_a_loaded_sequence")
+class CountsFromTheEnd(ModelProjector):
+    """Takes index -1 for the last pattern, as lists do."""
+
+    def profile(self, index: int) -> Pixels:
+        return super().profile(index % len(self.loaded) if self.loaded is not None else index)
+
+
+@breaks("a_sequence_of_another_size_is_refused")
+class _ScalesPatterns(ModelProjector):
+    def load(self, sequence: PatternSequence) -> None:
+        super().load(PatternSequence(self.info.size, sequence.patterns, sequence.profiles))
+
+
+@breaks("a_projector_plays_only_if_it_says_so")
+class _PlaysSilently(ModelProjector):
+    plays = False
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        self.require_open()
+        assert exposure_s < period_s
+
+
+@breaks("a_projector_plays_only_if_it_says_so")
+class PlaysUnloaded(ModelProjector):
+    """Plays nothing where nothing is loaded."""
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        if self.loaded is not None or self.closed.is_set():
+            super().play(exposure_s, period_s)
+
+
+@breaks("a_played_sequence_gives_every_frame_in_order")
+class PulsesOnceMore(ModelProjector):
+    """Makes a pulse when it is ready, and so one more than there are patterns."""
+
+    def pulse(self, index: int, at_ns: int) -> None:
+        super().pulse(index, at_ns)
+        if self.loaded is not None and index + 1 == len(self.loaded):
+            super().pulse(index, at_ns + 1)
+
+
+@breaks("a_play_can_be_stopped", "frames")
+class _PlaysOn(ModelProjector):
+    def stop(self) -> None:
+        self.blank()
+
+
+@breaks("a_whole_sequence_is_proven", "pattern")
+class _SwapsPatterns(ModelProjector):
+    def profile(self, index: int) -> Pixels:
+        return super().profile({6: 8, 8: 6}.get(index, index))

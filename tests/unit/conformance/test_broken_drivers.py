@@ -14,7 +14,7 @@ from slrig.conformance import CHECKS, Check, Examination, Outcome, Result, run
 from slrig.devices import CameraInfo, Rig, Synchronisation, Trigger
 from slrig.errors import DeviceBusyError
 from slrig.model import Calibration, CameraFormat, Frame, Pinhole, Size
-from tests.unit.conformance import broken_drivers as drivers
+from tests.unit.conformance import model_rig as drivers
 from tests.unit.conformance.model_rig import (
     ALL,
     CAMERA,

@@ -22,8 +22,7 @@ from slrig.devices import Rig
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.jobs.examinations import last_examination
 from slrig.model import Pixels
-from tests.unit.conformance.broken_drivers import DeliversStale, Hangs, LightsLate, StaysLit
-from tests.unit.conformance.model_rig import Maker, ModelProjector, sequence
+from tests.unit.conformance.model_rig import DeliversStale, Hangs, LightsLate, Maker, ModelProjector, StaysLit, sequence
 
 
 def owners() -> set[threading.Thread]:

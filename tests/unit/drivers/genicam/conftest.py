@@ -16,7 +16,7 @@ from slrig.model import Pixels
 from tests.contract import genicam_bench, gentl_bench
 from tests.contract.genicam_bench import FakeGigE, Fate, require_aravis, scene
 from tests.contract.genicam_peer import PIXEL_FORMATS
-from tests.contract.gentl_camera import MemoryCamera
+from tests.contract.gentl_producer import MemoryCamera
 from tests.contract.stage import Stage
 
 EXPOSURE_S = 0.005

@@ -32,7 +32,7 @@ from slrig.errors import (
 from slrig.model import Frame, Size
 from tests.contract import genicam_bench, gentl_bench
 from tests.contract.genicam_bench import CAMERA, FakeGigE, Fate, Relay, require_aravis, scene
-from tests.contract.gentl_camera import OVERHEAD_S, MemoryCamera
+from tests.contract.gentl_producer import OVERHEAD_S, MemoryCamera
 from tests.contract.stage import Stage
 from tests.unit.drivers.genicam.conftest import EXPOSURE_S, Device
 
