@@ -28,11 +28,11 @@ from slrig.errors import NothingToReconstructError, ScanEvidenceError
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.exposure_look import Looking
 from slrig.scan.exposure_proposal import Proposal, proposal
-from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.scan.plan_check import pattern_sequence
 from slrig.scan.presets import SHIPPED
-from slrig.scan.reconstruct import reconstruct_bundle
 from tests.golden.shipped_rigs import PAINT, SMALL, rig_file
+from tests.golden.test_bundles import reconstructed
 
 OBJECTS = {
     "matt": """albedo = 0.85
@@ -97,10 +97,7 @@ def scanned(rig: Rig, plan: ScanPlan, name: str) -> Row:
         try:
             capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
             seconds = (rig.clock.now_ns() - began_ns) / 1e9
-            report: Mapping[str, Any] = reconstruct_bundle(
-                bundle, Path(folder, "result"), plan=ReconstructionPlan(), progress=lambda *_: None,
-                cancelled=lambda: False,
-            )  # fmt: skip
+            report: Mapping[str, Any] = reconstructed(bundle, Path(folder, "result"))
         except (ScanEvidenceError, NothingToReconstructError):
             return Row(name, 0.0, 0, 0.0, 0.0)
     truth = report["truth"]

@@ -28,6 +28,7 @@ from slrig.reconstruction.camera import CameraCurves, camera_curves
 from slrig.reconstruction.frames import axis_frames
 from slrig.reconstruction.limits import CodeTables, Limits
 from tests.light_bound import ExposedView, pixel_bound, stripe_bound
+from tests.unit.reconstruction.builders import rms
 
 PLANE: Mapping[str, object] = {"shape": "plane", "size_mm": [240.0, 240.0], "rotation_deg": [8.0, -12.0, 0.0]}
 SPHERE: Mapping[str, object] = {"shape": "sphere", "radius_mm": 60.0, "position_mm": [0.0, 0.0, 40.0]}
@@ -70,13 +71,14 @@ class Rig:
         ).column_px  # fmt: skip
 
 
-def rig(thing: Mapping[str, object], *, size_px: tuple[int, int], blur_px: float) -> Rig:
+def rig(thing: Mapping[str, object], *, size_px: tuple[int, int], blur_px: float, columns: int = 512) -> Rig:
     """Return a rig like those in `config/rigs`, whose projector lights all that the camera sees of `thing`.
 
-    blur_px : of both lenses. The sensor reads 8 bits, 30 000 electrons deep, above a pedestal that keeps its noise.
+    blur_px : of both lenses; columns : of the projector. The sensor reads 8 bits, 30 000 electrons deep, above a
+    pedestal that keeps its noise.
     """
     lamp = ProjectorOptions.model_validate({
-        "size_px": [512, 384], "focal_px": [2200.0, 2202.2], "distortion": [0.03, -0.02, 0.0003, 0.0, 0.0],
+        "size_px": [columns, 384], "focal_px": [2200.0, 2202.2], "distortion": [0.03, -0.02, 0.0003, 0.0, 0.0],
         "position_mm": [105.0, -10.0, -590.0], "target_mm": [0.0, 0.0, 0.0], "blur_px": blur_px,
     })  # fmt: skip
     eye = CameraOptions.model_validate({
@@ -164,11 +166,6 @@ class Points:
         """How many pixels' samples in all line frames, averaged without loss, would scatter as the points do."""
         scatter = self.scatter_px / self.pixel_px[self._freedom > 0]
         return float(1.0 / np.nanmean(scatter**2))
-
-
-def rms(values: FloatArray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def measured(rig: Rig, exposed: ExposedView, *, captures: int, seed: int = 1) -> Points:

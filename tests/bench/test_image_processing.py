@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.golden.lit_scenes import Light, lit_scene
+from tests.golden.lit_scenes import Light, scanned
 from tests.golden.test_bundles import SCENES
 from tests.golden.test_image_processing import scored
 
@@ -62,8 +62,8 @@ def reliefs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("reliefs")
     for name, light in RELIEFS.items():
         (folder / name).mkdir()
-        lit_scene(light).scanned(folder / name, seed=1)
-    return {name: folder / name / "bundle-1" for name in RELIEFS}
+        scanned(light, folder / name)
+    return {name: folder / name / "bundle" for name in RELIEFS}
 
 
 @pytest.mark.parametrize("processing", PROCESSING)

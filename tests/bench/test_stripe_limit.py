@@ -16,7 +16,8 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from tests.bench.stripe_limit import PLANE, SHARP_PX, SOFT_PX, SPHERE, Points, exposed_at_snr, measured, rig, rms
+from tests.bench.stripe_limit import PLANE, SHARP_PX, SOFT_PX, SPHERE, Points, exposed_at_snr, measured, rig
+from tests.unit.reconstruction.builders import rms
 
 CAPTURES = 6
 SNRS = (20.0, 30.0, 40.0, 60.0)

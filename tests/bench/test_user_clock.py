@@ -25,12 +25,9 @@ import pytest
 
 from slrig.client import Client
 from slrig.client.events import Captured, FileReady, Progress, StateChange
-from slrig.config import read_rig
-from slrig.discovery import open_rig
-from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.bench.test_pipeline_speed import RIG
-from tests.bench.test_whole_commands import told
+from tests.bench.test_whole_commands import rendered, told
 from tests.e2e.conftest import KEY, ServiceProcess, Start
 
 RUNS, ROW = 5, 10
@@ -43,19 +40,12 @@ TO_MESH_S, TO_ALL_S, BETWEEN_S = 0.40, 0.80, 0.10
 def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rig that plays the frames of the bench scan, without their truth."""
     folder = tmp_path_factory.mktemp("clock")
-    (folder / "rendered.toml").write_text(RIG)
-    with open_rig(read_rig(folder / "rendered.toml")) as rig:
-        capture_frames(
-            rig, ScanPlan(), folder / "recording", progress=lambda *_: None, cancelled=lambda: False
-        ).finish()
-    for truth in (folder / "recording").glob("truth*"):
-        truth.unlink()
-    description = folder / "recording" / "bundle.json"
+    description = rendered(folder / "scan", RIG, ScanPlan()) / "bundle.json"
     recorded = json.loads(description.read_text())
     for number, frame in enumerate(recorded["frames"]):
         frame["time_s"] = number / FRAMES_PER_S
     description.write_text(json.dumps(recorded))
-    (folder / "rig.toml").write_text('name = "clock"\n[head]\ndriver = "replay"\nbundle = "recording"\nspeed = 1\n')
+    (folder / "rig.toml").write_text('name = "clock"\n[head]\ndriver = "replay"\nbundle = "scan/bundle"\nspeed = 1\n')
     return folder / "rig.toml"
 
 

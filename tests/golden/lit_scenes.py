@@ -17,11 +17,11 @@ from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import SceneSurface, read_scene, surface_of
 from slrig.bundle import write_bundle, write_truth
-from slrig.model import Calibration, CameraFormat, Capture, PatternSequence, Shot, Surface, Truth
+from slrig.model import Calibration, CameraFormat, Capture, Shot, Surface, Truth
 from slrig.scan.artefacts import decode_mesh_ply
-from slrig.scan.plan import PatternPlan, ReconstructionPlan
+from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence
-from slrig.scan.reconstruct import reconstruct_bundle
+from tests.golden.test_bundles import reconstructed
 from tests.light_bound import ExposedView
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -64,50 +64,8 @@ class Figures:
     sigma_rms_mm: float
 
 
-@dataclass(frozen=True)
-class LitScene:
-    """The scene before the rig under one light, exposed. calibration, truth and sequence are those of every scan."""
-
-    exposed: ExposedView
-    calibration: Calibration
-    truth: Truth
-    sequence: PatternSequence
-    camera: str
-
-    def scanned(self, work: Path, *, seed: int) -> Figures:
-        """Make one noisy capture of the scene in the folder `work`, and reconstruct it there."""
-        sensor, rng = self.exposed.sensor, np.random.default_rng(seed)
-        shots = tuple(
-            Shot(
-                index,
-                self.camera,
-                sensor.read_out(mean, gain=self.exposed.gain, rng=rng),
-                exposure_s=self.exposed.exposure_s,
-            )
-            for index, mean in enumerate(map(self.exposed.electrons, self.sequence.profiles))
-        )
-        size = self.calibration.cameras[self.camera].size
-        capture = Capture(
-            self.sequence.projector, self.sequence.patterns, {self.camera: CameraFormat(size, sensor.bit_depth)}, shots
-        )
-        bundle, output = work / f"bundle-{seed}", work / f"out-{seed}"
-        write_bundle(bundle, capture, self.calibration)
-        write_truth(bundle, self.truth)
-        report: Any = reconstruct_bundle(
-            bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
-        )
-        truth = report["truth"]
-        sigma_mm = decode_mesh_ply((output / "mesh.ply").read_bytes()).sigma_mm.astype(np.float64)
-        return Figures(
-            rms_mm=truth["rms_mm"],
-            complete_03=truth["complete_0.3mm"],
-            error_over_sigma=truth["error_over_sigma_p68"],
-            sigma_rms_mm=float(np.sqrt(np.nanmean(sigma_mm**2))),
-        )
-
-
-def lit_scene(light: Light, *, share: float = 1.0) -> LitScene:
-    """Return the scene under a light, seen by the middle `share` of the camera's width and height."""
+def scanned(light: Light, work: Path, *, share: float = 1.0) -> Figures:
+    """Capture and reconstruct the scene in the folder `work`, by the middle `share` of the camera's image."""
     table = tomllib.loads((CONFIG / "rigs" / "relief.toml").read_text(encoding="utf-8"))["head"]
     del table["driver"]
     table["projector"] |= {"gamma": light.gamma, "signal_blur_px": light.signal_blur_px}
@@ -122,17 +80,28 @@ def lit_scene(light: Light, *, share: float = 1.0) -> LitScene:
         eye.pinhole(), stage, blur_px=eye.blur_px, ambient=options.ambient, jitter=False, seed=options.seed,
         samples_per_axis=options.samples_per_axis, workers=options.workers,
     )  # fmt: skip
-    sensor = eye.sensor()
+    sensor, rng = eye.sensor(), np.random.default_rng(1)
     # The brightest part in a thousand of the expected white comes to WHITE_LEVEL of what the well holds.
     full = ExposedView(view, lamp.size, lamp.response(), sensor, sensor.saturation_s)
     brightest_e = np.percentile(full.ends[0], BRIGHTEST_PERCENT)
     exposure_s = float(sensor.saturation_s * WHITE_LEVEL * sensor.full_well_e / brightest_e)
-    return LitScene(
-        exposed=ExposedView(view, lamp.size, lamp.response(), sensor, exposure_s),
-        calibration=Calibration({eye.name: eye.pinhole()}, lamp.pinhole()),
-        truth=Truth(Surface(surface.vertices_mm, surface.faces), {eye.name: view.truth()}),
-        sequence=pattern_sequence(PatternPlan(), lamp.size),
-        camera=eye.name,
+    exposed = ExposedView(view, lamp.size, lamp.response(), sensor, exposure_s)
+    sequence = pattern_sequence(PatternPlan(), lamp.size)
+    shots = tuple(
+        Shot(index, eye.name, sensor.read_out(mean, gain=exposed.gain, rng=rng), exposure_s=exposure_s)
+        for index, mean in enumerate(map(exposed.electrons, sequence.profiles))
+    )
+    cameras = {eye.name: CameraFormat(eye.size, sensor.bit_depth)}
+    capture = Capture(sequence.projector, sequence.patterns, cameras, shots)
+    write_bundle(work / "bundle", capture, Calibration({eye.name: eye.pinhole()}, lamp.pinhole()))
+    write_truth(work / "bundle", Truth(Surface(surface.vertices_mm, surface.faces), {eye.name: view.truth()}))
+    truth = reconstructed(work / "bundle", work / "out")["truth"]
+    sigma_mm = decode_mesh_ply((work / "out" / "mesh.ply").read_bytes()).sigma_mm.astype(np.float64)
+    return Figures(
+        rms_mm=truth["rms_mm"],
+        complete_03=truth["complete_0.3mm"],
+        error_over_sigma=truth["error_over_sigma_p68"],
+        sigma_rms_mm=float(np.sqrt(np.nanmean(sigma_mm**2))),
     )
 
 

@@ -12,7 +12,7 @@ import pytest
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from tests.bench.preset_sweep import best_within, by_assistant, by_preset, object_rig, swept
-from tests.golden.lit_scenes import Figures, Light, lit_scene
+from tests.golden.lit_scenes import Figures, Light, scanned
 
 pytestmark = pytest.mark.slow
 
@@ -21,14 +21,10 @@ SHARE = 0.4
 SCALED = Light(signal_blur_px=0.5)
 
 
-def scanned(light: Light, work: Path) -> Figures:
-    return lit_scene(light, share=SHARE).scanned(work, seed=1)
-
-
 @pytest.fixture(scope="module")
 def references(tmp_path_factory: pytest.TempPathFactory) -> dict[Light, Figures]:
     """The best light, from a projector with native pixels and through a scaler."""
-    return {light: scanned(light, tmp_path_factory.mktemp("reference")) for light in (Light(), SCALED)}
+    return {light: scanned(light, tmp_path_factory.mktemp("reference"), share=SHARE) for light in (Light(), SCALED)}
 
 
 @pytest.mark.parametrize(
@@ -43,7 +39,7 @@ def references(tmp_path_factory: pytest.TempPathFactory) -> dict[Light, Figures]
 def test_worse_light_costs_at_most_half_more_error(
     light: Light, reference: Light, references: dict[Light, Figures], tmp_path: Path
 ) -> None:
-    found, best = scanned(light, tmp_path), references[reference]
+    found, best = scanned(light, tmp_path, share=SHARE), references[reference]
     assert best.rms_mm < 0.012
     assert found.rms_mm <= GOAL * best.rms_mm
     assert found.complete_03 >= best.complete_03 - 0.005
@@ -52,7 +48,7 @@ def test_worse_light_costs_at_most_half_more_error(
 def test_a_camera_out_of_focus_states_what_it_errs_by(references: dict[Light, Figures], tmp_path: Path) -> None:
     # The whole scene: its borders are what matters. Light fades out there over more than the usual 2 px: with these
     # 22 µm, and 9 stated.
-    found = lit_scene(Light(camera_blur_px=1.2)).scanned(tmp_path, seed=1)
+    found = scanned(Light(camera_blur_px=1.2), tmp_path)
     assert found.rms_mm <= 1.2 * found.sigma_rms_mm
     assert found.rms_mm <= 3 * references[Light()].rms_mm
     assert found.complete_03 >= 0.985
@@ -64,7 +60,7 @@ def test_of_a_texture_out_of_focus_what_is_stated_holds(texture: str, tmp_path: 
     small and nothing said of what the first order leaves beside an edge.
     """
     light = Light(camera_blur_px=1.2, texture_ratio=7.0, texture=texture)
-    assert 0.8 <= lit_scene(light).scanned(tmp_path, seed=1).error_over_sigma <= 1.25
+    assert 0.8 <= scanned(light, tmp_path).error_over_sigma <= 1.25
 
 
 # For each object: exposures from too short to too long, and a bracket that does it.

@@ -2,30 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from simulated_rig.options import ProjectorOptions
-from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import Scene, surface_of
 from slrig.model import FloatArray
-from slrig.patterns.sequence import encode, scan_patterns
-from tests.bench.stripe_limit import (
-    PLANE,
-    SHARP_PX,
-    SOFT_PX,
-    SPHERE,
-    Points,
-    Rig,
-    exposed_at_snr,
-    measured,
-    rig,
-    rms,
-)
+from tests.bench.stripe_limit import PLANE, SHARP_PX, SOFT_PX, SPHERE, Points, exposed_at_snr, measured, rig
+from tests.unit.reconstruction.builders import rms
 
 pytestmark = pytest.mark.slow
 
@@ -33,26 +17,11 @@ COLUMNS = 140
 SNR = 40.0
 
 
-def narrow_rig() -> Rig:
-    """The rig of the stripe limit with a narrower projector, whose light ends inside the view on both sides."""
-    whole = rig(PLANE, size_px=(240, 90), blur_px=SHARP_PX)
-    lamp = ProjectorOptions.model_validate(whole.projector.model_dump() | {"size_px": [COLUMNS, 384]})
-    scene = Scene.model_validate({"object": [{**PLANE, "albedo": 0.8}]})
-    stage = Stage(surface_of(scene, Path()), lamp.pinhole(), working_distance_mm=600.0)
-    view = View(
-        whole.camera.pinhole(), stage, blur_px=SHARP_PX, ambient=0.01, samples_per_axis=3, jitter=False, seed=1,
-        workers=2,
-    )  # fmt: skip
-    patterns = scan_patterns(
-        lamp.size, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
-    )
-    return dataclasses.replace(whole, projector=lamp, stage=stage, view=view, sequence=encode(patterns, lamp.size))
-
-
 @pytest.fixture(scope="module")
 def points() -> tuple[Points, FloatArray]:
     """The points of some captures, and the distance of each one's line from the nearer border's, columns."""
-    bench = narrow_rig()
+    # The light of so narrow a projector ends inside the view on both sides.
+    bench = rig(PLANE, size_px=(240, 90), blur_px=SHARP_PX, columns=COLUMNS)
     column = bench.view.truth().projector_px[..., 0]
     assert np.isnan(column[45, [0, -1]]).all()
     found = measured(bench, exposed_at_snr(bench, SNR), captures=20)

@@ -183,6 +183,10 @@ def gaussian_stripe(distance_px: FloatArray, sigma_px: float) -> NDArray[np.floa
     return np.exp(-(distance_px**2) / (2 * sigma_px**2)).astype(np.float32)
 
 
+def rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def code_frames(
     *,
     bits: NDArray[np.float32],

@@ -29,7 +29,7 @@ from slrig.patterns.sequence import scan_patterns
 from slrig.reconstruction.camera import CameraCurves, CameraStream, camera_curves
 from slrig.reconstruction.frames import FrameStacks, axis_frames, axis_patterns, ends_repeats, telling_shots
 from slrig.reconstruction.limits import CodeTables, Limits
-from tests.unit.reconstruction.builders import grid, seen_by_camera
+from tests.unit.reconstruction.builders import grid, rms, seen_by_camera
 
 CAMERA = Size(210, 100)
 PROJECTOR, WIDE = Size(128, 96), Size(160, 128)
@@ -315,10 +315,6 @@ def seen_tilted(slope: float, angle_rad: float, *, axis: Axis = Axis.COLUMN, **l
 def misses_px(curves: CameraCurves, slope: float, angle_rad: float) -> FloatArray:
     """Distance of points from their lines, camera pixels."""
     return errors_px(curves, tilted(slope, angle_rad)) / slope
-
-
-def rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from slrig.reconstruction.stripes import (
     normalised,
     stripe_points,
 )
-from tests.unit.reconstruction.builders import gaussian_stripe, grid
+from tests.unit.reconstruction.builders import gaussian_stripe, grid, rms
 
 SHAPE = (90, 100)
 QUIET = 1e-3
@@ -65,10 +65,6 @@ def located(
 
 def errors_px(stripes: Stripes, distance: Distance) -> FloatArray:
     return distance(stripes.points_px[:, 0], stripes.points_px[:, 1])
-
-
-def rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 @ANGLES

@@ -28,10 +28,6 @@ def model_of(views: list[View], *, voxel_mm: float | None = None) -> FusedModel:
     return fused([view.mesh for view in views], [view.pose for view in views], voxel_mm=voxel_mm)
 
 
-def rms(values: FloatArray) -> float:
-    return float(np.sqrt((values**2).mean()))
-
-
 def sheet(
     height_mm: float,
     *,
