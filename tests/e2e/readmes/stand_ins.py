@@ -15,60 +15,17 @@ RENDERED = "rendered.toml"
 
 _CALIBRATED = "config/rigs/rendered-calibration.toml"
 
-_BOARD = """
-name = "board"
-[[object]]
-name = "board"
-shape = "board"
-kind = "charuco"
-columns = 11
-rows = 8
-square_mm = {square_mm}
-marker_mm = {marker_mm}
-margin_mm = 8.0
-[[object]]
-name = "wall"
-shape = "plane"
-size_mm = [900.0, 800.0]
-position_mm = [0.0, 0.0, 260.0]
-albedo = 0.35
-"""
-
-# Small pictures, a ray a pixel, and the fewest poses that determine a calibration: what takes minutes takes seconds.
-_RIG = """
-name = "bench"
-[head]
-driver = "simulated"
-scene = "{scene}"
-seed = 6
-samples_per_axis = 1
-ambient = 0.01
-carries_calibration = false
-[head.poses]
-count = 8
-tilt_deg = [15.0, 40.0]
-roll_deg = 25.0
-depth_mm = [-60.0, 80.0]
-[head.projector]
-size_px = [320, 200]
-focal_px = [390.0, 390.4]
-principal_px = [159.3, 226.4]
-distortion = [-0.035, 0.022, 0.0003, -0.0002, 0.0]
-position_mm = [120.0, 190.0, -585.0]
-target_mm = [10.0, 190.0, 0.0]
-blur_px = 0.6
-gamma = 1.8
-[[head.camera]]
-name = "left"
-size_px = [560, 448]
-focal_px = [1064.0, 1065.0]
-principal_px = [281.6, 221.3]
-distortion = [-0.11, 0.15, -0.0003, 0.0005, 0.0]
-position_mm = [-110.0, -10.0, -575.0]
-target_mm = [0.0, 0.0, 0.0]
-saturation_s = 0.02
-blur_px = 0.6
-"""
+_SMALLER = (
+    ("samples_per_axis = 2", "samples_per_axis = 1"),
+    ("count = 20", "count = 8"),
+    ("[1280, 800]", "[320, 200]"),
+    ("[1560.0, 1561.4]", "[390.0, 390.4]"),
+    ("[637.2, 905.6]", "[159.3, 226.4]"),
+    ("[1280, 1024]", "[560, 448]"),
+    ("[1900.0, 1901.9]", "[1064.0, 1065.0]"),
+    ("[643.7, 505.9]", "[281.6, 221.3]"),
+)
+"""Of that rig: small pictures, a ray a pixel, and the fewest poses that are enough, for seconds in place of minutes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,10 +159,7 @@ def _halved(extent: re.Match[str]) -> str:
 
 
 def lay_out_rigs(folder: Path) -> None:
-    """Write the rendered rig of the stand-ins, and make the one whose calibration takes minutes as small as it.
-
-    The others that are scanned and examined have pictures as small as those of the tests' small rig, and a ray a pixel.
-    """
+    """Make the rigs that are scanned and calibrated smaller, and write the rendered rig of the stand-ins."""
     for each, halvings in (("demo", 2), ("plane", 1)):
         rig = folder / "config" / "rigs" / f"{each}.toml"
         smaller = rig.read_text(encoding="utf-8")
@@ -213,11 +167,12 @@ def lay_out_rigs(folder: Path) -> None:
             smaller, count = _EXTENTS.subn(_halved, smaller)
             assert count == 6, smaller
         rig.write_text(re.sub(r"samples_per_axis = \d", "samples_per_axis = 1", smaller), encoding="utf-8")
-    for rig, scene, square_mm in (
-        (folder / RENDERED, folder / "board.toml", 12.0),
-        (folder / _CALIBRATED, folder / "config" / "scenes" / "small-board.toml", 14.0),
-    ):
-        scene.write_text(_BOARD.format(square_mm=square_mm, marker_mm=0.75 * square_mm), encoding="utf-8")
-        name = re.search(r'^name = "(.*)"$', rig.read_text(), re.MULTILINE) if rig.is_file() else None
-        text = _RIG.format(scene=scene)
-        rig.write_text(text if name is None else text.replace('"bench"', f'"{name.group(1)}"', 1), encoding="utf-8")
+    small = (folder / _CALIBRATED).read_text(encoding="utf-8")
+    for old, new in _SMALLER:
+        assert old in small, old
+        small = small.replace(old, new)
+    (folder / _CALIBRATED).write_text(small, encoding="utf-8")
+    bench = small.replace("../scenes/charuco_board.toml", "board.toml").replace("rendered-calibration", "bench", 1)
+    (folder / RENDERED).write_text(bench, encoding="utf-8")
+    board = (folder / "config" / "scenes" / "charuco_board.toml").read_text(encoding="utf-8")
+    (folder / "board.toml").write_text(board.replace("14.0", "12.0").replace("10.5", "9.0"), encoding="utf-8")

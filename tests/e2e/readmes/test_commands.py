@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.readmes.commands import commands
-from tests.e2e.readmes.person import Person
+from tests.e2e.readmes.person import Person, commands
 from tests.e2e.readmes.stand_ins import STAND_INS, WORDS, as_typed, lay_out_rigs
 from tests.npm import lacking
 
