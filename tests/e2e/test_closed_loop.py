@@ -10,10 +10,16 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
+import subprocess
+import tempfile
+import threading
+import time
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import cv2
 import numpy as np
@@ -22,13 +28,19 @@ import trimesh
 from numpy.typing import NDArray
 
 from simulated_rig.device import simulated_head
+from simulated_rig.light import light_table
+from simulated_rig.options import HeadOptions
+from simulated_rig.rendering import Stage, View
+from simulated_rig.scene import read_scene
+from simulated_rig.staging import Script
 from slrig.bundle.calibration_file import write_calibration
+from slrig.bundle.faults import checked
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig
 from slrig.discovery import open_rig
 from slrig.meshing.quality import TruthScore, score
 from slrig.meshing.search_tree import SearchTree
-from slrig.model import Mesh, Pixels, Truth
+from slrig.model import Calibration, CameraFormat, Mesh, Pixels, Size, Truth
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.plan_check import pattern_sequence
@@ -36,20 +48,253 @@ from slrig.scan.reconstruct import reconstruct_bundle
 from tests.contract.screen_bench import let_go
 from tests.contract.screen_server import DummyServer, OutputPixels, require_xorg
 from tests.contract.serial_bench import TriggerBox
+from tests.contract.v4l2_bench import DEBIAN_PYTHON, ROOT, Faked, why_not
+from tests.contract.v4l2_sensor import SensorService
 from tests.contract.wired_camera import WiredCamera
-from tests.e2e.closed_loop.node import VideoNode, require_umockdev
-from tests.e2e.closed_loop.output import WatchedOutput
-from tests.e2e.closed_loop.world import World, profile_of
 from tests.e2e.conftest import scanned, serving, slrig, write_rig
 from tests.e2e.test_calibration_walk import BOARD, Caller
 from tests.e2e.test_calibration_walk import write_rig as write_board_rig
+from tests.npm import lacking
 from tests.unit.drivers.serial_projector.engines import CoreEngine, Scene, description
 from tests.unit.drivers.serial_projector.line import SerialLine
 
 if TYPE_CHECKING:
-    from tests.contract.stage import Stage
+    from tests.contract.stage import Stage as Below
 
 pytestmark = pytest.mark.slow
+
+DARK: Pixels = np.zeros((1, 1), np.uint8)
+
+
+def profile_of(colours: NDArray[np.uint8]) -> Pixels:
+    """The one line that a picture, (H, W, 3), repeats: (1, W), (H, 1), or (1, 1) where all its pixels are alike.
+
+    Raises
+    ------
+    ValueError
+        The picture has a colour, or varies along both axes: no pattern, and nothing that the world can render.
+    """
+    grey = colours[..., 0]
+    if (colours != grey[..., None]).any():
+        raise ValueError("expected a grey picture on the output, found colours")
+    along, down = bool((grey != grey[:, :1]).any()), bool((grey != grey[:1]).any())
+    if along and down:
+        message = "expected a picture that varies along one axis on the output, found one that varies along both"
+        raise ValueError(message)
+    return grey[: None if down else 1, : None if along else 1].copy()
+
+
+class World:
+    """The scene of a rendered rig's file, its projector's lens and lamp, and what its camera's sensor reads.
+
+    Stands where `tests.contract.stage.Stage` does: below drivers. Light comes by `show` and `changed`, in
+    CLOCK_MONOTONIC; `exposed` answers for any interval of the past, by a mixture where the light changed in it. Safe
+    between threads. `seed` is of the sensor's noise.
+    """
+
+    def __init__(self, rig: Path, *, seed: int) -> None:
+        head = read_rig(rig).head
+        assert head is not None
+        options = checked(HeadOptions, head.options, str(rig))
+        (camera,) = options.camera
+        scene = rig.parent / options.scene
+        lens = options.projector.pinhole()
+        self._script = Script(options, read_scene(scene), scene.parent)
+        self._stage = Stage(
+            self._script.surface(0),
+            lens,
+            working_distance_mm=options.projector.working_distance_mm or float(np.linalg.norm(lens.centre_mm)),
+        )
+        self._view = View(
+            camera.pinhole(),
+            self._stage,
+            blur_px=camera.blur_px,
+            ambient=options.ambient,
+            samples_per_axis=options.samples_per_axis,
+            jitter=options.jitter,
+            seed=options.seed,
+            workers=options.workers,
+        )
+        self._format = CameraFormat(camera.size, camera.bit_depth)
+        self.projector: Size = options.projector.size
+        self.calibration = Calibration({camera.name: camera.pinhole()}, lens)
+        self._response = options.projector.response()
+        self._sensor = camera.sensor()
+        self._rng = np.random.default_rng((seed, 0x6C6F6F70))
+        self._lock = threading.Lock()
+        self._changes: list[tuple[int, Pixels]] = [(0, DARK)]
+        self._images: dict[tuple[tuple[int, ...], bytes], NDArray[np.float32]] = {}
+        # Tracing takes seconds: now, and not while a sensor waits.
+        self._seen(DARK)
+
+    @property
+    def format(self) -> CameraFormat:
+        return self._format
+
+    def move(self, index: int) -> None:
+        """Put what the script moves into a pose, as a person does: between photographs."""
+        with self._lock:
+            self._stage.change(surface=self._script.surface(index))
+            self._images.clear()
+        self._seen(DARK)
+
+    @property
+    def profiles(self) -> list[Pixels]:
+        with self._lock:
+            return [profile for _, profile in self._changes]
+
+    def show(self, profile: Pixels | None) -> int:
+        """Change the light now, to a pattern's profile or to the dark; return the instant, ns."""
+        at_ns = time.monotonic_ns()
+        self.changed(DARK if profile is None else profile, at_ns=at_ns)
+        return at_ns
+
+    def changed(self, profile: Pixels, *, at_ns: int) -> None:
+        with self._lock:
+            self._changes.append((max(at_ns, self._changes[-1][0]), profile))
+
+    def exposed(self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0) -> Pixels:
+        """(H, W): what the sensor reads after an exposure, with its noise."""
+        with self._lock:
+            changes = list(self._changes)
+        span_ns = max(t_end_ns - t_start_ns, 1)
+        mean = np.zeros(self._format.size.shape, np.float32)
+        for index, (at_ns, profile) in enumerate(changes):
+            until_ns = changes[index + 1][0] if index + 1 < len(changes) else t_end_ns
+            share = (min(until_ns, t_end_ns) - max(at_ns, t_start_ns)) / span_ns
+            if share > 0:
+                mean += np.float32(share) * self._seen(profile)
+        electrons = self._sensor.electrons(mean, span_ns / 1e9)
+        with self._lock:
+            return self._sensor.read_out(electrons, gain=gain, rng=self._rng)
+
+    def _seen(self, profile: Pixels) -> NDArray[np.float32]:
+        """(H, W): the mean light on the sensor while this is shown; light adds up, so mixtures are sums of these."""
+        key = (profile.shape, profile.tobytes())
+        with self._lock:
+            if key not in self._images:
+                self._images[key] = self._view.image([(1.0, light_table(profile, self.projector, self._response))])
+            return self._images[key]
+
+
+_BETWEEN_LOOKS_S = 0.003
+_LOOKS_AGAIN_IN_S = 10.0
+
+
+class WatchedOutput:
+    """Looks at an output's pixels all the time and lights a world with them. A context manager.
+
+    Stands before a sensor as the world itself does. A frame is read out only after a look at the output that follows
+    its exposure, so a program that waits for the frame cannot have changed the picture before. A change is known to
+    within two looks, and taken to have done so right after the first of them. A picture that is no pattern ends the
+    watch, and is raised on leaving. `pictures` : each that was there, (H, W, 3).
+    """
+
+    def __init__(self, pixels: OutputPixels, world: World) -> None:
+        self._pixels, self._world = pixels, world
+        self._left = threading.Event()
+        self._looked = threading.Condition()
+        self._seen_until_ns = 0
+        self._fault: Exception | None = None
+        self.pictures: list[NDArray[np.uint8]] = []
+        self._thread = threading.Thread(target=self._watch, name="watched output", daemon=True)
+
+    @property
+    def format(self) -> CameraFormat:
+        return self._world.format
+
+    def exposed(self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0) -> Pixels:
+        """See `World`. Waits until the output was seen after the exposure."""
+        self._see(t_end_ns)
+        return self._world.exposed(t_start_ns, t_end_ns, gain=gain)
+
+    def _see(self, t_ns: int) -> None:
+        with self._looked:
+            seen = self._looked.wait_for(lambda: self._fault or self._seen_until_ns > t_ns, _LOOKS_AGAIN_IN_S)
+        assert seen, "the output was not looked at"
+
+    def _watch(self) -> None:
+        last_ns = time.monotonic_ns()
+        try:
+            while not self._left.is_set():
+                now_ns = time.monotonic_ns()
+                picture = self._pixels.colours()
+                if not self.pictures or not np.array_equal(picture, self.pictures[-1]):
+                    self._world.changed(profile_of(picture), at_ns=last_ns)
+                    self.pictures.append(picture)
+                last_ns = now_ns
+                with self._looked:
+                    self._seen_until_ns = now_ns
+                    self._looked.notify_all()
+                self._left.wait(_BETWEEN_LOOKS_S)
+        except (AssertionError, ValueError) as fault:
+            with self._looked:
+                self._fault = fault
+                self._looked.notify_all()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self._see(0)
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        # The last picture counts as well.
+        self._see(time.monotonic_ns())
+        self._left.set()
+        self._thread.join(_LOOKS_AGAIN_IN_S)
+        self._pixels.close()
+        if self._fault is not None and kind is None:
+            raise self._fault
+
+
+def require_umockdev() -> None:
+    """Skip where a fake device cannot stand; fail instead where CI=true, which installs what it needs."""
+    if why_not():
+        lacking(why_not())
+
+
+class VideoNode:
+    """A fake kernel's /dev/video0, 8 bits of grey. A context manager.
+
+    environment : what a program needs in its environment to find the device. `sensor.asked` : every exposure read.
+    """
+
+    def __init__(self, folder: Path, world: World | WatchedOutput) -> None:
+        require_umockdev()
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "faults").mkdir()
+        # Socket paths may have 107 characters, and those of test folders have more.
+        self._short = tempfile.TemporaryDirectory(prefix="slrig-loop-")
+        socket = Path(self._short.name) / "light"
+        self.sensor = SensorService(socket, cast("Below", world))
+        size = world.format.size
+        faked = Faked(formats={"GREY": [(size.width_px, size.height_px)]})
+        config = folder / "device.json"
+        config.write_text(json.dumps(faked.config(socket, folder / "faults")))
+        self._server = subprocess.Popen(  # noqa: S603 - our own program
+            ["umockdev-wrapper", str(DEBIAN_PYTHON), "-m", "tests.contract.v4l2_server", str(config)],  # noqa: S607
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+        )
+        assert self._server.stdout is not None
+        word, root = self._server.stdout.readline().split(maxsplit=1)
+        assert word == "ready"
+        loaded = ["libumockdev-preload.so.0", *filter(None, [os.environ.get("LD_PRELOAD")])]
+        self.environment = {"UMOCKDEV_DIR": root.strip(), "LD_PRELOAD": ":".join(loaded)}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError, subprocess.TimeoutExpired):
+            self._server.communicate(timeout=10)
+        self._server.kill()
+        self._server.wait(10)
+        self.sensor.close()
+        self._short.cleanup()
+
 
 EXPOSURE_S = 0.0167
 OUTPUT = "DUMMY1"
@@ -233,9 +478,9 @@ def test_screen_and_v4l2_around_the_world(
 
 def test_trigger_box_plays_to_a_camera_on_its_wire(reference: Reference, tmp_path: Path) -> None:
     world = World(reference.rig, seed=5)
-    box = TriggerBox(cast("Stage", world), pattern_sequence(PatternPlan(), world.projector))
+    box = TriggerBox(cast("Below", world), pattern_sequence(PatternPlan(), world.projector))
     try:
-        camera = WiredCamera("left", cast("Stage", world))
+        camera = WiredCamera("left", cast("Below", world))
         box.cameras = {"left": camera}
         projector = box.projector()
         assert projector.info.plays

@@ -1,7 +1,4 @@
-"""Scans of an object on a stage made one model over HTTP: the mesh is right, and a kill in the middle costs nothing.
-
-The views are given here, or shot by the service.
-"""
+"""Scans of an object on a stage made one model over HTTP: the mesh is right, and a kill in the middle costs nothing."""
 
 from __future__ import annotations
 
@@ -17,10 +14,8 @@ import pytest
 from slrig.bundle.poses_file import read_poses
 from slrig.client import Client
 from slrig.client.errors import ConflictError, ModelFailedError
-from slrig.client.events import Progress
 from slrig.combine.offered import MEDIA_TYPES
 from slrig.jobs.records import utc_now
-from slrig.rig.turn_count import FROM_THE_START
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import KeptRecord, write_record
@@ -95,32 +90,4 @@ def test_scans_become_a_model_over_http_and_a_kill_while_it_is_made_costs_nothin
         client.scans.delete(scans[0])
         client.models.delete(cut_off)
         assert {each["id"] for each in client.models.list()["models"]} >= {made["id"], waiting}
-    assert second.stop() == 0
-
-
-@pytest.mark.slow
-def test_a_kill_within_a_view_costs_that_view_only(start: Start) -> None:
-    count = 6  # fewer do not overlap
-    rig = Path(__file__).parents[2] / "config" / "rigs" / "turntable.toml"
-    first = start(rig)
-    with first.client() as client:
-        axis = {"point_mm": [2.0, 0.0, 1.5], "direction": [0.03, -1.0, -0.05]}
-        model = client.models.shoot(views=count, axis=axis, label="figure", if_busy="queue")["id"]
-        for event in client.models.follow(model):
-            if isinstance(event, Progress) and event.detail.startswith(f"view 2 of {count}"):
-                break
-        first.kill()
-    second = start(rig)
-    with second.client() as client:
-        done = client.models.wait(model)
-        assert set(done["links"]["files"]) == set(MEDIA_TYPES)
-        scans = client.scans.series(model)["scans"]
-        whole = [each for each in scans if each["state"] == "succeeded"]
-        assert sorted(each["plan"]["series"]["number"] for each in whole) == list(range(1, count + 1))
-        assert [each["state"] for each in scans if each not in whole] in (["interrupted"], [])
-        for each in whole:
-            turned = {"angle_deg": each["plan"]["turn_deg"], "turned_by": "table", "count": FROM_THE_START}
-            assert each["summary"]["stage"] == turned
-        report = json.loads(client.models.file(model, "report.json"))
-        assert report["axis"]["stage_error_deg"] == pytest.approx([0.0] * count, abs=0.1)
     assert second.stop() == 0
