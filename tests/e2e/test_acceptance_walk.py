@@ -1,4 +1,4 @@
-"""An acceptance test over HTTP to its report, through the real service, on a rendered rig."""
+"""Through the real service: an acceptance test to its report, and a schedule that outlives a kill in a run."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.scene import SCENE, scripted_config
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from tests.e2e.conftest import Start, write_rig
-from tests.e2e.schedules import awaited
-from tests.e2e.test_calibration_walk import Caller
+from tests.e2e.conftest import SLOW, Start, write_rig
+from tests.e2e.schedules import at_once, awaited, newest
+from tests.e2e.test_calibration_walk import BOARD, Caller
+from tests.e2e.test_calibration_walk import write_rig as write_board_rig
 
 REPEATS = 2
 
@@ -66,4 +67,39 @@ def test_acceptance_over_http_to_its_report(start: Start, tmp_path: Path) -> Non
         spacing = next(each for each in report["quantities"] if each["quantity"] == "SD")
         assert abs(spacing["error_mm"]) < report["volume_diagonal_mm"] / 2000
         assert caller.http.get(found["files"]["report.html"]).text.count("data:image/jpeg;base64,") == 23
+    assert service.stop() == 0
+
+
+@pytest.mark.slow
+def test_a_schedule_is_kept_through_a_kill_in_the_middle_of_a_run(start: Start, tmp_path: Path) -> None:
+    rig = write_board_rig(tmp_path / "rig", head=SLOW, carries="true")
+    service = start(rig)
+    with Caller(service) as caller:
+        caller.ready()
+        options = {"board": BOARD, "position": 1}
+        made = caller.post("/schedule", 201, cron="* * * * *", task="verification", enabled=False, options=options)
+        at_once(caller, service, made)
+        assert len(caller.get(made["links"]["self"])["upcoming"]) == 5
+        name = awaited(lambda: caller.get("/rig")["holder"], "the run")
+        assert name.startswith(f"schedule {made['id'][:8]}, verification due ")
+        refused = caller.post("/scan", 409)
+        assert refused["holder"] == name
+        assert name in refused["detail"]
+        assert newest(caller, made, "running")
+        service.kill()
+    service = start(rig)
+    with Caller(service) as caller:
+        (cut_off,) = caller.get(made["links"]["runs"])["runs"]
+        assert (cut_off["state"], cut_off["reason"]) == ("interrupted", "the service ended in the middle of it")
+        assert list((service.data / ".incoming").iterdir()) == []
+        # This one comes by the clock.
+        caller.post(made["links"]["resume"], 200)
+        run = awaited(lambda: newest(caller, made, "succeeded"), "a whole run")
+        assert run["due"] > cut_off["due"]
+        assert run["result"]["state"] == "good", run["result"]
+        health = caller.get("/rig/health")
+        assert (health["state"], health["latest"]["id"]) == ("good", run["result"]["verification"])
+        figures = caller.http.get("/metrics").text
+        assert 'slrig_scheduled_runs{state="interrupted",task="verification"} 1.0' in figures
+        assert 'slrig_rig_health{state="good"} 1.0' in figures
     assert service.stop() == 0
