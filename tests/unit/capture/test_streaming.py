@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from slrig.bundle.refused import Refused
 from slrig.capture.cadence import Cadence
 from slrig.capture.frame_reader import FrameReader
 from slrig.capture.sequencer import capture
 from slrig.capture.streaming import _Lead
 from slrig.devices import Camera, Synchronisation, Trigger
-from slrig.errors import DeviceGoneError
+from slrig.errors import DeviceGoneError, FrameTimeoutError
 from slrig.model import Frame
 from tests.contract.live_devices import Webcam
 from tests.contract.test_streaming import SEQUENCE, live
@@ -148,6 +149,14 @@ def test_a_camera_that_goes_ends_the_capture_and_its_thread() -> None:
     with pytest.raises(Exception, match="closed"):
         list(frames)
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("slrig-frames")]
+
+
+def test_a_frame_that_never_comes_is_waited_for_in_three_showings() -> None:
+    rig = replace(live(Webcam(lost=1.0)).rig, synchronisation=Synchronisation(0.0, 0.0, earliest_s=0.0))
+    refused: list[Refused] = []
+    with pytest.raises(FrameTimeoutError, match="failed 3 times"):
+        list(capture(rig, SEQUENCE, timeout_s=0.1, refused=refused.append))
+    assert [each.attempt for each in refused] == [1, 2, 3]
 
 
 REFRESH_NS = 16_666_667
