@@ -223,11 +223,11 @@ def _curves(rig: Rig, exposed: ExposedView, means: list[NDArray[np.float32]], rn
 def _bounds(rig: Rig, exposed: ExposedView) -> dict[str, FloatArray]:
     """What is known of each cell, (lines * rows,) float64, by name; NaN where there is no stripe."""
     rows, columns = rig.camera.size.height_px, rig.projector.size.width_px
-    told = {name: np.full(rows * columns, np.nan) for name in ("snr", "bound_px")}
+    known = {name: np.full(rows * columns, np.nan) for name in ("snr", "bound_px")}
     stripes = [stripe_bound(exposed, rig.sequence.profiles[index], lines) for index, lines in rig.lines()]
     width_px = float(np.median(np.concatenate([each.width_px for each in stripes])))
     for each in stripes:
         at = np.rint(each.line_px).astype(np.intp) * rows + each.row
-        told["snr"][at] = each.snr
-        told["bound_px"][at] = each.averaged_px(max(width_px, _FINEST_SMOOTHING_PX))
-    return told
+        known["snr"][at] = each.snr
+        known["bound_px"][at] = each.averaged_px(max(width_px, _FINEST_SMOOTHING_PX))
+    return known

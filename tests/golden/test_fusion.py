@@ -42,8 +42,8 @@ def require_one_model(truth: trimesh.Trimesh, count: int) -> TopologyCounts:
     assert (counts.nonmanifold_edges, counts.misoriented_edges, counts.duplicate_faces) == (0, 0, 0)
     seen = np.concatenate([view.seen_mm for view in views])[::7]
     assert (SearchTree.over(model.mesh.vertices_mm, model.mesh.faces).distances_mm(seen) < 0.1).mean() > 0.995
-    told = np.quantile(known.distances_mm(model.mesh.vertices_mm) / model.mesh.sigma_mm, 0.6827)
-    assert 0.8 < told < 1.25
+    over_sigma = np.quantile(known.distances_mm(model.mesh.vertices_mm) / model.mesh.sigma_mm, 0.6827)
+    assert 0.8 < over_sigma < 1.25
     return counts
 
 
