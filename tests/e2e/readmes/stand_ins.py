@@ -101,7 +101,6 @@ STAND_INS = (
         "--output teapot-bundle",
         "the Gray code of the demonstration, in smaller pictures, takes the place of another program's images",
     ),
-    StandIn("pip install -e '.[test,bench]'", None, "would change the environment of the tests"),
     StandIn("pytest tests/bench/test_pipeline_speed.py -s", None, "measures speed: nothing else may run beside it"),
     StandIn("pytest tests/bench -s", None, "takes an hour, on a machine that does nothing else"),
 )
