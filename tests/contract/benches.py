@@ -20,7 +20,7 @@ from tests.contract import (
     gentl_bench,
     opencv_bench,
     serial_bench,
-    v4l2_virtual,
+    v4l2_bench,
 )
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench, BenchHead, rig_of, sequence_for
@@ -113,7 +113,7 @@ BENCHES: dict[str, Callable[[Path], Bench]] = {
     "simulated in real time": partial(simulated, realtime=True),
     "replay": replayed,
     "replay in real time, 50 times as fast": partial(replayed, speed=50),
-    "v4l2 (fake kernel)": v4l2_virtual.bench,
+    "v4l2 (fake kernel)": v4l2_bench.bench,
     "opencv (stream)": opencv_bench.served_bench,
     "opencv (file)": partial(opencv_bench.served_bench, through="file"),
     "genicam (GigE Vision on loopback)": genicam_bench.bench,

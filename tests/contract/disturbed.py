@@ -21,7 +21,6 @@ from tests.contract import (
     gentl_bench,
     opencv_bench,
     v4l2_bench,
-    v4l2_virtual,
 )
 from tests.contract.genicam_bench import Fate, Relay
 from tests.contract.genicam_peer import INTERFACE
@@ -83,7 +82,7 @@ def v4l2(leaving: ExitStack, _: Path, *, stamp: str) -> Disturbed:
     faked = Faked(
         stamp=stamp, readout_s=0.0015, bands=4, jitter_s=0.001, lost=0.1, corrupt=0.05, noise_when_corrupt=False
     )
-    device = leaving.enter_context(v4l2_virtual.VirtualDevice(v4l2_virtual.virtually(noise_dn=1.0), faked))
+    device = leaving.enter_context(v4l2_bench.VirtualDevice(v4l2_bench.virtually(noise_dn=1.0), faked))
 
     def open_head() -> BenchHead:
         camera = device.open_camera(frame_rate_hz=400, gain_unity=GAIN_UNITS)

@@ -1,4 +1,4 @@
-"""A camera of the kernel's: OpenCV's part is a stand-in that behaves as measured, the kernel's is `v4l2_virtual`."""
+"""A camera of the kernel's: OpenCV's part is a stand-in that behaves as measured, the kernel's is `v4l2_bench`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from drivers.opencv.controls import Controls, negotiate
 from drivers.opencv.options import OpenCvOptions
 from slrig.devices import CameraSettings, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
-from tests.contract.v4l2_bench import CONTROLS, Faked, control
-from tests.contract.v4l2_virtual import NODE, VirtualDevice, virtually
+from tests.contract.v4l2_bench import CONTROLS, NODE, Faked, VirtualDevice, control, virtually
 
 
 def number(code: str) -> float:

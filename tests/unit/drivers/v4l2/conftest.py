@@ -8,8 +8,7 @@ from contextlib import ExitStack
 import pytest
 
 from tests.contract.stage import Stage
-from tests.contract.v4l2_bench import Faked
-from tests.contract.v4l2_virtual import VirtualDevice, virtually
+from tests.contract.v4l2_bench import Faked, VirtualDevice, virtually
 
 Plug = Callable[..., VirtualDevice]
 

@@ -22,9 +22,8 @@ from slrig.errors import (
 )
 from slrig.model import Pixels
 from tests.contract.stage import Stage
-from tests.contract.v4l2_bench import CAMERA, CONTROLS, Faked, control
+from tests.contract.v4l2_bench import CAMERA, CONTROLS, Faked, VirtualDevice, control, virtually
 from tests.contract.v4l2_sensor import GAIN_UNITS
-from tests.contract.v4l2_virtual import VirtualDevice, virtually
 from tests.unit.capture.fake_rig import Scene
 from tests.unit.drivers.v4l2.conftest import Plug
 from tests.virtual_clock import VirtualClock
