@@ -206,7 +206,7 @@ def test_features_and_a_region_are_set_through_aravis(device: Device) -> None:
     )
     assert set_to == pytest.approx((50, 2, True))
     camera.close()
-    camera = device.open(region={"x_px": 16, "y_px": 8, "width_px": 60, "height_px": 40})
+    camera = device.open(**PATIENT, region={"x_px": 16, "y_px": 8, "width_px": 60, "height_px": 40})
     assert tuple(asked(camera, "get_region")) == (16, 8, 60, 40)
     assert one_frame(device, camera).image.shape == (40, 60)
     camera.close()
