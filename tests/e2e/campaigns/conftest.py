@@ -12,8 +12,7 @@ import pytest
 
 from slrig.client import Client
 from tests.e2e.conftest import ServiceProcess, scanned
-from tests.e2e.faulty_rig.desk import Desk
-from tests.e2e.faulty_rig.service import serve
+from tests.e2e.faulty_rig.service import Desk, serve
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,13 +1,13 @@
-"""The service ends, or is killed, while its rig is at a step of a scan, and is started again on its data.
+"""The service ends, or is killed, at a step of a scan, and is started again on its data; or on a restored backup.
 
 SIGTERM leaves the projector dark and every scan marked as interrupted; clients that follow a scan hear of it. After
-SIGKILL the light is the duty of the projector's own watchdog, if it has one, until the next start opens the projector,
-which darkens it and marks the scan. A scan that waited for the rig waits again, and one with all its frames is
-reconstructed.
+SIGKILL the next start darkens the projector and marks the scan. A scan that waited waits again, and one with all its
+frames is reconstructed.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import select
 import signal
@@ -26,10 +26,8 @@ from slrig.client import Client
 from tests.e2e.campaigns.conftest import Stand
 from tests.e2e.campaigns.test_faults import READ, preview
 from tests.e2e.conftest import KEY, STOP_LIMIT_S, ServiceProcess, ended, followed_to, scanned, serving, slrig, write_rig
-from tests.e2e.faulty_rig.desk import Desk, Step
-from tests.e2e.faulty_rig.driver import PLAYER
-from tests.e2e.faulty_rig.scenery import CAMERA_NAME
-from tests.e2e.faulty_rig.service import Follower, half_written
+from tests.e2e.faulty_rig.driver import CAMERA_NAME, PLAYER
+from tests.e2e.faulty_rig.service import Desk, Follower, Step, half_written
 
 pytestmark = pytest.mark.slow
 
@@ -217,3 +215,35 @@ def test_a_service_ends_with_the_program_that_started_it(tmp_path: Path) -> None
         assert [path for path in (data, data / "first-key", data / "slrig.sqlite") if path.stat().st_mode & 0o077] == []
         service.stdin.close()
         assert service.wait(STOP_LIMIT_S) == 0
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def test_a_backup_while_scans_run_restores_every_finished_scan(
+    serve_again: Callable[..., ServiceProcess], desk: Desk, tmp_path: Path
+) -> None:
+    first = serve_again()
+    with first.client() as client:
+        done = [scanned(client, label="first")["id"]]
+        slrig("backup", tmp_path / "earlier", "--data", first.data)
+        done.append(scanned(client, label="second")["id"])
+        with desk.held(READ) as hold:
+            shot, waits = (client.scans.start(if_busy="queue")["id"] for _ in range(2))
+            hold.until_reached()
+            linked = ("--link-previous", tmp_path / "earlier")
+            made = slrig("backup", tmp_path / "backup", "--data", first.data, "--json", *linked).stdout
+    assert json.loads(made)["scans"] == 2
+    assert first.stop() == 0
+    kept = {scan: contents(first.data / "scans" / scan) for scan in done}
+    first.data.rename(tmp_path / "lost")
+    slrig("restore", tmp_path / "backup", "--data", first.data)
+    second = serve_again()
+    with second.client() as client:
+        states = {each["id"]: each["state"] for each in client.get("/scan")["scans"]}
+        # What ran or waited is on record, and does not go on by itself.
+        assert states == dict.fromkeys(done, "succeeded") | dict.fromkeys((shot, waits), "interrupted")
+        assert all(len(files) > 10 for files in kept.values())
+        assert {scan: contents(second.data / "scans" / scan) for scan in done} == kept
+        assert scanned(client)["state"] == "succeeded"

@@ -23,10 +23,8 @@ import pytest
 
 from tests.e2e.campaigns.conftest import Stand
 from tests.e2e.conftest import KEY, ended, followed_to, scanned
-from tests.e2e.faulty_rig.desk import Desk, Step
-from tests.e2e.faulty_rig.driver import PLAYER
-from tests.e2e.faulty_rig.scenery import CAMERA_NAME
-from tests.e2e.faulty_rig.service import half_written
+from tests.e2e.faulty_rig.driver import CAMERA_NAME, PLAYER
+from tests.e2e.faulty_rig.service import Desk, Step, half_written
 from tests.e2e.schedules import awaited
 
 pytestmark = pytest.mark.slow

@@ -10,10 +10,8 @@ import pytest
 from slrig.errors import ServiceError
 from tests.e2e.campaigns.test_faults import READ
 from tests.e2e.conftest import ServiceProcess, ended, scanned
-from tests.e2e.faulty_rig.desk import Desk, Step
-from tests.e2e.faulty_rig.driver import PLAYER
-from tests.e2e.faulty_rig.scenery import CAMERA_NAME
-from tests.e2e.faulty_rig.service import Follower, half_written
+from tests.e2e.faulty_rig.driver import CAMERA_NAME, PLAYER
+from tests.e2e.faulty_rig.service import Desk, Follower, Step, half_written
 
 pytestmark = pytest.mark.realtime
 
