@@ -228,6 +228,17 @@ def test_device_or_solve_that_fails_fails_the_run(bench: TaskBench) -> None:
         bench.do(TaskKind.CALIBRATION, board=BOARD)
 
 
+def test_rig_that_cannot_be_opened_fails_the_run_with_its_cause(tmp_path: Path) -> None:
+    bench = TaskBench(tmp_path)
+    bench.open_error = DeviceError("no camera is plugged in")
+    bench.runner.start()
+    with pytest.raises(DeviceError, match="no camera is plugged in"):
+        bench.do(TaskKind.CALIBRATION, board=BOARD)
+    bench.open_error = None
+    assert bench.do(TaskKind.CALIBRATION, board=BOARD)["accepted"] == 3
+    bench.close()
+
+
 def test_verification_is_of_the_board_in_use(bench: TaskBench) -> None:
     with pytest.raises(CalibrationError, match=r"that was made here is in use\. Give the schedule the option .board"):
         bench.do(TaskKind.VERIFICATION)
