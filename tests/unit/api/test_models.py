@@ -11,7 +11,7 @@ from fastapi.testclient import TestClient
 from slrig.combine.offered import MEDIA_TYPES
 from slrig.combine.plan import GivenPoses, MarkerPoses, StatedAxis, TurntablePoses, UnknownPoses
 from slrig.errors import RegistrationRefusedError
-from tests.unit.api.conftest import ServedBench, ended
+from tests.unit.api.conftest import ServedBench, ended, refusal
 from tests.unit.combine.model_bench import kept_scan, until_told
 
 AXIS = {"point_mm": [4.0, 45.0, 12.0], "direction": [0.0, -1.0, 0.0]}
@@ -129,6 +129,11 @@ def test_model_is_shot_while_a_person_turns_the_object(client: TestClient, serve
     assert client.post(f"/model/{model['id']}/combine").status_code == 202
     assert over(client, model)["state"] == "succeeded"
     assert len(served.combining.asked[-1][0]) == 2
+
+
+def test_views_wait_for_a_busy_rig_only_on_request(client: TestClient, served: ServedBench) -> None:
+    served.held(client)
+    assert refusal(client, "POST", "/model/shoot", json={**BY_HAND, "if_busy": "reject"}) == (409, "/problems/rig-busy")
 
 
 @pytest.mark.parametrize(
