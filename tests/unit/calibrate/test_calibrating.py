@@ -15,7 +15,7 @@ from structlog.testing import capture_logs
 
 from slrig.bundle.calibration_file import read_calibration, write_calibration
 from slrig.calibrate.pose_shooting import PoseRequest
-from slrig.calibrate.records import PoseRecord, SessionState
+from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, with_jobs
 from slrig.calibrate.retention import Retention, named_by_scans
 from slrig.calibrate.store import CalibrationStore
 from slrig.errors import (
@@ -28,7 +28,7 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
 from slrig.model import Size
 from slrig.scan.sweep import sweep
 from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench, tame_calibration
@@ -90,6 +90,23 @@ def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBe
     of_all = [*of_each, *of_each, "queued", "computing", "succeeded"]
     assert [event.data["state"] for event in events if event.kind == "state"] == of_all
     assert {"capture", "adjust"} <= {event.data["stage"] for event in events if event.kind == "progress"}
+
+
+def test_the_progress_of_a_session_is_that_of_its_job_under_way() -> None:
+    now = datetime(2026, 11, 28, tzinfo=UTC)
+
+    def solve(state: JobState, stage: str) -> JobRecord:
+        progress = JobProgress(stage, 0.5, "")
+        return JobRecord(1, uuid4(), JobKind.SOLVE, state, None, "rig", {}, now, None, None, progress, None, None)
+
+    waits, runs, done = (
+        solve(JobState.QUEUED, "waits"), solve(JobState.COMPUTING, "runs"), solve(JobState.SUCCEEDED, "done"),
+    )  # fmt: skip
+    session = SessionRecord(1, uuid4(), now, "rig")
+    found = with_jobs(session, [done, waits, runs])
+    assert (found.state, found.under_way, found.progress) == (SessionState.SOLVING, True, runs.progress)
+    assert with_jobs(session, [done, waits]).progress is None
+    assert not with_jobs(session, [done]).under_way
 
 
 def test_pose_is_shot_along_both_axes_and_knows_no_earlier_calibration(bench: CalibrationBench) -> None:
