@@ -84,6 +84,7 @@ class Streaming(Obstinate):
     def __init__(self) -> None:
         super().__init__()
         self.values |= {cv2.CAP_PROP_FPS: 1 / PERIOD_S, cv2.CAP_PROP_EXPOSURE: 3, cv2.CAP_PROP_BUFFERSIZE: 4}
+        self.values[cv2.CAP_PROP_CONVERT_RGB] = 1
         self.flows, self.gone, self.ahead_ns, self.lost = threading.Event(), False, 0, 0
         self.flows.set()
         self.number, self._never = 0, threading.Event()
@@ -100,8 +101,10 @@ class Streaming(Obstinate):
         self._never.wait((1 + lost) * PERIOD_S)
         self.number += 1
         self.values[cv2.CAP_PROP_POS_MSEC] = (time.monotonic_ns() + self.ahead_ns) / 1e6
-        yuyv = np.full((480, 640, 2), self.number % 200, np.uint8)
-        return (False, None) if self.gone else (True, yuyv)
+        picture = np.full((480, 640, 2), self.number % 200, np.uint8)
+        if self.values[cv2.CAP_PROP_CONVERT_RGB]:
+            picture = np.zeros((480, 640, 3), np.uint8)
+        return (False, None) if self.gone else (True, picture)
 
 
 Plug = Callable[..., tuple[Streaming, VirtualDevice]]
