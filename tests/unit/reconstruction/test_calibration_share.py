@@ -24,8 +24,8 @@ from tests.unit.calibration.perturbed import (
     right_camera,
 )
 
-# Scans by an uncalibrated or exact rig need none of these kernels, which take seconds to compile.
-pytestmark = pytest.mark.slow
+# Kernels of two cameras take seconds to compile.
+slow = pytest.mark.slow
 BOX = np.array([[-60.0, -50, 550], [60, 50, 660]])
 NAMES = ("left", "right")
 
@@ -159,7 +159,7 @@ def changes(calibration: Calibration) -> FloatArray:
     return factor(calibration.solved.covariance).T
 
 
-@pytest.mark.parametrize("axis", [Axis.COLUMN, Axis.ROW])
+@pytest.mark.parametrize("axis", [Axis.COLUMN, pytest.param(Axis.ROW, marks=slow)])
 def test_the_share_of_a_camera_and_a_projector(axis: Axis) -> None:
     camera, projector = left_camera(), light_source()
     if axis is Axis.ROW:
@@ -183,6 +183,7 @@ def test_the_share_of_a_camera_and_a_projector(axis: Axis) -> None:
     assert np.abs(share(calibration, points, normals, axis=axis) / expected - 1).max() < 0.01
 
 
+@slow
 def test_the_share_of_two_cameras() -> None:
     left, right = left_camera(), right_camera()
     calibration = calibrated({"left": left, "right": right}, None)
@@ -202,6 +203,7 @@ def test_the_share_of_two_cameras() -> None:
     assert found(None) == pytest.approx(found(epipolar_tangents(points)), rel=1e-4)
 
 
+@slow
 def test_the_share_of_two_cameras_and_a_projector() -> None:
     """Points of either camera, and the mean of both by how far each sees a point move along the projector's ray."""
     left, right, projector = left_camera(), right_camera(), light_source()
@@ -235,6 +237,7 @@ def test_the_share_of_two_cameras_and_a_projector() -> None:
         assert np.abs(found / sigma_of(moves[kind], normals) - 1).max() < 0.01
 
 
+@slow
 def test_cameras_in_another_order_and_one_that_is_not_in_the_scan() -> None:
     left, right, projector = left_camera(), right_camera(), light_source()
     whole = calibrated({"right": right, "left": left}, projector)
@@ -247,6 +250,7 @@ def test_cameras_in_another_order_and_one_that_is_not_in_the_scan() -> None:
     assert share(whole, points, normals) == pytest.approx(share(alone, points, normals))
 
 
+@slow
 def test_without_a_normal_the_viewing_ray_stands() -> None:
     calibration = calibrated({"left": left_camera()}, light_source())
     points, _ = surface(30, 8)

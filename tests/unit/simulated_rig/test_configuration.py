@@ -17,7 +17,15 @@ RENDERED = [path for path in RIGS if tomllib.loads(path.read_text()).get("head",
 
 
 # Every golden scan opens the demonstration, whose mesh is large.
-@pytest.mark.parametrize("path", [each for each in RENDERED if each.stem != "demo"], ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        # Normals of a mesh that has none take seconds to compile.
+        pytest.param(each, marks=pytest.mark.slow if each.stem == "mesh_file" else (), id=each.stem)
+        for each in RENDERED
+        if each.stem != "demo"
+    ],
+)
 def test_every_rendered_rig_we_ship_sees_a_lit_surface(path: Path) -> None:
     table = tomllib.loads(path.read_text())["head"]
     table.pop("driver")
