@@ -10,6 +10,7 @@ import os
 import socket
 import struct
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -59,7 +60,7 @@ class Faults:
     stale_answer: bool = False
 
 
-class Sequencer:
+class Sequencer(ABC):
     """What fake engines have in common: a light, and a thread that plays. It wakes up with the light on."""
 
     def __init__(self, clock: Clock | None) -> None:
@@ -97,8 +98,8 @@ class Sequencer:
         if halt is not None:
             halt.set()
 
-    def _relight(self) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _relight(self) -> None: ...
 
     def _is_fresh(self, lit: Pixels | None) -> bool:
         """Take note of light; whether it has changed."""

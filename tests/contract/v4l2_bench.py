@@ -172,7 +172,7 @@ class _Kernel(Device):
         self.faults: set[str] = set()
         self.controls_set: dict[str, int] = {}
 
-    def told(self, fault: str) -> bool:
+    def has_fault(self, fault: str) -> bool:
         return fault in self.faults
 
     def was_set(self, control: str, value: int) -> None:

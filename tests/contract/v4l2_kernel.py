@@ -106,7 +106,7 @@ class Light:
     path: str
     stream: Any = None
 
-    def seen(self, question: dict[str, Any]) -> bytes:
+    def image_bytes(self, question: dict[str, Any]) -> bytes:
         if self.stream is None:
             link = socket.socket(socket.AF_UNIX)
             link.connect(self.path)
@@ -144,7 +144,7 @@ class Device:
         found = self.config["rates_of"].get(f"{code or self.code} {width} x {height}", self.config["rates"])
         return list(found)
 
-    def told(self, fault: str) -> bool:
+    def has_fault(self, fault: str) -> bool:
         """Whether the test asks for this fault now."""
         return (Path(self.config["faults"]) / fault).exists()
 
@@ -155,7 +155,7 @@ class Device:
 
     def answer(self, request: int, data: bytearray, file: object) -> int | None:
         """Answer into `data`; return when to ask again (ns) if there is nothing to tell yet. Raises Refused."""
-        if self.told("unplugged"):
+        if self.has_fault("unplugged"):
             # What is plugged in again is another device, for the kernel.
             self.owner, self.buffers, self.streaming = None, 0, False
             raise Refused(errno.ENODEV)
@@ -272,7 +272,7 @@ class Device:
         struct.pack_into("I", data, 0, self.buffers)
 
     def require_free(self, file: object) -> None:
-        if self.told("busy") or (self.owner is not None and self.owner is not file):
+        if self.has_fault("busy") or (self.owner is not None and self.owner is not file):
             raise Refused(errno.EBUSY)
 
     def place(self, data: bytearray) -> None:
@@ -290,7 +290,7 @@ class Device:
     def start(self, file: object) -> None:
         if self.owner is not file:
             raise Refused(errno.EBUSY)
-        if self.told("no bandwidth"):
+        if self.has_fault("no bandwidth"):
             raise Refused(errno.ENOSPC)
         exposure_ns = self.values.get(EXPOSURE_ABSOLUTE, 0) * 100_000
         if EXPOSURE_LINES in self.values:
@@ -308,13 +308,13 @@ class Device:
     def fill_until(self, now_ns: int) -> None:
         """Let the sensor run: each frame goes into the buffer that waited longest, if one did when it began to come."""
         for shot in self.sensor.done_until(now_ns) if self.streaming else ():
-            if shot.lost or self.told("silent"):
+            if shot.lost or self.has_fault("silent"):
                 continue
             if self.queued and self.queued[0][0] <= shot.start_ns + shot.exposure_ns:
                 self.filled.append((self.queued.popleft()[1], shot))
 
     def dequeue(self, data: bytearray) -> int | None:
-        if self.told("dead"):
+        if self.has_fault("dead"):
             raise Refused(errno.EIO)
         if not self.streaming:
             raise Refused(errno.EINVAL)
@@ -324,7 +324,7 @@ class Device:
             due_ns = self.sensor.coming.done_ns if self.sensor.coming is not None else now_ns
             return min(due_ns, now_ns + LONGEST_WAIT_NS)
         index, shot = self.filled.popleft()
-        image = self.light.seen(
+        image = self.light.image_bytes(
             {
                 "number": shot.number,
                 "start_ns": shot.start_ns,

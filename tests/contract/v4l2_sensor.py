@@ -68,7 +68,7 @@ class Sensor:
         self.rng = np.random.default_rng(1)
         self.asked: list[dict[str, Any]] = []
 
-    def seen(self, asked: dict[str, Any]) -> bytes:
+    def image_bytes(self, asked: dict[str, Any]) -> bytes:
         self.asked.append(asked)
         data = encoded(self.image(asked), asked["code"], asked["row_bytes"])
         if not asked["corrupt"]:
@@ -97,7 +97,7 @@ class SensorService(Sensor):
         class Handler(socketserver.StreamRequestHandler):
             def handle(self) -> None:
                 for line in self.rfile:
-                    data = service.seen(json.loads(line))
+                    data = service.image_bytes(json.loads(line))
                     self.wfile.write(b"%d\n" % len(data) + data)
 
         class Server(socketserver.ThreadingUnixStreamServer):

@@ -13,6 +13,7 @@ import select
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -49,6 +50,13 @@ ENDED = (
 KILLED = tuple((step, signal.SIGKILL) for step in (OPEN, SHOW, READ, Step("disk", "sync"), COMMIT))
 
 
+def until_it_is_ending(service: ServiceProcess) -> None:
+    """Wait until a service has noticed the signal that ends it."""
+    limit_s = time.monotonic() + STOP_LIMIT_S
+    while "is ending" not in httpx2.get(f"{service.url}/readyz").text:
+        assert time.monotonic() < limit_s, service.log.read_text()
+
+
 def settled(client: Client, scan: dict[str, Any]) -> str:
     """The state of a scan after the next start; an interrupted one says what to do."""
     record = ended(client, scan)
@@ -80,8 +88,9 @@ def test_an_end_at_any_step_loses_at_most_the_scan_of_that_step(
             follower = Follower(service, scan)
             service.process.send_signal(how)
             if how is not signal.SIGKILL:
-                while step is OPEN and "is ending" not in httpx2.get(f"{service.url}/readyz").text:
-                    pass  # Otherwise the driver may return before the signal arrives, and the scan begins.
+                if step is OPEN:
+                    # Otherwise the driver may return before the signal arrives, and the scan begins.
+                    until_it_is_ending(service)
                 desk.lift()
             assert service.gone() == (-how if how is signal.SIGKILL else 0)
         if how is signal.SIGKILL:

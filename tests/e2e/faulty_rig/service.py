@@ -1,6 +1,6 @@
 """The desk, where a test decides what the faulty rig meets, and the real service on such a rig.
 
-The desk lives in the process of the test, so that its records survive whatever becomes of the service.
+The desk lives in the process of the test, so that its records survive the service.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ PLUGGED_IN = {
 
 
 def looks_as_elsewhere(page: Page, name: str) -> None:
-    """`looks_as_kept` with one device, whatever is plugged in here, and without a path of this machine."""
+    """`looks_as_kept` with one device, not those of this machine, and without a path of it."""
 
     def without_path(route: Route) -> None:
         found = route.fetch()

@@ -103,8 +103,8 @@ def test_missing_board_and_unknown_verification_are_refused(health_client: TestC
     assert no_board.status_code == 422
     assert 'send "board"' in no_board.json()["detail"]
     assert health_client.get("/rig/health/history", params={"since": "2026-01-01T00:00:00"}).status_code == 422
-    nobody = health_client.get("/rig/verification/00000000-0000-0000-0000-000000000000")
-    assert nobody.status_code == 404
+    missing = health_client.get("/rig/verification/00000000-0000-0000-0000-000000000000")
+    assert missing.status_code == 404
 
 
 SESSION, SCAN = UUID(int=7), UUID(int=8)

@@ -1,4 +1,4 @@
-"""A pool: its members, its machines and its store; and bundles reconstructed by it, or here whatever becomes of it."""
+"""A pool: its members, its machines and its store; and bundles reconstructed by it, or here if the pool fails."""
 
 from __future__ import annotations
 
@@ -220,10 +220,10 @@ def test_members_of_one_pool_accept_one_another_and_no_others(tmp_path: Path) ->
         greet(context(theirs / "rig", "connection"), server)
     with pytest.raises(ssl.SSLError):
         greet(context(ours / "rig", "connection"), context(theirs / "rig", "listen"))
-    nobody = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    nobody.check_hostname, nobody.verify_mode = False, ssl.CERT_NONE
+    anonymous = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    anonymous.check_hostname, anonymous.verify_mode = False, ssl.CERT_NONE
     with pytest.raises(ssl.SSLError):
-        greet(nobody, server)
+        greet(anonymous, server)
     keys = [*ours.glob(f"*/{KEY}"), ours / AUTHORITY_KEY]
     assert len(keys) == 5
     assert {oct(path.stat().st_mode & 0o777) for path in keys} == {"0o600"}

@@ -323,7 +323,7 @@ def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Bo
     assert worst[-1] <= GOALS.sigma_px < worst[0]
 
 
-# ---- What a person is told after a pose: each bad one is refused or warned of, with its cause and the cure
+# ---- What a person reads after a pose: each bad one is refused or warned of, with its cause and the cure
 
 
 GOOD = held(CHESSBOARD, tilt=(-30.0, 10.0), middle_mm=(-60.0, -40.0, 570.0))
