@@ -73,6 +73,9 @@ def test_cut_frames_are_passed_over_and_counted() -> None:
         camera.arm(1, Trigger.FREE)
         light.show(WHITE)
         frames = [camera.read(time.monotonic_ns(), LONG_S) for _ in range(6)]
+        # Which frames are cut is chance, and on a busy machine the reader may begin after the first of them.
+        while frames[-1].dropped_count == 0 and len(frames) < 60:
+            frames.append(camera.read(time.monotonic_ns(), LONG_S))
         assert frames[-1].dropped_count > 0
         assert all(frame.image.mean() > 30 for frame in frames[2:])
 
