@@ -24,9 +24,12 @@ from slrig.model.patterns import (
     Pattern,
     PatternSequence,
     Primary,
+    SequenceName,
     White,
     coarse_bits,
+    divides_period,
     telling_bits,
+    telling_lines,
 )
 from slrig.model.region import Region
 from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, LightMap, Pinhole, Size, Solved
@@ -73,6 +76,7 @@ __all__ = [
     "Primary",
     "Refusal",
     "Region",
+    "SequenceName",
     "Shot",
     "Size",
     "Solved",
@@ -84,9 +88,11 @@ __all__ = [
     "White",
     "bracket_fault",
     "coarse_bits",
+    "divides_period",
     "exposure_groups",
     "share_across",
     "telling_bits",
+    "telling_lines",
     "told_depth",
     "triangulated_axis",
     "without_missing_bits",

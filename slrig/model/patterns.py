@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Literal
 
 import numpy as np
@@ -10,6 +12,17 @@ import numpy as np
 from slrig.errors import PatternError
 from slrig.model.arrays import Pixels
 from slrig.model.rig import Axis, Size
+
+FEWEST_STEPS = 3
+"""Of a line's shifts within a period: two leave its direction open."""
+
+
+class SequenceName(StrEnum):
+    """Pattern sequences by what they are for; `slrig.patterns.sequence.SEQUENCES` has what they play."""
+
+    FAST = "fast"
+    STANDARD = "standard"
+    ROBUST = "robust"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +71,20 @@ class Gray:
                 f"of {self.bits}, cell {self.cell_px} px, offset {self.offset_px} px"
             )
 
+    @property
+    def inverse(self) -> Gray:
+        """The bit that is lit where this one is dark."""
+        return replace(self, inverted=not self.inverted)
+
+
+def divides_period(lines: Sequence[LineShift]) -> bool:
+    """Whether the shifts of lines divide their period evenly, into three or more. lines : by shift."""
+    count = len(lines)
+    if count < FEWEST_STEPS or lines[0].period_px % count:
+        return False
+    step_px = lines[0].period_px // count
+    return all(line.shift == k * step_px and line.period_px == lines[0].period_px for k, line in enumerate(lines))
+
 
 def coarse_bits(bits: int) -> int:
     """How many bits of a code, the first of them, are coarse: few pixels lie at their edges, and the rest tell noise.
@@ -95,6 +122,28 @@ class LineShift:
     def centre_px(self) -> float:
         """Position of the first line's centre: shift + (width - 1)/2."""
         return self.shift + (self.line_width_px - 1) / 2
+
+    @property
+    def lights_half(self) -> bool:
+        """Whether its lines are half as wide as their period."""
+        return 2 * self.line_width_px == self.period_px
+
+    @property
+    def inverse(self) -> LineShift | None:
+        """The lines that are lit where these are dark; None unless they are half as wide as their period."""
+        return replace(self, shift=(self.shift + self.line_width_px) % self.period_px) if self.lights_half else None
+
+
+def telling_lines(lines: Sequence[LineShift]) -> tuple[tuple[LineShift, LineShift], ...]:
+    """Two pairs of lines and their inverses, about a quarter of a period apart, that tell what a camera makes of light:
+    where the one pair has its edges, the other has none. None where there are no such pairs.
+
+    lines : of one axis, period and width.
+    """
+    shown = set(lines)
+    pairs = [(line, line.inverse) for line in sorted(lines, key=lambda each: each.shift)[: len(lines) // 2]]
+    told = [(line, inverse) for line, inverse in pairs if inverse in shown and inverse is not None]
+    return (told[0], told[len(told) // 2]) if len(told) > 1 else ()
 
 
 Pattern = White | Black | Primary | Gray | LineShift

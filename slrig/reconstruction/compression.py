@@ -95,10 +95,14 @@ def loss_variance(frames: AxisFrames, noise: NoiseModel, code: CodeMap, images: 
 
 
 def frames_loss(frames: AxisFrames, lit: NDArray[np.bool_], images: Images | None = None) -> FloatArray:
-    """`compression_loss` of these images, of one camera and axis; by default of its code. lit : (H, W) bool."""
-    telling = telling_bits(len(frames.bits))
-    direct = [frames.bits[bit] for bit in telling]
-    told_by = direct + ([] if frames.inverses is None else [frames.inverses[bit] for bit in telling])
+    """`compression_loss` of these images, of one camera and axis; by default of those that tell what the camera makes
+    of light. lit : (H, W) bool.
+    """
+    telling, lines = telling_bits(len(frames.bits)), frames.telling_lines
+    direct = [frames.bits[bit] for bit in telling] if lines is None else lines[0]
+    told_by = direct + (lines[1] if lines is not None else [])
+    if frames.inverses is not None:
+        told_by += [frames.inverses[bit] for bit in telling]
     return compression_loss(direct if images is None else images, told_by, lit, frames.full_scale)
 
 

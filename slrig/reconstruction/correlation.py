@@ -52,15 +52,18 @@ class PixelSum(NamedTuple):
 def phase_sum(frames: AxisFrames, lit: NDArray[np.bool_]) -> PixelSum:
     """As the fit to the phase of line frames sums pixels. lit : (H, W) bool.
 
-    How close lines lie is told by a fine bit of the code, which changes its sign every so many projector pixels. The
-    finest may not resolve.
+    How close lines lie is told by lines and their inverse, or by a fine bit of the code, which change their sign every
+    so many projector pixels. The finest bit may not resolve.
     """
+    lines, period_px = frames.telling_lines, frames.line_patterns[0].period_px
     index = max(len(frames.bits) - 2, 0)
-    changes_px = (2 << (len(frames.bits) - 1 - index)) * frames.gray.cell_px
+    changes_px = (2 << (len(frames.bits) - 1 - index)) * frames.gray.cell_px if lines is None else period_px // 2
     every = max(1, lit.size // _MOST_COUNTED)
 
     def above(first: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         rows = slice(first, None if first else -1, every)
+        if lines is not None:
+            return lines[0][0][rows] > lines[1][0][rows], lit[rows]
         if frames.inverses is not None:
             against = frames.inverses[index][rows]
         else:
@@ -69,7 +72,7 @@ def phase_sum(frames: AxisFrames, lit: NDArray[np.bool_]) -> PixelSum:
 
     def cycles_per_px(here: NDArray[np.bool_], there: NDArray[np.bool_], both: NDArray[np.bool_]) -> float:
         changes = int(np.count_nonzero((here != there) & both)) / max(int(np.count_nonzero(both)), 1)
-        return changes * changes_px / frames.line_patterns[0].period_px
+        return changes * changes_px / period_px
 
     (here, known), (below, known_below) = above(0), above(1)
     across = cycles_per_px(here[:, 1:], here[:, :-1], known[:, 1:] & known[:, :-1])
@@ -87,19 +90,41 @@ def edge_sum(scale_px: float) -> PixelSum:
 def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_], summed: PixelSum) -> float:
     """Variance of sums of pixels, over what it would be by `noise` if it were independent; 1 where it is not more.
 
-    where : (H, W) bool, pixels to look at. Only the coarser half of the bits counts, as for `noise.estimate_noise`, and
-    that away from their edges. Bits without inverses tell nothing, and few windows no more than that.
+    where : (H, W) bool, pixels to look at. Of bits and their inverses only the coarser half counts, as for
+    `noise.estimate_noise`, and that away from their edges. Of single bits two that light the same window tell, or lines
+    of half their period, whichever tell less, as there. Otherwise, and of few windows, nothing is told.
     """
-    if frames.inverses is None or len(frames.bits) < _FEWEST_BITS:
-        return 1.0
-    count = coarse_bits(len(frames.bits))
-    bits, inverses = frames.bits[:count], frames.inverses[:count]
+    count, lines = coarse_bits(len(frames.bits)), frames.telling_lines
     corner = _windows(where, len(summed.weights))
-    if len(corner[0]) < _LEAST_WINDOWS:
+    if len(corner[0]) < _LEAST_WINDOWS or len(frames.bits) < _FEWEST_BITS:
         return 1.0
-    direct, inverse = _seen_in(bits, corner, summed), _seen_in(inverses, corner, summed)
-    contrast = _seen_in([frames.contrast], corner, summed)
-    clear = np.abs(direct - inverse) > _CLEAR_SHARE * contrast
+    if frames.inverses is not None:
+        direct = _seen_in(frames.bits[:count], corner, summed)
+        inverse = _seen_in(frames.inverses[:count], corner, summed)
+        contrast = _seen_in([frames.contrast], corner, summed)
+        clear = np.abs(direct - inverse) > _CLEAR_SHARE * contrast
+        ratio = _ratio_of_pairs(frames, noise, corner, summed, direct, inverse, clear, edges=False)
+    elif frames.lines_halve:
+        ratio = _ratio_of_bits(frames, noise, corner, summed, count)
+        if lines is None:
+            ratio = min(ratio, _ratio_of_lines(frames, noise, corner, summed))
+        else:
+            direct, inverse = (_seen_in(images, corner, summed) for images in lines)
+            clear = np.minimum(direct, inverse) > 0
+            ratio = min(ratio, _ratio_of_pairs(frames, noise, corner, summed, direct, inverse, clear, edges=True))
+    else:
+        return 1.0
+    return ratio if ratio >= _LEAST_RATIO else 1.0
+
+
+def _ratio_of_pairs(
+    frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum,
+    direct: NDArray[np.float32], inverse: NDArray[np.float32], clear: NDArray[np.bool_], *, edges: bool,
+) -> float:  # fmt: skip
+    """The ratio by windows of images and their inverses, (images, windows, k²) each, where they are clear; 1 of few.
+
+    edges : there are edges within the windows, at which an image differs from its inverse by more than noise.
+    """
     # Where the dark one of both is cut off at zero, pixels and sums lose alike.
     clear &= np.maximum(direct, inverse) < frames.clipped_at
     kept = clear.all(axis=(0, 2))
@@ -107,9 +132,39 @@ def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_]
         return 1.0
     ends = _seen_in([noise.variance(frames.white) + noise.variance(frames.black)], corner, summed)[0, kept]
     direct, inverse = direct[:, kept], inverse[:, kept]
-    swings = _ratio(np.abs(direct - inverse), ends, summed)
-    ratio = swings if summed.of_swings else max(swings, _ratio(direct + inverse, ends, summed))
-    return ratio if ratio >= _LEAST_RATIO else 1.0
+    swings = 1.0 if edges else _ratio(np.abs(direct - inverse), ends, summed)
+    return swings if summed.of_swings else max(swings, _ratio(direct + inverse, ends, summed))
+
+
+def _ratio_of_lines(
+    frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum
+) -> float:
+    """The ratio by lines that light half of their period: they add up to white and black."""
+    lines = _seen_in(frames.lines, corner, summed)
+    white, black = (_seen_in([each], corner, summed)[0] for each in (frames.white, frames.black))
+    kept = ((lines.max(axis=0) < frames.clipped_at) & (lines.min(axis=0) > 0) & (white < frames.clipped_at)).all(axis=1)
+    if np.count_nonzero(kept) < _LEAST_WINDOWS:
+        return 1.0
+    count = np.float32(len(lines))
+    steady = np.stack([2 * lines[:, kept].sum(axis=0) / count, (white + black)[kept]])
+    variance = noise.variance(frames.white) + noise.variance(frames.black)
+    return _ratio(steady, _seen_in([variance], corner, summed)[0, kept] * (1 / count + 1 / 2), summed)
+
+
+def _ratio_of_bits(
+    frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum,
+    count: int,
+) -> float:  # fmt: skip
+    """The ratio by the windows that two coarse bits light wholly."""
+    bits = _seen_in(frames.bits[:count], corner, summed)
+    white, black = (_seen_in([each], corner, summed)[0] for each in (frames.white, frames.black))
+    lit = ((2 * bits - white - black > _CLEAR_SHARE * (white - black)) & (bits < frames.clipped_at)).all(axis=2)
+    two = np.count_nonzero(lit, axis=0) > 1
+    if np.count_nonzero(two) < _LEAST_WINDOWS:
+        return 1.0
+    ends = np.argmax(lit, axis=0), len(lit) - 1 - np.argmax(lit[::-1], axis=0)
+    steady = np.stack([bits[at[two], np.flatnonzero(two)] for at in ends])
+    return _ratio(steady, _seen_in([noise.variance(frames.white)], corner, summed)[0, two], summed)
 
 
 def _ratio(steady: NDArray[np.float32], variance: NDArray[np.float32], summed: PixelSum) -> float:

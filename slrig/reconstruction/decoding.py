@@ -105,10 +105,14 @@ def _decode_rows(
 ) -> None:  # fmt: skip
     """Fill in the code of some rows."""
     paired = frames.inverses is not None
-    against = rows_of(frames.inverses) if frames.inverses is not None else ((frames.white + frames.black) / 2)[None]
+    against = rows_of(frames.inverses) if frames.inverses is not None else frames.middle[None]
     spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))
     # Against the middle of white and black a bit swings half as far as against its inverse.
-    margin = np.maximum(limits.bit_sigma * spread, limits.bit_fraction * frames.contrast) * (1.0 if paired else 0.5)
+    swing = 1.0 if paired else 0.5
+    margin = np.maximum(limits.bit_sigma * swing * spread, limits.bit_fraction * swing * frames.contrast)
+    if not paired and frames.lines_halve:
+        alone = np.sqrt(noise.variance(frames.white) + noise.variance(against[0]) / np.float32(len(frames.lines)))
+        margin = np.maximum(limits.bit_sigma * alone, limits.bit_fraction * swing * frames.contrast)
     _decode_kernel(
         0, len(unread), rows_of(frames.bits), against, paired, frames.white, lit_pixels(frames, noise, limits), unread,
         margin.astype(np.float32), np.float32(frames.clipped_at), words, cell_count, limits.widest_interval, *code,

@@ -27,8 +27,10 @@ from slrig.model import (
     Pattern,
     Shot,
     White,
+    divides_period,
     exposure_groups,
     telling_bits,
+    telling_lines,
 )
 
 Image = NDArray[np.float32]
@@ -37,6 +39,8 @@ Images = Sequence[NDArray[Any]] | NDArray[np.float32]
 
 NEARLY_FULL = 0.97
 """Of full scale: from here on sensors bend."""
+
+_NEAR_MIDDLE = 0.3  # of the contrast
 
 _BAND_BYTES = 2**22
 """Of what is made of images at a time: it stays in a core's cache."""
@@ -102,6 +106,36 @@ class AxisFrames:
         return self.full_scale * self.exposure_ratio
 
     @property
+    def telling_lines(self) -> tuple[list[NDArray[Any]], list[NDArray[Any]]] | None:
+        """Of single bits, two line images and their inverses, which tell what the camera makes of light; None where
+        there are none.
+        """
+        pairs = () if self.inverses is not None else telling_lines(self.line_patterns)
+        direct, inverted = ([self.lines[self.line_patterns.index(pair[i])] for pair in pairs] for i in (0, 1))
+        return (direct, inverted) if pairs else None
+
+    @property
+    def lines_halve(self) -> bool:
+        """Whether the lines' mean is the middle of white and black: see `halving`."""
+        return len(self.lines) > 0 and halving(self.line_patterns)
+
+    @property
+    def middle(self) -> Image:
+        """(H, W) float32: what single bits are held against: the middle of white and black, or near it the mean of
+        lines that light half of their period: a projector's white may be dimmer than its other patterns.
+        """
+        middle = np.asarray(self.white + self.black, dtype=np.float32) / np.float32(2)
+        if not self.lines_halve:
+            return middle
+        average = np.zeros(middle.shape, dtype=np.float32)
+        for line in self.lines:
+            average += line
+        average /= len(self.lines)
+        near = np.abs(average - middle) < _NEAR_MIDDLE * self.contrast
+        average[~near] = middle[~near]
+        return average
+
+    @property
     def contrast(self) -> Image:
         """(H, W) float32: white minus black, the light that the projector adds."""
         return self.white - self.black
@@ -136,6 +170,33 @@ class AxisPatterns:
     def paired(self) -> bool:
         """Whether every bit comes with its inverse."""
         return len(self.direct) == len(self.inverted) == self.gray.bits
+
+    @property
+    def showing_noise(self) -> frozenset[Pattern]:
+        """The patterns that tell the camera's noise and response: with inverses and ends `telling_bits`; without
+        inverses `telling_lines`, or else lines of half their period and some bits; otherwise all of the code.
+        """
+        if len(self.ends) == 2:
+            told = telling_lines(self.lines)
+            bits = [replace(self.gray, bit=bit) for bit in telling_bits(self.gray.bits)]
+            if self.paired:
+                return frozenset((*self.ends, *bits, *(replace(bit, inverted=True) for bit in bits)))
+            if self.halving and not self.inverted:
+                lines = [line for pair in told for line in pair] or self.lines
+                return frozenset((*self.ends, *bits, *lines))
+        return frozenset(each for each in self.needed if not isinstance(each, LineShift))
+
+    @property
+    def showing_code(self) -> frozenset[Pattern]:
+        """The patterns that the code is read from."""
+        if self.halving and not self.paired:
+            return self.needed
+        return frozenset(each for each in self.needed if not isinstance(each, LineShift))
+
+    @property
+    def halving(self) -> bool:
+        """Whether lines light half of their period, and all of them together every place alike."""
+        return halving(self.lines)
 
     @property
     def needed(self) -> frozenset[Pattern]:
@@ -188,6 +249,13 @@ def axis_patterns(shown: Collection[Pattern], camera: str, axis: Axis) -> AxisPa
         message = f"camera '{camera}' has line-shift frames of two periods or widths on the {axis.value} axis; keep one"
         raise PatternError(message)
     return AxisPatterns(Gray(axis, 0, first.bits, first.cell_px, first.offset_px), direct, inverted, lines, ends)
+
+
+def halving(lines: Sequence[LineShift], /) -> bool:
+    """Whether lines light half of their period, and their shifts divide it evenly: their mean is then the middle of
+    white and black. lines : of one axis, period and width, by shift.
+    """
+    return divides_period(lines) and lines[0].lights_half
 
 
 def telling(shown: Sequence[Pattern], exposures_s: Sequence[float | None]) -> list[bool]:
@@ -303,22 +371,13 @@ class FrameStacks:
 
     @property
     def noise_shown(self) -> bool:
-        """Whether all is in that tells the camera's noise and response: white, black and `telling_bits`, if all bits
-        come with their inverses; otherwise all of the code.
-        """
-        patterns = self.patterns
-        if not patterns.paired or len(patterns.ends) < 2:
-            return self.coded
-        bits = telling_bits(patterns.gray.bits)
-        return all(
-            isinstance(pattern, LineShift) or (isinstance(pattern, Gray) and pattern.bit not in bits)
-            for pattern in self._missing
-        )
+        """Whether all is in that tells the camera's noise and response."""
+        return self._missing.isdisjoint(self.patterns.showing_noise)
 
     @property
     def coded(self) -> bool:
-        """Whether all that decoding needs is in: everything but line frames."""
-        return all(isinstance(pattern, LineShift) for pattern in self._missing)
+        """Whether all is in that the code is read from."""
+        return self._missing.isdisjoint(self.patterns.showing_code)
 
     def frames(self) -> AxisFrames:
         """The frames, once `noise_shown`; those that are not in are black until they are."""

@@ -28,6 +28,10 @@ _DARK_SHARE = 0.25
 _BINS = 24
 _LEAST_PER_BIN = 50
 _BOX = np.ones((3, 3), dtype=np.uint8)
+_FEWEST_BITS = 3
+_LEAST_LIT = 0.02  # of full scale, white over black
+_CLEAR_SWING = 0.75  # of white less black, from the middle: what is less lies at an edge of the code
+_MEDIAN_SQUARE = 0.4549  # the median of a squared normal, of its variance
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +62,10 @@ class NoiseModel:
         read, shot = np.float32(self.read_variance) * self.read_share, np.float32(self.slope) * self.shot_share
         return np.asarray(read + shot * np.maximum(image, 0), dtype=np.float32)
 
+    def at(self, level: float) -> float:
+        """The variance of a sample of this level of a frame as the camera gives it."""
+        return self.read_variance + self.slope * max(level, 0.0)
+
     def rows(self, rows: slice) -> NoiseModel:
         """The noise of some rows."""
         return replace(self, read_share=at_rows(self.read_share, rows), shot_share=at_rows(self.shot_share, rows))
@@ -77,9 +85,13 @@ def estimate_noise(frames: AxisFrames) -> NoiseModel:
     A bit and its inverse add up to white plus black whatever the code and the lens, so the scatter of that sum over the
     bits is noise alone: variance = 2 · read + slope · (white + black). A projector that spreads its signal before its
     gamma (a scaler, a cable) breaks the sum at code edges, so only the coarser half of the bits counts, which has few.
+    Of single bits, two coarse ones that light a pixel differ by noise, and two that do not; and by the light that walls
+    of a hollow send to one another. That adds up in lines of half their period and their inverses, or in all such
+    lines, which a scaler breaks: the lesser of both is noise.
+
     Where the sums have one level only, as on an even wall, or none that is dark, the black frame's scatter between
-    neighbouring pixels (Immerkær 1996, DOI 10.1006/cviu.1996.0060) tells the noise of the dark. Without inverses that
-    scatter of white and black stands alone.
+    neighbouring pixels (Immerkær 1996, DOI 10.1006/cviu.1996.0060) tells the noise of the dark. Without any of these
+    frames that scatter of white and black stands alone.
     """
     return fitted_noise([noise_samples(frames)])
 
@@ -97,10 +109,17 @@ def noise_samples(
 
     where : (H, W) bool, the pixels to take them from; all if it is None.
     """
-    if frames.inverses is None or len(frames.bits) < 3:
+    coarse, lines = coarse_bits(len(frames.bits)), frames.telling_lines
+    if frames.inverses is not None and len(frames.bits) >= _FEWEST_BITS:
+        level, variance = _scatter_of_sums(frames.bits[:coarse], frames.inverses[:coarse], frames.clipped_at, where)
+    elif frames.lines_halve and len(frames.bits) >= _FEWEST_BITS:
+        level, variance = _scatter_of_bits(frames, coarse, where)
+        by_lines = _scatter_of_lines(frames, where) if lines is None else _scatter_of_pairs(frames, lines, where)
+        bright = float(np.median(frames.white))
+        if _fitted(*by_lines).at(bright) < _fitted(level, variance).at(bright):
+            level, variance = by_lines
+    else:
         return _scatter_between_neighbours(frames, where, frames.white, frames.black)
-    coarse = coarse_bits(len(frames.bits))
-    level, variance = _scatter_of_sums(frames.bits[:coarse], frames.inverses[:coarse], frames.clipped_at, where)
     if len(level) and not _tells_slope(level, variance):
         dark, dark_variance = _scatter_between_neighbours(frames, where, frames.black)
         level, variance = np.concatenate([level, dark]), np.concatenate([variance, dark_variance])
@@ -130,6 +149,76 @@ def _scatter_of_sums(
     return sums.mean(axis=0)[unclipped] / 2, (variance[unclipped] / 2).astype(np.float32)
 
 
+def _scatter_of_lines(
+    frames: AxisFrames, where: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Levels and variances of single samples: lines that light half of their period add up to white and black, half as
+    often as there are lines.
+    """
+    step = math.ceil(math.sqrt(frames.white.size / _MOST_SAMPLES))
+    lines, ends = sampled(frames.lines, step, step), (frames.white + frames.black)[::step, ::step]
+    half = len(lines) / 2
+    usable = (lines.max(axis=0) < frames.clipped_at) & (lines.min(axis=0) > 0)
+    usable &= (frames.white[::step, ::step] < frames.clipped_at) & (frames.black[::step, ::step] > 0)
+    if where is not None:
+        usable &= where[::step, ::step]
+    difference = (lines.sum(axis=0) - np.float32(half) * ends)[usable]
+    return ends[usable] / 2, _variances(difference, 2 * half + 2 * half**2 / frames.ends_repeats)
+
+
+def _scatter_of_pairs(
+    frames: AxisFrames, lines: tuple[Images, Images], where: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Levels and variances of single samples: two lines and their inverses have the same sums. Of the pixels that are
+    lit, the half that lies farthest from edges counts.
+    """
+    step = math.ceil(math.sqrt(frames.white.size / _MOST_SAMPLES))
+    direct, inverse = (sampled(images, step, step) for images in lines)
+    contrast = frames.contrast[::step, ::step]
+    usable = (np.maximum(direct, inverse).max(axis=0) < frames.clipped_at) & (
+        np.minimum(direct, inverse).min(axis=0) > 0
+    )
+    clear = np.abs(direct - inverse).min(axis=0) / np.maximum(contrast, 1)
+    lit = contrast > _LEAST_LIT * frames.clipped_at
+    usable &= ~lit | (clear >= (np.median(clear[lit]) if lit.any() else 0.0))
+    if where is not None:
+        usable &= where[::step, ::step]
+    first, second = (direct + inverse)[:, usable]
+    # White and black tell the level: whether the mean of whole numbers is whole goes by whether they differ by an even
+    # number.
+    level = (frames.white + frames.black)[::step, ::step][usable] / 2
+    return level, _variances(first - second, 4)
+
+
+def _scatter_of_bits(
+    frames: AxisFrames, coarse: int, where: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Levels and variances of single samples: of coarse bits, two that light a pixel, and two that do not."""
+    step = math.ceil(math.sqrt(frames.white.size / _MOST_SAMPLES))
+    bits = sampled(frames.bits[:coarse], step, step)
+    white, black = (each[::step, ::step] for each in (frames.white, frames.black))
+    swing = (2 * bits - white - black) / np.maximum(white - black, 1)
+    usable = (bits.max(axis=0) < frames.clipped_at) & (bits.min(axis=0) > 0)
+    if where is not None:
+        usable &= where[::step, ::step]
+    levels, variances = [], []
+    for state, level in ((swing > _CLEAR_SWING, white), (swing < -_CLEAR_SWING, black)):
+        first = np.argmax(state, axis=0)
+        last = coarse - 1 - np.argmax(state[::-1], axis=0)
+        two = usable & (np.count_nonzero(state, axis=0) > 1)
+        one, other = (np.take_along_axis(bits, at[None], axis=0)[0][two] for at in (first, last))
+        levels.append(level[two])
+        variances.append(_variances(one - other, 2))
+    return np.concatenate(levels), np.concatenate(variances)
+
+
+def _variances(difference: NDArray[np.float32], samples: float) -> NDArray[np.float32]:
+    """(n,) float32: variances of single samples, whose median is to be taken, by what so many of them differ."""
+    # Whole numbers have a coarse median; spread over the interval that each stands for, they have a fine one.
+    spread = difference + np.random.default_rng(0).uniform(-0.5, 0.5, len(difference)).astype(np.float32)
+    return np.asarray((spread**2 / _MEDIAN_SQUARE - 1 / 12) / samples, dtype=np.float32)
+
+
 def _scatter_between_neighbours(
     frames: AxisFrames, where: NDArray[np.bool_] | None, *images: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -144,8 +233,8 @@ def _scatter_between_neighbours(
         if where is not None:
             unclipped &= where[1:-1, 1:-1]
         levels.append(mean[unclipped])
-        # median of a squared normal = 0.4549 of its variance; the mask has norm² 36
-        variances.append(both[unclipped] ** 2 * (frames.ends_repeats / 36 / 0.4549))
+        # The mask has norm² 36.
+        variances.append(both[unclipped] ** 2 * (frames.ends_repeats / 36 / _MEDIAN_SQUARE))
     return np.concatenate(levels), np.concatenate(variances)
 
 

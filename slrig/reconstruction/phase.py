@@ -7,6 +7,7 @@ Only the first harmonic of the light is used: neither the stripe's shape nor the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.model import FloatArray, LineShift
+from slrig.model import FloatArray, LineShift, divides_period
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames, band_rows, rows_of
 from slrig.reconstruction.noise import NoiseModel
@@ -32,10 +33,16 @@ class PositionMap(NamedTuple):
     sigma: NDArray[np.float32]
 
 
+def line_step_px(patterns: Sequence[LineShift], /) -> int | None:
+    """The step of shifts that divide their period evenly into three or more, px, so that their light tells the phase at
+    each pixel; None for others. patterns : of one period and width, by shift.
+    """
+    return patterns[0].period_px // len(patterns) if divides_period(patterns) else None
+
+
 def has_phase(frames: AxisFrames, /) -> bool:
-    """Whether every shift of the line pattern was shown, so that its light tells the phase at each pixel."""
-    patterns = frames.line_patterns
-    return len(patterns) > 0 and len(patterns) == patterns[0].period_px
+    """Whether the lines' light tells the phase at each pixel."""
+    return line_step_px(frames.line_patterns) is not None
 
 
 def position_map(

@@ -17,7 +17,7 @@ from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.edges import beside_steps_px, near_edges, near_shadows_of, near_steps
 from slrig.reconstruction.identification import with_refused_points
 from slrig.reconstruction.limits import CodeTables, Limits
-from slrig.reconstruction.phase import has_phase, position_map
+from slrig.reconstruction.phase import line_step_px, position_map
 from slrig.reconstruction.refinement import refined
 from slrig.reconstruction.stripes import LinePoints
 
@@ -49,7 +49,8 @@ def placed(
     frames, code, disagreement_px, points = coded.frames, coded.code, np.zeros(0), found
     seen = position_map(frames, coded.position_noise, code, tables.cell_position)
     resolution_px = cell_width_px(coded)
-    if has_phase(frames):
+    step_px = line_step_px(frames.line_patterns)
+    if step_px is not None:
         resolution_px = 0.0
         period_px = frames.line_patterns[0].period_px
         blur_px, by_lines = told_blur(frames, seen, ~coded.near_shadow, limits.camera_blur_px)
@@ -65,7 +66,7 @@ def placed(
         known = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
         lines_used()
         refinement = refined(
-            found, seen, usable, code, tables.position_of, displaced_px=displaced_px,
+            found, seen, usable, code, tables.position_of, step_px, displaced_px=displaced_px,
             largest_disagreement_px=limits.largest_disagreement_px,
         )  # fmt: skip
         points, disagreement_px = refinement.points, refinement.disagreement_px

@@ -45,7 +45,7 @@ def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np
     """
     lit = lit & (frames.white < frames.clipped_at)
     bits = len(frames.bits)
-    against = frames.inverses if frames.inverses is not None else [(frames.white + frames.black) / 2] * bits
+    against = frames.inverses if frames.inverses is not None else [frames.middle] * bits
     word = np.zeros(lit.shape, dtype=np.int32)
     for shown, other in zip(frames.bits, against, strict=True):
         word <<= 1

@@ -6,9 +6,11 @@ values a stripe's first harmonic is mixed with its others, which makes waves of 
 over its edges than a blur can.
 
 The code tells γ: where a bit and its inverse are alike, at the middle of an edge, each has half of the projector's
-light, 2 m^γ = white^γ + black^γ. A lens and a projector that is out of focus blur light, and keep that; sharpening is
-the same on both sides of an edge. A projector or cable that blurs the signal, before the projector's own gamma, loses
-light at edges, which looks like γ < 1, and nothing is made straight then.
+light, 2 m^γ = white^γ + black^γ. So do lines of half their period and their inverses (`AxisFrames.telling_lines`); and
+where there are none of these, lines whose light adds up to the middle of white and black. A lens and a projector that
+is out of focus blur light, and keep that; sharpening is the same on both sides of an edge. A projector or cable that
+blurs the signal, before the projector's own gamma, loses light at edges, which looks like γ < 1, and nothing is made
+straight then.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from slrig.reconstruction.noise import NoiseModel, estimate_noise
 
 _LEAST = 1.2  # chosen: cameras bend by 1.8 and more if at all, and edges of eight scenes by straight ones told 1.00
 _MOST = 4.0
+_AT_EDGE = 0.5  # of the contrast, from its middle
 _ALIKE = 0.15  # of the contrast, between a bit and its inverse: their mean is then the middle to 2 %
 _CLEAR_LEVELS = 20.0  # of 255: of white over black, so that rounding tells nothing of the middle
 _LEAST_EDGES = 500
@@ -39,21 +42,31 @@ _TURNS = 20  # each halves what γ may be
 
 def found_gamma(frames: AxisFrames) -> float:
     """How a camera bends light into values, by the edges of the code; 1 where that is not told, or next to nothing."""
-    if frames.inverses is None or frames.exposure_ratio != 1.0:
+    if frames.exposure_ratio != 1.0:
         return 1.0
-    full = frames.full_scale
+    full, telling, lines = frames.full_scale, telling_bits(len(frames.bits)), frames.telling_lines
     # Rows enough: an edge of the code crosses most of them.
     step = max(1, frames.white.size // _MOST_PIXELS)
-    telling = telling_bits(len(frames.bits))
-    bits, inverses = ([images[bit][::step] for bit in telling] for images in (frames.bits, frames.inverses))
-    found = in_bands(partial(_edges, bits, inverses, full, frames.clipped_at), len(bits[0]))
-    middle, bright, dark = np.maximum(np.concatenate(found, axis=1), 0).astype(np.float64) / full
-    if len(middle) < _LEAST_EDGES:
+    if frames.inverses is not None:
+        pairs = [frames.bits[bit] for bit in telling], [frames.inverses[bit] for bit in telling]
+    elif lines is not None:
+        pairs = lines
+    elif frames.lines_halve:
+        found = _sums(frames, step)
+    else:
+        return 1.0
+    if frames.inverses is not None or lines is not None:
+        bits, inverses = ([image[::step] for image in images] for images in pairs)
+        edges = partial(_edges, bits, inverses, full, frames.clipped_at, lines is not None)
+        found = np.concatenate(in_bands(edges, len(bits[0])), axis=1)
+    *halves, bright, dark = np.maximum(found, 0).astype(np.float64) / full
+    if len(bright) < _LEAST_EDGES:
         return 1.0
 
     def bends_more(gamma: float) -> bool:
         # Bent values have the middle too high, and the more so the less is made of γ.
-        return bool(np.median((2 * middle**gamma - bright**gamma - dark**gamma) / bright**gamma) > 0)
+        middle = 2 * np.mean([half**gamma for half in halves], axis=0)
+        return bool(np.median((middle - bright**gamma - dark**gamma) / bright**gamma) > 0)
 
     low, high = _LEAST, _MOST
     if not bends_more(low):
@@ -67,13 +80,30 @@ def found_gamma(frames: AxisFrames) -> float:
     return low
 
 
+def _sums(frames: AxisFrames, step: int) -> NDArray[np.float32]:
+    """(lines + 2, n): where one of the lines that light half of their period has an edge, in every so many rows, all of
+    them, and white and black as single bits show them.
+    """
+    lines, bits = ([image[::step] for image in images] for images in (frames.lines, frames.bits))
+    told = [bits[bit] for bit in telling_bits(len(bits))]
+    shown, seen = rows_of(lines), rows_of(told)
+    white, black = seen.max(axis=0), seen.min(axis=0)
+    clear = (white - black > _CLEAR_LEVELS / 255 * frames.full_scale) & (white < frames.clipped_at)
+    clear &= (np.abs(2 * shown - white - black) < _AT_EDGE * (white - black)).any(axis=0)
+    return np.concatenate([shown[:, clear], [white[clear], black[clear]]])
+
+
 def _edges(
-    bits: Images, inverses: Images, full: float, clipped_at: float, first: int, last: int
+    bits: Images, inverses: Images, full: float, clipped_at: float, apart: bool, first: int, last: int
 ) -> NDArray[np.float32]:
-    """(3, n): at edges of the code in some rows, the mean of a bit and its inverse, white and black."""
+    """(3, n): at edges of the code in some rows, the mean of a bit and its inverse, white and black.
+
+    apart : where one pair has its edges, another has none.
+    """
     direct, inverted = rows_of(bits, slice(first, last)), rows_of(inverses, slice(first, last))
     # At most bits a pixel is clear of edges. White does not tell: projectors may dim a picture that is all white.
-    white, black = (_middle(each(direct, inverted)) for each in (np.maximum, np.minimum))
+    bright, dark = np.maximum(direct, inverted), np.minimum(direct, inverted)
+    white, black = (bright.max(axis=0), dark.min(axis=0)) if apart else (_middle(bright), _middle(dark))
     clear = (white - black > _CLEAR_LEVELS / 255 * full) & (white < clipped_at)
     found = []
     for bit, inverse in zip(direct, inverted, strict=True):

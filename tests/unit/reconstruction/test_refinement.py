@@ -53,7 +53,7 @@ def line_crossings(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Where lines cross pixels, by the position map alone: frame (n,) int32, starts_px (n, 2) and targets_px (n,)."""
     begun = _nothing_taken(len(position_of), usable.shape)
-    return _crossings(seen, usable, code, position_of, *begun, no_points(0), np.zeros(0))
+    return _crossings(seen, usable, code, position_of, 1, *begun, no_points(0), np.zeros(0))
 
 
 NONE = points_at(np.zeros((0, 2)))
@@ -139,7 +139,7 @@ def test_points_of_the_filter_move_onto_their_lines_and_say_how_far(slope: float
         mine = exact[(frame == k) & inside]
         found.append(points_at(mine + (shift + rng.normal(0, 0.02, len(mine)))[:, None] * across))
     found[5] = NONE
-    refinement = refined([*found], here, EVERYWHERE, code, POSITION_OF)
+    refinement = refined([*found], here, EVERYWHERE, code, POSITION_OF, 1)
     for k, misses in enumerate(on_lines(refinement, surface, slope)):
         assert len(misses) >= len(found[k].points_px)
         # Lines of other pixels that the code calls by the same cell are refused before; the rest is on its line.
@@ -166,7 +166,7 @@ def test_no_pixel_holds_two_points_of_one_line(slope: float, angle_rad: float, s
     _, first = np.unique(pixels, return_index=True)
     first = first[rng.random(len(first)) < share]
     found = [points_at(starts[first][frame[first] == k]) for k in range(8)]
-    stripes = chained(refined([*found], here, EVERYWHERE, code, POSITION_OF).points, SHAPE)
+    stripes = chained(refined([*found], here, EVERYWHERE, code, POSITION_OF, 1).points, SHAPE)
     frame = np.repeat(stripes.frame, np.diff(stripes.offsets))
     at = np.column_stack([np.rint(stripes.points_px).astype(int), frame])
     assert len(at) > 1400
@@ -182,7 +182,7 @@ def test_squeezed_stripes_that_no_filter_tells_apart_are_added(slope: float, ang
     surface = tilted(slope, angle_rad)
     here, code = mapped(surface, noise=0.02)
     x, y = grid(SHAPE)
-    refinement = refined([NONE] * 8, here, EVERYWHERE, code, POSITION_OF)
+    refinement = refined([NONE] * 8, here, EVERYWHERE, code, POSITION_OF, 1)
     truth = surface(x, y)
     inner = np.zeros(SHAPE, dtype=np.bool_)
     inner[4:-4, 4:-4] = True
@@ -205,7 +205,7 @@ def test_points_are_held_once(*, moved: bool) -> None:
     given = [points_at(starts[frame == k]) for k in range(8)]
     found = given.copy()
     limit_px = math.inf if moved else -1.0
-    refinement = refined(found, here, EVERYWHERE, code, POSITION_OF, largest_disagreement_px=limit_px)
+    refinement = refined(found, here, EVERYWHERE, code, POSITION_OF, 1, largest_disagreement_px=limit_px)
     assert found == []
     assert refinement.moved == moved
     assert len(refinement.points) == 8
@@ -220,7 +220,7 @@ def test_mixed_light_and_pixels_of_two_lines_give_no_points() -> None:
     code = CodeMap(np.where(two, code.lowest - 2, code.lowest).astype(np.int32), code.highest, code.refusal)
     frame, starts, _ = line_crossings(here, EVERYWHERE, cells_of(here.position.astype(np.float64), 4), POSITION_OF)
     found = [points_at(starts[frame == k]) for k in range(8)]
-    refinement = refined([*found], here, usable, code, POSITION_OF)
+    refinement = refined([*found], here, usable, code, POSITION_OF, 1)
     lost = 0
     for k, points in enumerate(refinement.points):
         columns, rows = np.rint(points.points_px).astype(int).T
@@ -238,8 +238,8 @@ def test_points_beside_a_step_stay_and_state_what_light_of_the_other_side_does()
     step = np.zeros(SHAPE, dtype=np.bool_)
     step[:, 40] = True
     usable = ~step
-    plain = refined([NONE] * 8, here, usable, code, POSITION_OF)
-    stated = refined([NONE] * 8, here, usable, code, POSITION_OF, displaced_px=beside_steps_px(step))
+    plain = refined([NONE] * 8, here, usable, code, POSITION_OF, 1)
+    stated = refined([NONE] * 8, here, usable, code, POSITION_OF, 1, displaced_px=beside_steps_px(step))
     beside = 0
     for one, other in zip(plain.points, stated.points, strict=True):
         np.testing.assert_array_equal(one.points_px, other.points_px)
@@ -255,8 +255,8 @@ def test_points_too_coarse_to_use_are_left_out() -> None:
     here, code = mapped(tilted(0.9, 0.3), noise=0.3)
     frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)
     found = [points_at(starts[frame == k]) for k in range(8)]
-    every = refined([*found], here, EVERYWHERE, code, POSITION_OF)
-    fewer = refined([*found], here, EVERYWHERE, code, POSITION_OF, coarsest_px=0.15)
+    every = refined([*found], here, EVERYWHERE, code, POSITION_OF, 1)
+    fewer = refined([*found], here, EVERYWHERE, code, POSITION_OF, 1, coarsest_px=0.15)
     assert 0 < sum(len(each.points_px) for each in fewer.points) < sum(len(each.points_px) for each in every.points)
     assert max(each.sigma_px.max() for each in fewer.points) < 0.15
     assert max(each.sigma_px.max() for each in every.points) < 0.5
