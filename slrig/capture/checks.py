@@ -32,6 +32,8 @@ BAND_SAMPLES = 300
 
 _LIT_SAMPLES = 40
 
+_NEARLY_FULL = 0.97
+
 _ALIKE = 0.02
 """Of a frame's own variation: lines that are blurred to three times their width differ by more from step to step."""
 
@@ -163,6 +165,10 @@ def reference(
     contrast = white - black
     lit = contrast >= threshold_dn
     usable = lit & (white < full_scale)
+    # Noise makes of a clipped sample one that is nearly full, and of half of its light more than half of it is seen.
+    clear = usable & (white < _NEARLY_FULL * full_scale)
+    if np.count_nonzero(clear) >= BAND_SAMPLES * BANDS:
+        usable = clear
     judged = usable & (contrast >= np.median(contrast[usable]))
     return Reference(white, black, np.maximum(contrast, np.float32(1)), lit, judged, row, _bands(row))
 
@@ -190,6 +196,14 @@ def noise_dn(bit: Samples, inverse: Samples, ref: Reference, *, sums: Sequence[S
     """
     pair = bit + inverse
     return min(_noise_of_four((pair - other)[ref.judged]) for other in (ref.white + ref.black, *sums))
+
+
+def noise_of_bit(bit: Samples, ref: Reference) -> float:
+    """Noise of one frame, DN, by a bit that lights few edges: where it is lit it shows what white does, else black."""
+    above, below = bit - ref.white, bit - ref.black
+    nearer = np.where(np.abs(above) < np.abs(below), above, below)[ref.judged]
+    # Of two frames; the square root of two less than what four would tell.
+    return max(NOISE_FLOOR_DN, _noise_of_four(nearer) * math.sqrt(2))
 
 
 def _noise_of_four(rest: Samples) -> float:
@@ -309,7 +323,7 @@ def changed_fault(
     if noise is None:
         noise = max(NOISE_FLOOR_DN, 1.4826 * float(np.median(change)) / 2**0.5)
     wrong = change > np.maximum(0.3 * contrast[lit], 8 * noise)
-    where = _worst(wrong, _bands(row[lit]), row[lit], whole=0.05)
+    where = _worst(wrong, _bands(row[lit]), row[lit], whole=0.05, quarter=0.15)
     if where is None:
         return None
     return (
@@ -321,6 +335,11 @@ def changed_fault(
 def worst_judged(wrong: Chosen, ref: Reference, *, whole: float, quarter: float = 0.25) -> str | None:
     """Words for the share of judged pixels that are wrong: None below `whole` of all and below `quarter` of a band."""
     return _worst(wrong, ref.band[ref.judged], ref.row[ref.judged], whole=whole, quarter=quarter)
+
+
+def worst_of(wrong: Chosen, row: NDArray[np.intp], *, whole: float, quarter: float = 0.25) -> str | None:
+    """As `worst_judged`, of any lit pixels in these rows."""
+    return _worst(wrong, _bands(row), row, whole=whole, quarter=quarter)
 
 
 def _worst(

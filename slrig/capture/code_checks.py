@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slrig.capture.checks import (
     BAND_SAMPLES,
@@ -20,8 +21,10 @@ from slrig.capture.checks import (
     rows_of,
     variation,
     worst_judged,
+    worst_of,
 )
-from slrig.model.gray_code import Integers, gray_index, to_gray
+from slrig.model import LineShift
+from slrig.model.gray_code import Integers, from_gray, gray_index, to_gray
 
 _EDGE_PX = 8.0
 """Breadth of an edge that a scaler blurred, projector pixels: from end to end of a Gaussian of 2 px, ± 2 deviations."""
@@ -46,7 +49,24 @@ _BAND_LINES = 4  # of a band: where it is used says why
 _LEAST_SUM_OFF = 0.25
 """Of white: sums of line frames that differ by less are those of sharp lines on pixels as wide as theirs."""
 
+_LEAST_SUM_OFF_HALF = 0.08
+"""Of white, for lines of half their period: of twelve rendered scenes the sums of all differ by less."""
+
 _AS_MUCH_TO_BLAME = 0.1  # of the wrong pixels: frames that explain as many, less this
+
+_FEW = 0.25  # of the pairs that come closer when two bits are exchanged back: those that come apart
+_MANY = 0.5  # of the pixels in what is wrong: a bit that explains fewer is not to blame alone
+_FEWEST_FOR_SHAPE = 5  # line frames: three tell a wave's place, height and level, and no more
+_LEAST_HEIGHT = 0.15  # of white over black; sharp lines have 0.64
+_SHAPE_BINS = 32
+_SHAPE_SPREADS, _LEAST_ODD = 6.0, 0.15  # of the wave's height, which half of a wave rises by
+_ODD, _ODD_IN_BAND = 0.05, 0.15  # of the judged pixels
+_NEAR_EDGE, _NEARER = 0.8, 0.2  # of white over black, by which a bit swings beside its edge, and less than another
+_SURE_OF_WAVE = 5.0  # standard deviations
+_LEAST_WAVE = 0.03  # of white over black, for each line; sharp lines have 0.32
+_LIT_BY_LINES = 0.1
+_NEARLY_FULL = 0.97
+_LEAST_ENDS_OFF, _LEAST_ABOVE = 0.3, 0.15  # of what lines light of a pixel, from dark to bright
 
 
 def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float, run_px: int) -> str | None:
@@ -154,18 +174,21 @@ def _roughness(frame: Samples, ref: Reference) -> tuple[Samples, Samples]:
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """Gray code read at the sampled pixels. index : (n,) int64, cell index; sure : every bit is beyond doubt."""
+    """Gray code read at the sampled pixels. index : (n,) int64, cell index; sure : every bit is beyond doubt;
+    differences : (bits, n), of each bit from its inverse.
+    """
 
     index: Integers
     sure: Chosen
     bits: int
+    differences: Samples
 
 
 def read_code(differences: Sequence[Samples], ref: Reference) -> Code:
     """Decode: one vector bit − inverse (or 2·bit − white − black) per bit, most significant first."""
     stack = np.stack(differences)
     sure = ref.lit & (np.abs(stack) > 0.2 * ref.contrast).all(axis=0)
-    return Code(gray_index(stack > 0), sure, len(stack))
+    return Code(gray_index(stack > 0), sure, len(stack), stack)
 
 
 def swapped_bit(code: Code) -> int | None:
@@ -221,6 +244,152 @@ class LineExpectation:
     def lines(self, where: Chosen) -> int:
         """How many periods these pixels, all of them sure, lie in."""
         return len(np.unique(np.floor(self.position[where])))
+
+
+def exchanged_bits(code: Code) -> tuple[int, int] | None:
+    """Which two bits stand in each other's place, told from pixels beside each other: these have close indices.
+
+    Exchanged back, indices come closer at many pairs, and apart at few. What this cannot see: an exchange of bits of
+    which neither changes over what is lit.
+    """
+    here, beside = code.index.reshape(2, -1)
+    sure = code.sure.reshape(2, -1).all(axis=0)
+    sure &= here != beside
+    words = [to_gray(each[sure]) for each in (here, beside)]
+    apart = np.abs(here - beside)[sure]
+    # A table is faster than the sums that it is made of, twice for each pair of bits.
+    index_of = from_gray(np.arange(2**code.bits))
+    for one in range(code.bits):
+        for other in range(one + 1, code.bits):
+            first, second = code.bits - 1 - one, code.bits - 1 - other
+            a, b = (index_of[_exchanged(word, first, second)] for word in words)
+            change = np.abs(a - b) - apart
+            nearer = np.count_nonzero(change < 0)
+            if nearer >= _CROSSINGS and np.count_nonzero(change > 0) < _FEW * nearer:
+                return one, other
+    return None
+
+
+def _exchanged(word: Integers, first: int, second: int) -> Integers:
+    """Words with two of their bits, counted from the least significant one, in each other's place."""
+    unlike = ((word >> first) ^ (word >> second)) & 1
+    return np.asarray(word ^ (unlike << first) ^ (unlike << second))
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """What lines say of the code at the sampled pixels.
+
+    told : (n,) where they say anything; wrong : (n,) where they contradict the code. reversed : whether lines run
+    through the cells against the code, as if they came in the opposite order.
+    """
+
+    told: Chosen
+    wrong: Chosen
+    reversed: bool
+
+
+def agreement(
+    code: Code,
+    lines: Sequence[tuple[LineShift, Samples]],
+    ref: Reference,
+    *,
+    cell_px: int,
+    offset_px: int,
+    noise: float,
+) -> Agreement:
+    """Hold the place within its period that lines tell of each pixel against the cell of the code.
+
+    A single wrong bit, whichever it is, moves the index by an odd number of cells, and half a period where a cell is as
+    wide as that: an error of any one frame of the code shows at every pixel where it turned the bit over.
+
+    lines : the frames of one axis whose shifts divide their period evenly.
+    """
+    period_px, count = lines[0][0].period_px, len(lines)
+    turn = 2j * np.pi / period_px
+    waves = np.sum([frame * np.exp(turn * line.centre_px) for line, frame in lines], axis=0)
+    clear = np.abs(waves) > np.maximum(_SURE_OF_WAVE * noise * (count / 2) ** 0.5, _LEAST_WAVE * count * ref.contrast)
+    centre_px = cell_px * code.index - offset_px + (cell_px - 1) / 2
+    off_px = (np.angle(waves) / abs(turn) - centre_px + period_px / 2) % period_px - period_px / 2
+    told = code.sure & clear
+    wrong = told & (np.abs(off_px) > cell_px / 2 + period_px / 16)
+    # Which edge of its cell a pixel lies nearer to is told by the bit that changes there: it is the less clear one.
+    swing = np.abs(code.differences) / ref.contrast
+    before, after = (swing[_changing_bit(code, step), np.arange(len(code.index))] for step in (-1, 1))
+    beside = told & (np.minimum(before, after) < _NEAR_EDGE) & (np.abs(before - after) > _NEARER)
+    against = (before < after) != (off_px < 0)
+    turned = np.count_nonzero(beside) >= BAND_SAMPLES and np.mean(against[beside]) > _MANY
+    return Agreement(told, wrong, bool(turned))
+
+
+def _changing_bit(code: Code, step: int) -> Integers:
+    """(n,) which bit, the most significant one first, differs between each cell and the one before or after it."""
+    changed = to_gray(code.index) ^ to_gray(np.clip(code.index + step, 0, 2**code.bits - 1))
+    return np.asarray(code.bits - 1 - np.log2(np.maximum(changed, 1)).astype(np.int64))
+
+
+def blamed_bits(code: Code, wrong: Chosen) -> tuple[int, ...]:
+    """Which bits are to blame where lines contradict the code: those that, turned over there, bring pixels beside each
+    other as close as they are elsewhere; all of them where none does.
+
+    A bit that is turned over mirrors the index: cells run backwards there.
+    """
+    here, beside = code.index.reshape(2, -1)
+    wrong_here, wrong_beside = wrong.reshape(2, -1)
+    crossing = code.sure.reshape(2, -1).all(axis=0) & (here != beside)
+    doubted = crossing & (wrong_here | wrong_beside)
+    every = tuple(range(code.bits))
+    if np.count_nonzero(doubted) < _CROSSINGS:
+        return every
+    sound = np.abs(here - beside)[crossing & ~doubted]
+    close = max(1.0, float(np.percentile(sound, 90))) if len(sound) else 1.0
+    closed = []
+    for bit in every:
+        mirror = 2 ** (code.bits - bit) - 1
+        a, b = here ^ (mirror * wrong_here), beside ^ (mirror * wrong_beside)
+        closed.append(float(np.mean(np.abs(a - b)[doubted] <= close)))
+    most = max(closed)
+    return tuple(bit for bit in every if closed[bit] >= most - _AS_MUCH_TO_BLAME) if most >= _MANY else every
+
+
+def ends_fault(
+    white: Samples, black: Samples, lines: Sequence[Samples], *, threshold_dn: float, full_scale: int,
+    row: NDArray[np.intp],
+) -> str | None:  # fmt: skip
+    """Lines that light half of their period are on average the middle of white and black, at pixels of the whole image:
+    those that other tests ask were chosen by white and black, and damage may have chosen them.
+
+    lines : by shift. threshold_dn : of light that a pixel gets from lines.
+    """
+    stack = np.stack(lines)
+    if len(stack) % 2:
+        average, reach = stack.mean(axis=0), np.ptp(stack, axis=0)
+    else:
+        # Lines and their inverses: one of them that was damaged says nothing of white and black.
+        half = len(stack) // 2
+        average = np.median(stack[:half] + stack[half:], axis=0) / 2
+        second = np.sort(stack, axis=0)[[1, -2]]
+        reach = second[1] - second[0]
+    # What is clipped adds up to less.
+    clear = stack.max(axis=0) < _NEARLY_FULL * full_scale
+    clipped = white >= _NEARLY_FULL * full_scale
+    lit = clear & (reach >= max(threshold_dn, _LIT_BY_LINES * float(np.percentile(reach, 99))))
+    told = ~clipped[lit]
+    if np.count_nonzero(told) < BAND_SAMPLES:
+        return None
+    off = ((white + black - 2 * average) / np.maximum(reach, 1))[lit]
+    usual = float(np.median(off[told]))
+    slack = max(_LEAST_ENDS_OFF, 6 * 1.4826 * float(np.median(np.abs(off - usual)[told])))
+    # A white that is clipped is less than the lines foresee, never more.
+    off[~told] = np.maximum(off[~told], usual)
+    wrong = (np.abs(off - usual) > slack) | (np.minimum(white - average, average - black) < _LEAST_ABOVE * reach)[lit]
+    where = worst_of(wrong, row[lit], whole=0.05, quarter=0.1)
+    if where is None:
+        return None
+    return (
+        f"{where} are not as far above the average of the line frames in white as below it in black: one of these two "
+        "was damaged in transfer or shows another pattern; check the cable, and scan again"
+    )
 
 
 def expect_lines(
@@ -292,20 +461,26 @@ def line_fault(
     return True, None
 
 
-def line_sum(frames: Sequence[Samples], ref: Reference, *, noise: float) -> tuple[tuple[int, ...], str] | None:
+def line_sum(
+    frames: Sequence[Samples], ref: Reference, *, noise: float, half: bool = False
+) -> tuple[tuple[int, ...], str] | None:
     """Judge the sum of the n line frames of one axis, given by shift: those to blame and what is wrong, or None.
 
     Each place is lit by one frame as every other place is by another, so the sum is the same everywhere, also where a
     camera is not linear or a scaler blurs. To blame is a frame that the sum's error can be taken from with light left
-    between black and white.
+    between black and white. half : lines light half of their period, and so much of it is in every sum that pixels
+    which are as wide as a line differ less.
     """
     light = np.stack([ref.relative(frame) for frame in frames])
     total = light.sum(axis=0)
     off = total - np.median(total)
     spread = 1.4826 * float(np.median(np.abs(off)))
-    slack = np.maximum(max(_LEAST_SUM_OFF, 6 * spread), 8 * noise * len(frames) ** 0.5 / ref.contrast[ref.judged])
+    slack = np.maximum(
+        max(_LEAST_SUM_OFF_HALF if half else _LEAST_SUM_OFF, 6 * spread),
+        8 * noise * len(frames) ** 0.5 / ref.contrast[ref.judged],
+    )
     wrong = np.abs(off) > slack
-    where = worst_judged(wrong, ref, whole=0.1)
+    where = worst_judged(wrong, ref, whole=0.1, quarter=0.15)
     if where is None:
         return None
     without = (light - off)[:, wrong]
@@ -315,6 +490,51 @@ def line_sum(frames: Sequence[Samples], ref: Reference, *, noise: float) -> tupl
         f"on {where} the line frames do not add up to what they do elsewhere: one of them was damaged in transfer or "
         "shows another pattern, or something moved; check the cable, and scan again"
     )
+
+
+def line_shape(
+    lines: Sequence[LineShift], frames: Sequence[Samples], ref: Reference, *, noise: float
+) -> tuple[int, str] | None:
+    """Judge each line frame by the others: (which one shows something else, what is wrong), or None.
+
+    The wave that all frames draw at a pixel, light over shift, has the same shape everywhere, at a place, height and
+    level of its own. One frame off it is not where the others say; of three frames a wave tells nothing.
+
+    lines, frames : by shift, of one axis; the shifts divide the period evenly.
+    """
+    count = len(frames)
+    if count < _FEWEST_FOR_SHAPE:
+        return None
+    light = np.stack([ref.relative(frame) for frame in frames])
+    shifts = np.exp(2j * np.pi / lines[0].period_px * np.array([line.centre_px for line in lines]))
+    wave = shifts @ light * (2 / count)
+    height = np.abs(wave)
+    clear = height > _LEAST_HEIGHT
+    if np.count_nonzero(clear) < BAND_SAMPLES:
+        return None
+    around = np.angle(wave / shifts[:, np.newaxis]) / (2 * np.pi) % 1
+    bins = np.minimum((around * _SHAPE_BINS).astype(np.intp), _SHAPE_BINS - 1)
+    swing = (light - light.mean(axis=0)) / np.maximum(height, _LEAST_HEIGHT)
+    every = np.arange(_SHAPE_BINS)
+    off = swing - np.array([_median_of(swing[(bins == each) & clear]) for each in every])[bins]
+    # Edges that are sharp differ by how pixels lie on them.
+    spread = 1.4826 * np.array([_median_of(np.abs(off[(bins == each) & clear])) for each in every])[bins]
+    slack = np.maximum(
+        np.maximum(_LEAST_ODD, _SHAPE_SPREADS * spread), 5 * noise / (ref.contrast[ref.judged] * height + 1e-6)
+    )
+    wrong = (np.abs(off) > slack) & clear
+    worst = int(np.argmax(np.count_nonzero(wrong, axis=1)))
+    where = worst_judged(wrong[worst], ref, whole=_ODD, quarter=_ODD_IN_BAND)
+    if where is None:
+        return None
+    return worst, (
+        f"on {where} its light is not what the other line frames draw: it was damaged in transfer or shows another "
+        "pattern, or something moved; check the cable, and scan again"
+    )
+
+
+def _median_of(values: Samples) -> float:
+    return float(np.median(values)) if len(values) else 0.0
 
 
 def line_order(frames: Sequence[Samples], ref: Reference, *, noise: float) -> tuple[bool, int | None]:

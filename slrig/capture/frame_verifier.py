@@ -9,10 +9,28 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from slrig.capture import checks, code_checks
-from slrig.capture.checks import Contradiction, Lighting, Reference, Samples, named, place
+from slrig.capture.checks import Chosen, Contradiction, Lighting, Reference, Samples, named, place
 from slrig.capture.code_checks import Code
 from slrig.capture.sampling import Sampler
-from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Primary, Shot, White
+from slrig.model import (
+    Axis,
+    Black,
+    CameraFormat,
+    Gray,
+    LineShift,
+    Pattern,
+    Pixels,
+    Primary,
+    Shot,
+    White,
+    coarse_bits,
+    divides_period,
+)
+
+_WRONG, _WRONG_IN_BAND = 0.01, 0.03  # of the judged pixels; of twelve sound scenes 0.4 % in the worst band
+_ALIKE = 0.7  # of the pixels that are wrong in one exposure or another: those that are in both
+_FEW_SUSPECTS = 3  # frames that a message names
+_OF_THE_SCENE = 0.25  # of the pixels that are told: a frame that shows another pattern is wrong at half of them
 
 
 @dataclass(slots=True)
@@ -21,7 +39,8 @@ class Findings:
 
     verified : the patterns whose frames passed a test that another pattern would fail. light_drift : largest change of
     the light between two frames of one pattern, as a share of white. sums : of the last pair of a bit and its inverse.
-    sound : a pair of a bit and its inverse has added up to white and black, which vouches for these two.
+    sound : a pair of a bit or of lines and their inverse has added up to white and black, or lines alone have, which
+    vouches for these two.
     lined : axes of which a line frame lay where the Gray code says, which vouches for the code.
     """
 
@@ -64,6 +83,7 @@ class FrameVerifier:
         self._referees: tuple[int, ...] = ()
         self._refused = False
         self._untold: list[Contradiction] = []
+        self._disputed: dict[Axis, Chosen] = {}
 
     @property
     def _noise(self) -> float:
@@ -122,7 +142,7 @@ class FrameVerifier:
     def _admit(self, index: int, image: Pixels) -> list[Contradiction]:
         pattern = self._patterns[index]
         self.found.firsts.setdefault(pattern, index)
-        if isinstance(pattern, White | Black):
+        if isinstance(pattern, White | Black) or (isinstance(pattern, LineShift) and pattern.lights_half):
             self._overview[index] = self._anywhere.take(image)
         if self._sampler is None:
             self._waiting[index] = image
@@ -189,11 +209,13 @@ class FrameVerifier:
             return self._again(index, first, ref)
         if isinstance(pattern, White | Black):
             return []
-        found = self._gray(index, pattern, ref) if isinstance(pattern, Gray) else self._range([index], ref)
+        found = self._alone_or_paired(index, pattern, ref)
+        if not found and isinstance(pattern, Gray | LineShift):
+            found += self._complete_code(pattern, ref)
         if not found:
             found += self._repetition(index, pattern, ref)
         if not found and isinstance(pattern, LineShift):
-            found += self._line(index, pattern, ref)
+            found += self._line(index, pattern, ref) or self._line_family(pattern.axis, ref)
         # One light from another is told by times alone: an object may send back as much of both.
         if not found and isinstance(pattern, Primary) and checks.dimmed(self._frames[index], ref):
             self.found.verified.add(index)
@@ -232,59 +254,173 @@ class FrameVerifier:
         judged = ((index, checks.range_fault(self._frames[index], ref, noise=noise)) for index in indices)
         return [self._says(index, fault, [index], beyond) for index, fault in judged if fault is not None]
 
-    def _gray(self, index: int, pattern: Gray, ref: Reference) -> list[Contradiction]:
-        partner = self.found.firsts.get(_inverse(pattern))
-        # A pair tells the noise, which the other tests need: the first of a pair waits for the second.
-        if partner is not None:
-            bit, inverse = self._frames[index], self._frames[partner]
-            fault = code_checks.pair_fault(bit, inverse, ref, noise=self._noise, run_px=_run_px(pattern))
-            if fault is not None:
-                words = f"beside {named(partner, self._patterns[partner])}, {fault}"
-                return [self._says(index, words, [index, partner], self._unproven_reference)]
-            self.found.noises.append(checks.noise_dn(bit, inverse, ref, sums=self.found.sums))
-            self.found.sums = [bit + inverse]
-            found = self._range([partner, index], ref)
-            if not found:
+    def _alone_or_paired(self, index: int, pattern: Pattern, ref: Reference) -> list[Contradiction]:
+        """Judge a frame beside that of the inverse of its pattern, or alone where there is none."""
+        inverse = pattern.inverse if isinstance(pattern, Gray | LineShift) else None
+        if isinstance(pattern, LineShift) and not self._single(pattern.axis):
+            # Bits and their inverses vouch for white and black, and the sum of all lines names the one that is wrong.
+            inverse = None
+        partner = None if inverse is None else self.found.firsts.get(inverse)
+        if partner is None or not isinstance(pattern, Gray | LineShift):
+            # A pair tells the noise, which the other tests need: the first of a pair waits for the second.
+            return [] if inverse in self._patterns else self._alone(index, pattern, ref)
+        frame, other = self._frames[index], self._frames[partner]
+        fault = code_checks.pair_fault(frame, other, ref, noise=self._noise, run_px=_run_px(pattern))
+        if fault is not None:
+            words = f"beside {named(partner, self._patterns[partner])}, {fault}"
+            return [self._says(index, words, [index, partner], self._unproven_reference)]
+        self.found.noises.append(checks.noise_dn(frame, other, ref, sums=self.found.sums))
+        self.found.sums = [frame + other]
+        found = self._range([partner, index], ref)
+        if not found:
+            if isinstance(pattern, Gray):
                 self.found.verified |= {index, partner}
-                self.found.sound = True
-        else:
-            found = [] if _inverse(pattern) in self._patterns else self._range([index], ref)
-        return found or self._complete_code(pattern, ref)
+            self.found.sound = True
+        return found
+
+    def _alone(self, index: int, pattern: Pattern, ref: Reference) -> list[Contradiction]:
+        """Judge a frame whose pattern has no inverse in the sequence."""
+        found = self._range([index], ref)
+        if found or not isinstance(pattern, Gray):
+            return found
+        lines = [
+            self._frames[i] for p, i in self.found.firsts.items() if isinstance(p, LineShift) and p.axis is pattern.axis
+        ]
+        # Lines have edges everywhere, and bits have fewer.
+        rough = code_checks.rougher(self._frames[index], lines, ref, noise=self._noise) if lines else None
+        if rough is not None:
+            return [self._says(index, rough, [index], self._unproven_reference)]
+        if pattern.bit < coarse_bits(pattern.bits):
+            self.found.noises.append(checks.noise_of_bit(self._frames[index], ref))
+        return []
 
     def _family(self, pattern: Gray) -> list[Gray]:
         """Every bit of the code that a pattern belongs to, as far as it is shown."""
         return [p for p in self._patterns if isinstance(p, Gray) and _code_of(p) == _code_of(pattern)]
 
-    def _complete_code(self, pattern: Gray, ref: Reference) -> list[Contradiction]:
-        """Decode once the last frame of a code is in, and judge the line frames that waited for it."""
-        if pattern.axis in self.found.codes:
+    def _single(self, axis: Axis) -> bool:
+        """Whether the bits of an axis come without their inverses."""
+        return not any(isinstance(p, Gray) and p.axis is axis and p.inverted for p in self._patterns)
+
+    def _lines(self, axis: Axis) -> list[LineShift]:
+        """The lines of one axis, by shift."""
+        lines = {p for p in self._patterns if isinstance(p, LineShift) and p.axis is axis}
+        return sorted(lines, key=lambda line: line.shift)
+
+    def _complete_code(self, pattern: Gray | LineShift, ref: Reference) -> list[Contradiction]:
+        """Decode once the last frame of a code is in, and judge the line frames that waited for it.
+
+        Bits without inverses are held against the lines, and wait for these where there are any.
+        """
+        axis = pattern.axis
+        gray = next((p for p in self._patterns if isinstance(p, Gray) and p.axis is axis), None)
+        if axis in self.found.codes or gray is None:
             return []
-        family, firsts = self._family(pattern), self.found.firsts
-        if {p.bit for p in family} != set(range(pattern.bits)) or any(p not in firsts for p in family):
+        family, firsts, lines = self._family(gray), self.found.firsts, self._lines(axis)
+        single = self._single(axis)
+        if {p.bit for p in family} != set(range(gray.bits)) or any(p not in firsts for p in family):
             return []
-        differences = [self._difference(bit, family, ref) for bit in range(pattern.bits)]
+        proven_by = lines if single and divides_period(lines) else []
+        if any(firsts.get(line) not in self._frames for line in proven_by):
+            return []
+        middle = np.asarray((ref.white + ref.black) / 2, dtype=np.float32)
+        shown = [self._frames[firsts[line]] for line in proven_by]
+        if shown and lines[0].lights_half:
+            fault = self._ends_fault([firsts[line] for line in lines])
+            if fault is not None:
+                return [self._says(self._referees[0], fault, self._referees)]
+            middle = np.mean(np.stack(shown), axis=0).astype(np.float32)
+        differences = [self._difference(bit, family, middle) for bit in range(gray.bits)]
         code = code_checks.read_code(differences, ref)
-        exchanged = code_checks.swapped_bit(code)
-        if exchanged is not None:
-            fault = (
-                f"bit {exchanged} of the {pattern.axis} code is exchanged with its inverse: codes jump where coarser "
-                "bits change; check that the projector shows the patterns in the order they were loaded"
-            )
-            pair = [firsts[p] for p in family if p.bit == exchanged]
-            return [self._says(pair[0], fault, pair, [firsts[p] for p in family])]
-        self.found.codes[pattern.axis] = (code, pattern)
+        found = self._exchanged(code, family, single=single)
+        if not found and shown:
+            found, wrong = self._agreement(code, gray, family, list(zip(proven_by, shown, strict=True)), ref)
+            code = replace(code, sure=code.sure & ~wrong)
+        if found:
+            return found
+        self.found.codes[axis] = (code, gray)
         waited, self.found.waiting_lines = self.found.waiting_lines, []
-        found: list[Contradiction] = []
         for index in waited:
             line = self._patterns[index]
             if isinstance(line, LineShift):
                 found += self._line(index, line, ref)
+        if waited and not found:
+            found += self._line_family(axis, ref)
         return found
 
-    def _difference(self, bit: int, family: Sequence[Gray], ref: Reference) -> Samples:
+    def _ends_fault(self, lines: Sequence[int]) -> str | None:
+        if self.lighting is None or any(index not in self._overview for index in (*self._referees, *lines)):
+            return None
+        white, black = (self._overview[index] for index in self._referees)
+        return code_checks.ends_fault(
+            white, black, [self._overview[index] for index in lines], threshold_dn=self.lighting.threshold_dn,
+            full_scale=self._format.full_scale, row=self._anywhere.row,
+        )  # fmt: skip
+
+    def _exchanged(self, code: Code, family: Sequence[Gray], *, single: bool) -> list[Contradiction]:
+        """Judge whether bits stand where they should, by their order alone."""
+        firsts = self.found.firsts
+        order = "check that the projector shows the patterns in the order they were loaded"
+        if single:
+            both = code_checks.exchanged_bits(code)
+            if both is None:
+                return []
+            blamed: tuple[int, ...] = both
+            fault = f"bits {both[0]} and {both[1]} of the {family[0].axis} code are exchanged: codes jump; {order}"
+        else:
+            exchanged = code_checks.swapped_bit(code)
+            if exchanged is None:
+                return []
+            blamed = (exchanged,)
+            fault = (
+                f"bit {exchanged} of the {family[0].axis} code is exchanged with its inverse: codes jump where coarser "
+                f"bits change; {order}"
+            )
+        pair = [firsts[p] for p in family if p.bit in blamed]
+        return [self._says(pair[0], fault, pair, [firsts[p] for p in family])]
+
+    def _agreement(
+        self, code: Code, gray: Gray, family: Sequence[Gray], lines: list[tuple[LineShift, Samples]], ref: Reference
+    ) -> tuple[list[Contradiction], Chosen]:
+        """Hold the code against the lines, which proves its bits; also where they contradict it."""
+        firsts, axis = self.found.firsts, gray.axis
+        told = code_checks.agreement(
+            code, lines, ref, cell_px=gray.cell_px, offset_px=gray.offset_px, noise=self._noise
+        )  # fmt: skip
+        members = [firsts[line] for line, _ in lines]
+        if told.reversed:
+            fault = (
+                f"the {axis} line frames come in the opposite order: the places that they tell jump from pixel to "
+                "pixel; check that the projector shows the patterns in the order they were loaded"
+            )
+            return [self._says(members[0], fault, members)], told.wrong
+        where = checks.worst_of(told.wrong, ref.row, whole=_WRONG, quarter=_WRONG_IN_BAND)
+        if where is None:
+            if np.count_nonzero(told.told) >= checks.BAND_SAMPLES:
+                self.found.verified |= {firsts[p] for p in family}
+            return [], told.wrong
+        before = self._disputed.get(axis)
+        self._disputed[axis] = told.wrong
+        if before is not None and len(before) == len(told.wrong):
+            alike = np.count_nonzero(before & told.wrong) / np.count_nonzero(before | told.wrong)
+            if alike > _ALIKE and np.mean(told.wrong[told.told]) < _OF_THE_SCENE:
+                # Exposed again it is the same: what stands there does it, light that walls of a hollow send to each
+                # other, for one. No frame is to blame, and none is proven.
+                return [], told.wrong
+        bits = code_checks.blamed_bits(code, told.wrong)
+        suspects = [firsts[p] for p in family if p.bit in bits]
+        few = len(suspects) <= _FEW_SUSPECTS
+        which = " or ".join(named(each, self._patterns[each]) for each in suspects) if few else "the frame of a bit"
+        fault = (
+            f"{where} have a code that their lines contradict: {which} was not shown or was damaged, or something "
+            "moved; check the cable and the projector's latency, and scan again; if it stays, light comes from "
+            "elsewhere on the object: scan with the sequence robust"
+        )
+        return [self._says(suspects[0], fault, suspects, [*(firsts[p] for p in family), *members])], told.wrong
+
+    def _difference(self, bit: int, family: Sequence[Gray], middle: Samples) -> Samples:
         frames = {p.inverted: self._frames[self.found.firsts[p]] for p in family if p.bit == bit}
-        half = (ref.white + ref.black) / 2
-        return np.asarray(frames.get(False, half) - frames.get(True, half)) * (1 if len(frames) == 2 else 2)
+        return np.asarray(frames.get(False, middle) - frames.get(True, middle)) * (1 if len(frames) == 2 else 2)
 
     def _repetition(self, index: int, pattern: Pattern, ref: Reference) -> list[Contradiction]:
         own = {pattern, White(), Black()}
@@ -336,20 +472,26 @@ class FrameVerifier:
         if compared:
             self.found.verified.add(index)
             self.found.lined.add(pattern.axis)
-        return self._line_order(index, pattern, ref)
+        return []
 
-    def _line_order(self, index: int, pattern: LineShift, ref: Reference) -> list[Contradiction]:
-        """Judge the sum and the order of the line frames once the last one is in."""
-        family = [replace(pattern, shift=shift) for shift in range(pattern.period_px)]
-        firsts = self.found.firsts
+    def _line_family(self, axis: Axis, ref: Reference) -> list[Contradiction]:
+        """Judge the sum, the shape and the order of the line frames of an axis once all and the code are in."""
+        family, firsts = self._lines(axis), self.found.firsts
+        if axis not in self.found.codes or not divides_period(family):
+            return []
         if any(firsts.get(line) not in self._frames for line in family):
             return []
         frames = [self._frames[firsts[line]] for line in family]
         members = [firsts[line] for line in family]
-        unequal = code_checks.line_sum(frames, ref, noise=self._noise)
+        index, half = max(members), family[0].lights_half
+        unequal = code_checks.line_sum(frames, ref, noise=self._noise, half=half)
         if unequal is not None:
             blamed, fault = unequal
             return [self._says(index, fault, [members[each] for each in blamed], members)]
+        odd = code_checks.line_shape(family, frames, ref, noise=self._noise) if half else None
+        if odd is not None:
+            at, fault = odd
+            return [self._says(members[at], fault, [members[at]], members)]
         shows, shift = code_checks.line_order(frames, ref, noise=self._noise)
         if shift is None:
             # One frame that lies where the code says, and the right order, place them all.
@@ -357,7 +499,7 @@ class FrameVerifier:
                 self.found.verified |= set(members)
             return []
         fault = (
-            f"the {pattern.axis} line frames are out of order at shift {shift}: its lines overlap those of the frame "
+            f"the {axis} line frames are out of order at shift {shift}: its lines overlap those of the frame "
             "before the last more than those of the last; check that the projector shows the patterns in the order "
             "they were loaded"
         )
@@ -365,12 +507,10 @@ class FrameVerifier:
         return [self._says(index, fault, around, members)]
 
 
-def _inverse(pattern: Gray) -> Gray:
-    return replace(pattern, inverted=not pattern.inverted)
-
-
-def _run_px(pattern: Gray) -> int:
+def _run_px(pattern: Gray | LineShift) -> int:
     """Length of the pattern's inner runs of equal pixels: the finest bit of a Gray code changes every two cells."""
+    if not isinstance(pattern, Gray):
+        return pattern.line_width_px
     return pattern.cell_px << (pattern.bits - pattern.bit if pattern.bit else pattern.bits - 1)
 
 
