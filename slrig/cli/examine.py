@@ -54,6 +54,7 @@ def doctor(
     """
     set_up_logs_for_a_person()
     config = read_rig(rig_file)
+    lines = _own_plan(config).named
     if output is not None:
         refuse_existing(output, force=force)
     with progress_shown() as display:
@@ -67,7 +68,8 @@ def doctor(
                 _as_scanned(rig, config),
                 own_sequence=_own_sequence(rig, config),
                 displays=displays,
-                period_px=_own_plan(config).line_shift_period_px,
+                period_px=lines.period_px,
+                steps=lines.steps or lines.period_px,
                 search_s=search_s,
                 told=display,
             )

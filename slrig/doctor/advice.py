@@ -1,7 +1,8 @@
-"""Which exposure to write into a rig file, and why."""
+"""Which exposure and which lines to write into a rig file, and why."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,9 @@ from slrig.doctor.light import Seen
 _WHOLE = 0.02
 _STEADY = 0.004
 _MOST_PERIODS = 64
+_PERIODS_PX = (8, 12, 16, 24, 32)
+"""From the default on: what is sharper than that gains nothing by a shorter period (`tests/bench/line_sweep.py`)."""
+_LEAST_GAIN = 1.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +25,56 @@ class ExposureAdvice:
     exposure_s: float
     reason: str
     usable_s: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class LineAdvice:
+    """Which distance of lines suits a rig's blur, projector pixels.
+
+    steps : how many line frames; gain : how many times less noise a point has than with the rig's own lines.
+    """
+
+    period_px: int
+    steps: int
+    gain: float
+    reason: str
+
+    @property
+    def less_noise(self) -> str:
+        """The gain in words."""
+        return f"{self.gain:.1f} times less noise" if self.gain < 10 else "less than a tenth of the noise"
+
+
+def line_advice(blur_px: float, own_period_px: int, own_steps: int) -> LineAdvice | None:
+    """Return the lines that leave least noise where they are blurred by a Gaussian; None where the rig's own do nearly
+    as well.
+
+    A point's deviation goes by period/(contrast · √steps), and the first harmonic keeps exp(−2 (π σ/period)²) of its
+    contrast: of all periods 2 π σ is best. Periods longer than the default have eight steps: as many frames.
+
+    blur_px : σ, of projector, camera and pixels, projector pixels.
+    """
+    if not math.isfinite(blur_px):
+        return None
+
+    def deviation(period_px: int, steps: int) -> float:
+        return period_px * math.exp(2 * (math.pi * blur_px / period_px) ** 2) / math.sqrt(steps)
+
+    chosen = min(((period_px, _steps(period_px)) for period_px in _PERIODS_PX), key=lambda each: deviation(*each))
+    gain = deviation(own_period_px, own_steps) / deviation(*chosen)
+    if gain < _LEAST_GAIN:
+        return None
+    reason = f"measured: bars are blurred by {blur_px:.1f} projector pixels (standard deviation)"
+    return LineAdvice(*chosen, gain, reason)
+
+
+def _steps(period_px: int) -> int:
+    """About eight, which divide the period: as many frames as the default has.
+
+    >>> [_steps(period_px) for period_px in (8, 12, 16, 24)]
+    [8, 6, 8, 8]
+    """
+    return max(steps for steps in range(3, 9) if period_px % steps == 0)
 
 
 def exposure_advice(

@@ -15,7 +15,7 @@ from slrig.capture.sequencer import choose_triggers
 from slrig.capture.streaming import earliest_change_s
 from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation, UnprovenLight
 from slrig.doctor import timing
-from slrig.doctor.advice import ExposureAdvice, exposure_advice, is_whole, unsnapped
+from slrig.doctor.advice import ExposureAdvice, LineAdvice, exposure_advice, is_whole, line_advice, unsnapped
 from slrig.doctor.current import sense_of_current
 from slrig.doctor.findings import Finding, Severity, camera_named, fault, ms, note, ok
 from slrig.doctor.flicker import Flicker, flicker
@@ -39,13 +39,14 @@ USUAL_PERIOD_PX = 8
 class Diagnosis:
     """What an examination found. None or absent is what could not be measured.
 
-    exposures : by camera. synchronisation : as measured; None too where the rig needs none. refresh_hz : None without a
-    grid of refreshes.
+    exposures : by camera. lines : that suit the blur better than the rig's own. synchronisation : as measured; None too
+    where the rig needs none. refresh_hz : None without a grid of refreshes.
     """
 
     rig: str
     findings: tuple[Finding, ...]
     exposures: Mapping[str, ExposureAdvice]
+    lines: LineAdvice | None
     synchronisation: Synchronisation | None
     refresh_hz: float | None
     response: ResponseCurve | None
@@ -80,6 +81,7 @@ def examine(
     own_sequence: PatternSequence,
     displays: Sequence[FoundDevice] = (),
     period_px: int = USUAL_PERIOD_PX,
+    steps: int = USUAL_PERIOD_PX,
     search_s: float = USUAL_SEARCH_S,
     told: Told = lambda _stage, _fraction, _detail: None,
 ) -> Diagnosis:
@@ -87,10 +89,10 @@ def examine(
 
     own_sequence : the patterns of a scan on this rig, for a projector that holds them and can show no others.
     displays : projectors and outputs that finders found, this rig's among them. period_px : distance of the lines that
-    this rig scans with, by which its focus is judged. search_s : how late light may be. told : is told the stage, the
-    fraction done and a detail.
+    this rig scans with, by which its focus is judged; steps : how many frames of them it plays. search_s : how late
+    light may be. told : is told the stage, the fraction done and a detail.
     """
-    examination = _Examination(rig, own_sequence, displays, period_px, search_s, told)
+    examination = _Examination(rig, own_sequence, displays, period_px, steps, search_s, told)
     try:
         examination.run()
     finally:
@@ -110,6 +112,7 @@ class _Examination:
     sequence: PatternSequence
     displays: Sequence[FoundDevice]
     period_px: int
+    steps: int
     search_s: float
     told: Told
 
@@ -122,6 +125,7 @@ class _Examination:
         self.flickers: tuple[Flicker, ...] = ()
         self.unproven = False
         self._advice: dict[str, ExposureAdvice] = {}
+        self._blurs_px: list[float] = []
 
     def run(self) -> None:
         self.findings += _declared(self.rig, self.displays)
@@ -151,8 +155,14 @@ class _Examination:
         order = list(Severity)[::-1]
         findings = tuple(sorted(self.findings, key=lambda each: order.index(each.severity)))
         return Diagnosis(
-            self.rig.name, findings, self._advice, self.synchronisation, self.refresh_hz, self.curve, self.flickers
-        )
+            self.rig.name, findings, self._advice, self._lines(), self.synchronisation, self.refresh_hz, self.curve,
+            self.flickers,
+        )  # fmt: skip
+
+    def _lines(self) -> LineAdvice | None:
+        """By the camera that sees them least sharp."""
+        measured = [blur_px for blur_px in self._blurs_px if math.isfinite(blur_px)]
+        return line_advice(max(measured), self.period_px, self.steps) if measured else None
 
     @property
     def synchronisation(self) -> Synchronisation | None:
@@ -231,7 +241,9 @@ class _Examination:
         for name, seen in self.seen.items():
             shown, findings = picture(self._viewer(name), self.sequence, seen, self.rig.calibration)
             self.findings += findings
-            self.findings += focus(name, self.sequence, seen, shown, period_px=self.period_px)
+            blur_px, findings = focus(name, self.sequence, seen, shown, period_px=self.period_px)
+            self._blurs_px.append(blur_px)
+            self.findings += findings
             self.findings += sharpening(name, seen, shown, self.rig.calibration)
 
     def _best_lit(self) -> Seen | None:

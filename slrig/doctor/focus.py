@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.doctor.advice import line_advice
 from slrig.doctor.findings import Finding, camera_named, fault, note, ok
 from slrig.doctor.geometry import Picture
 from slrig.doctor.light import Seen
@@ -18,17 +19,23 @@ from slrig.patterns.gray import edge_indices
 _WHOLE_PERIODS = 4
 _FEWEST_PIXELS = 200
 _NOTE, _FAULT = 0.5, 0.25
-_WANTED = 0.6
 _CAMERA_SHARE, _PROJECTOR_SHARE = 0.6, 0.35
 _NEAR_PX = 12
 
 
-def focus(name: str, sequence: PatternSequence, seen: Seen, shown: Picture, *, period_px: int) -> list[Finding]:
-    """Judge the blur of the bars by what it leaves of lines that are `period_px` projector pixels apart."""
+def focus(
+    name: str, sequence: PatternSequence, seen: Seen, shown: Picture, *, period_px: int
+) -> tuple[float, list[Finding]]:
+    """The blur of the bars, standard deviation, projector pixels, and what it leaves of lines `period_px` apart.
+
+    The blur is that of projector, camera and pixels together, along the axis where it is greater; 0 where it is finer
+    than the finest bars tell, infinite where no bars are left, NaN where no code is read.
+    """
     subject = camera_named(name)
     lies = shown.orientation
     if lies is None:
-        return [ok("focus.untold", subject, "the focus cannot be judged where codes of both axes are not read")]
+        untold = "the focus cannot be judged where codes of both axes are not read"
+        return math.nan, [ok("focus.untold", subject, untold)]
     blurs: list[tuple[float, float]] = []
     for axis in Axis:
         blur_px = bar_blur_px(_bars(axis, sequence, seen, shown))
@@ -46,15 +53,18 @@ def focus(name: str, sequence: PatternSequence, seen: Seen, shown: Picture, *, p
     )
     words = f"{blurred}: {left:.0%} is left of the contrast of lines {period_px} px apart"
     if left >= _NOTE:
-        return [ok("focus.sharp", subject, words)]
+        return worst_px, [ok("focus.sharp", subject, words)]
     kind = fault if left < _FAULT else note
     edges = _edges(sequence, seen, shown)
-    wider = ""
-    if math.isfinite(worst_px):
-        wanted_px = math.ceil(worst_px * math.pi * (2 / math.log(1 / _WANTED)) ** 0.5)
-        wider = f"; until then line_shift_period_px = {wanted_px} in [scan] would do"
     which, why, remedy = _blame(edges, worst_px * camera_px)
-    return [kind(f"focus.{which}", "projector" if which == "projector" else subject, f"{words}. {why}", remedy + wider)]
+    advice = line_advice(worst_px, period_px, period_px)
+    if advice is not None:
+        remedy += (
+            f"; until then line_shift_period_px = {advice.period_px} and line_steps = {advice.steps} in [scan]: "
+            f"{advice.less_noise} is expected"
+        )
+    about = "projector" if which == "projector" else subject
+    return worst_px, [kind(f"focus.{which}", about, f"{words}. {why}", remedy)]
 
 
 def _bars(axis: Axis, sequence: PatternSequence, seen: Seen, shown: Picture) -> list[BarContrast]:

@@ -31,7 +31,7 @@ Comments = Mapping[Path_, str]
 
 
 def write_rig_file(diagnosis: Diagnosis, source: Path, target: Path, *, force: bool) -> None:
-    """Write the rig file `source` to `target` with what was found: exposures and the table [synchronisation].
+    """Write the rig file `source` to `target` with what was found: exposures, lines and the table [synchronisation].
 
     Everything else stays; paths that are relative to the one file are made relative to the other. Its own comments are
     not kept. Raises ConfigError where there is a file of that name and `force` is not given; StorageError.
@@ -64,10 +64,19 @@ def doctored(data: Mapping[str, Any], diagnosis: Diagnosis, *, source: Path, tar
         tables = _moved(tables, source.parent, target.parent)
     comments: dict[Path_, str] = {}
     _expose(tables, diagnosis.exposures, comments)
+    lines = diagnosis.lines
+    table: dict[str, Any]
+    if lines is not None:
+        table = tables.setdefault("scan", {})
+        # What belonged to other lines goes: half a period wide, and cells as wide, is the default.
+        for key in ("line_width_px", "gray_cell_px"):
+            table.pop(key, None)
+        table |= {"line_shift_period_px": lines.period_px, "line_steps": lines.steps}
+        comments["scan", "line_shift_period_px"] = f"{lines.reason}; {lines.less_noise} is expected"
     found = diagnosis.synchronisation
     if found is not None:
         latency_s, error_s = round(found.latency_s, 6), round(found.latency_error_s, 6)
-        table: dict[str, Any] = {"latency_s": latency_s, "latency_error_s": error_s}
+        table = {"latency_s": latency_s, "latency_error_s": error_s}
         comments |= {
             (_WAITS, "latency_s"): "measured by flashes: how much later than the projector says its light comes, on "
             "average",

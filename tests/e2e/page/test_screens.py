@@ -79,7 +79,7 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
         fault("light.dark", "camera 'left'", "it is too dark", "open the iris"),
         ok("focus.sharp", "camera 'left'", "it is sharp"),
     )
-    keep(service.data, "doctor", Diagnosis("small", findings, {}, None, None, None, ()).document())
+    keep(service.data, "doctor", Diagnosis("small", findings, {}, None, None, None, None, ()).document())
     page.get_by_text("it is too dark").wait_for()
     page.get_by_text("open the iris").wait_for()
     page.get_by_text("What is well: 1").click()

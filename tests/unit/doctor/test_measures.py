@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.config import read_rig
 from slrig.devices import Synchronisation
-from slrig.doctor.advice import ExposureAdvice, exposure_advice, unsnapped
+from slrig.doctor.advice import ExposureAdvice, LineAdvice, exposure_advice, line_advice, unsnapped
 from slrig.doctor.doctor import Diagnosis
 from slrig.doctor.findings import Finding, Severity, fault, ok
 from slrig.doctor.flicker import Flicker
@@ -383,7 +384,12 @@ exposure_s = 0.25
 """
 
 
-def diagnosis(*, synchronisation: Synchronisation | None = None, cameras: tuple[str, ...] = ("left",)) -> Diagnosis:
+def diagnosis(
+    *,
+    synchronisation: Synchronisation | None = None,
+    cameras: tuple[str, ...] = ("left",),
+    lines: LineAdvice | None = None,
+) -> Diagnosis:
     return Diagnosis(
         rig="bench",
         findings=(
@@ -394,6 +400,7 @@ def diagnosis(*, synchronisation: Synchronisation | None = None, cameras: tuple[
             name: ExposureAdvice(1 / 60 + index / 100, "1 × the refresh period", (0.002, 0.03))
             for index, name in enumerate(cameras)
         },
+        lines=lines,
         synchronisation=synchronisation,
         refresh_hz=60.0,
         response=None,
@@ -438,6 +445,45 @@ def test_the_new_file_is_the_old_one_with_what_was_measured(old: Path) -> None:
         assert lines[lines.index(key) - 1].startswith(words)
     assert lines[0] == "# Written by slrig doctor, from old.toml."
     assert "# Fault, projector: light comes late, by far. Do: write it down." in lines
+
+
+def test_lines_that_suit_the_blur_take_the_place_of_those_there(old: Path) -> None:
+    old.write_text(old.read_text() + "line_width_px = 2\ngray_cell_px = 2\n")
+    advice = line_advice(3.5, 12, 12)
+    assert advice is not None
+    new = old.with_name("new.toml")
+    write_rig_file(diagnosis(lines=advice), old, new, force=False)
+    assert tomllib.loads(new.read_text())["scan"] == {"line_shift_period_px": 24, "line_steps": 8}
+    comment = " ".join(new.read_text().partition("[scan]")[2].partition("line_shift_period_px")[0].split())
+    assert "bars are blurred by 3.5 projector pixels" in comment
+
+
+@pytest.mark.parametrize(
+    ("blur_px", "period_px"),
+    [(0.0, None), (0.6, None), (1.5, None), (2.2, 16), (3.0, 16), (5.0, 32), (math.inf, None), (math.nan, None)],
+)
+def test_lines_are_advised_where_they_gain(blur_px: float, period_px: int | None) -> None:
+    advice = line_advice(blur_px, 8, 8)
+    assert (None if advice is None else advice.period_px) == period_px
+    if advice is not None:
+        # Against lines that are played, blurred and measured: a sine of their contrast under the same noise.
+        assert advice.gain == pytest.approx(
+            scatter_px(blur_px, 8, 8) / scatter_px(blur_px, advice.period_px, advice.steps), rel=0.1
+        )
+
+
+def scatter_px(blur_px: float, period_px: int, steps: int) -> float:
+    """Of the places that lines of half a period tell under noise, by drawing it: standard deviation, px."""
+    fine, noise = 64, 1e-5
+    at = np.arange(0, period_px, 1 / fine)
+    light = gaussian_filter(np.tile((at < period_px / 2).astype(float), 9), blur_px * fine)
+    light = light[4 * at.size : 5 * at.size]
+    frames = np.stack([np.roll(light, step * at.size // steps)[::fine] for step in range(steps)])[:, :, None]
+    drawn = frames + np.random.default_rng(1).normal(0, noise, (*frames.shape[:2], 4000))
+    turns = np.exp(2j * np.pi * np.arange(steps) / steps)[:, None, None]
+    waves = (drawn * turns).sum(axis=0)
+    true = (frames * turns).sum(axis=0)
+    return float(np.std(np.angle(waves / true))) * period_px / (2 * np.pi)
 
 
 def test_paths_count_from_the_new_folder(old: Path) -> None:

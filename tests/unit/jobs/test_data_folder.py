@@ -367,7 +367,7 @@ def test_examination_is_kept_for_its_rig_and_replaced_by_the_next(tmp_path: Path
     (tmp_path / "scans").mkdir()
     assert last_examination(tmp_path, "doctor", "bench") is None
     for rig in ("other", "bench"):
-        found = Diagnosis(rig, FINDINGS, {}, None, None, None, ()).document()
+        found = Diagnosis(rig, FINDINGS, {}, None, None, None, None, ()).document()
         assert keep(tmp_path, "doctor", found)
     kept = last_examination(tmp_path, "doctor", "bench")
     assert kept is not None
