@@ -10,7 +10,7 @@ from slrig.client import Client
 PRESET = {
     "format": "slrig-preset",
     "version": 1,
-    "scan": {"line_width_px": 2, "exposure_factors": [0.5, 1.0]},
+    "scan": {"sequence": "robust", "exposure_factors": [0.5, 1.0]},
 }
 
 

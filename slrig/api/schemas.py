@@ -34,7 +34,7 @@ from slrig.bundle.scan_options import (
 from slrig.bundle.stage import TurnedBy
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
-from slrig.model import Axis, FlipRule, Size
+from slrig.model import Axis, FlipRule, SequenceName, Size
 from slrig.scan.plan import MOST_TURN_DEG, PatternPlan, PresetUse, ReconstructionPlan, ScanPlan
 
 MOST_EXPOSURE_S = 60.0
@@ -46,16 +46,32 @@ Body = TypeVar("Body", bound=BaseModel)
 class PatternRequest(Strict):
     """Which patterns to play. What is absent or null is as the rig file says, and else the default."""
 
+    sequence: Annotated[SequenceName, Field(strict=False)] | None = Field(
+        default=None,
+        description="what stands where the options below say nothing: `fast`, fewest frames; `standard`; `robust`, "
+        "each bit with its inverse, for reflecting and concave objects. Default standard",
+    )
     line_shift: bool | None = Field(default=None, description="false: Gray code only. Default true")
     line_shift_period_px: Annotated[int, Field(ge=4, le=1024)] | None = Field(
-        default=None, description="distance of two lines in one frame, and the number of line frames. Default 8"
+        default=None, description="distance of two lines in one frame, projector pixels. Default: the sequence's"
     )
-    line_width_px: Annotated[int, Field(ge=1, le=256)] | None = Field(default=None, description="Default 1")
+    line_steps: Annotated[int, Field(ge=3, le=1024)] | None = Field(
+        default=None,
+        description="number of line frames, which divide the distance evenly. Default: the sequence's; of `standard` "
+        "and `robust` one for each pixel of the distance",
+    )
+    line_width_px: Annotated[int, Field(ge=1, le=256)] | None = Field(
+        default=None, description="Default: the sequence's; of `fast` and `standard` half the line period"
+    )
     gray_cell_px: Annotated[int, Field(ge=1, le=1024)] | None = Field(
-        default=None, description="width of the finest Gray cell. Default: half the line period, or 1 without lines"
+        default=None, description="width of the finest Gray cell. Default: half the line period, or 2 without lines"
     )
     gray_offset_px: Annotated[int, Field(ge=0, le=65535)] | None = Field(
         default=None, description="moves the edges of the Gray cells. Default 0"
+    )
+    inverses: bool | None = Field(
+        default=None,
+        description="play each bit of the code with its inverse. Default: the sequence's, and true without lines",
     )
     rows: bool | None = Field(
         default=None,

@@ -12,7 +12,7 @@ from slrig.bundle.faults import Strict
 from slrig.bundle.free_text import FreeText
 from slrig.bundle.region_file import RegionTable
 from slrig.bundle.storage import json_bytes
-from slrig.model import FEWEST_EXPOSURES, MOST_EXPOSURES, Axis, FlipRule, bracket_fault
+from slrig.model import FEWEST_EXPOSURES, MOST_EXPOSURES, Axis, FlipRule, SequenceName, bracket_fault
 
 PRESET_VERSION: Final = 1
 EXPOSURE_KEYS = ("exposure_s", "exposures_s", "exposure_factors")
@@ -60,9 +60,14 @@ def alone(asked: T, info: ValidationInfo, keys: Sequence[str] = EXPOSURE_KEYS) -
 class ScanDefaults(Strict):
     """What a scan on this rig does unless its request says otherwise. The keys are those of a scan's plan."""
 
+    sequence: Annotated[SequenceName, Field(strict=False)] | None = Field(
+        default=None, description="what stands where the other pattern options say nothing. Default: standard"
+    )
     line_shift: bool | None = None
     line_shift_period_px: Annotated[int, Field(ge=4)] | None = None
+    line_steps: Annotated[int, Field(ge=3)] | None = None
     line_width_px: Annotated[int, Field(ge=1)] | None = None
+    inverses: bool | None = None
     gray_cell_px: Annotated[int, Field(ge=1)] | None = None
     gray_offset_px: Annotated[int, Field(ge=0)] | None = None
     rows: bool | None = None

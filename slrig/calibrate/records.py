@@ -16,10 +16,10 @@ from slrig.calibration.board import Board
 from slrig.errors import InvalidInputError, PoseRefusedError, StorageError
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
-from slrig.model import Size
+from slrig.model import SequenceName, Size
 from slrig.scan.plan import PatternPlan
 
-USUAL_PATTERNS = PatternPlan(rows=True)
+USUAL_PATTERNS = PatternPlan(sequence=SequenceName.ROBUST, rows=True)
 """White, Gray code and line shift along both axes: the projector has columns and rows to be calibrated."""
 
 

@@ -104,6 +104,13 @@ def scan(
         list[float] | None,
         typer.Option(help="Exposure of every camera, seconds; repeated, a bracket for what is dark here, shiny there."),
     ] = None,
+    sequence: Annotated[
+        Literal["fast", "standard", "robust"] | None,
+        typer.Option(
+            help="Patterns: fewest frames; the usual ones; each bit with its inverse, for what reflects or is hollow. "
+            "Default: the rig file's, or standard."
+        ),
+    ] = None,
     period_px: Annotated[int | None, typer.Option(help="Distance of two lines in one frame, projector pixels.")] = None,
     line_width_px: Annotated[int | None, typer.Option(help="Width of a line, projector pixels.")] = None,
     gray_cell_px: Annotated[int | None, typer.Option(help="Width of the finest Gray cell, projector pixels.")] = None,
@@ -130,7 +137,7 @@ def scan(
         repeat=repeat if repeat > 1 else None,
         every_s=every_s,
         patterns=given(
-            line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
+            sequence=sequence, line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
             line_shift=False if gray_only else None, rows=rows or None,
         ),
         reconstruction=mesh.asked(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,6 +13,9 @@ from slrig.cli.options import RigFile, given
 
 def patterns(
     rig: RigFile,
+    sequence: Annotated[
+        Literal["fast", "standard", "robust"] | None, typer.Option(help="If scans ask for another than the rig file.")
+    ] = None,
     period_px: Annotated[
         int | None, typer.Option(help="Distance of two lines in one frame, if scans ask for another one.")
     ] = None,
@@ -25,7 +28,9 @@ def patterns(
 
     For trigger boxes and light engines: all that scans, calibration, verification and the doctor show, each once.
     """
-    asked = given(line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px)
+    asked = given(
+        sequence=sequence, line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
+    )  # fmt: skip
     typer.echo(written_patterns(rig, asked))
 
 

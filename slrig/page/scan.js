@@ -6,6 +6,7 @@ import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, JobBadge, Progress, Refusal, count, length, moment} from "./ui.js";
 
 const SHOWN = 12;
+const SEQUENCES = {fast: "fast: fewest frames", standard: "standard", robust: "robust: for what reflects or is hollow"};
 const over = (scan) => !["queued", "capturing", "computing"].includes(scan.state);
 
 export function ScanScreen({rig, may}) {
@@ -13,12 +14,13 @@ export function ScanScreen({rig, may}) {
   const [bracket, setBracket] = useState(null);
   const [known] = useValue("/preset");
   const [preset, setPreset] = useState("");
+  const [sequence, setSequence] = useState("");
   const [typed, region, change] = useLimits();
   const scans = list?.scans ?? [];
   // The oldest that is not over holds the rig, whoever asked for it, and also after this page was loaded anew.
   const active = scans.filter((scan) => !over(scan)).at(-1);
   const [start, busy, refused] = useAction(async () => {
-    const body = {if_busy: "queue", ...(preset ? {preset} : {}), ...(bracket ? {exposures_s: bracket} : {}), ...(region ? {reconstruction: {region}} : {})};
+    const body = {if_busy: "queue", ...(preset ? {preset} : {}), ...(sequence ? {patterns: {sequence}} : {}), ...(bracket ? {exposures_s: bracket} : {}), ...(region ? {reconstruction: {region}} : {})};
     const scan = await ask("POST", "/scan", {body, headers: once()});
     sessionStorage.setItem("asked", scan.id);
     await again();
@@ -32,6 +34,8 @@ export function ScanScreen({rig, may}) {
       <${Action} kind="primary large" busy=${busy} disabled=${!may("scan")} onClick=${start}>Scan<//>
       ${may("scan") && known && html`<label>For an object that is <select value=${preset} onChange=${(event) => setPreset(event.target.value)}>
         <option value="">as the rig is set</option>${known.presets.filter(({fault}) => !fault).map(({name}) => html`<option value=${name}>${name}</option>`)}</select></label>`}
+      ${may("scan") && html`<label>Patterns <select value=${sequence} onChange=${(event) => setSequence(event.target.value)}>
+        <option value="">as the rig is set</option>${Object.entries(SEQUENCES).map(([name, words]) => html`<option value=${name}>${words}</option>`)}</select></label>`}
       ${may("scan") && html`<${Limits} typed=${typed} region=${region} change=${change} others=${preset ? null : rig?.scan_defaults?.region} preset=${preset} />`}
       ${!may("scan") && html`<p class="quiet">Your key is for looking only.</p>`}
       ${blocked && html`<p class="warning">${blocked} ${rig?.calibrated === false && html`<a href="#/calibrate">Calibrate</a>`}</p>`}

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Black, Gray, LineShift, Pattern, PatternSequence, Primary, Size, White, telling_bits
+from slrig.model import (
+    Axis,
+    Black,
+    Gray,
+    LineShift,
+    Pattern,
+    PatternSequence,
+    Primary,
+    SequenceName,
+    Size,
+    White,
+    telling_bits,
+    telling_lines,
+)
+from slrig.model.patterns import FEWEST_STEPS
 from slrig.patterns.gray import gray_bits, gray_profile
 from slrig.patterns.line_shift import line_profile
 
@@ -19,35 +34,66 @@ the rendered plane the rms is 19.2 µm with cells of 1 px and 4.2 µm with 2; be
 scene it is 19.1, 13.5 and 14.3 µm with 1, 2 and 3 px, and 2 px cover most."""
 
 
+@dataclass(frozen=True, slots=True)
+class SequenceOptions:
+    """What a named sequence plays.
+
+    period_px : of the lines; steps : into how many shifts the period is divided, None for one of each pixel.
+    line_width_px : None for half of the period. inverses : whether each bit is followed by its inverse. closing : how
+    many of white and black end the sequence.
+    """
+
+    period_px: int
+    steps: int | None
+    line_width_px: int | None
+    inverses: bool
+    closing: int
+
+
+SEQUENCES: Mapping[SequenceName, SequenceOptions] = {
+    SequenceName.FAST: SequenceOptions(period_px=6, steps=3, line_width_px=None, inverses=False, closing=0),
+    SequenceName.STANDARD: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=False, closing=1),
+    SequenceName.ROBUST: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=True, closing=2),
+}
+"""Chosen by `tests/bench/line_sweep.py` and proven by `tests/bench/fault_campaign.py`; `slrig/scan/README.md` has what
+each costs and gives.
+"""
+
+
 def scan_patterns(
     size: Size,
     *,
     line_shift: bool,
     period_px: int,
-    line_width_px: int,
+    steps: int | None = None,
+    line_width_px: int | None,
     gray_cell_px: int | None,
     gray_offset_px: int,
     rows: bool,
     columns: bool = True,
     coloured_light: bool = False,
+    inverses: bool = True,
+    closing: int = 2,
 ) -> tuple[Pattern, ...]:
     """List the patterns of one scan in the order of play.
 
-    White, black; for columns, then for rows, as far as they are asked for: the Gray bits, each followed by its inverse,
-    first `telling_bits`, most significant first, and after the n line frames the rest; white, black again. The two
-    pairs of white and black bracket everything that can drift. What tells how a camera sees comes first, so that
-    stripes are found while the bits come that only number them.
+    White, black; for columns, then for rows, as far as they are asked for, code and lines; white, black again, as far
+    as `closing` says. What tells how a camera sees comes first, `telling_bits` and without inverses `telling_lines`, so
+    that stripes are found while the bits come that only number them.
 
-    size : the projector. line_shift : False leaves the line frames out: a Gray-only scan. period_px, line_width_px : n
-    and the width of a line. gray_cell_px : None stands for ⌊n/2⌋, or `GRAY_ONLY_CELL_PX` without line shift.
-    gray_offset_px : added to a position before it is cut into cells: moves the cell edges. rows, columns : the axes to
-    play. coloured_light : white in red, green and blue as well, each between two of the last frames of code: so an
-    old frame in the place of any of them, or of the one after it, does not pass for it.
+    size : the projector. line_shift : False leaves the line frames out: a Gray-only scan. period_px : n. steps : the
+    number of line frames, which divide the period evenly; None stands for n. line_width_px : of a line; None stands for
+    ⌊n/2⌋: of all widths it has the strongest first harmonic at a given exposure, 4/π of a sine's, and frames half a
+    period apart are each other's inverse. gray_cell_px : None stands for ⌊n/2⌋, or `GRAY_ONLY_CELL_PX` without line
+    shift. gray_offset_px : added to a position before it is cut into cells: moves the cell edges. rows, columns : the
+    axes to play. inverses : each bit is followed by its inverse. coloured_light : white in red, green and blue as well,
+    each between two of the last frames of code: so an old frame in the place of any of them, or of the one after it,
+    does not pass for it.
 
-    Raises PatternError: a code that cannot tell the lines of one frame apart, or a pattern that does not fit the
-    projector.
+    Raises PatternError: a code that cannot tell the lines of one frame apart, steps that do not divide the period, or a
+    pattern that does not fit the projector.
 
-    >>> options = dict(line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False)
+    >>> options = dict(line_width_px=None, gray_cell_px=None, gray_offset_px=0, rows=False)
     >>> patterns = scan_patterns(Size(1280, 800), line_shift=True, period_px=8, **options)
     >>> len(patterns), patterns[2]
     (30, Gray(axis=<Axis.COLUMN: 'column'>, bit=0, bits=9, cell_px=4, offset_px=0, inverted=False, kind='gray'))
@@ -58,25 +104,35 @@ def scan_patterns(
             f"a Gray cell of {cell_px} px cannot number lines that are {period_px} px apart: a cell edge that is "
             f"slightly off moves a stripe by a whole period; use gray_cell_px ≤ {period_px // 2} or a longer period"
         )
-    bracket: tuple[Pattern, ...] = (White(), Black())
+    steps = period_px if steps is None else steps
+    if line_shift and (steps < FEWEST_STEPS or period_px % steps):
+        raise PatternError(
+            f"lines {period_px} px apart cannot be shifted in {steps} equal steps of whole pixels; use a number from "
+            f"{FEWEST_STEPS} on that divides the period, or a period that is a multiple of {max(steps, FEWEST_STEPS)}"
+        )
+    width_px = line_width_px if line_width_px is not None else period_px // 2
+    ends: tuple[Pattern, ...] = (White(), Black())
     middle: list[Pattern] = []
     for axis in [each for each, played in ((Axis.COLUMN, columns), (Axis.ROW, rows)) if played]:
-        code = _gray_patterns(axis, size.along(axis), cell_px, gray_offset_px)
-        shifts = range(period_px) if line_shift else ()
+        shifts = range(0, period_px, period_px // steps) if line_shift else ()
+        lines = [LineShift(axis, shift, period_px, width_px) for shift in shifts]
+        first = list(chain.from_iterable(telling_lines(lines)))
+        code = _gray_patterns(axis, size.along(axis), cell_px, gray_offset_px, inverses=inverses)
         telling = telling_bits(code[0].bits)
         middle += [each for each in code if each.bit in telling]
-        middle += [LineShift(axis, shift, period_px, line_width_px) for shift in shifts]
+        middle += [*first, *(line for line in lines if line not in first)] if not inverses else lines
         middle += [each for each in code if each.bit not in telling]
     if coloured_light:
         between = [at for at, pair in enumerate(pairwise(middle), 1) if all(isinstance(each, Gray) for each in pair)]
         for light, at in zip((Primary("blue"), Primary("green"), Primary("red")), reversed(between), strict=False):
             middle.insert(at, light)
-    return (*bracket, *middle, *bracket)
+    return (*ends, *middle, *ends[:closing])
 
 
-def _gray_patterns(axis: Axis, extent_px: int, cell_px: int, offset_px: int) -> list[Gray]:
+def _gray_patterns(axis: Axis, extent_px: int, cell_px: int, offset_px: int, *, inverses: bool) -> list[Gray]:
     bits = gray_bits(extent_px, cell_px, offset_px)
-    return [Gray(axis, bit, bits, cell_px, offset_px, inverted) for bit in range(bits) for inverted in (False, True)]
+    kinds = (False, True) if inverses else (False,)
+    return [Gray(axis, bit, bits, cell_px, offset_px, inverted) for bit in range(bits) for inverted in kinds]
 
 
 def united(sequences: Sequence[PatternSequence]) -> PatternSequence:

@@ -10,7 +10,8 @@ from uuid import UUID
 
 from slrig.bundle.stage import TurnedBy
 from slrig.errors import ConfigError, setting
-from slrig.model import Axis, FlipRule, Region, bracket_fault
+from slrig.model import Axis, FlipRule, Region, SequenceName, bracket_fault
+from slrig.patterns.sequence import SEQUENCES, SequenceOptions
 
 MOST_TURN_DEG = 3600.0
 """Ten turns either way: more is a slip, and winds up the cables of what stands on a stage."""
@@ -28,20 +29,42 @@ class Progress(Protocol):
 class PatternPlan:
     """Which patterns to play: see `slrig.patterns.sequence.scan_patterns`.
 
-    `line_shift_period_px` n; `gray_cell_px` defaults to ⌊n/2⌋, so that a code edge may be off by n/4 px.
-    `line_shift` False gives a Gray-only scan, whose cell defaults to 2 px. `rows` True plays columns and rows, False
-    columns alone, and None what the calibration asks for: columns for devices side by side, rows for devices above one
-    another; see `slrig.scan.light_axis.played_axes`. `codes` False plays white and black alone: enough for poses that
-    calibrate cameras without the projector, and for no scan.
+    sequence : what stands where the other options say nothing; see `SEQUENCES` there. line_shift : False gives a
+    Gray-only scan. line_shift_period_px : n. line_steps : the number of line frames. line_width_px : of a line.
+    gray_cell_px : None stands for ⌊n/2⌋, so that a code edge may be off by n/4 px, or without lines for 2.
+    inverses : each bit is followed by its inverse; None stands for True without lines, which prove bits otherwise.
+    rows : True plays columns and rows, False columns alone, and None what the calibration asks for: columns for
+    devices side by side, rows for devices above one another; see `slrig.scan.light_axis.played_axes`. codes : False
+    plays white and black alone: enough for poses that calibrate cameras without the projector, and for no scan.
     """
 
+    sequence: SequenceName = SequenceName.STANDARD
     line_shift: bool = True
-    line_shift_period_px: int = 8
-    line_width_px: int = 1
+    line_shift_period_px: int | None = None
+    line_steps: int | None = None
+    line_width_px: int | None = None
     gray_cell_px: int | None = None
     gray_offset_px: int = 0
+    inverses: bool | None = None
     rows: bool | None = None
     codes: bool = True
+
+    def __post_init__(self) -> None:
+        # Requests and stored plans bring plain text.
+        object.__setattr__(self, "sequence", SequenceName(self.sequence))
+
+    @property
+    def named(self) -> SequenceOptions:
+        """The sequence with what this plan says otherwise."""
+        usual = SEQUENCES[self.sequence]
+        inverses = usual.inverses or not self.line_shift if self.inverses is None else self.inverses
+        return SequenceOptions(
+            period_px=self.line_shift_period_px or usual.period_px,
+            steps=self.line_steps or usual.steps,
+            line_width_px=self.line_width_px or usual.line_width_px,
+            inverses=inverses,
+            closing=max(usual.closing, 2 if inverses else 0),
+        )
 
 
 @dataclass(frozen=True, slots=True)

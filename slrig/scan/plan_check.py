@@ -32,11 +32,15 @@ def pattern_sequence(
     if recorded and plan == PatternPlan():
         return encode(recorded, size)
     axes = played_axes(plan.rows, calibration, cameras, axis=axis)
+    named = plan.named
     patterns = scan_patterns(
         size,
         line_shift=plan.line_shift,
-        period_px=plan.line_shift_period_px,
-        line_width_px=plan.line_width_px,
+        period_px=named.period_px,
+        steps=named.steps,
+        inverses=named.inverses,
+        closing=named.closing,
+        line_width_px=named.line_width_px,
         gray_cell_px=plan.gray_cell_px,
         gray_offset_px=plan.gray_offset_px,
         rows=plan.codes and Axis.ROW in axes,

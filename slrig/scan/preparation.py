@@ -115,8 +115,9 @@ def sample_scan() -> tuple[Capture, Calibration]:
     """Frames of a wavy sheet with a hole in it, as one camera beside a projector sees them, and the calibration."""
     camera, projector = _device(0.0), _device(_BASELINE_MM)
     patterns = scan_patterns(
-        _SIZE, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
-    )
+        _SIZE, line_shift=True, period_px=8, line_width_px=None, gray_cell_px=None, gray_offset_px=0, rows=False,
+        inverses=False, closing=1,
+    )  # fmt: skip
     column, lit = _seen_columns(camera, projector)
     noise = np.random.default_rng(0)
     shots = []

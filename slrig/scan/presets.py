@@ -16,21 +16,21 @@ from slrig.bundle.scan_options import PRESET_NAME, Preset, PresetDocument
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, PresetNotFoundError
+from slrig.model import SequenceName
 
 MOST_PRESET_BYTES = 2**20
 
 SHIPPED: Mapping[str, Preset] = {
-    "matt": Preset(description="matt and light: plaster, paint, 3-D prints", exposure_factors=(1.0,), line_width_px=2),
-    "dark": Preset(
-        description="dark, with lighter parts: rubber, black plastic", exposure_factors=(1.0, 8.0), line_width_px=2
+    "matt": Preset(description="matt and light: plaster, paint, 3-D prints", exposure_factors=(1.0,)),
+    "dark": Preset(description="dark, with lighter parts: rubber, black plastic", exposure_factors=(1.0, 8.0)),
+    "shiny": Preset(description="glossy: machined metal, varnish", exposure_factors=(0.25, 2.0)),
+    "mixed": Preset(description="dark here and shining there", exposure_factors=(0.0625, 0.5, 4.0)),
+    "fast": Preset(
+        description="least time, for matt and light objects", exposure_factors=(0.5,), sequence=SequenceName.FAST
     ),
-    "shiny": Preset(description="glossy: machined metal, varnish", exposure_factors=(0.25, 2.0), line_width_px=2),
-    "mixed": Preset(description="dark here and shining there", exposure_factors=(0.0625, 0.5, 4.0), line_width_px=2),
-    "fast": Preset(description="least time, for matt and light objects", exposure_factors=(0.5,), line_shift=False),
     "precise": Preset(
         description="least noise, for objects that stand still",
         exposure_factors=(0.0625, 0.25, 1.0, 4.0),
-        line_width_px=2,
     ),
 }
 """Factors, because seconds mean nothing on another rig: they are of the exposure at which a light matt object comes

@@ -25,6 +25,7 @@ from slrig.config import read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import NothingToReconstructError, ScanEvidenceError
+from slrig.model import SequenceName
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.exposure_look import Looking
 from slrig.scan.exposure_proposal import Proposal, proposal
@@ -57,16 +58,16 @@ FACTORS = (
 )  # fmt: skip
 USUAL = {"matt": (1,), "dark": (1, 8), "shiny": (1 / 4, 2), "mixed": (1 / 16, 1 / 2, 4)}
 PATTERNS = {
-    "lines of 2 px": PatternPlan(line_width_px=2),
-    "period 4": PatternPlan(line_shift_period_px=4),
-    "period 6": PatternPlan(line_shift_period_px=6),
-    "period 16, lines of 2 px": PatternPlan(line_shift_period_px=16, line_width_px=2),
+    "fast": PatternPlan(sequence=SequenceName.FAST),
+    "robust": PatternPlan(sequence=SequenceName.ROBUST),
+    "lines of 1 px": PatternPlan(line_width_px=1),
+    "period 16": PatternPlan(line_shift_period_px=16),
     "Gray code alone": PatternPlan(line_shift=False),
-    "columns and rows, lines of 2 px": PatternPlan(line_width_px=2, rows=True),
+    "columns and rows": PatternPlan(rows=True),
 }
 
 
-QUICK = ("lines of 2 px", "period 4", "Gray code alone")
+QUICK = ("fast", "Gray code alone")
 
 
 @dataclass(frozen=True, slots=True)

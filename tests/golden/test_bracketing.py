@@ -71,8 +71,9 @@ def test_a_bracket_is_more_complete_and_no_less_exact_than_any_of_its_exposures(
     assert 0.85 < truth["error_over_sigma_p68"] < 1.35
     assert truth["false_area_0.5mm"] == 0
     camera = report["cameras"]["left"]
-    assert camera["refused_pixels"]["saturated"] == 0
-    assert report["identity"] == "26/26 patterns verified"
+    # Wide lines are as bright as white: in the glints the shortest exposure clips, too.
+    assert camera["refused_pixels"]["saturated"] < 0.01 * camera["decoded_pixels"]
+    assert report["identity"] == "18/18 patterns verified"
     uses = camera["exposures"]
     assert [use["exposure_s"] for use in uses] == list(EXPOSURES_S)
     assert [use["light"] for use in uses] == pytest.approx([1, 1, 1], abs=0.01)

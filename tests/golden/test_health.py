@@ -128,4 +128,5 @@ def test_rows_of_another_frame_are_damage(recorded: Bundle) -> None:
     shots = (*capture.shots[:index], replace(shot, image=image), *capture.shots[index + 1 :])
     damaged = Capture(capture.projector, capture.patterns, capture.cameras, shots)
     (found,) = check_capture(damaged).faults
-    assert "its lines are not where the Gray code says" in found
+    assert "shift 2 of 8): on " in found
+    assert "its light is not what the other line frames draw" in found

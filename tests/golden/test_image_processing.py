@@ -132,12 +132,12 @@ LIGHTS = {
     "creeping exposure": Light({"exposure_drift": 0.0015}, rms=1.1),
     "rolling bands": Light({"line_time_s": 3e-5}, head="ambient = 0.1\nambient_flicker_depth = 0.3", rms=2.3),
     # Sharp at the ball; on the wall behind it the projector's spread is 1.5 px more, and the camera's 1.0 px. The rms,
-    # 40.2 and 57.3 µm, is that of the shadow's border, where the projector's spread is wider than what is refused; the
+    # 38.8 and 57.3 µm, is that of the shadow's border, where the projector's spread is wider than what is refused; the
     # median error is 10 µm. 1.10 and 1.39 times what is stated.
     # The projector's focus changes with the slope here, and lines would tell 0.56 px of blur for 0.67; but slopes are
     # so even that what is expected stands.
     "focus over depth": Light(
-        {"focus_mm": 540.0, "defocus_px": 9.5}, {"focus_mm": 570.0, "defocus_px": 15.0}, rms=4.9, sigma=1.5
+        {"focus_mm": 540.0, "defocus_px": 9.5}, {"focus_mm": 570.0, "defocus_px": 15.0}, rms=5.0, sigma=1.5
     ),
 }
 
@@ -207,6 +207,6 @@ def test_light_of_a_bench_is_not_shot_again_and_the_surface_is_as_good(tmp_path:
 def test_automatic_exposure_is_refused_in_words(tmp_path: Path) -> None:
     stepped = Light(faults="[head.faults]\nexposure_step_frames = [9]\nexposure_step = 0.75\n")
     with pytest.raises(
-        ScanEvidenceError, match=r"7[3-7]% of the light of white and black, evenly .* automatic exposure"
+        ScanEvidenceError, match=r"light changed by -2[3-7]% of white since this pattern .* automatic exposure"
     ):
         scanned(rig_of(tmp_path / "rig", stepped), plan=PatternPlan())

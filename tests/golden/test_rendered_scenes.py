@@ -31,7 +31,7 @@ def test_a_rendered_scene_meets_its_figures(name: str, scan_of: Callable[[str], 
     assert truth["rms_mm"] <= 0.016
     assert truth["p99_mm"] <= 0.06
     assert truth["complete_0.1mm"] >= 0.95
-    assert truth["complete_0.3mm"] >= 0.955
+    assert truth["complete_0.3mm"] >= 0.953
     assert truth["gross_fraction"] <= 0.0005
     assert truth["false_area_0.5mm"] <= 0.001
     # Two cameras see two surfaces where one looks behind what the other sees: there a second layer is no fault.

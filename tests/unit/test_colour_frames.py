@@ -150,7 +150,7 @@ def test_a_scan_keeps_colour_of_white_and_black_where_a_camera_has_it_and_makes_
     captured(fake := coloured_rig(), tmp_path / "bundle", sink := Sink())
     capture = read_bundle(tmp_path / "bundle").capture
     for shots in (sink.shots, capture.shots):
-        assert sum(shot.colour is not None for shot in shots) == fake.cameras["left"].coloured == 4
+        assert sum(shot.colour is not None for shot in shots) == fake.cameras["left"].coloured == 3
         for shot in shots:
             assert (shot.colour is not None) == (shot.camera == "left" and is_end(capture, shot))
             if shot.colour is not None:
@@ -163,7 +163,7 @@ def test_colour_of_a_refused_frame_is_not_kept(tmp_path: Path) -> None:
     listed = {each.colour_file for each in open_bundle(tmp_path / "bundle")._description.frames} - {None}
     there = {str(path.relative_to(tmp_path / "bundle")) for path in (tmp_path / "bundle").rglob("*-colour.png")}
     assert there == listed
-    assert len(listed) == 4
+    assert len(listed) == 3
 
 
 def test_colour_is_left_out_or_refused_by_the_plan(tmp_path: Path) -> None:

@@ -242,7 +242,7 @@ def facts(size: Size = SMALL, bit_depth: int = 8) -> RigFacts:
 def test_plan_takes_as_many_bytes_as_it_plays_frames() -> None:
     plain = facts()
     one = check_plan(ScanPlan(exposure_s=0.01), plain)
-    assert one == check_plan(ScanPlan(), plain) == 2 * 22 * 200 * 100
+    assert one == check_plan(ScanPlan(), plain) == 2 * 16 * 200 * 100
     assert check_plan(ScanPlan(exposures_s=(0.01, 0.02, 0.04)), plain) == 3 * one
     assert check_plan(ScanPlan(exposures_s=(0.01, 0.02, 0.04)), facts(bit_depth=12)) == 6 * one
     lit = replace(plain, projector=replace(plain.projector, lights=True))
@@ -259,7 +259,7 @@ BRACKET_S = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032)
         (ScanPlan(exposures_s=(0.01, 0.2)), r"exposures_s: 0\.2 s .*'left' can do 0\.001 s to 0\.1 s"),
         (ScanPlan(exposure_s=0.0002), r"exposure_s: 0\.0002 s .*'left' can do 0\.001 s to 0\.1 s"),
         (ScanPlan(coloured_light=True), "no lights of its own"),
-        (ScanPlan(exposures_s=BRACKET_S), r"would take 10\.8 GB, a bundle holds 4\.3 GB.*fewer exposures"),
+        (ScanPlan(exposures_s=BRACKET_S), r"would take 7\.9 GB, a bundle holds 4\.3 GB.*fewer exposures"),
     ],
 )
 def test_plan_must_fit_the_devices(plan: ScanPlan, words: str) -> None:

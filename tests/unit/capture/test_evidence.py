@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,9 @@ from slrig.capture.code_checks import line_sum, rougher
 from slrig.capture.evidence import Evidence, EvidenceSummary, check_capture
 from slrig.capture.sampling import Sampler
 from slrig.errors import ScanEvidenceError
-from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White
+from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, SequenceName, Shot, Size, White
+from slrig.scan.plan import PatternPlan
+from slrig.scan.plan_check import pattern_sequence
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, add, patterns_for
 
 PATTERNS = patterns_for()
@@ -32,6 +34,10 @@ def judged(scene: Scene, shots: Sequence[Shot], patterns: Sequence[Pattern] = PA
     for shot in shots:
         add(evidence, shot)
     return evidence
+
+
+def judged_summary(shots: Sequence[Shot], patterns: Sequence[Pattern]) -> EvidenceSummary:
+    return check_capture(Capture(PROJECTOR, tuple(patterns), {"left": SCENE.format}, tuple(shots)))
 
 
 def recorded(shots: Sequence[Shot]) -> Capture:
@@ -129,10 +135,13 @@ def test_other_sequences_are_understood(
 @pytest.mark.parametrize(
     ("patterns", "proven"),
     [
-        (tuple(p for p in PATTERNS if not (isinstance(p, Gray) and p.inverted)), lambda p: not isinstance(p, Gray)),
+        (
+            tuple(p for p in patterns_for(line_shift=False) if not (isinstance(p, Gray) and p.inverted)),
+            lambda p: not isinstance(p, Gray),
+        ),
         (tuple(p for p in PATTERNS if isinstance(p, Gray)), lambda _: False),
     ],
-    ids=["without inverses no bit", "without white and black nothing"],
+    ids=["without inverses and lines no bit", "without white and black nothing"],
 )
 def test_what_no_frame_speaks_for_is_not_proven(
     patterns: tuple[Pattern, ...], proven: Callable[[Pattern], bool]
@@ -140,6 +149,88 @@ def test_what_no_frame_speaks_for_is_not_proven(
     summary = judged(SCENE, SCENE.shots(patterns), patterns).summary()
     assert (summary.patterns, summary.faults) == (len(patterns), ())
     assert summary.verified == sum(map(proven, patterns))
+
+
+# ---- sequences without inverses: bits are proven by lines
+
+SINGLE = {
+    name: pattern_sequence(PatternPlan(sequence=name), PROJECTOR).patterns
+    for name in (SequenceName.STANDARD, SequenceName.FAST)
+}
+
+
+@pytest.mark.parametrize("sequence", SINGLE)
+@pytest.mark.parametrize("name", SCENES)
+def test_bits_without_inverses_are_proven_by_the_lines(name: str, sequence: SequenceName) -> None:
+    scene, patterns = SCENES[name], SINGLE[sequence]
+    summary = judged(scene, scene.shots(patterns), patterns).summary()
+    assert (summary.patterns, summary.faults) == (len(patterns), ())
+    if name in PROVEN:
+        assert summary.verified == len(patterns)
+
+
+@pytest.mark.parametrize("sequence", SINGLE)
+def test_a_single_frame_that_is_not_what_it_claims_is_refused(sequence: SequenceName) -> None:
+    patterns = SINGLE[sequence]
+    shots = SCENE.shots(patterns)
+    passed = []
+    for index, spoil in product(range(2, len(patterns) - (sequence is SequenceName.STANDARD)), SPOILS):
+        image = spoil(shots, index)
+        changed = np.mean(np.abs(image.astype(float) - shots[index].image)) > 5
+        if changed and not judged_summary(with_image(shots, index, image), patterns).faults:
+            passed.append((index, spoil.__name__))
+    assert passed == []
+
+
+@pytest.mark.parametrize("sequence", SINGLE)
+def test_any_two_frames_in_each_others_place_are_refused(sequence: SequenceName) -> None:
+    patterns = SINGLE[sequence]
+    shots = SCENE.shots(patterns)
+    passed = []
+    for one, other in combinations(range(len(patterns)), 2):
+        if patterns[one] == patterns[other]:
+            continue
+        swapped = with_image(with_image(shots, one, shots[other].image), other, shots[one].image)
+        if not judged_summary(swapped, patterns).faults:
+            passed.append((patterns[one], patterns[other]))
+    assert passed == []
+
+
+def test_of_a_bit_that_lines_contradict_the_bit_is_blamed() -> None:
+    patterns = SINGLE[SequenceName.STANDARD]
+    shots = SCENE.shots(patterns)
+    index = patterns.index(Gray(Axis.COLUMN, 3, 5, 4))
+    image = shots[index].image.copy()
+    image[60:110] = shots[1].image[60:110]
+    evidence = Evidence(patterns, {"left": SCENE.format})
+    found = [each for shot in with_image(shots, index, image) for each in evidence.contradictions(shot)]
+    assert [index in each.suspects and len(each.suspects) < 3 for each in found] == [True]
+    assert "have a code that their lines contradict" in found[0].cause
+    evidence.retract("left", found[0].suspects)
+    assert [each for suspect in found[0].suspects for each in evidence.contradictions(shots[suspect])] == []
+    assert evidence.summary().verified == len(patterns)
+
+
+def test_what_the_scene_itself_does_is_no_fault_when_it_comes_again() -> None:
+    """Light that a wall of a hollow sends to another turns a bit over wherever it falls, in every exposure."""
+    patterns = SINGLE[SequenceName.STANDARD]
+    shots = SCENE.shots(patterns)
+    index = patterns.index(Gray(Axis.COLUMN, 2, 5, 4))
+
+    def lit_by_a_wall() -> Shot:
+        image = SCENE.shots(patterns)[index].image.copy()
+        image[100:120] = shots[0].image[100:120]
+        return replace(shots[index], image=image)
+
+    evidence = Evidence(patterns, {"left": SCENE.format})
+    found = [each for shot in with_image(shots, index, lit_by_a_wall().image) for each in evidence.contradictions(shot)]
+    (first,) = found
+    evidence.retract("left", first.suspects)
+    again = [each for i in sorted(first.suspects) for each in evidence.contradictions(
+        lit_by_a_wall() if i == index else shots[i]
+    )]  # fmt: skip
+    assert again == []
+    assert evidence.summary().verified < len(patterns)
 
 
 # ---- white and black
@@ -503,6 +594,29 @@ def test_damage_to_white_or_black_shows_by_the_end(index: int, damage: Spoil, wh
     found = check_capture(recorded(with_image(shots, index, damage(shots, index))))
     # Black that is darker still shows nothing: it is as dark as the room in truth.
     assert (found.faults == ()) == (index in {1, COUNT - 1} and damage is black_rows)
+
+
+@pytest.mark.parametrize("sequence", SINGLE)
+@pytest.mark.parametrize(
+    ("index", "damage"), [(0, garbled), (0, black_rows), (0, bright_rows), (1, garbled), (1, bright_rows)]
+)
+def test_lines_tell_damage_to_white_and_black(index: int, damage: Spoil, sequence: SequenceName) -> None:
+    """Rows of a white frame that are full look like an exposure that is too long: lines tell that it is not."""
+    scene, patterns = Scene(noise_dn=1.0, white=0.6), SINGLE[sequence]
+    shots = scene.shots(patterns)
+    assert judged_summary(with_image(shots, index, damage(shots, index)), patterns).faults
+
+
+def test_a_line_frame_with_rows_of_another_is_named_by_the_others() -> None:
+    """Lines at a quarter of their period light half of every cell: the code says nothing of them."""
+    patterns = SINGLE[SequenceName.STANDARD]
+    shots = Scene(noise_dn=4.0, white=0.3).shots(patterns)
+    index, other = (patterns.index(LineShift(Axis.COLUMN, shift, 8, 4)) for shift in (2, 5))
+    image = shots[index].image.copy()
+    image[60:110] = shots[other].image[60:110]
+    (fault,) = judged_summary(with_image(shots, index, image), patterns).faults
+    assert f"pattern {index} " in fault
+    assert "its light is not what the other line frames draw" in fault
 
 
 def test_an_opening_frame_that_shows_half_of_white_is_found_by_the_closing_one() -> None:

@@ -75,7 +75,7 @@ def same_points(part: Mesh, whole: Mesh, kept: Any) -> None:
     distance, _ = KDTree(whole.vertices_mm).query(part.vertices_mm)
     sigma = float(np.median(whole.sigma_mm))
     assert np.quantile(distance, 0.5) < 0.05 * sigma
-    assert np.quantile(distance, 0.98) < 0.5 * sigma
+    assert np.quantile(distance, 0.95) < 0.5 * sigma
     # The boundary is moved by the paper's smoothing, and a region has more of it.
     assert abs(len(part.vertices_mm) / np.count_nonzero(kept) - 1) < 0.02
     assert np.median(part.sigma_mm) == pytest.approx(np.median(whole.sigma_mm[kept]), rel=0.1)

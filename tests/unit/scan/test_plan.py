@@ -129,7 +129,7 @@ def test_a_sequence_holds_the_patterns_of_these_axes_and_no_others(
     coded = [pattern for pattern in sequence.patterns if isinstance(pattern, Gray | LineShift)]
     assert {pattern.axis for pattern in coded} == axes
     assert {pattern.axis for pattern in coded if isinstance(pattern, LineShift)} == axes
-    assert len(coded) == len(sequence) - 4
+    assert len(coded) == len(sequence) - 3
 
 
 @pytest.mark.parametrize(("bit_depth", "colour", "sample_bytes"), [(8, False, 1), (12, False, 2), (8, True, 1)])
@@ -138,8 +138,8 @@ def test_frames_take_as_many_bytes_as_they_have_samples(bit_depth: int, colour: 
     camera = replace(TameCamera().info, format=CameraFormat(size, bit_depth), colour=colour)
     facts = RigFacts({"cam0": camera}, TameProjector().info, None)
     frames = len(pattern_sequence(PatternPlan(), facts.projector.size))
-    # White and black, shown at the beginning and at the end, are kept in colour, too.
-    images = frames + (3 * 4 if colour else 0)
+    # White, black and the closing white are kept in colour, too.
+    images = frames + (3 * 3 if colour else 0)
     assert check_plan(ScanPlan(), facts) == images * 640 * 480 * sample_bytes
     assert check_plan(ScanPlan(exposures_s=(0.01, 0.02)), facts) == 2 * images * 640 * 480 * sample_bytes
 
