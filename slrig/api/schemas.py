@@ -71,7 +71,8 @@ class PatternRequest(Strict):
     )
     inverses: bool | None = Field(
         default=None,
-        description="play each bit of the code with its inverse. Default: the sequence's, and true without lines",
+        description="play each bit of the code with its inverse. Default: the sequence's, and true without lines of "
+        "half their period",
     )
     rows: bool | None = Field(
         default=None,

@@ -284,9 +284,10 @@ class FrameVerifier:
         if found or not isinstance(pattern, Gray):
             return found
         lines = [
-            self._frames[i] for p, i in self.found.firsts.items() if isinstance(p, LineShift) and p.axis is pattern.axis
-        ]
-        # Lines have edges everywhere, and bits have fewer.
+            self._frames[i] for p, i in self.found.firsts.items()
+            if isinstance(p, LineShift) and p.axis is pattern.axis and p.lights_half
+        ]  # fmt: skip
+        # Lines have edges everywhere, and bits have fewer. Those of narrow lines are less high.
         rough = code_checks.rougher(self._frames[index], lines, ref, noise=self._noise) if lines else None
         if rough is not None:
             return [self._says(index, rough, [index], self._unproven_reference)]

@@ -32,7 +32,7 @@ class PatternPlan:
     sequence : what stands where the other options say nothing; see `SEQUENCES` there. line_shift : False gives a
     Gray-only scan. line_shift_period_px : n. line_steps : the number of line frames. line_width_px : of a line.
     gray_cell_px : None stands for ⌊n/2⌋, so that a code edge may be off by n/4 px, or without lines for 2.
-    inverses : each bit is followed by its inverse; None stands for True without lines, which prove bits otherwise.
+    inverses : each bit is followed by its inverse; None stands for True unless lines of half their period prove bits.
     rows : True plays columns and rows, False columns alone, and None what the calibration asks for: columns for
     devices side by side, rows for devices above one another; see `slrig.scan.light_axis.played_axes`. codes : False
     plays white and black alone: enough for poses that calibrate cameras without the projector, and for no scan.
@@ -57,11 +57,13 @@ class PatternPlan:
     def named(self) -> SequenceOptions:
         """The sequence with what this plan says otherwise."""
         usual = SEQUENCES[self.sequence]
-        inverses = usual.inverses or not self.line_shift if self.inverses is None else self.inverses
+        period_px, width_px = self.line_shift_period_px or usual.period_px, self.line_width_px or usual.line_width_px
+        proven = self.line_shift and (2 * width_px == period_px if width_px else period_px % 2 == 0)
+        inverses = usual.inverses or not proven if self.inverses is None else self.inverses
         return SequenceOptions(
-            period_px=self.line_shift_period_px or usual.period_px,
+            period_px=period_px,
             steps=self.line_steps or usual.steps,
-            line_width_px=self.line_width_px or usual.line_width_px,
+            line_width_px=width_px,
             inverses=inverses,
             closing=max(usual.closing, 2 if inverses else 0),
         )

@@ -22,6 +22,7 @@ from slrig.model import (
     Gray,
     LineShift,
     Pinhole,
+    SequenceName,
     Size,
     share_across,
     told_depth,
@@ -130,6 +131,26 @@ def test_a_sequence_holds_the_patterns_of_these_axes_and_no_others(
     assert {pattern.axis for pattern in coded} == axes
     assert {pattern.axis for pattern in coded if isinstance(pattern, LineShift)} == axes
     assert len(coded) == len(sequence) - 3
+
+
+@pytest.mark.parametrize(
+    ("plan", "inverses"),
+    [
+        (PatternPlan(), False),
+        (PatternPlan(sequence=SequenceName.FAST), False),
+        (PatternPlan(sequence=SequenceName.ROBUST), True),
+        (PatternPlan(inverses=True), True),
+        # What proves no bit: no lines, lines that are narrow, and half of an odd period, which is none.
+        (PatternPlan(line_shift=False), True),
+        (PatternPlan(line_width_px=1), True),
+        (PatternPlan(line_shift_period_px=9), True),
+        (PatternPlan(line_shift_period_px=12), False),
+        (PatternPlan(line_width_px=1, inverses=False), False),
+    ],
+)
+def test_bits_come_with_inverses_where_lines_do_not_prove_them(plan: PatternPlan, inverses: bool) -> None:
+    bits = [each for each in pattern_sequence(plan, Size(64, 48)).patterns if isinstance(each, Gray)]
+    assert any(each.inverted for each in bits) == inverses
 
 
 @pytest.mark.parametrize(("bit_depth", "colour", "sample_bytes"), [(8, False, 1), (12, False, 2), (8, True, 1)])
