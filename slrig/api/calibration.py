@@ -37,7 +37,7 @@ from slrig.bundle.description import CAMERA_NAME
 from slrig.bundle.free_text import FreeText, SafeText
 from slrig.calibrate.calibrating import EXPORTS
 from slrig.calibrate.pose_shooting import PoseRequest
-from slrig.calibrate.records import PoseRecord, SessionRecord, pose_of
+from slrig.calibrate.records import USUAL_PATTERNS, PoseRecord, SessionRecord, pose_of
 from slrig.calibrate.store import REPORT, picture_name
 from slrig.calibration.board import USUAL_BOARD, Board, BoardKind
 from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
@@ -87,9 +87,11 @@ def open_calibration(
 ) -> CalibrationBody:
     """Open a calibration session for a board. Touches no device."""
     patterns = pattern_plan(request.patterns, service.scan_defaults)
-    if request.patterns.rows is None:
-        patterns = replace(patterns, rows=True)
-    patterns = replace(patterns, codes=request.projector)
+    # A pose is shot once and counts for long: its rows and its sequence are not what scans of the rig play.
+    usual = {
+        key: getattr(USUAL_PATTERNS, key) for key in ("rows", "sequence") if getattr(request.patterns, key) is None
+    }
+    patterns = replace(patterns, **usual, codes=request.projector)
     board = USUAL_BOARD if request.board is None else request.board.board()
     record = service.calibrations.open(board, label=request.label, patterns=patterns)
     response.headers["Location"] = f"/calibration/{record.id}"

@@ -68,8 +68,9 @@ def test_calibration_is_opened_shot_solved_and_used(calibrating: TestClient, ser
     assert (made["state"], made["label"], made["poses"]) == ("open", "spring", 0)
     named = {"marker_mm": None, "dictionary": None, "square_sigma": 0.001, "aspect": 1.0}
     assert made["board"] == {**BOARD, **named, "title": "chessboard 4x3, 10 mm"}
-    # Both axes unless the request says otherwise; the rest as the rig file says.
+    # Both axes, and each bit with its inverse, unless the request says otherwise; the rest as the rig file says.
     assert made["patterns"]["rows"] is True
+    assert made["patterns"]["sequence"] == "robust"
     assert (made["patterns"]["line_width_px"], made["patterns"]["line_shift_period_px"]) == (2, 6)
     assert refusal(client, "GET", f"{here}/coverage.png")[0] == 409
     quiet = client.get(made["links"]["events"])
