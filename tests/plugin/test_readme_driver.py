@@ -88,7 +88,8 @@ def test_without_its_time_rule_it_would_not(tmp_path: Path) -> None:
         return text.replace(RULE, "True")
 
     report = run(before_a_stage(loaded(tmp_path, unruly)), sequence(), checks=[named("read_passes_over_stale_frames")])
-    assert "drop those that began before" in failures(report)[0]
+    # Which of the two it is goes by how long the machine takes to come to the frame.
+    assert re.search("drop those that began before|delivers frames of an earlier pattern", failures(report)[0])
 
 
 def test_as_it_stands_it_shows_its_ramp(tmp_path: Path) -> None:
