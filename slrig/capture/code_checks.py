@@ -516,11 +516,13 @@ def line_shape(
     bins = np.minimum((around * _SHAPE_BINS).astype(np.intp), _SHAPE_BINS - 1)
     swing = (light - light.mean(axis=0)) / np.maximum(height, _LEAST_HEIGHT)
     every = np.arange(_SHAPE_BINS)
-    off = swing - np.array([_median_of(swing[(bins == each) & clear]) for each in every])[bins]
-    # Edges that are sharp differ by how pixels lie on them.
+    shape = np.array([_median_of(swing[(bins == each) & clear]) for each in every])
+    off = swing - shape[bins]
+    # Within its bin an edge rises, and edges that are sharp differ by how pixels lie on them.
+    rise = np.abs(np.roll(shape, -1) - np.roll(shape, 1))[bins] / 2
     spread = 1.4826 * np.array([_median_of(np.abs(off[(bins == each) & clear])) for each in every])[bins]
     slack = np.maximum(
-        np.maximum(_LEAST_ODD, _SHAPE_SPREADS * spread), 5 * noise / (ref.contrast[ref.judged] * height + 1e-6)
+        np.maximum(_LEAST_ODD + rise, _SHAPE_SPREADS * spread), 5 * noise / (ref.contrast[ref.judged] * height + 1e-6)
     )
     wrong = (np.abs(off) > slack) & clear
     worst = int(np.argmax(np.count_nonzero(wrong, axis=1)))
