@@ -425,6 +425,8 @@ class FrameVerifier:
 
     def _repetition(self, index: int, pattern: Pattern, ref: Reference) -> list[Contradiction]:
         own = {pattern, White(), Black()}
+        # A bit of narrow cells may light what lines do.
+        own |= {each for each in self._patterns if _light_of(each) == _light_of(pattern)}
         kin = Primary if isinstance(pattern, Primary) else ()
         earlier = [
             i for i in self._frames
@@ -513,6 +515,11 @@ def _run_px(pattern: Gray | LineShift) -> int:
     if not isinstance(pattern, Gray):
         return pattern.line_width_px
     return pattern.cell_px << (pattern.bits - pattern.bit if pattern.bit else pattern.bits - 1)
+
+
+def _light_of(pattern: Pattern) -> Pattern:
+    """The pattern, or the lines that light the same."""
+    return (pattern.as_lines or pattern) if isinstance(pattern, Gray) else pattern
 
 
 def _code_of(pattern: Gray) -> tuple[Axis, int, int, int]:

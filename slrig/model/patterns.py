@@ -76,6 +76,15 @@ class Gray:
         """The bit that is lit where this one is dark."""
         return replace(self, inverted=not self.inverted)
 
+    @property
+    def as_lines(self) -> LineShift | None:
+        """The lines that light the same, half as wide as their period; None of the first bit, which lights one side."""
+        if self.bit == 0:
+            return None
+        run_px = self.cell_px << (self.bits - self.bit)
+        shift = (run_px // 2 - self.offset_px + run_px * self.inverted) % (2 * run_px)
+        return LineShift(self.axis, shift, 2 * run_px, run_px)
+
 
 def divides_period(lines: Sequence[LineShift]) -> bool:
     """Whether the shifts of lines divide their period evenly, into three or more. lines : by shift."""

@@ -18,6 +18,7 @@ from slrig.capture.evidence import Evidence, EvidenceSummary, check_capture
 from slrig.capture.sampling import Sampler
 from slrig.errors import ScanEvidenceError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, SequenceName, Shot, Size, White
+from slrig.patterns.sequence import encode
 from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, add, patterns_for
@@ -167,6 +168,17 @@ def test_bits_without_inverses_are_proven_by_the_lines(name: str, sequence: Sequ
     assert (summary.patterns, summary.faults) == (len(patterns), ())
     if name in PROVEN:
         assert summary.verified == len(patterns)
+
+
+def test_a_bit_that_lights_what_lines_do_is_no_repetition() -> None:
+    """With cells of one pixel the second finest bit but one is lit as lines of period 8 and 4 px are."""
+    patterns = pattern_sequence(PatternPlan(gray_cell_px=1), PROJECTOR).patterns
+    bits = [each for each in patterns if isinstance(each, Gray) and each.as_lines in patterns]
+    assert len(bits) == 1
+    summary = judged(SCENE, SCENE.shots(patterns), patterns).summary()
+    assert (summary.faults, summary.verified) == ((), len(patterns))
+    whole = encode([bits[0], bits[0].as_lines or bits[0]], PROJECTOR)
+    np.testing.assert_array_equal(*(np.broadcast_to(each, PROJECTOR.shape) for each in whole.profiles))
 
 
 @pytest.mark.parametrize("sequence", SINGLE)
