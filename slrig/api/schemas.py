@@ -61,7 +61,7 @@ class PatternRequest(Strict):
         "and `robust` one for each pixel of the distance",
     )
     line_width_px: Annotated[int, Field(ge=1, le=256)] | None = Field(
-        default=None, description="Default: the sequence's; of `fast` and `standard` half the line period"
+        default=None, description="of a line, projector pixels. Default: half the line period"
     )
     gray_cell_px: Annotated[int, Field(ge=1, le=1024)] | None = Field(
         default=None, description="width of the finest Gray cell. Default: half the line period, or 2 without lines"

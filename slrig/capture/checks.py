@@ -32,7 +32,7 @@ BAND_SAMPLES = 300
 
 _LIT_SAMPLES = 40
 
-_NEARLY_FULL = 0.97
+NEARLY_FULL = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
 
 _ALIKE = 0.02
 """Of a frame's own variation: lines that are blurred to three times their width differ by more from step to step."""
@@ -166,7 +166,7 @@ def reference(
     lit = contrast >= threshold_dn
     usable = lit & (white < full_scale)
     # Noise makes of a clipped sample one that is nearly full, and of half of its light more than half of it is seen.
-    clear = usable & (white < _NEARLY_FULL * full_scale)
+    clear = usable & (white < NEARLY_FULL * full_scale)
     if np.count_nonzero(clear) >= BAND_SAMPLES * BANDS:
         usable = clear
     judged = usable & (contrast >= np.median(contrast[usable]))

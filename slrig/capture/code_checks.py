@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from slrig.capture.checks import (
     BAND_SAMPLES,
     BANDS,
+    NEARLY_FULL,
     Chosen,
     Reference,
     Samples,
@@ -65,7 +66,6 @@ _NEAR_EDGE, _NEARER = 0.8, 0.2  # of white over black, by which a bit swings bes
 _SURE_OF_WAVE = 5.0  # standard deviations
 _LEAST_WAVE = 0.03  # of white over black, for each line; sharp lines have 0.32
 _LIT_BY_LINES = 0.1
-_NEARLY_FULL = 0.97
 _LEAST_ENDS_OFF, _LEAST_ABOVE = 0.3, 0.15  # of what lines light of a pixel, from dark to bright
 
 
@@ -298,7 +298,7 @@ def agreement(
     offset_px: int,
     noise: float,
 ) -> Agreement:
-    """Hold the place within its period that lines tell of each pixel against the cell of the code.
+    """Compare the phase of the lines at each pixel with the cell that the code gives.
 
     A single wrong bit, whichever it is, moves the index by an odd number of cells, and half a period where a cell is as
     wide as that: an error of any one frame of the code shows at every pixel where it turned the bit over.
@@ -313,7 +313,7 @@ def agreement(
     off_px = (np.angle(waves) / abs(turn) - centre_px + period_px / 2) % period_px - period_px / 2
     told = code.sure & clear
     wrong = told & (np.abs(off_px) > cell_px / 2 + period_px / 16)
-    # Which edge of its cell a pixel lies nearer to is told by the bit that changes there: it is the less clear one.
+    # The bit that changes at an edge of the cell swings least beside it: so it shows which edge a pixel is nearer to.
     swing = np.abs(code.differences) / ref.contrast
     before, after = (swing[_changing_bit(code, step), np.arange(len(code.index))] for step in (-1, 1))
     beside = told & (np.minimum(before, after) < _NEAR_EDGE) & (np.abs(before - after) > _NEARER)
@@ -371,8 +371,8 @@ def ends_fault(
         second = np.sort(stack, axis=0)[[1, -2]]
         reach = second[1] - second[0]
     # What is clipped adds up to less.
-    clear = stack.max(axis=0) < _NEARLY_FULL * full_scale
-    clipped = white >= _NEARLY_FULL * full_scale
+    clear = stack.max(axis=0) < NEARLY_FULL * full_scale
+    clipped = white >= NEARLY_FULL * full_scale
     lit = clear & (reach >= max(threshold_dn, _LIT_BY_LINES * float(np.percentile(reach, 99))))
     told = ~clipped[lit]
     if np.count_nonzero(told) < BAND_SAMPLES:

@@ -18,12 +18,11 @@ from enum import StrEnum
 import numpy as np
 
 from slrig.bundle.refused import Refused
-from slrig.capture.checks import NOISE_FLOOR_DN, Samples, named
+from slrig.capture.checks import NEARLY_FULL, NOISE_FLOOR_DN, Samples, named
 from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.capture.sampling import Sampler
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
 
-NEARLY_FULL = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
 _ROUNDED = 1e-6  # of a refresh period: a range that is stated as whole ones is
 _MOST_SATURATED = 0.9  # of what is lit, as `checks.lighting` has it
 _LEAST_LIT = 40  # samples, as `checks` has it

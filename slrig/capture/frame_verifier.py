@@ -39,8 +39,7 @@ class Findings:
 
     verified : the patterns whose frames passed a test that another pattern would fail. light_drift : largest change of
     the light between two frames of one pattern, as a share of white. sums : of the last pair of a bit and its inverse.
-    sound : a pair of a bit or of lines and their inverse has added up to white and black, or lines alone have, which
-    vouches for these two.
+    sound : a pair of a bit or of lines and their inverse has added up to white and black, which vouches for these two.
     lined : axes of which a line frame lay where the Gray code says, which vouches for the code.
     """
 
