@@ -160,6 +160,10 @@ SINGLE = {
 }
 
 
+IN_TURN = [SequenceName.FAST, pytest.param(SequenceName.STANDARD, marks=pytest.mark.slow)]
+"""The shorter one; the other in the long run."""
+
+
 @pytest.mark.parametrize("sequence", SINGLE)
 @pytest.mark.parametrize("name", SCENES)
 def test_bits_without_inverses_are_proven_by_the_lines(name: str, sequence: SequenceName) -> None:
@@ -181,7 +185,7 @@ def test_a_bit_that_lights_what_lines_do_is_no_repetition() -> None:
     np.testing.assert_array_equal(whole.image(0), whole.image(1))
 
 
-@pytest.mark.parametrize("sequence", SINGLE)
+@pytest.mark.parametrize("sequence", IN_TURN)
 def test_a_single_frame_that_is_not_what_it_claims_is_refused(sequence: SequenceName) -> None:
     patterns = SINGLE[sequence]
     shots = SCENE.shots(patterns)
@@ -194,7 +198,7 @@ def test_a_single_frame_that_is_not_what_it_claims_is_refused(sequence: Sequence
     assert passed == []
 
 
-@pytest.mark.parametrize("sequence", SINGLE)
+@pytest.mark.parametrize("sequence", IN_TURN)
 def test_any_two_frames_in_each_others_place_are_refused(sequence: SequenceName) -> None:
     patterns = SINGLE[sequence]
     shots = SCENE.shots(patterns)
