@@ -30,7 +30,8 @@ class PatternPlan:
     """Which patterns to play: see `slrig.patterns.sequence.scan_patterns`.
 
     sequence : what stands where the other options say nothing; see `SEQUENCES` there. line_shift : False gives a
-    Gray-only scan. line_shift_period_px : n. line_steps : the number of line frames. line_width_px : of a line.
+    Gray-only scan. line_shift_period_px : n. line_steps : the number of line frames; None stands for that of the
+    sequence, or the next number that divides n. line_width_px : of a line.
     gray_cell_px : None stands for ⌊n/2⌋, so that a code edge may be off by n/4 px, or without lines for 2.
     inverses : each bit is followed by its inverse; None stands for True unless lines of half their period prove bits.
     rows : True plays columns and rows, False columns alone, and None what the calibration asks for: columns for
@@ -60,9 +61,13 @@ class PatternPlan:
         period_px, width_px = self.line_shift_period_px or usual.period_px, self.line_width_px or usual.line_width_px
         proven = self.line_shift and (2 * width_px == period_px if width_px else period_px % 2 == 0)
         inverses = usual.inverses or not proven if self.inverses is None else self.inverses
+        steps = self.line_steps or usual.steps
+        if not self.line_steps and steps:
+            # Of a period of its own the fewest steps that divide it.
+            steps = next((each for each in range(steps, period_px) if period_px % each == 0), period_px)
         return SequenceOptions(
             period_px=period_px,
-            steps=self.line_steps or usual.steps,
+            steps=steps,
             line_width_px=width_px,
             inverses=inverses,
             closing=max(usual.closing, 2 if inverses else 0),

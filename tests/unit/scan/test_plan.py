@@ -153,6 +153,12 @@ def test_bits_come_with_inverses_where_lines_do_not_prove_them(plan: PatternPlan
     assert any(each.inverted for each in bits) == inverses
 
 
+@pytest.mark.parametrize(("period_px", "frames"), [(None, 3), (7, 7), (8, 4), (9, 3), (10, 5)])
+def test_a_period_of_its_own_has_the_fewest_frames_of_lines_that_divide_it(period_px: int | None, frames: int) -> None:
+    plan = PatternPlan(sequence=SequenceName.FAST, line_shift_period_px=period_px)
+    assert sum(isinstance(each, LineShift) for each in pattern_sequence(plan, Size(64, 48)).patterns) == frames
+
+
 @pytest.mark.parametrize(("bit_depth", "colour", "sample_bytes"), [(8, False, 1), (12, False, 2), (8, True, 1)])
 def test_frames_take_as_many_bytes_as_they_have_samples(bit_depth: int, colour: bool, sample_bytes: int) -> None:
     size = Size(640, 480)
