@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import FloatArray, Pattern, Refusal
+from slrig.model import FloatArray, IntArray, Pattern, Refusal
 from slrig.reconstruction.asked import AskedPixels, without_others
 from slrig.reconstruction.coded import Coded, cell_width_px, code_edge_points, line_image, not_yet_coded
 from slrig.reconstruction.correlation import edge_sum, phase_sum
@@ -21,7 +21,7 @@ from slrig.reconstruction.identification import identify
 from slrig.reconstruction.limits import CodeTables, Limits
 from slrig.reconstruction.linking import StripeEnsemble, link
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.phase import position_map
+from slrig.reconstruction.phase import line_step_px, position_map
 from slrig.reconstruction.placing import placed
 from slrig.reconstruction.resolution import lost_lines, unresolved_bits
 from slrig.reconstruction.response import in_light
@@ -36,6 +36,8 @@ from slrig.reconstruction.stripes import (
 _FINEST_SCALE_PX = 1.0  # at 0.7 px, stripes of 0.7 px are found to 0.027 px rms, at 1.0 px to 0.008
 _COARSEST_SCALE_PX = 2.5  # chosen; half and double give the same figures of a rendered vase, refined by phase
 _REACH_PX = 16  # of the widest filter, 9 px, and of what a point may lie beside its pixel
+_POINTS_TO_JUDGE = 4_000  # of a frame: their median is known to a thirtieth of their scatter
+_BAND_ROWS, _MOST_APART = 8, 16  # of sampled rows; one of so many rows at least
 _LEAST_SMOOTHED_PX = 1.4  # stripe and filter together: see `_matched_scale_px`
 
 
@@ -184,13 +186,15 @@ class CameraStream:
             if self._scales is None:
                 # The first frame tells for all.
                 coded = coded.summed(coded.frames.lines[:1], phase_sum(coded.frames, coded.searched))
-            image, deviation = line_image(coded, len(self._points))
-            lit = coded.searched
+            rows = _sampled_rows(coded)
+            image, deviation = line_image(coded, len(self._points), rows.index)
+            lit = coded.searched[rows.index]
             if self._scales is None:
-                blur_px = measured_sigma_px(image, deviation, lit)
+                blur_px = measured_sigma_px(image, deviation, lit & rows.inner)
                 self._scales = _Scales(self._limits.stripes.sigma_px or _matched_scale_px(blur_px), blur_px)
             scale_px = self._scales.filter_px
-            self._points.append(stripe_points(image, deviation, lit, self._limits.stripes, sigma_px=scale_px))
+            points = stripe_points(image, deviation, lit & rows.inner, self._limits.stripes, sigma_px=scale_px)
+            self._points.append(rows.placed(points))
         return coded
 
 
@@ -207,6 +211,52 @@ def camera_curves(
     """Reconstruct the curves of one camera; `entered`, `noise` and `asked` as for `CameraStream`."""
     stream = CameraStream(FrameStacks.of(frames), tables, limits, entered=entered, noise=noise, asked=asked)
     return stream.finish()[0]
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """The rows of an image in which a filter looks for points: all, or bands with what its window needs beside them.
+
+    index : (n,) of the image's rows, or a slice of all; inner : (n, 1) bool, those in which points are looked for.
+    """
+
+    index: IntArray | slice
+    inner: NDArray[np.bool_] | Literal[True]
+
+    def placed(self, points: LinePoints) -> LinePoints:
+        """Points that were found in these rows alone, where they are in the image."""
+        if isinstance(self.index, slice):
+            return points
+        row = np.rint(points.points_px[:, 1]).astype(np.intp)
+        points.points_px[:, 1] += self.index[row] - row
+        return points
+
+
+_ALL_ROWS = _Rows(slice(None), inner=True)
+
+
+def _is_sampled(frames: AxisFrames) -> bool:
+    """Whether a filter looks for some of the points only: those of lines of half their period, of which the phase at
+    each pixel has all. By narrow lines it has a part in each point.
+    """
+    patterns = frames.line_patterns
+    return line_step_px(patterns) is not None and patterns[0].lights_half
+
+
+def _sampled_rows(coded: Coded) -> _Rows:
+    """Bands of rows in which each frame has enough points for `refinement.refined` to judge its light by."""
+    frames = coded.frames
+    if not _is_sampled(frames):
+        return _ALL_ROWS
+    points = int(np.count_nonzero(coded.searched)) // frames.line_patterns[0].period_px
+    apart = _BAND_ROWS * min(points // _POINTS_TO_JUDGE, _MOST_APART)
+    if apart <= _BAND_ROWS + 2 * _REACH_PX:
+        return _ALL_ROWS
+    row = np.arange(len(frames.white))
+    away = np.abs((row - apart // 2) % apart - (_BAND_ROWS - 1) / 2)
+    near = (away < _BAND_ROWS / 2 + _REACH_PX) | (away > apart - _BAND_ROWS / 2 - _REACH_PX)
+    index = np.flatnonzero(near).astype(np.int32)
+    return _Rows(index, (away[index] < _BAND_ROWS / 2)[:, None])
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +283,13 @@ def _curves(
     """
     frames = coded.frames
     entered("refine stripes")
-    best = placed(coded, found, scales.blur_px, tables, limits, stacks.let_lines_go)
+    sampled = _is_sampled(frames)
+    best = placed(coded, found, scales.blur_px, tables, limits, stacks.let_lines_go, sampled=sampled)
+    if sampled and not best.refined:
+        best.points[:] = [
+            stripe_points(*line_image(coded, index), coded.searched, limits.stripes, sigma_px=scales.filter_px)
+            for index in range(len(frames.lines))
+        ]
     points, code, near_shadow, near_step = best.points, best.code, best.near_shadow, best.near_step
     entered("identify stripes")
     shortest = limits.stripes.shortest_points

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import Refusal
+from slrig.model import IntArray, Refusal
 from slrig.reconstruction.compression import loss_variance
 from slrig.reconstruction.correlation import PixelSum, shared_noise
 from slrig.reconstruction.decoding import CodeMap, lit_pixels
@@ -25,6 +25,8 @@ from slrig.reconstruction.stripes import (
     normalised_kernel,
     normalised_line,
 )
+
+_WHOLE = slice(None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +109,13 @@ def cell_width_px(coded: Coded) -> float | NDArray[np.float32]:
     return float(cell_px) if coded.unresolved is None else cell_px * np.exp2(coded.unresolved, dtype=np.float32)
 
 
-def line_image(coded: Coded, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Line frame `index` relative to white, and its noise."""
-    frames, noise = coded.frames, coded.position_noise
-    line = frames.lines[index].astype(np.float32, copy=False)
+def line_image(
+    coded: Coded, index: int, rows: IntArray | slice = _WHOLE
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Some rows of line frame `index` relative to white, and its noise."""
+    alone = replace(coded.frames, lines=coded.frames.lines[index : index + 1], bits=(), inverses=None)
+    frames, noise = alone.rows(rows), coded.position_noise.rows(rows)
+    line = frames.lines[0].astype(np.float32, copy=False)
     if noise.read_share is None:
         return normalised_line(
             line, frames.white, frames.black, noise.read_variance, noise.slope, frames.ends_repeats

@@ -23,6 +23,7 @@ from slrig.model import (
     Black,
     Capture,
     Gray,
+    IntArray,
     LineShift,
     Pattern,
     Shot,
@@ -64,7 +65,7 @@ def band_rows(images: Images, columns: int) -> int:
     return max(16, _BAND_BYTES // (4 * columns * max(len(images), 1)))
 
 
-def at_rows(values: Any, rows: slice) -> Any:
+def at_rows(values: Any, rows: slice | IntArray) -> Any:
     """Some rows of (H, W) values; what is not an array holds for all."""
     return values[rows] if isinstance(values, np.ndarray) else values
 
@@ -140,7 +141,7 @@ class AxisFrames:
         """(H, W) float32: white minus black, the light that the projector adds."""
         return self.white - self.black
 
-    def rows(self, rows: slice) -> AxisFrames:
+    def rows(self, rows: slice | IntArray) -> AxisFrames:
         """Some rows of all images."""
         return replace(
             self,

@@ -6,7 +6,6 @@ column in the frame that the point was found in. A chain is cut where the column
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, Refusal
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.stripes import LinePoints, Stripes, gathered
+from slrig.reconstruction.stripes import Stripes, gathered
 
 _AMBIGUOUS_LINE = int(Refusal.AMBIGUOUS_LINE)
 _BEYOND_PROJECTOR = int(Refusal.BEYOND_PROJECTOR)
@@ -68,9 +67,8 @@ def identify(
     return CodedStripes(Stripes(offsets, stripes.frame[chains], *cut), position), refusal
 
 
-def with_refused_points(
+def with_refused_pixels(
     code: CodeMap,
-    found: Sequence[LinePoints],
     frames: AxisFrames,
     position: NDArray[np.float32],
     position_of: FloatArray,
@@ -78,10 +76,10 @@ def with_refused_points(
     near_step: NDArray[np.bool_],
     /,
 ) -> CodeMap:
-    """The code map with the causes of those points marked that a filter found and that the refinement leaves out.
+    """The code map with the causes of those pixels marked in which the refinement makes no point.
 
-    Arguments as for `identify`; found : the points of each line frame, as the filter found them; position : (H, W)
-    float32, that of `phase.position_map`, NaN where a line frame is clipped.
+    Arguments as for `identify`; position : (H, W) float32, that of `phase.position_map`, NaN where a line frame is
+    clipped.
     """
     refusal = code.refusal.copy()
     clipped = np.zeros(refusal.shape, dtype=np.bool_)
@@ -91,33 +89,33 @@ def with_refused_points(
             clipped[first:last] |= image[first:last] >= frames.clipped_at
 
     in_bands(clip, len(clipped))
-    for index, points in enumerate(found):
-        cause = np.zeros(len(points.points_px), dtype=np.uint8)
-        in_bands(
-            _cause_kernel, len(cause), points.points_px, position_of[index], code, clipped, position,
-            near_shadow, near_step, cause,
-        )  # fmt: skip
-        # One after another: the last of the points that share a pixel stands.
-        refused = np.flatnonzero(cause)
-        columns, rows = np.rint(points.points_px[refused]).astype(np.int32).T
-        refusal[rows, columns] = cause[refused]
+    by_cell = np.ascontiguousarray(position_of.T)
+    in_bands(_cause_kernel, len(refusal), by_cell, code, clipped, position, near_shadow, near_step, refusal)
     return code._replace(refusal=refusal)
 
 
 @kernel
 def _cause_kernel(
-    first: int, last: int, points: Any, position_of: Any, code: Any, clipped: Any, position: Any,
-    near_shadow: Any, near_step: Any, cause: Any,
+    first: int, last: int, by_cell: Any, code: Any, clipped: Any, position: Any, near_shadow: Any, near_step: Any,
+    refusal: Any,
 ) -> None:  # fmt: skip
-    """Fill in why each point of a frame is refused, 0 where it is not."""
-    for i in range(first, last):
-        x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
-        if code.lowest[y, x] < 0:
-            continue
-        low, high = position_of[code.lowest[y, x]], position_of[code.highest[y, x]]
-        cause[i] = _cause(low, high, near_shadow[y, x], near_step[y, x])
-        if not cause[i] and np.isnan(position[y, x]) and clipped[y, x]:
-            cause[i] = _SATURATED
+    """Fill in why a pixel has no point, by the line that is nearest to it."""
+    frames = by_cell.shape[1]
+    for y in range(first, last):
+        for x in range(position.shape[1]):
+            lowest, highest = code.lowest[y, x], code.highest[y, x]
+            if lowest < 0:
+                continue
+            here, frame, nearest = position[y, x], 0, np.inf
+            for k in range(frames):
+                away = abs(by_cell[lowest, k] - here)
+                if away < nearest:
+                    frame, nearest = k, away
+            cause = _cause(by_cell[lowest, frame], by_cell[highest, frame], near_shadow[y, x], near_step[y, x])
+            if not cause and np.isnan(here) and clipped[y, x]:
+                cause = _SATURATED
+            if cause:
+                refusal[y, x] = cause
 
 
 @kernel_part(inline="always")

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import FloatArray, coarse_bits
+from slrig.model import FloatArray, IntArray, coarse_bits
 from slrig.reconstruction.frames import AxisFrames, Images, at_rows, sampled
 
 _QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
@@ -66,7 +66,7 @@ class NoiseModel:
         """The variance of a sample of this level of a frame as the camera gives it."""
         return self.read_variance + self.slope * max(level, 0.0)
 
-    def rows(self, rows: slice) -> NoiseModel:
+    def rows(self, rows: slice | IntArray) -> NoiseModel:
         """The noise of some rows."""
         return replace(self, read_share=at_rows(self.read_share, rows), shot_share=at_rows(self.shot_share, rows))
 

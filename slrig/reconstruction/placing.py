@@ -15,7 +15,7 @@ from slrig.reconstruction.coded import Coded, cell_width_px
 from slrig.reconstruction.curvature import freed_of_curvature
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.edges import beside_steps_px, near_edges, near_shadows_of, near_steps
-from slrig.reconstruction.identification import with_refused_points
+from slrig.reconstruction.identification import with_refused_pixels
 from slrig.reconstruction.limits import CodeTables, Limits
 from slrig.reconstruction.phase import line_step_px, position_map
 from slrig.reconstruction.refinement import refined
@@ -39,12 +39,13 @@ class Placed:
 
 def placed(
     coded: Coded, found: list[LinePoints], stripe_blur_px: float, tables: CodeTables, limits: Limits,
-    lines_used: Callable[[], None],
+    lines_used: Callable[[], None], *, sampled: bool,
 ) -> Placed:  # fmt: skip
     """Put the points that were found where the light of all frames puts them, if it was the same in all.
 
     found : is given away. stripe_blur_px : the blur that the stripes' width tells, the projector's included.
     lines_used : is called when the images of lines are needed no more, before what takes most memory begins.
+    sampled : as of `refinement.refined`.
     """
     frames, code, disagreement_px, points = coded.frames, coded.code, np.zeros(0), found
     seen = position_map(frames, coded.position_noise, code, tables.cell_position)
@@ -63,11 +64,10 @@ def placed(
         seen = freed_of_curvature(centred, usable, blur_px**2, period_px)
         displaced_px = np.hypot(beside_steps_px(near_step), beyond_px)
         del centred, beyond_px
-        known = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
-        lines_used()
+        known = with_refused_pixels(code, frames, seen.position, tables.position_of, near_shadow, near_step)
         refinement = refined(
             found, seen, usable, code, tables.position_of, step_px, displaced_px=displaced_px,
-            largest_disagreement_px=limits.largest_disagreement_px,
+            largest_disagreement_px=limits.largest_disagreement_px, sampled=sampled, steady=lines_used,
         )  # fmt: skip
         points, disagreement_px = refinement.points, refinement.disagreement_px
         if refinement.moved:

@@ -8,6 +8,7 @@ own stripes must lie where all frames together put them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -29,6 +30,9 @@ _POINTS_TIED = 5  # by a filter along the stripe: 2√π of its scale, 4.3 point
 _CLEAR_PX = 0.12  # so near to the border of a pixel, a fit of its own might end beyond it
 _LINES_KEPT = 2  # of the lines that begin at one pixel, which are neighbours, these many are remembered
 _MOST_FOR_MEDIAN = 20_000  # tied, their median is known to a fiftieth of their scatter
+_ENDS = 0.5  # cosine between a line and the way to pixels that are not usable, where it ends there
+_BEYOND_PX = 0.25  # half way to the border of the last usable pixel, which is lit to its border
+_WITHIN_PX = 0.49  # of a pixel's centre
 _CROSSING_PX = 0.62  # more than half a pixel: two neighbours' noisy slopes must not both miss a line between them
 
 
@@ -42,11 +46,13 @@ def _crossings(
     landed: NDArray[np.uint8],
     fitted: FittedPoints,
     targets: FloatArray,
+    beyond_px: float = 0.0,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Where lines cross pixels, less those crossings from which a fit would surely land at a pixel that has its point.
 
     position_of : (frames, cells) float64, as for `identify`; step_px : from one frame's lines to the next one's. A line
-    crosses a pixel when it passes within 0.62 px of its centre, along either axis.
+    crosses a pixel when it passes within 0.62 px of its centre, along either axis. beyond_px : by how much a line goes
+    on beyond the centre of the last usable pixel.
     Returns frame (n,) int32, starts_px (n, 2) and targets_px (n,), frame by frame, row by row.
     """
     by_cell = np.ascontiguousarray(position_of.T)
@@ -57,7 +63,7 @@ def _crossings(
     # Line n of them all, counted across the projector, is at first + n steps and in frame n mod frames.
     frame = int(np.flatnonzero(np.isfinite(position_of).any(axis=1))[0])
     first = float(shown[0]) - frame * step_px
-    given = seen.position, usable, code, by_cell, first, float(step_px), started, landed, fitted, targets
+    given = seen.position, usable, code, by_cell, first, float(step_px), beyond_px, started, landed, fitted, targets
     counts = np.zeros((rows, frames), dtype=np.int64)
     crossed = np.zeros(usable.shape, dtype=np.bool_)
     nowhere = np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0)
@@ -72,7 +78,7 @@ def _crossings(
 @kernel
 def _crossing_kernel(
     begin: int, end: int, position: Any, usable: Any, code: Any, by_cell: Any, first: float,
-    step: float, started: Any, landed: Any, fitted: Any, begun_targets: Any,
+    step: float, beyond: float, started: Any, landed: Any, fitted: Any, begun_targets: Any,
     crossed: Any, place: Any, fill: bool, frame: Any, starts: Any, targets: Any,
 ) -> None:  # fmt: skip
     """Count the crossings of each row and frame in `place`, and note the pixels in `crossed`; or put them where `place`
@@ -103,6 +109,16 @@ def _crossing_kernel(
                 dx, dy = miss * gx / squared, miss * gy / squared
                 if abs(dx) > _CROSSING_PX or abs(dy) > _CROSSING_PX:
                     continue
+                if beyond > 0:
+                    # The unit vector along the line, towards pixels that are not usable where it ends here.
+                    ahead_x = int(usable[y, x - 1]) - int(usable[y, x + 1])
+                    ahead_y = int(usable[y - 1, x]) - int(usable[y + 1, x])
+                    length = np.sqrt(squared)
+                    along = (ahead_y * gx - ahead_x * gy) / length
+                    if abs(along) > _ENDS:
+                        further = np.copysign(beyond, along) / length
+                        dx = min(max(dx - further * gy, -_WITHIN_PX), _WITHIN_PX)
+                        dy = min(max(dy + further * gx, -_WITHIN_PX), _WITHIN_PX)
                 i = started[int(np.rint(y + dy)), int(np.rint(x + dx)), k % _LINES_KEPT] - 1
                 if i >= 0 and begun_targets[i] == low:
                     # The same surface was fitted for a point that began here: this one would end beside it, straight
@@ -159,13 +175,16 @@ def refined(
     displaced_px: NDArray[np.float32] | None = None,
     coarsest_px: float = 0.5,
     largest_disagreement_px: float = np.inf,
+    sampled: bool = False,
+    steady: Callable[[], None] = lambda: None,
 ) -> Refinement:
     """Refine the points of all line frames of one axis, which `found` gives away.
 
     Points of mixed light (not `usable`) or of no single line are left out, as are those whose standard deviation
     exceeds coarsest_px pixels. position_of : (frames, cells) float64, as for `identify`; step_px : from one frame's
     lines to the next one's. displaced_px : (H, W), what points err by and no pixels' scatter shows, standard deviation;
-    they state it.
+    they state it. sampled : `found` are a few of the points, which show whether the light was the same in all frames,
+    and all points come from the position map. steady : is called when it was, before what takes most memory begins.
     """
     borders = np.concatenate([[0], np.cumsum([len(each.points_px) for each in found], dtype=np.int64)])
     parts = [slice(a, b) for a, b in pairwise(borders)]
@@ -184,12 +203,19 @@ def refined(
         own = np.ascontiguousarray(points.sigma_px)
         in_bands(_settle_kernel, len(starts), starts, own, clear, coarsest_px, fitted, away)
         disagreement[index] = _sure_median(_drawn(away, fitted.found))
-        _taken_kernel(starts, fitted.points, fitted.found, part.start, index, started, landed)
+        if not sampled:
+            _taken_kernel(starts, fitted.points, fitted.found, part.start, index, started, landed)
     if _differs(disagreement) > largest_disagreement_px:
         unmoved = found.copy()
         found.clear()
         return Refinement(unmoved, disagreement, moved=False)
-    frame, *crossings = _crossings(seen, usable, code, position_of, step_px, started, landed, old, targets)
+    steady()
+    if sampled:
+        found[:] = [points.first(0) for points in found]
+        old, targets, parts = no_points(0), np.zeros(0), [slice(0, 0)] * len(found)
+    frame, *crossings = _crossings(
+        seen, usable, code, position_of, step_px, started, landed, old, targets, _BEYOND_PX if sampled else 0.0
+    )
     # Each step from here on takes as much again.
     del started, targets
     missed = no_points(len(frame))
@@ -307,7 +333,7 @@ def _nothing_taken(frames: int, shape: tuple[int, int]) -> tuple[IntArray, NDArr
     return np.zeros((*shape, _LINES_KEPT), dtype=np.int32), np.zeros((-(-frames // 8), *shape), dtype=np.uint8)
 
 
-@kernel
+@kernel(in_every_scan=False)
 def _taken_kernel(starts: Any, moved: Any, good: Any, first: int, frame: int, started: Any, landed: Any) -> None:
     """Note which good point of a frame began at each pixel (one more than its index), and whether one landed there."""
     slot, word, bit = frame % _LINES_KEPT, frame >> 3, np.uint8(1 << (frame & 7))

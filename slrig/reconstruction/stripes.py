@@ -71,6 +71,13 @@ class LinePoints(NamedTuple):
     strong: NDArray[np.bool_]
     sigma_px: FloatArray
 
+    def first(self, count: int) -> LinePoints:
+        """The first so many of them."""
+        return LinePoints(
+            self.points_px[:count], self.normals[:count], self.strength[:count], self.strong[:count],
+            self.sigma_px[:count],
+        )  # fmt: skip
+
 
 def chained(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
     """The points of each frame linked along their lines; all chains as one value, frame by frame.

@@ -155,6 +155,29 @@ def test_points_of_the_filter_move_onto_their_lines_and_say_how_far(slope: float
         assert points.strength[kept:].max(initial=0.0) < points.strength[:kept].min(initial=1.0)
 
 
+def test_a_sample_tells_of_the_light_and_the_map_gives_all_points() -> None:
+    surface = tilted(0.9, 0.3)
+    here, code = mapped(surface, noise=0.002)
+    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)
+    rows = (np.rint(starts[:, 1]) % 8 == 0) & (starts[:, 1] > 4) & (starts[:, 1] < SHAPE[0] - 5)
+    across = np.array([math.cos(0.3), math.sin(0.3)])
+    found = [points_at(starts[(frame == k) & rows] + 0.05 * (k == 2) * across) for k in range(8)]
+    usable = EVERYWHERE.copy()
+    usable[30:] = False
+    held: list[str] = []
+    sampled = refined(
+        [*found], here, usable, code, POSITION_OF, 1, sampled=True, steady=lambda: held.append("given back")
+    )
+    assert held == ["given back"]
+    assert sampled.disagreement_px[2] == pytest.approx(-0.05, abs=0.02)
+    every = refined([NONE] * 8, here, usable, code, POSITION_OF, 1)
+    for one, other, misses in zip(sampled.points, every.points, on_lines(sampled, surface, 0.9), strict=True):
+        assert len(one.points_px) == len(other.points_px)
+        assert np.abs(misses).max() < 0.02
+        # Lines go on beyond the centre of the last usable pixel, and not beyond its border.
+        assert other.points_px[:, 1].max() < 29.2 < one.points_px[:, 1].max() < 29.5
+
+
 @SLOPES
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_no_pixel_holds_two_points_of_one_line(slope: float, angle_rad: float, share: float) -> None:
