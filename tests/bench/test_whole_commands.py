@@ -71,7 +71,7 @@ def half_a_million(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def twelve_megapixels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """56 frames of 12.6 megapixels: a projector of 1920 x 1200 plays columns and rows."""
+    """37 frames of 12.6 megapixels: a projector of 1920 x 1200 plays columns and rows."""
     text = scaled(scaled(RIG, "[[head.camera]]", 3.1), "[head.projector]", 1.5)
     return rendered(tmp_path_factory.mktemp("large") / "scan", text, ScanPlan(patterns=PatternPlan(rows=True)))
 
@@ -132,6 +132,6 @@ def test_a_large_sensor(twelve_megapixels: Path, tmp_path: Path) -> None:
     cost_of(command)
     mine = median([cost_of(command) for _ in range(3)])
     told(
-        "56 frames of 12.6 megapixels, 4 million points",
+        "37 frames of 12.6 megapixels, 4 million points",
         {"CPU s": (mine.cpu_s, 12.0), "wall s": (mine.wall_s, None), "peak MB": (mine.peak_mb, 1536)},
     )
