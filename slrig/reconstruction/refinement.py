@@ -204,7 +204,7 @@ def refined(
         in_bands(_settle_kernel, len(starts), starts, own, clear, coarsest_px, fitted, away)
         disagreement[index] = _sure_median(_drawn(away, fitted.found))
         if not sampled:
-            _taken_kernel(starts, fitted.points, fitted.found, part.start, index, started, landed)
+            _note_points(starts, fitted, part.start, index, started, landed)
     if _differs(disagreement) > largest_disagreement_px:
         unmoved = found.copy()
         found.clear()
@@ -329,18 +329,20 @@ def _target_kernel(first: int, last: int, points: Any, code: Any, position_of: A
 
 
 def _nothing_taken(frames: int, shape: tuple[int, int]) -> tuple[IntArray, NDArray[np.uint8]]:
-    """What `_taken_kernel` fills in: (H, W, 2) int32, and (frames / 8, H, W) uint8, a bit for each frame."""
+    """What `_note_points` fills in: (H, W, 2) int32, and (frames / 8, H, W) uint8, a bit for each frame."""
     return np.zeros((*shape, _LINES_KEPT), dtype=np.int32), np.zeros((-(-frames // 8), *shape), dtype=np.uint8)
 
 
-@kernel(in_every_scan=False)
-def _taken_kernel(starts: Any, moved: Any, good: Any, first: int, frame: int, started: Any, landed: Any) -> None:
+def _note_points(
+    starts: FloatArray, fitted: FittedPoints, first: int, frame: int, started: IntArray, landed: NDArray[np.uint8]
+) -> None:
     """Note which good point of a frame began at each pixel (one more than its index), and whether one landed there."""
-    slot, word, bit = frame % _LINES_KEPT, frame >> 3, np.uint8(1 << (frame & 7))
-    for i in range(len(starts)):
-        if good[i]:
-            started[int(np.rint(starts[i, 1])), int(np.rint(starts[i, 0])), slot] = first + i + 1
-            landed[word, int(np.rint(moved[i, 1])), int(np.rint(moved[i, 0]))] |= bit
+    good = np.flatnonzero(fitted.found)
+    columns, rows = np.rint(starts[good]).astype(np.intp).T
+    # Of several that begin at a pixel the last one stands.
+    started[rows, columns, frame % _LINES_KEPT] = first + good + 1
+    columns, rows = np.rint(fitted.points[good]).astype(np.intp).T
+    landed[frame >> 3, rows, columns] |= np.uint8(1 << (frame & 7))
 
 
 @kernel_part(inline="always")
