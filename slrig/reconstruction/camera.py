@@ -38,6 +38,7 @@ _COARSEST_SCALE_PX = 2.5  # chosen; half and double give the same figures of a r
 _REACH_PX = 16  # of the widest filter, 9 px, and of what a point may lie beside its pixel
 _POINTS_TO_JUDGE = 4_000  # of a frame: their median is known to a thirtieth of their scatter
 _BAND_ROWS, _MOST_APART = 8, 16  # of sampled rows; one of so many rows at least
+_LEAST_TELLING_PX = 2.0  # a filter so wide sums more pixels than the fit, and a tenth of the error goes (out of focus)
 _LEAST_SMOOTHED_PX = 1.4  # stripe and filter together: see `_matched_scale_px`
 
 
@@ -186,14 +187,18 @@ class CameraStream:
             if self._scales is None:
                 # The first frame tells for all.
                 coded = coded.summed(coded.frames.lines[:1], phase_sum(coded.frames, coded.searched))
-            rows = _sampled_rows(coded)
+                rows = _sampled_rows(coded) if _phase_has_all(coded.frames) else _ALL_ROWS
+                image, deviation = line_image(coded, 0, rows.index)
+                blur_px = measured_sigma_px(image, deviation, coded.searched[rows.index] & rows.inner)
+                filter_px = self._limits.stripes.sigma_px or _matched_scale_px(blur_px)
+                self._scales = _Scales(
+                    filter_px, blur_px, sampled=_phase_has_all(coded.frames) and filter_px < _LEAST_TELLING_PX
+                )
+            scales = self._scales
+            rows = _sampled_rows(coded) if scales.sampled else _ALL_ROWS
             image, deviation = line_image(coded, len(self._points), rows.index)
-            lit = coded.searched[rows.index]
-            if self._scales is None:
-                blur_px = measured_sigma_px(image, deviation, lit & rows.inner)
-                self._scales = _Scales(self._limits.stripes.sigma_px or _matched_scale_px(blur_px), blur_px)
-            scale_px = self._scales.filter_px
-            points = stripe_points(image, deviation, lit & rows.inner, self._limits.stripes, sigma_px=scale_px)
+            lit = coded.searched[rows.index] & rows.inner
+            points = stripe_points(image, deviation, lit, self._limits.stripes, sigma_px=scales.filter_px)
             self._points.append(rows.placed(points))
         return coded
 
@@ -235,9 +240,10 @@ class _Rows:
 _ALL_ROWS = _Rows(slice(None), inner=True)
 
 
-def _is_sampled(frames: AxisFrames) -> bool:
-    """Whether a filter looks for some of the points only: those of lines of half their period, of which the phase at
-    each pixel has all. By narrow lines it has a part in each point.
+def _phase_has_all(frames: AxisFrames) -> bool:
+    """Whether the phase at each pixel gives every point: that of lines of half their period.
+
+    Narrow lines light too little for that, and the filter contributes to each point.
     """
     patterns = frames.line_patterns
     return line_step_px(patterns) is not None and patterns[0].lights_half
@@ -246,8 +252,6 @@ def _is_sampled(frames: AxisFrames) -> bool:
 def _sampled_rows(coded: Coded) -> _Rows:
     """Bands of rows in which each frame has enough points for `refinement.refined` to judge its light by."""
     frames = coded.frames
-    if not _is_sampled(frames):
-        return _ALL_ROWS
     points = int(np.count_nonzero(coded.searched)) // frames.line_patterns[0].period_px
     apart = _BAND_ROWS * min(points // _POINTS_TO_JUDGE, _MOST_APART)
     if apart <= _BAND_ROWS + 2 * _REACH_PX:
@@ -261,10 +265,14 @@ def _sampled_rows(coded: Coded) -> _Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Scales:
-    """Scale of the filter that points were found with, and the blur that the stripes' width tells, px."""
+    """Scale of the filter that points were found with, and the blur by the stripes' width, px.
+
+    sampled : whether the filter looks for some of the points only, as of `refinement.refined`.
+    """
 
     filter_px: float
     blur_px: float
+    sampled: bool = False
 
 
 def _curves(
@@ -283,9 +291,8 @@ def _curves(
     """
     frames = coded.frames
     entered("refine stripes")
-    sampled = _is_sampled(frames)
-    best = placed(coded, found, scales.blur_px, tables, limits, stacks.let_lines_go, sampled=sampled)
-    if sampled and not best.refined:
+    best = placed(coded, found, scales.blur_px, tables, limits, stacks.let_lines_go, sampled=scales.sampled)
+    if scales.sampled and not best.refined:
         best.points[:] = [
             stripe_points(*line_image(coded, index), coded.searched, limits.stripes, sigma_px=scales.filter_px)
             for index in range(len(frames.lines))

@@ -109,6 +109,23 @@ def _crossing_kernel(
                 dx, dy = miss * gx / squared, miss * gy / squared
                 if abs(dx) > _CROSSING_PX or abs(dy) > _CROSSING_PX:
                     continue
+                if beyond > 0 and (abs(dx) > 0.5 or abs(dy) > 0.5):
+                    # Of two pixels that a line passes between, the one to whose centre it is nearer has the point.
+                    nx, ny = int(np.rint(x + dx)), int(np.rint(y + dy))
+                    if 1 <= nx < columns - 1 and 1 <= ny < rows - 1 and usable[ny, nx]:
+                        there = position[ny, nx]
+                        hx = _slope(
+                            position[ny, nx - 1], there, position[ny, nx + 1], usable[ny, nx - 1], usable[ny, nx + 1]
+                        )
+                        hy = _slope(
+                            position[ny - 1, nx], there, position[ny + 1, nx], usable[ny - 1, nx], usable[ny + 1, nx]
+                        )
+                        steep = hx * hx + hy * hy
+                        if steep > LEAST_GRADIENT * LEAST_GRADIENT and by_cell[code.lowest[ny, nx], k] == low:
+                            off_x, off_y = abs((low - there) * hx / steep), abs((low - there) * hy / steep)
+                            first_of_both = ny * columns + nx < y * columns + x
+                            if max(off_x, off_y) <= (_CROSSING_PX if first_of_both else 0.5):
+                                continue
                 if beyond > 0:
                     # The unit vector along the line, towards pixels that are not usable where it ends here.
                     ahead_x = int(usable[y, x - 1]) - int(usable[y, x + 1])
