@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from slrig.meshing.normals import vertex_normals
+from slrig.meshing.surface import vertex_normals
 from slrig.model import FloatArray, IntArray, Mesh
 from slrig.views.turntable import turntable
 from tests.unit.meshing.plain import grid_faces, mesh_of

@@ -20,7 +20,7 @@ from slrig.combine.plan import START_ERROR_MM, GivenPoses, MarkerPoses, Starting
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
 from slrig.kernels import compilations_told
-from slrig.meshing.open_borders import open_borders
+from slrig.meshing import open_borders
 from slrig.model import AlbedoMark, Mesh, StagePlane
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.mesh_formats import encode_mesh_glb
@@ -245,7 +245,7 @@ def _of_model(whole: FusedModel) -> dict[str, Any]:
     """What report.json says of the fused mesh.
 
     sigma_ends_mm : 5 % and 95 % of its vertices are below. seen_by : share of them by how many views tell of each.
-    open : its borders, of holes and of what no view has seen, see `slrig.meshing.open_borders`. marked : vertices whose
+    open : its borders, of holes and of what no view has seen, see `slrig.meshing.topology`. marked : vertices whose
     colour is in doubt, by cause.
     """
     mesh = whole.mesh

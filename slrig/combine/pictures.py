@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from slrig.meshing.topology import used_vertices
+from slrig.meshing import used_vertices
 from slrig.model import FloatArray, Mesh, Pinhole, Size
 from slrig.scan.pictures import captioned, draw_scale, encode_png, side_by_side
 from slrig.scan.shading import Picture, shaded

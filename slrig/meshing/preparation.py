@@ -13,7 +13,7 @@ import threading
 import numpy as np
 
 from slrig.meshing.quality import mesh_figures
-from slrig.meshing.surface import MeshingLimits, finished_mesh
+from slrig.meshing.surface import MeshingLimits, build_surface
 from slrig.model import FlipRule
 
 _CURVES, _POINTS = 16, 40  # a few hundred points: it is compiling that takes the time
@@ -34,7 +34,7 @@ def mesh_sample() -> None:
     depth = 400 + np.sin(curve / 3) * np.cos(along / 7) + 0.3 * random.standard_normal(len(curve))
     points = np.column_stack((curve, 0.5 * along, depth))
     bridge = np.zeros(len(points), dtype=np.bool_)
-    surface = finished_mesh(
+    surface = build_surface(
         points, offsets, curve.astype(np.float64), bridge, np.ones(len(points)), np.zeros(3), _LIMITS,
         entered=lambda _: None,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a camera sees of a mesh, by a z-buffer: the nearest triangle at every pixel, and then the normal there."""
+"""Rasterisation of a mesh by a z-buffer: the nearest triangle at every pixel, and its normal."""
 
 from __future__ import annotations
 
@@ -17,36 +17,33 @@ _FACES_AT_LEAST = 50_000  # in a band: a millisecond of work, as much as it take
 Nearness = TypeVar("Nearness", NDArray[np.float32], NDArray[np.float64])
 
 
-class View(NamedTuple):
+class RasterView(NamedTuple):
     """The nearest triangle at every pixel centre.
 
-    depth_mm : (H, W) float32, along the optical axis, NaN where nothing is seen.
-    face : (H, W) int32, which triangle, -1 where nothing is seen; the first of those that are equally near.
+    depth_mm : (H, W) float32, along the optical axis; NaN without a triangle.
+    face : (H, W) int32, index of the triangle, -1 without one; the first of equally near ones.
     """
 
     depth_mm: NDArray[np.float32]
     face: IntArray
 
 
-def rasterised(placed: NDArray[np.float32], faces: IntArray, size: Size) -> View:
-    """The view of a mesh whose vertices are `placed`, (V, 3) float32: column and row, pixels, and depth, mm.
+def rasterise(placed: NDArray[np.float32], faces: IntArray, size: Size) -> RasterView:
+    """Rasterise a mesh. placed : (V, 3) float32, column and row, pixels, and depth, mm, of its vertices.
 
-    Inverse depth is linear in the picture, so it is what is interpolated.
-    Triangles with a vertex that is not in front of the camera are left out, whole.
+    Interpolates inverse depth, which is linear in the image. Skips triangles with a vertex behind the camera.
     """
     at_least = max(_FACES_AT_LEAST, -(-len(faces) // _MOST_BANDS))
     given = np.ascontiguousarray(placed), np.ascontiguousarray(faces), size.height_px, size.width_px
-    inverse, face = brought_together(in_bands(_z_buffer, len(faces), *given, rows_at_least=at_least))
+    inverse, face = merge_depth_buffers(in_bands(_z_buffer, len(faces), *given, rows_at_least=at_least))
     unseen = inverse == 0
     inverse[unseen] = np.nan
     face[unseen] = -1
-    return View(np.reciprocal(inverse, out=inverse), face)
+    return RasterView(np.reciprocal(inverse, out=inverse), face)
 
 
-def brought_together(pictures: list[tuple[Nearness, IntArray]]) -> tuple[Nearness, IntArray]:
-    """The first of some pictures of inverse depth and triangle, (H, W) each, with what is nearer in the others, which
-    the list loses.
-    """
+def merge_depth_buffers(pictures: list[tuple[Nearness, IntArray]]) -> tuple[Nearness, IntArray]:
+    """Merge pairs of inverse depth and triangle index, (H, W) each; empties the list to save memory."""
     inverse, face = pictures.pop(0)
     while pictures:
         next_inverse, next_face = pictures.pop(0)
@@ -57,20 +54,20 @@ def brought_together(pictures: list[tuple[Nearness, IntArray]]) -> tuple[Nearnes
     return inverse, face
 
 
-def normals_seen(
-    view: View, placed: NDArray[np.float32], normals: NDArray[np.float32], faces: IntArray
+def rasterise_normals(
+    view: RasterView, placed: NDArray[np.float32], normals: NDArray[np.float32], faces: IntArray
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """The normal of the side that is seen, at every pixel of a view of a mesh, and whether that is the front.
+    """Normal of the visible side at every pixel, and whether that side is the front.
 
     Parameters
     ----------
-    placed, faces : as they were given to `rasterised`.
+    placed, faces : the arguments of `rasterise`.
     normals : (V, 3) float32 of the vertices, in any frame; NaN counts as 0.
 
     Returns
     -------
-    normals : (H, W, 3) float32, in that frame, unit, turned round for backs; 0 where nothing is seen.
-    front : (H, W) bool, the triangle is counter-clockwise in the picture.
+    normals : (H, W, 3) float32, in that frame, unit, reversed for backs; 0 without a triangle.
+    front : (H, W) bool, the triangle is counter-clockwise in the image.
     """
     seen, front = np.zeros((*view.face.shape, 3), dtype=np.float32), np.zeros(view.face.shape, dtype=np.bool_)
     given = np.ascontiguousarray(placed), np.ascontiguousarray(normals), np.ascontiguousarray(faces)
@@ -82,7 +79,7 @@ def normals_seen(
 def _z_buffer(
     first: int, last: int, placed: Any, faces: Any, height: int, width: int
 ) -> tuple[NDArray[np.float32], IntArray]:
-    """Inverse depth, 0 where nothing is seen, and number of the nearest among the triangles from first to last."""
+    """Inverse depth, 0 without a triangle, and index of the nearest triangle from first to last."""
     inverse = np.zeros((height, width), dtype=np.float32)
     nearest = np.zeros((height, width), dtype=np.int32)
     for face in range(first, last):

@@ -1,25 +1,145 @@
-"""From curves to the finished mesh, stage by stage (Yang & Chen 2010, section 3): the rows of the paper's Table 1."""
+"""Surface from curves, step by step (Yang & Chen 2010, section 3): strips, edge flips, boundary, normals.
+
+The steps are the rows of the paper's Table 1.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
+from numba import config
 from numpy.typing import NDArray
 
-from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrunk, smoothed
-from slrig.meshing.initial import InitialMesh, initial_mesh
-from slrig.meshing.normals import vertex_normals
-from slrig.meshing.optimisation import Optimised, optimised
-from slrig.model import FlipRule, FloatArray, IntArray
+from slrig.kernels import in_bands, kernel, kernel_part
+from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrink_boundary, smooth_boundary
+from slrig.meshing.flips import EdgeOptimisation, angle_rad, optimise_edges
+from slrig.meshing.strips import InitialMesh, initial_mesh
+from slrig.meshing.topology import used_vertices
+from slrig.model import FlipRule, FloatArray, IntArray, Mesh
+
+_BLOCK = 488  # not a power of two: rows of a page each would share their places in the cache
+
+
+def vertex_normals(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> NDArray[np.float32]:
+    """(V, 3) float32, unit: mean normal of the triangles at each vertex, weighted by their angle there.
+
+    Weighting by angle makes the normal independent of how the surface is cut into triangles
+    (Thürmer and Wüthrich 1998, "Computing vertex normals from polygonal facets").
+    NaN where no triangle with an area meets the vertex.
+    """
+    points = np.ascontiguousarray(vertices_mm, dtype=np.float64)
+    sums = np.zeros((len(points), 3))
+    normals = np.full((len(points), 3), np.nan, dtype=np.float32)
+    parts = config.NUMBA_NUM_THREADS
+    in_bands(_add_normals, parts, points, np.ascontiguousarray(faces), parts, sums)
+    in_bands(_unit_normals, len(points), sums, normals)
+    return normals
+
+
+@kernel_part
+def _weigh_normals(count: int, work: Any) -> None:
+    """From normals as long as twice the area, (0, 1, 2), and the dots of the edges at a and b, (3, 4), of up to _BLOCK
+    triangles, their unit normals and their angles at a, b and c, (3, 4, 5).
+
+    Row r of `work` is work[r * _BLOCK :]. Nothing else stands in this loop, so that it runs in vector registers.
+    """
+    for at in range(count):
+        nx, ny, nz = work[at], work[_BLOCK + at], work[2 * _BLOCK + at]
+        twice_area = np.sqrt(nx * nx + ny * ny + nz * nz)
+        # The cross product of any two edges is twice the area: each angle is atan2(2 A, dot of the edges there).
+        at_a = angle_rad(twice_area, work[3 * _BLOCK + at])
+        at_b = angle_rad(twice_area, work[4 * _BLOCK + at])
+        work[at], work[_BLOCK + at], work[2 * _BLOCK + at] = nx / twice_area, ny / twice_area, nz / twice_area
+        work[3 * _BLOCK + at], work[4 * _BLOCK + at], work[5 * _BLOCK + at] = at_a, at_b, np.pi - at_a - at_b
+
+
+@kernel
+def _add_normals(begin: int, end: int, points: Any, faces: Any, parts: int, sums: Any) -> None:
+    # Each part owns a range of vertices, goes over all faces and adds to its own vertices only: every vertex has its
+    # sum taken in the order of the faces, so the result is the same for any number of threads.
+    for part in range(begin, end):
+        low, high = len(points) * part // parts, len(points) * (part + 1) // parts
+        work, mine = np.zeros(6 * _BLOCK), np.zeros(_BLOCK, dtype=np.int32)
+        face = 0
+        while face < len(faces):
+            count = 0
+            while face < len(faces) and count < _BLOCK:
+                a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                face += 1
+                if not (low <= a < high or low <= b < high or low <= c < high):
+                    continue
+                ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+                vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+                work[count] = uy * vz - uz * vy
+                work[_BLOCK + count] = uz * vx - ux * vz
+                work[2 * _BLOCK + count] = ux * vy - uy * vx
+                work[3 * _BLOCK + count] = ux * vx + uy * vy + uz * vz
+                work[4 * _BLOCK + count] = ux * (ux - vx) + uy * (uy - vy) + uz * (uz - vz)
+                mine[count] = face - 1
+                count += 1
+            _weigh_normals(count, work)
+            for at in range(count):
+                x, y, z = work[at], work[_BLOCK + at], work[2 * _BLOCK + at]
+                # A triangle without an area has no normal: it was divided by zero.
+                if not x * x + y * y + z * z > 0.0:
+                    continue
+                for corner in range(3):
+                    vertex, angle = faces[mine[at], corner], work[(3 + corner) * _BLOCK + at]
+                    if low <= vertex < high:
+                        sums[vertex, 0] += angle * x
+                        sums[vertex, 1] += angle * y
+                        sums[vertex, 2] += angle * z
+
+
+@kernel
+def _unit_normals(first: int, last: int, sums: Any, normals: Any) -> None:
+    for vertex in range(first, last):
+        x, y, z = sums[vertex, 0], sums[vertex, 1], sums[vertex, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        if length > 0.0:
+            normals[vertex, 0], normals[vertex, 1], normals[vertex, 2] = x / length, y / length, z / length
+
+
+def compact_mesh(
+    faces: IntArray,
+    points_mm: FloatArray,
+    normals: NDArray[np.float32],
+    colour: NDArray[np.uint8],
+    mark: NDArray[np.uint8],
+    sigma_mm: FloatArray,
+    offsets: IntArray,
+    position_px: FloatArray,
+    /,
+) -> Mesh:
+    """Mesh of the points that faces use, in their order.
+
+    faces : (F, 3) int32 into points_mm (n, 3) float64; normals (n, 3), colour (n, 3), mark (n,), sigma_mm (n,) of
+    the points.
+    offsets : (c + 1,) int32, curve i holds points offsets[i]:offsets[i + 1], all points belong to one;
+    position_px : (c,) float64, projector column of each curve.
+    """
+    used = used_vertices(faces, len(points_mm))
+    numbers, where = np.cumsum(used, dtype=np.int32) - np.int32(1), np.flatnonzero(used)
+    return Mesh(
+        vertices_mm=np.take(points_mm, where, axis=0).astype(np.float32),
+        faces=numbers[faces],
+        normals=np.take(normals, where, axis=0),
+        colour=np.take(colour, where, axis=0),
+        mark=np.take(mark, where),
+        sigma_mm=np.take(sigma_mm, where).astype(np.float32),
+        stripe=np.take(np.repeat(np.floor(position_px).astype(np.int32), np.diff(offsets)), where),
+    )
+
 
 FIRST_STAGE = "initial meshing"
 
 
 @dataclass(frozen=True, slots=True)
 class MeshingLimits:
-    """How curves become a surface; the fields of the same names of a reconstruction's plan say what they mean.
+    """Options of the meshing; see the fields of the same names in `slrig.scan.plan.ReconstructionPlan`.
 
     widest_step_px : neighbouring curves further apart than this are not meshed together.
     """
@@ -32,8 +152,8 @@ class MeshingLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
-    """The mesh after one stage: a row of the paper's Table 1 but for the time."""
+class MeshStage:
+    """Size of the mesh after one step: a row of the paper's Table 1 without its time."""
 
     name: str
     triangles: int
@@ -41,27 +161,27 @@ class Stage:
 
 
 @dataclass(frozen=True, slots=True)
-class FinishedMesh:
-    """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the eye; normals : (n, 3) float32,
-    unit, NaN for points in no triangle; stages in order.
+class SurfaceMesh:
+    """The surface through the points of all curves.
 
-    steps : what the single steps did, in figures: their own meshes would take several times the memory of the last one.
-    `initial`, `optimisation` (paper, Fig. 10, turn by turn), and `boundary` where that was smoothed.
+    faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the eye; normals : (n, 3) float32, unit,
+    NaN for points without a triangle. stages : in order. steps : statistics of each step: `initial`, `optimisation`
+    (Fig. 10, round by round), and `boundary` if it was smoothed.
     """
 
     faces: IntArray
     normals: NDArray[np.float32]
-    stages: tuple[Stage, ...]
+    stages: tuple[MeshStage, ...]
     steps: Mapping[str, Mapping[str, object]]
 
-    def of_points(self, kept: NDArray[np.bool_], step: str, /) -> FinishedMesh:
-        """The triangles all of whose points are kept, (n,) bool; `step` names this one among `steps`."""
+    def with_points(self, kept: NDArray[np.bool_], step: str, /) -> SurfaceMesh:
+        """Keep the triangles whose three points are kept, (n,) bool; `step` is the name of this step in `steps`."""
         faces = self.faces[kept[self.faces].all(axis=1)]
         dropped = {"points": int(np.count_nonzero(~kept)), "triangles": len(self.faces) - len(faces)}
         return replace(self, faces=faces, steps={**self.steps, step: dropped})
 
 
-def finished_mesh(
+def build_surface(
     points_mm: FloatArray,
     offsets: IntArray,
     position_px: FloatArray,
@@ -73,19 +193,19 @@ def finished_mesh(
     *,
     entered: Callable[[str], None],
     runs: IntArray | None = None,
-) -> FinishedMesh:
-    """Mesh the curves: strips and what is dropped of them, global optimisation, boundary.
+) -> SurfaceMesh:
+    """Mesh the curves: strips, dropped triangles, global optimisation, boundary.
 
-    No mesh of an earlier step is kept: of millions of triangles each takes as much memory as the points.
-    Arrays as for `initial_mesh`. `entered` is told the name of each stage as it begins; `Stage.name` repeats it.
+    Keeps no mesh of an earlier step: with millions of triangles each takes as much memory as the points.
+    Arrays as for `initial_mesh`. entered : called with the name of each step when it begins.
     """
-    stages: list[Stage] = []
+    stages: list[MeshStage] = []
     steps: dict[str, Mapping[str, object]] = {}
 
-    def done(name: str, faces: IntArray, adjacency: IntArray | None) -> None:
-        # Flips leave the boundary as it is: without an adjacency it is that of the stage before.
+    def add_stage(name: str, faces: IntArray, adjacency: IntArray | None) -> None:
+        # Flips do not change the boundary: without an adjacency it is that of the previous step.
         points = stages[-1].boundary_points if adjacency is None else boundary_point_count(faces, adjacency)
-        stages.append(Stage(name, len(faces), points))
+        stages.append(MeshStage(name, len(faces), points))
 
     entered(FIRST_STAGE)
     initial = initial_mesh(
@@ -94,51 +214,51 @@ def finished_mesh(
         runs=runs,
     )  # fmt: skip
     faces, adjacency = initial.faces, initial.adjacency
-    done(FIRST_STAGE, faces, adjacency)
-    steps["initial"] = _of_initial(initial)
+    add_stage(FIRST_STAGE, faces, adjacency)
+    steps["initial"] = _initial_figures(initial)
     del initial
     entered("global optimisation")
-    best = optimised(points_mm, faces, rule=limits.flip_rule, adjacency=adjacency)
+    best = optimise_edges(points_mm, faces, rule=limits.flip_rule, adjacency=adjacency)
     faces, adjacency = best.faces, best.adjacency
-    done("global optimisation", faces, None)
-    steps["optimisation"] = _of_flips(best)
+    add_stage("global optimisation", faces, None)
+    steps["optimisation"] = _flip_figures(best)
     del best
     if limits.smooth_boundary and len(faces):
         entered("shrinking boundary")
-        less = shrunk(points_mm, faces, longest_boundary_edge_mm(points_mm, faces), adjacency=adjacency)
+        less = shrink_boundary(points_mm, faces, longest_boundary_edge_mm(points_mm, faces), adjacency=adjacency)
         faces, adjacency, shrunk_triangles = less.faces, less.adjacency, less.removed_triangles
         del less
-        done("shrinking boundary", faces, adjacency)
+        add_stage("shrinking boundary", faces, adjacency)
         entered("smoothing boundary")
         allowed_mm = limits.depth_edge_ratio * sampling_mm
         if limits.keep_holes:
-            # Nothing is filled in at a bridge: what was left open there is to stay open.
+            # Fill nothing at a bridge: gaps that were left open there stay open.
             ends = np.flatnonzero(bridge_after)
             allowed_mm[np.concatenate([ends, ends + 1])] = -np.inf
-        smooth = smoothed(points_mm, faces, allowed_mm, adjacency=adjacency)
+        smooth = smooth_boundary(points_mm, faces, allowed_mm, adjacency=adjacency)
         faces, adjacency = smooth.faces, smooth.adjacency
         added, removed_triangles, rounds = smooth.added, smooth.removed_triangles, smooth.rounds
         del smooth
-        done("smoothing boundary", faces, adjacency)
+        add_stage("smoothing boundary", faces, adjacency)
         entered("optimising boundary")
-        # Nothing is flipped unless triangles were added, and then the arrays are the smoothing's own.
-        mended = optimised(points_mm, faces, rule=limits.flip_rule, among=added, adjacency=adjacency)
+        # Flips happen only if triangles were added, and then the arrays belong to the smoothing step.
+        mended = optimise_edges(points_mm, faces, rule=limits.flip_rule, among=added, adjacency=adjacency)
         faces = mended.faces
-        done("optimising boundary", faces, None)
+        add_stage("optimising boundary", faces, None)
         steps["boundary"] = {
             "shrunk_triangles": shrunk_triangles,
             "added_triangles": int(np.count_nonzero(added)),
             "removed_triangles": removed_triangles,
             "rounds": rounds,
-            "optimisation": _of_flips(mended),
+            "optimisation": _flip_figures(mended),
         }
         del mended
     del adjacency
     entered("vertex normals")
-    return FinishedMesh(faces, vertex_normals(points_mm, faces), tuple(stages), steps)
+    return SurfaceMesh(faces, vertex_normals(points_mm, faces), tuple(stages), steps)
 
 
-def _of_initial(made: InitialMesh) -> dict[str, object]:
+def _initial_figures(made: InitialMesh) -> dict[str, object]:
     return {
         "strips": made.strip_pairs,
         "strip_triangles": made.strip_triangles,
@@ -150,7 +270,7 @@ def _of_initial(made: InitialMesh) -> dict[str, object]:
     }
 
 
-def _of_flips(made: Optimised) -> dict[str, object]:
+def _flip_figures(made: EdgeOptimisation) -> dict[str, object]:
     return {
         "harmonic_index_before": made.harmonic_index_before,
         "turns": [asdict(turn) for turn in made.turns],

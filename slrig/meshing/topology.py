@@ -1,4 +1,4 @@
-"""How the triangles of a mesh hang together: edges, borders, faults of orientation, components.
+"""Topology of a mesh: adjacency, borders, orientation faults, connected components.
 
 `faces` is (F, 3) int32, vertex indices, throughout. Coordinates play no part.
 """
@@ -10,15 +10,126 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.meshing.adjacency import in_groups
-from slrig.model import IntArray
+from slrig.model import FloatArray, IntArray
+
+_CROWDED, _REPEATED = 1, 2  # what is wrong with a face
+
+
+@kernel
+def sort_into_groups(groups: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """Offset of each group's first member, (count + 1,) int32, and the members by group, ascending, (n,) int32.
+
+    groups : (n,) int32, the group of each, from 0 to count - 1. A counting sort.
+    """
+    starts = np.zeros(count + 2, dtype=np.int32)
+    for group in groups:
+        starts[group + 2] += 1
+    for group in range(count):
+        starts[group + 2] += starts[group + 1]
+    members = np.zeros(len(groups), dtype=np.int32)
+    for member in range(len(groups)):
+        # A group's start stands one place to the right until its members have moved it on to its end.
+        place = groups[member] + 1
+        members[starts[place]] = member
+        starts[place] += 1
+    return starts[:-1], members
+
+
+def neighbours(faces: IntArray, *, vertex_count: int) -> IntArray:
+    """Adjacency, (F, 3) int32: entry k is the face across the edge opposite corner k, -1 at a boundary.
+
+    Linear in F as long as no vertex has very many triangles. Faces may meet in a vertex alone: that makes no
+    neighbours.
+
+    Raises
+    ------
+    ValueError
+        A face names a vertex that is not there or the same one twice, or an edge is not one of a consistently wound
+        manifold: two faces run along it in the same direction. More than two faces on an edge always do.
+    """
+    faces = np.ascontiguousarray(faces)
+    if faces.size and (faces.min() < 0 or faces.max() >= vertex_count):
+        message = (
+            f"faces name vertices {faces.min()} to {faces.max()}, there are {vertex_count}; "
+            "pass the number of points that the faces index"
+        )
+        raise ValueError(message)
+    across = np.full(faces.shape, -1, dtype=np.int32)
+    fault = np.zeros(len(faces), dtype=np.uint8)
+    in_bands(_neighbours, len(faces), faces, *sort_into_groups(faces.ravel(), vertex_count), across, fault)
+    if fault.any():
+        face = int(np.flatnonzero(fault)[0])
+        named = faces[face].tolist()
+        message = (
+            f"face {face} {named} uses a vertex twice; take degenerate faces away first"
+            if fault[face] == _REPEATED
+            else f"face {face} {named} shares an edge with a face that runs along it in the same direction; "
+            "take away what makes the mesh non-manifold, and wind all faces alike"
+        )
+        raise ValueError(message)
+    return across
+
+
+@kernel(in_every_scan=False)
+def _neighbours(first: int, last: int, faces: Any, starts: Any, corners: Any, across: Any, fault: Any) -> None:
+    for face in range(first, last):
+        for corner in range(3):
+            after = corner + 1 if corner < 2 else 0
+            # The edge from a to b, opposite the third corner; a neighbour runs from b to a.
+            a, b = faces[face, corner], faces[face, after]
+            if a == b:
+                fault[face] = _REPEATED
+            found, alike = -1, 0
+            for at in range(starts[b], starts[b + 1]):
+                other, origin = corners[at] // 3, corners[at] % 3
+                if faces[other, origin + 1 if origin < 2 else 0] == a:
+                    alike += found >= 0
+                    found = other
+                elif faces[other, origin - 1 if origin else 2] == a:
+                    # This face itself, or another that runs along the edge in the same direction.
+                    alike += other != face
+            across[face, after + 1 if after < 2 else 0] = found
+            if alike:
+                fault[face] = max(fault[face], _CROWDED)
+
+
+@dataclass(frozen=True, slots=True)
+class OpenBorders:
+    """Borders of a mesh, longest first: length_mm, area_mm2 (n,) float64; edges : their total number.
+
+    The area is that of the loop's shadow where it is largest, |½ Σ p × q| over its edges: a flat hole's own, and less
+    than what it takes to fill one that is not flat. Loops that meet in a vertex count as one.
+    """
+
+    edges: int
+    length_mm: FloatArray
+    area_mm2: FloatArray
+
+
+def open_borders(points_mm: NDArray[np.floating[Any]], faces: IntArray) -> OpenBorders:
+    """Open borders of a mesh: points (n, 3), faces (F, 3). Raises ValueError: not a manifold (see `neighbours`)."""
+    face, corner = np.divmod(np.flatnonzero(neighbours(faces, vertex_count=len(points_mm)) < 0), 3)
+    if not len(face):
+        return OpenBorders(0, np.zeros(0), np.zeros(0))
+    begin, end = faces[face, (corner + 1) % 3], faces[face, (corner + 2) % 3]
+    graph = coo_matrix((np.ones(len(begin)), (begin, end)), shape=(len(points_mm),) * 2)
+    loop = np.unique(connected_components(graph, directed=False)[1][begin], return_inverse=True)[1].ravel()
+    # Near the origin, so that large coordinates do not cancel: a closed loop's sum does not depend on it.
+    points = points_mm.astype(np.float64) - points_mm[begin].mean(axis=0, dtype=np.float64)
+    across = np.cross(points[begin], points[end]) / 2
+    area = np.linalg.norm(np.stack([np.bincount(loop, across[:, axis]) for axis in range(3)]), axis=0)
+    length = np.bincount(loop, np.linalg.norm(points[end] - points[begin], axis=1)).astype(np.float64)
+    order = np.argsort(-length, kind="stable")
+    return OpenBorders(len(begin), length[order], area[order])
 
 
 @dataclass(frozen=True, slots=True)
 class TopologyCounts:
-    """What is right and wrong with how a mesh hangs together.
+    """Counts of what is connected, and of topological faults.
 
     vertices : those that a face uses. boundary_edges : used by one triangle; boundary_vertices : their ends.
     nonmanifold_edges : used by more than two triangles.
@@ -40,44 +151,44 @@ class TopologyCounts:
 
 
 def duplicate_face_count(faces: IntArray) -> int:
-    """Number of faces whose three vertices, in any order, an earlier face has already."""
+    """Number of faces with the same three vertices, in any order, as an earlier face."""
     if not len(faces):
         return 0
     faces = np.ascontiguousarray(faces)
     bound = _vertex_bound(faces)
     a, b, c = faces.T
     lowest = np.minimum(np.minimum(a, b), c)  # a tenth of the time of a minimum over an axis of three
-    return sum(in_bands(_duplicates, bound, faces, *in_groups(lowest, bound)))
+    return sum(in_bands(_duplicates, bound, faces, *sort_into_groups(lowest, bound)))
 
 
 def degenerate_faces(faces: IntArray) -> NDArray[np.bool_]:
-    """(F,) bool: a vertex comes twice in the face."""
+    """(F,) bool: faces with a repeated vertex."""
     a, b, c = faces.T
     return np.asarray((a == b) | (b == c) | (c == a))
 
 
 def component_sizes(faces: IntArray, among: NDArray[np.bool_]) -> IntArray:
-    """(F,) int32: number of faces in the connected piece that each face belongs to, in a mesh of those `among` alone.
+    """(F,) int32: number of faces in the connected component of each face, in a mesh of those `among` alone.
 
     among : (F,) bool. 0 for the others. Faces that share a vertex belong together.
     """
     faces = np.ascontiguousarray(faces)
-    piece = _joined(faces, among, _vertex_bound(faces))[faces[:, 0]]
+    piece = _component_roots(faces, among, _vertex_bound(faces))[faces[:, 0]]
     sizes = np.bincount(piece[among], minlength=_vertex_bound(faces)).astype(np.int32)
     return np.where(among, sizes[piece], np.int32(0))
 
 
 def topology_counts(faces: IntArray) -> TopologyCounts:
-    """All the counts of this module at once."""
+    """Count edges, faults and components of a mesh."""
     faces = np.ascontiguousarray(faces)
     bound = _vertex_bound(faces)
     border = np.zeros(bound, dtype=np.bool_)
-    half_edges = in_groups(np.minimum(faces, faces[:, [1, 2, 0]]).ravel(), bound)
+    half_edges = sort_into_groups(np.minimum(faces, faces[:, [1, 2, 0]]).ravel(), bound)
     counted = in_bands(_edge_counts, bound, faces, *half_edges, border)
     edges, boundary, nonmanifold, misoriented = (sum(each) for each in zip(*counted, strict=True))
     used = used_vertices(faces, bound)
     vertices = int(np.count_nonzero(used))
-    roots = _joined(faces, np.ones(len(faces), dtype=np.bool_), bound)
+    roots = _component_roots(faces, np.ones(len(faces), dtype=np.bool_), bound)
     return TopologyCounts(
         vertices=vertices,
         edges=edges,
@@ -93,16 +204,16 @@ def topology_counts(faces: IntArray) -> TopologyCounts:
 
 
 def boundary_vertices(faces: IntArray, vertex_count: int) -> NDArray[np.bool_]:
-    """(vertex_count,) bool: the ends of edges that one triangle alone uses."""
+    """(vertex_count,) bool: ends of edges with a single triangle."""
     faces = np.ascontiguousarray(faces)
     border = np.zeros(vertex_count, dtype=np.bool_)
-    half_edges = in_groups(np.minimum(faces, faces[:, [1, 2, 0]]).ravel(), vertex_count)
+    half_edges = sort_into_groups(np.minimum(faces, faces[:, [1, 2, 0]]).ravel(), vertex_count)
     in_bands(_edge_counts, vertex_count, faces, *half_edges, border)
     return border
 
 
 def used_vertices(faces: IntArray, vertex_count: int) -> NDArray[np.bool_]:
-    """(vertex_count,) bool: the vertices that a face uses."""
+    """(vertex_count,) bool: vertices of at least one face."""
     used = np.zeros(vertex_count, dtype=np.bool_)
     _mark(np.ascontiguousarray(faces), used)
     return used
@@ -115,18 +226,18 @@ def _mark(faces: IntArray, used: Any) -> None:
             used[faces[face, corner]] = True
 
 
-def kept_faces(faces: IntArray, adjacency: IntArray, kept: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
-    """The faces that stay, (F,) bool, in their order, and their neighbours in the new numbering: (K, 3) int32 each."""
+def select_faces(faces: IntArray, adjacency: IntArray, kept: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
+    """Selected faces, kept : (F,) bool, in order, and their neighbours in the new numbering: (K, 3) int32 each."""
     numbers = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
     rest = np.zeros((int(np.count_nonzero(kept)), 3), dtype=np.int32)
     across = np.zeros_like(rest)
     given = np.ascontiguousarray(faces), np.ascontiguousarray(adjacency)
-    in_bands(_keep, len(faces), *given, numbers, rest, across)
+    in_bands(_select_faces, len(faces), *given, numbers, rest, across)
     return rest, across
 
 
 @kernel
-def _keep(
+def _select_faces(
     first: int, last: int, faces: IntArray, adjacency: IntArray, numbers: IntArray, rest: Any, across: Any
 ) -> None:
     for face in range(first, last):
@@ -146,7 +257,7 @@ def _vertex_bound(faces: IntArray) -> int:
 def _edge_counts(
     first: int, last: int, faces: IntArray, starts: IntArray, halves: IntArray, border: Any
 ) -> tuple[int, int, int, int]:
-    """Edges; those of one triangle, marking their ends; those of more than two; directions run along more than once."""
+    """Numbers of edges, of those with one triangle (marks their ends), with more than two, and misoriented ones."""
     edges, boundary, nonmanifold, misoriented = 0, 0, 0, 0
     most = 0
     for vertex in range(first, last):
@@ -204,8 +315,8 @@ def _root(parents: IntArray, vertex: int) -> int:
 
 
 @kernel
-def _joined(faces: IntArray, among: Any, vertex_bound: int) -> IntArray:
-    """The lowest vertex of each vertex's piece, by union-find with path halving, the lower index always the root."""
+def _component_roots(faces: IntArray, among: Any, vertex_bound: int) -> IntArray:
+    """Lowest vertex of each vertex's component, by union-find with path halving; the lower index is the root."""
     parents = np.arange(vertex_bound).astype(np.int32)
     for face in range(len(faces)):
         if not among[face]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from slrig.errors import NothingToReconstructError, setting
-from slrig.meshing.rasteriser import rasterised
+from slrig.meshing import rasterise
 from slrig.model import Mesh, Refusal, Size
 from slrig.scan.placing import placed_vertices, resampled
 from slrig.scan.report import lit_pixels
@@ -31,7 +31,7 @@ def covered_share(mesh: Mesh, seen: CameraResult) -> float | None:
     if not decoded.any():
         return None
     coarse = resampled(seen.device, 1 / step, Size(columns, rows))
-    view = rasterised(placed_vertices(mesh.vertices_mm, coarse), mesh.faces, coarse.size)
+    view = rasterise(placed_vertices(mesh.vertices_mm, coarse), mesh.faces, coarse.size)
     return float(((view.face >= 0) & decoded).sum() / decoded.sum())
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.meshing.rasteriser import brought_together
+from slrig.meshing import merge_depth_buffers
 from slrig.model import IntArray, Mesh, Pinhole
 from slrig.model.lens_kernels import distorted, undistorted
 from slrig.reconstruction.optics import SETTLED, distorted_from_pixel, packed, project
@@ -67,7 +67,7 @@ def organised(
     in_bands(_sighted, high, packed(at_home), sight, rows_at_least=_ROWS_AT_LEAST)
     given = packed(at_home), seen, project(at_home, seen), faces, sight
     at_least = max(_FACES_AT_LEAST, -(-len(faces) // _MOST_BANDS))
-    _, face = brought_together(in_bands(_nearest, len(faces), *given, rows_at_least=at_least))
+    _, face = merge_depth_buffers(in_bands(_nearest, len(faces), *given, rows_at_least=at_least))
     cause = np.where((refused == 0) & (face < 0), np.uint8(len(causes)), refused)
     points_mm, normals = (np.full((high, wide, 3), np.nan, dtype=np.float32) for _ in range(2))
     cloud = OrganisedCloud(

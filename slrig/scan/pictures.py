@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import StorageError
-from slrig.meshing.quality import weighted_percentiles
+from slrig.meshing import weighted_percentiles
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, Refusal, Size
 from slrig.scan.placing import resampled
 from slrig.scan.shading import Picture, resized, shaded

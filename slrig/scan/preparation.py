@@ -22,7 +22,7 @@ from numba import config
 from slrig.bundle.writing import write_bundle
 from slrig.errors import StorageError
 from slrig.kernels import Prepared, compilations_told, prepared
-from slrig.meshing.surface import FIRST_STAGE
+from slrig.meshing import FIRST_STAGE
 from slrig.model import Calibration, CameraFormat, Capture, FloatArray, Pinhole, Pixels, Shot, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.scan.plan import ReconstructionPlan

@@ -25,9 +25,7 @@ from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
 from slrig.kernels import Prepared, compilations_told
 from slrig.memory import give_back
-from slrig.meshing.quality import mesh_figures, score
-from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
-from slrig.meshing.vertices import compact_mesh
+from slrig.meshing import MeshingLimits, MeshStage, build_surface, compact_mesh, mesh_figures, score
 from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region
 from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
@@ -75,7 +73,7 @@ class _Meshed:
     share_mm: FloatArray | None
     mesh_share_mm: FloatArray | None
     cameras: list[CameraResult]
-    stages: tuple[Stage, ...]
+    stages: tuple[MeshStage, ...]
     figures: Mapping[str, object]
     redundancy: Mapping[str, object]
     albedo: Mapping[str, object]
@@ -241,7 +239,7 @@ def _meshed(
     gap_px = widest_gap_px(projector, axis)
     beside = steps(cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=gap_px)
     sampling = sampling_mm(points.points_mm, first.device, projector, axis, beside.at_points_px)
-    surface = finished_mesh(
+    surface = build_surface(
         points.points_mm, points.offsets, points.position_px, points.bridge_after,
         # Two points of one place are as far apart as noise has them.
         np.hypot(sampling, np.linalg.norm(points.deviation_mm, axis=1)), first.device.centre_mm,
@@ -267,7 +265,7 @@ def _meshed(
     limit_mm = None if plan.region is None else plan.region.most_sigma_mm
     if limit_mm is not None:
         known = sigma <= limit_mm
-        surface = surface.of_points(known, "sigma_limit")
+        surface = surface.with_points(known, "sigma_limit")
         cameras = [_where_known(seen, joined_curves, index, known) for index, seen in enumerate(cameras)]
         require_surface(len(surface.faces) > 0, folder, f"no surface is known to {limit_mm:g} mm", cameras)
     light = walked.devices.light

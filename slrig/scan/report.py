@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle.description import read_description
 from slrig.capture.evidence import EvidenceSummary
-from slrig.meshing.surface import FinishedMesh, Stage
+from slrig.meshing import MeshStage, SurfaceMesh
 from slrig.model import (
     Axis,
     Calibration,
@@ -165,7 +165,7 @@ def _pair_report(pair: PairRedundancy) -> dict[str, object]:
     }
 
 
-def mesh_report(surface: FinishedMesh, mesh: Mesh, curves: PointCurves) -> dict[str, object]:
+def mesh_report(surface: SurfaceMesh, mesh: Mesh, curves: PointCurves) -> dict[str, object]:
     """What each step did to the mesh, and its stated error."""
     sigma = np.percentile(mesh.sigma_mm, (5, 50, 95))
     return {
@@ -176,7 +176,7 @@ def mesh_report(surface: FinishedMesh, mesh: Mesh, curves: PointCurves) -> dict[
     }
 
 
-def with_seconds(stages: Sequence[Stage], seconds: Mapping[str, float]) -> list[dict[str, object]]:
+def with_seconds(stages: Sequence[MeshStage], seconds: Mapping[str, float]) -> list[dict[str, object]]:
     """The paper's Table 1: each meshing stage with its triangles, boundary points and time."""
     return [{**asdict(stage), "seconds": seconds.get(stage.name)} for stage in stages]
 

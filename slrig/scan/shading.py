@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
-from slrig.meshing.rasteriser import normals_seen, rasterised
+from slrig.meshing import rasterise, rasterise_normals
 from slrig.model import Mesh, Pinhole, Pixels, Size
 from slrig.scan.placing import placed_vertices, resampled
 
@@ -33,8 +33,8 @@ def shaded(mesh: Mesh, camera: Pinhole) -> Picture:
     wide, high = (extent * _SUPERSAMPLING for extent in (camera.size.width_px, camera.size.height_px))
     finer = resampled(camera, _SUPERSAMPLING, Size(wide, high))
     placed = placed_vertices(mesh.vertices_mm, finer)
-    view = rasterised(placed, mesh.faces, finer.size)
-    normals, front = normals_seen(view, placed, mesh.normals, mesh.faces)
+    view = rasterise(placed, mesh.faces, finer.size)
+    normals, front = rasterise_normals(view, placed, mesh.normals, mesh.faces)
     leaning = float(normals.sum(axis=0).sum(axis=0, dtype=np.float64) @ camera.rotation[0])
     to_side = _TO_SIDE_LIGHT * (math.copysign(1.0, leaning), 1.0, 1.0) / np.linalg.norm(_TO_SIDE_LIGHT)
     # Normals are in the world: rather than each of them, the lights are turned.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import setting
-from slrig.meshing.runs import parts_of_curves
+from slrig.meshing import runs_of_curve_parts
 from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Region, share_across, told_depth
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.epipolar import stripe_crossing
@@ -185,7 +185,7 @@ def steps(
             at_points[mine] = each[rows[mine], columns[mine]]
     # A curve may have a neighbour that another camera does not resolve.
     widest_px = max(float(each.max()) for each in maps if each is not None)
-    runs = parts_of_curves(
+    runs = runs_of_curve_parts(
         curves.position_px, curves.offsets, curves.along_px,
         widest_step_px=max(step_px * max_gap, widest_px), widest_gap_px=_WIDEST_BRIDGES * widest_gap_px,
     )  # fmt: skip

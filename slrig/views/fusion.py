@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.kernels import in_bands, kernel
-from slrig.meshing.boundary import smoothed
-from slrig.meshing.normals import vertex_normals
-from slrig.meshing.optimisation import optimised
-from slrig.meshing.topology import component_sizes, used_vertices
+from slrig.meshing import component_sizes, optimise_edges, smooth_boundary, used_vertices, vertex_normals
 from slrig.model import FloatArray, IntArray, Mesh
 from slrig.model.arrays import require
 from slrig.model.srgb import srgb_of
@@ -191,9 +188,9 @@ def _halve(first: int, last: int, quads: Any, points: Any, normals: Any, faces: 
 def _mended(points: FloatArray, faces: IntArray, voxel_mm: float) -> IntArray:
     """Flipped to the shape of the surface, its border smoothed, without dust."""
     points = np.nan_to_num(points)
-    best = optimised(points, faces)
+    best = optimise_edges(points, faces)
     allowed: NDArray[np.float64] = np.full(len(points), _LONGEST_EDGE * voxel_mm)
-    smooth = smoothed(points, best.faces, allowed, adjacency=best.adjacency)
-    faces = optimised(points, smooth.faces, among=smooth.added, adjacency=smooth.adjacency).faces
+    smooth = smooth_boundary(points, best.faces, allowed, adjacency=best.adjacency)
+    faces = optimise_edges(points, smooth.faces, among=smooth.added, adjacency=smooth.adjacency).faces
     sizes = component_sizes(faces, np.ones(len(faces), dtype=np.bool_))
     return np.ascontiguousarray(faces[sizes >= _FEWEST_TRIANGLES])

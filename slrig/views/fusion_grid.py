@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import InvalidInputError
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.meshing.topology import used_vertices
+from slrig.meshing import used_vertices
 from slrig.model import FloatArray, IntArray
 from slrig.views.fusion_sheets import Sheets
 

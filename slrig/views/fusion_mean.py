@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.meshing.nearest_point import on_triangle
+from slrig.meshing import nearest_on_triangle
 from slrig.model import AlbedoMark, FloatArray, IntArray
 from slrig.model.srgb import light_of
 from slrig.views.fusion_sheets import Sheets
@@ -128,7 +128,7 @@ def _view_at(sheets: Any, face: int, x: float, y: float, z: float, rule: Any, ro
     """What a view's nearest triangle says of a point, into a row; whether it counts there."""
     points, normals, insets, sigmas = sheets.points_mm, sheets.normals, sheets.inset_mm, sheets.sigma_mm
     a, b, c = sheets.faces[face, 0], sheets.faces[face, 1], sheets.faces[face, 2]
-    gap2, wa, wb, wc = on_triangle(x, y, z, points, a, b, c)
+    gap2, wa, wb, wc = nearest_on_triangle(x, y, z, points, a, b, c)
     dx = x - (wa * points[a, 0] + wb * points[b, 0] + wc * points[c, 0])
     dy = y - (wa * points[a, 1] + wb * points[b, 1] + wc * points[c, 1])
     dz = z - (wa * points[a, 2] + wb * points[b, 2] + wc * points[c, 2])

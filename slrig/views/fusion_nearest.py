@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.meshing.nearest_point import on_triangle
+from slrig.meshing import nearest_on_triangle
 from slrig.model import FloatArray, IntArray
 from slrig.views.fusion_grid import CELLS, MARGIN, SEEN_BEYOND, Grid, brick_at, cells_about, new_cache
 from slrig.views.fusion_sheets import Sheets
@@ -119,7 +119,7 @@ def _nearest_faces(
                                             gap2 = height * height + aside * aside  # at least
                                         if gap2 < gap * gap:
                                             if corner == 3:
-                                                gap2 = on_triangle(px, py, pz, corners, a, b, c)[0]
+                                                gap2 = nearest_on_triangle(px, py, pz, corners, a, b, c)[0]
                                             if gap2 < gap * gap:
                                                 gaps[at] = np.sqrt(gap2)
                                                 nearest[view, at] = face

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.kernels import kernel
-from slrig.meshing.adjacency import neighbours
+from slrig.meshing import neighbours
 from slrig.model import FloatArray, IntArray, Mesh
 from slrig.views.matching import moved, turned
 

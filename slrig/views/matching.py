@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from slrig.meshing.topology import boundary_vertices
+from slrig.meshing import boundary_vertices
 from slrig.model import AlbedoMark, FloatArray, IntArray, Mesh
 
 CORRELATED_MM = 0.005

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import StageRefusedError
-from slrig.meshing.topology import used_vertices
+from slrig.meshing import used_vertices
 from slrig.model import FloatArray, Mesh, PlaneKind, StageAxis, StagePlane
 
 MARGIN_MM, MARGIN_SIGMAS = 1.0, 4.0

@@ -23,7 +23,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from slrig.combine.combining import read_mesh
-from slrig.meshing.search_tree import SearchTree
+from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, Mesh
 from tests.turned_views import displacement_mm
@@ -123,7 +123,7 @@ def test_a_turned_object(name: str, count: int, tmp_path: Path, capsys: pytest.C
 
     apart_mm = [displacement_mm(*each) for each in zip(views, poses, true, strict=True)]
     ours = [1e3 * each for each in apart_mm[1:]]
-    known = SearchTree.over(np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
+    known = SearchTree.build(np.asarray(solid.vertices), np.asarray(solid.faces, np.int32))
     model = read_mesh(tmp_path / "model" / "model.ply")
     errors = known.distances_mm(model.vertices_mm)
     ones = [
@@ -131,7 +131,7 @@ def test_a_turned_object(name: str, count: int, tmp_path: Path, capsys: pytest.C
         for view, pose in zip(views, true, strict=True)
     ]
     crossed = topology_counts(model.faces).nonmanifold_edges
-    tree = SearchTree.over(model.vertices_mm.astype(float), model.faces)
+    tree = SearchTree.build(model.vertices_mm.astype(float), model.faces)
     seen = np.concatenate(
         [view.vertices_mm[::11] @ pose[:3, :3].T + pose[:3, 3] for view, pose in zip(views, true, strict=True)]
     )

@@ -38,8 +38,7 @@ from slrig.bundle.faults import checked
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig
 from slrig.discovery import open_rig
-from slrig.meshing.quality import TruthScore, score
-from slrig.meshing.search_tree import SearchTree
+from slrig.meshing.quality import SearchTree, TruthScore, score
 from slrig.model import Calibration, CameraFormat, Mesh, Pixels, Size, Truth
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
@@ -378,7 +377,7 @@ def distances_mm(first: Mesh, second: Mesh) -> NDArray[np.float64]:
     """(n,): from the vertices of either mesh to the other's surface."""
     ways = []
     for mesh, other in ((first, second), (second, first)):
-        surface = SearchTree.over(np.asarray(other.vertices_mm, np.float64), other.faces)
+        surface = SearchTree.build(np.asarray(other.vertices_mm, np.float64), other.faces)
         ways.append(surface.distances_mm(np.asarray(mesh.vertices_mm, np.float64)))
     return np.concatenate(ways)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from slrig.meshing.search_tree import SearchTree
+from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import TopologyCounts, topology_counts
 from slrig.views.fusion import fused
 from tests.unit.views.known_views import around, plate_on_box, star, torus, views_of
@@ -25,7 +25,7 @@ OBJECTS: dict[str, tuple[Callable[[], trimesh.Trimesh], int]] = {
 def require_one_model(truth: trimesh.Trimesh, count: int) -> TopologyCounts:
     """See that views from all around make one model, better than each of them; its topology."""
     views = views_of(truth, around(count), PIXEL_MM)
-    known = SearchTree.over(truth.vertices, np.asarray(truth.faces, np.int32))
+    known = SearchTree.build(truth.vertices, np.asarray(truth.faces, np.int32))
     model = fused([view.mesh for view in views], [view.pose for view in views])
 
     def errors_mm(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -41,7 +41,7 @@ def require_one_model(truth: trimesh.Trimesh, count: int) -> TopologyCounts:
     counts = topology_counts(model.mesh.faces)
     assert (counts.nonmanifold_edges, counts.misoriented_edges, counts.duplicate_faces) == (0, 0, 0)
     seen = np.concatenate([view.seen_mm for view in views])[::7]
-    assert (SearchTree.over(model.mesh.vertices_mm, model.mesh.faces).distances_mm(seen) < 0.1).mean() > 0.995
+    assert (SearchTree.build(model.mesh.vertices_mm, model.mesh.faces).distances_mm(seen) < 0.1).mean() > 0.995
     over_sigma = np.quantile(known.distances_mm(model.mesh.vertices_mm) / model.mesh.sigma_mm, 0.6827)
     assert 0.8 < over_sigma < 1.25
     return counts

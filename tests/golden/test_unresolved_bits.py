@@ -14,7 +14,7 @@ import pytest
 import trimesh
 
 from slrig.bundle import read_bundle
-from slrig.meshing.rasteriser import rasterised
+from slrig.meshing.rasteriser import rasterise
 from slrig.model import Axis
 from slrig.reconstruction.frames import axis_frames
 from slrig.scan.placing import placed_vertices
@@ -56,7 +56,7 @@ def covered_shares(rig: Path) -> list[float]:
     loaded: Any = trimesh.load(rig.parent / "out" / "mesh.ply", process=False)
     device = bundle.calibration.cameras["camera0"]
     placed = placed_vertices(np.asarray(loaded.vertices, np.float64), device)
-    met = rasterised(placed, np.asarray(loaded.faces, np.int32), device.size).face >= 0
+    met = rasterise(placed, np.asarray(loaded.faces, np.int32), device.size).face >= 0
     left = np.indices(met.shape)[1] < met.shape[1] / 2
     return [float((met & decoded & part).sum() / (decoded & part).sum()) for part in (left, ~left)]
 

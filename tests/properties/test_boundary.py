@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from slrig.meshing.adjacency import neighbours
-from slrig.meshing.boundary import smoothed
-from slrig.meshing.runs import neighbouring_curves, whole_curves
-from slrig.meshing.strips import strips
-from slrig.meshing.topology import topology_counts
+from slrig.meshing.boundary import smooth_boundary
+from slrig.meshing.strips import neighbouring_curves, runs_of_whole_curves, strips
+from slrig.meshing.topology import neighbours, topology_counts
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.plain import boundary_edges, grid_faces
 
@@ -46,7 +44,7 @@ def ragged_strips(draw: st.DrawFn) -> tuple[FloatArray, IntArray]:
     offsets = np.concatenate(([0], np.cumsum(lengths))).astype(np.int32)
     points = np.concatenate([np.zeros((0, 3)), *curves])
     pairs = neighbouring_curves(np.arange(len(lengths), dtype=np.float64), offsets, widest_step_px=1.0)
-    return points, strips(points, whole_curves(pairs, offsets))
+    return points, strips(points, runs_of_whole_curves(pairs, offsets))
 
 
 meshes = torn_grids() | ragged_strips()
@@ -78,7 +76,7 @@ def test_smoothing_keeps_what_makes_a_mesh_and_ends(
 ) -> None:
     points, faces = mesh
     before = points.copy(), faces.copy()
-    result = smoothed(points, faces, np.full(len(points), allowed), psi_rad=psi, most_rounds=rounds)
+    result = smooth_boundary(points, faces, np.full(len(points), allowed), psi_rad=psi, most_rounds=rounds)
     hold_together(result.faces, result.adjacency, len(points))
     assert len(result.faces) == len(faces) - result.removed_triangles + result.added.sum()
     assert result.rounds <= rounds

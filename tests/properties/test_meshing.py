@@ -9,12 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from slrig.meshing.adjacency import neighbours
-from slrig.meshing.flips import prefers_flip
-from slrig.meshing.optimisation import NO_FLIPS, optimised
-from slrig.meshing.runs import neighbouring_curves, whole_curves
-from slrig.meshing.strips import strips
-from slrig.meshing.topology import topology_counts
+from slrig.meshing.flips import NO_FLIPS, optimise_edges, prefers_flip
+from slrig.meshing.strips import neighbouring_curves, runs_of_whole_curves, strips
+from slrig.meshing.topology import neighbours, topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
 from tests.unit.meshing.plain import boundary_edges
 
@@ -57,10 +54,10 @@ def surface(lengths: list[int], seed: int) -> tuple[FloatArray, IntArray]:
 def test_optimisation_keeps_what_makes_a_surface(lengths: list[int], seed: int, rule: FlipRule, share: float) -> None:
     points, offsets = surface(lengths, seed)
     pairs = neighbouring_curves(np.arange(len(lengths), dtype=np.float64), offsets, widest_step_px=1.0)
-    everything = strips(points, whole_curves(pairs, offsets))
+    everything = strips(points, runs_of_whole_curves(pairs, offsets))
     # What is left has holes and pinched vertices.
     faces = everything[np.random.default_rng(seed).random(len(everything)) < share]
-    found = optimised(points, faces, rule=rule)
+    found = optimise_edges(points, faces, rule=rule)
     before, after = topology_counts(faces), topology_counts(found.faces)
     assert after.nonmanifold_edges == after.misoriented_edges == after.duplicate_faces == after.degenerate_faces == 0
     assert (after.vertices, after.edges, after.euler_characteristic) == (
@@ -73,4 +70,4 @@ def test_optimisation_keeps_what_makes_a_surface(lengths: list[int], seed: int, 
     assert found.turns[0].tested_triangles == len(faces)
     # What it ends with is the end.
     if found.ended_by == NO_FLIPS:
-        assert optimised(points, found.faces, rule=rule).faces.tolist() == found.faces.tolist()
+        assert optimise_edges(points, found.faces, rule=rule).faces.tolist() == found.faces.tolist()

@@ -191,7 +191,7 @@ def test_processes_that_compile_at_once_leave_each_signature_its_own_code(tmp_pa
 _MESHES_IN_3_S = """
 import time
 import numpy as np
-from slrig.meshing.optimisation import optimised
+from slrig.meshing.flips import optimised
 points = np.array([[0, 0, 0], [9, 0, 0], [0, 1, 0], [3, 1, 5]], dtype=np.float64)
 faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32)
 optimised(points, faces)

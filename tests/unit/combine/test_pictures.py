@@ -13,7 +13,7 @@ from slrig.calibration.boards.artwork import marker_dictionary
 from slrig.combine.markers import bundle_of, markers_in_view
 from slrig.combine.pictures import six_sides_png
 from slrig.errors import BundleError
-from slrig.meshing.normals import vertex_normals
+from slrig.meshing.surface import vertex_normals
 from slrig.model import FloatArray, Mesh, Pinhole, Size
 
 PANEL_PX, GAP_PX, ROW_PX = 400, 10, 444

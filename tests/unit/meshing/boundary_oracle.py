@@ -159,7 +159,7 @@ class ByHand:
 def smoothed_by_hand(
     points: FloatArray, faces: IntArray, allowed: FloatArray, psi_rad: float, most_rounds: int
 ) -> ByHand:
-    """What `slrig.meshing.boundary.smoothed` must come to, but for corners of exactly equal angles."""
+    """What `slrig.meshing.boundary.smooth_boundary` must come to, but for corners of exactly equal angles."""
     mesh = ByHand(points, allowed, {})
     for face in faces.tolist():
         mesh.put(*face)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.meshing.normals import vertex_normals
+from slrig.meshing.surface import vertex_normals
 from slrig.model import FloatArray, IntArray, Mesh
 
 

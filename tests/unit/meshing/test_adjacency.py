@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.meshing.adjacency import in_groups, neighbours
+from slrig.meshing.topology import neighbours, sort_into_groups
 from slrig.model import IntArray
 from tests.unit.meshing.plain import faces_of
 
@@ -68,7 +68,7 @@ def test_what_is_no_wound_manifold_is_refused(faces: IntArray, said: str) -> Non
 
 def test_groups_list_corners_by_vertex() -> None:
     faces = patch(6, 7, 3)
-    starts, corners = in_groups(faces.ravel(), 50)
+    starts, corners = sort_into_groups(faces.ravel(), 50)
     for vertex in range(50):
         wanted = [3 * i + k for i, face in enumerate(faces.tolist()) for k in range(3) if face[k] == vertex]
         assert corners[starts[vertex] : starts[vertex + 1]].tolist() == wanted

@@ -8,9 +8,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from slrig.meshing.adjacency import neighbours
-from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrunk, smoothed
-from slrig.meshing.topology import topology_counts
+from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrink_boundary, smooth_boundary
+from slrig.meshing.topology import neighbours, topology_counts
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.boundary_oracle import as_set, smoothed_by_hand
 from tests.unit.meshing.plain import boundary_edges, faces_of, grid_faces
@@ -42,7 +41,7 @@ def everywhere(points: FloatArray, mm: float = ANYTHING_MM) -> FloatArray:
 
 def test_a_right_angle_is_no_spike_and_a_straight_border_no_notch() -> None:
     points, faces = grid(4, 5)
-    result = smoothed(points, faces, everywhere(points))
+    result = smooth_boundary(points, faces, everywhere(points))
     np.testing.assert_array_equal(result.faces, faces)
     assert (result.removed_triangles, int(result.added.sum()), result.rounds) == (0, 0, 0)
 
@@ -52,7 +51,7 @@ def test_a_notch_is_filled_with_one_triangle_of_the_same_winding() -> None:
     points = with_border_point(points, 0.0, columns=7)
     points[3, 1] = 1.2
     points[10, 1] = 1.6
-    result = smoothed(points, faces, everywhere(points))
+    result = smooth_boundary(points, faces, everywhere(points))
     assert as_set(result.faces[result.added]) == {(2, 4, 3)}
     assert result.removed_triangles == 0
     np.testing.assert_array_equal(result.faces[:-1], faces)
@@ -62,7 +61,7 @@ def test_a_notch_is_filled_with_one_triangle_of_the_same_winding() -> None:
 def test_a_spike_goes_with_its_triangles() -> None:
     points, faces = grid(5, 7)
     points = with_border_point(points, -1.5, columns=7)
-    result = smoothed(points, faces, everywhere(points))
+    result = smooth_boundary(points, faces, everywhere(points))
     assert not result.added.any()
     assert as_set(faces) - as_set(result.faces) == as_set(faces[(faces == 3).any(axis=1)])
     assert result.removed_triangles == (faces == 3).any(axis=1).sum()
@@ -80,7 +79,7 @@ def test_a_spike_of_many_triangles_stays(triangles: int, removed: int) -> None:
     steps = np.arange(1, triangles + 1, dtype=np.int32)
     tip = np.stack([0 * steps, steps, steps + 1], axis=1)
     faces = np.concatenate([tip, 1 + grid_faces(4, triangles + 1)[:, ::-1]])
-    result = smoothed(points, faces, everywhere(points), psi_rad=1.2, most_rounds=1)
+    result = smooth_boundary(points, faces, everywhere(points), psi_rad=1.2, most_rounds=1)
     assert result.removed_triangles == removed
 
 
@@ -88,13 +87,13 @@ def test_a_spike_of_many_triangles_stays(triangles: int, removed: int) -> None:
 def test_an_angle_that_means_nothing_is_refused(psi_rad: float) -> None:
     points, faces = grid(2, 2)
     with pytest.raises(ValueError, match="psi_rad: expected an angle between 0 and π"):
-        smoothed(points, faces, everywhere(points), psi_rad=psi_rad)
+        smooth_boundary(points, faces, everywhere(points), psi_rad=psi_rad)
 
 
 def test_a_hole_of_three_edges_is_closed() -> None:
     points, faces = grid(5, 5)
     hole = faces[9]
-    result = smoothed(points, np.delete(faces, 9, axis=0), everywhere(points))
+    result = smooth_boundary(points, np.delete(faces, 9, axis=0), everywhere(points))
     assert as_set(result.faces) == as_set(faces)
     assert as_set(result.faces[result.added]) == as_set(hole[None])
     np.testing.assert_array_equal(result.adjacency, neighbours(result.faces, vertex_count=len(points)))
@@ -106,7 +105,7 @@ def test_a_thin_post_keeps_both_sides(width: int) -> None:
     points, faces = grid(20, width + 1, slant=0.5)
     rng = np.random.default_rng(width)
     points[:, :2] += rng.uniform(-0.15, 0.15, (len(points), 2))
-    result = smoothed(points, faces, everywhere(points))
+    result = smooth_boundary(points, faces, everywhere(points))
     used = np.unique(result.faces)
     sides = set(range(0, len(points), width + 1)) | set(range(width, len(points), width + 1))
     # At most the sharp corner of each end goes.
@@ -116,7 +115,7 @@ def test_a_thin_post_keeps_both_sides(width: int) -> None:
 
 def test_a_slanted_border_is_not_peeled() -> None:
     points, faces = grid(40, 40, slant=0.7)
-    result = smoothed(points, faces, everywhere(points))
+    result = smooth_boundary(points, faces, everywhere(points))
     # Two corners of the slanted square are sharp.
     assert result.removed_triangles <= 4
     assert not result.added[: len(faces) - result.removed_triangles].any()
@@ -138,7 +137,7 @@ def test_shrinking_agrees_with_dropping_until_nothing_changes() -> None:
             if not any(has):
                 break
             left = left[~np.array(has)]
-        result = shrunk(points, faces, longest)
+        result = shrink_boundary(points, faces, longest)
         np.testing.assert_array_equal(result.faces, left)
         assert result.removed_triangles == len(faces) - len(left)
 
@@ -151,8 +150,8 @@ def test_lambda_follows_the_wider_spacing_of_sparse_curves() -> None:
     assert longest[6 * 10 + 2] == pytest.approx(4 * 6.0, rel=0.01)
     assert (longest >= 5.0).all()
     # The paper's fixed 5 mm takes the whole mesh away; this takes nothing.
-    assert len(shrunk(points, faces, everywhere(points, 5.0)).faces) == 0
-    assert shrunk(points, faces, longest).removed_triangles == 0
+    assert len(shrink_boundary(points, faces, everywhere(points, 5.0)).faces) == 0
+    assert shrink_boundary(points, faces, longest).removed_triangles == 0
 
 
 def test_lambda_does_not_follow_the_long_triangles_beside_the_end_of_a_curve() -> None:
@@ -165,7 +164,7 @@ def test_lambda_does_not_follow_the_long_triangles_beside_the_end_of_a_curve() -
     steps = np.concatenate(([last], np.arange(at, at + 24)))
     fan = np.stack((np.full(24, end), steps[:-1], steps[1:]), axis=1).astype(np.int32)
     points, joined = np.concatenate((points, tail)), np.concatenate((faces, fan))
-    left = shrunk(points, joined, longest_boundary_edge_mm(points, joined))
+    left = shrink_boundary(points, joined, longest_boundary_edge_mm(points, joined))
     # The fan goes back to where it is 5 mm long.
     corners = points[left.faces]
     assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= 5.0
@@ -194,8 +193,8 @@ def test_the_boundary_points_are_counted() -> None:
 
 def test_nothing_to_do_on_no_faces() -> None:
     points, none = np.zeros((3, 3)), faces_of()
-    assert len(smoothed(points, none, everywhere(points)).faces) == 0
-    assert len(shrunk(points, none, everywhere(points)).faces) == 0
+    assert len(smooth_boundary(points, none, everywhere(points)).faces) == 0
+    assert len(shrink_boundary(points, none, everywhere(points)).faces) == 0
     assert longest_boundary_edge_mm(points, none).tolist() == [5.0] * 3
 
 
@@ -209,7 +208,7 @@ def test_smoothing_agrees_with_plain_python() -> None:
         allowed = rng.uniform(1.2, 4.0, len(points))
         psi = rng.uniform(1.0, 2.2)
         rounds = int(rng.integers(1, 9))
-        result = smoothed(points, faces, allowed, psi_rad=psi, most_rounds=rounds)
+        result = smooth_boundary(points, faces, allowed, psi_rad=psi, most_rounds=rounds)
         wanted = smoothed_by_hand(points, faces, allowed, psi, rounds)
         assert as_set(result.faces) == wanted.faces
         assert as_set(result.faces[result.added]) == wanted.added

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.meshing.adjacency import neighbours
-from slrig.meshing.initial import InitialMesh, initial_mesh
-from slrig.meshing.normals import vertex_normals
+from slrig.meshing.strips import InitialMesh, initial_mesh
+from slrig.meshing.surface import vertex_normals
+from slrig.meshing.topology import neighbours
 from slrig.model import FloatArray, IntArray
 
 EYE_MM = np.array([5.0, 5.0, -400.0])

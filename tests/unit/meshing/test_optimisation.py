@@ -10,11 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from slrig.meshing.adjacency import neighbours
-from slrig.meshing.optimisation import INDEX, NO_FLIPS, TURN_LIMIT, Optimised, optimised
-from slrig.meshing.runs import whole_curves
-from slrig.meshing.strips import strips
-from slrig.meshing.topology import topology_counts
+from slrig.meshing.flips import INDEX, NO_FLIPS, ROUND_LIMIT, EdgeOptimisation, optimise_edges
+from slrig.meshing.strips import runs_of_whole_curves, strips
+from slrig.meshing.topology import neighbours, topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
 from tests.unit.meshing.plain import harmonic_indices
 from tests.unit.meshing.test_flips import delaunay, verdict
@@ -23,7 +21,7 @@ from tests.unit.meshing.test_flips import delaunay, verdict
 def all_strips(points: FloatArray, offsets: IntArray) -> IntArray:
     """Strips between each curve and the next."""
     count = len(offsets) - 1
-    return strips(points, whole_curves(np.stack([np.arange(count - 1), np.arange(1, count)], axis=1), offsets))
+    return strips(points, runs_of_whole_curves(np.stack([np.arange(count - 1), np.arange(1, count)], axis=1), offsets))
 
 
 def joined(curves: list[FloatArray]) -> tuple[FloatArray, IntArray]:
@@ -141,7 +139,7 @@ def plain_optimised(
 def test_the_course_is_that_of_a_plain_one(seed: int, rule: FlipRule) -> None:
     points, faces = wandering(9, 7, seed)
     wanted, turns, ended_by = plain_optimised(points, faces, constrained=rule is FlipRule.CONSTRAINED)
-    found = optimised(points, faces, rule=rule)
+    found = optimise_edges(points, faces, rule=rule)
     assert found.faces.tolist() == wanted.tolist()
     assert [(turn.tested_triangles, turn.flipped_edges) for turn in found.turns] == turns
     assert found.ended_by == ended_by
@@ -157,13 +155,13 @@ def test_without_a_constraint_a_plane_becomes_its_delaunay_triangulation(seed: i
     start = Delaunay(flat * [5, 1]).simplices.astype(np.int32)
     wanted = Delaunay(flat).simplices.astype(np.int32)
     points = np.column_stack([flat, np.zeros(300)])
-    found = optimised(points, start, rule=FlipRule.DELAUNAY)
+    found = optimise_edges(points, start, rule=FlipRule.DELAUNAY)
     assert as_set(start) != as_set(wanted)
     assert as_set(found.faces) == as_set(wanted)
     assert found.ended_by == NO_FLIPS
     # In a plane γ changes the verdict on some edges: it is another triangulation.
-    assert as_set(optimised(points, start).faces) != as_set(wanted)
-    assert as_set(optimised(points, start, gamma=math.pi).faces) == as_set(wanted)
+    assert as_set(optimise_edges(points, start).faces) != as_set(wanted)
+    assert as_set(optimise_edges(points, start, gamma=math.pi).faces) == as_set(wanted)
 
 
 def test_figure_5_six_points_of_a_cylinder() -> None:
@@ -178,7 +176,7 @@ def test_figure_5_six_points_of_a_cylinder() -> None:
         cosine = abs((normals * radial).sum(axis=1)) / np.linalg.norm(normals, axis=1) / np.linalg.norm(radial, axis=1)
         return float(np.degrees(np.arccos(cosine)).max())
 
-    ours, theirs = optimised(points, start).faces, optimised(points, start, rule=FlipRule.DELAUNAY).faces
+    ours, theirs = optimise_edges(points, start).faces, optimise_edges(points, start, rule=FlipRule.DELAUNAY).faces
     assert as_set(ours) != as_set(theirs)
     # "This mesh not only contains some sharp triangles, but exits a sharp edge": not so with the constraint.
     assert off_radial_deg(ours) < 12 < 70 < off_radial_deg(theirs)
@@ -187,27 +185,27 @@ def test_figure_5_six_points_of_a_cylinder() -> None:
 
 def test_turns_are_limited() -> None:
     points, faces = wandering(20, 20, 1)
-    everything = optimised(points, faces)
+    everything = optimise_edges(points, faces)
     assert len(everything.turns) > 3
     for most in range(3):
-        found = optimised(points, faces, most_turns=most)
+        found = optimise_edges(points, faces, most_turns=most)
         assert found.turns == everything.turns[:most]
-        assert found.ended_by == TURN_LIMIT
-    assert optimised(points, faces, most_turns=0).faces.tolist() == faces.tolist()
+        assert found.ended_by == ROUND_LIMIT
+    assert optimise_edges(points, faces, most_turns=0).faces.tolist() == faces.tolist()
 
 
 def test_an_optimal_mesh_has_one_turn_without_flips() -> None:
     points, faces = wandering(20, 20, 1, across=0.05, depth=0.05)
-    once = optimised(points, faces)
+    once = optimise_edges(points, faces)
     assert once.ended_by == NO_FLIPS
-    again = optimised(points, once.faces)
+    again = optimise_edges(points, once.faces)
     assert again.faces.tolist() == once.faces.tolist()
     assert [(t.tested_triangles, t.flipped_edges) for t in again.turns] == [(len(faces), 0)]
     assert again.turns[0].harmonic_index == again.harmonic_index_before == once.turns[-1].harmonic_index
     assert again.ended_by == NO_FLIPS
 
 
-def spoilt(best: Optimised, face: int) -> tuple[IntArray, NDArray[np.bool_]]:
+def spoilt(best: EdgeOptimisation, face: int) -> tuple[IntArray, NDArray[np.bool_]]:
     """The mesh with one edge of this face flipped for the worse, and which two triangles those are."""
     faces = best.faces.copy()
     other = int(best.adjacency[face].max())
@@ -220,55 +218,56 @@ def spoilt(best: Optimised, face: int) -> tuple[IntArray, NDArray[np.bool_]]:
 
 def test_among_limits_where_flips_begin() -> None:
     points, faces = wandering(20, 20, 1, across=0.05, depth=0.05)
-    best = optimised(points, faces)
+    best = optimise_edges(points, faces)
     worse, here = spoilt(best, 150)
     assert topology_counts(worse).nonmanifold_edges == 0
-    repaired = optimised(points, worse, among=here)
+    repaired = optimise_edges(points, worse, among=here)
     assert as_set(repaired.faces) == as_set(best.faces)
     assert repaired.turns[0].tested_triangles == 2
     elsewhere = ~here
     elsewhere[best.adjacency[here].ravel()] = False
     elsewhere[here] = False
-    assert optimised(points, worse, among=elsewhere).faces.tolist() == worse.tolist()
+    assert optimise_edges(points, worse, among=elsewhere).faces.tolist() == worse.tolist()
 
 
 def test_an_edge_that_exists_is_not_made() -> None:
     # Each edge of a tetrahedron has its opposite edge in the mesh already.
     corners = np.array([[0, 0, 0], [9, 0, 0], [0, 1, 0], [3, 1, 5]], dtype=np.float64)
     tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32)
-    assert optimised(corners, tetrahedron).faces.tolist() == tetrahedron.tolist()
+    assert optimise_edges(corners, tetrahedron).faces.tolist() == tetrahedron.tolist()
     # Two triangles back to back.
     pillow = np.array([[0, 1, 2], [0, 2, 1]], dtype=np.int32)
-    assert optimised(corners, pillow).faces.tolist() == pillow.tolist()
+    assert optimise_edges(corners, pillow).faces.tolist() == pillow.tolist()
 
 
 def test_an_edge_that_exists_beyond_a_pinched_vertex_is_not_made() -> None:
     # Edge 0-1 wants to become 2-3; far from it in the mesh, triangle 4 joins 2 and 3.
     points = np.array([[-3, 0, 0], [3, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 9]], dtype=np.float64)
     quad, beyond = [[2, 0, 1], [3, 1, 0]], [2, 3, 4]
-    alone = optimised(points, np.array(quad, dtype=np.int32))
+    alone = optimise_edges(points, np.array(quad, dtype=np.int32))
     assert alone.turns[0].flipped_edges == 1
-    assert topology_counts(optimised(points, np.array([*quad, beyond], dtype=np.int32)).faces).nonmanifold_edges == 0
-    assert optimised(points, np.array([*quad, beyond], dtype=np.int32)).turns[0].flipped_edges == 0
+    both = np.array([*quad, beyond], dtype=np.int32)
+    assert topology_counts(optimise_edges(points, both).faces).nonmanifold_edges == 0
+    assert optimise_edges(points, both).turns[0].flipped_edges == 0
     # Pinched at 2 alone, nothing is in the way.
     elsewhere = np.array([*quad, [2, 5, 4]], dtype=np.int32)
-    assert optimised(np.concatenate([points, [[5, 5, 5]]]), elsewhere).turns[0].flipped_edges == 1
+    assert optimise_edges(np.concatenate([points, [[5, 5, 5]]]), elsewhere).turns[0].flipped_edges == 1
 
 
 def test_flat_triangles_are_flipped_away_and_leave_the_mean_alone() -> None:
     points = np.array([[0, 0, 0], [2, 0, 0], [1, 0, 0], [1, -1, 0]], dtype=np.float64)
     # Corner 2 lies on edge 0-1.
     faces = np.array([[0, 1, 2], [1, 0, 3]], dtype=np.int32)
-    found = optimised(points, faces)
+    found = optimise_edges(points, faces)
     assert found.harmonic_index_before == pytest.approx(8)
     assert as_set(found.faces) == {(0, 3, 2), (1, 2, 3)}
     assert found.turns[-1].harmonic_index == pytest.approx(8)
-    only_flat = optimised(np.zeros((3, 3)), np.array([[0, 1, 2]], dtype=np.int32))
+    only_flat = optimise_edges(np.zeros((3, 3)), np.array([[0, 1, 2]], dtype=np.int32))
     assert math.isnan(only_flat.harmonic_index_before)
 
 
 def test_no_face_is_no_fault() -> None:
-    found = optimised(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
+    found = optimise_edges(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
     assert found.faces.shape == (0, 3)
     assert found.ended_by == NO_FLIPS
     assert math.isnan(found.harmonic_index_before)
@@ -277,10 +276,10 @@ def test_no_face_is_no_fault() -> None:
 def test_what_does_not_fit_is_refused() -> None:
     points, faces = wandering(5, 5, 3)
     with pytest.raises(ValueError, match="among: expected shape"):
-        optimised(points, faces, among=np.ones(3, dtype=np.bool_))
+        optimise_edges(points, faces, among=np.ones(3, dtype=np.bool_))
     with pytest.raises(ValueError, match="adjacency: expected shape"):
-        optimised(points, faces, adjacency=np.zeros((3, 3), dtype=np.int32))
+        optimise_edges(points, faces, adjacency=np.zeros((3, 3), dtype=np.int32))
     with pytest.raises(ValueError, match="angle from 0 to π"):
-        optimised(points, faces, gamma=4.0)
+        optimise_edges(points, faces, gamma=4.0)
     with pytest.raises(ValueError, match="same direction"):
-        optimised(points, np.concatenate([faces, faces[:1]]))
+        optimise_edges(points, np.concatenate([faces, faces[:1]]))

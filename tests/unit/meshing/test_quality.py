@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from slrig.meshing.open_borders import open_borders
 from slrig.meshing.quality import TruthScore, mesh_figures, score, weighted_percentiles
+from slrig.meshing.topology import open_borders
 from slrig.model import FloatArray, Mesh, Surface
 from tests.unit.meshing.plain import grid_faces, joined, mesh_of, soup
 

@@ -8,7 +8,7 @@ from numba import config
 from numpy.typing import NDArray
 
 from slrig.meshing import rasteriser
-from slrig.meshing.rasteriser import normals_seen, rasterised
+from slrig.meshing.rasteriser import rasterise, rasterise_normals
 from slrig.model import FloatArray, IntArray, Size
 from tests.unit.meshing.plain import grid_faces
 
@@ -58,7 +58,7 @@ def test_the_view_is_that_of_trying_every_triangle_at_every_pixel(
 ) -> None:
     share_out(monkeypatch, threads)
     placed, faces, _ = random_triangles()
-    view = rasterised(placed, faces, SIZE)
+    view = rasterise(placed, faces, SIZE)
     depth, which = plain_view(placed, faces, SIZE)
     assert 0.2 < (which >= 0).mean() < 1
     assert view.depth_mm == pytest.approx(depth, nan_ok=True)
@@ -79,8 +79,8 @@ def test_normals_are_those_of_the_triangle_that_is_seen_on_the_side_that_is_seen
         expected[here] = np.einsum("irc,ik->rck", weights, normals[face].astype(np.float64))[here]
     expected[~front] *= -1
     length = np.linalg.norm(expected, axis=2, keepdims=True)
-    view = rasterised(placed, faces, SIZE)
-    found, found_front = normals_seen(view, placed, normals, faces)
+    view = rasterise(placed, faces, SIZE)
+    found, found_front = rasterise_normals(view, placed, normals, faces)
     assert 0.2 < front[which >= 0].mean() < 0.8
     assert np.array_equal(found_front, front)
     assert found == pytest.approx(expected / np.where(length > 0, length, 1), abs=1e-5)
@@ -90,9 +90,9 @@ def test_normals_are_those_of_the_triangle_that_is_seen_on_the_side_that_is_seen
 def test_of_equally_near_triangles_the_first_is_seen(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
     share_out(monkeypatch, threads)
     placed, faces, _ = random_triangles()
-    once = rasterised(placed, faces, SIZE)
+    once = rasterise(placed, faces, SIZE)
     # The same triangles again and again: some copies in the band of the first, some in others.
-    again = rasterised(placed, np.tile(faces, (5, 1)), SIZE)
+    again = rasterise(placed, np.tile(faces, (5, 1)), SIZE)
     assert np.array_equal(again.face, once.face)
 
 
@@ -101,7 +101,7 @@ def test_a_sheet_of_small_triangles_has_no_holes() -> None:
     for shift in (0.0, 0.5):
         x, y = (axis.ravel() + shift for axis in np.meshgrid(side, side))
         faces = grid_faces(32, 32)
-        view = rasterised(placed_at(np.stack((x, y), 1), np.full(len(x), 300.0)), faces, Size(34, 34))
+        view = rasterise(placed_at(np.stack((x, y), 1), np.full(len(x), 300.0)), faces, Size(34, 34))
         seen = np.zeros((34, 34), dtype=bool)
         seen[: 31 + round(2 * shift), : 31 + round(2 * shift)] = True
         assert np.array_equal(view.face >= 0, seen)
@@ -111,13 +111,13 @@ def test_a_triangle_with_a_vertex_behind_the_camera_or_unmeasured_is_left_out() 
     pixels = np.array([[1, 1], [8, 1], [1, 8], [np.nan, 8], [np.nan, np.nan]], dtype=np.float64)
     faces = np.array([[0, 1, 2], [0, 1, 3], [0, 4, 1], [4, 0, 1], [0, 1, 4]], dtype=np.int32)
     depth = np.array([1.0, 1.0, -1.0, np.nan, 1.0])
-    view = rasterised(placed_at(pixels, depth), faces, Size(10, 10))
+    view = rasterise(placed_at(pixels, depth), faces, Size(10, 10))
     assert np.isnan(view.depth_mm).all()
     assert (view.face == -1).all()
 
 
 def test_no_triangles_are_no_view() -> None:
     placed, faces = np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32)
-    view = rasterised(placed, faces, Size(4, 3))
+    view = rasterise(placed, faces, Size(4, 3))
     assert np.isnan(view.depth_mm).all()
-    assert not normals_seen(view, placed, placed, faces)[0].any()
+    assert not rasterise_normals(view, placed, placed, faces)[0].any()

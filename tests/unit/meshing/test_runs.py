@@ -5,16 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.meshing.adjacency import neighbours
-from slrig.meshing.runs import neighbouring_curves, parts_of_curves, whole_curves
-from slrig.meshing.strips import strip_neighbours, strips
+from slrig.meshing.strips import (
+    neighbouring_curves,
+    runs_of_curve_parts,
+    runs_of_whole_curves,
+    strip_neighbours,
+    strips,
+)
+from slrig.meshing.topology import neighbours
 from slrig.model import FloatArray, IntArray
 
 
 def parts(*along: list[float], widest_step_px: float = 2.0, widest_gap_px: float = 3.0) -> list[list[int]]:
     """The runs of curves at 0, 1, 2, ... with points at these places."""
     offsets = np.concatenate([[0], np.cumsum([len(each) for each in along])]).astype(np.int32)
-    runs: list[list[int]] = parts_of_curves(
+    runs: list[list[int]] = runs_of_curve_parts(
         np.arange(len(along), dtype=np.float64), offsets, np.concatenate([np.array(each, float) for each in along]),
         widest_step_px=widest_step_px, widest_gap_px=widest_gap_px,
     ).tolist()  # fmt: skip
@@ -50,7 +55,7 @@ def test_curves_without_gaps_are_joined_to_their_ends() -> None:
     first, last = rng.integers(0, 8, 30), rng.integers(12, 30, 30)
     along = [np.arange(a, b, dtype=np.float64) for a, b in zip(first, last, strict=True)]
     offsets = np.concatenate([[0], np.cumsum(last - first)]).astype(np.int32)
-    whole = whole_curves(neighbouring_curves(np.arange(30.0), offsets, widest_step_px=1.0), offsets)
+    whole = runs_of_whole_curves(neighbouring_curves(np.arange(30.0), offsets, widest_step_px=1.0), offsets)
     assert parts(*(each.tolist() for each in along), widest_step_px=1.0) == whole.tolist()
 
 
@@ -72,7 +77,7 @@ def torn_curves(seed: int) -> tuple[FloatArray, IntArray, FloatArray, FloatArray
 @pytest.mark.parametrize("seed", range(20))
 def test_strips_are_a_manifold_whatever_the_curves(seed: int) -> None:
     points, offsets, position, along = torn_curves(seed)
-    runs = parts_of_curves(position, offsets, along, widest_step_px=4.0, widest_gap_px=2.0)
+    runs = runs_of_curve_parts(position, offsets, along, widest_step_px=4.0, widest_gap_px=2.0)
     assert (runs[:, 0] <= runs[:, 1]).all()
     assert (runs[:, 2] <= runs[:, 3]).all()
     curve = np.searchsorted(offsets, np.arange(len(points)), side="right") - 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.meshing.search_tree import SearchTree
+from slrig.meshing.quality import SearchTree
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.plain import grid_faces
 
@@ -55,7 +55,7 @@ def test_distances_are_those_of_trying_every_triangle(count: int) -> None:
     vertices, faces = soup(count, count)
     points = np.random.default_rng(0).uniform(-15, 15, (20, 3))
     expected = [plain_distance(point, vertices[faces]) for point in points]
-    assert SearchTree.over(vertices, faces).distances_mm(points) == pytest.approx(np.array(expected), abs=1e-6)
+    assert SearchTree.build(vertices, faces).distances_mm(points) == pytest.approx(np.array(expected), abs=1e-6)
 
 
 def test_rays_are_those_of_trying_every_triangle() -> None:
@@ -64,7 +64,7 @@ def test_rays_are_those_of_trying_every_triangle() -> None:
     origin = np.array([1.0, -30.0, 4.0])
     directions = random.uniform(-8, 8, (40, 3)) - origin
     directions[0] = (0.0, 1.0, 0.0)
-    tree = SearchTree.over(vertices, faces)
+    tree = SearchTree.build(vertices, faces)
     reaches = [plain_reaches(origin, direction, vertices[faces]) for direction in directions]
     assert max(map(len, reaches)) > 2
     assert tree.first_hits(origin, directions) == pytest.approx(np.array([min(r, default=np.inf) for r in reaches]))
@@ -78,12 +78,12 @@ def test_a_ray_through_vertices_and_along_edges_does_not_slip_through() -> None:
     faces = grid_faces(41, 41)
     eye = np.array([3.7, -2.9, -90.3])
     inner = vertices[(np.abs(vertices[:, :2]) < 20).all(axis=1)]
-    reach = SearchTree.over(vertices, faces).first_hits(eye, inner - eye)
+    reach = SearchTree.build(vertices, faces).first_hits(eye, inner - eye)
     assert reach == pytest.approx(np.ones(len(inner)), abs=1e-6)
 
 
 def test_a_tree_of_nothing_is_infinitely_far() -> None:
-    tree = SearchTree.over(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
+    tree = SearchTree.build(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
     assert tree.distances_mm(np.zeros((2, 3))).tolist() == [np.inf, np.inf]
     assert tree.first_hits(np.zeros(3), np.ones((1, 3))).tolist() == [np.inf]
 
@@ -91,7 +91,7 @@ def test_a_tree_of_nothing_is_infinitely_far() -> None:
 def test_a_point_that_is_not_finite_has_no_distance() -> None:
     vertices, faces = soup(10, 1)
     points = np.array([[0, 0, np.nan], [np.inf, 0, 0], [0, 0, 0]])
-    found = SearchTree.over(vertices, faces).distances_mm(points)
+    found = SearchTree.build(vertices, faces).distances_mm(points)
     assert np.isnan(found).tolist() == [True, True, False]
 
 
@@ -99,5 +99,5 @@ def test_a_vertex_that_is_not_finite_is_refused_if_it_is_used() -> None:
     vertices, faces = soup(10, 1)
     vertices[4] = np.nan
     with pytest.raises(ValueError, match="finite vertices"):
-        SearchTree.over(vertices, faces)
-    assert np.isfinite(SearchTree.over(vertices, faces[3:]).distances_mm(np.zeros((1, 3)))).all()
+        SearchTree.build(vertices, faces)
+    assert np.isfinite(SearchTree.build(vertices, faces[3:]).distances_mm(np.zeros((1, 3)))).all()

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.meshing.adjacency import neighbours
-from slrig.meshing.runs import neighbouring_curves, whole_curves
-from slrig.meshing.strips import strip_neighbours, strips, to_drop
+from slrig.meshing.strips import faces_to_drop, neighbouring_curves, runs_of_whole_curves, strip_neighbours, strips
+from slrig.meshing.topology import neighbours
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.test_flips import verdict
 
@@ -24,7 +23,7 @@ def offsets_of(*curves: FloatArray) -> IntArray:
 def between(*curves: FloatArray) -> IntArray:
     """Strips between each curve and the next."""
     pairs = np.stack([np.arange(len(curves) - 1), np.arange(1, len(curves))], axis=1).astype(np.int32)
-    return strips(np.concatenate(curves), whole_curves(pairs, offsets_of(*curves)))
+    return strips(np.concatenate(curves), runs_of_whole_curves(pairs, offsets_of(*curves)))
 
 
 def wandering(seed: int, x: float, count: int) -> FloatArray:
@@ -70,7 +69,7 @@ def test_triangles_are_counter_clockwise_in_an_image_with_curves_running_down() 
 
 
 def test_no_pairs_give_no_triangles() -> None:
-    none = whole_curves(np.zeros((0, 2), dtype=np.int32), np.zeros(1, dtype=np.int32))
+    none = runs_of_whole_curves(np.zeros((0, 2), dtype=np.int32), np.zeros(1, dtype=np.int32))
     assert strips(np.zeros((0, 3)), none).shape == (0, 3)
     assert strips(curve(0.0, np.arange(4.0)), none).shape == (0, 3)
 
@@ -109,7 +108,7 @@ def dropped(
 ) -> tuple[list[bool], list[bool], list[bool]]:  # fmt: skip
     none = np.zeros(len(points), dtype=np.bool_)
     spacing = np.ones(len(points)) if sampling is None else sampling
-    depth_edge, bridge = to_drop(
+    depth_edge, bridge = faces_to_drop(
         points, faces, none if bridge_after is None else bridge_after, spacing,
         depth_edge_ratio=ratio, keep_holes=keep_holes,
     )  # fmt: skip
@@ -146,7 +145,7 @@ def test_strips_know_their_neighbours(seed: int) -> None:
     position = np.cumsum(rng.integers(1, 3, 9)).astype(np.float64)
     for widest in (1.0, 2.0):
         pairs = neighbouring_curves(position, offsets, widest_step_px=widest)
-        runs = whole_curves(pairs, offsets)
+        runs = runs_of_whole_curves(pairs, offsets)
         faces = strips(points, runs)
         found = strip_neighbours(faces, runs, len(points))
         assert found.dtype == np.int32

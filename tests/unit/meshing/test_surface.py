@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slrig.meshing.surface import FinishedMesh, MeshingLimits, finished_mesh
+from slrig.meshing.surface import MeshingLimits, SurfaceMesh, build_surface
 from slrig.meshing.topology import topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
 
@@ -33,9 +33,9 @@ def jagged_curves(*, curves: int = 60, points: int = 80) -> tuple[FloatArray, In
     return np.concatenate(parts), offsets
 
 
-def meshed(points: FloatArray, offsets: IntArray, limits: MeshingLimits = LIMITS) -> tuple[FinishedMesh, list[str]]:
+def meshed(points: FloatArray, offsets: IntArray, limits: MeshingLimits = LIMITS) -> tuple[SurfaceMesh, list[str]]:
     told: list[str] = []
-    made = finished_mesh(
+    made = build_surface(
         points, offsets, np.arange(len(offsets) - 1.0), np.zeros(len(points), dtype=bool), np.ones(len(points)), EYE_MM,
         limits, entered=told.append,
     )  # fmt: skip
@@ -91,7 +91,7 @@ def test_a_hole_at_a_bridge_stays_open_when_holes_are_kept() -> None:
     shorter = (offsets - np.searchsorted(np.array(gaps), offsets)).astype(np.int32)
     holes = {}
     for keep_holes in (True, False):
-        made = finished_mesh(
+        made = build_surface(
             points[keep], shorter, np.arange(len(offsets) - 1.0), bridge[keep], np.ones(int(keep.sum())), EYE_MM,
             replace(LIMITS, keep_holes=keep_holes), entered=lambda _: None,
         )  # fmt: skip

@@ -6,20 +6,18 @@ from collections import Counter
 
 import numpy as np
 
-from slrig.meshing.adjacency import neighbours
-from slrig.meshing.angles import angle_rad
-from slrig.meshing.boundary_rules import boundary_half_edges
-from slrig.meshing.flips import BLOCK, GAMMA, prefer_flips, prefers_flip
-from slrig.meshing.normals import vertex_normals
+from slrig.meshing.boundary import boundary_half_edges
+from slrig.meshing.flips import BLOCK, GAMMA, angle_rad, prefer_flips, prefers_flip
+from slrig.meshing.surface import compact_mesh, vertex_normals
 from slrig.meshing.topology import (
     boundary_vertices,
     component_sizes,
     degenerate_faces,
-    kept_faces,
+    neighbours,
+    select_faces,
     topology_counts,
     used_vertices,
 )
-from slrig.meshing.vertices import compact_mesh
 from slrig.model import IntArray
 from tests.unit.meshing.plain import boundary_edges, faces_of, grid_faces, soup
 
@@ -99,7 +97,7 @@ def test_sizes_of_components_agree_with_flooding() -> None:
 def test_kept_faces_keep_their_neighbours() -> None:
     faces = grid_faces(6, 9)
     kept = np.asarray(np.random.default_rng(8).random(len(faces)) < 0.6)
-    rest, across = kept_faces(faces, neighbours(faces, vertex_count=54), kept)
+    rest, across = select_faces(faces, neighbours(faces, vertex_count=54), kept)
     np.testing.assert_array_equal(rest, faces[kept])
     np.testing.assert_array_equal(across, neighbours(rest, vertex_count=54))
     assert rest.dtype == across.dtype == np.int32

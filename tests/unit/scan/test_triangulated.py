@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.meshing.vertices import compact_mesh
+from slrig.meshing.surface import compact_mesh
 from slrig.model import AlbedoMark, Axis, FloatArray, Mesh, Pinhole, Refusal, Size
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.linking import StripeEnsemble

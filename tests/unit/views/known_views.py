@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.casting import caster
-from slrig.meshing.normals import vertex_normals
+from slrig.meshing.surface import vertex_normals
 from slrig.meshing.topology import used_vertices
 from slrig.model import FloatArray, Mesh
 from tests.unit.meshing.plain import grid_faces

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slrig.errors import InvalidInputError, NothingToReconstructError
-from slrig.meshing.search_tree import SearchTree
+from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import AlbedoMark, FloatArray, Mesh
 from slrig.model.srgb import light_of, srgb_of
@@ -53,7 +53,7 @@ def test_it_is_open_where_nothing_was_seen() -> None:
     assert counts.boundary_edges > 100
     assert (counts.nonmanifold_edges, counts.components) == (0, 1)
     seen = views_of(star(subdivisions=5), around(8)[:1], 0.3, QUIET)[0]
-    tree_of_view = SearchTree.over(seen.mesh.vertices_mm @ seen.pose[:3, :3].T + seen.pose[:3, 3], seen.mesh.faces)
+    tree_of_view = SearchTree.build(seen.mesh.vertices_mm @ seen.pose[:3, :3].T + seen.pose[:3, 3], seen.mesh.faces)
     # Not further beyond the view's border than half a voxel, and its own noise.
     assert tree_of_view.distances_mm(model.mesh.vertices_mm).max() < 0.8 * model.voxel_mm
 

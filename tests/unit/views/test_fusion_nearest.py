@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.meshing.search_tree import SearchTree
+from slrig.meshing.quality import SearchTree
 from slrig.model import FloatArray
 from slrig.views.fusion_grid import corners_mm, grid_about, wanted_corners
 from slrig.views.fusion_mean import AGREEING_SIGMAS, PoseErrors, Rule, mean_values
@@ -83,7 +83,7 @@ def plain_value(seen: Sheets, point: FloatArray, nearest: list[int]) -> tuple[fl
 
 def distances(seen: Sheets, view: int, points: FloatArray) -> FloatArray:
     faces = seen.faces[seen.first_face[view] : seen.first_face[view + 1]]
-    return SearchTree.over(seen.points_mm, faces).distances_mm(points)
+    return SearchTree.build(seen.points_mm, faces).distances_mm(points)
 
 
 def told(seen: Sheets, points: FloatArray, nearest: np.ndarray) -> FloatArray:
