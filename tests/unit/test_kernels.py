@@ -191,13 +191,13 @@ def test_processes_that_compile_at_once_leave_each_signature_its_own_code(tmp_pa
 _MESHES_IN_3_S = """
 import time
 import numpy as np
-from slrig.meshing.flips import optimised
+from slrig.meshing.flips import optimise_edges
 points = np.array([[0, 0, 0], [9, 0, 0], [0, 1, 0], [3, 1, 5]], dtype=np.float64)
 faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32)
-optimised(points, faces)
+optimise_edges(points, faces)
 end, count = time.monotonic() + 3, 0
 while time.monotonic() < end:
-    optimised(points, faces)
+    optimise_edges(points, faces)
     count += 1
 print(count)
 """
