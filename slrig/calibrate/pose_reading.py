@@ -27,9 +27,9 @@ from slrig.patterns.positions import (
     index_of_word,
     line_positions,
 )
+from slrig.reconstruction.coded import CodeTables
 from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
 from slrig.reconstruction.frames import AxisFrames, axis_frames
-from slrig.reconstruction.limits import CodeTables
 from slrig.reconstruction.phase import has_phase
 
 MOST_LIGHT = 30_000

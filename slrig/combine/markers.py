@@ -16,7 +16,7 @@ from slrig.calibration.boards.grey import Grey
 from slrig.calibration.boards.sightings import markers_in
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, White
-from slrig.reconstruction.optics import project, rays
+from slrig.reconstruction.triangulation import project, rays
 from slrig.scan.artefacts import MESH
 from slrig.views.markers import SeenMarker
 from slrig.views.stage_planes import fitted_plane

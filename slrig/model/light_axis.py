@@ -24,7 +24,8 @@ def triangulated_axis(cameras: Sequence[Pinhole], projector: Pinhole | None, /) 
     many pixels as its focal length times its baseline, seen in the projector's frame; inverse variances add up.
     Without a projector the baseline is that from the first camera to another, seen in the first camera's frame; of
     several the one that is longest across the view. The projector is then assumed to stand upright to the first camera,
-    within 45°: its columns run down the image. Whether that holds, the stripes tell (`slrig.reconstruction.epipolar`).
+    within 45°: its columns run down the image. The direction of the stripes shows whether that holds
+    (`slrig.reconstruction.triangulation`).
     """
     across = share_across(Axis.COLUMN, cameras, projector)
     return Axis.COLUMN if across >= share_across(Axis.ROW, cameras, projector) else Axis.ROW

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
 from slrig.model import AlbedoMark, FloatArray, Pinhole
-from slrig.reconstruction.optics import project
+from slrig.reconstruction.triangulation import project
 
 LEAST_COSINE = 0.2
 """Of the angle at which light falls, up to which albedo is relied on: at 78° one degree that a normal is off makes 9 %

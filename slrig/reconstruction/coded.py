@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import IntArray, Refusal
-from slrig.reconstruction.compression import loss_variance
-from slrig.reconstruction.correlation import PixelSum, shared_noise
-from slrig.reconstruction.decoding import CodeMap, lit_pixels
-from slrig.reconstruction.edges import near_shadows
+from slrig.model import FloatArray, IntArray, Refusal
+from slrig.reconstruction.camera_response import PixelSum, gain, loss_variance, shared_noise
+from slrig.reconstruction.decoding import CodeMap, DecodingLimits, lit_pixels
 from slrig.reconstruction.frames import AxisFrames, Images, at_rows, band_rows, rows_of
-from slrig.reconstruction.limits import Limits
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.response import gain
+from slrig.reconstruction.phase import EdgeLimits, near_shadows
 from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
@@ -25,6 +22,36 @@ from slrig.reconstruction.stripes import (
     normalised_kernel,
     normalised_line,
 )
+
+
+@dataclass(frozen=True, slots=True)
+class CodeTables:
+    """What the patterns mean. index_of_word : (2^bits,) int32; cell_position : (cells,) float64, px;
+    position_of : (frames, cells) float64, px, of lines or of code edges; edges_of : (bits, cells) float64, px, of the
+    code edges that stand for lines where those are not resolved, None where nothing does.
+    """
+
+    index_of_word: IntArray
+    cell_position: FloatArray
+    position_of: FloatArray
+    edges_of: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """All thresholds of a camera's reconstruction.
+
+    largest_disagreement_px : where the stripes of one frame lie further than this from where all frames together put
+    them, the light changed from frame to frame, and each stripe stands as its own frame shows it.
+    camera_blur_px : its own, where neither lines nor a print tell it: a lens in focus, 0.58 px, and its pixel, 1/12 px²
+    """
+
+    decoding: DecodingLimits = field(default_factory=DecodingLimits)
+    stripes: StripeLimits = field(default_factory=StripeLimits)
+    edges: EdgeLimits = field(default_factory=EdgeLimits)
+    largest_disagreement_px: float = 0.03
+    camera_blur_px: float = 0.65
+
 
 _WHOLE = slice(None)
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import PatternError
 from slrig.model import Axis, Capture, FloatArray, Gray, Pattern, exposure_groups
-from slrig.reconstruction.compression import compression_loss
+from slrig.reconstruction.camera_response import compression_loss
 from slrig.reconstruction.frames import (
     NEARLY_FULL,
     AxisFrames,

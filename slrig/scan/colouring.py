@@ -12,7 +12,7 @@ from slrig.model import AlbedoMark, Axis, LightMap, Mesh, Pinhole, Refusal, Sour
 from slrig.model.srgb import srgb_of
 from slrig.reconstruction.albedo import BRIGHT_ALBEDO, BRIGHT_PERCENT, Albedo, LitPoints, LitView, albedo
 from slrig.reconstruction.merging import MergedCurves
-from slrig.reconstruction.sheet_curves import SheetCurves
+from slrig.reconstruction.triangulation import SheetCurves
 from slrig.scan.stream import CameraResult
 
 _NEUTRAL = 128

@@ -21,12 +21,11 @@ from slrig.disk import refusals_of
 from slrig.errors import PatternError, setting
 from slrig.model import Axis, Capture, Gray, Refusal, without_missing_bits
 from slrig.patterns.positions import cell_positions, index_of_word
-from slrig.reconstruction.decoding import DecodingLimits, decode, lit_pixels
+from slrig.reconstruction.decoding import DecodingLimits, decode, lit_pixels, unresolved_bits
 from slrig.reconstruction.frames import AxisFrames, axis_frames, exposure_count
 from slrig.reconstruction.fusion import fused_frames
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from slrig.reconstruction.phase import position_map
-from slrig.reconstruction.resolution import unresolved_bits
 from slrig.scan.artefacts import REPORT, REPORT_FORMAT, staged_folder, write_report
 from slrig.scan.pictures import encode_png, rejection_picture
 

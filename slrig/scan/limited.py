@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from slrig.errors import ConfigError
 from slrig.model import Axis, CameraFormat, FloatArray, Pinhole, Pixels, Refusal, Region, Shot, Size
-from slrig.reconstruction.asked import AskedPixels
 from slrig.reconstruction.camera import CameraCurves
-from slrig.reconstruction.optics import project, rays, to_depths
-from slrig.reconstruction.sheet_curves import SheetCurves, selected
+from slrig.reconstruction.decoding import AskedPixels
+from slrig.reconstruction.triangulation import SheetCurves, project, rays, selected, to_depths
 
 Sample = TypeVar("Sample", bound=np.generic)
 

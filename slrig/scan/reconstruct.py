@@ -27,11 +27,15 @@ from slrig.kernels import Prepared, compilations_told
 from slrig.memory import give_back
 from slrig.meshing import MeshingLimits, MeshStage, build_surface, compact_mesh, mesh_figures, score
 from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region
-from slrig.reconstruction.agreement import disagreement
-from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
-from slrig.reconstruction.merging import MergedCurves
-from slrig.reconstruction.optics import project
-from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
+from slrig.reconstruction.merging import MergedCurves, disagreement
+from slrig.reconstruction.triangulation import project
+from slrig.reconstruction.uncertainty import (
+    calibration_modes,
+    calibration_sigma,
+    sampling_mm,
+    sigma_along_normal,
+    stripe_tangents,
+)
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.colouring import albedo_report, coloured
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface

@@ -31,8 +31,7 @@ from slrig.model import (
 from slrig.model.header import CaptureHeader
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.fusion import ExposureUse
-from slrig.reconstruction.merging import MergedCurves
-from slrig.reconstruction.redundancy import PairRedundancy, Redundancy
+from slrig.reconstruction.merging import MergedCurves, PairRedundancy, Redundancy
 from slrig.scan.artefacts import REPORT_FORMAT
 
 _MOST_OFF = 0.1

@@ -35,8 +35,9 @@ from slrig.model import (
 )
 from slrig.model.header import CaptureHeader
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
-from slrig.reconstruction.asked import AskedPixels
 from slrig.reconstruction.camera import CameraCurves, CameraStream, camera_curves
+from slrig.reconstruction.coded import CodeTables, Limits
+from slrig.reconstruction.decoding import AskedPixels
 from slrig.reconstruction.frames import (
     NEARLY_FULL,
     AxisFrames,
@@ -52,7 +53,6 @@ from slrig.reconstruction.frames import (
     telling_shots,
 )
 from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_colour, fused_frames
-from slrig.reconstruction.limits import CodeTables, Limits
 from slrig.scan.light_axis import chosen_axis
 from slrig.scan.limited import FramePart, frame_part
 from slrig.scan.report import Stopwatch

@@ -25,8 +25,8 @@ from slrig.model import Axis, CameraFormat, Capture, FloatArray, Gray, LineShift
 from slrig.patterns.positions import cell_positions, index_of_word, line_positions
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.reconstruction.camera import CameraCurves, camera_curves
+from slrig.reconstruction.coded import CodeTables, Limits
 from slrig.reconstruction.frames import axis_frames
-from slrig.reconstruction.limits import CodeTables, Limits
 from tests.light_bound import ExposedView, pixel_bound, stripe_bound
 from tests.unit.reconstruction.builders import rms
 

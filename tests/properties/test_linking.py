@@ -10,8 +10,7 @@ import numpy as np
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from slrig.reconstruction.identification import CodedStripes
-from slrig.reconstruction.linking import link
+from slrig.reconstruction.identification import CodedStripes, link
 from tests.unit.reconstruction.builders import stripes_of
 
 # A choice between two that are closer than this is one of rounding.

@@ -19,7 +19,7 @@ from slrig.model import Axis, CameraFormat, Capture, FloatArray, Gray, IntArray,
 from slrig.patterns.sequence import encode
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.linking import StripeEnsemble
+from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.stripes import Stripes
 
 _TO_THE_LAST_BIT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-15)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, Pinhole, Solved, Source
-from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
+from slrig.reconstruction.uncertainty import calibration_modes, calibration_sigma, stripe_tangents
 from tests.unit.calibration.perturbed import (
     changed,
     covariance_by_known_points,

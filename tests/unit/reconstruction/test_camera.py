@@ -27,8 +27,8 @@ from slrig.model import (
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.patterns.sequence import scan_patterns
 from slrig.reconstruction.camera import CameraCurves, CameraStream, camera_curves
+from slrig.reconstruction.coded import CodeTables, Limits
 from slrig.reconstruction.frames import FrameStacks, axis_frames, axis_patterns, ends_repeats, telling_shots
-from slrig.reconstruction.limits import CodeTables, Limits
 from tests.unit.reconstruction.builders import grid, rms, seen_by_camera
 
 CAMERA = Size(210, 100)

@@ -10,14 +10,14 @@ from scipy.ndimage import correlate, gaussian_filter1d
 
 from slrig.kernels import in_bands
 from slrig.model import FloatArray
-from slrig.reconstruction.centroid import (
+from slrig.reconstruction.phase import (
+    PositionMap,
     _beyond_quadratic,
     _edges_kernel,
     _shift_kernel,
     at_pixel_centres,
     third_order_px,
 )
-from slrig.reconstruction.phase import PositionMap
 from tests.unit.reconstruction.builders import grid
 
 FINE = 20

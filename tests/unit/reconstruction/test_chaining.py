@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray
-from slrig.reconstruction.chaining import (
+from slrig.reconstruction.stripes import (
     _LONGEST_STEP_PX,
     _SAME_LINE_ANGLE,
     _SAME_LINE_PX,

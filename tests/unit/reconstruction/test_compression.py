@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.reconstruction.compression import compression_loss, white_equivalent
-from slrig.reconstruction.correlation import PixelSum
+from slrig.reconstruction.camera_response import PixelSum, compression_loss, white_equivalent
 
 SIDE = 400
 EVERYWHERE = np.ones((SIDE, SIDE), dtype=np.bool_)

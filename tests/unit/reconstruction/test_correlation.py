@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve
 
 from slrig.model import FloatArray
-from slrig.reconstruction.correlation import PixelSum, edge_sum, shared_noise
+from slrig.reconstruction.camera_response import PixelSum, edge_sum, shared_noise
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from tests.unit.reconstruction.builders import code_frames, grid

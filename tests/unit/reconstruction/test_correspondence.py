@@ -13,16 +13,16 @@ from scipy.special import ndtr
 from slrig.model import Axis, FloatArray, Gray, LineShift, Pattern, Size
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.patterns.sequence import profile
-from slrig.reconstruction.code_edges import edge_crossings
+from slrig.reconstruction.coded import CodeTables
 from slrig.reconstruction.correspondence import (
     CorrespondenceLimits,
     ProjectorPositions,
+    edge_crossings,
     near_print,
     projector_positions,
 )
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.limits import CodeTables
 from slrig.reconstruction.noise import NoiseModel
 from tests.unit.reconstruction.builders import code_frames
 

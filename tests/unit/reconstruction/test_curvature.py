@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from slrig.model import FloatArray
-from slrig.reconstruction.curvature import freed_of_curvature
+from slrig.reconstruction.blur import freed_of_curvature
 from slrig.reconstruction.phase import PositionMap
 
 FINE = 8

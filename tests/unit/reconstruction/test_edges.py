@@ -11,8 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray
-from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_shadows_of
-from slrig.reconstruction.phase import PositionMap
+from slrig.reconstruction.phase import EdgeLimits, PositionMap, near_edges, near_shadows, near_shadows_of
 from tests.unit.reconstruction.builders import grid
 
 SHAPE = (30, 40)

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Size, lens
 from slrig.model.lens_kernels import undistorted
-from slrig.reconstruction.light_sheet import on_light_sheets
-from slrig.reconstruction.linking import StripeEnsemble
-from slrig.reconstruction.optics import normalised_from_pixel, packed
+from slrig.reconstruction.identification import StripeEnsemble
+from slrig.reconstruction.triangulation import normalised_from_pixel, on_light_sheets, packed
 from tests.unit.reconstruction.builders import ensemble_of, looking
 
 LENGTHS = (1, 3, 255, 256, 257, 600)  # of curves: blocks that are full, and what is left over

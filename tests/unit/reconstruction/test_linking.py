@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from slrig.model import Axis, FloatArray
-from slrig.reconstruction.identification import CodedStripes
-from slrig.reconstruction.linking import StripeEnsemble, link
+from slrig.reconstruction.identification import CodedStripes, StripeEnsemble, link
 from slrig.reconstruction.triangulation import camera_projector
 from tests.unit.reconstruction.builders import CAMERA, PROJECTOR, opencv_pixels, opencv_rays, stripes_of
 

@@ -13,8 +13,15 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import Axis, FloatArray, Pinhole, Source
-from slrig.reconstruction.agreement import FEWEST_POINTS, Disagreement, disagreement
-from slrig.reconstruction.merging import MergedCurves, _alone_kernel, _fuse_kernel, merged
+from slrig.reconstruction.merging import (
+    FEWEST_POINTS,
+    Disagreement,
+    MergedCurves,
+    _alone_kernel,
+    _fuse_kernel,
+    disagreement,
+    merged,
+)
 from slrig.reconstruction.triangulation import SheetCurves, camera_projector
 from tests.unit.reconstruction.builders import BALL, CAMERA, OTHER_CAMERA, PROJECTOR, seen_on_ball
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from slrig.model import FloatArray, Pinhole, Size
-from slrig.reconstruction.epipolar import runs_down, stripe_crossing
-from slrig.reconstruction.linking import StripeEnsemble
-from slrig.reconstruction.optics import project, rays, to_depths
+from slrig.reconstruction.identification import StripeEnsemble
+from slrig.reconstruction.triangulation import project, rays, runs_down, stripe_crossing, to_depths
 from tests.unit.reconstruction.builders import (
     CAMERA,
     OTHER_CAMERA,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slrig.model import Axis, FloatArray, Pinhole, Size, Source
-from slrig.reconstruction.redundancy import (
+from slrig.reconstruction.merging import (
     CELLS,
     FEWEST_PAIRS,
     PairRedundancy,

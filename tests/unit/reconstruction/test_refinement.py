@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 
 from slrig.model import Axis, FloatArray, IntArray, LineShift
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.edges import beside_steps_px
-from slrig.reconstruction.phase import PositionMap, no_points
+from slrig.reconstruction.phase import PositionMap, beside_steps_px, no_points
 from slrig.reconstruction.refinement import Refinement, _crossings, _nothing_taken, refined
 from slrig.reconstruction.stripes import LinePoints, chained
 from tests.unit.reconstruction.builders import cells_of, grid, nearest_lines

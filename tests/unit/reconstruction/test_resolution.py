@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from slrig.model import Axis, Gray, Size
 from slrig.patterns.gray import gray_profile
-from slrig.reconstruction.decoding import CodeMap
+from slrig.reconstruction.decoding import BLOCK_PX, CodeMap, _passed, _tally, lost_lines, unresolved_bits
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.resolution import BLOCK_PX, _passed, _tally, lost_lines, unresolved_bits
 
 PROJECTOR = Size(1024, 32)
 BITS = 10

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from slrig.model import FloatArray
+from slrig.reconstruction.camera_response import found_gamma, gain, in_light
 from slrig.reconstruction.decoding import DecodingLimits
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
-from slrig.reconstruction.response import found_gamma, gain, in_light
 from tests.unit.reconstruction.builders import code_frames, grid
 
 SHAPE = (240, 400)

@@ -11,17 +11,21 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, gaussian_filter
 
 from slrig.model import FloatArray
-from slrig.reconstruction.steger import (
+from slrig.reconstruction.stripes import (
     _NEWTON_BOX,
     _SUPPORT,
     _TAYLOR_BOX,
     EDGE,
     RIDGE,
+    LinePoints,
+    StripeLimits,
+    Stripes,
+    chained,
     kernels,
     newton_step,
+    stripe_points,
     taylor_step,
 )
-from slrig.reconstruction.stripes import LinePoints, StripeLimits, Stripes, chained, stripe_points
 from tests.unit.reconstruction.builders import gaussian_stripe, grid
 
 SHAPE = (80, 90)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slrig.model import Axis, FloatArray, Pinhole, Refusal, Size, Source
-from slrig.reconstruction.linking import StripeEnsemble
+from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.triangulation import camera_projector
 from tests.unit.reconstruction.builders import (
     BALL,

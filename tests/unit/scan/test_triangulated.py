@@ -10,7 +10,7 @@ import pytest
 from slrig.meshing.surface import compact_mesh
 from slrig.model import AlbedoMark, Axis, FloatArray, Mesh, Pinhole, Refusal, Size
 from slrig.reconstruction.camera import CameraCurves
-from slrig.reconstruction.linking import StripeEnsemble
+from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.noise import NoiseModel
 from slrig.scan.colouring import Coloured, albedo_report, coloured
 from slrig.scan.stream import CameraResult
