@@ -16,7 +16,7 @@ from simulated_rig.scene import read_scene
 from simulated_rig.staging import Script, Staging
 from simulated_rig.turning import RenderedTurntable
 from simulated_rig.world import Flicker, VirtualClock
-from slrig.bundle.faults import checked
+from slrig.bundle.validation import checked
 from slrig.devices import Camera, Clock, Head, Positioner, SystemClock, progress_reporter
 from slrig.kernels import compilations_told
 from slrig.model import Calibration, Surface, Truth

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.tables import Positive, Triple
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 from slrig.model import Pinhole
 
 PROJECTOR = "projector"

@@ -15,7 +15,7 @@ from simulated_rig.poses import Pose, PoseSeries
 from simulated_rig.sensor import Sensor
 from simulated_rig.tables import Fraction, Names, NotNegative, Pair, Positive, Triple, at_least_one
 from simulated_rig.turning import TurntableOptions
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 from slrig.errors import CalibrationError
 from slrig.model import Pinhole, Size
 

@@ -9,7 +9,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.tables import Fraction, NotNegative, Positive, Triple
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 from slrig.model import FloatArray
 
 TEXTURES = ("uniform", "checker", "noise")

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from simulated_rig.boards import Board
 from simulated_rig.optics import field_radius, image_positions
 from simulated_rig.tables import NotNegative, Pair, Triple
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, Pinhole
 

@@ -21,7 +21,7 @@ from simulated_rig.boards import Board, Print
 from simulated_rig.placed import Colour, Placed, turned_by
 from simulated_rig.shapes import Part
 from simulated_rig.tables import NotNegative, Pair, Positive, at_least_one
-from slrig.bundle.faults import Strict, checked, read_toml
+from slrig.bundle.validation import Strict, checked, read_toml
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, IntArray
 

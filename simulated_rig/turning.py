@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.tables import Names, NotNegative, Triple
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 from slrig.devices import AnyAngle
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray, StageAxis

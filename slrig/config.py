@@ -15,9 +15,8 @@ from pydantic import ConfigDict, Field, SecretStr, ValidationError, field_valida
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
 
 from slrig.bundle.description import CameraName
-from slrig.bundle.faults import Strict, checked, explain, read_toml
-from slrig.bundle.region_file import with_masks
-from slrig.bundle.scan_options import ExposureSeconds, Preset, PresetName, ScanDefaults
+from slrig.bundle.options import ExposureSeconds, Preset, PresetName, ScanDefaults, with_masks
+from slrig.bundle.validation import Strict, checked, explain, read_toml
 from slrig.errors import ConfigError
 
 MOST_CONFIG_BYTES = 2**20

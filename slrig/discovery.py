@@ -18,8 +18,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from slrig.bundle.calibration_file import check_calibration, check_rays, read_calibration
-from slrig.bundle.faults import explain
+from slrig.bundle.calibration import check_calibration, check_rays, read_calibration
+from slrig.bundle.validation import explain
 from slrig.config import DriverTable, RigConfig
 from slrig.devices import (
     Camera,

@@ -20,7 +20,7 @@ from drivers.depthai.library import library
 from drivers.depthai.messages import Delivery, brightness, coloured
 from drivers.depthai.options import OakOptions, Stream
 from drivers.depthai.sensors import Sensor
-from slrig.bundle.faults import checked
+from slrig.bundle.validation import checked
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import CalibrationError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Size

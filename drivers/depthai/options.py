@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 from slrig.model import Size
 
 USUAL_FPS = 20.0

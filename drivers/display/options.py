@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 from slrig.model import Size
 
 Extent = Annotated[int, Field(ge=1, le=65_535)]

@@ -28,7 +28,7 @@ from pydantic import Field
 from drivers.dlpc350.planes import PLANES, picture_of, planes_in
 from drivers.dlpc350.timing import MOST_IMAGES
 from drivers.pattern_engine.planes import Plane, keys_of_plane, plane_of, words
-from slrig.bundle.faults import Strict, checked, read_json, read_text
+from slrig.bundle.validation import Strict, checked, read_json, read_text
 from slrig.errors import ConfigError, StorageError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 

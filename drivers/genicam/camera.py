@@ -25,7 +25,7 @@ from drivers.genicam.options import CameraOptions, GenicamOptions, GentlOptions
 from drivers.genicam.pixels import FORMATS
 from drivers.genicam.session import Session
 from drivers.genicam.setup import line_of, prepare, set_trigger
-from slrig.bundle.faults import checked
+from slrig.bundle.validation import checked
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame

@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 
 Stamp = Literal["exposure", "exposure_start", "exposure_end", "none"]
 

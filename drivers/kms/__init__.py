@@ -55,7 +55,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     """
     from drivers.kms.options import KmsOptions
     from drivers.linux import require_linux
-    from slrig.bundle.faults import checked
+    from slrig.bundle.validation import checked
 
     del folder
     told = checked(KmsOptions, options, "the [projector] table of driver 'kms'")

@@ -16,7 +16,7 @@ from typing import Any
 from drivers.picamera2.library import cameras, library, told
 from drivers.picamera2.options import PiCameraOptions
 from drivers.picamera2.stream import Stream, configured
-from slrig.bundle.faults import checked
+from slrig.bundle.validation import checked
 from slrig.devices import (
     AppliedSettings,
     Camera,

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 
 PixelExtent = Annotated[int, Field(ge=16, le=16384)]
 

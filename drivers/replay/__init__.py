@@ -17,7 +17,7 @@ from drivers.replay.camera import ReplayCamera, Stage
 from drivers.replay.clock import ReplayClock
 from drivers.replay.projector import ReplayProjector
 from slrig.bundle import Bundle, read_bundle
-from slrig.bundle.faults import Strict, checked
+from slrig.bundle.validation import Strict, checked
 from slrig.devices import Camera, Head, Projector
 from slrig.errors import BundleError, ConfigError
 from slrig.model import Calibration, Truth, without_missing_bits

@@ -164,7 +164,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.faults import checked
+from slrig.bundle.validation import checked
 from slrig.devices import FoundDevice, Projector
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 
 
 class SerialProjectorOptions(Strict, use_attribute_docstrings=True):

@@ -18,8 +18,7 @@ from slrig.accept.plan import (
     usual_limits,
 )
 from slrig.accept.positions import acceptance_plan, rig_volume_mm
-from slrig.bundle.faults import Strict
-from slrig.bundle.free_text import SafeText
+from slrig.bundle.validation import SafeText, Strict
 from slrig.errors import InvalidInputError
 from slrig.model import Calibration
 

@@ -10,8 +10,7 @@ from uuid import UUID
 from pydantic import BaseModel, BeforeValidator, Field
 
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, filled
-from slrig.bundle.faults import Strict
-from slrig.bundle.free_text import FreeText, SafeText
+from slrig.bundle.validation import FreeText, SafeText, Strict
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, plain
 from slrig.calibration.board import USUAL_BOARD, BoardKind, BoardShape
 from slrig.jobs.records import JobState

@@ -14,8 +14,7 @@ from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
 from slrig.api.service import Service, Serving
-from slrig.bundle.faults import Strict
-from slrig.bundle.moments import AwareMoment
+from slrig.bundle.validation import AwareMoment, Strict
 from slrig.calibration.board import Board
 from slrig.calibration.health.verdict import THRESHOLDS, HealthState, Thresholds
 from slrig.calibration.health.verification import Drift, PairFigures

@@ -14,9 +14,8 @@ from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import problems
 from slrig.api.schemas import JobBody, JobLinks, filled
 from slrig.api.service import Cursor, PageLength, Service, Serving, paged
-from slrig.bundle.faults import Strict
-from slrig.bundle.free_text import FreeText, SafeText
-from slrig.bundle.poses_file import MOST_VIEWS, AxisEntry, PoseEntry, rotating
+from slrig.bundle.options import MOST_VIEWS, AxisEntry, PoseEntry, rotating
+from slrig.bundle.validation import FreeText, SafeText, Strict
 from slrig.combine.offered import MEDIA_TYPES
 from slrig.combine.plan import (
     MARKER_DICTIONARY,

@@ -19,19 +19,18 @@ from pydantic import (
 )
 
 from slrig.api.problems import fault_problem
-from slrig.bundle.faults import Strict
-from slrig.bundle.free_text import FreeText
-from slrig.bundle.region_file import RegionTable
-from slrig.bundle.scan_options import (
+from slrig.bundle.options import (
     EXPOSURE_KEYS,
     BracketSeconds,
     ExposureFactors,
     PresetDocument,
     PresetName,
+    RegionTable,
     ScanDefaults,
     alone,
 )
-from slrig.bundle.stage import TurnedBy
+from slrig.bundle.sidecars import TurnedBy
+from slrig.bundle.validation import FreeText, Strict
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
 from slrig.model import Axis, FlipRule, SequenceName, Size

@@ -13,7 +13,7 @@ from fastapi import Depends, Query, Request, Response
 from slrig.accept.desk import AcceptanceDesk
 from slrig.api.latency import Durations
 from slrig.api.traces import traces_by_environment
-from slrig.bundle.scan_options import Preset, ScanDefaults
+from slrig.bundle.options import Preset, ScanDefaults
 from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools

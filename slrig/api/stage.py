@@ -11,8 +11,8 @@ from pydantic import BaseModel, Field
 
 from slrig.api.openapi import file_of, problems
 from slrig.api.service import Serving
-from slrig.bundle.faults import Strict
-from slrig.bundle.stage_file import AxisSource, StageEntry, StageRecord, stage_entry, stage_record
+from slrig.bundle.options import AxisSource, StageEntry, StageRecord, stage_entry, stage_record
+from slrig.bundle.validation import Strict
 from slrig.calibrate.tools import setting_of
 from slrig.combine.stage import StageState, state_of
 from slrig.combine.stage_plot import stage_svg

@@ -1,9 +1,14 @@
 """The scan bundle: a folder with a description, frames, and a calibration, written by us or by someone else."""
 
-from slrig.bundle.calibration_file import check_calibration, read_calibration, write_calibration
-from slrig.bundle.opencv_calibration import read_opencv_calibration, write_opencv_calibration
+from slrig.bundle.calibration import (
+    check_calibration,
+    read_calibration,
+    read_opencv_calibration,
+    write_calibration,
+    write_opencv_calibration,
+)
 from slrig.bundle.reading import Bundle, read_bundle, read_capture
-from slrig.bundle.truth import BundleTruth, read_truth, write_truth
+from slrig.bundle.sidecars import BundleTruth, read_truth, write_truth
 from slrig.bundle.writing import BundleWriter, write_bundle
 
 __all__ = [

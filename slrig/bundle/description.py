@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator, field_validator
 
-from slrig.bundle.faults import MOST_FAULTS, Strict, read_description_of
-from slrig.bundle.moments import AwareMoment
+from slrig.bundle.validation import MOST_FAULTS, AwareMoment, Strict, read_description_of
 from slrig.errors import BundleError, PatternError
 from slrig.model import CameraFormat, Pattern, Size
 

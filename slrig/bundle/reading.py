@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slrig.bundle.calibration_file import check_calibration, read_calibration
+from slrig.bundle.calibration import check_calibration, read_calibration
 from slrig.bundle.description import Description, FrameEntry, read_description
 from slrig.bundle.images import read_colour, read_with_colour
 from slrig.errors import BundleError

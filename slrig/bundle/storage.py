@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from contextlib import suppress
 from pathlib import Path
 
 from slrig.disk import refusals_of, staging_name
+
+
+def natural(path: Path) -> tuple[list[str | int], str]:
+    """A key to sort by. Capitals count only where nothing else tells two paths apart.
+
+    >>> [path.name for path in sorted(map(Path, ("Scan-2", "scan-10", "scan-1", "scan-2")), key=natural)]
+    ['scan-1', 'Scan-2', 'scan-2', 'scan-10']
+    """
+    parts = re.split(r"([0-9]+)", str(path))
+    return [int(part) if place % 2 else part.casefold() for place, part in enumerate(parts)], str(path)
+
 
 _WINDOWS = os.name == "nt"
 

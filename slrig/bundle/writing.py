@@ -14,11 +14,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from slrig.bundle.calibration_file import write_calibration
+from slrig.bundle.calibration import write_calibration
 from slrig.bundle.description import CAMERA_NAME, DESCRIPTION, PROJECTOR
-from slrig.bundle.png import encode_frame
+from slrig.bundle.images import encode_frame
 from slrig.bundle.reading import CALIBRATION
-from slrig.bundle.refused import FOLDER, LIST, Refused, RefusedEntry, RefusedList
+from slrig.bundle.sidecars import FOLDER, LIST, Refused, RefusedEntry, RefusedList
 from slrig.bundle.storage import json_bytes, sync_folder, write_durably
 from slrig.disk import refusals_of, staging_name
 from slrig.errors import BundleError, CalibrationError, StorageError

@@ -8,8 +8,7 @@ from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.bundle.calibration_file import write_calibration
-from slrig.bundle.opencv_calibration import write_opencv_calibration
+from slrig.bundle.calibration import write_calibration, write_opencv_calibration
 from slrig.bundle.storage import write_durably
 from slrig.calibrate.pose_shooting import PoseDesk, outcome_of
 from slrig.calibrate.records import USUAL_PATTERNS, SessionRecord, SessionState

@@ -111,6 +111,6 @@ def calibration_tools(worker: Compute) -> CalibrationTools:
         report=worker.task(f"{room}.pose_judging:write_report", "report of the solve"),
         summary=worker.task(f"{room}.pose_judging:summary", "summary of the solve"),
         compare=worker.task("slrig.calibration.judging.comparison:comparison", "comparison"),
-        parse=worker.task("slrig.bundle.calibration_file:read_calibration", "reading of the calibration"),
+        parse=worker.task("slrig.bundle.calibration:read_calibration", "reading of the calibration"),
         warm=worker.task(f"{room}.pose_judging:warm", "preparation"),
     )

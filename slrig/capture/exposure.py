@@ -17,10 +17,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from slrig.bundle.refused import Refused
-from slrig.capture.checks import NEARLY_FULL, NOISE_FLOOR_DN, Samples, named
-from slrig.capture.evidence import EvidenceSummary, check_capture
-from slrig.capture.sampling import Sampler
+from slrig.bundle.sidecars import Refused
+from slrig.capture.frame_checks import NEARLY_FULL, NOISE_FLOOR_DN, Samples, named
+from slrig.capture.verifier import EvidenceSummary, Sampler, check_capture
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
 
 _ROUNDED = 1e-6  # of a refresh period: a range that is stated as whole ones is
@@ -163,7 +162,7 @@ def bracket_summary(
 
 
 def check_exposures(recorded: Capture, refused: Sequence[Refused] = ()) -> EvidenceSummary:
-    """Judge a recorded capture as `slrig.capture.evidence.check_capture` does, a bracket exposure by exposure."""
+    """Judge a recorded capture as `slrig.capture.verifier.check_capture` does, a bracket exposure by exposure."""
     alike = exposure_groups(shot.exposure_s for shot in recorded.shots)
     of_camera = {name: {alike[s.exposure_s] for s in recorded.shots if s.camera == name} for name in recorded.cameras}
     if all(len(exposures) <= 1 for exposures in of_camera.values()) or None in alike:

@@ -6,19 +6,154 @@ patterns, numbered without a gap, that agree with one another. One that does not
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slrig.bundle.refused import Refused
-from slrig.capture.checks import place
-from slrig.capture.latency import shutter_skew_s
-from slrig.capture.retry_policy import RetryPolicy, in_words
-from slrig.capture.session import Session
-from slrig.devices import Trigger
-from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
+from slrig.bundle.sidecars import Refused
+from slrig.capture.frame_checks import named, place
+from slrig.capture.latency import shutter_skew_s, stable_from_ns
+from slrig.capture.verifier import RetryPolicy, in_words
+from slrig.devices import AppliedSettings, Rig, Shown, Trigger
+from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import Frame, Gray, PatternSequence, Primary, Shot
+
+SETTINGS_TOLERANCE = 0.01
+"""How far a camera's exposure and gain may be from what was asked, as a fraction."""
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One capture. `applied` has the cameras that were set; `timeout_s` is how long a frame may take beyond that."""
+
+    rig: Rig
+    sequence: PatternSequence
+    applied: Mapping[str, AppliedSettings]
+    triggers: Mapping[str, Trigger]
+    timeout_s: float
+    cancelled: Callable[[], bool]
+
+    def pattern(self, index: int) -> str:
+        """Words for a pattern."""
+        return named(index, self.sequence.patterns[index])
+
+    def patience_s(self, name: str) -> float:
+        """How long to wait for a frame of this camera."""
+        return self.timeout_s + self.applied[name].exposure_s if name in self.applied else self.timeout_s
+
+    def stop_if_cancelled(self, index: int) -> None:
+        """Raise ScanCancelledError if somebody asked for it."""
+        if self.cancelled():
+            raise ScanCancelledError(f"the scan was cancelled at {self.pattern(index)} of {len(self.sequence)}")
+
+    def settled_ns(self, shown: Shown) -> int:
+        """Wait until a pattern's light is the only one, and return since when it is."""
+        stable_ns = stable_from_ns(shown, self.rig.synchronisation)
+        self.rig.clock.wait_until(stable_ns, threading.Event())
+        return stable_ns
+
+    def read(self, name: str, after_ns: int, timeout_s: float) -> Frame:
+        """Return the next frame under the name that the rig gives its camera. Raises as `Camera.read` does."""
+        return under_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
+
+    def own_fault(self, frame: Frame, after_ns: int, before: Frame | None) -> str | None:
+        """Say why a frame was exposed too early, was delivered before, or was exposed otherwise than asked."""
+        if frame.t_start_ns < after_ns or frame.t_end_ns < frame.t_start_ns:
+            return (
+                f"the frame was exposed from {frame.t_start_ns} to {frame.t_end_ns} ns (± {frame.t_err_ns} ns), its "
+                f"light was stable from {after_ns} ns only: the driver delivered a stale frame; report it to the "
+                "driver's maintainer, and use another driver for this camera"
+            )
+        if before is not None and frame.sequence_number <= before.sequence_number:
+            return (
+                f"frame number {frame.sequence_number} came after number {before.sequence_number}: a frame was "
+                "delivered twice, or the camera restarted; scan again"
+            )
+        asked = self.applied.get(frame.camera)
+        if asked is not None and differ(frame.exposure_s, asked.exposure_s):
+            return (
+                f"exposed for {frame.exposure_s:.6g} s, set to {asked.exposure_s:.6g} s: switch off automatic "
+                "exposure, and scan again"
+            )
+        return None
+
+
+def under_name(name: str, frame: Frame) -> Frame:
+    """A frame under the name that the rig gives its camera."""
+    return frame if frame.camera == name else replace(frame, camera=name)
+
+
+def differ(got: float, asked: float) -> bool:
+    """Whether a setting is not what was asked."""
+    return abs(got - asked) > SETTINGS_TOLERANCE * abs(asked)
+
+
+_Taken = tuple[int, str, Frame | str, str | None]
+"""Pattern and camera, what it gave or why nothing came in time, and what the frame says against itself."""
+
+
+def software_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]:
+    """Show each pattern, and again where frames failed, until every frame counts. Raises as `RetryPolicy` does."""
+    rig = session.rig
+    rig.projector.load(session.sequence)
+    for name, camera in rig.cameras.items():
+        camera.arm(retries.most_shots, session.triggers[name])
+    ahead = iter(range(len(session.sequence)))
+    last: dict[str, Frame] = {}
+    waiting: list[_Taken] = []
+    while True:
+        if retries.again:
+            # First what failed, in order.
+            index = min(retries.again)
+            names = retries.again.pop(index)
+        elif (index := next(ahead, -1)) >= 0:
+            names = list(rig.cameras)
+        elif waiting:
+            yield from _judged(retries, waiting)
+            waiting = []
+            continue
+        else:
+            return
+        session.stop_if_cancelled(index)
+        shown = rig.projector.show(index)
+        stable_ns = session.settled_ns(shown)
+        for name in names:
+            retries.begin(name, index)
+            if session.triggers[name] is Trigger.SOFTWARE:
+                rig.cameras[name].trigger()
+        # The sensors are at work now: there is time for the frames before.
+        yield from _judged(retries, waiting)
+        waiting = [_taken(session, name, shown, stable_ns, last) for name in names]
+
+
+def _judged(retries: RetryPolicy, taken: list[_Taken]) -> Iterator[Shot]:
+    for index, name, frame, fault in taken:
+        if isinstance(frame, str):
+            retries.missed(name, index, frame)
+        elif (shot := retries.took(index, frame, fault)) is not None:
+            yield shot
+
+
+def _taken(session: Session, name: str, shown: Shown, after_ns: int, last: dict[str, Frame]) -> _Taken:
+    session.stop_if_cancelled(shown.index)
+    timeout_s = session.patience_s(name)
+    try:
+        frame = session.read(name, after_ns, timeout_s)
+    except FrameTimeoutError as error:
+        # Frames that are rendered or replayed have no cable.
+        computed = session.rig.cameras[name].info.limits.computed
+        cause = (
+            f"no frame came within {timeout_s:.3f} s of its light, visible since {shown.t_visible_ns} ns "
+            f"± {shown.t_err_ns} ns ({error}); "
+            + ("is the machine busy?" if computed else "check the camera's cable, bandwidth and trigger")
+        )
+        return shown.index, name, cause, None
+    fault = session.own_fault(frame, after_ns, last.get(name))
+    last[name] = frame
+    return shown.index, name, frame, fault
+
 
 MOST_PLAYS = 3
 

@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 
-from slrig.bundle.refused import Refused
-from slrig.capture.evidence import Evidence
-from slrig.capture.frame_reader import FrameReader
-from slrig.capture.hardware_trigger import hardware_triggered
-from slrig.capture.retry_policy import RetryPolicy
-from slrig.capture.session import Session, differ
-from slrig.capture.software_trigger import software_triggered
-from slrig.capture.streaming import earliest_change_s, streamed
+from slrig.bundle.sidecars import Refused
+from slrig.capture.hardware_trigger import Session, differ, hardware_triggered, software_triggered
+from slrig.capture.streaming import FrameReader, earliest_change_s, streamed
+from slrig.capture.verifier import Evidence, RetryPolicy
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Rig, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence, Shot

@@ -12,17 +12,132 @@ Both are `slrig latency`'s, measured by the same time stamps. A pattern for whic
 
 from __future__ import annotations
 
+import math
+import queue
+import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from slrig.capture.cadence import Cadence
-from slrig.capture.frame_reader import FrameReader
+import numpy as np
+
+from slrig.capture.hardware_trigger import Session, under_name
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
-from slrig.capture.retry_policy import RetryPolicy
-from slrig.capture.session import Session, under_name
-from slrig.devices import Rig, Shown, Trigger
+from slrig.capture.verifier import RetryPolicy
+from slrig.devices import Camera, Rig, Shown, Trigger
+from slrig.errors import FrameTimeoutError
 from slrig.model import Frame, Shot
+
+_REMEMBERED = 24
+"""Frames that the period is taken from: at 30 a second, a little less than a second's."""
+
+_FEWEST = 3
+"""Frames that tell a period, and whether it can be relied on. With fewer, the camera's own word counts."""
+
+_UNPROVEN = 0.1
+"""How much of the period that a camera states its next frame may come otherwise than foretold by that. Stamps of
+webcams scatter by about a millisecond; where the period is wrong, one pattern is shown again."""
+
+_SPARE = 2.0
+"""Standard deviations of the stamps that a frame may come otherwise than foretold. One in twenty comes otherwise still,
+and is shown again: to allow for it would cost every pattern more."""
+
+_WORST_JITTER = 0.25
+"""Standard deviation of the stamps, in periods, from which on nothing is foretold."""
+
+
+class Cadence:
+    """Follows the frames of one camera, in order. stated_s : its period as it says itself; None where it does not."""
+
+    def __init__(self, stated_s: float | None = None) -> None:
+        self._starts: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
+        self._stated_ns = None if stated_s is None else stated_s * 1e9
+
+    def note(self, frame: Frame) -> None:
+        """Take note of a frame's number and its start."""
+        if self._starts and frame.sequence_number <= self._starts[-1][0]:
+            self._starts.clear()
+        self._starts.append((frame.sequence_number, frame.t_start_ns))
+
+    def start_after(self, t_ns: int) -> tuple[int, int] | None:
+        """Return when the first frame begins that surely begins at `t_ns` or later, and by how much later it may, ns.
+
+        None where too few frames are known, or they come too unevenly. The line through the frames' numbers and starts
+        is one of least squares: numbers, because frames may be lost in between.
+        """
+        if not self._starts:
+            return None
+        numbers, starts_ns = np.array(self._starts, np.int64).T
+        last, latest_ns = int(numbers[-1]), int(starts_ns[-1])
+        if len(self._starts) >= _FEWEST:
+            x, y = (numbers - last).astype(np.float64), (starts_ns - latest_ns).astype(np.float64)
+            slope, offset = np.polyfit(x, y, 1)
+            jitter_ns = float(np.std(y - slope * x - offset))
+            if slope <= 0 or jitter_ns > _WORST_JITTER * slope:
+                return None
+            begun_ns, spare_ns = latest_ns + offset, _SPARE * jitter_ns
+        elif self._stated_ns is not None:
+            slope, begun_ns, spare_ns = self._stated_ns, latest_ns, _UNPROVEN * self._stated_ns
+        else:
+            return None
+        ahead = max(math.ceil((t_ns + spare_ns - begun_ns) / slope), 1)
+        return round(begun_ns + ahead * slope), round(spare_ns)
+
+
+_WAIT_S = 0.25
+"""How long one read may take: so soon a reader notices that it shall end, where its camera gives no frames."""
+
+Arrival = tuple[str, Frame | Exception]
+"""A camera's name in its rig, and its next frame or what its driver raised."""
+
+
+class FrameReader:
+    """Reads every frame of several armed cameras until it is stopped.
+
+    Meanwhile nobody else calls these cameras: each has one thread at a time. What a driver raises ends its camera's
+    thread; a frame that does not come raises nothing here.
+    """
+
+    def __init__(self, cameras: Mapping[str, Camera]) -> None:
+        self._cameras = cameras
+        self._arrived: queue.SimpleQueue[Arrival] = queue.SimpleQueue()
+        self._stopped = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> None:
+        """Begin to read. The cameras are armed."""
+        for name, camera in self._cameras.items():
+            thread = threading.Thread(
+                target=self._read, args=(name, camera), name=f"slrig-frames of {name}", daemon=True
+            )
+            self._threads.append(thread)
+            thread.start()
+
+    def next(self, timeout_s: float) -> Arrival | None:
+        """Return what came first of what waits, in the order of its arrival; None if nothing comes in that time."""
+        try:
+            return self._arrived.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def stop(self) -> None:
+        """Read no more, and return when every camera is let go. Idempotent."""
+        self._stopped.set()
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+
+    def _read(self, name: str, camera: Camera) -> None:
+        while not self._stopped.is_set():
+            try:
+                frame = camera.read(0, _WAIT_S)
+            except FrameTimeoutError:
+                continue
+            except Exception as error:  # noqa: BLE001 - it is raised on the thread that captures
+                self._arrived.put((name, error))
+                return
+            self._arrived.put((name, frame))
+
 
 MOST_AHEAD = 12
 """Patterns that may have been shown without any frame of theirs: cameras and links hold back some frames, and one that

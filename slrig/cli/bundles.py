@@ -16,7 +16,7 @@ import typer
 from rich.table import Column
 
 from slrig.bundle.description import DESCRIPTION, read_description
-from slrig.bundle.natural_order import natural
+from slrig.bundle.storage import natural
 from slrig.cli.display import ProgressDisplay, print_table, progress_shown
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError

@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 import typer
 from pydantic import ValidationError
 
-from slrig.bundle.faults import explain, keys_of
 from slrig.bundle.storage import write_file
+from slrig.bundle.validation import explain, keys_of
 from slrig.cli.driver_options import explained, option
 from slrig.config import rig_of
 from slrig.devices import FoundDevice

@@ -85,7 +85,7 @@ def model(
     Says how well they agree, and which motions their shape leaves open. The start is a stage's angle, poses,
     markers, or unknown. Where no scan has seen the object, the mesh is open.
     """
-    from slrig.bundle.stage_file import StageRecord, read_stage
+    from slrig.bundle.options import StageRecord, read_stage
     from slrig.cli.display import progress_shown
     from slrig.cli.reconstruct import keep_kernels
     from slrig.combine.offered import POSES, REPORT, REPORT_FORMAT
@@ -227,7 +227,7 @@ def _starts(
     """Where the scans start from. found : unknown, or by markers. Raises ConfigError: that is not told in one way
     alone, or not of all scans.
     """
-    from slrig.bundle.poses_file import read_poses
+    from slrig.bundle.options import read_poses
     from slrig.combine.plan import GivenPoses, TurntablePoses
 
     ways = [angle is not None, file is not None, found is not None]
@@ -278,7 +278,7 @@ def _require_order(files: Mapping[str, Path], angle: float) -> None:
 
 def _axis(file: Path | None, point: Vector | None, direction: Vector | None) -> StatedAxis | None:
     """The axis that was told. Raises ConfigError: twice, by half, without a length, or `file` has none."""
-    from slrig.bundle.poses_file import read_poses
+    from slrig.bundle.options import read_poses
     from slrig.combine.plan import StatedAxis
 
     if (point is None) != (direction is None) or (file is not None and point is not None):
@@ -303,7 +303,7 @@ def _named_meshes(asked: Sequence[Path]) -> dict[str, Path]:
 
     Raises ConfigError: there is none, fewer than two, or two of one name.
     """
-    from slrig.bundle.natural_order import natural
+    from slrig.bundle.storage import natural
     from slrig.cli.bundles import matching
     from slrig.scan.artefacts import MESH
 

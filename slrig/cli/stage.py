@@ -10,7 +10,7 @@ import typer
 from slrig.cli.options import BoardOptions, grouped
 
 if TYPE_CHECKING:
-    from slrig.bundle.stage_file import StageRecord
+    from slrig.bundle.options import StageRecord
 
 app = typer.Typer(no_args_is_help=True, help="A turntable's axis, its plate and what is behind.")
 
@@ -38,7 +38,7 @@ def axis(
     from rich.table import Column
 
     from slrig.bundle import read_calibration
-    from slrig.bundle.stage_file import AxisSource
+    from slrig.bundle.options import AxisSource
     from slrig.bundle.storage import write_file
     from slrig.cli.boards import chosen_board
     from slrig.cli.calibrate_solve import pose_bundles
@@ -56,7 +56,7 @@ def axis(
     )
     keep_kernels()
     with progress_shown() as display:
-        from slrig.bundle.stage_file import encode_stage
+        from slrig.bundle.options import encode_stage
         from slrig.calibrate.pose_reading import read_pose
         from slrig.calibrate.stage_axis import axis_of_poses
         from slrig.combine.stage import with_axis
@@ -108,7 +108,7 @@ def planes(
     """
     from dataclasses import replace
 
-    from slrig.bundle.stage_file import encode_stage
+    from slrig.bundle.options import encode_stage
     from slrig.bundle.storage import write_file
     from slrig.cli.display import print_table
     from slrig.cli.reconstruct import keep_kernels
@@ -132,6 +132,6 @@ def planes(
 
 def _known(file: Path) -> StageRecord:
     """What the file says already. Raises ConfigError: it is damaged, and is left as it is."""
-    from slrig.bundle.stage_file import StageRecord, read_stage
+    from slrig.bundle.options import StageRecord, read_stage
 
     return read_stage(file) if file.exists() else StageRecord()

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import structlog
 
-from slrig.bundle.stage_file import AxisSource, ChangeEntry, StageRecord, encode_stage, read_stage
+from slrig.bundle.options import AxisSource, ChangeEntry, StageRecord, encode_stage, read_stage
 from slrig.bundle.storage import sync_folder, write_file
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, StorageError

@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from slrig.capture.evidence import Evidence
 from slrig.capture.sequencer import capture, choose_triggers
+from slrig.capture.verifier import Evidence
 from slrig.conformance.bench import LONG_S, SHORT_S, RigBench
 from slrig.conformance.check import Need, check
 from slrig.conformance.expectation import STEPPED, ExpectationError, Failure, at, expect, refused

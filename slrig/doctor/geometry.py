@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture.evidence import Evidence
+from slrig.capture.verifier import Evidence
 from slrig.doctor.findings import Finding, camera_named, fault, note, ok
 from slrig.doctor.light import Seen
 from slrig.doctor.measures.pictures import Orientation, apart_deg, expected_orientation, orientation

@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from slrig.bundle.faults import read_text
 from slrig.bundle.storage import write_durably
+from slrig.bundle.validation import read_text
 from slrig.config import MOST_CONFIG_BYTES, read_rig
 from slrig.disk import refusals_of, staging_name
 from slrig.doctor.advice import ExposureAdvice

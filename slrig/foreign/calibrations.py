@@ -6,10 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-from slrig.bundle.calibration_file import read_calibration, write_calibration
-from slrig.bundle.faults import read_text
-from slrig.bundle.file_storage import read_file_storage
-from slrig.bundle.opencv_calibration import MOST_FILE_BYTES, read_opencv_calibration, write_opencv_calibration
+from slrig.bundle.calibration import (
+    MOST_FILE_BYTES,
+    read_calibration,
+    read_file_storage,
+    read_opencv_calibration,
+    write_calibration,
+    write_opencv_calibration,
+)
+from slrig.bundle.validation import read_text
 from slrig.errors import CalibrationError
 from slrig.foreign.kalibr import read_kalibr, write_kalibr
 from slrig.foreign.pairs import program_of, read_pair

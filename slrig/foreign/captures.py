@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from slrig.bundle.calibration_file import check_calibration
+from slrig.bundle.calibration import check_calibration
 from slrig.bundle.description import MOST_CAMERA_PX
-from slrig.bundle.faults import read_text
 from slrig.bundle.images import frame_format, read_with_colour
-from slrig.bundle.natural_order import natural
+from slrig.bundle.storage import natural
+from slrig.bundle.validation import read_text
 from slrig.bundle.writing import BundleWriter
 from slrig.disk import refusals_of
 from slrig.errors import BundleError

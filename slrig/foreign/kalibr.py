@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import Field
 
 from slrig.bundle.description import CAMERA_NAME
-from slrig.bundle.faults import Strict, checked
 from slrig.bundle.storage import write_file
+from slrig.bundle.validation import Strict, checked
 from slrig.errors import CalibrationError
 from slrig.foreign.ros import Side
 from slrig.foreign.yaml_text import read_yaml, yaml_bytes

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slrig.bundle.file_storage import Value
-from slrig.bundle.opencv_calibration import five_terms
+from slrig.bundle.calibration import Value, five_terms
 from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, Gray, Pinhole, Size
 

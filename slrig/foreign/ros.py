@@ -17,8 +17,8 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from slrig.bundle.description import MOST_SIDE_PX
-from slrig.bundle.faults import Strict, checked
 from slrig.bundle.storage import sync_folder, write_durably
+from slrig.bundle.validation import Strict, checked
 from slrig.disk import refusals_of, staging_name
 from slrig.errors import CalibrationError
 from slrig.foreign.yaml_text import read_yaml, yaml_bytes

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from slrig.bundle.faults import read_text
+from slrig.bundle.validation import read_text
 from slrig.errors import CalibrationError
 
 MOST_BYTES = 2**18

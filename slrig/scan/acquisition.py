@@ -21,12 +21,10 @@ from typing import Self
 import structlog
 
 from slrig.bundle import BundleWriter, write_truth
-from slrig.bundle.notes import write_notes
-from slrig.bundle.refused import FOLDER, Refused
-from slrig.bundle.stage import StageAngle, write_stage
+from slrig.bundle.sidecars import FOLDER, Refused, StageAngle, write_notes, write_stage
 from slrig.capture.exposure import whole_refreshes_s
+from slrig.capture.hardware_trigger import SETTINGS_TOLERANCE
 from slrig.capture.sequencer import choose_triggers
-from slrig.capture.session import SETTINGS_TOLERANCE
 from slrig.devices import Camera, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
 from slrig.jobs.frame_feed import FrameSink

@@ -11,9 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from slrig.bundle.refused import Refused
-from slrig.capture.checks import NOISE_FLOOR_DN, Samples
-from slrig.capture.evidence import Evidence, EvidenceSummary
+from slrig.bundle.sidecars import Refused
 from slrig.capture.exposure import (
     ExposedSamples,
     Unfit,
@@ -22,8 +20,9 @@ from slrig.capture.exposure import (
     movement_between,
     verdict,
 )
-from slrig.capture.sampling import Sampler
+from slrig.capture.frame_checks import NOISE_FLOOR_DN, Samples
 from slrig.capture.sequencer import capture
+from slrig.capture.verifier import Evidence, EvidenceSummary, Sampler
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import ScanEvidenceError
 from slrig.model import Black, PatternSequence, Pixels, Shot, White

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.calibration_file import read_calibration
+from slrig.bundle.calibration import read_calibration
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION, open_bundle
 from slrig.disk import refusals_of

@@ -11,10 +11,9 @@ from uuid import uuid4
 
 import numpy as np
 
-from slrig.capture.evidence import Evidence
 from slrig.capture.exposure import whole_refreshes_s
-from slrig.capture.sampling import Sampler
 from slrig.capture.sequencer import capture
+from slrig.capture.verifier import Evidence, Sampler
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import RigBusyError, UnsupportedByDeviceError
 from slrig.jobs.job import Holder, Job

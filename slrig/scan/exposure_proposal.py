@@ -16,8 +16,8 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture.checks import NEARLY_FULL, Chosen, Samples
 from slrig.capture.exposure import LEAST_CLEAR, LEAST_CLEAR_DN
+from slrig.capture.frame_checks import NEARLY_FULL, Chosen, Samples
 from slrig.errors import ConfigError
 from slrig.reconstruction.noise import NoiseModel, fitted_noise
 

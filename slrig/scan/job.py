@@ -12,8 +12,8 @@ from typing import Any, Protocol
 
 import structlog
 
-from slrig.bundle.health import write_health
-from slrig.capture.evidence import EvidenceSummary
+from slrig.bundle.sidecars import write_health
+from slrig.capture.verifier import EvidenceSummary
 from slrig.devices import Rig
 from slrig.errors import StorageError
 from slrig.failure import disk_errors

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from slrig.bundle import read_calibration
-from slrig.bundle.calibration_file import check_rays
+from slrig.bundle.calibration import check_rays
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION, BundleFiles, open_bundle
-from slrig.bundle.refused import read_refused
-from slrig.capture.evidence import Evidence, EvidenceSummary, judged_frames
+from slrig.bundle.sidecars import read_refused
 from slrig.capture.exposure import check_exposures
+from slrig.capture.verifier import Evidence, EvidenceSummary, judged_frames
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
 from slrig.model import LEAST_SHARE, Axis, Calibration, Region, Shot, without_missing_bits
 from slrig.model.header import CaptureHeader

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from slrig.bundle.faults import read_description_of
-from slrig.bundle.scan_options import PRESET_NAME, Preset, PresetDocument
+from slrig.bundle.options import PRESET_NAME, Preset, PresetDocument
 from slrig.bundle.storage import json_bytes, write_file
+from slrig.bundle.validation import read_description_of
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, PresetNotFoundError
 from slrig.model import SequenceName

@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle import read_truth
-from slrig.bundle.health import read_health
-from slrig.bundle.notes import read_notes
-from slrig.bundle.stage import read_stage
+from slrig.bundle.sidecars import read_health, read_notes, read_stage
 from slrig.bundle.storage import write_file
-from slrig.capture.evidence import EvidenceSummary
+from slrig.capture.verifier import EvidenceSummary
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle.description import read_description
-from slrig.capture.evidence import EvidenceSummary
+from slrig.capture.verifier import EvidenceSummary
 from slrig.meshing import MeshStage, SurfaceMesh
 from slrig.model import (
     Axis,

@@ -7,8 +7,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import Field, ValidationError
 
-from slrig.bundle.faults import Strict, explain, keys_of
-from slrig.bundle.free_text import FreeText
+from slrig.bundle.validation import FreeText, Strict, explain, keys_of
 from slrig.calibration.board import PRINT_SIGMA, Board, BoardKind
 from slrig.errors import ScheduleError
 from slrig.rig.session import RigFacts

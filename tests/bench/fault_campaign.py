@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 import structlog
 
-from slrig.capture.evidence import check_capture
+from slrig.capture.verifier import check_capture
 from slrig.model import Capture, PatternSequence, Pixels, SequenceName, Shot
 from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence

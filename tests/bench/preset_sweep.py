@@ -20,7 +20,7 @@ from typing import Any
 import structlog
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.bundle.scan_options import PresetDocument, ScanDefaults
+from slrig.bundle.options import PresetDocument, ScanDefaults
 from slrig.config import read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig

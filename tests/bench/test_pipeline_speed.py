@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from slrig.bundle import Bundle, read_bundle
-from slrig.capture.evidence import check_capture
+from slrig.capture.verifier import check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, Mesh, Region

@@ -25,8 +25,8 @@ from drivers.dlpc350.planes import MIRRORS
 from drivers.dlpc350.projector import DLPC350, LightEngine
 from drivers.pattern_engine.finding import engines
 from drivers.pattern_engine.link import Link
-from slrig.capture.evidence import Evidence
 from slrig.capture.sequencer import capture
+from slrig.capture.verifier import Evidence
 from slrig.conformance import run
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.model import PatternSequence

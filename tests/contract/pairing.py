@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.refused import Refused
-from slrig.capture.checks import Contradiction
-from slrig.capture.evidence import Evidence
+from slrig.bundle.sidecars import Refused
+from slrig.capture.frame_checks import Contradiction
 from slrig.capture.sequencer import capture
+from slrig.capture.verifier import Evidence
 from slrig.devices import Head, Projector, ProjectorInfo, Rig, Shown
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
 from slrig.model import Pattern, PatternSequence, Pixels, Shot

@@ -33,8 +33,8 @@ from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import read_scene
 from simulated_rig.staging import Script
-from slrig.bundle.calibration_file import write_calibration
-from slrig.bundle.faults import checked
+from slrig.bundle.calibration import write_calibration
+from slrig.bundle.validation import checked
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig
 from slrig.discovery import open_rig

@@ -11,7 +11,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 
-from slrig.bundle.poses_file import read_poses
+from slrig.bundle.options import read_poses
 from slrig.client import Client
 from slrig.client.errors import ConflictError, ModelFailedError
 from slrig.combine.offered import MEDIA_TYPES

@@ -23,7 +23,7 @@ from simulated_rig.options import HeadOptions
 from simulated_rig.scene import read_scene, surface_of
 from simulated_rig.transport import trace
 from slrig.bundle import read_bundle, read_calibration, write_calibration
-from slrig.capture.evidence import check_capture
+from slrig.capture.verifier import check_capture
 from slrig.cli.commands import app
 from slrig.errors import CalibrationError
 from slrig.model import AlbedoMark, Black, Capture, FloatArray, LightMap, Primary, SequenceName, White

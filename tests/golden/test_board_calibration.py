@@ -15,7 +15,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
-from slrig.bundle.calibration_file import write_calibration
+from slrig.bundle.calibration import write_calibration
 from slrig.calibrate.pose_frames import bundle_device_sizes
 from slrig.calibrate.pose_reading import read_pose
 from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from slrig.capture.evidence import EvidenceSummary
+from slrig.capture.verifier import EvidenceSummary
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, Shot

@@ -19,7 +19,7 @@ from slrig.calibrate.solving import solve_poses
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.health.verdict import HealthState, judged
 from slrig.calibration.solution import PROJECTOR
-from slrig.capture.evidence import check_capture
+from slrig.capture.verifier import check_capture
 from slrig.model import Axis, Calibration, Capture, LineShift, Size
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan

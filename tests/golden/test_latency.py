@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from slrig.capture.latency import measure_latency
-from slrig.capture.latency_fit import CameraLatency
+from slrig.capture.latency import CameraLatency, measure_latency
 from slrig.capture.sequencer import capture
 from slrig.cli.commands import app
 from slrig.config import read_rig

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from slrig.bundle.poses_file import read_poses
-from slrig.bundle.stage_file import StageRecord, encode_stage
+from slrig.bundle.options import StageRecord, encode_stage, read_poses
 from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
 from slrig.model import PlaneKind, StagePlane

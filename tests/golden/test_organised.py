@@ -19,7 +19,7 @@ import PIL.Image
 import pytest
 import trimesh
 
-from slrig.bundle.calibration_file import read_calibration
+from slrig.bundle.calibration import read_calibration
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import read_bundle
 from slrig.model import FloatArray, Pinhole, White

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from simulated_rig.device import simulated_head
 from slrig.bundle import write_calibration
-from slrig.bundle.stage_file import read_stage
+from slrig.bundle.options import read_stage
 from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
 from slrig.devices import CameraSettings, Rig, Turntable

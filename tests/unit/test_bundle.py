@@ -17,7 +17,7 @@ import pytest
 import tifffile
 
 from slrig.bundle import BundleWriter, read_bundle, read_truth, storage, write_bundle, write_calibration, write_truth
-from slrig.bundle.refused import Refused, read_refused
+from slrig.bundle.sidecars import Refused, read_refused
 from slrig.bundle.storage import write_file
 from slrig.errors import BundleError, ScanEvidenceError, StorageError
 from slrig.model import Black, CameraFormat, CameraTruth, Capture, Gray, LineShift, Shot, Size, Surface, Truth, White

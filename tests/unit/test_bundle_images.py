@@ -14,8 +14,7 @@ import pytest
 
 from slrig.bundle import read_bundle, write_bundle
 from slrig.bundle.description import DESCRIPTION
-from slrig.bundle.images import read_pages
-from slrig.bundle.png import encode_frame, rows_above_added
+from slrig.bundle.images import encode_frame, read_pages, rows_above_added
 from slrig.errors import BundleError
 from slrig.model import CameraFormat, Capture, Pixels, Shot, Size, White
 

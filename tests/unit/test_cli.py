@@ -28,7 +28,7 @@ from slrig.accept.running import run_acceptance
 from slrig.accept.scene import scripted_config
 from slrig.accept.verdicts import AcceptanceResult
 from slrig.api.schemas import ScanRequest
-from slrig.bundle.region_file import read_region
+from slrig.bundle.options import read_region
 from slrig.calibration.artefacts import Decision
 from slrig.cli import accept as accepting
 from slrig.cli.accept import moving, placed_by_hand, plan_for

@@ -13,9 +13,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import Result
 
-from slrig.bundle.poses_file import Poses, encode_poses, read_poses
-from slrig.bundle.stage import StageAngle, write_stage
-from slrig.bundle.stage_file import AxisSource, StageRecord, encode_stage, read_stage
+from slrig.bundle.options import AxisSource, Poses, StageRecord, encode_poses, encode_stage, read_poses, read_stage
+from slrig.bundle.sidecars import StageAngle, write_stage
 from slrig.cli import model_shoot
 from slrig.client.events import Progress
 from slrig.combine import plan

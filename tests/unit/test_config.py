@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from drivers.serial_projector.device import main as box
-from slrig.bundle.scan_options import ScanDefaults
+from slrig.bundle.options import ScanDefaults
 from slrig.cli.init import failure_of
 from slrig.config import RigConfig, is_loopback, read_rig, read_settings
 from slrig.errors import ConfigError

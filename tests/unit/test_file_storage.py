@@ -23,7 +23,7 @@ from slrig.bundle import (
     write_calibration,
     write_opencv_calibration,
 )
-from slrig.bundle.file_storage import read_file_storage
+from slrig.bundle.calibration import read_file_storage
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, LightMap, Size
 from tests.samples import CAMERA, PROJECTOR, pinhole, sample_calibration, sample_capture

@@ -8,8 +8,7 @@ from datetime import UTC, datetime
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from slrig.bundle.free_text import FreeText
-from slrig.bundle.moments import AwareMoment, Moment
+from slrig.bundle.validation import AwareMoment, FreeText, Moment
 from slrig.printable import printable
 
 LABEL: TypeAdapter[str] = TypeAdapter(FreeText)

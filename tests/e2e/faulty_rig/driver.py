@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from slrig.bundle.faults import Strict
+from slrig.bundle.validation import Strict
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Projector, ProjectorInfo, Shown, Trigger
 from slrig.errors import (
     DeviceBusyError,

@@ -14,7 +14,7 @@ from slrig.api.app import create_app
 from slrig.api.keys import KeyRing
 from slrig.api.problems import install_problems
 from slrig.api.service import Service, _of_request
-from slrig.bundle.scan_options import ScanDefaults
+from slrig.bundle.options import ScanDefaults
 from slrig.config import ServiceSettings
 from slrig.jobs.copies import Copies
 from slrig.jobs.data_folder import DataFolder

@@ -10,7 +10,7 @@ from uuid import uuid4
 import pytest
 from fastapi.testclient import TestClient
 
-from slrig.bundle.calibration_file import write_calibration
+from slrig.bundle.calibration import write_calibration
 from slrig.calibration.board import USUAL_BOARD, Board, BoardKind
 from slrig.calibration.boards.printing import board_pdf
 from slrig.errors import SolveRefusedError

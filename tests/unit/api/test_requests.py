@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 
 from slrig.api.schemas import ScanRequest, scan_plan
 from slrig.bundle.description import MOST_CAPTURE_BYTES
-from slrig.bundle.scan_options import Preset, PresetDocument, ScanDefaults
+from slrig.bundle.options import Preset, PresetDocument, ScanDefaults
 from slrig.config import read_rig
 from slrig.devices import CameraInfo, ProjectorInfo, Trigger
 from slrig.errors import ConfigError, UnsupportedByDeviceError

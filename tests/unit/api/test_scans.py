@@ -25,7 +25,7 @@ from slrig.api import clouds
 from slrig.api.artefacts import _made_so_far, ready_files
 from slrig.api.idempotency import fingerprint, own_key
 from slrig.api.schemas import ScanRequest
-from slrig.bundle.calibration_file import write_calibration
+from slrig.bundle.calibration import write_calibration
 from slrig.bundle.writing import BundleWriter
 from slrig.devices import Rig
 from slrig.jobs import data_folder

@@ -16,7 +16,7 @@ import pytest
 from fastapi.testclient import TestClient
 from typer.testing import Result
 
-from slrig.bundle.calibration_file import write_calibration
+from slrig.bundle.calibration import write_calibration
 from slrig.cli.options import Service
 from slrig.client import Client
 from slrig.schedule.records import RunState

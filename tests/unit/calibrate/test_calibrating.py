@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from slrig.bundle.calibration_file import read_calibration, write_calibration
+from slrig.bundle.calibration import read_calibration, write_calibration
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, with_jobs
 from slrig.calibrate.retention import Retention, named_by_scans

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from slrig.bundle.calibration_file import check_rays
+from slrig.bundle.calibration import check_rays
 from slrig.calibrate.charts import error_slices
 from slrig.calibrate.figures import baselines, device_figures, pose_figures
 from slrig.calibrate.pose_judging import judgement, summary

@@ -11,11 +11,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.bundle.refused import Refused
-from slrig.capture.checks import NOISE_FLOOR_DN, Reference, Samples, noise_dn, reference, repeated
-from slrig.capture.code_checks import line_sum, rougher
-from slrig.capture.evidence import Evidence, EvidenceSummary, check_capture
-from slrig.capture.sampling import Sampler
+from slrig.bundle.sidecars import Refused
+from slrig.capture.frame_checks import (
+    NOISE_FLOOR_DN,
+    Reference,
+    Samples,
+    line_sum,
+    noise_dn,
+    reference,
+    repeated,
+    rougher,
+)
+from slrig.capture.verifier import Evidence, EvidenceSummary, Sampler, check_capture
 from slrig.errors import ScanEvidenceError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, SequenceName, Shot, Size, White
 from slrig.patterns.sequence import encode

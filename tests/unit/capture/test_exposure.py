@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.bundle.refused import Refused
-from slrig.capture.evidence import EvidenceSummary, check_capture
+from slrig.bundle.sidecars import Refused
 from slrig.capture.exposure import ExposedSamples, Unfit, bracket_summary, check_exposures, movement_between, verdict
-from slrig.capture.sampling import Sampler
+from slrig.capture.verifier import EvidenceSummary, Sampler, check_capture
 from slrig.model import Black, Capture, Gray, LineShift, Shot, White, bracket_fault, exposure_groups
 from slrig.patterns.sequence import encode
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for

@@ -12,8 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.capture.latency import LatencyMeasurement, measure_latency, shutter_skew_s, stable_from_ns
-from slrig.capture.latency_fit import CameraLatency, Flash, FlashRows, RowLevels, fitted, row_levels, rows_of
+from slrig.capture.latency import (
+    CameraLatency,
+    Flash,
+    FlashRows,
+    LatencyMeasurement,
+    RowLevels,
+    fitted,
+    measure_latency,
+    row_levels,
+    rows_of,
+    shutter_skew_s,
+    stable_from_ns,
+)
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig, Shown, Synchronisation, SystemClock, Trigger
 from slrig.discovery import open_rig

@@ -12,12 +12,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from slrig.bundle.refused import Refused
-from slrig.capture import sampling
-from slrig.capture.evidence import Evidence, EvidenceSummary
+from slrig.bundle.sidecars import Refused
 from slrig.capture.hardware_trigger import frame_shift
-from slrig.capture.retry_policy import MOST_FAILURES, RetryPolicy
 from slrig.capture.sequencer import capture
+from slrig.capture.verifier import MOST_FAILURES, Evidence, EvidenceSummary, RetryPolicy
 from slrig.devices import CameraSettings, Synchronisation, Trigger
 from slrig.errors import (
     DeviceGoneError,
@@ -44,7 +42,7 @@ EVERY = frozenset(Trigger)
 @pytest.fixture(autouse=True)
 def few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """How frames are judged is checked by test_evidence.py, with as many pixels as in a real capture."""
-    monkeypatch.setattr(sampling, "_SAMPLES", 3000)
+    monkeypatch.setattr("slrig.capture.verifier._SAMPLES", 3000)
 
 
 def run(

@@ -8,11 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.bundle.refused import Refused
-from slrig.capture.cadence import Cadence
-from slrig.capture.frame_reader import FrameReader
+from slrig.bundle.sidecars import Refused
 from slrig.capture.sequencer import capture
-from slrig.capture.streaming import _Lead
+from slrig.capture.streaming import Cadence, FrameReader, _Lead
 from slrig.devices import Camera, Synchronisation, Trigger
 from slrig.errors import DeviceGoneError, FrameTimeoutError
 from slrig.model import Frame

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
-from slrig.bundle.stage_file import AxisSource
+from slrig.bundle.options import AxisSource
 from slrig.combine.desk import ModelDesk
 from slrig.combine.offered import MEDIA_TYPES, REPORT
 from slrig.combine.plan import StartingPoses

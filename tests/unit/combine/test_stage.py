@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slrig.bundle.stage_file import AxisSource, StageRecord, read_stage
+from slrig.bundle.options import AxisSource, StageRecord, read_stage
 from slrig.combine.stage import StageState, StageStore, state_of
 from slrig.combine.stage_plot import stage_svg
 from slrig.errors import ConfigError, StorageError

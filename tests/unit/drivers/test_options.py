@@ -17,7 +17,7 @@ from drivers.depthai.library import ENVIRONMENT, library
 from drivers.genicam.library import install_command
 from drivers.genicam.library import library as aravis
 from drivers.genicam.producers import core
-from slrig.bundle.faults import checked
+from slrig.bundle.validation import checked
 from slrig.errors import ConfigError, LibraryMissingError
 from slrig.option_models import described_drivers, kinds_of, option_model
 

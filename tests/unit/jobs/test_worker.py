@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from slrig.capture.evidence import EvidenceSummary
+from slrig.capture.verifier import EvidenceSummary
 from slrig.errors import (
     NothingToReconstructError,
     OutOfMemoryError,

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slrig.capture.evidence import EvidenceSummary
+from slrig.capture.verifier import EvidenceSummary
 from slrig.errors import NothingToReconstructError, ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.model import Calibration, Mesh, Region, Shot

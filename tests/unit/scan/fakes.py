@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from slrig.capture.evidence import EvidenceSummary
+from slrig.capture.verifier import EvidenceSummary
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FrameSink

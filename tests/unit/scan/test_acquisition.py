@@ -16,11 +16,9 @@ import numpy as np
 import pytest
 
 from slrig.bundle import BundleWriter, read_bundle
-from slrig.bundle.notes import read_notes
-from slrig.bundle.refused import Refused, read_refused
-from slrig.bundle.stage import StageAngle, read_stage
-from slrig.capture.evidence import EvidenceSummary, check_capture
+from slrig.bundle.sidecars import Refused, StageAngle, read_notes, read_refused, read_stage
 from slrig.capture.exposure import check_exposures
+from slrig.capture.verifier import EvidenceSummary, check_capture
 from slrig.devices import CameraSettings, Projector, Synchronisation, Trigger
 from slrig.errors import (
     BundleError,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from slrig.capture.checks import Samples
+from slrig.capture.frame_checks import Samples
 from slrig.errors import ConfigError
 from slrig.model import FloatArray
 from slrig.scan.exposure_proposal import Look, Proposal, SeenObject, proposal, seen_object

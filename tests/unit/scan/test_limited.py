@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.bundle import read_bundle, write_bundle
-from slrig.capture.evidence import check_capture
+from slrig.capture.verifier import check_capture
 from slrig.errors import ConfigError, NothingToReconstructError
 from slrig.model import Mesh, Pinhole, Refusal, Region
 from slrig.model.header import CaptureHeader

@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from slrig.bundle import BundleWriter, read_bundle, read_calibration, write_bundle, write_calibration
 from slrig.bundle.description import read_description
 from slrig.bundle.images import read_with_colour as read_frame_pages
-from slrig.bundle.notes import write_notes
 from slrig.bundle.reading import MOST_READERS, open_bundle
-from slrig.bundle.stage import StageAngle, write_stage
-from slrig.capture.evidence import check_capture
+from slrig.bundle.sidecars import StageAngle, write_notes, write_stage
+from slrig.capture.verifier import check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.errors import (

@@ -21,7 +21,7 @@ from drivers.pattern_engine.link import Link
 from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.planes import plane_of
 from drivers.pattern_engine.timing import Timing
-from slrig.bundle.faults import checked
+from slrig.bundle.validation import checked
 from slrig.devices import FlashedProjector
 from slrig.errors import (
     ConfigError,

@@ -8,15 +8,58 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from slrig.errors import ConfigError, InvalidInputError
+from slrig.printable import UNSAFE, unsafe
+
+
+def _refuse_unsafe(text: str) -> str:
+    found = unsafe.search(text)
+    if found is not None:
+        message = (
+            f"expected text without control characters, found U+{ord(found[0]):04X} at character {found.start() + 1}; "
+            "leave it out"
+        )
+        raise ValueError(message)
+    return text
+
+
+SafeText = Annotated[str, Field(json_schema_extra={"pattern": f"^[^{UNSAFE}]*$"}), AfterValidator(_refuse_unsafe)]
+"""Text of which no character does something to a terminal."""
+
+FreeText = Annotated[SafeText, Field(min_length=1, max_length=200)]
+"""The same, of 1 to 200 characters."""
+
+
+_number = re.compile(r"\s*[+-]?[\d._]+(e[+-]?\d+)?\s*", re.IGNORECASE | re.ASCII)
+
+
+def _refuse_number(sent: object) -> object:
+    """Pydantic takes a text of digits for seconds since 1970."""
+    if isinstance(sent, (int, float)) or (isinstance(sent, str) and _number.fullmatch(sent)):
+        message = (
+            f"expected a date and time with the offset from UTC, as 2026-11-20T06:00:00Z, found the number {sent}; "
+            "write it as ISO 8601 does"
+        )
+        raise ValueError(message)
+    return sent
+
+
+Moment = Annotated[datetime, Field(strict=False), BeforeValidator(_refuse_number)]
+"""A date and time as ISO 8601 text. A number is none."""
+
+AwareMoment = Annotated[AwareDatetime, Field(strict=False), BeforeValidator(_refuse_number)]
+"""The same, with its offset from UTC."""
+
 
 MOST_FAULTS = 20
 LONGEST_VALUE = 60
