@@ -16,9 +16,9 @@ from slrig.calibrate.solving import ReadPose
 from slrig.calibrate.tools import Setting
 from slrig.calibration.board import Board
 from slrig.calibration.observations import PoseObservation
+from slrig.calibration.poses.checks import coverage_picture, pose_picture
 from slrig.calibration.poses.coverage import coverage
-from slrig.calibration.poses.light_view import lit_board
-from slrig.calibration.poses.pictures import coverage_picture, pose_picture
+from slrig.calibration.poses.rough import lit_board
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Pixels, Size, White

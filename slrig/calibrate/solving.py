@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from uuid import uuid4
 
 from slrig.calibration.board import Board, BoardShape
-from slrig.calibration.judging.board_size import check_scale
-from slrig.calibration.judging.odd_even import OddEven, odd_even
-from slrig.calibration.judging.verdict import Verdict, verdict
+from slrig.calibration.judging.comparison import OddEven, odd_even
+from slrig.calibration.judging.verdict import Verdict, check_scale, verdict
 from slrig.calibration.observations import Observations, PoseObservation, ViewFigures
 from slrig.calibration.poses.coverage import Coverage, coverage
 from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
@@ -70,7 +69,7 @@ def solve_poses(
         The poses determine no calibration, or do not span a volume to state an error for.
     """
     # Late: the service knows these values, and loads no compiled kernel before somebody solves.
-    from slrig.calibration.judging.expected_error import expected_error
+    from slrig.calibration.judging.comparison import expected_error
     from slrig.calibration.solving.solve import solve
 
     observed = tuple(pose.observation for pose in poses)

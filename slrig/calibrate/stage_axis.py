@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from slrig.calibration.board import Board
-from slrig.calibration.health.standing import board_poses
+from slrig.calibration.health.drift import board_poses
 from slrig.calibration.observations import PoseObservation
 from slrig.model import Calibration
 from slrig.views.stage_axis import BoardAxis, board_axis

@@ -80,7 +80,7 @@ def board_option(
     board = Board(BoardKind(kind), *counted, square_mm, marker_mm, dictionary)
     if board.kind is BoardKind.CHARUCO:
         # OpenCV knows whether there is such a dictionary, with markers enough. Late, for it takes a while to load.
-        from slrig.calibration.boards.artwork import charuco_board
+        from slrig.calibration.boards.printing import charuco_board
 
         charuco_board(board)
     return board

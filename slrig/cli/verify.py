@@ -12,8 +12,7 @@ from rich.markup import escape
 from slrig.bundle import read_calibration
 from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
-from slrig.calibration.health.verdict import Health, HealthState, judged
-from slrig.calibration.health.verification import Verification
+from slrig.calibration.health.verification import Health, HealthState, Verification, judged
 from slrig.cli.display import print_json, progress_shown
 from slrig.config import read_rig
 from slrig.discovery import open_rig

@@ -10,9 +10,15 @@ from numpy.typing import NDArray
 
 from slrig.bundle.description import DESCRIPTION
 from slrig.bundle.reading import open_bundle
-from slrig.calibration.boards.artwork import marker_dictionary
-from slrig.calibration.boards.corner_fit import FLOOR_PX, WORST_SIGMA_PX, FittedPlaces, fitted_corners, patch_offsets
-from slrig.calibration.boards.grey import Grey
+from slrig.calibration.boards.corner_fit import (
+    FLOOR_PX,
+    WORST_SIGMA_PX,
+    FittedPlaces,
+    Grey,
+    fitted_corners,
+    patch_offsets,
+)
+from slrig.calibration.boards.printing import marker_dictionary
 from slrig.calibration.boards.sightings import markers_in
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, White

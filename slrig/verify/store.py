@@ -11,8 +11,7 @@ from uuid import UUID, uuid4
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from slrig.calibration.health.verdict import Health, HealthState, judged
-from slrig.calibration.health.verification import Verification, verification_from_document
+from slrig.calibration.health.verification import Health, HealthState, Verification, judged, verification_from_document
 from slrig.jobs.database import Database
 from slrig.jobs.tables import VerificationRow
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from slrig.calibrate.tools import CapturePose
 from slrig.calibration.board import Board
-from slrig.calibration.health.verdict import Health, HealthState
-from slrig.calibration.health.verification import Verification
+from slrig.calibration.health.verification import Health, HealthState, Verification
 from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.compute import Compute
 from slrig.model import Calibration
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 _STILL_PX = 0.3
 
 
-_READ, _JUDGE = "slrig.calibrate.pose_reading:read_pose", "slrig.calibration.health.verifying:verify_by_board"
+_READ, _JUDGE = "slrig.calibrate.pose_reading:read_pose", "slrig.calibration.health.verification:verify_by_board"
 
 
 @dataclass(frozen=True, slots=True)

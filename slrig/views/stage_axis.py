@@ -50,7 +50,7 @@ def board_axis(
 ) -> BoardAxis:
     """The axis from poses of a board that stood still on the stage.
 
-    poses : (m, 4, 4), board to world. covariance : (6 m, 6 m), as `slrig.calibration.health.standing` has both.
+    poses : (m, 4, 4), board to world. covariance : (6 m, 6 m), as `slrig.calibration.health.drift` has both.
     points_mm : (n, 3), the board's corners. angles_deg : (m,), where the stage says that it stood; its sense tells the
     axis' direction. Without, it points up in the first camera's image.
 

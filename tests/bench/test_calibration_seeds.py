@@ -31,7 +31,7 @@ from slrig.calibrate.pose_reading import read_pose
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import Solution
-from slrig.calibration.solving.parameters import difference
+from slrig.calibration.solving.projection import difference
 from slrig.calibration.solving.solve import solve
 from slrig.errors import PoseRefusedError, ScanEvidenceError
 from slrig.model import Calibration

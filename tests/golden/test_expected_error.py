@@ -31,7 +31,7 @@ from slrig.bundle import write_calibration
 from slrig.calibrate.pose_reading import read_pose
 from slrig.calibration.board import Board, BoardKind, BoardShape
 from slrig.calibration.displacement import modes_of, moved_points, rigid_free
-from slrig.calibration.judging.expected_error import expected_error
+from slrig.calibration.judging.comparison import expected_error
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import ExpectedError
 from slrig.calibration.solving.solve import solve

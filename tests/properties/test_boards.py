@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.artwork import artwork
 from slrig.calibration.boards.lattice import equivalent_views
-from slrig.calibration.boards.printing import FIT, PAGES_MM, board_svg
+from slrig.calibration.boards.printing import FIT, PAGES_MM, artwork, board_svg
 from slrig.calibration.observations import BoardView
 from slrig.errors import CalibrationError
 

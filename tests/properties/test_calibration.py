@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.solving.adjustment import corner_terms, match_terms
-from slrig.calibration.solving.measurements import spread
+from slrig.calibration.solving.projection import spread
 from slrig.calibration.solving.solve import solve
 from tests.unit.calibration.solving.test_adjustment import aside, true_geometry
 from tests.unit.calibration.synthetic import Recipe, made

@@ -15,11 +15,26 @@ import cv2
 import numpy as np
 
 from slrig.calibration.board import Board
-from slrig.calibration.boards.blobs import Blobs, dark_blobs, lattice_of, of_circles
-from slrig.calibration.boards.board_map import BoardMap, fitted_map
-from slrig.calibration.boards.corner_fit import FLOOR_PX, WORST_SIGMA_PX, FittedPlaces, fitted_circles, patch_offsets
-from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.lattice import Lattice, half_turn_looks_same, pointing_right, right_handed
+from slrig.calibration.boards.corner_fit import (
+    FLOOR_PX,
+    WORST_SIGMA_PX,
+    BoardMap,
+    FittedPlaces,
+    Grey,
+    fitted_circles,
+    fitted_map,
+    patch_offsets,
+)
+from slrig.calibration.boards.lattice import (
+    Blobs,
+    Lattice,
+    dark_blobs,
+    half_turn_looks_same,
+    lattice_of,
+    of_circles,
+    pointing_right,
+    right_handed,
+)
 from slrig.calibration.boards.sightings import UNMIRRORED, half_words, other_words, unclear_words
 from slrig.calibration.observations import BoardView
 from slrig.errors import PoseRefusedError, setting

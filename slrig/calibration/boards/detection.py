@@ -14,13 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.artwork import artwork
-from slrig.calibration.boards.board_map import BoardMap, fitted_map
-from slrig.calibration.boards.chessboard import chessboard_view
 from slrig.calibration.boards.circles import circle_blur_px, circles_again, circles_view
-from slrig.calibration.boards.corner_fit import placed_corners
-from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.markers import charuco_view
+from slrig.calibration.boards.corner_fit import BoardMap, Grey, fitted_map, placed_corners
+from slrig.calibration.boards.markers import charuco_view, chessboard_view
+from slrig.calibration.boards.printing import artwork
 from slrig.calibration.observations import BoardView
 from slrig.model import FloatArray
 

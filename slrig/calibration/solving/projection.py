@@ -16,13 +16,131 @@ with the ray o + s d, the surface's normal n, the board's turn w_b and shift dt_
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from slrig.calibration.observations import Correspondences, Observations
+from slrig.calibration.solution import PARAMETERS, BoardPose
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.model import FloatArray
+from slrig.model import FloatArray, IntArray, Pinhole, Size
 from slrig.model.lens_kernels import by_terms, distorted, undistorted
+
+LEAST_CORNERS = 6
+"""A view with fewer corners than this tells too little of a pose."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """All observations of some poses by some cameras.
+
+    corner_where : (n, 3) int32, camera, pose and corner; corner_px : (n, 2); corner_sigma : (n,), px, as stated.
+    match_where : of the correspondences with the projector, (k, 3) int32, camera, pose and axis; match_pixel : (k, 2),
+    in the camera; match_px : (k,), projector coordinates; match_sigma : (k,), as stated.
+    """
+
+    corner_where: IntArray
+    corner_px: FloatArray
+    corner_sigma: FloatArray
+    match_where: IntArray
+    match_pixel: FloatArray
+    match_px: FloatArray
+    match_sigma: FloatArray
+
+    def of(self, corners: NDArray[np.bool_], matches: NDArray[np.bool_]) -> Measurements:
+        """Those that are chosen: (n,) and (k,) bool."""
+        return Measurements(
+            self.corner_where[corners], self.corner_px[corners], self.corner_sigma[corners], self.match_where[matches],
+            self.match_pixel[matches], self.match_px[matches], self.match_sigma[matches],
+        )  # fmt: skip
+
+    def of_poses(self, poses: NDArray[np.bool_], /, *, matches: bool = True) -> Measurements:
+        """Those of the chosen poses, (m,) bool; without their matches if those are not wanted."""
+        return self.of(poses[self.corner_where[:, 1]], poses[self.match_where[:, 1]] & matches)
+
+    def thinned(self, limit: int) -> Measurements:
+        """The same with at most `limit` correspondences of each camera, pose and axis, spread over its image."""
+        keep = np.zeros(len(self.match_px), dtype=np.bool_)
+        for rows in groups(self.match_where):
+            keep[rows.start + spread(self.match_pixel[rows], limit)] = True
+        return self.of(np.ones(len(self.corner_px), dtype=np.bool_), keep)
+
+
+def measured(
+    observations: Observations, flipped: Mapping[tuple[int, int], bool], /, *, matches_per_view: int
+) -> Measurements:
+    """Flat arrays of all poses; what is not finite, or has no positive deviation, is left out.
+
+    flipped : by (camera, pose), whether that view's corners are counted from the board's other end.
+    matches_per_view : at most as many correspondences of each camera, pose and axis are used, spread over its image.
+    """
+    last = observations.board.corner_count - 1
+    nothing = np.zeros((0, 3), np.int32), np.zeros((0, 2)), np.zeros(0)
+    corners, matches = [nothing], [(*nothing, np.zeros(0))]
+    for number, pose in enumerate(observations.poses):
+        for camera, name in enumerate(observations.cameras):
+            view = pose.views.get(name)
+            if view is not None and len(view.corner) >= LEAST_CORNERS:
+                corner = last - view.corner if flipped.get((camera, number), False) else view.corner
+                where = np.column_stack([np.full((len(corner), 2), (camera, number)), corner]).astype(np.int32)
+                good = np.isfinite(view.points_px).all(axis=1) & (view.sigma_px > 0) & np.isfinite(view.sigma_px)
+                corners.append((where[good], view.points_px[good], view.sigma_px[good]))
+            seen = pose.correspondences.get(name)
+            if seen is not None and len(seen.axis) and observations.projector is not None:
+                matches.append(_match_rows(camera, number, seen, matches_per_view))
+    columns = [*zip(*corners, strict=True), *zip(*matches, strict=True)]
+    return Measurements(*(np.concatenate(column) for column in columns))
+
+
+def _match_rows(
+    camera: int, pose: int, seen: Correspondences, limit: int
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    finite = np.isfinite(seen.pixels_px).all(axis=1) & np.isfinite(seen.position_px)
+    good = finite & np.isfinite(seen.sigma_px) & (seen.sigma_px > 0)
+    chosen: list[IntArray] = []
+    for axis in (0, 1):
+        rows = np.flatnonzero(good & (seen.axis == axis))
+        chosen.append(rows[spread(seen.pixels_px[rows], limit)].astype(np.int32))
+    kept = np.concatenate(chosen)
+    where = np.column_stack([np.full((len(kept), 2), (camera, pose)), seen.axis[kept]]).astype(np.int32)
+    return where, seen.pixels_px[kept], seen.position_px[kept], seen.sigma_px[kept]
+
+
+def groups(where: IntArray, /, *, columns: int = 3) -> list[slice]:
+    """The runs of rows whose first `columns` numbers are the same. Measurements lie in such runs, pose by pose."""
+    if not len(where):
+        return []
+    changes = np.flatnonzero(np.any(np.diff(where[:, :columns], axis=0) != 0, axis=1)) + 1
+    ends = [0, *changes.tolist(), len(where)]
+    return [slice(first, last) for first, last in pairwise(ends)]
+
+
+def spread(points_px: FloatArray, limit: int) -> IntArray:
+    """(at most limit,) int: row numbers of points (n, 2) that lie evenly over their extent, one per cell first.
+
+    Cells have about the size at which the points would fill `limit` of them; which point of a cell is taken is random,
+    and the same every time.
+    """
+    count = len(points_px)
+    if count <= limit:
+        return np.arange(count, dtype=np.int32)
+    order = np.random.default_rng(count).permutation(count)
+    least = points_px.min(axis=0)
+    extent = np.maximum(points_px.max(axis=0) - least, 1.0)
+    side = np.sqrt(extent[0] * extent[1] / limit)
+    cell = ((points_px[order] - least) / side).astype(np.int64)
+    key = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    by_key = np.argsort(key, kind="stable")
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(key[by_key]) != 0]))
+    rank = np.arange(count) - np.repeat(starts, np.diff(np.append(starts, count)))
+    first = by_key[np.argsort(rank, kind="stable")[:limit]]
+    return np.sort(order[first])
+
 
 DEVICE, POSE, BEND = 15, 6, 7
 CORNER_TERMS = DEVICE + POSE + 2 + BEND
@@ -270,3 +388,133 @@ def _block_kernel(
         for a in range(terms):
             for b in range(a):
                 block[a, b] = block[b, a]
+
+
+_FIRST_TURN = PARAMETERS.index("turn_x")
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """Where everything stands. Arrays as the kernels take them (`slrig.calibration.solving.projection`).
+
+    devices : (d, 21); poses : (m, 12); points : (corners, 2), the board's corners as they are printed, mm; offsets :
+    (corners, 2), by how much they lie off, mm; bend : (7,), mm; frame : (3,), the bend's coordinates.
+    """
+
+    devices: FloatArray
+    poses: FloatArray
+    points: FloatArray
+    offsets: FloatArray
+    bend: FloatArray
+    frame: FloatArray
+
+    @property
+    def layout(self) -> Layout:
+        """Where each number lies in the vector."""
+        return Layout(len(self.devices), len(self.poses), len(self.points))
+
+    def moved(self, step: FloatArray) -> Geometry:
+        """A step of the whole vector on."""
+        layout = self.layout
+        devices, poses = self.devices.copy(), self.poses.copy()
+        by_device = step[: layout.first_pose].reshape(-1, DEVICE)
+        devices[:, :_FIRST_TURN] += by_device[:, :_FIRST_TURN]
+        devices[:, 9:18] = turned(devices[:, 9:18], by_device[:, 9:12])
+        devices[:, 18:] += by_device[:, 12:]
+        by_pose = step[layout.first_pose : layout.first_offset].reshape(-1, POSE)
+        poses[:, :9] = turned(poses[:, :9], by_pose[:, :3])
+        poses[:, 9:] += by_pose[:, 3:]
+        offsets = self.offsets + step[layout.first_offset : layout.first_bend].reshape(-1, 2)
+        return replace(self, devices=devices, poses=poses, offsets=offsets, bend=self.bend + step[layout.first_bend :])
+
+    def shape_mm(self) -> FloatArray:
+        """(corners, 3) float64: by how much each corner lies off its place on a flat board."""
+        return np.column_stack([self.offsets, self.bend_basis() @ self.bend])
+
+    def bend_basis(self) -> FloatArray:
+        """(corners, 7) float64: what each number of the bend adds to the height of each corner."""
+        a, b = ((self.points + self.offsets - self.frame[:2]) / self.frame[2]).T
+        return np.stack([a * a, a * b, b * b, a**3, a * a * b, a * b * b, b**3], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where the numbers of `devices`, `poses` and `corners` lie in the vector."""
+
+    devices: int
+    poses: int
+    corners: int
+
+    @property
+    def first_pose(self) -> int:
+        """Index of the first pose's turn."""
+        return DEVICE * self.devices
+
+    @property
+    def first_offset(self) -> int:
+        """Index of the first corner's x."""
+        return self.first_pose + POSE * self.poses
+
+    @property
+    def first_bend(self) -> int:
+        """Index of the first number of the bend."""
+        return self.first_offset + 2 * self.corners
+
+    @property
+    def count(self) -> int:
+        """Length of the vector."""
+        return self.first_bend + BEND
+
+    def free(self, poses: NDArray[np.bool_], /, *, bend: bool = False, offsets: bool = False) -> NDArray[np.bool_]:
+        """(count,) bool: what may move. poses : (m,) bool.
+
+        The first device's pose is the world's and stays. Without `bend` the board is flat, without `offsets` its
+        corners lie as printed.
+        """
+        free = np.zeros(self.count, dtype=np.bool_)
+        devices = free[: self.first_pose].reshape(-1, DEVICE)
+        devices[:, :_FIRST_TURN] = True
+        devices[1:, _FIRST_TURN:] = True
+        free[self.first_pose : self.first_offset] = np.repeat(poses, POSE)
+        free[self.first_offset : self.first_bend] = offsets
+        free[self.first_bend :] = bend
+        return free
+
+
+def turned(rotations: FloatArray, turns: FloatArray) -> FloatArray:
+    """(n, 9) float64: exp([turn]x) R for rotations (n, 9) row by row and turns (n, 3), rad."""
+    matrices = Rotation.from_rotvec(turns).as_matrix() @ rotations.reshape(-1, 3, 3)
+    return np.asarray(matrices.reshape(-1, 9), dtype=np.float64)
+
+
+def difference(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(d, 15) float64: the step that leads from the second devices (d, 21) to the first."""
+    turn = first[:, 9:18].reshape(-1, 3, 3) @ second[:, 9:18].reshape(-1, 3, 3).transpose(0, 2, 1)
+    turns = Rotation.from_matrix(turn).as_rotvec()
+    lens = _FIRST_TURN
+    return np.hstack([first[:, :lens] - second[:, :lens], turns, first[:, 18:] - second[:, 18:]])
+
+
+def device_row(
+    matrix: FloatArray, distortion: FloatArray, rotation: FloatArray, translation_mm: FloatArray
+) -> FloatArray:
+    """(21,) float64: a device as kernels take it. A skew of the matrix is dropped."""
+    lens = np.concatenate([distortion, np.zeros(5)])[:5]
+    focal = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    return np.concatenate([focal, lens, np.ravel(rotation), np.ravel(translation_mm)]).astype(np.float64)
+
+
+def pose_row(rotation: FloatArray, translation_mm: FloatArray) -> FloatArray:
+    """(12,) float64: a pose as kernels take it."""
+    return np.concatenate([np.ravel(rotation), np.ravel(translation_mm)]).astype(np.float64)
+
+
+def to_pinhole(row: FloatArray, size: Size) -> Pinhole:
+    """The device of a row."""
+    matrix = np.array([[row[0], 0.0, row[2]], [0.0, row[1], row[3]], [0.0, 0.0, 1.0]])
+    return Pinhole(size, matrix, row[4:9].copy(), row[9:18].reshape(3, 3).copy(), row[18:].copy())
+
+
+def to_board_pose(row: FloatArray) -> BoardPose:
+    """The board's pose of a row."""
+    return BoardPose(row[:9].reshape(3, 3).copy(), row[9:].copy())

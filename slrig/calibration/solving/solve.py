@@ -3,28 +3,334 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from slrig.calibration.board import BoardShape
+from slrig.calibration.board import Board, BoardShape
 from slrig.calibration.observations import Observations
-from slrig.calibration.solution import CELLS, PROJECTOR, DeviceResiduals, Solution, scale_mode
-from slrig.calibration.solving.adjustment import Prior, kept_of, match_terms
-from slrig.calibration.solving.consistency import most_left_out, refuse_bump, worst_pose
-from slrig.calibration.solving.covariance import allowing_for, covariance_of
-from slrig.calibration.solving.halves import halves_of
-from slrig.calibration.solving.held_out import bend_of, chosen_shape, folds_of, held_out, shapes_of
-from slrig.calibration.solving.initial import LEAST_POSES, start_of
-from slrig.calibration.solving.initial_projector import projector_start
-from slrig.calibration.solving.measurements import LEAST_CORNERS, measured
-from slrig.calibration.solving.parameters import Geometry, to_board_pose, to_pinhole
-from slrig.calibration.solving.problem import Fit, Problem, fitted, flat_geometry, free_of
-from slrig.calibration.solving.stretch import size_of, with_stretch
+from slrig.calibration.solution import CELLS, PROJECTOR, BoardSize, DeviceResiduals, Solution, device_title, scale_mode
+from slrig.calibration.solving.adjustment import (
+    Fit,
+    Prior,
+    Problem,
+    Weights,
+    corner_terms,
+    fitted,
+    flat_geometry,
+    free_of,
+    kept_of,
+    match_terms,
+    normal_equations,
+    sizes_of,
+    solved,
+    weights_of,
+)
+from slrig.calibration.solving.held_out import (
+    allowing_for,
+    bend_of,
+    chosen_shape,
+    covariance_of,
+    folds_of,
+    halves_of,
+    held_out,
+    shapes_of,
+)
+from slrig.calibration.solving.initial import LEAST_POSES, projector_start, start_of
+from slrig.calibration.solving.projection import (
+    DEVICE,
+    LEAST_CORNERS,
+    POSE,
+    Geometry,
+    groups,
+    measured,
+    to_board_pose,
+    to_pinhole,
+)
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, FloatArray, IntArray, Size
 from slrig.model.lens import LENS_TERMS
+
+_WITHIN_GROUP = 6.0
+_LEAST_AFTER = 2
+_BUMP_SHARE = 0.82
+_ALIKE_GAIN = 0.9
+_TIMES_OTHERS = 2.5
+_SPREADS_FROM_OTHERS = 6.0
+_LEAST_OFF_PX = 0.05
+"""A pose that is off by less harms nothing, and lenses are not modelled better than that."""
+
+_MOST_LEFT_OUT = 1 / 3
+_MEDIAN = 0.6745
+
+
+def refuse_bump(problem: Problem, fit: Fit, free: NDArray[np.bool_], /) -> None:
+    """See that no device moved between two poses.
+
+    Raises SolveRefusedError where one did, with its name and the pose from which on it stands elsewhere.
+    """
+    bump = _bump(problem, fit, free)
+    if bump is None:
+        return
+    devices, pose, share = bump
+    first = problem.pose_names[pose]
+    before = problem.pose_names[int(np.flatnonzero(problem.used[:pose])[-1])]
+    spoken = [device_title(name) for name in devices]
+    who = spoken[0] if len(spoken) == 1 else f"one of {' and '.join(spoken)} (or both)"
+    message = (
+        f"{who} moved between pose '{before}' and pose '{first}': from '{first}' on the board is seen elsewhere than "
+        f"the poses before say, and letting it stand elsewhere takes {1 - share:.0%} off the residuals; fasten "
+        f"it, and shoot the poses anew, or solve from those before or from those after alone"
+    )
+    raise SolveRefusedError(message)
+
+
+def _bump(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> tuple[list[str], int, float] | None:
+    """The move that explains most, or None where none explains enough.
+
+    The devices of which one moved, the number of the first pose after it, and the share of the rms that is left when
+    the later poses may have that device elsewhere.
+    """
+    devices = len(problem.devices)
+    used = np.flatnonzero(problem.used)
+    if devices < 2 or len(used) < 2 * _LEAST_AFTER:
+        return None
+    sigma = problem.deviations(fit.noise)
+    kept = _within_groups(problem, fit)
+    size = sizes_of(fit.residuals, sigma)
+    weight = (kept[0] * sigma.corner_weight, kept[1] * sigma.match_weight)
+    matrices, gradients, squares = [], [], []
+    m = problem.measurements
+    for pose in used:
+        mask = np.zeros(len(problem.pose_names), dtype=np.bool_)
+        mask[pose] = True
+        mine = (m.corner_where[:, 1] == pose, m.match_where[:, 1] == pose)
+        weights = ((weight[0] / sigma.corners**2)[mine[0]], (weight[1] / sigma.matches**2)[mine[1]])
+        matrix, gradient = normal_equations(fit.geometry, m.of_poses(mask), weights)
+        matrices.append(matrix)
+        gradients.append(gradient)
+        told = [own & (w > 0) for own, w in zip(mine, weight, strict=True)]
+        squares.append(
+            2 * float(np.sum(size[0][told[0]] ** 2 * weight[0][told[0]]))
+            + float(np.sum(size[1][told[1]] ** 2 * weight[1][told[1]]))
+        )
+    every, pulls, square = np.array(matrices), np.array(gradients), np.array(squares)
+    total = square.sum() - _taken(every.sum(axis=0), pulls.sum(axis=0), free)
+    gains = _gains(every, pulls, free, devices)
+    device, after = np.unravel_index(int(np.argmax(gains)), gains.shape)
+    best = float(gains[device, after])
+    share = float(np.sqrt(max(total - best, 0.0) / total)) if total > 0 else 1.0
+    if share > _BUMP_SHARE:
+        return None
+    # A pose that is off by itself, among the last ones, looks like half a move; without it nothing is left to explain.
+    for alone in range(len(used)):
+        rest = np.arange(len(used)) != alone
+        left = square[rest].sum() - _taken(every[rest].sum(axis=0), pulls[rest].sum(axis=0), free)
+        if total - left > best:
+            return None
+    # Which of several devices explains it as well: of two, either.
+    correlated = [name for k, name in enumerate(problem.devices) if gains[k, after] >= _ALIKE_GAIN * best]
+    return correlated, int(used[after]), share
+
+
+def _factored(matrix: FloatArray, free: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], FloatArray, Any] | None:
+    """Cholesky's factor of what is free of a matrix, scaled to a unit diagonal; which numbers these are, and the scale.
+    None where it is singular.
+    """
+    free = free & (np.diagonal(matrix) > 0)
+    inner = matrix[np.ix_(free, free)]
+    scale = 1 / np.sqrt(np.diagonal(inner))
+    inner = inner * np.outer(scale, scale)
+    inner[np.diag_indices_from(inner)] += 1e-12
+    try:
+        return free, scale, cho_factor(inner)
+    except LinAlgError:
+        return None
+
+
+def _taken(matrix: FloatArray, pull: FloatArray, free: NDArray[np.bool_]) -> float:
+    """Gᵀ H⁻¹ G: what a step of Newton's method takes off a sum of squares; 0 where that is not told."""
+    made = _factored(matrix, free)
+    if made is None:
+        return 0.0
+    free, scale, factor = made
+    return float(pull[free] * scale @ cho_solve(factor, pull[free] * scale))
+
+
+def _gains(matrices: FloatArray, gradients: FloatArray, free: NDArray[np.bool_], devices: int) -> FloatArray:
+    """(devices, poses): what a move of a device before a pose takes off the sum of squares; 0 where not told."""
+    gains = np.zeros((devices, len(matrices)))
+    made = _factored(matrices.sum(axis=0), free)
+    if made is None:
+        return gains
+    free, scale, factor = made
+    pull = gradients.sum(axis=0)[free] * scale
+    for after in range(_LEAST_AFTER, len(matrices) - _LEAST_AFTER + 1):
+        later, pulled = matrices[after:].sum(axis=0), gradients[after:].sum(axis=0)
+        for device in range(devices):
+            own = np.arange(DEVICE * device + 9, DEVICE * device + DEVICE)
+            crossed = later[np.ix_(free, own)] * scale[:, None]
+            solved = cho_solve(factor, crossed)
+            square = later[np.ix_(own, own)]
+            left = square - crossed.T @ solved
+            pull_left = pulled[own] - solved.T @ pull
+            unit = 1 / np.sqrt(np.maximum(np.diagonal(square), 1e-300))
+            values, vectors = np.linalg.eigh(left * np.outer(unit, unit))
+            # A move that the poses of the board can follow is none that can be told.
+            along = vectors.T @ (pull_left * unit)
+            gains[device, after] = float(np.sum(np.where(values > 1e-9, along**2 / np.maximum(values, 1e-9), 0.0)))
+    return gains
+
+
+def _within_groups(problem: Problem, fit: Fit) -> Weights:
+    """1 for what is not far off among its own camera and pose, whether or not these are off as a whole; else 0."""
+    m = problem.measurements
+    kept = (np.zeros(len(m.corner_px)), np.zeros(len(m.match_px)))
+    corner = np.hypot(*fit.residuals.corners.T)
+    for where, columns, size, into in (
+        (m.corner_where, 2, corner, kept[0]),
+        (m.match_where, 3, np.abs(fit.residuals.matches), kept[1]),
+    ):
+        for rows in groups(where, columns=columns):
+            here = size[rows]
+            if np.isfinite(here).any():
+                into[rows] = here <= _WITHIN_GROUP / _MEDIAN * np.nanmedian(here)
+    return kept
+
+
+def worst_pose(problem: Problem, fit: Fit, /) -> tuple[int, str] | None:
+    """The pose that lies farthest from what the others say, and the reason in words; None where all agree."""
+    names, m = problem.pose_names, problem.measurements
+    sigma = problem.deviations(fit.noise)
+    size = sizes_of(fit.residuals, sigma)
+    pixels = (np.hypot(*fit.residuals.corners.T), np.abs(fit.residuals.matches))
+    worst: tuple[float, int, str] | None = None
+    for device, name in enumerate(problem.devices):
+        beam = problem.beam(device)
+        kind = 1 if beam else 0
+        pose = m.match_where[:, 1] if beam else m.corner_where[:, 1]
+        mine = np.ones(len(pose), dtype=np.bool_) if beam else m.corner_where[:, 0] == device
+        median, median_px = np.full(len(names), np.nan), np.full(len(names), np.nan)
+        for number in np.unique(pose[mine]):
+            rows = mine & (pose == number)
+            # Light that misses the board altogether is as far off as can be.
+            median[number] = float(np.median(np.nan_to_num(size[kind][rows], nan=1e6)))
+            median_px[number] = (
+                float(np.nanmedian(pixels[kind][rows])) if np.isfinite(pixels[kind][rows]).any() else np.inf
+            )
+        if np.isfinite(median).sum() < 3:
+            continue
+        middle = float(np.nanmedian(median))
+        spread = float(np.nanmedian(np.abs(median - middle))) / _MEDIAN
+        bound = max(_TIMES_OTHERS * middle, middle + _SPREADS_FROM_OTHERS * spread)
+        excess = np.where(median_px >= _LEAST_OFF_PX, np.nan_to_num(median / bound, nan=0.0), 0.0)
+        number = int(np.argmax(excess))
+        if excess[number] > 1 and (worst is None or excess[number] > worst[0]):
+            reason = _reason(name, float(median_px[number]), float(np.nanmedian(median_px)))
+            worst = (float(excess[number]), number, reason)
+    return None if worst is None else (worst[1], worst[2])
+
+
+def _reason(device: str, own_px: float, others_px: float) -> str:
+    what = "the projector's light lies" if device == PROJECTOR else f"its corners in camera '{device}' lie"
+    return (
+        f"{what} {own_px:.2f} px from where the other poses put it (the others: {others_px:.2f} px); the board or a "
+        "device moved while it was shot, or the board was read wrongly; shoot it again"
+    )
+
+
+def most_left_out(problem: Problem) -> int:
+    """How many poses may be left out before it is the set that is wrong."""
+    return max(1, int(len(problem.pose_names) * _MOST_LEFT_OUT))
+
+
+_SETTLED = 0.1  # of its own deviation
+_MOST_TURNS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Of a print: value and deviation sigma, shares; by_device : (15 d,) float64, by how much one unit more of it would
+    move the devices.
+    """
+
+    value: float
+    sigma: float
+    by_device: FloatArray
+
+    def mode(self) -> FloatArray:
+        """(15 d,) float64: by how much one deviation of it moves the devices."""
+        return self.sigma * self.by_device
+
+
+def stretched(geometry: Geometry, board: Board, stretch: float, /) -> Geometry:
+    """The geometry with the corners of a board that is stretched so much."""
+    return replace(geometry, points=board.points_mm[:, :2] * [1 + stretch / 2, 1 - stretch / 2])
+
+
+def with_stretch(
+    problem: Problem, fit: Fit, board: Board, value: float = 0.0, /, *, correlated: bool = False
+) -> tuple[Fit, Stretch]:
+    """The fit with the board stretched as its poses tell, and that stretch. value : the one that the fit has.
+
+    Each round is one step of Gauss and Newton in the stretch and a whole fit of all else.
+    """
+    sigma = float(np.sqrt(2)) * board.square_sigma
+    for _ in range(_MOST_TURNS):
+        found = _told(problem, fit, value, sigma)
+        if abs(found.value - value) <= _SETTLED * found.sigma:
+            break
+        value = found.value
+        moved = stretched(fit.geometry, board, value)
+        fit = fitted(problem, moved, rounds=2, correlated=correlated, noise=fit.noise)
+    return fit, replace(found, value=value)
+
+
+def size_of(board: Board, stretch: Stretch, /) -> BoardSize:
+    """What is known of the size of a board whose stretch was found.
+
+    Width and height are each off by `square_sigma`, which leaves their mean 1/√2 of it. Where they differ by more than
+    that, the print is worse than was said, and its mean as unsure as half their difference.
+    """
+    scale = max(board.square_sigma / float(np.sqrt(2)), abs(stretch.value) / 2)
+    return BoardSize(scale, stretch.value, stretch.sigma)
+
+
+def _told(problem: Problem, fit: Fit, value: float, prior_sigma: float) -> Stretch:
+    geometry, m, layout = fit.geometry, problem.measurements, fit.geometry.layout
+    deviations = problem.deviations(fit.noise)
+    weights = weights_of(fit.residuals, deviations, kept_of(fit.residuals, deviations))
+    matrix, gradient = normal_equations(geometry, m, weights, prior=problem.prior)
+    residual, rows = corner_terms(geometry, m, jacobian=True)
+    corner = m.corner_where[:, 2]
+    # By the corner's x and y, and so by d.
+    by_corner = rows[:, :, DEVICE + POSE : DEVICE + POSE + 2]
+    by_stretch = np.einsum("nkc,nc->nk", by_corner, geometry.points[corner] * [0.5, -0.5])
+    weight = weights[0]
+    column = np.zeros(layout.count)
+    for run in groups(m.corner_where, columns=2):
+        device, pose = m.corner_where[run.start, :2]
+        shares = np.einsum("nki,nk,n->i", rows[run], by_stretch[run], weight[run])
+        column[DEVICE * device : DEVICE * (device + 1)] += shares[:DEVICE]
+        first = layout.first_pose + POSE * pose
+        column[first : first + POSE] += shares[DEVICE : DEVICE + POSE]
+        column[layout.first_bend :] += shares[DEVICE + POSE + 2 :]
+    own = np.einsum("nki,nk,n->ni", by_corner, by_stretch, weight)
+    np.add.at(column, layout.first_offset + 2 * corner[:, None] + np.arange(2), own)
+    free = free_of(problem, geometry) & (np.diagonal(matrix) > 0)
+    diagonal = np.sqrt(np.diagonal(matrix)[free])
+    scaled = matrix[np.ix_(free, free)] / np.outer(diagonal, diagonal)
+    by_free = solved(scaled, column[free] / diagonal) / diagonal
+    moved = np.zeros(layout.count)
+    moved[free] = -by_free
+    information = float(weight @ (by_stretch**2).sum(axis=1)) - float(column[free] @ by_free) + 1 / prior_sigma**2
+    pull = float(np.einsum("nk,nk,n->", by_stretch, np.nan_to_num(residual), weight)) - float(gradient[free] @ by_free)
+    pull += value / prior_sigma**2
+    return Stretch(value - pull / information, 1 / float(np.sqrt(information)), moved[: layout.first_pose])
+
 
 Progress = Callable[[str, float, str], None]
 """Called with the stage's name, the share of the whole that is done (0 to 1), and words for a person."""

@@ -12,7 +12,7 @@ import numpy as np
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.displacement import RigidMotion
-from slrig.calibration.judging.odd_even import OddEven
+from slrig.calibration.judging.comparison import OddEven
 from slrig.calibration.judging.verdict import verdict
 from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.calibration.poses.coverage import coverage

@@ -15,8 +15,7 @@ import pytest
 
 from slrig.calibrate.solving import ReadPose
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.health.verdict import Health, HealthState, judged
-from slrig.calibration.health.verification import Verification
+from slrig.calibration.health.verification import Health, HealthState, Verification, judged
 from slrig.calibration.observations import PoseObservation, ViewFigures
 from slrig.devices import Rig
 from slrig.errors import CalibrationStateError, PoseRefusedError

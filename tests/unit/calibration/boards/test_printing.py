@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.artwork import artwork, charuco_board
 from slrig.calibration.boards.detection import find_board
 from slrig.calibration.boards.lattice import equivalent_views, turned_half
-from slrig.calibration.boards.printing import FIT, PAGES_MM, board_pdf, board_svg
+from slrig.calibration.boards.printing import FIT, PAGES_MM, artwork, board_pdf, board_svg, charuco_board
 from slrig.calibration.observations import BoardView
 from slrig.cli.boards import board_option
 from slrig.errors import CalibrationError

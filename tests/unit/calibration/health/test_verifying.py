@@ -12,9 +12,15 @@ import numpy as np
 import pytest
 
 from slrig.calibration.health.drift import Change
-from slrig.calibration.health.verdict import HealthState, judged
-from slrig.calibration.health.verification import PairFigures, Verification, health_of_scan, verification_from_document
-from slrig.calibration.health.verifying import verify_by_board
+from slrig.calibration.health.verification import (
+    HealthState,
+    PairFigures,
+    Verification,
+    health_of_scan,
+    judged,
+    verification_from_document,
+    verify_by_board,
+)
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, Pinhole

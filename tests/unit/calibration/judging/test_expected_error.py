@@ -13,11 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.displacement import modes_of, moved_points, rigid_free, without_rigid_motion
-from slrig.calibration.judging.comparison import comparison
-from slrig.calibration.judging.expected_error import expected_error, volume_of
-from slrig.calibration.judging.grades import Grade
-from slrig.calibration.judging.odd_even import odd_even
-from slrig.calibration.judging.verdict import verdict
+from slrig.calibration.judging.comparison import comparison, expected_error, odd_even, volume_of
+from slrig.calibration.judging.verdict import Grade, verdict
 from slrig.calibration.observations import COLUMN, ROW, Correspondences, Observations, PoseObservation
 from slrig.calibration.solution import BoardPose, Half, Solution
 from slrig.errors import CalibrationError

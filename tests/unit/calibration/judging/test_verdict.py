@@ -9,9 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.calibration.judging.board_size import ScaleCheck, check_scale, judged_size, unattended_faults
-from slrig.calibration.judging.grades import Grade
-from slrig.calibration.judging.verdict import LIMITS, Verdict, verdict
+from slrig.calibration.judging.verdict import (
+    LIMITS,
+    Grade,
+    ScaleCheck,
+    Verdict,
+    check_scale,
+    judged_size,
+    unattended_faults,
+    verdict,
+)
 from slrig.calibration.poses.coverage import Coverage, coverage
 from slrig.calibration.solution import (
     PARAMETERS,

@@ -12,11 +12,19 @@ import pytest
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
 from slrig.calibration.poses import checks
-from slrig.calibration.poses.candidates import board_rotation
-from slrig.calibration.poses.checks import PoseAnswer, check_same_devices, judge_pose
-from slrig.calibration.poses.coverage import GOALS, attitude, cells_of, coverage, full_turn_deg
-from slrig.calibration.poses.next_move import Advice, _cells, _reach, next_move
-from slrig.calibration.poses.pictures import coverage_picture, pose_picture
+from slrig.calibration.poses.checks import PoseAnswer, check_same_devices, coverage_picture, judge_pose, pose_picture
+from slrig.calibration.poses.coverage import (
+    GOALS,
+    Advice,
+    _cells,
+    _reach,
+    attitude,
+    board_rotation,
+    cells_of,
+    coverage,
+    full_turn_deg,
+    next_move,
+)
 from slrig.calibration.poses.rough import rig_guess
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose
 from slrig.errors import CalibrationError

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from slrig.calibration.solution import PARAMETERS, PROJECTOR, Solution, scale_mode
-from slrig.calibration.solving.parameters import difference
+from slrig.calibration.solving.projection import difference
 from slrig.model import Calibration, FloatArray, Pinhole
 from tests.unit.calibration.solving.test_projection import row_of
 

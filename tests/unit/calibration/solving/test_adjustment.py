@@ -9,12 +9,21 @@ import pytest
 
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import COLUMN, Observations
-from slrig.calibration.solving.adjustment import CAUCHY, Deviations, adjusted, kept_of, losses_of, residuals_of
-from slrig.calibration.solving.initial import Start, start_of
-from slrig.calibration.solving.initial_projector import met_points, projector_start
-from slrig.calibration.solving.measurements import Measurements, measured
-from slrig.calibration.solving.parameters import Geometry, difference, pose_row
-from slrig.calibration.solving.problem import DeviceNoise, deviations_of, flat_geometry, noise_of, with_design_effect
+from slrig.calibration.solving.adjustment import (
+    CAUCHY,
+    Deviations,
+    DeviceNoise,
+    adjusted,
+    deviations_of,
+    flat_geometry,
+    kept_of,
+    losses_of,
+    noise_of,
+    residuals_of,
+    with_design_effect,
+)
+from slrig.calibration.solving.initial import Start, met_points, projector_start, start_of
+from slrig.calibration.solving.projection import Geometry, Measurements, difference, measured, pose_row
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration
 from tests.unit.calibration.solving.test_projection import row_of

@@ -7,11 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.calibration.solving.adjustment import corner_terms, match_terms, solved
-from slrig.calibration.solving.measurements import Measurements, groups, measured, spread
-from slrig.calibration.solving.parameters import Geometry, device_row, difference, pose_row, to_pinhole
-from slrig.calibration.solving.problem import flat_geometry
-from slrig.calibration.solving.projection import weighed_blocks
+from slrig.calibration.solving.adjustment import corner_terms, flat_geometry, match_terms, solved
+from slrig.calibration.solving.projection import (
+    Geometry,
+    Measurements,
+    device_row,
+    difference,
+    groups,
+    measured,
+    pose_row,
+    spread,
+    to_pinhole,
+    weighed_blocks,
+)
 from slrig.model import FloatArray, Pinhole
 from tests.unit.calibration.synthetic import Recipe, board_poses, made
 

@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 
 from slrig.calibration.board import BoardShape
-from slrig.calibration.judging.board_size import judged_size
-from slrig.calibration.judging.expected_error import expected_error
+from slrig.calibration.judging.comparison import expected_error
+from slrig.calibration.judging.verdict import judged_size
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import CELLS, LEAST_HALVED, PROJECTOR, DeviceResiduals, ExpectedError, Solution
-from slrig.calibration.solving.adjustment import LENS_SIGMA
-from slrig.calibration.solving.covariance import allowing_for
-from slrig.calibration.solving.halves import halves_of
-from slrig.calibration.solving.held_out import folds_of
-from slrig.calibration.solving.parameters import difference
-from slrig.calibration.solving.problem import Fit, Problem, fitted
+from slrig.calibration.solving.adjustment import LENS_SIGMA, Fit, Problem, fitted
+from slrig.calibration.solving.held_out import allowing_for, folds_of, halves_of
+from slrig.calibration.solving.projection import difference
 from slrig.calibration.solving.solve import solve
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, FloatArray
