@@ -72,10 +72,10 @@ class Placed(Standing):
         return self.colour, self.colour if self.texture.colour is None else self.texture.colour
 
 
-Thing = TypeVar("Thing", bound=Standing)
+PlacedThing = TypeVar("PlacedThing", bound=Standing)
 
 
-def put(thing: Thing, position_mm: FloatArray, rotation: FloatArray) -> Thing:
+def put(thing: PlacedThing, position_mm: FloatArray, rotation: FloatArray) -> PlacedThing:
     """The same object in another pose. rotation : (3, 3), object to world."""
     x, y, z = (float(each) for each in position_mm)
     a, b, c = (float(each) for each in Rotation.from_matrix(rotation).as_euler("xyz", degrees=True))

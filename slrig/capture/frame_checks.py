@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import Black, Gray, LineShift, Pattern, Primary, White
-from slrig.model.gray_code import Integers, from_gray, gray_index, to_gray
+from slrig.model.patterns import Integers, from_gray, gray_index, to_gray
 
 Samples = NDArray[np.float32]
 Chosen = NDArray[np.bool_]

@@ -26,14 +26,11 @@ from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import Progress
 from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
-from slrig.views.fusion import FusedModel, fused
-from slrig.views.fusion_mean import registered_poses
+from slrig.views.fusion import FusedModel, fused, put_together, registered_poses
 from slrig.views.markers import MarkerFit, MarkersSeen, marker_poses
-from slrig.views.placing import put_together
 from slrig.views.registration import Registration, registered
-from slrig.views.stage_planes import cut
-from slrig.views.turntable import FoundAxis, registered_on_stage
-from slrig.views.unknown import found_starts
+from slrig.views.turntable import FoundAxis, cut, registered_on_stage
+from slrig.views.unknown_poses import found_starts
 
 _SURFACE_POINTS = 500  # of a view, at which it is told how well markers put it
 _START_SIGMAS = 3.0  # of starts by markers, that have to lie within the start's error

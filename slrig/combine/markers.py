@@ -25,7 +25,7 @@ from slrig.model import FloatArray, Mesh, Pinhole, Pixels, White
 from slrig.reconstruction.triangulation import project, rays
 from slrig.scan.artefacts import MESH
 from slrig.views.markers import SeenMarker
-from slrig.views.stage_planes import fitted_plane
+from slrig.views.turntable import fitted_plane
 
 _REACH = 0.7
 """Of a module, from a marker's corner: inwards is its border, one wide, outwards paper, by a ChArUco board's least."""

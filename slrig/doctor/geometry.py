@@ -14,7 +14,7 @@ from slrig.doctor.light import Seen
 from slrig.doctor.measures.pictures import Orientation, apart_deg, expected_orientation, orientation
 from slrig.doctor.viewing import Viewer
 from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot
-from slrig.model.gray_code import gray_index
+from slrig.model.patterns import gray_index
 from slrig.patterns.gray import cell_centre_px
 
 _COARSE_BITS = 6

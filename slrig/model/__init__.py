@@ -4,7 +4,6 @@ Conventions: arrays are (row, column); extents only as `Size`; pixel centres at 
 world to device `X_dev = R @ X_world + t_mm`; millimetres; unmeasured is NaN.
 """
 
-from slrig.model.arrays import FloatArray, IntArray, Pixels
 from slrig.model.frames import (
     FEWEST_EXPOSURES,
     MOST_EXPOSURES,
@@ -15,7 +14,6 @@ from slrig.model.frames import (
     bracket_fault,
     exposure_groups,
 )
-from slrig.model.light_axis import LEAST_SHARE, share_across, told_depth, triangulated_axis
 from slrig.model.missing_bits import without_missing_bits
 from slrig.model.patterns import (
     Black,
@@ -32,8 +30,26 @@ from slrig.model.patterns import (
     telling_lines,
 )
 from slrig.model.region import Region
-from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, LightMap, Pinhole, Size, Solved
-from slrig.model.stage import MeasuredAxis, PlaneKind, StageAxis, StagePlane
+from slrig.model.rig import (
+    DEVICE_PARAMETERS,
+    LEAST_SHARE,
+    Axis,
+    Calibration,
+    FloatArray,
+    IntArray,
+    LightMap,
+    MeasuredAxis,
+    Pinhole,
+    Pixels,
+    PlaneKind,
+    Size,
+    Solved,
+    StageAxis,
+    StagePlane,
+    share_across,
+    told_depth,
+    triangulated_axis,
+)
 from slrig.model.surfaces import (
     AlbedoMark,
     CameraTruth,

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from slrig.errors import BundleError
-from slrig.model.arrays import Pixels, require
 from slrig.model.patterns import Pattern
-from slrig.model.rig import Size
+from slrig.model.rig import Pixels, Size, require
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from slrig.model.arrays import FloatArray
+from slrig.model.rig import FloatArray
 
 LENS_TERMS = ("k1", "k2", "p1", "p2", "k3")
 """The terms of the distortion, in the order of `Pinhole.distortion`."""

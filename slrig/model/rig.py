@@ -4,14 +4,34 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from math import hypot, sqrt
+from typing import Any
 
 import numpy as np
+from numpy import linalg
+from numpy.typing import NDArray
 
 from slrig.errors import CalibrationError
-from slrig.model.arrays import FloatArray, require
+
+Pixels = NDArray[np.unsignedinteger[Any]]
+"""A raw image: (H, W) uint8 or uint16."""
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+
+def require(array: NDArray[Any], name: str, shape: tuple[int | None, ...], kind: str) -> None:
+    """Raise ValueError unless an array has this shape (None: any length) and one of these dtype kinds."""
+    fits = array.ndim == len(shape) and all(
+        want is None or got == want for got, want in zip(array.shape, shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in kind:
+        wanted = ", ".join("n" if want is None else str(want) for want in shape)
+        raise ValueError(f"{name}: expected an array ({wanted}) of kind '{kind}', found {array.shape} {array.dtype}")
+
 
 DEVICE_PARAMETERS = 15
 """Numbers that describe one device in a covariance."""
@@ -200,3 +220,116 @@ class Calibration:
             sort_keys=True,
         )
         return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+LEAST_SHARE = 0.2
+"""A baseline that lies across the stripes by less than this share of it (12°) makes errors five times as large as they
+need be, and what is seen of depth is mostly errors."""
+
+
+def triangulated_axis(cameras: Sequence[Pinhole], projector: Pinhole | None, /) -> Axis:
+    """The axis of patterns to triangulate by, of cameras in their order.
+
+    Light that runs along the baseline is seen edge on, and an epipolar line meets such a stripe nowhere or everywhere:
+    it tells no depth. Columns are for devices side by side, rows for devices above one another.
+
+    With a projector that is the axis by which all cameras together know depth best: a point moves in a camera by as
+    many pixels as its focal length times its baseline, seen in the projector's frame; inverse variances add up.
+    Without a projector the baseline is that from the first camera to another, seen in the first camera's frame; of
+    several the one that is longest across the view. The projector is then assumed to stand upright to the first camera,
+    within 45°: its columns run down the image. The direction of the stripes shows whether that holds
+    (`slrig.reconstruction.triangulation`).
+    """
+    across = share_across(Axis.COLUMN, cameras, projector)
+    return Axis.COLUMN if across >= share_across(Axis.ROW, cameras, projector) else Axis.ROW
+
+
+def share_across(axis: Axis, cameras: Sequence[Pinhole], projector: Pinhole | None, /) -> float:
+    """0 to 1: the sine of the angle between the baseline of `triangulated_axis` and the stripes of an axis.
+
+    A point's error grows with its inverse. Of several baselines their root mean square by the same weights. Where there
+    is no baseline to be seen, 1 for columns and 0 for rows.
+    """
+    beside, above = _moved_px(cameras, projector)
+    length = hypot(beside, above)
+    if length == 0:
+        return 1.0 if axis is Axis.COLUMN else 0.0
+    return (beside if axis is Axis.COLUMN else above) / length
+
+
+def told_depth(axis: Axis, cameras: Sequence[Pinhole], projector: Pinhole, /) -> list[bool]:
+    """Which cameras an axis of light tells depth; all of them where it tells it to none."""
+    told = [share_across(axis, [camera], projector) >= LEAST_SHARE for camera in cameras]
+    return told if any(told) else [True] * len(told)
+
+
+def _moved_px(cameras: Sequence[Pinhole], projector: Pinhole | None) -> tuple[float, float]:
+    """By how much points move in images, px mm, along x and y of the frame that the baselines are seen in.
+
+    What of a baseline runs along the view is of no use.
+    """
+    first, *others = cameras
+    seen_by, ends = (first, others) if projector is None else (projector, cameras)
+    found = [
+        sqrt(abs(linalg.det(end.matrix[:2, :2]))) * abs(seen_by.rotation @ end.centre_mm + seen_by.translation_mm)
+        for end in ends
+    ]
+    if projector is None:
+        return max(((float(x), float(y)) for x, y, _ in found), key=lambda each: hypot(*each), default=(0.0, 0.0))
+    return hypot(*(float(x) for x, _, _ in found)), hypot(*(float(y) for _, y, _ in found))
+
+
+@dataclass(frozen=True, slots=True)
+class StageAxis:
+    """The axis that a stage turns about, in the calibration's world frame.
+
+    point_mm : (3,), any point of it. direction : (3,), unit; angles count right-handed about it.
+    """
+
+    point_mm: FloatArray
+    direction: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredAxis(StageAxis):
+    """An axis, and how well it is known.
+
+    covariance : (6, 6) float64, of the point (mm) and of the direction (rad), both across the axis: along it there is
+    none.
+    """
+
+    covariance: FloatArray
+
+    @property
+    def point_sigma_mm(self) -> float:
+        """Standard deviation of the point across the axis, rms of both directions."""
+        return float(np.sqrt(max(np.trace(self.covariance[:3, :3]), 0.0) / 2))
+
+    @property
+    def direction_sigma_rad(self) -> float:
+        """The same of the direction."""
+        return float(np.sqrt(max(np.trace(self.covariance[3:, 3:]), 0.0) / 2))
+
+
+class PlaneKind(StrEnum):
+    """What a plane is: of the plate that the object stands on, square to the axis, or of anything else behind it."""
+
+    PLATE = "plate"
+    BACKDROP = "backdrop"
+
+
+@dataclass(frozen=True, slots=True)
+class StagePlane:
+    """A plane of the empty stage, in the calibration's world frame; nothing of the object lies behind it.
+
+    point_mm : (3,), the middle of what was seen of it. normal : (3,), unit, to the side it was seen from. sigma_mm :
+    deviation of its surface from it; radius_mm : how far from the middle it was seen. margin_mm : what lies so near
+    before it is cut away, too.
+    """
+
+    kind: PlaneKind
+    point_mm: FloatArray
+    normal: FloatArray
+    sigma_mm: float
+    radius_mm: float
+    margin_mm: float

@@ -1,7 +1,7 @@
 """Patterns of Gray code, and the positions of its cells and of the edges between them.
 
 Position c (a projector column or row) lies in cell i = ⌊(c + offset)/cell⌋, whose code word is that of
-`slrig.model.gray_code`. Bit 0 is the most significant.
+`slrig.model.patterns`. Bit 0 is the most significant.
 
 Six columns, three bits, most significant first:
 
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slrig.errors import PatternError
 from slrig.model import Axis, FloatArray, Gray, Size
-from slrig.model.gray_code import to_gray
+from slrig.model.patterns import to_gray
 
 
 def gray_bits(extent_px: int, cell_px: int, offset_px: int) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Gray, IntArray, LineShift, Size
-from slrig.model.gray_code import from_gray
+from slrig.model.patterns import from_gray
 from slrig.patterns.gray import cell_centre_px, edge_indices, edge_position_px, require_addressable
 from slrig.patterns.line_shift import is_whole, line_number, line_position_px
 

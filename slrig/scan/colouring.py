@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import AlbedoMark, Axis, LightMap, Mesh, Pinhole, Refusal, Source
-from slrig.model.srgb import srgb_of
+from slrig.model.surfaces import srgb_of
 from slrig.reconstruction.albedo import BRIGHT_ALBEDO, BRIGHT_PERCENT, Albedo, LitPoints, LitView, albedo
 from slrig.reconstruction.merging import MergedCurves
 from slrig.reconstruction.triangulation import SheetCurves

@@ -1,6 +1,6 @@
 """From the frames of a scan to triangulated points, by the axis of light that tells most of depth.
 
-Where both axes were played the calibration names one of them (`slrig.model.light_axis`). What the frames hold may speak
+Where both axes were played the calibration names one of them (`slrig.model.rig`). What the frames hold may speak
 for the other: the projector stands otherwise than was assumed, or the camera resolves its patterns better. Where the
 first axis is weak both are tried, and the one that decodes more pixels to a smaller error is used.
 """

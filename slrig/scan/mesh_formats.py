@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Mesh
-from slrig.model.srgb import light_of
+from slrig.model.surfaces import light_of
 from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, Part, encode_glb
 
 _MOST_ROWS = 2**15  # rows that are worked on together: they stay in the processor's cache

@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray, Mesh
-from slrig.views.fusion import fused
-from slrig.views.fusion_mean import registered_poses
+from slrig.views.fusion import fused, registered_poses
 from slrig.views.registration import registered
 from slrig.views.turntable import turntable
 from tests.unit.views.known_views import Noise, star, views_of

@@ -21,8 +21,7 @@ from slrig.model import PlaneKind, StageAxis
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.views.registration import registered
-from slrig.views.stage_planes import cut, stage_planes
-from slrig.views.turntable import turntable
+from slrig.views.turntable import cut, stage_planes, turntable
 from tests.golden.test_bundles import reconstructed
 from tests.rendered_boards import board_head, board_options, board_rig, board_scene
 from tests.turned_views import displacement_mm

@@ -11,7 +11,7 @@ import pytest
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray
 from slrig.views.registration import registered
-from slrig.views.unknown import found_starts
+from slrig.views.unknown_poses import found_starts
 from tests.ten_objects import OBJECTS, SYMMETRIC, seen_around, seen_from
 from tests.turned_views import displacement_mm
 from tests.unit.views.known_views import View, around

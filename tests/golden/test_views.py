@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray
-from slrig.views.fusion import fused
-from slrig.views.fusion_mean import registered_poses
+from slrig.views.fusion import fused, registered_poses
 from slrig.views.matching import moved
 from slrig.views.matching import turned as turned_by
 from slrig.views.registration import Registration, registered

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slrig.model import Axis, Gray, LineShift, Size
-from slrig.model.gray_code import gray_index, to_gray
+from slrig.model.patterns import gray_index, to_gray
 from slrig.patterns.gray import (
     cell_centre_px,
     gray_bits,

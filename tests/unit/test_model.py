@@ -30,7 +30,7 @@ from slrig.model import (
     lens,
     lens_kernels,
 )
-from slrig.model.srgb import light_of, srgb_of
+from slrig.model.surfaces import light_of, srgb_of
 from tests.samples import pinhole
 
 FORMAT = CameraFormat(Size(4, 3), 8)

@@ -26,8 +26,7 @@ from slrig.jobs.records import JobKind, JobState
 from slrig.jobs.store import JobStore
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
-from slrig.views.stage_axis import BoardAxis, board_axis
-from slrig.views.stage_planes import stage_planes
+from slrig.views.turntable import BoardAxis, board_axis, stage_planes
 from tests.unit.accept.test_desk import PLAN, desk, desks, queue
 from tests.unit.api.conftest import app_of, refusal
 from tests.unit.jobs.tame_queue import TameQueue

@@ -21,7 +21,7 @@ from slrig.client.errors import ScanFailedError
 from slrig.client.events import Captured, Event, FileReady, Progress, StateChange
 from slrig.client.notebook import shown
 from slrig.errors import ScanCancelledError, ServiceError
-from slrig.model.srgb import light_of
+from slrig.model.surfaces import light_of
 from slrig.scan.artefacts import encode_mesh_ply
 from tests.unit.client.service import HERE, SCAN, Walk, client_of
 from tests.unit.scan.test_mesh_formats import half_ball

@@ -7,7 +7,7 @@ import pytest
 
 from slrig.errors import PatternError
 from slrig.model import Axis, Gray, LineShift, Size
-from slrig.model.gray_code import from_gray, to_gray
+from slrig.model.patterns import from_gray, to_gray
 from slrig.patterns.gray import (
     edge_indices,
     gray_bits,

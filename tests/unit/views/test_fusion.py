@@ -11,10 +11,9 @@ from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import AlbedoMark, FloatArray, Mesh
-from slrig.model.srgb import light_of, srgb_of
-from slrig.views.fusion import _FOLDED, _OUTWARD, FusedModel, _halve, fused
-from slrig.views.fusion_mean import PoseErrors, Rule, mean_values
-from slrig.views.fusion_sheets import sheets
+from slrig.model.surfaces import light_of, srgb_of
+from slrig.views.fusion import _FOLDED, _OUTWARD, FusedModel, PoseErrors, Rule, _halve, fused, mean_values
+from slrig.views.fusion_grid import sheets
 from tests.unit.meshing.plain import grid_faces, mesh_of
 from tests.unit.views.known_views import Noise, View, around, star, views_of
 

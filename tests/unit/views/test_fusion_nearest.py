@@ -7,10 +7,16 @@ import pytest
 
 from slrig.meshing.quality import SearchTree
 from slrig.model import FloatArray
-from slrig.views.fusion_grid import corners_mm, grid_about, wanted_corners
-from slrig.views.fusion_mean import AGREEING_SIGMAS, PoseErrors, Rule, mean_values
-from slrig.views.fusion_nearest import nearest_to_corners, nearest_within
-from slrig.views.fusion_sheets import Sheets, sheets
+from slrig.views.fusion import AGREEING_SIGMAS, PoseErrors, Rule, mean_values
+from slrig.views.fusion_grid import (
+    Sheets,
+    corners_mm,
+    grid_about,
+    nearest_to_corners,
+    nearest_within,
+    sheets,
+    wanted_corners,
+)
 from tests.unit.views.known_views import around, plate_on_box, views_of
 
 # Only models of several views need these kernels.

@@ -7,10 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slrig.errors import RegistrationRefusedError
-from slrig.views.candidates import rigid
-from slrig.views.evidence import evidence, seen_by
-from slrig.views.matching import moved
-from slrig.views.unknown import found_starts
+from slrig.views.matching import evidence, moved, seen_by
+from slrig.views.unknown_poses import found_starts, rigid
 from tests.ten_objects import OBJECTS, seen_from
 from tests.turned_views import displacement_mm
 from tests.unit.views.known_views import View

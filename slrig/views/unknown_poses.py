@@ -1,9 +1,9 @@
-"""Start poses of views that nobody knows the poses of: found from the surfaces, or refused.
+"""Initial poses of views without any known pose: found from the surfaces, or refused.
 
-Each pair of views has poses that it may have (`slrig.views.candidates`). From the pair that agrees best on, views are
-put together as long as all that they have seen agrees (`slrig.views.evidence`). Then each view, and each part that one
-pair holds to the rest, is tried wherever else its pairs may have it: what agrees better there is moved, and where it
-agrees nearly as well there are two answers, and none is given.
+Each pair of views yields candidate poses. Starting from the pair that agrees best, views are added while all of their
+surfaces agree (`slrig.views.matching`). Then each view, and each group that a single pair connects to the rest, is
+tried at its other candidates. It moves where that agrees better; where another answer agrees nearly as well, both are
+rejected as ambiguous.
 """
 
 from __future__ import annotations
@@ -14,16 +14,209 @@ from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray, IntArray, Mesh
-from slrig.views.candidates import apart_mm, candidate_poses
-from slrig.views.descriptors import cell_mm, keypoints, seen_mm2
-from slrig.views.evidence import SAMPLE, Evidence, Facing, Seen, evidence, fitted, seen_by
-from slrig.views.matching import moved
+from slrig.views.matching import SAMPLE, Evidence, Facing, Seen, Side, evidence, fitted, moved, seen_by
 from slrig.views.registration import registered
+
+_SUPPORT = 2500
+"""Vertices of a view that stand for its surface."""
+_KEYPOINTS = 500
+_RADII = (0.25, 0.12)
+"""Of a spin image, by the square root of the area that a view sees: of parts of the object, and of details."""
+_SMOOTHED = 0.7
+"""Of a cell, the radius that a keypoint's normal is the mean of."""
+_ACROSS, _ALONG = 8, 12
+
+
+@dataclass(frozen=True, slots=True)
+class Keypoints:
+    """Places of a view, one in each cell of a grid, in the view's frame.
+
+    points_mm, normals : (k, 3) float64; spins : (k, d) float32, unit, whose products are the likeness of two places.
+    """
+
+    points_mm: FloatArray
+    normals: FloatArray
+    spins: FloatArray
+
+
+def seen_mm2(view: Mesh) -> FloatArray:
+    """(V,) float64: the area of surface that each vertex stands for."""
+    a, b, c = (view.vertices_mm[view.faces[:, corner]].astype(np.float64) for corner in range(3))
+    third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    sums = np.bincount(view.faces.ravel(), np.repeat(third, 3), len(view.vertices_mm))
+    return np.asarray(sums, dtype=np.float64)
+
+
+def cell_mm(area_mm2: float) -> float:
+    """Edge of the grid that keypoints are chosen by, where a view sees so much surface."""
+    return float(np.sqrt(area_mm2 / _KEYPOINTS))
+
+
+def keypoints(side: Side, weights_mm2: FloatArray, area_mm2: float) -> Keypoints:
+    """Keypoints of a view. weights_mm2 : (V,), see `seen_mm2`; area_mm2 : what a view sees; the same for all views."""
+    chosen = side.order[:_SUPPORT]
+    points, normals = side.points_mm[chosen], side.normals[chosen]
+    # Fewer vertices than there are stand for the same area.
+    weights = weights_mm2[chosen] * (weights_mm2[side.order].sum() / max(weights_mm2[chosen].sum(), 1e-12))
+    cell = cell_mm(area_mm2)
+    first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)[1]
+    middles = points[first]
+    # A vertex's own normal has the noise of its neighbours: the mean over a cell tilts a spin image less.
+    which, other = np.nonzero(_squares(middles, points) < (_SMOOTHED * cell) ** 2)
+    mean = np.zeros((len(middles), 3))
+    for axis in range(3):
+        mean[:, axis] = np.bincount(which, (normals[:, axis] * weights)[other], len(middles))
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    spins = [_spins(middles, mean, points, weights, share * float(np.sqrt(area_mm2))) for share in _RADII]
+    return Keypoints(middles, mean, np.hstack(spins) / np.sqrt(len(spins)))
+
+
+def _squares(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(k, n): squared distances of points (k, 3) from others (n, 3)."""
+    return np.asarray((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T)
+
+
+def _spins(
+    middles: FloatArray, normals: FloatArray, points: FloatArray, weights: FloatArray, radius_mm: float
+) -> FloatArray:
+    """(k, bins) float32, unit: square roots of shares of area, whose products are Bhattacharyya's coefficient."""
+    squares = _squares(middles, points)
+    which, other = np.nonzero(squares < radius_mm**2)
+    along = ((points[other] - middles[which]) * normals[which]).sum(axis=1)
+    across = np.sqrt(np.maximum(squares[which, other] - along**2, 0.0))
+    # Each point counts in the four bins about it by its nearness, so that a small shift changes little.
+    u = across / radius_mm * _ACROSS - 0.5
+    v = (along / radius_mm + 1) / 2 * _ALONG - 0.5
+    image = np.zeros(len(middles) * _ACROSS * _ALONG)
+    for i in (0, 1):
+        for j in (0, 1):
+            row, column = np.floor(u).astype(np.int64) + i, np.floor(v).astype(np.int64) + j
+            share = (1 - np.abs(u - row)) * (1 - np.abs(v - column)) * weights[other]
+            row, column = np.clip(row, 0, _ACROSS - 1), np.clip(column, 0, _ALONG - 1)
+            image += np.bincount((which * _ACROSS + row) * _ALONG + column, share, len(image))
+    flat = image.reshape(len(middles), -1)
+    shares = flat / np.maximum(flat.sum(axis=1, keepdims=True), 1e-12)
+    return np.asarray(np.sqrt(shares), dtype=np.float32)
+
+
+_ALIKE = 3
+"""Of the other view, for each place of one: the likest, and as many of the next."""
+_OTHERS = 20
+"""Which one a place has to be clearly less like, to be a place that is known again: a plane is like itself all over."""
+_MOST_PAIRS = 600
+_TURNED = 0.25
+"""What a cosine of two normals may differ by."""
+_LEAST = 6
+"""Pairs that agree on a pose: three determine it."""
+_LEAST_COSINE = 0.8
+_SPARSE = 12
+_CANDIDATES_APART = 3.0
+"""Poses nearer to one another are fitted to the same one, in what places may be apart."""
+_CANDIDATES_TRIED = 700
+"""Hypotheses: where one place of eight is a right one, so is one hypothesis of fifty, and it is found again."""
+
+
+def candidate_poses(first: Keypoints, second: Keypoints, *, within_mm: float, most: int) -> FloatArray:
+    """(c, 4, 4), c up to `most`: poses that take the first view to the second, those with most pairs first.
+
+    within_mm : how far the same place may be apart in both, since keypoints are not chosen alike.
+    """
+    a, b = _alike(first.spins, second.spins)
+    p, q, m, n = first.points_mm[a], second.points_mm[b], first.normals[a], second.normals[b]
+    compatible = _compatible(p, q, m, n, within_mm)
+    ones, twos = np.nonzero(compatible)
+    if not len(ones):
+        return np.zeros((0, 4, 4))
+    # A pair of every place as often as that of any other, however many it is compatible with.
+    share = 1 / compatible.sum(axis=1)[ones]
+    tried = np.random.default_rng(0).choice(len(ones), _CANDIDATES_TRIED, p=share / share.sum())
+    both = np.stack([ones[tried], twos[tried]], axis=1)
+    # Two places with their normals determine a pose: as four points do.
+    arm = np.linalg.norm(p[both[:, 1]] - p[both[:, 0]], axis=1)[:, None, None]
+    poses = rigid(np.hstack([p[both], p[both] + arm * m[both]]), np.hstack([q[both], q[both] + arm * n[both]]))
+    agreeing = _agreeing(p, q, m, n, poses, within_mm)
+    counts = agreeing.sum(axis=1)
+    found: list[FloatArray] = []
+    for each in np.argsort(-counts, kind="stable"):
+        if counts[each] < _LEAST or len(found) == most:
+            break
+        if all(apart_mm(poses[each], other, p[::_SPARSE]) > _CANDIDATES_APART * within_mm for other in found):
+            found.append(rigid(p[agreeing[each]], q[agreeing[each]]))
+    return np.array(found).reshape(-1, 4, 4)
+
+
+def apart_mm(pose: FloatArray, other: FloatArray, points_mm: FloatArray) -> float:
+    """Rms distance by which two poses (4, 4) part points (n, 3)."""
+    return float(np.sqrt(((moved(pose, points_mm) - moved(other, points_mm)) ** 2).sum(axis=1).mean()))
+
+
+def _agreeing(
+    p: FloatArray, q: FloatArray, m: FloatArray, n: FloatArray, poses: FloatArray, within_mm: float
+) -> NDArray[np.bool_]:
+    """(h, k): which places, with their normals, poses (h, 4, 4) take to one another."""
+    turns = poses[:, :3, :3].astype(np.float32)
+    there = p.astype(np.float32) @ turns.swapaxes(1, 2) + poses[:, None, :3, 3].astype(np.float32)
+    near = ((there - q.astype(np.float32)) ** 2).sum(axis=2) < within_mm**2
+    cosine = ((m.astype(np.float32) @ turns.swapaxes(1, 2)) * n.astype(np.float32)).sum(axis=2)
+    return np.asarray(near & (cosine > _LEAST_COSINE))
+
+
+def rigid(source: FloatArray, target: FloatArray) -> FloatArray:
+    """(…, 4, 4): poses that take points (…, n, 3) nearest to others, by squares (Umeyama 1991, without scale)."""
+    middle, goal = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
+    left, _, right = np.linalg.svd((target - goal).swapaxes(-1, -2) @ (source - middle))
+    # No mirror: the least of the three directions turns round.
+    left[..., :, 2] *= np.linalg.det(left @ right)[..., None]
+    pose = np.broadcast_to(np.eye(4), (*source.shape[:-2], 4, 4)).copy()
+    pose[..., :3, :3] = left @ right
+    pose[..., :3, 3] = (goal - middle @ pose[..., :3, :3].swapaxes(-1, -2))[..., 0, :]
+    return pose
+
+
+def _alike(first: FloatArray, second: FloatArray) -> tuple[IntArray, IntArray]:
+    """Indices (p,) of places of both that look alike, the most telling ones."""
+    likeness = first @ second.T
+    found = []
+    for table, flip in ((likeness, False), (likeness.T, True)):
+        rank = min(_OTHERS, table.shape[1] - 1)
+        best = np.argpartition(-table, rank, axis=1)[:, : rank + 1]
+        value = np.take_along_axis(table, best, axis=1)
+        order = np.argsort(-value, axis=1)
+        best, value = np.take_along_axis(best, order, axis=1), np.take_along_axis(value, order, axis=1)
+        ratio = (1 - value[:, :_ALIKE]) / np.maximum(1 - value[:, -1:], 1e-9)
+        rows = np.repeat(np.arange(len(table)), ratio.shape[1])
+        pair = (best[:, :_ALIKE].ravel(), rows) if flip else (rows, best[:, :_ALIKE].ravel())
+        found.append(np.stack([*pair, ratio.ravel()]))
+    both = np.concatenate(found, axis=1)
+    both = both[:, np.argsort(both[2], kind="stable")]
+    keep = np.sort(np.unique(both[:2], axis=1, return_index=True)[1])[:_MOST_PAIRS]
+    a, b = both[:2, keep].astype(np.int64)
+    return a, b
+
+
+def _compatible(p: FloatArray, q: FloatArray, m: FloatArray, n: FloatArray, within_mm: float) -> NDArray[np.bool_]:
+    """(n, n): whether pairs of places p, q (n, 3) with normals m, n (n, 3), may belong to one pose."""
+    one, two = _relations(p, m), _relations(q, n)
+    distance, along, cosine = (np.abs(x - y) for x, y in zip(one, two, strict=True))
+    both = (distance < within_mm) & (along < within_mm) & (within_mm > along.T) & (cosine < _TURNED)
+    # Places near to one another are so in any pose.
+    return np.asarray(both & (one[0] > 2 * within_mm))
+
+
+def _relations(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, ...]:
+    """(n, n) each: distances; heights of the second point over the first's plane; cosines of the normals."""
+    points, normals = points.astype(np.float32), normals.astype(np.float32)
+    squares = (points**2).sum(axis=1)
+    distance = np.sqrt(np.maximum(squares[:, None] + squares - 2 * points @ points.T, 0))
+    along = normals @ points.T - (normals * points).sum(axis=1)[:, None]
+    return distance, along, normals @ normals.T
+
 
 _TRIED, _KEPT = 12, 6
 """Poses of a pair that are fitted, and that are kept: those that agree best."""
