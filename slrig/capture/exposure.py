@@ -23,13 +23,13 @@ from slrig.capture.verifier import EvidenceSummary, Sampler, check_capture
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
 
 _ROUNDED = 1e-6  # of a refresh period: a range that is stated as whole ones is
-_MOST_SATURATED = 0.9  # of what is lit, as `checks.lighting` has it
+_MOST_SATURATED = 0.9  # of what is lit, as `frame_checks.lighting` has it
 _LEAST_LIT = 40  # samples, as `checks` has it
 LEAST_CLEAR = 12.0  # noises that white lies above black
 LEAST_CLEAR_DN = 4.0  # rounding hides the shares of less
 _LEAST_COMPARED = 300  # samples, as many as a band needs to be judged
-_MOST_MOVED = 0.05  # of the pixels, as `checks.drift_fault` has it
-_MOVED = 0.3  # of white, as `checks.drift` has it
+_MOST_MOVED = 0.05  # of the pixels, as `frame_checks.drift_fault` has it
+_MOVED = 0.3  # of white, as `frame_checks.drift` has it
 
 
 def whole_refreshes_s(exposure_s: float, refresh_s: float | None, ranges_s: Iterable[tuple[float, float]]) -> float:

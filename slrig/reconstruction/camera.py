@@ -120,7 +120,7 @@ class CameraCurves:
     there was no phase. unresolved : (H, W) uint8, how many of the finest bits are left out at each pixel; None where
     bits only number lines. lost_lines : (H, W) bool, where code edges stand for lines that the camera does not resolve;
     None if nowhere. compression_dn : standard deviation of the noise that would err positions by as much as what
-    compression took from the frames; 0 for frames without loss. shared_noise : as of `correlation.shared_noise`.
+    compression took from the frames; 0 for frames without loss. shared_noise : as of `camera_response.shared_noise`.
     gamma : how the camera bent its values, which was taken out.
     """
 

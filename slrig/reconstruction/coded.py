@@ -64,7 +64,7 @@ class Coded:
     unresolved : as of `CameraCurves`; loss_variance : what compression adds to the variance of each sample for whoever
     finds positions, camera units squared. It bends stripes and edges, but turns no bit over: reading the code with it
     refused a tenth of a vase at quality 50, and saved it from no wrong point. shared : how much more variance sums of
-    pixels have than independent noise would give them, as of `correlation.shared_noise`. gamma : as of `CameraCurves`.
+    pixels have than independent noise would give them, as of `camera_response.shared_noise`. gamma : as of `CameraCurves`.
     asked : (H, W) bool, pixels that the scan is asked for; None for all.
     """
 

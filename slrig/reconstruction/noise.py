@@ -41,7 +41,7 @@ class NoiseModel:
     read_variance, slope : of a frame as the camera gives it.
     read_share, shot_share : (H, W) float32, what is left of them at each pixel of frames that are fused of several
     exposures (`slrig.reconstruction.fusion`); None for frames as the camera gives them, where both are 1.
-    loss : of a bracket and of a camera that bends its values, as `compression.compression_loss` gives it: fused and
+    loss : of a bracket and of a camera that bends its values, as `camera_response.compression_loss` gives it: fused and
     straightened frames do not show it any more.
     """
 

@@ -396,7 +396,7 @@ def _centred_weights(out: Any, centre: float, sigma: float, whole: Any) -> None:
 
 _SHARPEST_TURN = np.pi / 3  # chosen; π/6 and π/2 give the same figures of a rendered vase
 _SAME_LINE_ANGLE = np.pi / 6  # as linking after Steger has it
-_SAME_LINE_PX = 0.8  # a line may answer again up to 0.6 px away (`steger._TAYLOR_BOX`)
+_SAME_LINE_PX = 0.8  # a line may answer again up to 0.6 px away (`stripes._TAYLOR_BOX`)
 _LONGEST_STEP_PX = 2.2  # chosen; 1.5 takes 61 of 239 246 triangles from a rendered vase, 3.3 changes none
 # The neighbours of a pixel, by the octant that they lie in: 0 along x, 2 along y.
 _STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
