@@ -1,4 +1,4 @@
-"""OpenCV's FileStorage, read: the part of its YAML and XML that calibrations are written in, and nothing else.
+"""Calibration files: our calibration.json, and OpenCV's FileStorage (YAML, XML, JSON) with its own small reader.
 
 OpenCV's own reader is not for files of strangers: a short file can make it write outside its memory. This one knows
 maps, text, numbers and dense matrices of `d`, `f` or `i` with one channel. It keeps to its limits before it builds

@@ -1,4 +1,4 @@
-"""Frame files: PNG, TIFF, BMP and JPEG, their headers read before a pixel is decoded.
+"""Frame files: PNG, TIFF, BMP and JPEG; headers are checked before a pixel is decoded.
 
 A few hundred kilobytes can declare an image of gigabytes, so extent and depth come from the header, and only a file
 that fits what bundle.json declares is decoded. A PNG's chunks are walked with their checksums: a cut or damaged file is

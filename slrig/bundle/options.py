@@ -1,4 +1,4 @@
-"""What a scan may be asked for in files: `[scan]` of a rig file, and presets, which rigs may share."""
+"""Options in files: `[scan]` of a rig file and presets, turntables, poses of views, scan regions."""
 
 from __future__ import annotations
 

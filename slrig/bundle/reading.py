@@ -1,4 +1,4 @@
-"""A scan bundle, read: the description checked first, then the frames, several files at a time."""
+"""Reading a scan bundle: the description first, then the frames, several files at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a rendered rig knows of its scene, kept beside its bundle.
+"""Files beside the frames of a bundle: truth of a rendered scene, health, notes, refused frames, turntable.
 
 `truth.ply` is the surface (binary little endian), `visible_points.npy` the points of it that the first camera sees lit
 by the projector, `truth-CAMERA.npz` the maps of each camera. Maps and surface are float32 on disk: at a distance of one

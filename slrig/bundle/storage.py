@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written beside their place, brought to disk, and renamed once."""
+"""Files that are whole or absent: written beside their place, brought to disk, and renamed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Faults of a description, told in the words of the person who wrote it.
+"""Validation of descriptions: every fault, in the words of the file, and limits of free text and times.
 
 A description (bundle.json, calibration.json, a rig file) is checked by a pydantic model; what pydantic says is turned
 here into lines of the form `cameras.cam0.bit_depth: expected …, found …; do …`, all of them in one message.

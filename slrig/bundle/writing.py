@@ -1,4 +1,4 @@
-"""A scan bundle, written: each frame as it comes, the whole folder renamed into place once, or nothing left."""
+"""Writing a scan bundle: each frame as it comes; the whole folder appears at once, or nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exposure brackets: which exposures show what the projector lights, whether they show the same, and what they prove.
+"""Exposure brackets: which exposures show the scene, whether they agree, and what they prove.
 
 A bracket is the whole sequence once for each exposure, from short to long. Each sequence is judged by itself, so that
 every frame is proven as in a scan with one exposure; the alternative, all exposures of one pattern before the next,

@@ -1,4 +1,4 @@
-"""What a set of sampled pixels says about a frame: pure functions on vectors, each naming a contradiction or None.
+"""Checks of sampled pixels of a frame: pure functions on vectors, each returns a contradiction or None.
 
 All vectors hold the same n sampled pixels of one camera: (n,) float32, in digital numbers (DN). `u` is a frame on the
 scale on which the black frame is 0 and the white frame is 1. Only `Reference.judged` pixels are asked: lit, not

@@ -1,4 +1,4 @@
-"""Hardware synchronisation: the projector plays the sequence and triggers the cameras by wire; frame i shows pattern i.
+"""Triggered capture: by wire, where frame i shows pattern i, or by software, one pattern at a time.
 
 Nothing but their order tells such frames apart, so a play counts as a whole or not at all: exactly as many frames as
 patterns, numbered without a gap, that agree with one another. One that does not is played again.

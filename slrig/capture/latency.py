@@ -1,4 +1,4 @@
-"""Software synchronisation: how much later than the projector says its light is there, and for how long to wait.
+"""Latency of the light behind the projector's clock, measured, for capture without a trigger wire.
 
 `measure_latency` flashes the projector and times the light with each camera's own time stamps; `stable_from_ns` is
 what a scan waits for. What matters for a scan is only the sum of what projector and camera state wrongly: whether the

@@ -1,4 +1,4 @@
-"""Streaming: free-running cameras are read beside the projector, and no frame is waited for before the next pattern.
+"""Streaming capture: free-running cameras are read while patterns change, at the projector's cadence.
 
 A pattern is held until every camera must have exposed a frame within its light: their time stamps foretell when. The
 next one is asked for as early before that as its light is known to take. Frames come whenever they come. Each is paired

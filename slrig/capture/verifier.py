@@ -1,4 +1,4 @@
-"""One camera's frames of a sequence, judged against one another at a sample of pixels; each may be taken back."""
+"""Verification of the frames of a sequence against one another, with retries of frames that contradict."""
 
 from __future__ import annotations
 

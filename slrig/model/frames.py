@@ -1,4 +1,4 @@
-"""What cameras deliver: a frame as it comes, and a whole capture; and what a bracket of exposures is."""
+"""Frames as cameras deliver them, whole captures, and exposure brackets."""
 
 from __future__ import annotations
 

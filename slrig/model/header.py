@@ -1,4 +1,4 @@
-"""What a sequence will give, before a frame of it is there."""
+"""Header of a capture: its patterns and cameras, known before the first frame."""
 
 from __future__ import annotations
 

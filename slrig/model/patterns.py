@@ -1,4 +1,4 @@
-"""What a projector shows."""
+"""Patterns that a projector shows, and the Gray code that they are made of."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What of a scene a scan is asked to measure, and how well: all else is left out, most of it before it costs time."""
+"""Scan region: the part of a scene to measure, and the tolerance for its points."""
 
 from __future__ import annotations
 

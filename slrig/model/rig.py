@@ -1,4 +1,4 @@
-"""Extents, and the devices of a rig: lens, pose, and how well they are known."""
+"""Devices of a rig: extents, lens, pose, uncertainty; light axis; pose of a turntable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Surfaces, measured and known: curves of points, meshes, truth, and why a pixel gave no point."""
+"""Surfaces: curves of points, meshes, truth, causes of refused pixels, colours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much of the light that falls on a point it sends back: its albedo, from the frames of full and of no light.
+"""Albedo of each point, from the frames of full light and of no light.
 
 A dull surface of albedo ρ at distance d from the projector, on which the light falls at the angle i, shows
 

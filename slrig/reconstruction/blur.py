@@ -1,4 +1,4 @@
-"""How far the camera's blur reaches, told by the lines of the scan itself.
+"""Blur of the camera, estimated from the lines of a scan, and the correction of curved surfaces for it.
 
 The first harmonic of the lines' light, over white minus black, is what is left of it behind both lenses: the
 projector's part is the same everywhere in its own columns, and a Gaussian blur of the camera of variance σ² leaves

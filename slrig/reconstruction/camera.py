@@ -1,4 +1,4 @@
-"""One camera's frames to linked curves: noise, code, stripes, identity, links."""
+"""Reconstruction of one camera and axis, frame by frame: noise, code, stripes, refinement, identity, links."""
 
 from __future__ import annotations
 

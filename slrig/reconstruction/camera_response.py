@@ -1,4 +1,4 @@
-"""Cameras whose values bend against light, told by their own frames and made straight.
+"""Response of the camera, estimated from the frames: gamma, loss by compression, noise shared by neighbouring pixels.
 
 Cameras made for displays give v = full · (light/full)^(1/γ) (Rec. 709, sRGB: γ of about 2.2 as a whole). All that is
 done with frames takes light: stripes add up with the room's light, a pixel's light is a mean over its blur. On bent

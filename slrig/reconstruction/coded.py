@@ -1,4 +1,4 @@
-"""What one camera's code tells of every pixel, and the images in which points of lines and of code edges are found."""
+"""Decoded image of one camera, the limits of its reconstruction, and the images in which points are located."""
 
 from __future__ import annotations
 
@@ -58,14 +58,13 @@ _WHOLE = slice(None)
 
 @dataclass(frozen=True, slots=True)
 class Coded:
-    """What white, black and code frames tell of every pixel.
+    """Per-pixel result of white, black and code frames.
 
-    near_shadow : (H, W) bool, for a fit to pixels; contrast_deviation : (H, W) float32, of white minus black by noise;
-    unresolved : as of `CameraCurves`; loss_variance : what compression adds to the variance of each sample for whoever
-    finds positions, camera units squared. It bends stripes and edges, but turns no bit over: reading the code with it
-    refused a tenth of a vase at quality 50, and saved it from no wrong point. shared : how much more variance sums of
-    pixels have than independent noise would give them, as of `camera_response.shared_noise`. gamma : as of `CameraCurves`.
-    asked : (H, W) bool, pixels that the scan is asked for; None for all.
+    near_shadow : (H, W) bool, pixels too close to a shadow for a fit; contrast_deviation : (H, W) float32, standard
+    deviation of white minus black by noise; unresolved : as in `CameraCurves`; loss_variance : extra variance of each
+    sample caused by compression, camera units squared. It counts for positions only: it bends stripes and edges, but
+    turns no bit over. shared : factor by which noise shared by neighbours increases the variance of sums of pixels, see
+    `camera_response.shared_noise`. gamma : as in `CameraCurves`. asked : (H, W) bool, the scan region; None for all.
     """
 
     frames: AxisFrames

@@ -1,4 +1,4 @@
-"""Dense sub-pixel correspondences: which projector position each camera pixel of a smooth surface gets its light from.
+"""Dense sub-pixel correspondences: the projector position at each camera pixel of a smooth surface.
 
 Two sources, by what was shown. With every shift of a line pattern, the phase of their light tells the position at each
 pixel. With a Gray code alone, it is known exactly where the camera sees a code edge; the middles of code cells, good to

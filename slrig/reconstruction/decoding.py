@@ -1,4 +1,4 @@
-"""Gray-code decoding with a reason for every refused pixel.
+"""Gray-code decoding with a cause for every refused pixel, unresolved bits, and the mask of the scan region.
 
 A bit is read by comparing it with its inverse (or with the middle of white and black) against a margin that the
 noise sets. A bit inside the margin is ambiguous; the pixel is then known to an interval of cells. One such bit at

@@ -1,4 +1,4 @@
-"""The frames of one camera and one axis, sorted by what they show, ready for decoding.
+"""Frames of one camera and axis, sorted by pattern, ready for decoding.
 
 Repeats of a pattern at one exposure are averaged. Several exposures are a bracket: see `slrig.reconstruction.fusion`.
 

@@ -1,4 +1,4 @@
-"""Several exposures of every pattern fused into one image each, before anything is decoded.
+"""Fusion of several exposures of every pattern into one image each, before decoding.
 
 A pixel takes part with those exposures at which nothing that it showed was clipped, the same ones in all its frames and
 with the same weights: then whatever an exposure adds (a pedestal) or how far its time is off cancels in the differences

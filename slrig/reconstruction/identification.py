@@ -1,4 +1,4 @@
-"""Giving each stripe its projector column, and refusing ambiguous points.
+"""Projector column of each stripe, refusal of ambiguous points, and links between stripes of one column.
 
 Every point looks up the interval of code cells at its pixel; both ends of the interval must mean the same light
 column in the frame that the point was found in. A chain is cut where the column changes.

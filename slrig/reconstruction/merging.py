@@ -1,4 +1,4 @@
-"""One set of curves from several cameras that see the same light sheets.
+"""One set of curves from several cameras, their redundancy, and their disagreement.
 
 A projector ray meets one surface point, so on a light sheet the depth is a function of the projector row. Curves of one
 code from two cameras sample the same function: they are merged by row. Where both have it, the point is the mean

@@ -1,4 +1,4 @@
-"""The noise of a camera, estimated from the frames of a scan themselves.
+"""Noise of the camera, estimated from the frames of a scan.
 
 Model: variance(I) = read + slope · I, in camera units (photon transfer; EMVA 1288).
 """

@@ -1,4 +1,4 @@
-"""What all line frames say together: the projector position at every pixel.
+"""Projector position at every pixel from all line frames, its centroid correction, and depth and shadow edges.
 
 A stripe's own frame tells its centre from a few pixels. The other shifts light the same patch of surface, so the phase
 of their light tells the projector position there as well, at every pixel: x = n/2π · arg Σ I_k exp(2πi centre_k / n).

@@ -1,4 +1,4 @@
-"""Stripe points refined by the light of all line frames, and the stripes that a filter misses.
+"""Stripe points refined by the light of all line frames, and points that the filter misses.
 
 A local surface fitted to the position map, solved for the line's own column, uses the light of all shifts. It holds
 where stripes are squeezed together at a grazing view, and beside a shadow, where a filter reaches over the border

@@ -1,4 +1,4 @@
-"""Sub-pixel points on light stripes and on code edges, linked along the curve that they lie on.
+"""Sub-pixel points on light stripes and on code edges, and their chaining along each stripe.
 
 Stripes: Steger's curvilinear detector (PAMI 20(2) 1998, 113-125) with one further Newton step on kernels re-centred on
 the sub-pixel point, which removes the S-shaped error of a single Taylor step. Code edges: the zero crossing of a bit

@@ -1,4 +1,4 @@
-"""From linked stripes to curves in space: camera ray with light sheet, and camera ray with the same code elsewhere."""
+"""Curves in space: camera rays, curved light sheets, their intersections, and epipolar matches between cameras."""
 
 from __future__ import annotations
 

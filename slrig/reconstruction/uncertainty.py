@@ -1,4 +1,4 @@
-"""What the errors of stripe points mean in space."""
+"""Standard deviation of points in space: noise, sensitivity of the triangulation, share of the calibration."""
 
 from __future__ import annotations
 

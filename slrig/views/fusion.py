@@ -1,4 +1,4 @@
-"""Several views of one object, their poses known, to one mesh of their mean surface: watertight where it was seen.
+"""Fusion of several views with known poses into one mesh of their mean surface, with its colours.
 
 The views' signed distances are averaged on a sparse grid (after Curless and Levoy 1996, "A volumetric method for
 building complex models from range images", with exact distances to triangles and σ as weight), the surface where the

@@ -1,4 +1,4 @@
-"""A sparse grid about the views: bricks of 8 x 8 x 8 voxels where a triangle passes, and which corners are wanted.
+"""Sparse grid around the views: bricks of 8 x 8 x 8 voxels along the surfaces, and distances at their corners.
 
 A cell is named by its lowest corner. Flat index: 512 brick + 64 x + 8 y + z, x, y, z in 0 … 7 within the brick.
 """

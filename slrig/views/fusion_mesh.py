@@ -1,4 +1,4 @@
-"""The surface between the voxels of a sparse grid that are inside and those outside: a dual mesh, manifold by design.
+"""Surface between inside and outside voxels of a sparse grid: a dual mesh, manifold by construction.
 
 Each sheet of surface in a cell is a loop through its faces and crosses some of its edges; it has one vertex, at the
 mean of the crossings (Gibson 1998, "Constrained elastic surface nets", and Nielson 2004, "Dual marching cubes"). Each

@@ -1,4 +1,4 @@
-"""Poses of views from markers that turn with the object, where its own shape does not tell them.
+"""Poses of views from markers that turn with the object.
 
 The poses T_i and the corners X of all markers minimise Σ |T_i p - X|² / σ² over the corners p that views see, by Gauss
 and Newton's steps with the corners eliminated. What does not agree with what other views see of a marker, because that

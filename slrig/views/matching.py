@@ -1,4 +1,4 @@
-"""Which points of two views see the same place, and what each such match says of how one view has to move.
+"""Matches between two views: points of the same place, their evidence, and the uncertainty of the pose.
 
 A match is a vertex of one view and the nearest vertex of the other. Its residual is their distance along the mean of
 both normals, which leaves out that they are not the same point of a curved surface (Rusinkiewicz 2019, "A symmetric

@@ -1,4 +1,4 @@
-"""The axis of a stage, from a board that stood on it at several angles.
+"""Axis and angles of a turntable, from a board or planes at several angles, and its change over time.
 
 Where a board's poses B_i are those of one body that a stage turned, T_i = B_0 B_i⁻¹ turns about the axis, as the poses
 of views do: both are fitted by `slrig.views.turntable`.

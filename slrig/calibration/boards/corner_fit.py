@@ -1,4 +1,4 @@
-"""Corners and circles to a hundredth of a pixel: a model of the blurred print, fitted to each one's own pixels.
+"""Corners and circles to a hundredth of a pixel: a model of the blurred print, fitted to the pixels around each one.
 
 A corner is where two straight edges cross. With d1, d2 the distances of a pixel from the edges and s the blur,
 

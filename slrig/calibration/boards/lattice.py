@@ -1,4 +1,4 @@
-"""A grid of corners in view, whatever its size: how far it reaches, where the image cuts it, which corner is number 0.
+"""Grid of corners in view: its extent, where the image cuts it, and which corner is number 0.
 
 - A ChArUco board has one numbering: its markers say which.
 - A chessboard whose columns and rows of corners add up to an odd number (11 x 8) has one: the square up and left of

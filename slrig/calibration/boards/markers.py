@@ -1,4 +1,4 @@
-"""ChArUco boards: markers by OpenCV (`CharucoDetector`), the corners between them by a fit."""
+"""Corners of ChArUco boards and chessboards: found by OpenCV, placed by a fit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boards to print, in true size: a page as SVG or PDF, with rulers that tell whether the printer kept it.
+"""Boards to print in true size: artwork, and pages as SVG or PDF with rulers that check the printer.
 
 Everything is drawn in vectors, from one list of shapes in millimetres from the page's upper left corner.
 """

@@ -1,4 +1,4 @@
-"""Which device changed since the calibration, by how much, and which others the geometry cannot tell from it.
+"""Devices that changed since the calibration: equations, estimates, and which changes the geometry cannot separate.
 
 A hypothesis is a change δ of one device: it turned about its own centre (3), moved (3), did both (6), or its focal
 length changed (1). Each is fitted to the equations of one verification by the board

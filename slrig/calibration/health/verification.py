@@ -1,4 +1,4 @@
-"""What one verification of a calibration found, as numbers and words that are kept and sent."""
+"""Verification of a calibration by one view of a board: residuals, figures, and the verdict on its health."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two calibrations of one rig, compared: what changed of each device, in its σ, and by how much points move for it.
+"""Comparison of two calibrations: changes of each device in σ, the error that follows, and expected errors.
 
 Points move together, as one rigid body, and each by itself. Only the second changes what is measured of a shape, so
 that both are told apart (`slrig.calibration.displacement.without_rigid_motion`).

@@ -1,4 +1,4 @@
-"""Whether a solved calibration is good, usable, or not to be used, and why: figure, limit and cure in words."""
+"""Verdict on a solved calibration: good, usable, or not usable, with figure, limit and cure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a pose of the board can be used, said at once: a bad one is refused with its cause and what to do."""
+"""Checks of one pose of the board: refused with its cause and cure, or accepted; its picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the poses so far cover: the image of each device, depths, tilts and turns, and which goals are still open."""
+"""Coverage of image, depth and tilt by the poses so far, and the next pose to hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A rough guess at the devices and the board's poses while poses still come in: enough to judge them by.
+"""Rough estimate of devices and poses while poses still arrive, from boards and from projected light.
 
 Each device is fitted alone, its lens with a prior that stands where the poses do not speak yet: one pose already gives
 an answer, and poses that are all parallel do no harm. What a solve gives is better, and takes longer.

@@ -1,4 +1,4 @@
-"""Bundle adjustment: devices, poses of the board and its shape that leave the least residuals, by Levenberg-Marquardt.
+"""Bundle adjustment by Levenberg-Marquardt: devices, poses and shape of the board.
 
 The cost is Σ ρ(r/σ) with Cauchy's ρ(z) = c²/2 log(1 + z²/c²), c = 2.385 (95 % efficient for normal errors), minimised
 by weights 1/(1 + z²/c²) that follow the residuals (Holland and Welsch 1977). What lies beyond six deviations when an

@@ -1,4 +1,4 @@
-"""Poses that a solve has not seen: what is left there, and which shape of the board they are better with.
+"""Poses outside the solve: their residuals, the board's shape, halves of the poses, and the covariance.
 
 The poses are dealt into folds. For each fold all others are adjusted; then the devices are held, the fold's board poses
 are fitted to the cameras' corners alone, and all residuals of the fold are taken. All poses are of one board, so that

@@ -1,4 +1,4 @@
-"""A start for the cameras: each by Zhang's method, the board's poses, and how the cameras stand to one another.
+"""Initial values: cameras by Zhang's method, poses of the board, relative poses, projector.
 
 Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000, as in OpenCV. The board's pose in one
 camera comes of its corners (IPPE, Collins and Bartoli 2014). Cameras that see the board in the same pose are tied by

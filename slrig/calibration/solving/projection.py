@@ -1,4 +1,4 @@
-"""Where corners and light fall for given devices and poses, with analytic Jacobians, for kernels.
+"""Projection of corners and light for given devices and poses, with analytic Jacobians, for kernels.
 
 A device is a row of 21: fx, fy, cx, cy, k1, k2, p1, p2, k3, its rotation row by row, its translation (mm): world to
 device. A pose is a row of 12: rotation and translation, board to world. Lenses are those of `slrig.model.lens`.

@@ -1,4 +1,4 @@
-"""From what was seen of a board to the devices of a rig, and how well each number of them is known."""
+"""The solve: from observations of a board to devices, their covariance, and checks of consistency."""
 
 from __future__ import annotations
 
