@@ -3,8 +3,7 @@
 `slrig conform RIG` runs them on a rig; a driver's own tests call `run`, or `Examination.judge` check by check.
 """
 
-from slrig.conformance.check import Check
-from slrig.conformance.expectation import Failure
+from slrig.conformance.bench import Check, Failure
 from slrig.conformance.running import CHECKS, Examination, Outcome, Progress, Report, Result, run
 
 __all__ = ["CHECKS", "Check", "Examination", "Failure", "Outcome", "Progress", "Report", "Result", "run"]

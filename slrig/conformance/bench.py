@@ -6,19 +6,123 @@ the sensor are.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import wraps
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture.latency import stable_from_ns
-from slrig.conformance.expectation import STEPPED, at, expect, works
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Shown, Trigger
-from slrig.model import Frame, PatternSequence, Pixels
+from slrig.errors import SlrigError
+from slrig.model import Black, Frame, PatternSequence, Pixels, White
+
+TOLERANCE = 0.01
+"""How far an exposure or a gain may be from what was asked, as a fraction."""
+
+STEPPED = (Trigger.SOFTWARE, Trigger.FREE)
+"""The triggers with which a camera can follow a projector that steps; the better one first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """One broken expectation: which device, what was asked of it, what was found, and what its driver's author does."""
+
+    asked: str
+    found: str
+    do: str
+    where: str = ""
+
+    def __str__(self) -> str:
+        device = f"{self.where}: " if self.where else ""
+        return f"{device}{self.asked}; found {self.found}; {self.do}"
+
+
+class ExpectationError(Exception):
+    """A device does not do what the contract asks of it. Raised by checks only, and kept in their result."""
+
+    def __init__(self, failure: Failure) -> None:
+        super().__init__(str(failure))
+        self.failure = failure
+
+
+class NotApplicableError(Exception):
+    """A check found out, once at work, that it has nothing to ask of these devices. The message says why."""
+
+
+def expect(condition: object, *, asked: str, found: object, do: str) -> None:
+    """Go on if the condition holds. Raises ExpectationError."""
+    if not condition:
+        raise ExpectationError(Failure(asked, str(found), do))
+
+
+@contextmanager
+def refused(error: type[SlrigError], *, asked: str, do: str) -> Iterator[None]:
+    """Expect that the block raises `error`. Raises ExpectationError if it raises another, or none."""
+    asked = f"{asked} is refused with {error.__name__}"
+    try:
+        yield
+    except error:
+        return
+    except Exception as other:
+        raise ExpectationError(Failure(asked, _named(other), do)) from other
+    raise ExpectationError(Failure(asked, "no error", do))
+
+
+@contextmanager
+def works(*, asked: str, do: str) -> Iterator[None]:
+    """Expect that the block raises nothing. Raises ExpectationError."""
+    try:
+        yield
+    except Exception as error:
+        raise ExpectationError(Failure(asked, _named(error), do)) from error
+
+
+@contextmanager
+def at(where: str) -> Iterator[None]:
+    """Name the device in whatever goes wrong within the block; errors of a driver become failures of the check."""
+    try:
+        yield
+    except ExpectationError as error:
+        if error.failure.where:
+            raise
+        raise ExpectationError(replace(error.failure, where=where)) from error
+    except NotApplicableError:
+        raise
+    except Exception as error:
+        raise ExpectationError(replace(failure_of(error), where=where)) from error
+
+
+def failure_of(error: Exception) -> Failure:
+    """What an error means that came out of a device where none was due."""
+    if isinstance(error, ExpectationError):
+        return error.failure
+    do = (
+        "correct the rig as the message says, or the driver if it is wrong"
+        if isinstance(error, SlrigError)
+        else "a driver raises the errors of slrig.errors, and no others"
+    )
+    return Failure("no error comes from a call that the contract allows", _named(error), do)
+
+
+def near(got: float, asked: float) -> bool:
+    """Whether a setting is what was asked, within the tolerance. What a device cannot tell (NaN) is no contradiction.
+
+    >>> near(0.01001, 0.01), near(0.02, 0.01), near(math.nan, 0.01)
+    (True, False, True)
+    """
+    return math.isnan(got) or abs(got - asked) <= TOLERANCE * abs(asked) + 1e-12
+
+
+def _named(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
 
 SHORT_S = 0.05
 """How long a frame is waited for that must not come."""
@@ -308,3 +412,89 @@ def _noise(images: list[Pixels]) -> float:
     """Standard deviation of one frame, DN, from two of the same pattern; robust against what moves."""
     off = _signed(images[-1]) - _signed(images[0])
     return 1.4826 * float(np.median(np.abs(off - np.median(off)))) / float(np.sqrt(2))
+
+
+class Need(Enum):
+    """What a rig must have for a check to say anything."""
+
+    STEPPED = "a camera with software trigger or a free-running one"
+    SOFTWARE = "a camera with software trigger"
+    FREE = "a free-running camera"
+    HARDWARE = "a camera that is triggered by wire"
+    PLAYS = "a projector that plays sequences by itself, and a camera that it triggers by wire"
+    WHITE_AND_BLACK = "a sequence that begins with white and black"
+    POSITIONER = "a positioner"
+
+    def unmet(self, rig: Rig, sequence: PatternSequence) -> str | None:
+        """Why the check does not apply to this rig, in words; None if it does."""
+        declared = {trigger for camera in rig.cameras.values() for trigger in camera.info.triggers}
+        met: bool
+        match self:
+            case Need.STEPPED:
+                met = not declared.isdisjoint(STEPPED)
+            case Need.SOFTWARE:
+                met = Trigger.SOFTWARE in declared
+            case Need.FREE:
+                met = Trigger.FREE in declared
+            case Need.HARDWARE:
+                met = Trigger.HARDWARE in declared
+            case Need.PLAYS:
+                met = rig.projector.info.plays and Trigger.HARDWARE in declared
+            case Need.WHITE_AND_BLACK:
+                met = sequence.patterns[:2] == (White(), Black())
+            case Need.POSITIONER:
+                met = rig.positioner is not None
+        return None if met else f"it needs {self.value}"
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing that the contract asks of the devices of a rig.
+
+    title : in plain words. needs : what the rig must have. fresh : whether it wants a rig that was opened just now, and
+    is closed afterwards; the others share one. function : raises ExpectationError or NotApplicableError.
+    """
+
+    name: str
+    title: str
+    needs: tuple[Need, ...]
+    fresh: bool
+    function: Callable[[RigBench], None]
+
+
+def check(*needs: Need, fresh: bool = False) -> Callable[[Callable[[RigBench], None]], Check]:
+    """Make a check of the function below: its name is the check's, its docstring's first line the title."""
+
+    def made(function: Callable[[RigBench], None]) -> Check:
+        name = function.__name__
+        # Python may be told to leave docstrings out.
+        title = (function.__doc__ or name.replace("_", " ")).splitlines()[0].removesuffix(".")
+        return Check(name, title, needs, fresh, function)
+
+    return made
+
+
+def view_check(*needs: Need, every: bool = False) -> Callable[[Callable[[View], None]], Check]:
+    """Make a check of what the function below asks of one camera before the projector: each of `RigBench.ways`.
+
+    It applies where it does to one of them.
+    """
+
+    def made(function: Callable[[View], None]) -> Check:
+        @wraps(function)
+        def of_each(bench: RigBench) -> None:
+            reasons: list[str] = []
+            applies = False
+            for name, trigger in bench.ways(every=every):
+                with bench.view(name, trigger) as view:
+                    try:
+                        function(view)
+                        applies = True
+                    except NotApplicableError as reason:
+                        reasons.append(f"camera '{name}' {reason}")
+            if not applies:
+                raise NotApplicableError("; ".join(reasons))
+
+        return check(Need.STEPPED, *needs)(of_each)
+
+    return made

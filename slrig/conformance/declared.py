@@ -6,9 +6,7 @@ import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 
-from slrig.conformance.bench import RigBench
-from slrig.conformance.check import check
-from slrig.conformance.expectation import at, expect, refused
+from slrig.conformance.bench import RigBench, at, check, expect, refused
 from slrig.devices import Camera, Head, Projector, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Size

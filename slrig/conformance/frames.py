@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slrig.conformance.bench import View
-from slrig.conformance.check import Need, view_check
-from slrig.conformance.expectation import NotApplicableError, expect, near
+from slrig.conformance.bench import Need, NotApplicableError, View, expect, near, view_check
 from slrig.devices import AppliedSettings, CameraInfo
 from slrig.model import Frame
 

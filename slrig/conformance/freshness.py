@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import time
 
-from slrig.conformance.bench import FRAMES, SHORT_S, RigBench, View
-from slrig.conformance.check import Need, check, view_check
-from slrig.conformance.expectation import at, expect, refused
+from slrig.conformance.bench import FRAMES, SHORT_S, Need, RigBench, View, at, check, expect, refused, view_check
 from slrig.devices import Camera, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError
 

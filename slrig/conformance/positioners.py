@@ -6,9 +6,7 @@ import math
 
 import numpy as np
 
-from slrig.conformance.bench import RigBench
-from slrig.conformance.check import Need, check
-from slrig.conformance.expectation import at, expect, refused, works
+from slrig.conformance.bench import Need, RigBench, at, check, expect, refused, works
 from slrig.devices import Positioner, Turntable
 from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
 

@@ -15,9 +15,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
 from slrig.conformance import declared, frames, freshness, positioners, sequences, settings, shutdown, states
-from slrig.conformance.bench import RigBench
-from slrig.conformance.check import Check
-from slrig.conformance.expectation import ExpectationError, Failure, NotApplicableError, failure_of
+from slrig.conformance.bench import Check, ExpectationError, Failure, NotApplicableError, RigBench, failure_of
 from slrig.devices import Rig
 from slrig.errors import DeviceError
 from slrig.model import PatternSequence

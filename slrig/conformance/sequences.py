@@ -10,9 +10,19 @@ import numpy as np
 
 from slrig.capture.sequencer import capture, choose_triggers
 from slrig.capture.verifier import Evidence
-from slrig.conformance.bench import LONG_S, SHORT_S, RigBench
-from slrig.conformance.check import Need, check
-from slrig.conformance.expectation import STEPPED, ExpectationError, Failure, at, expect, refused
+from slrig.conformance.bench import (
+    LONG_S,
+    SHORT_S,
+    STEPPED,
+    ExpectationError,
+    Failure,
+    Need,
+    RigBench,
+    at,
+    check,
+    expect,
+    refused,
+)
 from slrig.conformance.frames import expect_declared, expect_exposed
 from slrig.devices import Camera, Projector, Rig, Trigger
 from slrig.errors import FrameTimeoutError, ScanCancelledError

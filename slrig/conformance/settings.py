@@ -6,9 +6,19 @@ import math
 
 import numpy as np
 
-from slrig.conformance.bench import FRAMES, RigBench, View
-from slrig.conformance.check import Need, check, view_check
-from slrig.conformance.expectation import NotApplicableError, at, expect, near, refused
+from slrig.conformance.bench import (
+    FRAMES,
+    Need,
+    NotApplicableError,
+    RigBench,
+    View,
+    at,
+    check,
+    expect,
+    near,
+    refused,
+    view_check,
+)
 from slrig.devices import Camera, CameraSettings
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Pixels

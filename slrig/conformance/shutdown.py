@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from slrig.conformance.bench import SHORT_S, RigBench
-from slrig.conformance.check import Need, check
-from slrig.conformance.expectation import at, expect, refused, works
+from slrig.conformance.bench import SHORT_S, Need, RigBench, at, check, expect, refused, works
 from slrig.devices import Camera, CameraSettings, Rig, Trigger
 from slrig.errors import DeviceStateError
 

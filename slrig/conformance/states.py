@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from slrig.conformance.bench import SHORT_S, RigBench, View
-from slrig.conformance.check import check, view_check
-from slrig.conformance.expectation import STEPPED, at, expect, refused
+from slrig.conformance.bench import SHORT_S, STEPPED, RigBench, View, at, check, expect, refused, view_check
 from slrig.devices import Trigger
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Size, White

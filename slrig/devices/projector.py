@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass
 from typing import NoReturn, Protocol, runtime_checkable
 
-from slrig.devices.limits import USUAL, CallLimits
+from slrig.devices.camera import USUAL, CallLimits
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Pattern, PatternSequence, Size
 

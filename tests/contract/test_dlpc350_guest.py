@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from slrig.conformance import CHECKS, Check
-from slrig.conformance.check import Need
+from slrig.conformance.bench import Need
 from tests.contract.dlpc350_bench import CHECKS as ON_A_NODE
 from tests.contract.guest.machine import Module
 from tests.contract.guest.outcome import require_passed, require_sound, told_by

@@ -8,7 +8,7 @@ import pytest
 
 from slrig.conformance import CHECKS as CONTRACT
 from slrig.conformance import Check
-from slrig.conformance.check import Need
+from slrig.conformance.bench import Need
 from tests.contract.guest.machine import Module
 from tests.contract.guest.outcome import require_passed, require_sound, told_by
 from tests.contract.kms_bench import CHECKS, DEVICES

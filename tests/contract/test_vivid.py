@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from slrig.conformance import CHECKS, Check
-from slrig.conformance.check import Need
+from slrig.conformance.bench import Need
 from tests.contract.guest.outcome import require_passed, require_sound, told_by
 from tests.contract.guest.vivid import modules
 from tests.contract.guest.vivid_checks import ALL

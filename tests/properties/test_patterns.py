@@ -14,8 +14,12 @@ from slrig.patterns.gray import (
     cell_centre_px,
     gray_bits,
     gray_profile,
+    is_whole,
+    line_count,
+    line_number,
+    line_position_px,
+    line_profile,
 )
-from slrig.patterns.line_shift import is_whole, line_count, line_number, line_position_px, line_profile
 
 few = settings(max_examples=30)
 

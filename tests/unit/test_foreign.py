@@ -14,10 +14,17 @@ import yaml
 
 from slrig.bundle import read_calibration, write_calibration
 from slrig.errors import BundleError, CalibrationError, PatternError, SlrigError
-from slrig.foreign.calibrations import read_any_calibration, write_any_calibration
-from slrig.foreign.captures import Naming, import_capture, parse_size
-from slrig.foreign.layouts import Code, name_pattern, pattern_of_name, scan3d_sequence, slstudio_sequence
-from slrig.foreign.yaml_text import MOST_BYTES, read_yaml
+from slrig.foreign.calibrations import MOST_BYTES, read_any_calibration, read_yaml, write_any_calibration
+from slrig.foreign.captures import (
+    Code,
+    Naming,
+    import_capture,
+    name_pattern,
+    parse_size,
+    pattern_of_name,
+    scan3d_sequence,
+    slstudio_sequence,
+)
 from slrig.model import Axis, Black, Calibration, Gray, LineShift, Pattern, Pinhole, Size, White
 from tests.samples import sample_calibration
 from tests.strangers import harmed

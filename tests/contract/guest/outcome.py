@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from slrig.conformance import Check, Outcome
-from slrig.conformance.check import Need
+from slrig.conformance.bench import Need
 from tests.contract.guest.machine import FILES, require_guest, run_in_guest
 
 Notes = dict[str, float | int | str]

@@ -18,7 +18,7 @@ from slrig.catalogue.store import Catalogue, open_catalogue
 from slrig.catalogue.tables import RigRow
 from slrig.config import ServiceSettings
 from slrig.conformance import Outcome, Report
-from slrig.conformance.expectation import Failure
+from slrig.conformance.bench import Failure
 from slrig.conformance.running import Result
 from slrig.doctor.doctor import Diagnosis
 from slrig.doctor.findings import fault, ok

@@ -15,9 +15,7 @@ from typer.testing import CliRunner
 from slrig.cli import examine
 from slrig.cli.commands import app
 from slrig.conformance import CHECKS, Examination, Failure, Outcome, Report, Result, run
-from slrig.conformance.bench import RigBench, learn_light
-from slrig.conformance.check import Need, check
-from slrig.conformance.expectation import ExpectationError, NotApplicableError
+from slrig.conformance.bench import ExpectationError, Need, NotApplicableError, RigBench, check, learn_light
 from slrig.devices import Rig
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.jobs.examinations import last_examination

@@ -12,9 +12,11 @@ from slrig.patterns.gray import (
     edge_indices,
     gray_bits,
     gray_profile,
+    is_whole,
+    line_count,
+    line_profile,
     require_addressable,
 )
-from slrig.patterns.line_shift import is_whole, line_count, line_profile
 
 
 def test_three_bits_are_the_table_in_every_textbook() -> None:

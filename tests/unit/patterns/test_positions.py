@@ -7,15 +7,16 @@ import pytest
 
 from slrig.errors import PatternError
 from slrig.model import Axis, FloatArray, Gray, LineShift, Size
-from slrig.patterns.gray import gray_bits, gray_profile
-from slrig.patterns.line_shift import line_profile
-from slrig.patterns.positions import (
+from slrig.patterns.gray import (
     LEAST_FROM_BORDER_PX,
     cell_count,
     cell_positions,
     edge_positions,
+    gray_bits,
+    gray_profile,
     index_of_word,
     line_positions,
+    line_profile,
 )
 
 CODES = [(16, 1, 0), (37, 4, 0), (37, 4, 3), (40, 3, 7), (64, 2, 1), (50, 5, 0), (29, 1, 5), (61, 8, 2)]
