@@ -20,7 +20,7 @@ from slrig.calibration.boards.detection import blur_sigma_px, board_region, find
 from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.errors import PatternError, PoseRefusedError
 from slrig.model import Axis, Capture, Size
-from slrig.patterns.gray import (
+from slrig.patterns.codes import (
     LEAST_FROM_BORDER_PX,
     cell_positions,
     edge_positions,

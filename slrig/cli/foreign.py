@@ -67,7 +67,7 @@ def import_images(
 
     Gray codes of OpenCV, scan3d-capture and SLStudio, or of named images. Then: slrig reconstruct.
     """
-    from slrig.foreign.captures import Code, Naming, import_capture, parse_size
+    from slrig.importers.captures import Code, Naming, import_capture, parse_size
 
     ways = {"--format": program, "--pattern": pattern, "--names": names, "--list": listed}
     asked = [way for way, value in ways.items() if value is not None]

@@ -15,7 +15,7 @@ from slrig.doctor.measures.pictures import Orientation, apart_deg, expected_orie
 from slrig.doctor.viewing import Viewer
 from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot
 from slrig.model.patterns import gray_index
-from slrig.patterns.gray import cell_centre_px
+from slrig.patterns.codes import cell_centre_px
 
 _COARSE_BITS = 6
 _SURE_SHARE = 0.25

@@ -25,7 +25,7 @@ from slrig.model import (
     telling_lines,
 )
 from slrig.model.patterns import FEWEST_STEPS
-from slrig.patterns.gray import gray_bits, gray_profile, line_profile
+from slrig.patterns.codes import gray_bits, gray_profile, line_profile
 
 GRAY_ONLY_CELL_PX = 2
 """Where edges are all that is measured, those of 1 px blur into one another at one or two camera pixels to a cell. Of

@@ -269,7 +269,7 @@ def projector_positions(
 
     asked : (H, W) bool; camera_blur_px : standard deviation of the camera's own blur, its pixel's area included;
     noise : where it is known already. Positions outside those that `tables` knows, near the projector's border, are
-    left out: see `slrig.patterns.gray`.
+    left out: see `slrig.patterns.codes`.
     """
     gamma = 1.0
     if noise is None:

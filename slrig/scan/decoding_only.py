@@ -20,7 +20,7 @@ from slrig.bundle.storage import write_file
 from slrig.disk import refusals_of
 from slrig.errors import PatternError, setting
 from slrig.model import Axis, Capture, Gray, Refusal, without_missing_bits
-from slrig.patterns.gray import cell_positions, index_of_word
+from slrig.patterns.codes import cell_positions, index_of_word
 from slrig.reconstruction.decoding import DecodingLimits, decode, lit_pixels, unresolved_bits
 from slrig.reconstruction.frames import AxisFrames, axis_frames, exposure_count
 from slrig.reconstruction.fusion import fused_frames

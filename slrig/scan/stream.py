@@ -34,7 +34,7 @@ from slrig.model import (
     exposure_groups,
 )
 from slrig.model.header import CaptureHeader
-from slrig.patterns.gray import cell_positions, edge_positions, index_of_word, line_positions
+from slrig.patterns.codes import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.camera import CameraCurves, CameraStream, camera_curves
 from slrig.reconstruction.coded import CodeTables, Limits
 from slrig.reconstruction.decoding import AskedPixels

@@ -22,7 +22,7 @@ from simulated_rig.options import CameraOptions, ProjectorOptions
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import Scene, surface_of
 from slrig.model import Axis, CameraFormat, Capture, FloatArray, Gray, LineShift, PatternSequence, Shot
-from slrig.patterns.gray import cell_positions, index_of_word, line_positions
+from slrig.patterns.codes import cell_positions, index_of_word, line_positions
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.reconstruction.camera import CameraCurves, camera_curves
 from slrig.reconstruction.coded import CodeTables, Limits

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from slrig.model import Axis, Gray, LineShift, Size
 from slrig.model.patterns import gray_index, to_gray
-from slrig.patterns.gray import (
+from slrig.patterns.codes import (
     cell_centre_px,
     gray_bits,
     gray_profile,

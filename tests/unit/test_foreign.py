@@ -14,8 +14,8 @@ import yaml
 
 from slrig.bundle import read_calibration, write_calibration
 from slrig.errors import BundleError, CalibrationError, PatternError, SlrigError
-from slrig.foreign.calibrations import MOST_BYTES, read_any_calibration, read_yaml, write_any_calibration
-from slrig.foreign.captures import (
+from slrig.importers.calibrations import MOST_BYTES, read_any_calibration, read_yaml, write_any_calibration
+from slrig.importers.captures import (
     Code,
     Naming,
     import_capture,

@@ -8,7 +8,7 @@ import pytest
 from slrig.errors import PatternError
 from slrig.model import Axis, Gray, LineShift, Size
 from slrig.model.patterns import from_gray, to_gray
-from slrig.patterns.gray import (
+from slrig.patterns.codes import (
     edge_indices,
     gray_bits,
     gray_profile,

@@ -7,7 +7,7 @@ import pytest
 
 from slrig.errors import PatternError
 from slrig.model import Axis, FloatArray, Gray, LineShift, Size
-from slrig.patterns.gray import (
+from slrig.patterns.codes import (
     LEAST_FROM_BORDER_PX,
     cell_count,
     cell_positions,

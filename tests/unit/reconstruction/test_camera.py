@@ -24,7 +24,7 @@ from slrig.model import (
     Shot,
     Size,
 )
-from slrig.patterns.gray import cell_positions, edge_positions, index_of_word, line_positions
+from slrig.patterns.codes import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.patterns.sequence import scan_patterns
 from slrig.reconstruction.camera import CameraCurves, CameraStream, camera_curves
 from slrig.reconstruction.coded import CodeTables, Limits

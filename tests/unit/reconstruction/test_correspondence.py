@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from slrig.model import Axis, FloatArray, Gray, LineShift, Pattern, Size
-from slrig.patterns.gray import cell_positions, edge_positions, index_of_word, line_positions
+from slrig.patterns.codes import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.patterns.sequence import profile
 from slrig.reconstruction.coded import CodeTables
 from slrig.reconstruction.correspondence import (

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import Axis, Gray, IntArray, Refusal
-from slrig.patterns.gray import index_of_word
+from slrig.patterns.codes import index_of_word
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel

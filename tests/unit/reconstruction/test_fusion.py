@@ -24,7 +24,7 @@ from slrig.model import (
     Size,
     White,
 )
-from slrig.patterns.gray import cell_positions, index_of_word
+from slrig.patterns.codes import cell_positions, index_of_word
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, axis_frames
 from slrig.reconstruction.fusion import FusedFrames, exposure_use, fused_frames

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import Axis, Gray, Size
-from slrig.patterns.gray import gray_profile
+from slrig.patterns.codes import gray_profile
 from slrig.reconstruction.decoding import BLOCK_PX, CodeMap, _passed, _tally, lost_lines, unresolved_bits
 from slrig.reconstruction.frames import AxisFrames
 

@@ -21,7 +21,7 @@ from slrig.cli.commands import app
 from slrig.errors import PatternError
 from slrig.model import Axis, Black, CameraFormat, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White
 from slrig.model.missing_bits import MOST_BITS, without_missing_bits
-from slrig.patterns.gray import gray_bits, gray_profile
+from slrig.patterns.codes import gray_bits, gray_profile
 from slrig.patterns.sequence import scan_patterns
 from slrig.scan.decoding_only import decode_bundle
 from slrig.scan.plan import ReconstructionPlan

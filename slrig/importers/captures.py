@@ -19,9 +19,9 @@ from slrig.bundle.validation import read_text
 from slrig.bundle.writing import BundleWriter
 from slrig.disk import refusals_of
 from slrig.errors import BundleError, PatternError
-from slrig.foreign.calibrations import read_any_calibration
+from slrig.importers.calibrations import read_any_calibration
 from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Shot, Size, White
-from slrig.patterns.gray import gray_bits
+from slrig.patterns.codes import gray_bits
 from slrig.patterns.sequence import encode
 
 SLSTUDIO_BITS = {Axis.COLUMN: 10, Axis.ROW: 6}
