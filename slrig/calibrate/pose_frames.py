@@ -12,7 +12,7 @@ from slrig.bundle.description import read_description
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import PoseRefusedError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White
-from slrig.reconstruction.frames import exposure_count
+from slrig.reconstruction import exposure_count
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -20,17 +20,16 @@ from slrig.calibration.boards.detection import blur_sigma_px, board_region, find
 from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.errors import PatternError, PoseRefusedError
 from slrig.model import Axis, Capture, Size
-from slrig.patterns.codes import (
-    LEAST_FROM_BORDER_PX,
-    cell_positions,
-    edge_positions,
-    index_of_word,
-    line_positions,
+from slrig.patterns import LEAST_FROM_BORDER_PX, cell_positions, edge_positions, index_of_word, line_positions
+from slrig.reconstruction import (
+    AxisFrames,
+    CodeTables,
+    CorrespondenceLimits,
+    ProjectorPositions,
+    axis_frames,
+    has_phase,
+    projector_positions,
 )
-from slrig.reconstruction.coded import CodeTables
-from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
-from slrig.reconstruction.frames import AxisFrames, axis_frames
-from slrig.reconstruction.phase import has_phase
 
 MOST_LIGHT = 30_000
 """Correspondences kept of one camera and axis. A pixel is drawn the more likely, the more it tells (1/σ²). Of pixels

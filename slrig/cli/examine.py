@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.capture.latency import STEADY, CameraLatency, measure_latency
+from slrig.capture import STEADY, CameraLatency, measure_latency
 from slrig.cli.display import print_json, progress_shown
 from slrig.cli.options import given
 from slrig.config import RigConfig, read_rig, read_settings

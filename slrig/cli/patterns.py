@@ -51,7 +51,7 @@ def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
     from slrig.doctor.doctor import doctor_sequence
     from slrig.errors import UnsupportedByDeviceError
     from slrig.logs import set_up_logs_for_a_person
-    from slrig.patterns.sequence import united
+    from slrig.patterns import united
     from slrig.scan.plan_check import pattern_sequence
 
     set_up_logs_for_a_person()

@@ -26,11 +26,21 @@ from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import Progress
 from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
-from slrig.views.fusion import FusedModel, fused, put_together, registered_poses
-from slrig.views.markers import MarkerFit, MarkersSeen, marker_poses
-from slrig.views.registration import Registration, registered
-from slrig.views.turntable import FoundAxis, cut, registered_on_stage
-from slrig.views.unknown_poses import found_starts
+from slrig.views import (
+    FoundAxis,
+    FusedModel,
+    MarkerFit,
+    MarkersSeen,
+    Registration,
+    cut,
+    found_starts,
+    fused,
+    marker_poses,
+    put_together,
+    registered,
+    registered_on_stage,
+    registered_poses,
+)
 
 _SURFACE_POINTS = 500  # of a view, at which it is told how well markers put it
 _START_SIGMAS = 3.0  # of starts by markers, that have to lie within the start's error

@@ -23,7 +23,7 @@ from slrig.reports.trend import (
     times,
     trend,
 )
-from slrig.views.turntable import FAR_MM
+from slrig.views import FAR_MM
 
 _HEIGHT = 470.0
 _COLOURS = {AxisSource.BOARD: GREY, AxisSource.DOCUMENT: GREY, AxisSource.MODEL: GREEN}

@@ -8,8 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from slrig.capture.sequencer import capture, choose_triggers
-from slrig.capture.verifier import Evidence
+from slrig.capture import Evidence, capture, choose_triggers
 from slrig.conformance.bench import (
     LONG_S,
     SHORT_S,

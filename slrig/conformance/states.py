@@ -6,7 +6,7 @@ from slrig.conformance.bench import SHORT_S, STEPPED, RigBench, View, at, check,
 from slrig.devices import Trigger
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Size, White
-from slrig.patterns.sequence import encode
+from slrig.patterns import encode
 
 _ANOTHER_CLOCK_NS = 60 * 10**9
 """Times that lie further apart count in different clocks: a recording need not have one that runs."""

@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slrig.capture.latency import USUAL_SEARCH_S, LatencyMeasurement
-from slrig.capture.sequencer import choose_triggers
-from slrig.capture.streaming import earliest_change_s
+from slrig.capture import USUAL_SEARCH_S, LatencyMeasurement, choose_triggers, earliest_change_s
 from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation, UnprovenLight
 from slrig.doctor import timing
 from slrig.doctor.advice import ExposureAdvice, LineAdvice, exposure_advice, is_whole, line_advice, unsnapped
@@ -28,7 +26,7 @@ from slrig.doctor.sharpening import sharpening
 from slrig.doctor.viewing import Viewer
 from slrig.errors import DeviceError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
-from slrig.patterns.sequence import encode, scan_patterns
+from slrig.patterns import encode, scan_patterns
 
 Told = Callable[[str, float, str], None]
 

@@ -14,7 +14,7 @@ from slrig.doctor.geometry import Picture
 from slrig.doctor.light import Seen
 from slrig.doctor.measures.pictures import BarContrast, EdgeBlur, bar_blur_px, bar_contrast, edge_blur
 from slrig.model import Axis, PatternSequence
-from slrig.patterns.codes import edge_indices
+from slrig.patterns import edge_indices
 
 _WHOLE_PERIODS = 4
 _FEWEST_PIXELS = 200

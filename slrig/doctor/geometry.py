@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture.verifier import Evidence
+from slrig.capture import Evidence
 from slrig.doctor.findings import Finding, camera_named, fault, note, ok
 from slrig.doctor.light import Seen
 from slrig.doctor.measures.pictures import Orientation, apart_deg, expected_orientation, orientation
 from slrig.doctor.viewing import Viewer
 from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot
 from slrig.model.patterns import gray_index
-from slrig.patterns.codes import cell_centre_px
+from slrig.patterns import cell_centre_px
 
 _COARSE_BITS = 6
 _SURE_SHARE = 0.25

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slrig.capture.latency import CameraLatency, LatencyMeasurement, measure_latency
+from slrig.capture import CameraLatency, LatencyMeasurement, measure_latency
 from slrig.devices import CameraSettings, Rig, Synchronisation
 from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
 from slrig.doctor.light import Seen

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from slrig.capture.latency import stable_from_ns
+from slrig.capture import stable_from_ns
 from slrig.devices import Camera, CameraSettings, Projector, Rig, Trigger
 from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Frame, PatternSequence

@@ -21,8 +21,7 @@ from slrig.disk import refusals_of
 from slrig.errors import BundleError, PatternError
 from slrig.importers.calibrations import read_any_calibration
 from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Shot, Size, White
-from slrig.patterns.codes import gray_bits
-from slrig.patterns.sequence import encode
+from slrig.patterns import encode, gray_bits
 
 SLSTUDIO_BITS = {Axis.COLUMN: 10, Axis.ROW: 6}
 """How many of the first bits SLStudio shows, whatever the projector."""

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import structlog
 
-from slrig.capture.verifier import EvidenceSummary
+from slrig.capture import EvidenceSummary
 from slrig.model import Calibration, Region, Shot
 from slrig.model.header import CaptureHeader
 

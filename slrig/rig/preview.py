@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from slrig.devices import Camera, Rig, Trigger
 from slrig.errors import FrameTimeoutError, SlrigError, UnsupportedByDeviceError
 from slrig.model import Frame, White
-from slrig.patterns.sequence import encode
+from slrig.patterns import encode
 
 PICTURES_PER_S = 15.0
 _ARMED_FOR = 32  # pictures; some drivers hold a buffer for each

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from slrig.capture.hardware_trigger import differ
+from slrig.capture import differ
 from slrig.devices import AppliedSettings, CameraSettings
 
 

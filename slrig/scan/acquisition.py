@@ -22,9 +22,7 @@ import structlog
 
 from slrig.bundle import BundleWriter, write_truth
 from slrig.bundle.sidecars import FOLDER, Refused, StageAngle, write_notes, write_stage
-from slrig.capture.exposure import whole_refreshes_s
-from slrig.capture.hardware_trigger import SETTINGS_TOLERANCE
-from slrig.capture.sequencer import choose_triggers
+from slrig.capture import SETTINGS_TOLERANCE, choose_triggers, whole_refreshes_s
 from slrig.devices import Camera, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
 from slrig.jobs.frame_feed import FrameSink

@@ -12,17 +12,20 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from slrig.bundle.sidecars import Refused
-from slrig.capture.exposure import (
+from slrig.capture import (
+    NOISE_FLOOR_DN,
+    Evidence,
+    EvidenceSummary,
     ExposedSamples,
+    Sampler,
+    Samples,
     Unfit,
     Verdict,
     bracket_summary,
+    capture,
     movement_between,
     verdict,
 )
-from slrig.capture.frame_checks import NOISE_FLOOR_DN, Samples
-from slrig.capture.sequencer import capture
-from slrig.capture.verifier import Evidence, EvidenceSummary, Sampler
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import ScanEvidenceError
 from slrig.model import Black, PatternSequence, Pixels, Shot, White

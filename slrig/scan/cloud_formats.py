@@ -10,7 +10,7 @@ import tifffile
 from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray
-from slrig.reconstruction.triangulation import to_depths
+from slrig.reconstruction import to_depths
 from slrig.ros_messages import POINT_FIELDS, point_table
 from slrig.scan.organised import OrganisedCloud
 

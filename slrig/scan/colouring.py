@@ -10,9 +10,16 @@ from numpy.typing import NDArray
 
 from slrig.model import AlbedoMark, Axis, LightMap, Mesh, Pinhole, Refusal, Source
 from slrig.model.surfaces import srgb_of
-from slrig.reconstruction.albedo import BRIGHT_ALBEDO, BRIGHT_PERCENT, Albedo, LitPoints, LitView, albedo
-from slrig.reconstruction.merging import MergedCurves
-from slrig.reconstruction.triangulation import SheetCurves
+from slrig.reconstruction import (
+    BRIGHT_ALBEDO,
+    BRIGHT_PERCENT,
+    Albedo,
+    LitPoints,
+    LitView,
+    MergedCurves,
+    SheetCurves,
+    albedo,
+)
 from slrig.scan.stream import CameraResult
 
 _NEUTRAL = 128

@@ -20,12 +20,20 @@ from slrig.bundle.storage import write_file
 from slrig.disk import refusals_of
 from slrig.errors import PatternError, setting
 from slrig.model import Axis, Capture, Gray, Refusal, without_missing_bits
-from slrig.patterns.codes import cell_positions, index_of_word
-from slrig.reconstruction.decoding import DecodingLimits, decode, lit_pixels, unresolved_bits
-from slrig.reconstruction.frames import AxisFrames, axis_frames, exposure_count
-from slrig.reconstruction.fusion import fused_frames
-from slrig.reconstruction.noise import NoiseModel, estimate_noise
-from slrig.reconstruction.phase import position_map
+from slrig.patterns import cell_positions, index_of_word
+from slrig.reconstruction import (
+    AxisFrames,
+    DecodingLimits,
+    NoiseModel,
+    axis_frames,
+    decode,
+    estimate_noise,
+    exposure_count,
+    fused_frames,
+    lit_pixels,
+    position_map,
+    unresolved_bits,
+)
 from slrig.scan.artefacts import REPORT, REPORT_FORMAT, staged_folder, write_report
 from slrig.scan.pictures import encode_png, rejection_picture
 

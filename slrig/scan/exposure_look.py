@@ -11,16 +11,14 @@ from uuid import uuid4
 
 import numpy as np
 
-from slrig.capture.exposure import whole_refreshes_s
-from slrig.capture.sequencer import capture
-from slrig.capture.verifier import Evidence, Sampler
+from slrig.capture import Evidence, Sampler, capture, whole_refreshes_s
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import RigBusyError, UnsupportedByDeviceError
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import utc_now
 from slrig.model import Black, Shot, White
-from slrig.patterns.sequence import encode
+from slrig.patterns import encode
 from slrig.rig.session import RigSession, driver_errors
 from slrig.scan.exposure_proposal import WELL_CLEAR, Look, Proposal, SeenObject, proposal, seen_object
 from slrig.scan.plan import ScanPlan

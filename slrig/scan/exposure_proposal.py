@@ -16,10 +16,9 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture.exposure import LEAST_CLEAR, LEAST_CLEAR_DN
-from slrig.capture.frame_checks import NEARLY_FULL, Chosen, Samples
+from slrig.capture import LEAST_CLEAR, LEAST_CLEAR_DN, NEARLY_FULL, Chosen, Samples
 from slrig.errors import ConfigError
-from slrig.reconstruction.noise import NoiseModel, fitted_noise
+from slrig.reconstruction import NoiseModel, fitted_noise
 
 DECODED_CLEAR = 7.0
 """Noises that white lies above black where a pixel is decoded. On dark and mixed rendered reliefs, at nine exposures,

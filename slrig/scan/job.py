@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import structlog
 
 from slrig.bundle.sidecars import write_health
-from slrig.capture.verifier import EvidenceSummary
+from slrig.capture import EvidenceSummary
 from slrig.devices import Rig
 from slrig.errors import StorageError
 from slrig.failure import disk_errors

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import ConfigError
 from slrig.model import Axis, CameraFormat, FloatArray, Pinhole, Pixels, Refusal, Region, Shot, Size
-from slrig.reconstruction.camera import CameraCurves
-from slrig.reconstruction.decoding import AskedPixels
-from slrig.reconstruction.triangulation import SheetCurves, project, rays, selected, to_depths
+from slrig.reconstruction import AskedPixels, CameraCurves, SheetCurves, project, rays, selected, to_depths
 
 Sample = TypeVar("Sample", bound=np.generic)
 

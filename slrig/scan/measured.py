@@ -18,12 +18,11 @@ from slrig.bundle.calibration import check_rays
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION, BundleFiles, open_bundle
 from slrig.bundle.sidecars import read_refused
-from slrig.capture.exposure import check_exposures
-from slrig.capture.verifier import Evidence, EvidenceSummary, judged_frames
+from slrig.capture import Evidence, EvidenceSummary, check_exposures, judged_frames
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
 from slrig.model import LEAST_SHARE, Axis, Calibration, Region, Shot, without_missing_bits
 from slrig.model.header import CaptureHeader
-from slrig.reconstruction.frames import exposure_count
+from slrig.reconstruction import exposure_count
 from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness

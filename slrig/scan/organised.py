@@ -17,7 +17,7 @@ from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing import merge_depth_buffers
 from slrig.model import IntArray, Mesh, Pinhole
 from slrig.model.lens_kernels import distorted, undistorted
-from slrig.reconstruction.triangulation import SETTLED, distorted_from_pixel, packed, project
+from slrig.reconstruction import SETTLED, distorted_from_pixel, packed, project
 
 NO_SURFACE = "no_surface"
 """Why a pixel has no point that the camera's map of causes has none for: no triangle lies on its ray. A hole of the

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import Pinhole, Size
-from slrig.reconstruction.triangulation import project, to_depths
+from slrig.reconstruction import project, to_depths
 
 _AT_ONCE = 65_536  # vertices: what is float64 in between stays below 4 MB
 

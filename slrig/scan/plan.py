@@ -11,7 +11,7 @@ from uuid import UUID
 from slrig.bundle.sidecars import TurnedBy
 from slrig.errors import ConfigError, setting
 from slrig.model import Axis, FlipRule, Region, SequenceName, bracket_fault
-from slrig.patterns.sequence import SEQUENCES, SequenceOptions
+from slrig.patterns import SEQUENCES, SequenceOptions
 
 MOST_TURN_DEG = 3600.0
 """Ten turns either way: more is a slip, and winds up the cables of what stands on a stage."""

@@ -8,7 +8,7 @@ from slrig.bundle.description import MOST_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo
 from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import Axis, Black, Calibration, Pattern, PatternSequence, Size, White
-from slrig.patterns.sequence import encode, scan_patterns
+from slrig.patterns import encode, scan_patterns
 from slrig.rig.session import RigFacts
 from slrig.scan.light_axis import played_axes
 from slrig.scan.plan import PatternPlan, ScanPlan

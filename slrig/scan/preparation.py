@@ -24,7 +24,7 @@ from slrig.errors import StorageError
 from slrig.kernels import Prepared, compilations_told, prepared
 from slrig.meshing import FIRST_STAGE
 from slrig.model import Calibration, CameraFormat, Capture, FloatArray, Pinhole, Pixels, Shot, Size
-from slrig.patterns.sequence import encode, scan_patterns
+from slrig.patterns import encode, scan_patterns
 from slrig.scan.plan import ReconstructionPlan
 
 _SIZE = Size(192, 144)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from slrig.bundle import read_truth
 from slrig.bundle.sidecars import read_health, read_notes, read_stage
 from slrig.bundle.storage import write_file
-from slrig.capture.verifier import EvidenceSummary
+from slrig.capture import EvidenceSummary
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
@@ -25,11 +25,12 @@ from slrig.kernels import Prepared, compilations_told
 from slrig.memory import give_back
 from slrig.meshing import MeshingLimits, MeshStage, build_surface, compact_mesh, mesh_figures, score
 from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region
-from slrig.reconstruction.merging import MergedCurves, disagreement
-from slrig.reconstruction.triangulation import project
-from slrig.reconstruction.uncertainty import (
+from slrig.reconstruction import (
+    MergedCurves,
     calibration_modes,
     calibration_sigma,
+    disagreement,
+    project,
     sampling_mm,
     sigma_along_normal,
     stripe_tangents,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle.description import read_description
-from slrig.capture.verifier import EvidenceSummary
+from slrig.capture import EvidenceSummary
 from slrig.meshing import MeshStage, SurfaceMesh
 from slrig.model import (
     Axis,
@@ -29,9 +29,7 @@ from slrig.model import (
     Source,
 )
 from slrig.model.header import CaptureHeader
-from slrig.reconstruction.camera import CameraCurves
-from slrig.reconstruction.fusion import ExposureUse
-from slrig.reconstruction.merging import MergedCurves, PairRedundancy, Redundancy
+from slrig.reconstruction import CameraCurves, ExposureUse, MergedCurves, PairRedundancy, Redundancy
 from slrig.scan.artefacts import REPORT_FORMAT
 
 _MOST_OFF = 0.1

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture.verifier import EvidenceSummary
+from slrig.capture import EvidenceSummary
 from slrig.model import (
     Axis,
     Black,
@@ -34,25 +34,32 @@ from slrig.model import (
     exposure_groups,
 )
 from slrig.model.header import CaptureHeader
-from slrig.patterns.codes import cell_positions, edge_positions, index_of_word, line_positions
-from slrig.reconstruction.camera import CameraCurves, CameraStream, camera_curves
-from slrig.reconstruction.coded import CodeTables, Limits
-from slrig.reconstruction.decoding import AskedPixels
-from slrig.reconstruction.frames import (
+from slrig.patterns import cell_positions, edge_positions, index_of_word, line_positions
+from slrig.reconstruction import (
     NEARLY_FULL,
+    AskedPixels,
     AxisFrames,
+    CameraCurves,
+    CameraStream,
+    CodeTables,
+    ExposureUse,
     FrameStacks,
+    FusedFrames,
     Image,
+    Limits,
     axis_frames,
     axis_patterns,
+    camera_curves,
     ends_repeats,
     exposure_count,
+    exposure_use,
+    fused_colour,
+    fused_frames,
     mean_image,
     straight,
     telling,
     telling_shots,
 )
-from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_colour, fused_frames
 from slrig.scan.light_axis import chosen_axis
 from slrig.scan.limited import FramePart, frame_part
 from slrig.scan.report import Stopwatch

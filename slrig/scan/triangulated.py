@@ -14,9 +14,18 @@ from numpy.typing import NDArray
 from slrig.errors import setting
 from slrig.meshing import runs_of_curve_parts
 from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Region, share_across, told_depth
-from slrig.reconstruction.camera import CameraCurves
-from slrig.reconstruction.merging import MergedCurves, Redundancy, merged, redundancy
-from slrig.reconstruction.triangulation import SheetCurves, camera_camera, camera_projector, selected, stripe_crossing
+from slrig.reconstruction import (
+    CameraCurves,
+    MergedCurves,
+    Redundancy,
+    SheetCurves,
+    camera_camera,
+    camera_projector,
+    merged,
+    redundancy,
+    selected,
+    stripe_crossing,
+)
 from slrig.scan.limited import limited
 from slrig.scan.report import lit_share
 from slrig.scan.stream import CameraResult

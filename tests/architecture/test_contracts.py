@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import shutil
 import subprocess
@@ -18,7 +19,7 @@ def test_broken_contracts_are_noticed(tmp_path: Path) -> None:
     ignored = shutil.ignore_patterns("__pycache__", "*.nbc", "*.nbi")
     for package in ("slrig", "drivers", "simulated_rig"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=ignored, copy_function=os.symlink)
-    for name, line in (("bundle/storage.py", "import slrig.discovery"), ("patterns/gray.py", "import pydantic")):
+    for name, line in (("bundle/storage.py", "import slrig.discovery"), ("patterns/codes.py", "import pydantic")):
         spoilt = tmp_path / "slrig" / name
         text = spoilt.read_text()
         spoilt.unlink()
@@ -40,3 +41,21 @@ def test_broken_contracts_are_noticed(tmp_path: Path) -> None:
     assert "slrig.bundle is not allowed to import slrig.discovery" in result.stdout
     assert "slrig.patterns is not allowed to import pydantic" in result.stdout
     assert "slrig.helpers" in result.stdout
+
+
+ROOMS = ("capture", "meshing", "patterns", "reconstruction", "views")
+"""Rooms whose `__init__` exports all that others import from them."""
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_other_rooms_import_what_a_room_exports(room: str) -> None:
+    inside = ROOT / "slrig" / room
+    sources = [each for name in ("slrig", "drivers", "simulated_rig") for each in (ROOT / name).rglob("*.py")]
+    bypassing = {
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in sources
+        if inside not in path.parents
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"slrig.{room}.")
+    }
+    assert bypassing == set()
