@@ -52,7 +52,7 @@ from slrig.reconstruction.stripes import LinePoints, StripeLimits, chained, meas
 class Placed:
     """Points of each line frame, or of each bit, at their best places, and the code with the causes of those left out.
 
-    near_shadow, near_step : (H, W) bool, where no point counts; refined, disagreement_px : as of `camera.CameraCurves`.
+    near_shadow, near_step : (H, W) bool, where no point counts; refined, disagreement_px : as in `CameraCurves`.
     """
 
     points: list[LinePoints]
@@ -257,15 +257,15 @@ class CameraStream:
             if self._scales is None:
                 # The first frame tells for all.
                 coded = coded.summed(coded.frames.lines[:1], phase_sum(coded.frames, coded.searched))
-                rows = _sampled_rows(coded) if _phase_has_all(coded.frames) else _ALL_ROWS
+                has_all = _phase_has_all(coded.frames)
+                rows = _sampled_rows(coded) if has_all else _ALL_ROWS
                 image, deviation = line_image(coded, 0, rows.index)
                 blur_px = measured_sigma_px(image, deviation, coded.searched[rows.index] & rows.inner)
                 filter_px = self._limits.stripes.sigma_px or _matched_scale_px(blur_px)
-                self._scales = _Scales(
-                    filter_px, blur_px, sampled=_phase_has_all(coded.frames) and filter_px < _LEAST_TELLING_PX
-                )
+                sampled = has_all and filter_px < _LEAST_TELLING_PX
+                self._scales = _Scales(filter_px, blur_px, sampled, rows if sampled else _ALL_ROWS)
             scales = self._scales
-            rows = _sampled_rows(coded) if scales.sampled else _ALL_ROWS
+            rows = scales.rows
             image, deviation = line_image(coded, len(self._points), rows.index)
             lit = coded.searched[rows.index] & rows.inner
             points = stripe_points(image, deviation, lit, self._limits.stripes, sigma_px=scales.filter_px)
@@ -337,12 +337,13 @@ def _sampled_rows(coded: Coded) -> _Rows:
 class _Scales:
     """Scale of the filter that points were found with, and the blur by the stripes' width, px.
 
-    sampled : whether the filter looks for some of the points only, as of `refinement.refined`.
+    sampled : whether the filter looks for some of the points only, as of `refinement.refined`; rows : where it looks.
     """
 
     filter_px: float
     blur_px: float
     sampled: bool = False
+    rows: _Rows = _ALL_ROWS
 
 
 def _curves(

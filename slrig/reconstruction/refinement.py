@@ -92,8 +92,7 @@ def _crossing_kernel(
             if not usable[y, x] or (fill and not crossed[y, x]):
                 continue
             here = position[y, x]
-            gx = _slope(position[y, x - 1], here, position[y, x + 1], usable[y, x - 1], usable[y, x + 1])
-            gy = _slope(position[y - 1, x], here, position[y + 1, x], usable[y - 1, x], usable[y + 1, x])
+            gx, gy = _gradient(position, usable, y, x)
             squared = gx * gx + gy * gy
             if not squared > LEAST_GRADIENT * LEAST_GRADIENT:
                 continue
@@ -114,12 +113,7 @@ def _crossing_kernel(
                     nx, ny = int(np.rint(x + dx)), int(np.rint(y + dy))
                     if 1 <= nx < columns - 1 and 1 <= ny < rows - 1 and usable[ny, nx]:
                         there = position[ny, nx]
-                        hx = _slope(
-                            position[ny, nx - 1], there, position[ny, nx + 1], usable[ny, nx - 1], usable[ny, nx + 1]
-                        )
-                        hy = _slope(
-                            position[ny - 1, nx], there, position[ny + 1, nx], usable[ny - 1, nx], usable[ny + 1, nx]
-                        )
+                        hx, hy = _gradient(position, usable, ny, nx)
                         steep = hx * hx + hy * hy
                         if steep > LEAST_GRADIENT * LEAST_GRADIENT and by_cell[code.lowest[ny, nx], k] == low:
                             off_x, off_y = abs((low - there) * hx / steep), abs((low - there) * hy / steep)
@@ -153,6 +147,14 @@ def _crossing_kernel(
                     targets[at] = low
                 crossed[y, x] = True
                 place[y, k] += 1
+
+
+@kernel_part(inline="always")
+def _gradient(position: Any, usable: Any, y: int, x: int) -> Any:
+    """Change of position per pixel along x and y, from usable neighbours of pixel (x, y); NaN along an axis without."""
+    here = position[y, x]
+    gx = _slope(position[y, x - 1], here, position[y, x + 1], usable[y, x - 1], usable[y, x + 1])
+    return gx, _slope(position[y - 1, x], here, position[y + 1, x], usable[y - 1, x], usable[y + 1, x])
 
 
 @kernel_part(inline="always")
