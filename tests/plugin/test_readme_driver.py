@@ -1,10 +1,11 @@
-"""The driver in drivers/README.md is a driver: it passes the contract, and its package can be installed."""
+"""The example of drivers/README.md is a driver: it passes the contract, and its package can be installed."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -20,23 +21,17 @@ from tests.contract.stage import Stage, StagedProjector
 from tests.plugin.conftest import path_with, pip_install, slrig
 from tests.unit.capture.fake_rig import Scene, patterns_for
 
-README = Path(__file__).resolve().parents[2] / "drivers" / "README.md"
+EXAMPLE = Path(__file__).resolve().parents[2] / "config" / "examples" / "slrig-ramp"
 PROJECTOR = Size(128, 96)
 CAMERA = Size(160, 120)
 MODULE = "slrig_ramp"
 RULE = "start_ns - STAMP_ERROR_NS >= after_ns"
 
 
-def fenced(marker: str, language: str) -> str:
-    block = re.search(rf"<!-- {marker} -->\n```{language}\n(.*?)```\n", README.read_text(encoding="utf-8"), re.DOTALL)
-    assert block is not None
-    return block.group(1)
-
-
 def loaded(folder: Path, change: Callable[[str], str] = str) -> ModuleType:
-    """The README's module, from a file, as it stands there or with a change."""
+    """Import the example's module from a file, unchanged or with a change."""
     path = folder / f"{MODULE}.py"
-    path.write_text(change(fenced("the minimal camera", "python")), encoding="utf-8")
+    path.write_text(change((EXAMPLE / f"{MODULE}.py").read_text(encoding="utf-8")), encoding="utf-8")
     spec = importlib.util.spec_from_file_location(MODULE, path)
     assert spec is not None
     assert spec.loader is not None
@@ -57,7 +52,7 @@ def before_a_stage(module: ModuleType) -> Callable[[], Rig]:
 
         camera = module.open_camera("left", {}, Path())
         camera.sensor = Sensor()
-        return Rig("readme", {"left": camera}, StagedProjector(stage), {"left": CameraSettings(0.01)})
+        return Rig("example", {"left": camera}, StagedProjector(stage), {"left": CameraSettings(0.01)})
 
     return opened
 
@@ -75,7 +70,7 @@ def named(name: str) -> Check:
 
 
 @pytest.mark.slow
-def test_the_camera_of_the_readme_conforms(tmp_path: Path) -> None:
+def test_the_example_conforms(tmp_path: Path) -> None:
     report = run(before_a_stage(loaded(tmp_path)), sequence())
     assert failures(report) == []
     assert report.conforms
@@ -98,7 +93,7 @@ def test_as_it_stands_it_shows_its_ramp(tmp_path: Path) -> None:
     def opened() -> Rig:
         stage = Stage(Scene(camera=CAMERA, projector=PROJECTOR))
         camera = module.open_camera("left", {"device": "ramp-0"}, tmp_path)
-        return Rig("readme", {"left": camera}, StagedProjector(stage), {"left": CameraSettings(0.01)})
+        return Rig("example", {"left": camera}, StagedProjector(stage), {"left": CameraSettings(0.01)})
 
     # It does not see the projector, and a sequence that does not begin with white does not ask it to.
     blind = encode(patterns_for(PROJECTOR)[1:], PROJECTOR)
@@ -112,10 +107,7 @@ def test_as_it_stands_it_shows_its_ramp(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_its_package_is_installed_and_found(tmp_path: Path) -> None:
-    source = tmp_path / "package"
-    source.mkdir()
-    (source / "pyproject.toml").write_text(fenced("the minimal package", "toml"), encoding="utf-8")
-    (source / f"{MODULE}.py").write_text(fenced("the minimal camera", "python"), encoding="utf-8")
+    source = shutil.copytree(EXAMPLE, tmp_path / "package")
     site = pip_install([source], tmp_path)
     done = slrig("devices", "--json", path=path_with(site), folder=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -69,7 +69,7 @@ STAND_INS = (
         "a person moves the board, and says when to solve; the rendered rig moves it by itself",
     ),
     StandIn(
-        "pip install ./slrig-ramp",
+        "pip install ./config/examples/slrig-ramp",
         None,
         "would change the environment of the tests; tests/plugin/test_readme_driver.py installs it into a folder",
     ),
