@@ -25,14 +25,12 @@ from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.scan.artefacts import MESH, ON_REQUEST, converted, write_converted
 from slrig.scan.offered import (
-    BAG,
     BUNDLE_ZIP,
     CALIBRATION_USED,
-    CLOUDS,
     MEDIA_TYPES,
-    ON_DEMAND,
     causes_picture,
     rejected_picture,
+    requested_forms,
 )
 
 # A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
@@ -129,7 +127,7 @@ def _kept(path: Path, media_type: str, headers: dict[str, str]) -> Response:
 
 
 def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known: str | None) -> Response:
-    """One of `ON_DEMAND`. Made only when a scan is over: it takes all of its files."""
+    """One of `requested_forms`. Made only when a scan is over: it takes all of its files."""
     place = service.folder.scan(scan_id)
     path = place / form.format(camera=camera)
     record = service.store.get(scan_id)
@@ -143,7 +141,7 @@ def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known
         make_cloud(service, scan_id, form, camera)
     if not service.folder.owns(path):
         refuse_absent(record, path.name)
-    return _kept(path, ON_DEMAND[form], headers)
+    return _kept(path, requested_forms()[form], headers)
 
 
 def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | None:
@@ -206,35 +204,37 @@ for _name, _media_type in MEDIA_TYPES.items():
 
 
 def _serve_cloud(form: str) -> Callable[..., Response]:
-    def fetch(service: Serving, scan_id: UUID, camera: Camera, known: KnownTag = None) -> Response:
-        return _cloud(service, scan_id, form, camera, known)
+    if "{camera}" in form:
 
+        def fetch(service: Serving, scan_id: UUID, camera: Camera, known: KnownTag = None) -> Response:
+            return _cloud(service, scan_id, form, camera, known)
+
+        what = f"{form.format(camera='CAMERA')}, the surface of a finished scan in the grid of a camera"
+    else:
+
+        def fetch(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:  # type: ignore[misc]
+            return _cloud(service, scan_id, form, None, known)
+
+        what = f"{form}, a finished scan with the points of all cameras"
     fetch.__doc__ = (
-        f"Return {form.format(camera='CAMERA')}, the surface of a finished scan in the grid of a camera. It is made of "
-        "the scan's files when it is first asked for, and kept; 503 while others are computed for long."
+        f"Return {what}. It is made of the scan's files when it is first requested, and kept; 503 while others are "
+        "computed for long."
     )
     return fetch
 
 
-for _form, _media_type in CLOUDS.items():
+for _form, _media_type in requested_forms().items():
     router.add_api_route(
         f"/{_form}",
         _serve_cloud(_form),
         methods=["GET"],
         response_class=Response,
         responses=file_answers(_media_type, 501, 503, 507),
-        operation_id=f"fetch_camera_{_form.replace('-{camera}.', '_')}",
+        operation_id=f"fetch_camera_{_form.replace('-{camera}.', '_')}"
+        if "{" in _form
+        else f"fetch_{_form.replace('.', '_')}",
         summary=f"Fetch {_form}",
     )
-
-
-@router.get(f"/{BAG}", response_class=Response, responses=file_answers(ON_DEMAND[BAG], 501, 503, 507))
-def fetch_bag(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
-    """Return a finished scan as a ROS 2 bag: points of each camera, white images, and where the devices stand.
-
-    It is made when it is first asked for, and kept; 503 while others are computed for long.
-    """
-    return _cloud(service, scan_id, BAG, None, known)
 
 
 @router.get(f"/{CALIBRATION_USED}", response_class=Response, responses=file_answers("application/json"))

@@ -17,7 +17,7 @@ from slrig.errors import InvalidInputError, JobNotFoundError, StorageError, Work
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.worker_process import Task
 from slrig.scan.artefacts import MESH, REPORT
-from slrig.scan.offered import BAG, CLOUDS, causes_picture, extra_of
+from slrig.scan.offered import causes_picture, missing_for, requested_forms
 
 MAKER = "slrig.scan.cloud_files:cloud_file"
 
@@ -33,26 +33,28 @@ _places = threading.BoundedSemaphore(MOST_WAITING)
 
 
 def clouds_of(folder: DataFolder, scan: Path, names: Iterable[str]) -> set[str]:
-    """The names of the clouds, and of the bag, that can be made of a finished scan, here. names : of its files."""
+    """Names of the files that can be made of a finished scan on request, here. names : of its files."""
     given = set(names)
     prefix, suffix = causes_picture("/").split("/")
     cameras = [name.removeprefix(prefix).removesuffix(suffix) for name in given if name.startswith(prefix)]
-    forms = [form for form in CLOUDS if extra_of(Path(form).suffix) is None]
-    found = {form.format(camera=camera) for camera in cameras if has_sources(folder, scan, camera) for form in forms}
-    if cameras and extra_of(Path(BAG).suffix) is None and has_sources(folder, scan, None):
-        found.add(BAG)
+    forms = [form for form in requested_forms() if missing_for(form) is None]
+    of_cameras = [form for form in forms if "{camera}" in form]
+    sources = [camera for camera in cameras if has_sources(folder, scan, camera)]
+    found = {form.format(camera=camera) for camera in sources for form in of_cameras}
+    if cameras and has_sources(folder, scan, None):
+        found.update(form for form in forms if "{camera}" not in form)
     return found
 
 
 def has_sources(folder: DataFolder, scan: Path, camera: str | None) -> bool:
-    """Whether the files are there that a camera's cloud is made of; None: the bag, but for maps of causes."""
+    """True if the sources of a camera's cloud exist; None: those of a file of all cameras, except maps of causes."""
     further = f"{BUNDLE}/{DESCRIPTION}" if camera is None else causes_picture(camera)
     sources = MESH, REPORT, further, f"{BUNDLE}/{CALIBRATION}"
     return all(folder.owns(scan / source) for source in sources)
 
 
 def make_cloud(service: Service, scan_id: UUID, form: str, camera: str | None) -> None:
-    """Have the worker make one of `ON_DEMAND` of a finished scan, and keep it, unless it is there.
+    """Make one of `requested_forms` of a finished scan in the worker, and keep it, unless it exists.
 
     Raises
     ------

@@ -12,7 +12,6 @@ from fastapi import Depends, Query, Request, Response
 
 from slrig.accept.desk import AcceptanceDesk
 from slrig.api.latency import Durations
-from slrig.api.traces import traces_by_environment
 from slrig.bundle.options import Preset, ScanDefaults
 from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.retention import Retention
@@ -32,6 +31,7 @@ from slrig.jobs.feed import JobFeed
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind, JobRecord, utc_now
 from slrig.jobs.store import JobStore
+from slrig.plugins import OBSERVERS, load
 from slrig.scan.presets import Presets
 from slrig.scan.retention import ScanLimits, ScanRetention
 from slrig.scan.runner import Runner
@@ -62,7 +62,7 @@ class Service:
     StorageError
         The disk refused. What was given is still the caller's to close.
     ConfigError
-        The environment asks for traces, and the library that sends them is not installed. Or a receiver of notices
+        A plug-in cannot be loaded, or what it needs is not installed. Or a receiver of notices
         cannot be told: see `senders_of`. Or the catalogue has no address, or no login.
     ExtraMissingError
         The catalogue's driver is not installed.
@@ -140,7 +140,7 @@ class Service:
         self.find_axis = worker.task("slrig.calibrate.stage_axis:axis_of_poses", "axis of the stage")
         self.find_planes = worker.task("slrig.combine.empty_stage:planes_in", "planes of the stage")
         self.durations = Durations()
-        self.traces = traces_by_environment()
+        self.observers = [each for observe in load(OBSERVERS).values() if (each := observe()) is not None]
         self._desks = (self.verifications, self.calibrations, self.acceptance, self.models)
         stores = (
             store,
@@ -183,8 +183,8 @@ class Service:
         try:
             events = jobs.events(record.id, after=0)
             self.durations.ended(record, events)
-            if self.traces is not None:
-                self.traces.ended(record, events)
+            for observer in self.observers:
+                observer.ended(record, events)
         except Exception:  # noqa: BLE001 - the job is over, and on record, whatever becomes of its figures
             _log.exception("how long a job took could not be noted", job=str(record.id))
 
@@ -220,8 +220,8 @@ class Service:
         self.end_work()
         for sender in self._tellers:
             sender.close()
-        if self.traces is not None:
-            self.traces.close()
+        for observer in self.observers:
+            observer.close()
         self.store.database.close()
         self.folder.release()
 

@@ -22,7 +22,7 @@ from slrig.jobs.worker import prepare_kernel_cache
 from slrig.jobs.worker_wait import PREPARING
 from slrig.logs import set_up_logs_for_a_person
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, write_converted
-from slrig.scan.offered import BUNDLE_ZIP, CALIBRATION_USED, extra_of, offered, on_demand
+from slrig.scan.offered import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.records import report_summary
 
@@ -124,7 +124,7 @@ def _require_offered(names: Sequence[str], bundle: Path) -> list[str]:
         message = f"{bundle}: it gives no {', '.join(unknown)}. There are: {', '.join(there_are)}."
         raise ConfigError(message)
     for name in names:
-        lacking = extra_of(Path(name).suffix)
+        lacking = missing_for(name)
         if lacking is not None:
             message = f"{name} takes a library that is not installed: {lacking}"
             raise ExtraMissingError(message)

@@ -141,7 +141,7 @@ def _completed(
     if missing:
         message = f"The scan has no {', '.join(missing)}. It has: {', '.join(result.files)}."
         for name in missing:
-            if (command := installed_by(Path(name).suffix)) is not None:
+            if (command := installed_by(name)) is not None:
                 message += f" For {name}, {command} where the service runs; the scan need not be repeated."
         raise ServiceError(message)
     with refusals_of(output):

@@ -6,7 +6,8 @@ The service has them made by the worker: they take kernels, and libraries of oth
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from datetime import datetime
 from pathlib import Path
 
 import cv2
@@ -15,16 +16,15 @@ from numpy.typing import NDArray
 
 from slrig.bundle.calibration import read_calibration
 from slrig.bundle.description import read_description
-from slrig.bundle.reading import CALIBRATION, open_bundle
+from slrig.bundle.reading import CALIBRATION, BundleFiles, open_bundle
 from slrig.disk import refusals_of
 from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.jobs.data_folder import BUNDLE
-from slrig.model import Mesh, Pinhole
+from slrig.model import Calibration, Mesh, Pinhole, Pixels, White
+from slrig.plugins import formats
 from slrig.scan.artefacts import MESH, REPORT, decode_mesh_ply
-from slrig.scan.bag_format import encode_bag, white_images
 from slrig.scan.cloud_formats import encode_depth_tiff, encode_npz, encode_pcd
-from slrig.scan.e57_format import encode_e57
-from slrig.scan.offered import BAG, causes_picture
+from slrig.scan.offered import causes_picture
 from slrig.scan.organised import OrganisedCloud, organised
 from slrig.scan.plan import Progress
 
@@ -35,7 +35,6 @@ ENCODERS: Mapping[str, Callable[[OrganisedCloud], bytes]] = {
     "points-{camera}.npz": encode_npz,
     "points-{camera}.pcd": encode_pcd,
     "depth-{camera}.tiff": encode_depth_tiff,
-    "points-{camera}.e57": encode_e57,
 }
 
 
@@ -48,8 +47,8 @@ def cloud_file(
     calibration: Path | None = None,
     progress: Progress = lambda *_: None,
 ) -> bytes:
-    """One of `ENCODERS`, for a camera, or the bag of all, made of the files of a finished scan. bundle : None for that
-    of the scan. calibration : the one that the mesh was made with, None for that in the bundle.
+    """Make a file of a finished scan. form : of `slrig.scan.offered.requested_forms`. camera : None for a file of all.
+    bundle : None for that of the scan. calibration : the one that the mesh was made with, None for that in the bundle.
 
     Raises
     ------
@@ -65,15 +64,19 @@ def cloud_file(
     progress(STAGE, 0.0, "")
     bundle = bundle or folder / BUNDLE
     calibration = calibration or bundle / CALIBRATION
-    if form == BAG:
-        return _bag(folder, bundle, calibration)
+    encode: Callable[..., bytes] = ENCODERS.get(form) or next(each.load() for each in formats() if each.name == form)
+    if "{camera}" not in form:
+        return encode(*_whole_scan(folder, bundle, calibration))
     if camera is None:
         message = f"{form}: expected the name of a camera, found none"
         raise InvalidInputError(message)
-    return ENCODERS[form](organised_scan(folder, camera, calibration=calibration))
+    return encode(organised_scan(folder, camera, calibration=calibration))
 
 
-def _bag(folder: Path, bundle: Path, calibration: Path) -> bytes:
+def _whole_scan(
+    folder: Path, bundle: Path, calibration: Path
+) -> tuple[Calibration, Iterator[OrganisedCloud], Mapping[str, Pixels], datetime | None]:
+    """Arguments of the encoder of a file of all cameras: see `slrig.plugins.FileFormat`."""
     known = read_calibration(calibration)
     cameras = {each: device for each, device in known.cameras.items() if (folder / causes_picture(each)).exists()}
     if not cameras:
@@ -82,7 +85,18 @@ def _bag(folder: Path, bundle: Path, calibration: Path) -> bytes:
     mesh = decode_mesh_ply(_read(folder / MESH))
     # One at a time: each takes some hundred megabytes.
     clouds = (_organised(folder, mesh, camera, device) for camera, device in cameras.items())
-    return encode_bag(known, clouds, white_images(open_bundle(bundle)), read_description(bundle).captured_at)
+    return known, clouds, _white_images(open_bundle(bundle)), read_description(bundle).captured_at
+
+
+def _white_images(bundle: BundleFiles) -> dict[str, Pixels]:
+    """The first white frame of each camera that has one, in colour if it was recorded so. Raises BundleError."""
+    outline = bundle.outline
+    order: dict[str, int] = {}
+    for index, shot in enumerate(outline.shots):
+        if isinstance(outline.patterns[shot.pattern], White):
+            order.setdefault(shot.camera, index)
+    shots = bundle.shots(list(order.values()))
+    return {shot.camera: shot.image if shot.colour is None else shot.colour for shot in shots}
 
 
 def organised_scan(folder: Path, camera: str, *, calibration: Path) -> OrganisedCloud:

@@ -5,8 +5,10 @@ Loads nothing: a command asks it before anything is shot.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterable, Mapping
+from pathlib import PurePath
+
+from slrig.plugins import formats
 
 MEDIA_TYPES: Mapping[str, str] = {
     "mesh.ply": "application/octet-stream",
@@ -51,18 +53,17 @@ CLOUDS: Mapping[str, str] = {
     "points-{camera}.npz": "application/octet-stream",
     "points-{camera}.pcd": "application/octet-stream",
     "depth-{camera}.tiff": "image/tiff",
-    "points-{camera}.e57": "model/e57",
 }
-"""The surface in the grid of a camera, made when asked for by `slrig.scan.cloud_files`: names and media types."""
+"""The surface in the grid of a camera, made on request by `slrig.scan.cloud_files`: names and media types."""
 
-BAG = "scan.mcap"
-"""The scan as a ROS 2 bag, made when asked for by `slrig.scan.cloud_files`, too: all cameras in one."""
 
-ON_DEMAND: Mapping[str, str] = {**CLOUDS, BAG: "application/octet-stream"}
-"""What the worker makes: names and media types."""
+def requested_forms() -> Mapping[str, str]:
+    """All files that the worker makes on request, those of plug-ins too: names and media types. Raises ConfigError."""
+    return {**CLOUDS, **{each.name: each.media_type for each in formats()}}
 
-PREFIXES = ("rejected-", "causes-", *sorted({form.partition("{")[0] for form in CLOUDS}))
-"""With which the name of a camera's file begins."""
+
+PREFIXES = ("rejected-", "causes-", "depth-", "points-")
+"""Beginnings of the names of a camera's files."""
 
 
 def camera_files(camera: str) -> tuple[str, ...]:
@@ -71,37 +72,34 @@ def camera_files(camera: str) -> tuple[str, ...]:
     >>> camera_files("left")[:3]
     ('rejected-left.png', 'causes-left.png', 'points-left.npz')
     """
-    return rejected_picture(camera), causes_picture(camera), *(form.format(camera=camera) for form in CLOUDS)
+    clouds = (form.format(camera=camera) for form in requested_forms() if "{camera}" in form)
+    return rejected_picture(camera), causes_picture(camera), *clouds
 
 
-_EXTRAS = {".e57": ("pye57", "e57"), ".mcap": ("rosbags", "ros")}
-"""Endings of files that take a library that slrig does not bring, and the extra that does."""
+def missing_for(name: str) -> str | None:
+    """The command that installs what a file of this name needs; None if nothing is missing."""
+    return next((each.missing for each in formats() if PurePath(each.name).suffix == PurePath(name).suffix), None)
 
 
-def extra_of(ending: str) -> str | None:
-    """What to install before files of this ending can be made; None where nothing is missing, or needed."""
-    library, _ = _EXTRAS.get(ending, (None, ""))
-    return None if library is None or importlib.util.find_spec(library) is not None else installed_by(ending)
+def installed_by(name: str) -> str | None:
+    """The command that installs what a file of this name needs where it is made; None if it needs nothing.
 
-
-def installed_by(ending: str) -> str | None:
-    """What to install where files of this ending are made; None where nothing is needed.
-
-    >>> installed_by(".e57"), installed_by(".npz")
+    >>> installed_by("points-left.e57"), installed_by("points-left.npz")
     ("pip install 'slrig[e57]'", None)
     """
-    return f"pip install 'slrig[{_EXTRAS[ending][1]}]'" if ending in _EXTRAS else None
+    return next((each.install for each in formats() if PurePath(each.name).suffix == PurePath(name).suffix), None)
 
 
 def on_demand(name: str, cameras: Iterable[str]) -> tuple[str, str | None] | None:
-    """Which of `ON_DEMAND` a name means, and of which camera; None where it means none.
+    """The form of `requested_forms` that a name has, and its camera; None if it has none of them.
 
     >>> on_demand("points-left.npz", ["left", "right"]), on_demand("scan.mcap", ["left"])
     (('points-{camera}.npz', 'left'), ('scan.mcap', None))
     """
-    if name == BAG:
-        return BAG, None
-    known = ((form, camera) for camera in cameras for form in CLOUDS)
+    forms = requested_forms()
+    if name in forms:
+        return name, None
+    known = ((form, camera) for camera in cameras for form in forms)
     return next((each for each in known if each[0].format(camera=each[1]) == name), None)
 
 
@@ -112,4 +110,5 @@ def offered(cameras: Iterable[str]) -> tuple[str, ...]:
     ('points-left.e57', 'scan.mcap', 'calibration.json', 'bundle.zip')
     """
     of_cameras = (name for camera in cameras for name in camera_files(camera))
-    return *MEDIA_TYPES, *of_cameras, BAG, CALIBRATION_USED, BUNDLE_ZIP
+    of_all = (form for form in requested_forms() if "{camera}" not in form)
+    return *MEDIA_TYPES, *of_cameras, *of_all, CALIBRATION_USED, BUNDLE_ZIP

@@ -1,4 +1,4 @@
-"""Which receivers the service's settings name, and what each of them is told."""
+"""Receivers of notices that the service's settings name: the webhook, and those of plug-ins."""
 
 from __future__ import annotations
 
@@ -10,31 +10,33 @@ from pydantic import SecretStr
 
 from slrig.config import NoticeKind, ServiceSettings, private_text
 from slrig.jobs.outbox import Outbox
-from slrig.schedule.mqtt import Broker
+from slrig.plugins import RECEIVERS, load
 from slrig.schedule.sending import Sender
 from slrig.schedule.webhook import Webhook, signing_key
 
 
 def wanted_kinds(settings: ServiceSettings) -> Mapping[str, Collection[NoticeKind]]:
-    """The kinds of notices that each receiver wants, by its name. Those who subscribe at a broker choose by topic."""
-    kinds = {"webhook": settings.webhook_kinds, "mqtt": get_args(NoticeKind)}
-    return {name: kinds[name] for name in kinds if getattr(settings, f"{name}_url") is not None}
+    """Kinds of notices for each named receiver; all kinds for other receivers than the webhook. Raises ConfigError."""
+    kinds = {"webhook": settings.webhook_kinds, **dict.fromkeys(load(RECEIVERS), get_args(NoticeKind))}
+    return {name: kinds[name] for name in kinds if getattr(settings, f"{name}_url", None) is not None}
 
 
 def senders_of(settings: ServiceSettings, outbox: Outbox) -> list[Sender]:
-    """One for each receiver. Raises ConfigError: an address or a secret is none, or an extra is not installed."""
+    """One sender for each receiver. Raises ConfigError: an address or secret is invalid, or an extra is missing."""
     found: list[Sender] = []
     if settings.webhook_url is not None:
         secret, source = secret_of(settings.webhook_secret, settings.webhook_secret_file, "webhook_secret")
         found.append(Webhook(outbox, settings.webhook_url, None if secret is None else signing_key(secret, source)))
-    if settings.mqtt_url is not None:
-        login, _ = secret_of(settings.mqtt_login, settings.mqtt_login_file, "mqtt_login")
-        found.append(Broker(outbox, settings.mqtt_url, login))
+    found += [
+        open_sender(settings, outbox)
+        for name, open_sender in load(RECEIVERS).items()
+        if getattr(settings, f"{name}_url", None) is not None
+    ]
     return found
 
 
 def secret_of(given: SecretStr | None, path: Path | None, name: str) -> tuple[str | None, str]:
-    """A secret, or what a file holds that nobody but its owner may read; and which it was. Raises ConfigError."""
+    """Return a secret, or the contents of a file that only its owner may read, and its source. Raises ConfigError."""
     if given is not None or path is None:
         return None if given is None else given.get_secret_value(), name
     source = f"{name}_file: {path}"

@@ -25,12 +25,12 @@ from slrig.bundle.reading import read_bundle
 from slrig.model import FloatArray, Pinhole, White
 from slrig.scan.artefacts import decode_mesh_ply, write_converted
 from slrig.scan.cloud_files import ENCODERS, cloud_file
-from slrig.scan.offered import BAG
 from tests.golden.conftest import Scan
 from tests.ros_readers import colours, library, point_columns, seen_at
 
 pytestmark = pytest.mark.slow
 
+BAG = "scan.mcap"
 CAMERAS = ("left", "right")
 SAMPLES = 20_000
 

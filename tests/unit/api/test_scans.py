@@ -36,7 +36,6 @@ from slrig.jobs.worker_process import Task
 from slrig.model import Calibration, CameraFormat, Pinhole, Shot, Size, White
 from slrig.scan.acquisition import Recording, capture_frames
 from slrig.scan.artefacts import ON_REQUEST
-from slrig.scan.offered import BAG
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.ros_readers import library
 from tests.unit.api.conftest import ServedBench, client_of, ended, refusal
@@ -510,10 +509,10 @@ def test_source_of_a_cloud_that_was_changed_is_named(
 def test_format_without_its_library_is_not_listed(
     client: TestClient, scan: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(clouds, "extra_of", lambda ending: "pip install" if ending in {".e57", ".mcap"} else None)
+    monkeypatch.setattr(clouds, "missing_for", lambda name: "pip install" if name.endswith(("e57", "mcap")) else None)
     files = client.get(f"/scan/{scan}").json()["links"]["files"]
     assert {"points-left.pcd", "depth-left.tiff", NAME} < set(files)
-    assert not {"points-left.e57", BAG} & set(files)
+    assert not {"points-left.e57", "scan.mcap"} & set(files)
     answer = client.get(f"/scan/{scan}/points-left.e57")
     if importlib.util.find_spec("pye57") is None:
         assert (answer.status_code, answer.json()["type"]) == (501, "/problems/extra-missing")
@@ -526,18 +525,18 @@ def test_scan_is_one_bag_of_all_its_cameras(client: TestClient, served: ServedBe
     library("rosbags.rosbag2")
     bundle = place_of(served, scan) / "bundle"
     (bundle / "bundle.json").unlink()
-    assert BAG not in client.get(f"/scan/{scan}").json()["links"]["files"]
-    assert client.get(f"/scan/{scan}/{BAG}").status_code == 409
+    assert "scan.mcap" not in client.get(f"/scan/{scan}").json()["links"]["files"]
+    assert client.get(f"/scan/{scan}/{'scan.mcap'}").status_code == 409
     forms, moment = {"left": CameraFormat(SIZE, 8)}, datetime(2026, 3, 4, tzinfo=UTC)
     with BundleWriter(tmp_path / "bundle", SIZE, [White()], forms, captured_at=moment) as written:
         written.add(Shot(0, "left", np.zeros(SIZE.shape, dtype=np.uint8)))
     shutil.copytree(tmp_path / "bundle", bundle, dirs_exist_ok=True)
     files = client.get(f"/scan/{scan}").json()["links"]["files"]
     assert client.get(files["calibration.json"]).json()["cameras"]["left"]["size_px"] == [40, 30]
-    fetched = client.get(files[BAG])
+    fetched = client.get(files["scan.mcap"])
     assert fetched.status_code == 200, fetched.text
-    assert fetched.content == (bundle.parent / BAG).read_bytes()
-    with library("rosbags.highlevel").AnyReader([bundle.parent / BAG]) as reader:
+    assert fetched.content == (bundle.parent / "scan.mcap").read_bytes()
+    with library("rosbags.highlevel").AnyReader([bundle.parent / "scan.mcap"]) as reader:
         assert {"/slrig/left/points", "/slrig/left/image_raw"} < set(reader.topics)
 
 

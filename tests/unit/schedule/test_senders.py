@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
-import socket
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -22,16 +20,15 @@ from slrig.jobs.database import Database
 from slrig.jobs.outbox import Notice, Outbox
 from slrig.jobs.records import JobKind, JobRecord, JobState, acting_as
 from slrig.jobs.store import JobStore
-from slrig.schedule.mqtt import Broker
 from slrig.schedule.notices import TOLD, NoticedHealth, tell_run
-from slrig.schedule.receivers import senders_of, wanted_kinds
+from slrig.schedule.receivers import senders_of
 from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.sending import Sender
 from slrig.schedule.webhook import Webhook, signature, signing_key
 from tests.samples import put_database
 from tests.unit.jobs.tame_queue import PowerCut
 from tests.unit.scan.fakes import WAIT_S, SetClock
-from tests.unit.schedule.receivers import LOGIN, PATH, SECRET, Hook, Mosquitto, own_certificate, signed
+from tests.unit.schedule.receivers import PATH, SECRET, Hook, own_certificate, signed
 from tests.unit.verify.health_bench import a_verification, hours
 
 DUE = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
@@ -184,19 +181,19 @@ BODY = b'{"test": 2432232314}'
 
 
 class Bench:
-    """An outbox on a clock that is set by hand, and the sender of a webhook or a broker, which steps when it has to."""
+    """An outbox on a manual clock, and the sender of a webhook, stepped by the test."""
 
-    def __init__(self, folder: Path, url: str, *, most: int = 10_000, **broker: Any) -> None:
+    receiver = "webhook"
+
+    def __init__(self, folder: Path, url: str, *, most: int = 10_000) -> None:
         self.clock = SetClock()
         self.database = Database(put_database(folder / "slrig.sqlite"))
-        receiver = "mqtt" if url.startswith("mqtt") else "webhook"
-        wanted = {receiver: get_args(NoticeKind)}
+        wanted = {self.receiver: get_args(NoticeKind)}
         self.outbox = Outbox(self.database, rig="bench", wanted=wanted, clock=self.clock, most=most)
-        self.sender: Sender = (
-            Broker(self.outbox, url, **{"login": LOGIN, **broker})
-            if receiver == "mqtt"
-            else Webhook(self.outbox, url, KEY, clock=self.clock, timeout_s=0.5)
-        )
+        self.sender = self.open_sender(url)
+
+    def open_sender(self, url: str) -> Sender:
+        return Webhook(self.outbox, url, KEY, clock=self.clock, timeout_s=0.5)
 
     @property
     def waiting(self) -> int:
@@ -525,100 +522,6 @@ def test_address_that_is_none_is_refused_and_not_repeated(url: str) -> None:
     with pytest.raises(ConfigError, match="webhook_url: expected an address that begins with http") as error:
         read_settings(webhook_url=url)
     assert url not in str(error.value)
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Mosquitto]:
-    made = Mosquitto(tmp_path)
-    yield made
-    made.stop()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("login", ["rig:wrong", None])
-def test_what_a_broker_refuses_waits(tmp_path: Path, broker: Mosquitto, login: str | None) -> None:
-    broker.start()
-    bench = Bench(tmp_path, broker.url, login=login)
-    bench.put("1")
-    # A wrong password is refused at the connection, a user without rights at the notice.
-    assert bench.fails() == "Not authorized"
-    bench.put("2")
-    bench.sender = Broker(bench.outbox, broker.url, LOGIN)
-    bench.empty()
-    bench.close()
-
-
-def test_broker_that_gives_no_answer_costs_one_try(tmp_path: Path) -> None:
-    pytest.importorskip("paho.mqtt.client", reason="needs paho-mqtt: pip install 'slrig[mqtt]'")
-    with socket.create_server(("127.0.0.1", 0)) as deaf:
-        bench = Bench(tmp_path, f"mqtt://127.0.0.1:{deaf.getsockname()[1]}/x", timeout_s=0.2)
-        bench.put("1")
-        assert bench.fails() == "no answer"
-    bench.close()
-
-
-@pytest.mark.slow
-# The library leaves the socket of a handshake that fails to Python's collector.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_certificate_of_a_broker_counts_where_its_authority_is_known(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pem = own_certificate(tmp_path)
-    broker = Mosquitto(tmp_path, certificate=pem)
-    broker.start()
-    bench = Bench(tmp_path, broker.url)
-    bench.put("1")
-    assert bench.fails() == "SSLCertVerificationError"
-    monkeypatch.setenv("SSL_CERT_FILE", str(pem))
-    bench.sender = Broker(bench.outbox, broker.url, LOGIN)
-    bench.empty()
-    bench.close()
-    broker.stop()
-
-
-@pytest.mark.parametrize(
-    "url",
-    [
-        "http://host/rig", "mqtt://host", "mqtt://host/", "mqtt:///rig", "mqtt://ann:secret@host/rig",
-        "mqtt://host:70000/rig", "mqtt://host/rig/#", "mqtt://host/+/rig", "mqtt://host/rig?x=secret",
-    ],
-)  # fmt: skip
-def test_invalid_address_of_a_broker_is_refused_and_not_repeated(tmp_path: Path, url: str) -> None:
-    pytest.importorskip("paho.mqtt.client", reason="needs paho-mqtt: pip install 'slrig[mqtt]'")
-    outbox = Bench(tmp_path, "mqtt://host/rig").outbox
-    with pytest.raises(ConfigError, match=r"^mqtt_url: expected mqtt://HOST:PORT/PREFIX") as error:
-        Broker(outbox, url, LOGIN)
-    assert "secret" not in str(error.value)
-
-
-def test_settings_name_a_broker_and_hide_the_login(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert wanted_kinds(ServiceSettings()) == {}
-    login = tmp_path / "login"
-    login.write_text(f"{LOGIN}\n")
-    login.chmod(0o644)
-    file = tmp_path / "settings.toml"
-    file.write_text('mqtt_url = "mqtt://[::1]/rigs/"\nmqtt_login_file = "login"\n')
-    settings, outbox = read_settings(file), Outbox(Database(tmp_path / "slrig.sqlite"))
-    assert wanted_kinds(settings) == {"mqtt": get_args(NoticeKind)}
-    with pytest.raises(ConfigError, match=r"mqtt_login_file: .* may be read by others.*chmod 600"):
-        senders_of(settings, outbox)
-    monkeypatch.setenv("SLRIG_MQTT_LOGIN", LOGIN)
-    settings = read_settings(file)
-    assert settings.mqtt_login == SecretStr(LOGIN)
-    assert LOGIN not in repr(settings)
-
-    real = builtins.__import__
-
-    def without(name: str, *given: Any, **named: Any) -> Any:
-        if name.startswith("paho"):
-            raise ModuleNotFoundError(name)
-        return real(name, *given, **named)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(
-        ConfigError, match=r"^mqtt_url needs a library.* pip install 'slrig\[mqtt\]', or leave mqtt_url out$"
-    ):
-        senders_of(settings, outbox)
 
 
 def test_what_waits_for_a_receiver_that_is_no_longer_named_is_dropped_as_late_as_any(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A broker of MQTT 5, which hands notices on to whoever subscribed to their topics."""
+"""Notices published at a broker of MQTT 5."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import ssl
 import time
 from typing import TYPE_CHECKING
 
+from slrig.config import ServiceSettings
 from slrig.errors import ConfigError
 from slrig.jobs.outbox import Notice, Outbox
+from slrig.schedule.receivers import secret_of
 from slrig.schedule.sending import TIMEOUT_S, Sender
 
 if TYPE_CHECKING:
@@ -22,12 +24,17 @@ _ADDRESS = re.compile(
 _LOOP_S = 0.5
 
 
+def open_broker(settings: ServiceSettings, outbox: Outbox) -> Broker:
+    """Return the sender of notices to the broker of `mqtt_url`. Raises ConfigError."""
+    login, _ = secret_of(settings.mqtt_login, settings.mqtt_login_file, "mqtt_login")
+    return Broker(outbox, settings.mqtt_url or "", login)
+
+
 class Broker(Sender):
-    """Takes a notice, published with QoS 1 as `PREFIX/KIND`, by an acknowledgement that is no refusal. Only MQTT 5 has
-    those: an older broker acknowledges, too, what it throws away.
+    """Publishes each notice with QoS 1 as `PREFIX/KIND`. It needs MQTT 5: older brokers acknowledge what they discard.
 
     url : `mqtt://HOST:PORT/PREFIX`, or `mqtts` with TLS. login : `USER:PASSWORD`. Raises ConfigError, which does not
-    repeat the address: people write passwords there.
+    repeat the address: it may hold a password.
     """
 
     receiver = "mqtt"

@@ -1,7 +1,7 @@
-"""A ROS 2 node that scans when its service is called, and publishes what came of it.
+"""A ROS 2 node that scans when its service is called, and publishes the result.
 
-`python -m slrig.client.ros2 --ros-args -p url:=http://scanner:8731` where ROS is set up. Every type is one of ROS's
-own: an action for scans would take a package of interfaces that is built first.
+`python -m slrig.extras.ros_node --ros-args -p url:=http://scanner:8731` where ROS is set up. All types are ROS's own:
+an action for scans would need a package of interfaces that is built first.
 """
 
 from __future__ import annotations

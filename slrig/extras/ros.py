@@ -1,7 +1,7 @@
-"""A scan as a ROS 2 bag: one MCAP file, as rosbag2 stores it, by rosbags.
+"""A scan as a ROS 2 bag: one MCAP file, as rosbag2 stores it, written by rosbags.
 
-rosbag2's folder with a metadata.yaml beside the MCAP would be no file that can be fetched; the MCAP holds the same
-metadata as a record, and `ros2 bag play FILE`, Foxglove and rosbags open it alone.
+The MCAP holds the bag's metadata as a record, so `ros2 bag play FILE`, Foxglove and rosbags open it without the folder
+and metadata.yaml that rosbag2 writes around it.
 """
 
 from __future__ import annotations
@@ -10,17 +10,22 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slrig.bundle.reading import BundleFiles
 from slrig.disk import refusals_of
 from slrig.errors import ExtraMissingError
-from slrig.model import Calibration, Pinhole, Pixels, White
+from slrig.plugins import FileFormat
 from slrig.ros_messages import PROJECTOR, TF_STATIC, Device, Messages, topic
-from slrig.scan.offered import BAG, extra_of
-from slrig.scan.organised import OrganisedCloud
+
+if TYPE_CHECKING:
+    from slrig.model import Calibration, Pinhole, Pixels
+    from slrig.scan.organised import OrganisedCloud
+
+FORMAT = FileFormat(
+    "scan.mcap", "application/octet-stream", "rosbags", "pip install 'slrig[ros]'", "slrig.extras.ros:encode_bag"
+)
 
 _FOREVER_S, _FOREVER_NS = 9_223_372_036, 854_775_807  # RMW_DURATION_INFINITE
 
@@ -31,24 +36,24 @@ def encode_bag(
     whites: Mapping[str, Pixels],
     captured_at: datetime | None,
 ) -> bytes:
-    """The bag: transforms of all devices, how each sees, a white image of each camera, and the points of each cloud.
+    """Encode transforms and camera_info of all devices, a white image of each camera, and the points of each cloud.
 
     whites : by camera, (H, W) grey or (H, W, 3) blue, green and red. captured_at : the stamp of all messages; None: 0.
-    Every topic has one message, and is latched: who subscribes late has it, too.
+    Every topic has one message and is latched, so that late subscribers receive it.
 
     Raises
     ------
     ExtraMissingError
         rosbags is not installed.
     StorageError
-        The folder for temporary files refused: the library writes files only.
+        The folder for temporary files cannot be written; the library writes files only.
     """
     try:
         from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ImportError as cause:
-        message = f"{BAG} is written by rosbags, which is missing: {extra_of('.mcap')}"
+        message = f"{FORMAT.name} is written by rosbags, which is missing: {FORMAT.install}"
         raise ExtraMissingError(message) from cause
     # The oldest that is maintained: later releases have the same definitions of these types.
     types = get_typestore(Stores.ROS2_HUMBLE)
@@ -68,7 +73,7 @@ def encode_bag(
     )
     with TemporaryDirectory(prefix="slrig-") as parent:
         # Writes FOLDER/FOLDER.mcap.
-        folder = Path(parent, Path(BAG).stem)
+        folder = Path(parent, Path(FORMAT.name).stem)
         with refusals_of(folder):
             # From version 9 on QoS is stated in words, which Humble does not read; later releases read both.
             writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
@@ -87,7 +92,7 @@ def encode_bag(
                     writer.write(topics[where], messages.stamp_ns, types.serialize_cdr(message, kind))
 
                 _write(write, messages, calibration, clouds, whites)
-            return (folder / BAG).read_bytes()
+            return (folder / FORMAT.name).read_bytes()
 
 
 def _write(
@@ -110,21 +115,8 @@ def _write(
 
 
 def device_of(pinhole: Pinhole) -> Device:
-    """A device as messages have it."""
+    """Convert a device to the form of `slrig.ros_messages`."""
     size = pinhole.size
     return Device(
         size.width_px, size.height_px, pinhole.matrix, pinhole.distortion, pinhole.rotation, pinhole.translation_mm
     )
-
-
-def white_images(bundle: BundleFiles) -> dict[str, Pixels]:
-    """The first white frame of each camera that has one; in colour, where it was recorded so.
-    Raises BundleError.
-    """
-    outline = bundle.outline
-    order: dict[str, int] = {}
-    for index, shot in enumerate(outline.shots):
-        if isinstance(outline.patterns[shot.pattern], White):
-            order.setdefault(shot.camera, index)
-    shots = bundle.shots(list(order.values()))
-    return {shot.camera: shot.image if shot.colour is None else shot.colour for shot in shots}

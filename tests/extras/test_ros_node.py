@@ -17,9 +17,10 @@ import httpx2
 import numpy as np
 import pytest
 
-from slrig.client import Client, ros2
-from slrig.client.ros2 import ScanNode, main
+from slrig.client import Client
 from slrig.errors import ConfigError
+from slrig.extras import ros_node
+from slrig.extras.ros_node import ScanNode, main
 from tests.ros_readers import colours, library, point_columns, seen_at
 from tests.unit.client.service import HERE, SCAN, client_of, event_answer, stream
 
@@ -39,6 +40,8 @@ DONE = {
     "started_at": "2026-03-04T05:06:07.250000Z",
     "links": {**SCAN["links"], "files": FILES},
 }
+
+pytestmark = pytest.mark.slow
 
 
 @dataclass
@@ -203,4 +206,4 @@ def test_the_node_runs_until_it_is_stopped(node: FakeNode, monkeypatch: pytest.M
 
 def test_a_calibration_without_a_projector_has_its_cameras() -> None:
     told = json.loads(json.dumps({**CALIBRATION, "projector": None}))
-    assert list(ros2._devices(told)) == ["left-2"]
+    assert list(ros_node._devices(told)) == ["left-2"]

@@ -1,23 +1,30 @@
-"""A cloud in a camera's grid as E57 (ASTM E2807), the format of scanners and surveyors, by pye57."""
+"""A cloud in a camera's grid as E57 (ASTM E2807), the format of surveyors, written by pye57."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from slrig.disk import refusals_of
 from slrig.errors import ExtraMissingError, NothingToReconstructError, StorageError
-from slrig.scan.offered import extra_of
-from slrig.scan.organised import OrganisedCloud
+from slrig.plugins import FileFormat
+
+if TYPE_CHECKING:
+    from slrig.scan.organised import OrganisedCloud
+
+FORMAT = FileFormat(
+    "points-{camera}.e57", "model/e57", "pye57", "pip install 'slrig[e57]'", "slrig.extras.e57:encode_e57"
+)
 
 _METRES_PER_MM = 0.001
 
 
 def encode_e57(cloud: OrganisedCloud) -> bytes:
-    """One scan of the points that are there, in metres, as the standard has it, in the world's axes, with sRGB colours
-    and the row and column of each. The format has no normals of its own. Two files of one cloud differ in their GUIDs.
+    """Encode the points that exist in metres, in the world's axes, with sRGB colours, row and column; without normals.
+    Two files of one cloud differ in their GUIDs.
 
     Raises
     ------
@@ -26,17 +33,17 @@ def encode_e57(cloud: OrganisedCloud) -> bytes:
     NothingToReconstructError
         There is no point.
     StorageError
-        The folder for temporary files refused: the library writes files only.
+        The folder for temporary files cannot be written; the library writes files only.
     """
     try:
         from pye57 import E57
         from pye57.libe57 import E57Exception
     except ImportError as cause:
-        message = f"points-{cloud.camera}.e57 is written by pye57, which is missing: {extra_of('.e57')}"
+        message = f"points-{cloud.camera}.e57 is written by pye57, which is missing: {FORMAT.install}"
         raise ExtraMissingError(message) from cause
     rows, columns = np.nonzero(cloud.cause == 0)
     if not len(rows):
-        message = f"camera '{cloud.camera}' sees nothing of the mesh, and E57 has no form for a scan without points"
+        message = f"camera '{cloud.camera}' sees nothing of the mesh, and E57 cannot hold a scan without points"
         raise NothingToReconstructError(message)
     points = cloud.points_mm[rows, columns] * np.float32(_METRES_PER_MM)
     colours = cloud.colour[rows, columns]

@@ -1,7 +1,7 @@
 """Jobs as OpenTelemetry traces: a span for each job, and below it one for each of its stages.
 
-Built from the record of a job when it ends: nothing of this is in the way of a job, and without OpenTelemetry's own
-variables in the environment nothing of it is loaded.
+Built from the record of a job when it ends. Without OpenTelemetry's own variables in the environment the library is not
+loaded.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
 
 _END_S = 2.0
-"""How long the end of the service waits for a collector to take the last spans."""
+"""Longest wait for a collector to take the last spans when the service ends."""
 
 
 def traces_by_environment() -> Traces | None:
-    """Where traces go by OpenTelemetry's own variables; None where they name no collector, or switch it off.
-    Raises ConfigError: they name one, and the extra is not installed.
+    """Return the sender of traces that OpenTelemetry's variables configure; None without a collector or if disabled.
+    Raises ConfigError: the extra is not installed.
     """
     named = next((name for name in _ENDPOINTS if os.environ.get(name)), None)
     off = os.environ.get("OTEL_SDK_DISABLED", "").strip().lower() == "true"
@@ -54,14 +54,14 @@ def traces_by_environment() -> Traces | None:
 
 
 class Traces:
-    """Sends each job that ended as a trace. Any thread may call; `close` at the end."""
+    """Sends each ended job as a trace. Thread-safe; call `close` at the end."""
 
     def __init__(self, provider: TracerProvider) -> None:
         self._provider = provider
         self._tracer = provider.get_tracer("slrig")
 
     def ended(self, record: JobRecord, events: Sequence[JobEvent]) -> None:
-        """Have a job sent. Returns at once."""
+        """Send a job's trace in the background."""
         from opentelemetry.context import Context
         from opentelemetry.trace import Status, StatusCode, set_span_in_context
 
@@ -73,7 +73,7 @@ class Traces:
         }
         if record.parent is not None:
             attributes["slrig.job.parent"] = str(record.parent)
-        # An empty context: whatever request or job this thread is at is not its parent.
+        # An empty context: the request or job of this thread is not its parent.
         job = self._tracer.start_span(
             str(record.kind), Context(), start_time=_nanoseconds(record.created_at), attributes=attributes
         )
@@ -91,7 +91,7 @@ class Traces:
         job.end(_nanoseconds(record.finished_at or record.created_at))
 
     def close(self) -> None:
-        """Send what was not sent yet; a collector that does not answer is not waited for. Idempotent."""
+        """Send the remaining spans; give up on a collector that does not answer. Idempotent."""
         ending = threading.Thread(target=self._provider.shutdown, name="slrig-traces", daemon=True)
         ending.start()
         ending.join(_END_S)

@@ -1,0 +1,81 @@
+"""What packages add to slrig by entry points. slrig's own additions are in `slrig.extras`; nothing else imports them.
+
+| group | name of the entry | object |
+|---|---|---|
+| slrig.formats | any | a `FileFormat`: a file that is made of a finished scan on request |
+| slrig.receivers | X, with the setting `X_url` | `open(settings, outbox) -> slrig.schedule.sending.Sender` |
+| slrig.observers | any | `observe()`, which returns None or an object with `ended(record, events)` and `close()` |
+
+Drivers have groups of their own: see `slrig.discovery`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from slrig.errors import ConfigError
+
+FORMATS, RECEIVERS, OBSERVERS = "slrig.formats", "slrig.receivers", "slrig.observers"
+
+
+@dataclass(frozen=True, slots=True)
+class FileFormat:
+    """A file that the worker makes of a finished scan when it is first requested.
+
+    name : of the file, such as "scan.mcap"; with "{camera}" there is one file for each camera. media_type : for HTTP.
+    library : the module that the encoder needs. install : the command that installs it. encoder : "module:function".
+    With "{camera}" the function takes a `slrig.scan.organised.OrganisedCloud`; without, the calibration, an iterator of
+    such clouds, the first white image by camera, and the time of capture or None. It returns the file's bytes.
+    """
+
+    name: str
+    media_type: str
+    library: str
+    install: str
+    encoder: str
+
+    @property
+    def missing(self) -> str | None:
+        """The command that installs the library; None if it is installed."""
+        return None if importlib.util.find_spec(self.library) is not None else self.install
+
+    def load(self) -> Callable[..., bytes]:
+        """Import the encoder."""
+        module, _, function = self.encoder.partition(":")
+        encode: Callable[..., bytes] = getattr(importlib.import_module(module), function)
+        return encode
+
+
+@cache
+def load(group: str) -> Mapping[str, Any]:
+    """Return the objects of a group by the names of their entries, in the order of names.
+
+    Raises
+    ------
+    ConfigError
+        One cannot be imported: the message names its package and the cause.
+    """
+    objects = {}
+    for entry in sorted(importlib.metadata.entry_points(group=group), key=lambda entry: entry.name):
+        try:
+            objects[entry.name] = entry.load()
+        except Exception as error:
+            package = "unknown" if entry.dist is None else entry.dist.name
+            cause = f"{type(error).__name__}: {error}"
+            message = (
+                f"{group}: '{entry.name}' of the package '{package}' cannot be loaded: {cause}. Update or uninstall "
+                "that package."
+            )
+            raise ConfigError(message) from error
+    return objects
+
+
+def formats() -> tuple[FileFormat, ...]:
+    """File formats of all installed packages. Raises ConfigError."""
+    return tuple(load(FORMATS).values())

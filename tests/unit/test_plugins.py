@@ -1,0 +1,45 @@
+"""Entry points of plug-ins: what is found, and a package that cannot be loaded."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Iterator
+
+import pytest
+
+from slrig import plugins
+from slrig.errors import ConfigError
+from slrig.scan.offered import missing_for, on_demand, requested_forms
+
+
+@pytest.fixture
+def entries(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[importlib.metadata.EntryPoint]]:
+    """Entry points of one group in place of the installed ones."""
+    found: list[importlib.metadata.EntryPoint] = []
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [e for e in found if e.group == group])
+    plugins.load.cache_clear()
+    yield found
+    plugins.load.cache_clear()
+
+
+def test_a_format_of_a_plugin_is_offered_and_names_what_it_needs(entries: list[importlib.metadata.EntryPoint]) -> None:
+    entries.append(importlib.metadata.EntryPoint("stl", f"{__name__}:FORMAT", plugins.FORMATS))
+    assert "cloud-{camera}.xyz" in requested_forms()
+    assert on_demand("cloud-left.xyz", ["right", "left"]) == ("cloud-{camera}.xyz", "left")
+    assert missing_for("cloud-left.xyz") == "pip install xyz"
+    assert FORMAT.load() is encode
+
+
+def test_a_plugin_that_cannot_be_loaded_is_named(entries: list[importlib.metadata.EntryPoint]) -> None:
+    entries.append(importlib.metadata.EntryPoint("broken", "slrig.no_such_module:x", plugins.RECEIVERS))
+    with pytest.raises(ConfigError, match=r"slrig\.receivers: 'broken' .* cannot be loaded: ModuleNotFoundError"):
+        plugins.load(plugins.RECEIVERS)
+
+
+def encode(_cloud: object) -> bytes:
+    return b""
+
+
+FORMAT = plugins.FileFormat(
+    "cloud-{camera}.xyz", "text/plain", "no_such_library", "pip install xyz", f"{__name__}:encode"
+)
