@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.meshing.surface import vertex_normals
 from slrig.model import FloatArray, IntArray, Mesh
-from slrig.views.turntable import turntable
+from slrig.multiview.turntable import turntable
 from tests.unit.meshing.plain import grid_faces, mesh_of
 
 Radius = Callable[[FloatArray], FloatArray]

@@ -8,7 +8,7 @@ from slrig.calibration.board import Board
 from slrig.calibration.health.drift import board_poses
 from slrig.calibration.observations import PoseObservation
 from slrig.model import Calibration
-from slrig.views import BoardAxis, board_axis
+from slrig.multiview import BoardAxis, board_axis
 
 
 def axis_of_poses(

@@ -22,11 +22,7 @@ from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
 from slrig.kernels import compilations_told
 from slrig.meshing import open_borders
 from slrig.model import AlbedoMark, Mesh, StagePlane
-from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
-from slrig.scan.mesh_formats import encode_mesh_glb
-from slrig.scan.plan import Progress
-from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
-from slrig.views import (
+from slrig.multiview import (
     FoundAxis,
     FusedModel,
     MarkerFit,
@@ -41,6 +37,10 @@ from slrig.views import (
     registered_on_stage,
     registered_poses,
 )
+from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
+from slrig.scan.mesh_formats import encode_mesh_glb
+from slrig.scan.plan import Progress
+from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
 
 _SURFACE_POINTS = 500  # of a view, at which it is told how well markers put it
 _START_SIGMAS = 3.0  # of starts by markers, that have to lie within the start's error

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from slrig.combine.combining import read_mesh
 from slrig.model import StageAxis, StagePlane
-from slrig.views import stage_planes
+from slrig.multiview import stage_planes
 
 
 def planes_in(mesh: Path, axis: StageAxis | None) -> tuple[StagePlane, ...]:

@@ -22,9 +22,9 @@ from slrig.calibration.boards.printing import marker_dictionary
 from slrig.calibration.boards.sightings import markers_in
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, White
+from slrig.multiview import SeenMarker, fitted_plane
 from slrig.reconstruction import project, rays
 from slrig.scan.artefacts import MESH
-from slrig.views import SeenMarker, fitted_plane
 
 _REACH = 0.7
 """Of a module, from a marker's corner: inwards is its border, one wide, outwards paper, by a ChArUco board's least."""

@@ -19,7 +19,7 @@ from slrig.disk import refusals_of
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.records import utc_now
 from slrig.model import MeasuredAxis, StagePlane
-from slrig.views import MOST_SIGMAS, Noted, noted
+from slrig.multiview import MOST_SIGMAS, Noted, noted
 
 _FILE = "stage.json"
 _log = structlog.get_logger(__name__)

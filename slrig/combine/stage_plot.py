@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from slrig.bundle.options import AxisSource, ChangeEntry
+from slrig.multiview import FAR_MM
 from slrig.reports.drawing import shape
 from slrig.reports.trend import (
     END,
@@ -23,7 +24,6 @@ from slrig.reports.trend import (
     times,
     trend,
 )
-from slrig.views import FAR_MM
 
 _HEIGHT = 470.0
 _COLOURS = {AxisSource.BOARD: GREY, AxisSource.DOCUMENT: GREY, AxisSource.MODEL: GREEN}

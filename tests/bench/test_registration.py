@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray, Mesh
-from slrig.views.fusion import fused, registered_poses
-from slrig.views.registration import registered
-from slrig.views.turntable import turntable
-from tests.unit.views.known_views import Noise, star, views_of
+from slrig.multiview.fusion import fused, registered_poses
+from slrig.multiview.registration import registered
+from slrig.multiview.turntable import turntable
+from tests.unit.multiview.known_views import Noise, star, views_of
 
 TILT_DEG = 25.0  # from which the camera looks down
 

@@ -10,8 +10,8 @@ import trimesh
 
 from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import TopologyCounts, topology_counts
-from slrig.views.fusion import fused
-from tests.unit.views.known_views import around, plate_on_box, star, torus, views_of
+from slrig.multiview.fusion import fused
+from tests.unit.multiview.known_views import around, plate_on_box, star, torus, views_of
 
 # 20 mm in size; a point each 0.12 mm, so that voxels are of 0.17 mm; σ from 10 µm and 4 µm that neighbours share.
 PIXEL_MM = 0.12

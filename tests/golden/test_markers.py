@@ -14,7 +14,7 @@ from slrig.bundle.options import StageRecord, encode_stage, read_poses
 from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
 from slrig.model import PlaneKind, StagePlane
-from slrig.views.turntable import cut, turntable
+from slrig.multiview.turntable import cut, turntable
 from tests.golden.test_stage import AXIS as STAGE_AXIS
 from tests.golden.test_stage import VASE, scanned
 from tests.turned_views import displacement_mm

@@ -18,10 +18,10 @@ from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
 from slrig.devices import CameraSettings, Rig, Turntable
 from slrig.model import PlaneKind, StageAxis
+from slrig.multiview.registration import registered
+from slrig.multiview.turntable import cut, stage_planes, turntable
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
-from slrig.views.registration import registered
-from slrig.views.turntable import cut, stage_planes, turntable
 from tests.golden.test_bundles import reconstructed
 from tests.rendered_boards import board_head, board_options, board_rig, board_scene
 from tests.turned_views import displacement_mm

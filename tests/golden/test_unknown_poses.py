@@ -10,11 +10,11 @@ import pytest
 
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray
-from slrig.views.registration import registered
-from slrig.views.unknown_poses import found_starts
+from slrig.multiview.registration import registered
+from slrig.multiview.unknown_poses import found_starts
 from tests.ten_objects import OBJECTS, SYMMETRIC, seen_around, seen_from
 from tests.turned_views import displacement_mm
-from tests.unit.views.known_views import View, around
+from tests.unit.multiview.known_views import View, around
 
 HELD = ("figure", "flange", "bossed box")
 ALIKE_MM = 0.002

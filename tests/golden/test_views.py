@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray
-from slrig.views.fusion import fused, registered_poses
-from slrig.views.matching import moved
-from slrig.views.matching import turned as turned_by
-from slrig.views.registration import Registration, registered
-from slrig.views.turntable import found_axis, registered_on_stage, turntable
+from slrig.multiview.fusion import fused, registered_poses
+from slrig.multiview.matching import moved
+from slrig.multiview.matching import turned as turned_by
+from slrig.multiview.registration import Registration, registered
+from slrig.multiview.turntable import found_axis, registered_on_stage, turntable
 from tests.turned_views import AXIS, bumpy, displacement_mm, off_surface_mm, seen, wrong_axis
-from tests.unit.views.known_views import Noise, plate_on_box, views_of
+from tests.unit.multiview.known_views import Noise, plate_on_box, views_of
 
 UP: FloatArray = np.array([0.0, 0.0, 1.0])
 ANGLES = [45.0 * number for number in range(8)]

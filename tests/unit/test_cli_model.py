@@ -22,14 +22,14 @@ from slrig.combine.stage import with_axis
 from slrig.devices import Rig
 from slrig.errors import ConfigError, DeviceGoneError, ServiceError
 from slrig.model import MeasuredAxis, PlaneKind, StagePlane
+from slrig.multiview import registration
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.scan.plan import ScanPlan
-from slrig.views import registration
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, seen, vase
 from tests.unit.capture.fake_rig import FakeTurntable, fake_rig
 from tests.unit.command import done, refused, slrig
-from tests.unit.views.test_stage_planes import AXIS as PLATE_AXIS
-from tests.unit.views.test_stage_planes import PLATE, WALL, joined
+from tests.unit.multiview.test_stage_planes import AXIS as PLATE_AXIS
+from tests.unit.multiview.test_stage_planes import PLATE, WALL, joined
 
 ANGLE = 40.0
 STAGE = [

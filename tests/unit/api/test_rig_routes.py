@@ -24,15 +24,15 @@ from slrig.jobs.database import Database
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind, JobState
 from slrig.jobs.store import JobStore
+from slrig.multiview.turntable import BoardAxis, board_axis, stage_planes
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
-from slrig.views.turntable import BoardAxis, board_axis, stage_planes
 from tests.unit.accept.test_desk import PLAN, desk, desks, queue
 from tests.unit.api.conftest import app_of, refusal
 from tests.unit.jobs.tame_queue import TameQueue
+from tests.unit.multiview.test_stage_axis import SIX_DEG, shot
+from tests.unit.multiview.test_stage_planes import AXIS, PLATE
 from tests.unit.verify.test_verification import TAME, queue_of
-from tests.unit.views.test_stage_axis import SIX_DEG, shot
-from tests.unit.views.test_stage_planes import AXIS, PLATE
 
 __all__ = ["desk", "desks", "queue"]
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from slrig.calibration.board import USUAL_BOARD
 from slrig.errors import StageRefusedError
 from slrig.model import FloatArray, MeasuredAxis
-from slrig.views.turntable import BoardAxis, board_axis, noted
+from slrig.multiview.turntable import BoardAxis, board_axis, noted
 
 POINT_MM = np.array([12.0, 60.0, 480.0])
 DIRECTION = np.array([0.05, -0.93, -0.36]) / np.linalg.norm([0.05, -0.93, -0.36])

@@ -15,7 +15,7 @@ from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing import nearest_on_triangle, neighbours, used_vertices
 from slrig.model import FloatArray, IntArray, Mesh
-from slrig.views.matching import moved, turned
+from slrig.multiview.matching import moved, turned
 
 _SHARP = 0.8  # cosine of 37°: noise turns normals less from vertex to vertex
 # Of the quadric's trace: holds a vertex in place along the edge, and where noise makes an edge of a surface. Of a box

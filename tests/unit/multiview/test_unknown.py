@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slrig.errors import RegistrationRefusedError
-from slrig.views.matching import evidence, moved, seen_by
-from slrig.views.unknown_poses import found_starts, rigid
+from slrig.multiview.matching import evidence, moved, seen_by
+from slrig.multiview.unknown_poses import found_starts, rigid
 from tests.ten_objects import OBJECTS, seen_from
 from tests.turned_views import displacement_mm
-from tests.unit.views.known_views import View
+from tests.unit.multiview.known_views import View
 
 ANGLES = np.deg2rad([0.0, 45.0, 90.0])
 FROM = np.stack([np.cos(ANGLES), np.sin(ANGLES), np.full(3, 0.4)], axis=1) / np.hypot(1, 0.4)

@@ -1,22 +1,22 @@
 """Several meshes of one object: registration, markers, turntable, fusion."""
 
-from slrig.views.fusion import (
+from slrig.multiview.fusion import (
     FusedModel,
     fused,
     put_together,
     registered_poses,
 )
-from slrig.views.markers import (
+from slrig.multiview.markers import (
     MarkerFit,
     MarkersSeen,
     SeenMarker,
     marker_poses,
 )
-from slrig.views.registration import (
+from slrig.multiview.registration import (
     Registration,
     registered,
 )
-from slrig.views.turntable import (
+from slrig.multiview.turntable import (
     FAR_MM,
     MOST_SIGMAS,
     BoardAxis,
@@ -29,7 +29,7 @@ from slrig.views.turntable import (
     registered_on_stage,
     stage_planes,
 )
-from slrig.views.unknown_poses import (
+from slrig.multiview.unknown_poses import (
     found_starts,
 )
 

@@ -10,9 +10,9 @@ import pytest
 from slrig.errors import RegistrationRefusedError
 from slrig.meshing.topology import boundary_vertices
 from slrig.model import AlbedoMark, FloatArray, Mesh
-from slrig.views.matching import side_of
-from slrig.views.registration import Motion, registered
-from slrig.views.turntable import found_axis, turntable
+from slrig.multiview.matching import side_of
+from slrig.multiview.registration import Motion, registered
+from slrig.multiview.turntable import found_axis, turntable
 from tests.turned_views import AXIS, AXIS_POINT_MM, Turned, bumpy, displacement_mm, plane, seen, vase, wrong_axis
 from tests.unit.meshing.plain import grid_faces, mesh_of
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray
-from slrig.views.markers import MarkerFit, MarkersSeen, SeenMarker, marker_poses
-from slrig.views.turntable import turntable
+from slrig.multiview.markers import MarkerFit, MarkersSeen, SeenMarker, marker_poses
+from slrig.multiview.turntable import turntable
 from tests.turned_views import AXIS, AXIS_POINT_MM
 
 POSES = turntable(AXIS_POINT_MM, AXIS, np.deg2rad(45.0 * np.arange(8)))

@@ -7,8 +7,8 @@ import pytest
 
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, IntArray
-from slrig.views.fusion_grid import Grid, brick_key
-from slrig.views.fusion_mesh import Net, net
+from slrig.multiview.fusion_grid import Grid, brick_key
+from slrig.multiview.fusion_mesh import Net, net
 
 # Only models of several views need these kernels.
 pytestmark = pytest.mark.slow

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
-from slrig.views.fusion_grid import CELLS, Grid, cell_beside, corner_of, corners_mm
+from slrig.multiview.fusion_grid import CELLS, Grid, cell_beside, corner_of, corners_mm
 
 _BITS = (4, 2, 1)  # of a corner of a cell: x, y, z
 _EDGES = np.array([(c, c | bit) for bit in _BITS for c in range(8) if not c & bit])

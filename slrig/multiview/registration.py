@@ -1,9 +1,9 @@
 """Several views of one object into one frame: all pairs at once, point to plane, each residual over its own deviation.
 
-The poses T_i minimise Σ ρ(r / σ) over the matches of all pairs of views (`slrig.views.matching`), Huber's ρ, by Gauss
-and Newton's steps; matches are looked for anew after each step (Chen and Medioni 1992; for all views at once Pulli
-1999). View 0 stands still. A match's residual may be as large as the start's error at first, and no larger than four
-deviations of all residuals then. Directions that no surface tells of are held as the start has them.
+The poses T_i minimise Σ ρ(r / σ) over the matches of all pairs of views (`slrig.multiview.matching`), Huber's ρ, by
+Gauss and Newton's steps; matches are looked for again after each step (Chen and Medioni 1992; for all views at once
+Pulli 1999). View 0 stands still. A match's residual may be as large as the start's error at first, and no larger than
+four deviations of all residuals then. Directions that no surface tells of are held as the start has them.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray, Mesh
-from slrig.views.markers import moved_by
-from slrig.views.matching import Matches, Side, Terms, assembled, inflation, matched, moved, side_of, terms_of
+from slrig.multiview.markers import moved_by
+from slrig.multiview.matching import Matches, Side, Terms, assembled, inflation, matched, moved, side_of, terms_of
 
 _LEAST_SHARE = 0.5
 """Of the information along a direction, what both surfaces have to agree on."""

@@ -7,8 +7,8 @@ import pytest
 
 from slrig.meshing.quality import SearchTree
 from slrig.model import FloatArray
-from slrig.views.fusion import AGREEING_SIGMAS, PoseErrors, Rule, mean_values
-from slrig.views.fusion_grid import (
+from slrig.multiview.fusion import AGREEING_SIGMAS, PoseErrors, Rule, mean_values
+from slrig.multiview.fusion_grid import (
     Sheets,
     corners_mm,
     grid_about,
@@ -17,7 +17,7 @@ from slrig.views.fusion_grid import (
     sheets,
     wanted_corners,
 )
-from tests.unit.views.known_views import around, plate_on_box, views_of
+from tests.unit.multiview.known_views import around, plate_on_box, views_of
 
 # Only models of several views need these kernels.
 pytestmark = pytest.mark.slow

@@ -1,7 +1,7 @@
 """Initial poses of views without any known pose: found from the surfaces, or refused.
 
 Each pair of views yields candidate poses. Starting from the pair that agrees best, views are added while all of their
-surfaces agree (`slrig.views.matching`). Then each view, and each group that a single pair connects to the rest, is
+surfaces agree (`slrig.multiview.matching`). Then each view, and each group that a single pair connects to the rest, is
 tried at its other candidates. It moves where that agrees better; where another answer agrees nearly as well, both are
 rejected as ambiguous.
 """
@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray, IntArray, Mesh
-from slrig.views.matching import SAMPLE, Evidence, Facing, Seen, Side, evidence, fitted, moved, seen_by
-from slrig.views.registration import registered
+from slrig.multiview.matching import SAMPLE, Evidence, Facing, Seen, Side, evidence, fitted, moved, seen_by
+from slrig.multiview.registration import registered
 
 _SUPPORT = 2500
 """Vertices of a view that stand for its surface."""

@@ -12,10 +12,10 @@ from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import AlbedoMark, FloatArray, Mesh
 from slrig.model.surfaces import light_of, srgb_of
-from slrig.views.fusion import _FOLDED, _OUTWARD, FusedModel, PoseErrors, Rule, _halve, fused, mean_values
-from slrig.views.fusion_grid import sheets
+from slrig.multiview.fusion import _FOLDED, _OUTWARD, FusedModel, PoseErrors, Rule, _halve, fused, mean_values
+from slrig.multiview.fusion_grid import sheets
 from tests.unit.meshing.plain import grid_faces, mesh_of
-from tests.unit.views.known_views import Noise, View, around, star, views_of
+from tests.unit.multiview.known_views import Noise, View, around, star, views_of
 
 # Only models of several views need these kernels.
 pytestmark = pytest.mark.slow

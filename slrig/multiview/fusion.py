@@ -28,7 +28,7 @@ from slrig.meshing import (
 from slrig.model import AlbedoMark, FloatArray, IntArray, Mesh
 from slrig.model.rig import require
 from slrig.model.surfaces import light_of, srgb_of
-from slrig.views.fusion_grid import (
+from slrig.multiview.fusion_grid import (
     SEEN_BEYOND,
     Grid,
     Sheets,
@@ -41,8 +41,8 @@ from slrig.views.fusion_grid import (
     sheets,
     wanted_corners,
 )
-from slrig.views.fusion_mesh import Net, net
-from slrig.views.matching import moved, turned
+from slrig.multiview.fusion_mesh import Net, net
+from slrig.multiview.matching import moved, turned
 
 AGREEING_SIGMAS = 4.0  # one honest difference in 16 000 is beyond
 _SAME_SIDE = 0.5  # cosine: noise turns a triangle by some 10°, and faces of a box are 90° apart

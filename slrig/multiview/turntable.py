@@ -1,7 +1,7 @@
 """Axis and angles of a turntable, from a board or planes at several angles, and its change over time.
 
 Where a board's poses B_i are those of one body that a stage turned, T_i = B_0 B_i⁻¹ turns about the axis, as the poses
-of views do: both are fitted by `slrig.views.turntable`.
+of views do: both are fitted by `slrig.multiview.turntable`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from slrig.errors import StageRefusedError
 from slrig.meshing import used_vertices
 from slrig.model import FloatArray, MeasuredAxis, Mesh, PlaneKind, StageAxis, StagePlane
-from slrig.views.registration import START_ERROR_MM, Registration, registered
+from slrig.multiview.registration import START_ERROR_MM, Registration, registered
 
 FAR_MM = 50.0
 """How far from the object's middle, along the axis, a difference of two axes is told."""

@@ -7,7 +7,7 @@ import pytest
 
 from slrig.errors import StageRefusedError
 from slrig.model import FloatArray, Mesh, PlaneKind, StageAxis
-from slrig.views.turntable import cut, stage_planes
+from slrig.multiview.turntable import cut, stage_planes
 from tests.unit.meshing.plain import grid_faces, joined, mesh_of
 
 __all__ = ["AXIS", "PLATE", "WALL", "joined"]
