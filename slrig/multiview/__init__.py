@@ -1,59 +1,44 @@
 """Several meshes of one object: registration, markers, turntable, fusion."""
 
-from slrig.multiview.fusion import (
-    FusedModel,
-    fused,
-    put_together,
-    registered_poses,
-)
-from slrig.multiview.markers import (
-    MarkerFit,
-    MarkersSeen,
-    SeenMarker,
-    marker_poses,
-)
-from slrig.multiview.registration import (
-    Registration,
-    registered,
-)
+from slrig.multiview.fusion import FusedModel, PoseErrors, concatenate_views, fuse_views
+from slrig.multiview.markers import MarkerFit, MarkerObservation, MarkerObservations, marker_poses
+from slrig.multiview.registration import Registration, register_views
 from slrig.multiview.turntable import (
-    FAR_MM,
-    MOST_SIGMAS,
+    AXIS_SPAN_MM,
+    MAX_AXIS_SIGMAS,
+    AxisUpdate,
     BoardAxis,
-    FoundAxis,
-    Noted,
-    board_axis,
-    cut,
-    fitted_plane,
-    noted,
-    registered_on_stage,
-    stage_planes,
+    TurntableAxis,
+    axis_from_board,
+    cut_view,
+    find_turntable_planes,
+    fit_plane,
+    register_on_turntable,
+    update_axis,
 )
-from slrig.multiview.unknown_poses import (
-    found_starts,
-)
+from slrig.multiview.unknown_poses import find_start_poses
 
 __all__ = [
-    "FAR_MM",
-    "MOST_SIGMAS",
+    "AXIS_SPAN_MM",
+    "MAX_AXIS_SIGMAS",
+    "AxisUpdate",
     "BoardAxis",
-    "FoundAxis",
     "FusedModel",
     "MarkerFit",
-    "MarkersSeen",
-    "Noted",
+    "MarkerObservation",
+    "MarkerObservations",
+    "PoseErrors",
     "Registration",
-    "SeenMarker",
-    "board_axis",
-    "cut",
-    "fitted_plane",
-    "found_starts",
-    "fused",
+    "TurntableAxis",
+    "axis_from_board",
+    "concatenate_views",
+    "cut_view",
+    "find_start_poses",
+    "find_turntable_planes",
+    "fit_plane",
+    "fuse_views",
     "marker_poses",
-    "noted",
-    "put_together",
-    "registered",
-    "registered_on_stage",
-    "registered_poses",
-    "stage_planes",
+    "register_on_turntable",
+    "register_views",
+    "update_axis",
 ]

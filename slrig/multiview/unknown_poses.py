@@ -1,9 +1,10 @@
 """Initial poses of views without any known pose: found from the surfaces, or refused.
 
-Each pair of views yields candidate poses. Starting from the pair that agrees best, views are added while all of their
-surfaces agree (`slrig.multiview.matching`). Then each view, and each group that a single pair connects to the rest, is
-tried at its other candidates. It moves where that agrees better; where another answer agrees nearly as well, both are
-rejected as ambiguous.
+Spin images of keypoints (Johnson and Hebert 1999, "Using spin images for efficient object recognition in cluttered 3D
+scenes") yield candidate poses of each pair of views. Starting from the pair that agrees best, views are added while all
+of their surfaces agree (`slrig.multiview.matching`). Then each view, and each group that a single pair connects to the
+rest, is tried at its other candidates. It moves where that agrees better; where another answer agrees nearly as well,
+both are rejected as ambiguous.
 """
 
 from __future__ import annotations
@@ -20,77 +21,87 @@ from scipy.spatial.transform import Rotation
 
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray, IntArray, Mesh
-from slrig.multiview.matching import SAMPLE, Evidence, Facing, Seen, Side, evidence, fitted, moved, seen_by
-from slrig.multiview.registration import registered
+from slrig.multiview.matching import (
+    SAMPLE,
+    PoseEvidence,
+    PreparedView,
+    ViewPair,
+    ViewWithDepth,
+    align_views,
+    compare_views,
+    prepare_with_depth,
+    transform_points,
+)
+from slrig.multiview.registration import Pair, register_views
 
-_SUPPORT = 2500
-"""Vertices of a view that stand for its surface."""
+_SUPPORT_VERTICES = 2500
+"""Vertices of a view that represent its surface."""
 _KEYPOINTS = 500
 _RADII = (0.25, 0.12)
-"""Of a spin image, by the square root of the area that a view sees: of parts of the object, and of details."""
-_SMOOTHED = 0.7
-"""Of a cell, the radius that a keypoint's normal is the mean of."""
+"""Radii of spin images, over the square root of a view's area: for parts of the object, and for details."""
+_NORMAL_RADIUS = 0.7
+"""Radius, in keypoint spacings, over which a keypoint's normal is averaged."""
 _ACROSS, _ALONG = 8, 12
 
 
 @dataclass(frozen=True, slots=True)
 class Keypoints:
-    """Places of a view, one in each cell of a grid, in the view's frame.
+    """Keypoints of a view, one in each cell of a grid, in the view's frame.
 
-    points_mm, normals : (k, 3) float64; spins : (k, d) float32, unit, whose products are the likeness of two places.
+    points_mm, normals : (k, 3) float64; spin_images : (k, d) float32, unit: their products are similarities.
     """
 
     points_mm: FloatArray
     normals: FloatArray
-    spins: FloatArray
+    spin_images: FloatArray
 
 
-def seen_mm2(view: Mesh) -> FloatArray:
-    """(V,) float64: the area of surface that each vertex stands for."""
+def vertex_areas_mm2(view: Mesh) -> FloatArray:
+    """(V,) float64: a third of the area of the triangles at each vertex."""
     a, b, c = (view.vertices_mm[view.faces[:, corner]].astype(np.float64) for corner in range(3))
     third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
     sums = np.bincount(view.faces.ravel(), np.repeat(third, 3), len(view.vertices_mm))
     return np.asarray(sums, dtype=np.float64)
 
 
-def cell_mm(area_mm2: float) -> float:
-    """Edge of the grid that keypoints are chosen by, where a view sees so much surface."""
+def keypoint_spacing_mm(area_mm2: float) -> float:
+    """Edge of the grid's cells for a view with this area."""
     return float(np.sqrt(area_mm2 / _KEYPOINTS))
 
 
-def keypoints(side: Side, weights_mm2: FloatArray, area_mm2: float) -> Keypoints:
-    """Keypoints of a view. weights_mm2 : (V,), see `seen_mm2`; area_mm2 : what a view sees; the same for all views."""
-    chosen = side.order[:_SUPPORT]
-    points, normals = side.points_mm[chosen], side.normals[chosen]
-    # Fewer vertices than there are stand for the same area.
-    weights = weights_mm2[chosen] * (weights_mm2[side.order].sum() / max(weights_mm2[chosen].sum(), 1e-12))
-    cell = cell_mm(area_mm2)
+def select_keypoints(view: PreparedView, weights_mm2: FloatArray, area_mm2: float) -> Keypoints:
+    """Select keypoints. weights_mm2 : (V,), see `vertex_areas_mm2`; area_mm2 : of a view, the same for all views."""
+    chosen = view.order[:_SUPPORT_VERTICES]
+    points, normals = view.points_mm[chosen], view.normals[chosen]
+    # The chosen vertices represent the area of all.
+    weights = weights_mm2[chosen] * (weights_mm2[view.order].sum() / max(weights_mm2[chosen].sum(), 1e-12))
+    cell = keypoint_spacing_mm(area_mm2)
     first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)[1]
     middles = points[first]
-    # A vertex's own normal has the noise of its neighbours: the mean over a cell tilts a spin image less.
-    which, other = np.nonzero(_squares(middles, points) < (_SMOOTHED * cell) ** 2)
+    # A mean normal has less noise than the vertex's own, and tilts a spin image less.
+    which, other = np.nonzero(_squared_distances(middles, points) < (_NORMAL_RADIUS * cell) ** 2)
     mean = np.zeros((len(middles), 3))
     for axis in range(3):
         mean[:, axis] = np.bincount(which, (normals[:, axis] * weights)[other], len(middles))
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    spins = [_spins(middles, mean, points, weights, share * float(np.sqrt(area_mm2))) for share in _RADII]
-    return Keypoints(middles, mean, np.hstack(spins) / np.sqrt(len(spins)))
+    images = [_spin_images(middles, mean, points, weights, share * float(np.sqrt(area_mm2))) for share in _RADII]
+    return Keypoints(middles, mean, np.hstack(images) / np.sqrt(len(images)))
 
 
-def _squares(a: FloatArray, b: FloatArray) -> FloatArray:
+def _squared_distances(a: FloatArray, b: FloatArray) -> FloatArray:
     """(k, n): squared distances of points (k, 3) from others (n, 3)."""
     return np.asarray((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T)
 
 
-def _spins(
+def _spin_images(
     middles: FloatArray, normals: FloatArray, points: FloatArray, weights: FloatArray, radius_mm: float
 ) -> FloatArray:
-    """(k, bins) float32, unit: square roots of shares of area, whose products are Bhattacharyya's coefficient."""
-    squares = _squares(middles, points)
+    """(k, bins) float32, unit: square roots of shares of area, so that products are Bhattacharyya coefficients."""
+    squares = _squared_distances(middles, points)
     which, other = np.nonzero(squares < radius_mm**2)
     along = ((points[other] - middles[which]) * normals[which]).sum(axis=1)
     across = np.sqrt(np.maximum(squares[which, other] - along**2, 0.0))
-    # Each point counts in the four bins about it by its nearness, so that a small shift changes little.
+    # Bilinear: each point counts in the four bins around it, so that small shifts change little.
     u = across / radius_mm * _ACROSS - 0.5
     v = (along / radius_mm + 1) / 2 * _ALONG - 0.5
     image = np.zeros(len(middles) * _ACROSS * _ALONG)
@@ -105,73 +116,74 @@ def _spins(
     return np.asarray(np.sqrt(shares), dtype=np.float32)
 
 
-_ALIKE = 3
-"""Of the other view, for each place of one: the likest, and as many of the next."""
-_OTHERS = 20
-"""Which one a place has to be clearly less like, to be a place that is known again: a plane is like itself all over."""
-_MOST_PAIRS = 600
-_TURNED = 0.25
-"""What a cosine of two normals may differ by."""
-_LEAST = 6
+_NEAREST_KEYPOINTS = 3
+"""Most similar keypoints of the other view that each keypoint is paired with."""
+_REFERENCE_RANK = 20
+"""Rank of the keypoint that a distinctive one has to be clearly less similar to: on a plane all are alike."""
+_MAX_PAIRS = 600
+_MAX_COSINE_DIFFERENCE = 0.25
+_MIN_PAIRS = 6
 """Pairs that agree on a pose: three determine it."""
-_LEAST_COSINE = 0.8
-_SPARSE = 12
-_CANDIDATES_APART = 3.0
-"""Poses nearer to one another are fitted to the same one, in what places may be apart."""
-_CANDIDATES_TRIED = 700
-"""Hypotheses: where one place of eight is a right one, so is one hypothesis of fifty, and it is found again."""
+_MIN_COSINE = 0.8
+_SPARSE_STEP = 12
+_CANDIDATE_SEPARATION = 3.0
+"""Distance of poses, over that of equal keypoints, below which alignment leads to the same pose."""
+_HYPOTHESES = 700
+"""Enough to find a pose again and again if one pair of keypoints in eight is right, and so one hypothesis in fifty."""
 
 
-def candidate_poses(first: Keypoints, second: Keypoints, *, within_mm: float, most: int) -> FloatArray:
-    """(c, 4, 4), c up to `most`: poses that take the first view to the second, those with most pairs first.
+def candidate_poses(first: Keypoints, second: Keypoints, *, within_mm: float, max_count: int) -> FloatArray:
+    """(c, 4, 4), c up to `max_count`: poses of the first view in the frame of the second, those with most pairs first.
 
-    within_mm : how far the same place may be apart in both, since keypoints are not chosen alike.
+    within_mm : distance of the same place in both views, since keypoints are selected independently.
     """
-    a, b = _alike(first.spins, second.spins)
+    a, b = _match_keypoints(first.spin_images, second.spin_images)
     p, q, m, n = first.points_mm[a], second.points_mm[b], first.normals[a], second.normals[b]
-    compatible = _compatible(p, q, m, n, within_mm)
+    compatible = _compatible_pairs(p, q, m, n, within_mm)
     ones, twos = np.nonzero(compatible)
     if not len(ones):
         return np.zeros((0, 4, 4))
-    # A pair of every place as often as that of any other, however many it is compatible with.
+    # Each pair is drawn equally often, however many others it is compatible with.
     share = 1 / compatible.sum(axis=1)[ones]
-    tried = np.random.default_rng(0).choice(len(ones), _CANDIDATES_TRIED, p=share / share.sum())
-    both = np.stack([ones[tried], twos[tried]], axis=1)
-    # Two places with their normals determine a pose: as four points do.
+    drawn = np.random.default_rng(0).choice(len(ones), _HYPOTHESES, p=share / share.sum())
+    both = np.stack([ones[drawn], twos[drawn]], axis=1)
+    # Two points with their normals determine a pose: as four points.
     arm = np.linalg.norm(p[both[:, 1]] - p[both[:, 0]], axis=1)[:, None, None]
-    poses = rigid(np.hstack([p[both], p[both] + arm * m[both]]), np.hstack([q[both], q[both] + arm * n[both]]))
-    agreeing = _agreeing(p, q, m, n, poses, within_mm)
-    counts = agreeing.sum(axis=1)
+    poses = rigid_motions(np.hstack([p[both], p[both] + arm * m[both]]), np.hstack([q[both], q[both] + arm * n[both]]))
+    consistent = _consistent_pairs(p, q, m, n, poses, within_mm)
+    counts = consistent.sum(axis=1)
     found: list[FloatArray] = []
     for each in np.argsort(-counts, kind="stable"):
-        if counts[each] < _LEAST or len(found) == most:
+        if counts[each] < _MIN_PAIRS or len(found) == max_count:
             break
-        if all(apart_mm(poses[each], other, p[::_SPARSE]) > _CANDIDATES_APART * within_mm for other in found):
-            found.append(rigid(p[agreeing[each]], q[agreeing[each]]))
+        distances = (pose_distance_mm(poses[each], other, p[::_SPARSE_STEP]) for other in found)
+        if all(distance > _CANDIDATE_SEPARATION * within_mm for distance in distances):
+            found.append(rigid_motions(p[consistent[each]], q[consistent[each]]))
     return np.array(found).reshape(-1, 4, 4)
 
 
-def apart_mm(pose: FloatArray, other: FloatArray, points_mm: FloatArray) -> float:
-    """Rms distance by which two poses (4, 4) part points (n, 3)."""
-    return float(np.sqrt(((moved(pose, points_mm) - moved(other, points_mm)) ** 2).sum(axis=1).mean()))
+def pose_distance_mm(pose: FloatArray, other: FloatArray, points_mm: FloatArray) -> float:
+    """Rms distance of points (n, 3) between two poses (4, 4)."""
+    apart = transform_points(pose, points_mm) - transform_points(other, points_mm)
+    return float(np.sqrt((apart**2).sum(axis=1).mean()))
 
 
-def _agreeing(
+def _consistent_pairs(
     p: FloatArray, q: FloatArray, m: FloatArray, n: FloatArray, poses: FloatArray, within_mm: float
 ) -> NDArray[np.bool_]:
-    """(h, k): which places, with their normals, poses (h, 4, 4) take to one another."""
+    """(h, k): True if pose h (4, 4) takes point k, with its normal, to its partner."""
     turns = poses[:, :3, :3].astype(np.float32)
     there = p.astype(np.float32) @ turns.swapaxes(1, 2) + poses[:, None, :3, 3].astype(np.float32)
     near = ((there - q.astype(np.float32)) ** 2).sum(axis=2) < within_mm**2
     cosine = ((m.astype(np.float32) @ turns.swapaxes(1, 2)) * n.astype(np.float32)).sum(axis=2)
-    return np.asarray(near & (cosine > _LEAST_COSINE))
+    return np.asarray(near & (cosine > _MIN_COSINE))
 
 
-def rigid(source: FloatArray, target: FloatArray) -> FloatArray:
-    """(…, 4, 4): poses that take points (…, n, 3) nearest to others, by squares (Umeyama 1991, without scale)."""
+def rigid_motions(source: FloatArray, target: FloatArray) -> FloatArray:
+    """(…, 4, 4): least-squares motions of points (…, n, 3) to others (Umeyama 1991, without scale)."""
     middle, goal = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
     left, _, right = np.linalg.svd((target - goal).swapaxes(-1, -2) @ (source - middle))
-    # No mirror: the least of the three directions turns round.
+    # A reflection becomes a rotation by reversing the direction with the least singular value.
     left[..., :, 2] *= np.linalg.det(left @ right)[..., None]
     pose = np.broadcast_to(np.eye(4), (*source.shape[:-2], 4, 4)).copy()
     pose[..., :3, :3] = left @ right
@@ -179,33 +191,36 @@ def rigid(source: FloatArray, target: FloatArray) -> FloatArray:
     return pose
 
 
-def _alike(first: FloatArray, second: FloatArray) -> tuple[IntArray, IntArray]:
-    """Indices (p,) of places of both that look alike, the most telling ones."""
-    likeness = first @ second.T
+def _match_keypoints(first: FloatArray, second: FloatArray) -> tuple[IntArray, IntArray]:
+    """Indices (p,) of similar keypoints of both views, the most distinctive pairs."""
+    similarity = first @ second.T
     found = []
-    for table, flip in ((likeness, False), (likeness.T, True)):
-        rank = min(_OTHERS, table.shape[1] - 1)
+    for table, flip in ((similarity, False), (similarity.T, True)):
+        rank = min(_REFERENCE_RANK, table.shape[1] - 1)
         best = np.argpartition(-table, rank, axis=1)[:, : rank + 1]
         value = np.take_along_axis(table, best, axis=1)
         order = np.argsort(-value, axis=1)
         best, value = np.take_along_axis(best, order, axis=1), np.take_along_axis(value, order, axis=1)
-        ratio = (1 - value[:, :_ALIKE]) / np.maximum(1 - value[:, -1:], 1e-9)
+        ratio = (1 - value[:, :_NEAREST_KEYPOINTS]) / np.maximum(1 - value[:, -1:], 1e-9)
         rows = np.repeat(np.arange(len(table)), ratio.shape[1])
-        pair = (best[:, :_ALIKE].ravel(), rows) if flip else (rows, best[:, :_ALIKE].ravel())
+        columns = best[:, :_NEAREST_KEYPOINTS].ravel()
+        pair = (columns, rows) if flip else (rows, columns)
         found.append(np.stack([*pair, ratio.ravel()]))
     both = np.concatenate(found, axis=1)
     both = both[:, np.argsort(both[2], kind="stable")]
-    keep = np.sort(np.unique(both[:2], axis=1, return_index=True)[1])[:_MOST_PAIRS]
-    a, b = both[:2, keep].astype(np.int64)
+    unique = np.sort(np.unique(both[:2], axis=1, return_index=True)[1])[:_MAX_PAIRS]
+    a, b = both[:2, unique].astype(np.int64)
     return a, b
 
 
-def _compatible(p: FloatArray, q: FloatArray, m: FloatArray, n: FloatArray, within_mm: float) -> NDArray[np.bool_]:
-    """(n, n): whether pairs of places p, q (n, 3) with normals m, n (n, 3), may belong to one pose."""
+def _compatible_pairs(
+    p: FloatArray, q: FloatArray, m: FloatArray, n: FloatArray, within_mm: float
+) -> NDArray[np.bool_]:
+    """(n, n): True if two pairs of points p, q (n, 3) with normals m, n (n, 3) may belong to one pose."""
     one, two = _relations(p, m), _relations(q, n)
     distance, along, cosine = (np.abs(x - y) for x, y in zip(one, two, strict=True))
-    both = (distance < within_mm) & (along < within_mm) & (within_mm > along.T) & (cosine < _TURNED)
-    # Places near to one another are so in any pose.
+    both = (distance < within_mm) & (along < within_mm) & (within_mm > along.T) & (cosine < _MAX_COSINE_DIFFERENCE)
+    # Points near to one another are so in any pose.
     return np.asarray(both & (one[0] > 2 * within_mm))
 
 
@@ -218,34 +233,31 @@ def _relations(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, ...
     return distance, along, normals @ normals.T
 
 
-_TRIED, _KEPT = 12, 6
-"""Poses of a pair that are fitted, and that are kept: those that agree best."""
-_NEAR_CELLS = 2.0
-_AGAINST = 8.0
-"""How many points that agree one outweighs that contradicts: true poses have one of fifty, at steps and slits, wrong
-ones of objects that repeat themselves one of ten and more."""
-_LEAST_AGREE = 0.02
-"""Of the points of both views, as `registered` wants it."""
-_RIVAL = 0.5
-"""What a second answer may have of the best one's agreement, less contradictions."""
-_BETTER = 1.1
-"""Of the best one's agreement, what makes a second answer the best one; a view that is moved there is tried again."""
-_FEW, _COARSE, _FITTED = 100, 2.0, 4
-"""Of a second answer before it is fitted: points of a view that are asked, how many have to agree for one that
-contradicts, and the pairs that it is then fitted by."""
-_APART = 2.0
-"""Answers nearer to one another are the same, in what is near."""
+_MAX_FITTED, _MAX_CANDIDATES = 12, 6
+"""Poses of a pair that are aligned, and those that remain, the best ones."""
+_REACH_SPACINGS = 2.0
+_CONTRADICTION_WEIGHT = 8.0
+"""Points in agreement that outweigh a contradicting one: at true poses one point in fifty contradicts, at steps and
+slits; at wrong poses of repetitive objects one in ten or more."""
+_MIN_AGREE = 0.02
+"""Share of the points of both views, as `register_views` requires it."""
+_AMBIGUOUS_SHARE = 0.5
+"""Score of an alternative, over the best one, that makes the answer ambiguous."""
+_BETTER_SHARE = 1.1
+"""Score of an alternative, over the best one, that makes it the best one; all are then tried again."""
+_COARSE_SAMPLE, _COARSE_RATIO, _COARSE_PAIRS = 100, 2.0, 4
+"""Before an alternative is aligned: points of a view that are compared, points in agreement for each contradicting one,
+and pairs that it is then aligned by."""
+_ALTERNATIVE_SEPARATION = 2.0
+"""Distance of alternatives, over the reach, below which they are the same."""
 _ADVICE = (
-    "Scan it with something that is fixed to it and has no symmetry, or tell where to start from: the stage's angle "
-    "and axis, or poses"
+    "Scan it with something that is fixed to it and has no symmetry, or state where to start from: the turntable's "
+    "angle and axis, or poses"
 )
 
 
-Pair = tuple[int, int]
-
-
-class _Held(NamedTuple):
-    """A pose (4, 4) of view `first` in the frame of view `second`, and how well they agree there."""
+class _Candidate(NamedTuple):
+    """A pose (4, 4) of view `first` in the frame of view `second`, and its score."""
 
     first: int
     second: int
@@ -253,199 +265,201 @@ class _Held(NamedTuple):
     score: float
 
 
-class _Rival(NamedTuple):
-    """A part of the views (k,), what takes it elsewhere (4, 4), and how well it agrees there, of how it does here."""
+class _Alternative(NamedTuple):
+    """A part of the views (k,), its motion (4, 4) to another place, and its score there over the one here."""
 
     part: IntArray
     change: FloatArray
     share: float
 
 
-def found_starts(views: Sequence[Mesh], *, names: Sequence[str] | None = None) -> FloatArray:
-    """(N, 4, 4): poses of the views in the frame of the first, from what they see alone, at rest.
+def find_start_poses(views: Sequence[Mesh], *, names: Sequence[str] | None = None) -> FloatArray:
+    """(N, 4, 4): registered poses of the views in the frame of the first, from their surfaces alone.
 
-    Free space is looked at where a mesh lies before a camera at its origin. names : of the views, for messages.
+    Free space is checked if a mesh faces a camera at its origin. names : of the views, for messages.
 
     Raises
     ------
     RegistrationRefusedError
-        No poses agree with what was seen, or others agree nearly as well: the object is symmetric or repeats itself.
+        No poses agree with the views, or others agree nearly as well: the object is symmetric or repeats itself.
     """
     names = names or [f"view {number}" for number in range(len(views))]
     if len(views) < 2:
         message = f"expected two views or more to put into one frame, found {len(views)}; scan the object turned"
         raise RegistrationRefusedError(message)
-    search = _search([seen_by(view) for view in views], views, names)
-    poses = search.put_together()
+    search = _build_search([prepare_with_depth(view) for view in views], views, names)
+    poses = search.assemble()
     for _ in range(2 * len(views)):
-        # Poses that are wrong may not come to rest: then there is a better answer, or none.
+        # Wrong poses may not converge: an alternative is better, or none is right.
         refused = None
         try:
-            found = registered(views, poses, names=names, start_error_mm=search.near_mm)
+            found = register_views(views, poses, names=names, start_error_mm=search.reach_mm)
             poses = found.poses
         except RegistrationRefusedError as error:
             refused = error
-        rival = search.rival(poses)
-        if rival is None or rival.share < _BETTER:
+        alternative = search.best_alternative(poses)
+        if alternative is None or alternative.share < _BETTER_SHARE:
             break
-        poses[rival.part] = rival.change @ poses[rival.part]
+        poses[alternative.part] = alternative.change @ poses[alternative.part]
         poses = np.linalg.inv(poses[0]) @ poses
-    if rival is not None:
-        raise RegistrationRefusedError(search.second_answer(rival, poses))
+    if alternative is not None:
+        raise RegistrationRefusedError(search.ambiguity_message(alternative, poses))
     if refused is not None:
         raise refused
     if found.free:
-        each = found.free[0]
+        motion = found.free[0]
         message = (
-            f"{names[each.view]}: expected a shape that holds the views, found that this one may {each}, and no start "
-            f"that tells by how much. {_ADVICE}"
+            f"{names[motion.view]}: expected a shape that determines the poses, found that this view may {motion}, and "
+            f"no start that fixes it. {_ADVICE}"
         )
         raise RegistrationRefusedError(message)
     return poses
 
 
-def _search(seen: Sequence[Seen], views: Sequence[Mesh], names: Sequence[str]) -> _Search:
-    for name, each in zip(names, seen, strict=True):
-        if not len(each.side.order):
-            raise RegistrationRefusedError(
-                f"{name}: expected a surface, found no vertex that can be used; scan it again"
-            )
-    weights = [seen_mm2(view) for view in views]
-    area = float(np.median([each.sum() for each in weights]))
-    places = [keypoints(each.side, mine, area) for each, mine in zip(seen, weights, strict=True)]
-    cell = cell_mm(area)
-    near_mm = _NEAR_CELLS * cell
-    held = []
-    for i, j in combinations(range(len(seen)), 2):
-        near: list[_Held] = []
-        for start in candidate_poses(places[i], places[j], within_mm=cell, most=_TRIED):
-            pose = fitted([Facing(seen[i].side, seen[j].side, np.eye(4), np.eye(4))], start, near_mm)
-            if all(apart_mm(pose, other.pose, places[i].points_mm) > cell for other in near):
-                found = evidence(seen[i], seen[j], pose, near_mm)
-                if found.agree > _LEAST_AGREE * 2 * SAMPLE:
-                    near.append(_Held(i, j, pose, _score(found)))
-        held += sorted(near, key=lambda each: -each.score)[:_KEPT]
-    return _Search(seen, names, near_mm, sorted(held, key=lambda each: -each.score))
-
-
-def _score(found: Evidence) -> float:
-    return found.agree - _AGAINST * found.against
-
-
 @dataclass(frozen=True, slots=True)
 class _Search:
-    """Views, and the poses that pairs of them may have, the best first."""
+    """Views, and the candidate poses of pairs of them, the best first."""
 
-    seen: Sequence[Seen]
+    views: Sequence[ViewWithDepth]
     names: Sequence[str]
-    near_mm: float
-    held: Sequence[_Held]
+    reach_mm: float
+    candidates: Sequence[_Candidate]
 
-    def put_together(self) -> FloatArray:
+    def assemble(self) -> FloatArray:
         """Poses (N, 4, 4) of all views in the frame of the first.
 
-        Raises RegistrationRefusedError: not all views have a place.
+        Raises RegistrationRefusedError: a view has no place.
         """
-        count = len(self.seen)
+        count = len(self.views)
         poses, group = np.tile(np.eye(4), (count, 1, 1)), np.arange(count)
-        for each in self.held:
+        for each in self.candidates:
             some, others = (group == group[view] for view in (each.first, each.second))
             if each.score <= 0 or group[each.first] == group[each.second]:
                 continue
             pairs = list(product(np.flatnonzero(some).tolist(), np.flatnonzero(others).tolist()))
-            change = self._fitted(pairs, poses, _change(each, poses))
+            change = self._align(pairs, poses, _candidate_change(each, poses))
             if sum(_score(self._evidence(pair, poses, change, SAMPLE)) for pair in pairs) > 0:
                 poses[some] = change @ poses[some]
                 group[some] = group[each.second]
         if len(np.unique(group)) > 1:
             largest = np.bincount(group).argmax()
-            apart = ", ".join(name for name, mine in zip(self.names, group, strict=True) if mine != largest)
+            apart = ", ".join(name for name, own in zip(self.names, group, strict=True) if own != largest)
             message = (
-                f"{apart}: expected surface that is known again in other views and fits it there, found none that "
-                f"does. Scan from between, so that neighbours share half of what they see. {_ADVICE}"
+                f"{apart}: expected surface that matches other views, found none that does. Scan from between, so that "
+                f"neighbours share half of their surface. {_ADVICE}"
             )
             raise RegistrationRefusedError(message)
         return np.asarray(np.linalg.inv(poses[0]) @ poses)
 
-    def rival(self, poses: FloatArray) -> _Rival | None:
-        """The place of a part of the views elsewhere that agrees best, if it is nearly as well as where they are."""
-        count = len(self.seen)
+    def best_alternative(self, poses: FloatArray) -> _Alternative | None:
+        """The best other place of a part of the views; None if none agrees nearly as well."""
+        count = len(self.views)
         scores = np.zeros((count, count))
         for i, j in combinations(range(count), 2):
             scores[i, j] = scores[j, i] = _score(self._evidence((i, j), poses, np.eye(4), SAMPLE))
-        found: _Rival | None = None
+        found: _Alternative | None = None
         for part in _parts(scores):
             rest = np.setdiff1d(np.arange(count), part)
             best = max(float(scores[np.ix_(part, rest)].sum()), 1.0)
             pairs = list(product(part.tolist(), rest.tolist()))
             for change in self._changes(part, poses):
-                share = self._placed_score(pairs, poses, change, _RIVAL * best) / best
-                if share > max(_RIVAL, found.share if found else 0):
-                    found = _Rival(part, change, share)
+                share = self._score_after(pairs, poses, change, _AMBIGUOUS_SHARE * best) / best
+                if share > max(_AMBIGUOUS_SHARE, found.share if found else 0):
+                    found = _Alternative(part, change, share)
         return found
 
+    def ambiguity_message(self, alternative: _Alternative, poses: FloatArray) -> str:
+        """Message that the answer is ambiguous."""
+        angle = np.rad2deg(np.linalg.norm(Rotation.from_matrix(alternative.change[:3, :3]).as_rotvec()))
+        points = np.concatenate([transform_points(poses[view], self._points_mm(view)) for view in alternative.part])
+        away_mm = pose_distance_mm(alternative.change, np.eye(4), points)
+        return (
+            f"{', '.join(self.names[view] for view in alternative.part)}: expected one place that agrees with the "
+            f"other views, found a second one, turned by {angle:.0f}° and {away_mm:.0f} mm from the first, that agrees "
+            f"{alternative.share:.0%} as well: the object is symmetric or repeats itself. {_ADVICE}"
+        )
+
     def _changes(self, part: IntArray, poses: FloatArray) -> Iterator[FloatArray]:
-        """(4, 4) each: what takes a part of the views to where their pairs with others may have them."""
-        points = np.concatenate([moved(poses[view], self._points_mm(view)) for view in part])
+        """Motions (4, 4) of a part of the views to where candidates with the other views place it."""
+        points = np.concatenate([transform_points(poses[view], self._points_mm(view)) for view in part])
         tried = [np.eye(4)]
-        for each in self.held:
+        for each in self.candidates:
             if (each.first in part) != (each.second in part):
-                change = _change(each, poses)
+                change = _candidate_change(each, poses)
                 if each.second in part:
                     change = np.asarray(np.linalg.inv(change), dtype=np.float64)
-                if all(apart_mm(change, other, points) > _APART * self.near_mm for other in tried):
+                distances = (pose_distance_mm(change, other, points) for other in tried)
+                if all(distance > _ALTERNATIVE_SEPARATION * self.reach_mm for distance in distances):
                     tried.append(change)
                     yield change
 
-    def _placed_score(self, pairs: Sequence[Pair], poses: FloatArray, change: FloatArray, least: float) -> float:
-        """How well one part agrees with the rest after a change of it and a fit; -inf where it does not by far."""
-        few = [(pair, self._evidence(pair, poses, change, _FEW)) for pair in pairs]
-        agree, against = np.array([found for _, found in few]).sum(axis=0)
-        if agree < _COARSE * against or agree * SAMPLE / _FEW < least:
+    def _score_after(self, pairs: Sequence[Pair], poses: FloatArray, change: FloatArray, min_score: float) -> float:
+        """Score of a part with the rest after a motion of it and alignment; -inf if a sample is far from agreement."""
+        coarse = [(pair, self._evidence(pair, poses, change, _COARSE_SAMPLE)) for pair in pairs]
+        agree, contradict = np.array([found for _, found in coarse]).sum(axis=0)
+        if agree < _COARSE_RATIO * contradict or agree * SAMPLE / _COARSE_SAMPLE < min_score:
             return -np.inf
-        most = sorted(few, key=lambda each: -each[1].agree)[:_FITTED]
-        at = self._fitted([pair for pair, _ in most], poses, change)
-        return sum(_score(self._evidence(pair, poses, at, SAMPLE)) for pair in pairs)
+        best = sorted(coarse, key=lambda each: -each[1].agree)[:_COARSE_PAIRS]
+        aligned = self._align([pair for pair, _ in best], poses, change)
+        return sum(_score(self._evidence(pair, poses, aligned, SAMPLE)) for pair in pairs)
 
-    def _fitted(self, pairs: Sequence[Pair], poses: FloatArray, change: FloatArray) -> FloatArray:
-        facing = [Facing(self.seen[i].side, self.seen[j].side, poses[i], poses[j]) for i, j in pairs]
-        return fitted(facing, change, self.near_mm)
+    def _align(self, pairs: Sequence[Pair], poses: FloatArray, change: FloatArray) -> FloatArray:
+        both = [ViewPair(self.views[i].view, self.views[j].view, poses[i], poses[j]) for i, j in pairs]
+        return align_views(both, change, self.reach_mm)
 
-    def _evidence(self, pair: Pair, poses: FloatArray, change: FloatArray, most: int) -> Evidence:
-        """Of a pair of views at poses, the first one's changed."""
+    def _evidence(self, pair: Pair, poses: FloatArray, change: FloatArray, max_count: int) -> PoseEvidence:
+        """Evidence of a pair of views at poses, after a motion of the first one."""
         i, j = pair
-        return evidence(self.seen[i], self.seen[j], np.linalg.inv(poses[j]) @ change @ poses[i], self.near_mm, most)
+        relative = np.linalg.inv(poses[j]) @ change @ poses[i]
+        return compare_views(self.views[i], self.views[j], relative, self.reach_mm, max_count)
 
-    def _points_mm(self, view: int) -> FloatArray:
-        side = self.seen[view].side
-        return side.points_mm[side.order[:_FEW]]
-
-    def second_answer(self, rival: _Rival, poses: FloatArray) -> str:
-        """In words, that there is one."""
-        angle = np.rad2deg(np.linalg.norm(Rotation.from_matrix(rival.change[:3, :3]).as_rotvec()))
-        points = np.concatenate([moved(poses[view], self._points_mm(view)) for view in rival.part])
-        away_mm = apart_mm(rival.change, np.eye(4), points)
-        return (
-            f"{', '.join(self.names[view] for view in rival.part)}: expected one place that agrees with the other "
-            f"views, found a second one, turned by {angle:.0f}° and {away_mm:.0f} mm from the first, that agrees "
-            f"{rival.share:.0%} as well: the object is symmetric or repeats itself. {_ADVICE}"
-        )
+    def _points_mm(self, number: int) -> FloatArray:
+        view = self.views[number].view
+        return view.points_mm[view.order[:_COARSE_SAMPLE]]
 
 
-def _change(each: _Held, poses: FloatArray) -> FloatArray:
-    """(4, 4): what moves the first view, and all that lies with it, so that the pair lies as it is held."""
+def _build_search(prepared: Sequence[ViewWithDepth], views: Sequence[Mesh], names: Sequence[str]) -> _Search:
+    for name, each in zip(names, prepared, strict=True):
+        if not len(each.view.order):
+            raise RegistrationRefusedError(
+                f"{name}: expected a surface, found no vertex that can be used; scan it again"
+            )
+    weights = [vertex_areas_mm2(view) for view in views]
+    area = float(np.median([each.sum() for each in weights]))
+    keypoints = [select_keypoints(each.view, own, area) for each, own in zip(prepared, weights, strict=True)]
+    spacing = keypoint_spacing_mm(area)
+    reach_mm = _REACH_SPACINGS * spacing
+    candidates = []
+    for i, j in combinations(range(len(prepared)), 2):
+        of_pair: list[_Candidate] = []
+        for start in candidate_poses(keypoints[i], keypoints[j], within_mm=spacing, max_count=_MAX_FITTED):
+            pose = align_views([ViewPair(prepared[i].view, prepared[j].view, np.eye(4), np.eye(4))], start, reach_mm)
+            if all(pose_distance_mm(pose, other.pose, keypoints[i].points_mm) > spacing for other in of_pair):
+                found = compare_views(prepared[i], prepared[j], pose, reach_mm)
+                if found.agree > _MIN_AGREE * 2 * SAMPLE:
+                    of_pair.append(_Candidate(i, j, pose, _score(found)))
+        candidates += sorted(of_pair, key=lambda each: -each.score)[:_MAX_CANDIDATES]
+    return _Search(prepared, names, reach_mm, sorted(candidates, key=lambda each: -each.score))
+
+
+def _score(found: PoseEvidence) -> float:
+    return found.agree - _CONTRADICTION_WEIGHT * found.contradict
+
+
+def _candidate_change(each: _Candidate, poses: FloatArray) -> FloatArray:
+    """(4, 4): motion of the first view, and of all placed with it, that gives the pair its candidate pose."""
     return np.asarray(poses[each.second] @ each.pose @ np.linalg.inv(poses[each.first]))
 
 
 def _parts(scores: FloatArray) -> list[IntArray]:
-    """Each view alone, and what each pair of the tree that agrees best holds to the rest. scores : (N, N), of pairs."""
-    # The tree of most agreement is that of least cost; a cost of 0 would be no edge.
+    """Each view alone, and both sides of each edge of the tree of best scores. scores : (N, N), of pairs."""
+    # The tree of the highest scores is that of least cost; a cost of 0 would be no edge.
     cost = np.triu(scores.max() + 1 - scores, 1)
     tree = minimum_spanning_tree(cost).toarray()
     parts = [np.array([view]) for view in range(len(scores))]
-    for cut in np.argwhere(tree):
+    for edge in np.argwhere(tree):
         rest = tree.copy()
-        rest[tuple(cut)] = 0
+        rest[tuple(edge)] = 0
         group = connected_components(rest, directed=False)[1]
-        parts.append(np.flatnonzero(group == group[cut[0]]))
+        parts.append(np.flatnonzero(group == group[edge[0]]))
     return [part for part in parts if len(part) < len(scores)]

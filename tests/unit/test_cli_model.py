@@ -200,7 +200,7 @@ def test_scans_of_unknown_places_are_placed_and_a_vase_is_refused(scans: Path, t
     assert list(read_poses(tmp_path / "model" / "poses.json").poses) == ["scan-9", "scan-10", "scan-11"]
     refused = model(scans / "vase-0.ply", scans / "vase-1.ply", "--output", tmp_path / "vase", "--unknown")
     assert (refused.exit_code, (tmp_path / "vase").exists()) == (2, False), refused.output
-    assert "or tell where to start from" in " ".join(refused.output.split())
+    assert "or state where to start from" in " ".join(refused.output.split())
 
 
 TABLE = ["--axis-point", *map(str, AXIS_POINT_MM), "--axis-direction", *map(str, AXIS)]
