@@ -55,12 +55,10 @@ _COLOUR_SAMPLE = 50_000  # points: a twentieth of them is enough for a median to
 _MIN_SHARED = 100  # points that two views have to share to compare their colours
 _MIN_LIGHT = 0.01  # of white: below, an sRGB step is more than a tenth of the light
 
-NO_STRIPE = -1
-"""The stripe of a vertex that several views have found."""
+NO_STRIPE = -1  # the stripe of a vertex that several views have found
 MIN_CORRELATED_MM = 0.001
 """Least error that neighbouring points share: the position of the projected line is known no better."""
-SHARED_MM = 0.002
-"""Error that a good calibration leaves in all views of a rig alike, which no comparison of them shows."""
+SHARED_MM = 0.002  # error that a good calibration leaves in all views of a rig alike, which no comparison of them shows
 _CORNER_REACH = 1.5  # voxels beyond a border: corners of the cells at the views' surface
 _COMPARE_REACH = 0.5  # voxels: distance from the surface within which two views are compared
 _VERTEX_REACH = 0.5  # voxels: a cell's vertex is nearer to the mean surface

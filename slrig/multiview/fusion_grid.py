@@ -176,10 +176,7 @@ class Grid(NamedTuple):
 def build_grid(stack: StackedViews, voxel_mm: float) -> Grid:
     """Build the grid of all cells that the fused surface may pass through.
 
-    Raises
-    ------
-    InvalidInputError
-        There are more than `_MAX_BRICKS` bricks.
+    Raises InvalidInputError: there are more than `_MAX_BRICKS` bricks.
     """
     used = stack.points_mm[used_vertices(stack.faces, len(stack.points_mm))]
     # One brick free on all sides, so that all neighbours have keys.

@@ -20,13 +20,10 @@ from scipy.spatial.transform import Rotation
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray
 
-_REJECT_SIGMAS = 5.0
-"""Deviation, over the median of all markers, above which a marker has moved or was misread."""
-_ROBUST_SIGMAS = 3.0
-"""Deviation, over that median, above which a marker has little weight."""
+_REJECT_SIGMAS = 5.0  # deviation, over the median of all markers, above which a marker has moved or was misread
+_ROBUST_SIGMAS = 3.0  # deviation, over that median, above which a marker has little weight
 _MIN_WEIGHT = 1e-6
-_INLIER_FACTOR = 3.0
-"""Distance, over the median of a pair's markers, within which they share one motion."""
+_INLIER_FACTOR = 3.0  # distance, over the median of a pair's markers, within which they share one motion
 _MAX_STEPS, _SETTLED_MM = 60, 1e-6
 
 
@@ -81,10 +78,8 @@ def marker_poses(
     surfaces : (n, 3) each, points of the object in the view's frame. max_sigma_mm : limit of a view's `sigma_mm`; few,
     small or close markers exceed it.
 
-    Raises
-    ------
-    RegistrationRefusedError
-        No chain of shared markers connects a view to the first, or its pose is less certain than `max_sigma_mm`.
+    Raises RegistrationRefusedError: no chain of shared markers connects a view to the first, or its pose is less
+    certain than `max_sigma_mm`.
     """
     _require_connected(views, views, (), names)
     adjustment = _MarkerAdjustment.from_views(views)

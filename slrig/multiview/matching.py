@@ -20,16 +20,15 @@ from scipy.spatial.transform import Rotation
 from slrig.meshing import boundary_vertices
 from slrig.model import AlbedoMark, FloatArray, IntArray, Mesh
 
+Pair = tuple[int, int]
+"""Numbers of two views."""
+
 CORRELATED_MM = 0.005
 """Standard deviation of the error that a match shares with its neighbours and that no vertex σ includes."""
-_HUBER = 2.0
-"""Huber's threshold, in standard deviations: 99 % efficient."""
-_MIN_COSINE = 0.9
-"""Of the normals of a match: 26°, far more than noise and any start error turn them."""
-_NOISE_SIGMAS = 4.0
-"""Residuals within so many of their own standard deviations are always accepted."""
-_SEARCH_EDGES = 1.5
-"""Radius of the search for the nearest vertex, on top of the reach, in edges of the mesh."""
+_HUBER = 2.0  # Huber's threshold, in standard deviations: 99 % efficient
+_MIN_COSINE = 0.9  # of the normals of a match: 26°, far more than noise and any start error turn them
+_NOISE_SIGMAS = 4.0  # residuals within so many of their own standard deviations are always accepted
+_SEARCH_EDGES = 1.5  # radius of the search for the nearest vertex, on top of the reach, in edges of the mesh
 
 _BORDER_ROWS, _BLUR_ROWS = 2, 4
 """Rows of vertices left out along borders, and, if enough vertices remain, along sharp bends and borders. The camera's
@@ -216,7 +215,7 @@ def normal_equations(
     return NormalEquations(block_sums(mean, mean), (mixed + mixed.swapaxes(1, 2)) / 2, gradient)
 
 
-def assemble_equations(pairs: Iterable[tuple[tuple[int, int], NormalEquations]], count: int) -> NormalEquations:
+def assemble_equations(pairs: Iterable[tuple[Pair, NormalEquations]], count: int) -> NormalEquations:
     """Assemble the equations of pairs (first, second) of `count` views for the motions (6 (N - 1),) of views 1, 2, …"""
     pairs = list(pairs)
     lead = pairs[0][1].gradient.shape[:-1]
@@ -237,16 +236,12 @@ _ALIGN_SAMPLE = 300
 _MAX_STEPS = 10
 _MIN_MATCHES = 15
 _AGREE_SIGMAS = 5.0
-_SLACK_MM = 0.03
-"""Error that poses still have while only pairs of views have been aligned."""
+_SLACK_MM = 0.03  # error that poses still have while only pairs of views have been aligned
 _MEDIAN_PER_SIGMA = 0.6745
 _REACH_SIGMAS = 4.0
-_MIN_FACING = 0.95
-"""Share of a view's faces that face the origin if the camera is there, as in a scan's own frame."""
-_EDGES_PER_PIXEL = 1.0
-"""Size of a pixel of a depth buffer, in edges of the mesh."""
-_DEPTH_MARGIN = 3.0
-"""Least distance of a point in front of a depth buffer, in edges of the mesh."""
+_MIN_FACING = 0.95  # share of a view's faces that face the origin if the camera is there, as in a scan's own frame
+_EDGES_PER_PIXEL = 1.0  # size of a pixel of a depth buffer, in edges of the mesh
+_DEPTH_MARGIN = 3.0  # least distance of a point in front of a depth buffer, in edges of the mesh
 _DAMPING = 1e-4
 
 
@@ -349,14 +344,8 @@ def align_views(pairs: Sequence[ViewPair], change: FloatArray, reach_mm: float) 
     radius = float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean()))
     for _ in range(_MAX_STEPS):
         found = [
-            match_points(
-                pair.moving,
-                pair.fixed,
-                (change @ pair.pose, pair.fixed_pose),
-                reach_mm=reach_mm,
-                max_count=_ALIGN_SAMPLE,
-            )
-            for pair in pairs
+            match_points(moving, fixed, (change @ pose, fixed_pose), reach_mm=reach_mm, max_count=_ALIGN_SAMPLE)
+            for moving, fixed, pose, fixed_pose in pairs
         ]
         residual = np.concatenate([each.residual_mm for each in found])
         if len(residual) < _MIN_MATCHES:
@@ -375,51 +364,33 @@ def align_views(pairs: Sequence[ViewPair], change: FloatArray, reach_mm: float) 
     return change
 
 
-_COARSE_BLOCKS, _FINE_BLOCKS = 2, 4
-"""Blocks in the object's radius. Two sizes allow to extrapolate: one size alone underestimates long correlations."""
+_COARSE_BLOCKS, _FINE_BLOCKS = 2, 4  # blocks in the object's radius, two sizes to extrapolate to long correlations
 
 
 def inflation_factor(
-    matches: Mapping[tuple[int, int], PointMatches],
-    count: int,
-    middle_mm: FloatArray,
-    radius_mm: float,
-    covariance: FloatArray,
+    matches: Mapping[Pair, PointMatches], count: int, middle_mm: FloatArray, radius_mm: float, covariance: FloatArray
 ) -> float:
     """Factor of the poses' standard deviations, at least 1, for errors that neighbouring points share.
 
     matches : of pairs of the `count` views at their final poses. covariance : (p, p), mm², the inverse of the
-    information, 0 along free directions. The residuals' sums over blocks of the surface show how far they are
-    correlated.
+    information, 0 along free directions. The residuals' sums over blocks of the surface show their correlation. Blocks
+    are cubes of the model's space, the same for all pairs, which share the errors in them.
     """
-    coarse, fine = (
-        _inflation_at_block_size(matches, count, middle_mm, radius_mm, radius_mm / parts, covariance)
-        for parts in (_COARSE_BLOCKS, _FINE_BLOCKS)
-    )
-    return max(2 * coarse - fine, coarse, 1.0)
 
-
-def _inflation_at_block_size(
-    matches: Mapping[tuple[int, int], PointMatches],
-    count: int,
-    middle_mm: FloatArray,
-    radius_mm: float,
-    size_mm: float,
-    covariance: FloatArray,
-) -> float:
-    """Blocks are cubes of the model's space. All pairs of views share them, and the errors in them."""
-    cubes = [np.floor((each.midpoints_mm - middle_mm) / size_mm).astype(np.int32) for each in matches.values()]
-    numbers = np.unique(np.concatenate(cubes), axis=0, return_inverse=True)[1].ravel().astype(np.int32)
-    by_pair: list[IntArray] = np.split(numbers, np.cumsum([len(each) for each in cubes])[:-1])
-    number = int(numbers.max()) + 1
-    blocks = assemble_equations(
-        (
+    def at_block_size(size_mm: float) -> float:
+        cubes = [np.floor((each.midpoints_mm - middle_mm) / size_mm).astype(np.int32) for each in matches.values()]
+        numbers = np.unique(np.concatenate(cubes), axis=0, return_inverse=True)[1].ravel().astype(np.int32)
+        by_pair: list[IntArray] = np.split(numbers, np.cumsum([len(each) for each in cubes])[:-1])
+        number = int(numbers.max()) + 1
+        pairs = (
             (pair, normal_equations(each, middle_mm, radius_mm, blocks=(own, number)))
             for (pair, each), own in zip(matches.items(), by_pair, strict=True)
-        ),
-        count,
-    )
-    found = np.einsum("bi,ij,bj->", blocks.gradient, covariance, blocks.gradient)
-    share = covariance @ blocks.information
-    expected = np.einsum("bii->", share) - np.einsum("bij,bji->", share, share)
-    return float(np.sqrt(found / expected)) if expected > 0 else 1.0
+        )
+        blocks = assemble_equations(pairs, count)
+        found = np.einsum("bi,ij,bj->", blocks.gradient, covariance, blocks.gradient)
+        share = covariance @ blocks.information
+        expected = np.einsum("bii->", share) - np.einsum("bij,bji->", share, share)
+        return float(np.sqrt(found / expected)) if expected > 0 else 1.0
+
+    coarse, fine = (at_block_size(radius_mm / parts) for parts in (_COARSE_BLOCKS, _FINE_BLOCKS))
+    return max(2 * coarse - fine, coarse, 1.0)

@@ -23,6 +23,7 @@ from slrig.model import FloatArray, Mesh
 from slrig.multiview.markers import motion_jacobian
 from slrig.multiview.matching import (
     NormalEquations,
+    Pair,
     PointMatches,
     PreparedView,
     assemble_equations,
@@ -35,36 +36,24 @@ from slrig.multiview.matching import (
 
 START_ERROR_MM = 3.0
 """Distance of a surface from its place at the start: a turntable's axis known to 0.5° and 1 mm gives 2 mm."""
-_FIRST_SAMPLE, _SAMPLE = 2000, 8000
-"""Vertices of a view that are matched, at first and then."""
+_FIRST_SAMPLE, _SAMPLE = 2000, 8000  # vertices of a view that are matched, at first and then
 _MIN_OVERLAP = 0.02
 """Share of the queried vertices with a match. Pairs with less are left out: many of their matches are wrong."""
 _REACH_SIGMAS = 4.0
-_NEAR_SIGMAS = 3.0
-"""Robust σ of the scaled residuals below which views are near their final poses."""
-_MEDIAN_PER_SIGMA = 0.6745
-"""Median of absolute values over the standard deviation, for a normal distribution."""
+_NEAR_SIGMAS = 3.0  # robust σ of the scaled residuals below which views are near their final poses
+_MEDIAN_PER_SIGMA = 0.6745  # median of absolute values over the standard deviation, for a normal distribution
 _MAX_STEPS = 60
-_MIN_STEP = 0.1
-"""Mean square of a step, in standard deviations, at which the iteration ends."""
-_MAX_MISFIT = 4.0
-"""Robust σ of a view's scaled residuals above which its surface is not that of the others."""
+_MIN_STEP = 0.1  # mean square of a step, in standard deviations, at which the iteration ends
+_MAX_MISFIT = 4.0  # robust σ of a view's scaled residuals above which its surface is not that of the others
 
-_MIN_SHARE = 0.5
-"""Share of the information along a direction that has to remain without the noise of the normals."""
-_ROUNDING = 1e-9
-"""Share of all information below which the rest is rounding."""
-_MIN_PART = 0.5
-"""Part of a free motion of all views that a view has to have in it to be named."""
+_MIN_SHARE = 0.5  # share of the information along a direction that has to remain without the noise of the normals
+_ROUNDING = 1e-9  # share of all information below which the rest is rounding
+_MIN_PART = 0.5  # part of a free motion of all views that a view has to have in it to be named
 _MISFIT_GROWTH = 0.2
 """Growth of the squared residuals that shows a displacement; new matches alone change them by half of that."""
 _HALVINGS = 9
-_MIN_TURN_PART = 0.1
-"""Rotational part of a view's free motion below which it is a shift."""
-_MIN_TURN = 0.1
-"""Rotational part of a free motion of all views below which it only shifts them."""
-
-Pair = tuple[int, int]
+_MIN_TURN_PART = 0.1  # rotational part of a view's free motion below which it is a shift
+_MIN_TURN = 0.1  # rotational part of a free motion of all views below which it only shifts them
 
 
 class Motion(StrEnum):
@@ -153,10 +142,8 @@ def register_views(
     a surface from its place at the start. start_covariance : (6 (N - 1), 6 (N - 1)), of a small rotation (rad) about
     the origin of the first view's frame and a shift (mm) of it, if known.
 
-    Raises
-    ------
-    RegistrationRefusedError
-        A view overlaps no other, its surface does not agree with theirs, or the iteration does not converge.
+    Raises RegistrationRefusedError: a view overlaps no other, its surface does not agree with theirs, or the iteration
+    does not converge.
     """
     names = names or [f"view {number}" for number in range(len(views))]
     if len(views) < 2:
@@ -421,16 +408,9 @@ def _pair_fits(problem: _RegistrationProblem, matches: Mapping[Pair, PointMatche
         motion = -known @ np.linalg.solve(known.T @ equations.information @ known, known.T @ equations.gradient)
         midpoints = np.concatenate([each.midpoints_mm for each in both.values()])
         apart = problem.motion_jacobians(midpoints) @ motion
-        fits.append(
-            PairFit(
-                first=i,
-                second=j,
-                overlap=len(residual) / queried,
-                rms_mm=float(np.sqrt(np.mean(residual**2))),
-                rms_over_sigma=float(np.sqrt(np.mean((residual / sigma) ** 2))),
-                closure_mm=float(np.sqrt((apart**2).sum(axis=1).mean())),
-            )
-        )
+        rms_mm, rms = float(np.sqrt(np.mean(residual**2))), float(np.sqrt(np.mean((residual / sigma) ** 2)))
+        closure_mm = float(np.sqrt((apart**2).sum(axis=1).mean()))
+        fits.append(PairFit(i, j, len(residual) / queried, rms_mm, rms, closure_mm))
     return fits
 
 

@@ -20,10 +20,8 @@ from slrig.meshing import used_vertices
 from slrig.model import FloatArray, MeasuredAxis, Mesh, PlaneKind, StageAxis, StagePlane
 from slrig.multiview.registration import START_ERROR_MM, Registration, register_views
 
-AXIS_SPAN_MM = 50.0
-"""Distance along the axis, both ways from the object's middle, within which two axes are compared."""
-MAX_AXIS_SIGMAS = 5.0
-"""Limit of the distance of two axes in their four parameters: as rare (5e-5) as 4 σ in one."""
+AXIS_SPAN_MM = 50.0  # distance along the axis, both ways from the object's middle, within which two axes are compared
+MAX_AXIS_SIGMAS = 5.0  # limit of the distance of two axes in their four parameters: as rare (5e-5) as 4 σ in one
 _DRIFT_MM, _DRIFT_RAD = 0.005, 5e-5
 """Drift of a rig against its turntable between models: 1 K over 0.2 m of aluminium, and that over 0.1 m."""
 
@@ -85,23 +83,18 @@ def _axis_parameters(base: StageAxis, across: FloatArray, axis: MeasuredAxis) ->
     return parameters, transport @ axis.covariance @ transport.T
 
 
-MARGIN_MM, MARGIN_SIGMAS = 1.0, 4.0
-"""Margin of a plane: for its unevenness, and for its noise."""
+MARGIN_MM, MARGIN_SIGMAS = 1.0, 4.0  # margin of a plane: for its unevenness, and for its noise
 _MAX_PLANES = 4
-_MIN_SHARE = 0.1
-"""Share of a scan's vertices in a plate or a backdrop."""
+_MIN_SHARE = 0.1  # share of a scan's vertices in a plate or a backdrop
 _PLANE_REACH_MM, _PLANE_SIGMAS = 1.0, 4.0
 """Distance of a plane's vertices at first, and in standard deviations then. A surface that needs all of the former is
 curved."""
 _TRIALS, _TRIAL_SAMPLE = 600, 4000
 """Planes through three random vertices, enough to hit a plane of a fifth of all with 99 %; vertices to count."""
-_MIN_FLAT = 0.8
-"""Share of a plane's vertices whose normals are within 30° of its own."""
+_MIN_FLAT = 0.8  # share of a plane's vertices whose normals are within 30° of its own
 _FLAT_COSINE = 0.87
-_PLATE_COSINE = 0.97
-"""Of a plate's normal and the axis: 14°, more than a plate wobbles and less than a backdrop leans."""
-_MIN_LEFT = 0.01
-"""Share of a view's vertices that a cut has to leave."""
+_PLATE_COSINE = 0.97  # of a plate's normal and the axis: 14°, more than a plate wobbles and less than a backdrop leans
+_MIN_LEFT = 0.01  # share of a view's vertices that a cut has to leave
 
 
 def find_turntable_planes(empty: Mesh, axis: StageAxis | None = None) -> tuple[StagePlane, ...]:
@@ -109,10 +102,7 @@ def find_turntable_planes(empty: Mesh, axis: StageAxis | None = None) -> tuple[S
 
     axis : of the turntable, identifies the plate; without it all planes are backdrops.
 
-    Raises
-    ------
-    StageRefusedError
-        No plane was found.
+    Raises StageRefusedError: no plane was found.
     """
     points, normals = empty.vertices_mm.astype(np.float64), empty.normals.astype(np.float64)
     if len(points) < 3:
@@ -121,8 +111,7 @@ def find_turntable_planes(empty: Mesh, axis: StageAxis | None = None) -> tuple[S
     remaining = np.ones(len(points), dtype=np.bool_)
     found: list[StagePlane] = []
     while len(found) < _MAX_PLANES and remaining.sum() > max(_MIN_SHARE * len(points), 3):
-        middle, normal = _ransac_plane(points[remaining], random)
-        own, middle, normal, sigma = _refine_plane(points, remaining, middle, normal)
+        own, middle, normal, sigma = _find_plane(points, remaining, random)
         flat = float(np.mean(np.abs(normals[own] @ normal) > _FLAT_COSINE)) if own.any() else 0.0
         if own.mean() < _MIN_SHARE or flat < _MIN_FLAT or _PLANE_SIGMAS * sigma > _PLANE_REACH_MM:
             break
@@ -145,28 +134,26 @@ def fit_plane(points: FloatArray) -> tuple[FloatArray, FloatArray, float] | None
     if len(points) < 3:
         return None
     everywhere = np.ones(len(points), dtype=np.bool_)
-    start = _ransac_plane(points, np.random.default_rng(len(points)))
-    own, middle, normal, sigma = _refine_plane(points, everywhere, *start)
+    own, middle, normal, sigma = _find_plane(points, everywhere, np.random.default_rng(len(points)))
     return (middle, normal, sigma) if own.mean() > 0.5 else None
 
 
-def _ransac_plane(points: FloatArray, random: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Point and normal of the plane through three points that is near to most of the others."""
-    sample = points[random.integers(len(points), size=_TRIAL_SAMPLE)]
-    a, b, c = points[random.integers(len(points), size=(3, _TRIALS))]
+def _find_plane(
+    points: FloatArray, remaining: NDArray[np.bool_], random: np.random.Generator
+) -> tuple[NDArray[np.bool_], FloatArray, FloatArray, float]:
+    """Mask of the points of the plane that most of those remaining are near to, its middle, normal and σ.
+
+    RANSAC over planes through three points, then least squares within a shrinking reach.
+    """
+    candidates = points[remaining]
+    sample = candidates[random.integers(len(candidates), size=_TRIAL_SAMPLE)]
+    a, b, c = candidates[random.integers(len(candidates), size=(3, _TRIALS))]
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals /= np.where(length > 0, length, np.inf)
     near = np.abs(sample @ normals.T - (a * normals).sum(axis=1)) < _PLANE_REACH_MM
     best = int(np.argmax(np.where(length[:, 0] > 0, near.sum(axis=0), -1)))
-    return a[best], normals[best]
-
-
-def _refine_plane(
-    points: FloatArray, remaining: NDArray[np.bool_], middle: FloatArray, normal: FloatArray
-) -> tuple[NDArray[np.bool_], FloatArray, FloatArray, float]:
-    """Mask of a plane's points, its middle, normal and σ, by least squares within a shrinking reach."""
-    reach, sigma = _PLANE_REACH_MM, _PLANE_REACH_MM
+    middle, normal, reach, sigma = a[best], normals[best], _PLANE_REACH_MM, _PLANE_REACH_MM
     own = remaining & (np.abs((points - middle) @ normal) < reach)
     for _ in range(6):
         if own.sum() < 3:
@@ -212,10 +199,7 @@ class CutView(NamedTuple):
 def cut_view(view: Mesh, planes: Sequence[StagePlane], *, name: str = "the view") -> CutView:
     """Remove the vertices behind planes or within their margin in front of them, and all triangles of these vertices.
 
-    Raises
-    ------
-    StageRefusedError
-        Less than a hundredth would be left.
+    Raises StageRefusedError: less than a hundredth would be left.
     """
     if not planes:
         return CutView(view, ())
@@ -248,13 +232,10 @@ def cut_view(view: Mesh, planes: Sequence[StagePlane], *, name: str = "the view"
     return CutView(mesh, tuple(removed))
 
 
-_POSE_FLOOR_MM = 1e-3
-"""Least standard deviation of a pose."""
-_FREE_SIGMA_MM = 10.0
-"""Standard deviation along free directions: far more than any other, and than any start's error."""
+_POSE_FLOOR_MM = 1e-3  # least standard deviation of a pose
+_FREE_SIGMA_MM = 10.0  # standard deviation along free directions: far more than any other, and than any start's error
 _MAX_ROUNDS = 5
-_SETTLED_MM = 0.001
-"""Change of the axis, at the object, at which the rounds end."""
+_SETTLED_MM = 0.001  # change of the axis, at the object, at which the rounds end
 _MIN_ROTATION_RAD = np.deg2rad(1.0)
 
 
@@ -403,10 +384,8 @@ MIN_TURN_DEG = 20.0
 """Range of a board's angles: the arc over 20° bends by 1.5 % of its radius, enough to measure the radius."""
 _MIN_SLIP_MM, _SLIP_SIGMAS = 0.05, 2.0
 """Below either limit the rms residual is due to bearings or noise; of three poses one in 2000 has more."""
-_MAX_RESIDUAL_MM = 0.5
-"""Largest rms residual of turns about one axis: plastic bearings have 0.1 to 0.3 mm."""
-_SLIP_SHARE = 0.5
-"""Share of the residual that may remain without the pose that slipped."""
+_MAX_RESIDUAL_MM = 0.5  # largest rms residual of turns about one axis: plastic bearings have 0.1 to 0.3 mm
+_SLIP_SHARE = 0.5  # share of the residual that may remain without the pose that slipped
 _UP = np.array([0.0, -1.0, -1.0])
 """Direction of an axis without stated angles: up in the first camera's image, and towards the camera."""
 
@@ -438,11 +417,8 @@ def axis_from_board(
     points_mm : (n, 3), the board's corners. angles_deg : (m,), stated by the turntable; their sense determines the
     direction of the axis. Without them it points up in the first camera's image.
 
-    Raises
-    ------
-    StageRefusedError
-        There are fewer than three poses, or the board was turned by less than 20°, slipped, or does not turn about one
-        axis.
+    Raises StageRefusedError: there are fewer than three poses, or the board was turned by less than 20°, slipped, or
+    does not turn about one axis.
     """
     if len(names) < MIN_POSES:
         raise StageRefusedError(

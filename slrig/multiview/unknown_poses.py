@@ -23,6 +23,7 @@ from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray, IntArray, Mesh
 from slrig.multiview.matching import (
     SAMPLE,
+    Pair,
     PoseEvidence,
     PreparedView,
     ViewPair,
@@ -32,15 +33,13 @@ from slrig.multiview.matching import (
     prepare_with_depth,
     transform_points,
 )
-from slrig.multiview.registration import Pair, register_views
+from slrig.multiview.registration import register_views
 
-_SUPPORT_VERTICES = 2500
-"""Vertices of a view that represent its surface."""
+_SUPPORT_VERTICES = 2500  # vertices of a view that represent its surface
 _KEYPOINTS = 500
 _RADII = (0.25, 0.12)
 """Radii of spin images, over the square root of a view's area: for parts of the object, and for details."""
-_NORMAL_RADIUS = 0.7
-"""Radius, in keypoint spacings, over which a keypoint's normal is averaged."""
+_NORMAL_RADIUS = 0.7  # radius, in keypoint spacings, over which a keypoint's normal is averaged
 _ACROSS, _ALONG = 8, 12
 
 
@@ -116,14 +115,12 @@ def _spin_images(
     return np.asarray(np.sqrt(shares), dtype=np.float32)
 
 
-_NEAREST_KEYPOINTS = 3
-"""Most similar keypoints of the other view that each keypoint is paired with."""
+_NEAREST_KEYPOINTS = 3  # most similar keypoints of the other view that each keypoint is paired with
 _REFERENCE_RANK = 20
 """Rank of the keypoint that a distinctive one has to be clearly less similar to: on a plane all are alike."""
 _MAX_PAIRS = 600
 _MAX_COSINE_DIFFERENCE = 0.25
-_MIN_PAIRS = 6
-"""Pairs that agree on a pose: three determine it."""
+_MIN_PAIRS = 6  # pairs that agree on a pose: three determine it
 _MIN_COSINE = 0.8
 _SPARSE_STEP = 12
 _CANDIDATE_SEPARATION = 3.0
@@ -233,23 +230,18 @@ def _relations(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, ...
     return distance, along, normals @ normals.T
 
 
-_MAX_FITTED, _MAX_CANDIDATES = 12, 6
-"""Poses of a pair that are aligned, and those that remain, the best ones."""
+_MAX_FITTED, _MAX_CANDIDATES = 12, 6  # poses of a pair that are aligned, and those that remain, the best ones
 _REACH_SPACINGS = 2.0
 _CONTRADICTION_WEIGHT = 8.0
 """Points in agreement that outweigh a contradicting one: at true poses one point in fifty contradicts, at steps and
 slits; at wrong poses of repetitive objects one in ten or more."""
-_MIN_AGREE = 0.02
-"""Share of the points of both views, as `register_views` requires it."""
-_AMBIGUOUS_SHARE = 0.5
-"""Score of an alternative, over the best one, that makes the answer ambiguous."""
-_BETTER_SHARE = 1.1
-"""Score of an alternative, over the best one, that makes it the best one; all are then tried again."""
+_MIN_AGREE = 0.02  # share of the points of both views, as `register_views` requires it
+_AMBIGUOUS_SHARE = 0.5  # score of an alternative, over the best one, that makes the answer ambiguous
+_BETTER_SHARE = 1.1  # score of an alternative, over the best one, that makes it the best one; all are then tried again
 _COARSE_SAMPLE, _COARSE_RATIO, _COARSE_PAIRS = 100, 2.0, 4
 """Before an alternative is aligned: points of a view that are compared, points in agreement for each contradicting one,
 and pairs that it is then aligned by."""
-_ALTERNATIVE_SEPARATION = 2.0
-"""Distance of alternatives, over the reach, below which they are the same."""
+_ALTERNATIVE_SEPARATION = 2.0  # distance of alternatives, over the reach, below which they are the same
 _ADVICE = (
     "Scan it with something that is fixed to it and has no symmetry, or state where to start from: the turntable's "
     "angle and axis, or poses"
@@ -278,10 +270,8 @@ def find_start_poses(views: Sequence[Mesh], *, names: Sequence[str] | None = Non
 
     Free space is checked if a mesh faces a camera at its origin. names : of the views, for messages.
 
-    Raises
-    ------
-    RegistrationRefusedError
-        No poses agree with the views, or others agree nearly as well: the object is symmetric or repeats itself.
+    Raises RegistrationRefusedError: no poses agree with the views, or others agree nearly as well: the object is
+    symmetric or repeats itself.
     """
     names = names or [f"view {number}" for number in range(len(views))]
     if len(views) < 2:
