@@ -29,7 +29,7 @@ NEED_KERNELS = (
     "tests/golden/", "tests/properties/", "tests/contract/", "tests/e2e/", "tests/unit/accept/",
     "tests/unit/calibrate/", "tests/unit/calibration/", "tests/unit/combine/", "tests/unit/doctor/",
     "tests/unit/meshing/", "tests/unit/reconstruction/", "tests/unit/scan/", "tests/unit/simulated_rig/",
-    "tests/unit/views/", "tests/unit/test_cli_calibrate.py", "tests/unit/test_cli_model.py",
+    "tests/unit/multiview/", "tests/unit/test_cli_calibrate.py", "tests/unit/test_cli_model.py",
     "tests/unit/test_cli_reconstruct.py", "tests/unit/test_colour_frames.py", "tests/unit/test_light_bound.py",
 )  # fmt: skip
 """Tests that call compiled kernels. They run last, so that the kernels compile beside all others."""

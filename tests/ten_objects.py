@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray, Mesh
 from tests.turned_views import Radius, bumpy, vase
-from tests.unit.views.known_views import DISTANCE_MM, Noise, View, star, views_of
+from tests.unit.multiview.known_views import DISTANCE_MM, Noise, View, star, views_of
 
 _NOISE = Noise(0.010, 0.004, 4.0)
 _PIXEL_MM = 0.8

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.meshing.surface import vertex_normals
 from slrig.model import FloatArray, IntArray, Mesh
-from slrig.views.turntable import turntable
+from slrig.multiview.turntable import turntable_poses
 from tests.unit.meshing.plain import grid_faces, mesh_of
 
 Radius = Callable[[FloatArray], FloatArray]
@@ -75,7 +75,7 @@ def seen(radius: Radius, angles_deg: Sequence[float], *, pitch_mm: float = 0.5, 
     noise_mm : stated deviation of a vertex that is seen head on; twice that at 60°.
     """
     random = np.random.default_rng(5)
-    poses = turntable(AXIS_POINT_MM, AXIS, np.deg2rad(angles_deg))
+    poses = turntable_poses(AXIS_POINT_MM, AXIS, np.deg2rad(angles_deg))
     ball = trimesh.creation.icosphere(subdivisions=6, radius=1.0)
     shape = ball.vertices * radius(np.asarray(ball.vertices))[:, None]
     views = []
@@ -91,7 +91,7 @@ def plane(tilts_deg: Sequence[float]) -> Turned:
     """A flat plate of 60 x 60 mm before the camera, tilted about the x axis: its middle stays."""
     rows, columns = np.meshgrid(np.arange(-30, 30.5), np.arange(-30, 30.5), indexing="ij")
     flat = np.stack([columns.ravel(), rows.ravel(), np.zeros(rows.size)], axis=1)
-    poses = turntable(np.zeros(3), np.array([1.0, 0.0, 0.0]), np.deg2rad(tilts_deg))
+    poses = turntable_poses(np.zeros(3), np.array([1.0, 0.0, 0.0]), np.deg2rad(tilts_deg))
     views = []
     for pose in poses:
         points = flat @ pose[:3, :3]
@@ -165,4 +165,4 @@ def wrong_axis(angles_deg: Sequence[float]) -> list[FloatArray]:
     off = Rotation.from_rotvec(np.deg2rad(0.5) * np.cross(AXIS, [0.6, 0.0, 0.8]))
     angles = np.asarray(angles_deg) + np.append(0.0, random.normal(0, 0.05, len(angles_deg) - 1))
     point = AXIS_POINT_MM + np.array([0.7, 0.2, -0.68])
-    return list(turntable(point, off.apply(AXIS), np.deg2rad(angles)))
+    return list(turntable_poses(point, off.apply(AXIS), np.deg2rad(angles)))

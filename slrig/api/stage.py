@@ -103,7 +103,7 @@ def calibrate_stage(service: Serving, request: Annotated[AxisRequest, Body()]) -
         raise ConfigError(message)
     observed = [accepted[number].observation for number in numbers]
     found = service.find_axis(observed, board, calibration, request.angles_deg)
-    stage = service.stage.put_axis(found.found.measured, source=AxisSource.BOARD, of=str(record.id))
+    stage = service.stage.put_axis(found.axis.measured_axis, source=AxisSource.BOARD, of=str(record.id))
     poses = [
         StagePose(name=name, residual_mm=left, angle_deg=found.angles_deg[name], error_deg=found.errors_deg.get(name))
         for name, left in found.residual_mm.items()

@@ -8,7 +8,7 @@ from slrig.calibration.board import Board
 from slrig.calibration.health.drift import board_poses
 from slrig.calibration.observations import PoseObservation
 from slrig.model import Calibration
-from slrig.views import BoardAxis, board_axis
+from slrig.multiview import BoardAxis, axis_from_board
 
 
 def axis_of_poses(
@@ -27,4 +27,4 @@ def axis_of_poses(
         As `board_axis` does.
     """
     known = board_poses(poses, board, calibration)
-    return board_axis(known.names, known.poses, known.covariance, board.points_mm, angles_deg)
+    return axis_from_board(known.names, known.poses, known.covariance, board.points_mm, angles_deg)

@@ -240,8 +240,8 @@ def _starts(
         message = (
             "expected a stage's --angle with its axis (--stage FILE, --axis FILE, or --axis-point and "
             f"--axis-direction), --poses FILE, --markers, or --unknown, found {said}. Where --unknown is refused, "
-            "place the scans by hand in another program, and write what it says into a file as slrig/views/README.md "
-            "describes"
+            "place the scans by hand in another program, and write what it says into a file as "
+            "slrig/multiview/README.md describes"
         )
         raise ConfigError(message)
     if found is not None:

@@ -70,7 +70,7 @@ def axis(
             except (PoseRefusedError, PatternError) as error:
                 refused[name] = str(error)
         found = axis_of_poses(read, board, rig, None if angle is None else angles)
-        record = with_axis(before, found.found.measured, source=AxisSource.BOARD, of=folder.absolute().name)
+        record = with_axis(before, found.axis.measured_axis, source=AxisSource.BOARD, of=folder.absolute().name)
         write_file(output, encode_stage(record))
         display("done", 1.0, "")
     rows = [
@@ -82,10 +82,10 @@ def axis(
                  ("angle", "off", "residual"))), rows)  # fmt: skip
     for name, cause in refused.items():
         typer.echo(f"{'left out':<10}{name}: {cause}")
-    (x, y, z), (a, b, c) = found.found.point_mm, found.found.direction
+    (x, y, z), (a, b, c) = found.axis.point_mm, found.axis.direction
     typer.echo(
-        f"{'axis':<10}through ({x:.3f}, {y:.3f}, {z:.3f}) mm ± {found.found.point_sigma_mm:.4f} mm, along "
-        f"({a:.5f}, {b:.5f}, {c:.5f}) ± {math.degrees(found.found.direction_sigma_rad):.4f}°"
+        f"{'axis':<10}through ({x:.3f}, {y:.3f}, {z:.3f}) mm ± {found.axis.point_sigma_mm:.4f} mm, along "
+        f"({a:.5f}, {b:.5f}, {c:.5f}) ± {math.degrees(found.axis.direction_sigma_rad):.4f}°"
     )
     last = record.history[-1]
     if last.moved_mm is not None:

@@ -22,25 +22,25 @@ from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
 from slrig.kernels import compilations_told
 from slrig.meshing import open_borders
 from slrig.model import AlbedoMark, Mesh, StagePlane
+from slrig.multiview import (
+    FusedModel,
+    MarkerFit,
+    MarkerObservations,
+    PoseErrors,
+    Registration,
+    TurntableAxis,
+    concatenate_views,
+    cut_view,
+    find_start_poses,
+    fuse_views,
+    marker_poses,
+    register_on_turntable,
+    register_views,
+)
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import Progress
 from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
-from slrig.views import (
-    FoundAxis,
-    FusedModel,
-    MarkerFit,
-    MarkersSeen,
-    Registration,
-    cut,
-    found_starts,
-    fused,
-    marker_poses,
-    put_together,
-    registered,
-    registered_on_stage,
-    registered_poses,
-)
 
 _SURFACE_POINTS = 500  # of a view, at which it is told how well markers put it
 _START_SIGMAS = 3.0  # of starts by markers, that have to lie within the start's error
@@ -102,14 +102,14 @@ def combine_into(
         progress(*at, f"preparing kernels, first time only: {kernel}")
 
     with compilations_told(compiling):
-        names, views, removed, seen = list(meshes), [], [], list[MarkersSeen]()
+        names, views, removed, seen = list(meshes), [], [], list[MarkerObservations]()
         for number, (name, file) in enumerate(meshes.items()):
             entered("reading", 0.2 * number / len(meshes), name)
             mesh = read_mesh(file)
             if isinstance(poses, MarkerPoses):
                 # Before the cut: they lie on the plate.
                 seen.append(markers_of(file, mesh, poses.dictionary))
-            view, taken = cut(mesh, planes, name=name)
+            view, taken = cut_view(mesh, planes, name=name)
             views.append(view)
             removed.append(taken)
         entered("registering", 0.2, f"{len(views)} views")
@@ -120,8 +120,8 @@ def combine_into(
 
         found, axis = _registered(views, poses, marked, names, start_error_mm, again)
         entered("fusing", 0.4)
-        errors = registered_poses(found.covariance, found.middle_mm)
-        whole = fused(views, found.poses, voxel_mm=voxel_mm, pose_errors=errors)
+        errors = PoseErrors.from_registration(found.covariance, found.middle_mm)
+        whole = fuse_views(views, found.poses, voxel_mm=voxel_mm, pose_errors=errors)
         entered("writing", 0.9, f"{len(whole.mesh.faces)} triangles")
         known = Poses(
             dict(zip(names, found.poses, strict=True)), None if axis is None else (axis.point_mm, axis.direction)
@@ -137,7 +137,7 @@ def combine_into(
         files: dict[str, Callable[[], bytes | bytearray]] = {
             MODEL: lambda: encode_mesh_ply(whole.mesh, views=whole.views),
             MODEL_GLB: lambda: encode_mesh_glb(whole.mesh),
-            PLACED: lambda: encode_mesh_ply(put_together(views, found.poses)),
+            PLACED: lambda: encode_mesh_ply(concatenate_views(views, found.poses)),
             POSES: lambda: encode_poses(known),
             SIDES: lambda: six_sides_png(whole.mesh),
             VIEW: lambda: encode_view_glb(whole.mesh),
@@ -160,13 +160,13 @@ def read_mesh(file: Path) -> Mesh:
 
 
 def _marked(
-    views: Sequence[Mesh], seen: Sequence[MarkersSeen], names: Sequence[str], start_error_mm: float
+    views: Sequence[Mesh], seen: Sequence[MarkerObservations], names: Sequence[str], start_error_mm: float
 ) -> MarkerFit:
     """Where markers put the views. Raises RegistrationRefusedError."""
     surfaces = [
         view.vertices_mm[:: max(1, len(view.vertices_mm) // _SURFACE_POINTS)].astype(np.float64) for view in views
     ]
-    return marker_poses(seen, surfaces, names=names, most_sigma_mm=start_error_mm / _START_SIGMAS)
+    return marker_poses(seen, surfaces, names=names, max_sigma_mm=start_error_mm / _START_SIGMAS)
 
 
 def _registered(
@@ -176,16 +176,16 @@ def _registered(
     names: Sequence[str],
     start_error_mm: float,
     begun: Callable[[int], None],
-) -> tuple[Registration, FoundAxis | None]:
+) -> tuple[Registration, TurntableAxis | None]:
     """Where the views belong, and of a turntable the axis that they tell. Raises ConfigError; as `registered`."""
     if marked is not None:
-        found = registered(
+        found = register_views(
             views, marked.poses, names=names, start_error_mm=start_error_mm, start_covariance=marked.covariance
         )
         return found, None
     if not isinstance(poses, TurntablePoses):
-        starts = np.array(poses.matrices) if isinstance(poses, GivenPoses) else found_starts(views, names=names)
-        return registered(views, starts, names=names, start_error_mm=start_error_mm), None
+        starts = np.array(poses.matrices) if isinstance(poses, GivenPoses) else find_start_poses(views, names=names)
+        return register_views(views, starts, names=names, start_error_mm=start_error_mm), None
     if poses.axis is None or poses.angles_deg is None:
         raise ConfigError("poses: expected a turntable's axis and the angle of each view, found one of them at most")
     point, direction, angles = (
@@ -193,7 +193,9 @@ def _registered(
         np.array(poses.axis.direction),
         np.deg2rad(poses.angles_deg),
     )
-    return registered_on_stage(views, point, direction, angles, names=names, start_error_mm=start_error_mm, begun=begun)
+    return register_on_turntable(
+        views, point, direction, angles, names=names, start_error_mm=start_error_mm, on_round=begun
+    )
 
 
 def _report(
@@ -220,7 +222,7 @@ def _report(
     }
 
 
-def _of_markers(found: MarkerFit, seen: Sequence[MarkersSeen], names: Sequence[str]) -> list[dict[str, Any]]:
+def _of_markers(found: MarkerFit, seen: Sequence[MarkerObservations], names: Sequence[str]) -> list[dict[str, Any]]:
     """What report.json says of each view's markers: those seen, those of them that another view shares, how well they
     put its surface, and what was left out.
     """
@@ -233,7 +235,7 @@ def _of_markers(found: MarkerFit, seen: Sequence[MarkersSeen], names: Sequence[s
             "rms_over_sigma": float(found.rms_over_sigma[v]),
             "left_out": [
                 {"marker": each.marker, "off_mm": each.off_mm, "off_over_sigma": each.off_over_sigma}
-                for each in found.left_out
+                for each in found.rejected
                 if each.view == v
             ],
         }
@@ -241,7 +243,7 @@ def _of_markers(found: MarkerFit, seen: Sequence[MarkersSeen], names: Sequence[s
     ]
 
 
-def _axis(found: FoundAxis, told: StartingPoses) -> dict[str, Any]:
+def _axis(found: TurntableAxis, told: StartingPoses) -> dict[str, Any]:
     """The axis as the views have it. stage_error_deg : (N,), angles as found less those told, within half a turn."""
     stated_deg = np.array(told.angles_deg if isinstance(told, TurntablePoses) else ())
     off_deg = np.rad2deg(found.angles_rad) - (stated_deg - stated_deg[0])

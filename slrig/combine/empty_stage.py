@@ -6,9 +6,9 @@ from pathlib import Path
 
 from slrig.combine.combining import read_mesh
 from slrig.model import StageAxis, StagePlane
-from slrig.views import stage_planes
+from slrig.multiview import find_turntable_planes
 
 
 def planes_in(mesh: Path, axis: StageAxis | None) -> tuple[StagePlane, ...]:
     """The planes in a mesh.ply; see `stage_planes`. Raises as that does, InvalidInputError, and StorageError."""
-    return stage_planes(read_mesh(mesh), axis)
+    return find_turntable_planes(read_mesh(mesh), axis)

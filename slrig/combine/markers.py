@@ -22,9 +22,9 @@ from slrig.calibration.boards.printing import marker_dictionary
 from slrig.calibration.boards.sightings import markers_in
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, White
+from slrig.multiview import MarkerObservation, fit_plane
 from slrig.reconstruction import project, rays
 from slrig.scan.artefacts import MESH
-from slrig.views import SeenMarker, fitted_plane
 
 _REACH = 0.7
 """Of a module, from a marker's corner: inwards is its border, one wide, outwards paper, by a ChArUco board's least."""
@@ -53,7 +53,7 @@ def bundle_of(mesh_file: Path) -> Path:
     return found
 
 
-def markers_of(mesh_file: Path, mesh: Mesh, dictionary: str) -> dict[int, SeenMarker]:
+def markers_of(mesh_file: Path, mesh: Mesh, dictionary: str) -> dict[int, MarkerObservation]:
     """The markers of a scan, by number, in the frame of its mesh: where rays through their corners, in each white frame
     of each camera, meet the plane of the mesh there. dictionary : OpenCV's name.
 
@@ -74,7 +74,7 @@ def markers_of(mesh_file: Path, mesh: Mesh, dictionary: str) -> dict[int, SeenMa
         what = "calibration.json" if known is None else "frame in white"
         message = f"{files.folder}: expected a {what}, without which no marker can be put on the surface, found none"
         raise BundleError(f"{message}; say in another way where the scan belongs")
-    found: dict[int, list[SeenMarker]] = {}
+    found: dict[int, list[MarkerObservation]] = {}
     for shot in files.shots(white, colour=False):
         camera = known.cameras.get(shot.camera)
         if camera is not None:
@@ -87,7 +87,7 @@ def markers_of(mesh_file: Path, mesh: Mesh, dictionary: str) -> dict[int, SeenMa
 
 def markers_in_view(
     image: Pixels, camera: Pinhole, full_scale: float, mesh: Mesh, dictionary: str
-) -> Iterator[tuple[int, SeenMarker]]:
+) -> Iterator[tuple[int, MarkerObservation]]:
     """The markers of one frame, (H, W), whose pixels clip at `full_scale`; see `markers_of`."""
     grey = Grey.of(image, full_scale)
     outlines, numbers = markers_in(grey.eight, dictionary)
@@ -96,7 +96,7 @@ def markers_in_view(
     places = project(camera, vertices)
     for number, rough in zip(numbers.tolist(), outlines, strict=True):
         mine = vertices[_inside(rough, places)]
-        plane = fitted_plane(mine) if len(mine) >= _FEWEST_VERTICES else None
+        plane = fit_plane(mine) if len(mine) >= _FEWEST_VERTICES else None
         if plane is None or np.count_nonzero(numbers == number) > 1:
             continue
         middle, normal, off_mm = plane
@@ -113,7 +113,7 @@ def markers_in_view(
         # the plane's own error along the ray.
         across_mm = sigma_px * depth / camera.matrix[0, 0]
         sigma = np.sqrt((across_mm**2 * (1 + cosine**-2) + (off_mm / cosine) ** 2) / 3)
-        yield number, SeenMarker(camera.centre_mm + depth[:, None] * ways, sigma)
+        yield number, MarkerObservation(camera.centre_mm + depth[:, None] * ways, sigma)
 
 
 def _placed(level: FloatArray, rough: FloatArray, modules: int) -> FittedPlaces:
@@ -136,7 +136,7 @@ def _inside(outline: FloatArray, places: FloatArray) -> NDArray[np.bool_]:
     return np.asarray((left.all(axis=1) | ~left.any(axis=1)) & np.isfinite(places).all(axis=1))
 
 
-def _mean(seen: list[SeenMarker]) -> SeenMarker:
+def _mean(seen: list[MarkerObservation]) -> MarkerObservation:
     weight = np.array([each.sigma_mm for each in seen])[..., None] ** -2
     corners = (weight * [each.corners_mm for each in seen]).sum(axis=0) / weight.sum(axis=0)
-    return SeenMarker(corners, np.min([each.sigma_mm for each in seen], axis=0))
+    return MarkerObservation(corners, np.min([each.sigma_mm for each in seen], axis=0))

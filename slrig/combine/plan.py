@@ -18,7 +18,7 @@ from slrig.model import FloatArray
 from slrig.scan.plan import ScanPlan, SeriesPlace
 
 START_ERROR_MM = 3.0
-"""See `slrig.views.registration.START_ERROR_MM`, which is not loaded where nothing is computed."""
+"""See `slrig.multiview.registration.START_ERROR_MM`, which is not loaded where nothing is computed."""
 
 MOST_UNKNOWN = 24
 """Views whose poses are to be found: eight take 15 to 20 s, and the time grows with their square."""

@@ -19,7 +19,7 @@ from slrig.disk import refusals_of
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.records import utc_now
 from slrig.model import MeasuredAxis, StagePlane
-from slrig.views import MOST_SIGMAS, Noted, noted
+from slrig.multiview import MAX_AXIS_SIGMAS, AxisUpdate, update_axis
 
 _FILE = "stage.json"
 _log = structlog.get_logger(__name__)
@@ -44,7 +44,7 @@ def state_of(record: StageRecord) -> tuple[StageState, str]:
         last = record.history[-1]
         return StageState.MOVED, (
             f"model {last.of} turned about an axis that is {last.moved_mm:.3f} mm and {last.moved_deg:.3f}° from the "
-            f"one on record, {last.sigmas:.0f} deviations where {MOST_SIGMAS:g} are allowed: were the stage or the "
+            f"one on record, {last.sigmas:.0f} deviations where {MAX_AXIS_SIGMAS:g} are allowed: were the stage or the "
             "cameras moved, or is the rig newly calibrated? Then calibrate the axis again (POST /rig/stage/axis) and "
             "scan the empty stage (POST /rig/stage/planes); else scan the object again"
         )
@@ -55,7 +55,7 @@ def with_axis(
     record: StageRecord, axis: MeasuredAxis, *, source: AxisSource, of: str, at: datetime | None = None
 ) -> StageRecord:
     """The record with an axis in place of any other, and with how far it has moved."""
-    apart = None if record.axis is None else noted(record.axis, axis)
+    apart = None if record.axis is None else update_axis(record.axis, axis)
     return replace(record, axis=axis, history=(*record.history, _change(axis, source, of, at, apart, taken=True)))
 
 
@@ -101,7 +101,7 @@ class StageStore:
         with self._lock:
             return self.replace(replace(self.record(), planes=tuple(planes)))
 
-    def note(self, axis: MeasuredAxis, *, of: str, at: datetime | None = None) -> Noted | None:
+    def note(self, axis: MeasuredAxis, *, of: str, at: datetime | None = None) -> AxisUpdate | None:
         """Improve the axis on record by one that a model was found to turn about; None where none is on record.
 
         An axis that is too far from it (`MOST_SIGMAS`) is not taken, only told.
@@ -110,7 +110,7 @@ class StageStore:
             record = self.record()
             if record.axis is None:
                 return None
-            found = noted(record.axis, axis)
+            found = update_axis(record.axis, axis)
             change = _change(axis, AxisSource.MODEL, of, at, found, taken=found.agrees)
             self.replace(replace(record, axis=found.axis, history=(*record.history, change)))
         if not found.agrees:
@@ -134,7 +134,7 @@ class StageStore:
 
 
 def _change(
-    axis: MeasuredAxis, source: AxisSource, of: str, at: datetime | None, apart: Noted | None, *, taken: bool
+    axis: MeasuredAxis, source: AxisSource, of: str, at: datetime | None, apart: AxisUpdate | None, *, taken: bool
 ) -> ChangeEntry:
     return ChangeEntry(
         at=at or utc_now(),

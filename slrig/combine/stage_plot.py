@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from slrig.bundle.options import AxisSource, ChangeEntry
+from slrig.multiview import AXIS_SPAN_MM
 from slrig.reports.drawing import shape
 from slrig.reports.trend import (
     END,
@@ -23,7 +24,6 @@ from slrig.reports.trend import (
     times,
     trend,
 )
-from slrig.views import FAR_MM
 
 _HEIGHT = 470.0
 _COLOURS = {AxisSource.BOARD: GREY, AxisSource.DOCUMENT: GREY, AxisSource.MODEL: GREEN}
@@ -37,9 +37,9 @@ def stage_svg(history: Sequence[ChangeEntry], /) -> Markup:
     apart = [_apart(history[0], each) for each in history]
     second = TOP + PANEL + GAP
     turns = [each.direction_sigma_deg for each in history]
-    ends = [each.point_sigma_mm + FAR_MM * np.deg2rad(each.direction_sigma_deg) for each in history]
+    ends = [each.point_sigma_mm + AXIS_SPAN_MM * np.deg2rad(each.direction_sigma_deg) for each in history]
     parts = _panel(
-        history, f"From the first axis, up to {FAR_MM:g} mm along it, mm", TOP, [mm for mm, _ in apart], ends
+        history, f"From the first axis, up to {AXIS_SPAN_MM:g} mm along it, mm", TOP, [mm for mm, _ in apart], ends
     )
     parts += _panel(history, "Its direction from the first one's, °", second, [deg for _, deg in apart], turns)
     for number, (colour, words) in enumerate(((GREY, "board"), (GREEN, "model"), (ORANGE, "not taken"))):
@@ -67,6 +67,6 @@ def _panel(
 def _apart(first: ChangeEntry, later: ChangeEntry) -> tuple[float, float]:
     """How far two axes are apart at most, mm, up to 50 mm either way of the later one's point, and their angle, °."""
     way, other = np.array(first.direction), np.array(later.direction)
-    ends = [np.array(later.point_mm) + s * other - np.array(first.point_mm) for s in (-FAR_MM, FAR_MM)]
+    ends = [np.array(later.point_mm) + s * other - np.array(first.point_mm) for s in (-AXIS_SPAN_MM, AXIS_SPAN_MM)]
     sine = min(float(np.linalg.norm(np.cross(way, other))), 1.0)
     return max(float(np.linalg.norm(np.cross(way, end))) for end in ends), float(np.rad2deg(np.arcsin(sine)))

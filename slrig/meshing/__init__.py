@@ -1,25 +1,10 @@
 """From curves to a triangle mesh: strips, flips, boundary, quality."""
 
-from slrig.meshing.boundary import (
-    smooth_boundary,
-)
-from slrig.meshing.flips import (
-    optimise_edges,
-)
-from slrig.meshing.quality import (
-    mesh_figures,
-    nearest_on_triangle,
-    score,
-    weighted_percentiles,
-)
-from slrig.meshing.rasteriser import (
-    merge_depth_buffers,
-    rasterise,
-    rasterise_normals,
-)
-from slrig.meshing.strips import (
-    runs_of_curve_parts,
-)
+from slrig.meshing.boundary import smooth_boundary
+from slrig.meshing.flips import optimise_edges
+from slrig.meshing.quality import mesh_figures, nearest_on_triangle, score, weighted_percentiles
+from slrig.meshing.rasteriser import merge_depth_buffers, rasterise, rasterise_normals
+from slrig.meshing.strips import runs_of_curve_parts
 from slrig.meshing.surface import (
     FIRST_STAGE,
     MeshingLimits,

@@ -17,10 +17,10 @@ from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing.topology import neighbours, select_faces
 from slrig.model import FloatArray, IntArray
 
-# Of an added triangle: no sliver, no fold against the triangles that it is put beside.
-_COS_SMALLEST_ANGLE = math.cos(math.radians(10.0))
-_COS_LARGEST_FOLD = math.cos(math.radians(60.0))
-# Half-edges looked at on each side of a notch for a boundary that runs into it.
+# Limits of an added triangle: not a sliver, and not folded against its neighbours.
+_COS_MIN_ANGLE = math.cos(math.radians(10.0))
+_COS_MAX_FOLD = math.cos(math.radians(60.0))
+# Half-edges on each side of a notch that are checked for a boundary that runs into it.
 _STEPS_ASIDE = 4
 
 
@@ -133,7 +133,7 @@ def is_notch(points: Any, faces: Any, adjacency: Any, into: int, out: int) -> bo
 
 @kernel_part
 def _has_edge(faces: Any, adjacency: Any, degree: Any, into: int, other: int) -> Any:
-    """Whether the corner's fan of triangles has an edge to the vertex `other`, and whether its vertex has no other fan.
+    """Two flags: the corner's fan of triangles has an edge to the vertex `other`; its vertex has no other fan.
 
     degree : (n,) int32, triangles at each vertex.
     """
@@ -151,8 +151,8 @@ def _has_edge(faces: Any, adjacency: Any, degree: Any, into: int, other: int) ->
 
 
 @kernel_part
-def _lies_inside(points: Any, p: int, a: int, b: int, c: int, normal: Any) -> bool:
-    """Whether p, projected along the normal of triangle abc, lies inside it or on its edge."""
+def _is_inside(points: Any, p: int, a: int, b: int, c: int, normal: Any) -> bool:
+    """True if p, projected along the normal of triangle abc, lies inside it or on its edge."""
     for u, v in ((a, b), (b, c), (c, a)):
         if _dot(_cross(_difference(points, v, u), _difference(points, p, u)), normal) < 0.0:
             return False
@@ -161,14 +161,14 @@ def _lies_inside(points: Any, p: int, a: int, b: int, c: int, normal: Any) -> bo
 
 @kernel_part
 def _is_clear(points: Any, faces: Any, adjacency: Any, into: int, out: int, normal: Any) -> bool:
-    """Whether the boundary on either side stays outside the triangle between two half-edges; `normal` is its normal."""
+    """True if the boundary on either side stays outside the triangle between two half-edges; `normal` is its normal."""
     a, b, c = faces[into // 3, (into + 1) % 3], faces[into // 3, (into + 2) % 3], faces[out // 3, (out + 2) % 3]
     ahead, behind = out, into
     for _ in range(_STEPS_ASIDE):
         ahead = next_boundary_edge(faces, adjacency, ahead)
         behind = previous_boundary_edge(faces, adjacency, behind)
         for p in (faces[ahead // 3, (ahead + 2) % 3], faces[behind // 3, (behind + 1) % 3]):
-            if p != a and p != b and p != c and _lies_inside(points, p, c, b, a, normal):
+            if p != a and p != b and p != c and _is_inside(points, p, c, b, a, normal):
                 return False
     return True
 
@@ -177,7 +177,7 @@ def _is_clear(points: Any, faces: Any, adjacency: Any, into: int, out: int, norm
 def can_add_triangle(
     points: Any, faces: Any, adjacency: Any, degree: Any, allowed_mm: Any, into: int, out: int
 ) -> bool:
-    """Whether triangle (c, b, a) may fill the notch at b between half-edges `into` (a to b) and `out` (b to c).
+    """True if triangle (c, b, a) may fill the notch at b between half-edges `into` (a to b) and `out` (b to c).
 
     Not across a depth edge: its longest edge is at most the mean of `allowed_mm` (n,) at its corners. Not as a
     sliver, nor folded against the triangle on any side. Not where edge ac exists, unless it is the third side of a
@@ -188,33 +188,33 @@ def can_add_triangle(
     if not longest <= (allowed_mm[a] + allowed_mm[b] + allowed_mm[c]) / 3.0:
         return False
     sharpest = max(cosine_at(points, a, b, c), cosine_at(points, b, c, a), cosine_at(points, c, a, b))
-    if sharpest > _COS_SMALLEST_ANGLE:
+    if sharpest > _COS_MIN_ANGLE:
         return False
     normal = _unit_normal(points, c, b, a)
     third = next_boundary_edge(faces, adjacency, out)
     closes = faces[third // 3, (third + 2) % 3] == a
-    for beside in (into // 3, out // 3, third // 3 if closes else out // 3):
-        n = _unit_normal(points, faces[beside, 0], faces[beside, 1], faces[beside, 2])
-        if _dot(n, normal) < _COS_LARGEST_FOLD:
+    for face in (into // 3, out // 3, third // 3 if closes else out // 3):
+        n = _unit_normal(points, faces[face, 0], faces[face, 1], faces[face, 2])
+        if _dot(n, normal) < _COS_MAX_FOLD:
             return False
     if closes:
         return True
     found, whole = _has_edge(faces, adjacency, degree, out, a)
     if not (found or whole):
-        # Another fan of c may have the edge; then a has it as well. If neither fan is all there is, assume the worst.
+        # Another fan of c may have the edge; then a has it as well. If neither fan is complete, assume the worst.
         found, whole = _has_edge(faces, adjacency, degree, previous_boundary_edge(faces, adjacency, into), c)
         found |= not whole
     return not found and _is_clear(points, faces, adjacency, into, out, normal)
 
 
 @kernel_part
-def can_remove_fan(faces: Any, adjacency: Any, corners: Any, into: int, out: int, most_triangles: int) -> bool:
-    """Whether the spike at b between half-edges `into` (a to b) and `out` (b to c) may be removed with its triangles.
+def can_remove_fan(faces: Any, adjacency: Any, corners: Any, into: int, out: int, max_triangles: int) -> bool:
+    """True if the spike at b between half-edges `into` (a to b) and `out` (b to c) may be removed with its triangles.
 
     corners : (n,) int32, boundary corners at each vertex, 0 inside the surface.
-    The vertices that this lays bare must have been inside: otherwise two boundaries would touch in one, or a strip
-    of one triangle's width would be cut through. The triangles behind must reach inside as well, but for those that
-    the next half-edges on either side belong to: otherwise a strip of two triangles' width would be thinned.
+    The vertices that join the boundary must have been inside: otherwise two boundaries would touch in one, or a strip
+    of one triangle's width would be cut through. The triangles behind must reach inside as well, except those of the
+    next half-edges on either side: otherwise a strip of two triangles' width would be thinned.
     """
     face, corner = into // 3, (into + 2) % 3
     b = faces[face, corner]
@@ -235,7 +235,7 @@ def can_remove_fan(faces: Any, adjacency: Any, corners: Any, into: int, out: int
         count += 1
         last = 3 * face + (corner + 2) % 3 == out
         is_ear = last and count == 1
-        if count > most_triangles:
+        if count > max_triangles:
             return False
         if corners[apex] > 0 and (is_ear or (apex != left and apex != right)):
             return False
@@ -277,7 +277,7 @@ def add_triangle(faces: Any, adjacency: Any, degree: Any, corners: Any, face: in
 
 @kernel_part
 def remove_fan(
-    faces: Any, adjacency: Any, degree: Any, corners: Any, alive: Any, into: int, out: int, laid_bare: Any
+    faces: Any, adjacency: Any, degree: Any, corners: Any, alive: Any, into: int, out: int, new_boundary: Any
 ) -> None:
     """Remove the fan at the corner between half-edges `into` and `out`; append the new boundary half-edges in order."""
     face, corner = into // 3, (into + 2) % 3
@@ -290,7 +290,7 @@ def remove_fan(
         behind = adjacency[face, corner]
         side = corner_facing(adjacency, behind, face)
         adjacency[behind, side] = -1
-        laid_bare.append(np.int64(3 * behind + side))
+        new_boundary.append(np.int64(3 * behind + side))
         if 3 * face + (corner + 2) % 3 == out:
             return
         corners[faces[face, (corner + 1) % 3]] += 1
@@ -299,9 +299,9 @@ def remove_fan(
 
 
 PSI = math.pi / 2  # the paper's ψ
-LONGEST_MM = 5.0  # the paper's λ
-_SPACINGS = 4.0  # λ alone took 9 100 of 28 900 good triangles of every eighth stripe of a face
-_MOST_TRIANGLES_OF_A_SPIKE = 6  # chosen; 3 leaves 8 of 239 246 triangles more of a rendered vase, 12 the same
+MAX_EDGE_MM = 5.0  # the paper's λ
+_SPACINGS = 4.0  # λ alone removes good triangles of sparse curves
+_MAX_SPIKE_TRIANGLES = 6  # more make no difference
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,20 +329,19 @@ class SmoothResult:
     rounds: int
 
 
-def longest_boundary_edge_mm(points_mm: FloatArray, faces: IntArray, /) -> FloatArray:
+def max_boundary_edge_mm(points_mm: FloatArray, faces: IntArray, /) -> FloatArray:
     """(n,) float64: λ at each vertex, max(5 mm, 4 x local spacing); the local spacing is the median of its edges.
 
-    The paper's λ = 5 alone takes good triangles where the points are sparse. The median (the upper one) keeps to the
-    wider of the spacings along the curves and across, so that sparse curves of dense points are left alone too, and
-    does not see the one long triangle beside a curve's end. A vertex of one triangle only, that has no such
-    median, has the smaller spacing of the other two.
+    The paper's λ = 5 alone removes good triangles of sparse points. The median (the upper one) follows the wider of the
+    spacings along and across the curves, which spares sparse curves of dense points, and ignores a single long triangle
+    at a curve's end. A vertex of one triangle only, which has no such median, has the smaller spacing of the other two.
     """
     points, faces = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(faces)
-    longest = np.full(len(points), LONGEST_MM)
+    longest = np.full(len(points), MAX_EDGE_MM)
     near = np.zeros(len(points), dtype=np.bool_)
-    if not any(in_bands(_mark_long_edges, len(faces), points, faces, LONGEST_MM, near)):
+    if not any(in_bands(_mark_long_edges, len(faces), points, faces, MAX_EDGE_MM, near)):
         return longest
-    # The spacing of all that an edge too long touches, and of their neighbours, from all edges of both.
+    # The spacing at vertices of triangles with a long edge, and of their neighbours, from all edges of both.
     ring = np.zeros(len(points), dtype=np.bool_)
     ring[faces[near[faces].any(axis=1)]] = True
     around = faces[ring[faces].any(axis=1)]
@@ -359,7 +358,7 @@ def longest_boundary_edge_mm(points_mm: FloatArray, faces: IntArray, /) -> Float
     for corner in range(3):
         tip, left, right = (around[:, (corner + k) % 3] for k in range(3))
         smaller[tip[ear[tip]]] = np.minimum(spacing[left], spacing[right])[ear[tip]]
-    longest[near] = np.maximum(LONGEST_MM, _SPACINGS * smaller[near])
+    longest[near] = np.maximum(MAX_EDGE_MM, _SPACINGS * smaller[near])
     return longest
 
 
@@ -393,8 +392,8 @@ def shrink_boundary(
     removed = _shrink(points, faces, across, longest, alive)
     if not removed:
         return ShrinkResult(faces, across, 0)
-    kept, across = select_faces(faces, across, alive)
-    return ShrinkResult(kept, across, removed)
+    remaining, across = select_faces(faces, across, alive)
+    return ShrinkResult(remaining, across, removed)
 
 
 def smooth_boundary(
@@ -404,7 +403,7 @@ def smooth_boundary(
     /,
     *,
     psi_rad: float = PSI,
-    most_rounds: int = 8,
+    max_rounds: int = 8,
     adjacency: IntArray | None = None,
 ) -> SmoothResult:
     """Fill notches in the boundary and remove spikes.
@@ -420,7 +419,7 @@ def smooth_boundary(
 
     The paper's rule alone erodes posts of a few triangles' width, peels a slanted border row by row, and bridges depth
     edges. Therefore `can_add_triangle` and `can_remove_fan` may refuse, the two neighbours of a removed spike stay, and
-    a notch or a spike is followed over at most `most_rounds` points. The loop also ends without that limit: filling a
+    a notch or a spike is followed over at most `max_rounds` points. The loop also ends without that limit: filling a
     notch leaves fewer boundary edges, removing a spike fewer fans of triangles around a vertex.
 
     points_mm : (n, 3) float64; faces : (F, 3) int32, edge-manifold, consistently wound; allowed_mm : (n,) float64,
@@ -438,14 +437,14 @@ def smooth_boundary(
     points, allowed = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(allowed_mm, np.float64)
     faces = np.ascontiguousarray(faces)
     across = neighbours(faces, vertex_count=len(points)) if adjacency is None else np.ascontiguousarray(adjacency)
-    new_faces, new_across, alive, rounds = _smooth(points, faces, across, allowed, math.cos(psi_rad), most_rounds)
+    new_faces, new_across, alive, rounds = _smooth(points, faces, across, allowed, math.cos(psi_rad), max_rounds)
     removed = len(faces) - int(np.count_nonzero(alive[: len(faces)]))
     if not removed and len(new_faces) == len(faces):
         return SmoothResult(faces, across, np.zeros(len(faces), dtype=np.bool_), 0, rounds)
-    kept, across = select_faces(new_faces, new_across, alive)
-    added = np.zeros(len(kept), dtype=np.bool_)
+    remaining, across = select_faces(new_faces, new_across, alive)
+    added = np.zeros(len(remaining), dtype=np.bool_)
     added[len(faces) - removed :] = True
-    return SmoothResult(kept, across, added, removed, rounds)
+    return SmoothResult(remaining, across, added, removed, rounds)
 
 
 @kernel
@@ -487,7 +486,7 @@ def _smooth(
     given_adjacency: IntArray,
     allowed_mm: FloatArray,
     cos_psi: float,
-    most_rounds: int,
+    max_rounds: int,
 ) -> tuple[IntArray, IntArray, NDArray[np.bool_], int]:
     """Return all faces, given and added, their adjacency, which of them remain, and the number of rounds."""
     queue = np.flatnonzero(given_adjacency.ravel() < 0)
@@ -498,7 +497,7 @@ def _smooth(
     count = len(given)
     faces, adjacency = given.copy(), given_adjacency.copy()
     alive, waiting = np.ones(count, dtype=np.bool_), np.zeros((count, 3), dtype=np.bool_)
-    for rounds in range(most_rounds):
+    for rounds in range(max_rounds):
         waiting.ravel()[queue] = False
         sharp, rank = _sharp_corners(points, faces, adjacency, alive, queue, cos_psi)
         if not len(sharp):
@@ -509,9 +508,9 @@ def _smooth(
         alive = _with_more_rows(alive, room)
         count, queue = _smooth_corners(
             points, faces, adjacency, count, alive, waiting, degree, corners, stays, allowed_mm, cos_psi,
-            sharp[np.argsort(rank, kind="stable")], _MOST_TRIANGLES_OF_A_SPIKE,
+            sharp[np.argsort(rank, kind="stable")], _MAX_SPIKE_TRIANGLES,
         )  # fmt: skip
-    return faces[:count], adjacency[:count], alive[:count], most_rounds
+    return faces[:count], adjacency[:count], alive[:count], max_rounds
 
 
 def _with_more_rows(rows: Any, more: int) -> Any:
@@ -551,7 +550,7 @@ def _smooth_corners(
     allowed_mm: Any,
     cos_psi: float,
     sharp: Any,
-    most_triangles: int,
+    max_triangles: int,
 ) -> Any:
     """Process one round in place; return the number of faces after it, and the half-edges to examine in the next."""
     queue = [np.int64(0) for _ in range(0)]
@@ -572,7 +571,7 @@ def _smooth_corners(
                     changed.append(np.int64(3 * count + 1))
                     changed.append(previous_boundary_edge(faces, adjacency, np.int64(3 * count + 1)))
                 count += 1
-        elif not stays[b] and can_remove_fan(faces, adjacency, corners, into, out, most_triangles):
+        elif not stays[b] and can_remove_fan(faces, adjacency, corners, into, out, max_triangles):
             stays[a] = stays[c] = True
             changed.append(previous_boundary_edge(faces, adjacency, into))
             remove_fan(faces, adjacency, degree, corners, alive, into, out, changed)

@@ -50,8 +50,8 @@ def angle_rad(sine: float, cosine: float) -> float:
 
 GAMMA = math.pi / 6  # the paper's γ
 _COS_GAMMA, _SIN_GAMMA = math.cos(GAMMA), math.sin(GAMMA)
-_TIE = 1e-12  # far above rounding: of two sums of angles that are equal, neither is the wider
-BLOCK = 488  # not a power of two: rows of a page each would share their places in the cache
+_TIE = 1e-12  # far above rounding: of two equal sums of angles neither is the wider
+BLOCK = 488  # not a power of two: rows of a page each would share cache sets
 
 
 class Constraint(NamedTuple):
@@ -88,7 +88,7 @@ def _angle(ax: Any, ay: Any, az: Any, bx: Any, by: Any, bz: Any, cx: Any, cy: An
 
 @kernel_part(inline="always")
 def _larger(c1: float, s1: float, c2: float, s2: float) -> Any:
-    # sin(first - second) > 0 for angles in [0, π]. Which is larger cannot be foreseen: chosen without a jump.
+    # sin(first - second) > 0 for angles in [0, π]. Without a branch, which could not be predicted.
     first = s1 * c2 - c1 * s2 > 0
     return c1 if first else c2, s1 if first else s2
 
@@ -98,7 +98,7 @@ def _prefers(
     px: float, py: float, pz: float, qx: float, qy: float, qz: float,
     fx: float, fy: float, fz: float, wx: float, wy: float, wz: float, cos_gamma: float, sin_gamma: float,
 ) -> Any:  # fmt: skip
-    """`prefers_flip` of coordinates, without a jump: a loop over it runs in vector registers."""
+    """`prefers_flip` of coordinates, without a branch: a loop over it is vectorised."""
     fc, fs = _angle(px, py, pz, fx, fy, fz, qx, qy, qz)
     wc, ws = _angle(px, py, pz, wx, wy, wz, qx, qy, qz)
     pc, ps = _angle(fx, fy, fz, px, py, pz, wx, wy, wz)
@@ -149,9 +149,9 @@ def prefer_flips(count: int, corners: Any, cos_gamma: float, sin_gamma: float, f
 
 
 NO_FLIPS, INDEX, ROUND_LIMIT = "no flips", "index", "turn limit"
-_FLAT_INDEX = 1e5  # that of a triangle some 30 000 times as long as high
-_UNITS_PER_INDEX = 2.0**20  # 64 bits then hold the sum over 88 million triangles of the greatest index
-_FACES_AT_ONCE = 16384  # that are worth calling a kernel for
+_FLAT_INDEX = 1e5  # of a triangle about 30 000 times as long as high
+_UNITS_PER_INDEX = 2.0**20  # 64 bits hold the sum over 88 million triangles of the largest index
+_FACES_AT_ONCE = 16384  # enough to be worth a call of a kernel
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +187,7 @@ def optimise_edges(
     *,
     rule: FlipRule = FlipRule.CONSTRAINED,
     gamma: float = GAMMA,
-    most_turns: int = 200,
+    max_turns: int = 200,
     among: NDArray[np.bool_] | None = None,
     adjacency: IntArray | None = None,
 ) -> EdgeOptimisation:
@@ -229,7 +229,7 @@ def optimise_edges(
     must_fall = False
     pass_number = 1
     ended_by = ROUND_LIMIT
-    while len(turns) < most_turns:
+    while len(turns) < max_turns:
         # By index, worst first; the queue rises, and a stable sort keeps it so among equals.
         ordered = queue[np.argsort(-_harmonic_indices(points, faces, queue), kind="stable")]
         while True:
@@ -319,7 +319,7 @@ def _scan_edges(
             other = across[face, k]
             if other > face and (among[face] or among[other]):
                 p, q = faces[face, k + 1 if k < 2 else 0], faces[face, k - 1 if k else 2]
-                # The corner that p and q leave over. Found by the edge, not by the neighbour: two triangles back
+                # The corner that is neither p nor q. Found by the edge, not by the neighbour: two triangles back
                 # to back share three edges.
                 w = faces[other, 0] + faces[other, 1] + faces[other, 2] - p - q
                 for axis in range(3):
@@ -351,12 +351,11 @@ def _faces_of_flagged_edges(flagged: Any, across: Any, queued: Any) -> Any:
 
 
 @kernel_part
-def _may_be_joined(faces: Any, across: Any, valence: Any, start: int, vertex: int, sought: int) -> bool:
-    """Whether an edge from `vertex` to `sought` would keep the mesh manifold.
-
-    False if the triangles around `vertex`, one of them `start`, are all that it has and none of them has `sought`.
+def _may_share_edge(faces: Any, across: Any, valence: Any, start: int, vertex: int, sought: int) -> bool:
+    """True if `vertex` has an edge to `sought`, or may have one: a walk from the face `start` does not visit all of its
+    triangles.
     """
-    seen = 1
+    visited = 1
     for side in range(2):
         face = start
         while True:
@@ -366,11 +365,11 @@ def _may_be_joined(faces: Any, across: Any, valence: Any, start: int, vertex: in
                 return True
             face = across[face, after if side == 0 else before]
             if face == start:
-                return bool(seen != valence[vertex])
+                return bool(visited != valence[vertex])
             if face < 0:
                 break
-            seen += 1
-    return bool(seen != valence[vertex])
+            visited += 1
+    return bool(visited != valence[vertex])
 
 
 @kernel
@@ -402,9 +401,9 @@ def _flip_edges(
             f, p, q, w = faces[t, k], faces[t, k1], faces[t, k2], faces[u, m]
             if f == w or not prefers_flip(points, p, q, f, w, cosine, sine):
                 continue
-            # At a pinched vertex the walk does not see everything; the other end may then show that they are apart.
-            if _may_be_joined(faces, across, valence, t, f, w) and _may_be_joined(faces, across, valence, u, w, f):
-                # The edge in the way may be flipped yet.
+            # At a pinched vertex the walk is incomplete; the other end may show that they share none.
+            if _may_share_edge(faces, across, valence, t, f, w) and _may_share_edge(faces, across, valence, u, w, f):
+                # The edge in the way may still be flipped.
                 if queued[t] != pass_number:
                     queued[t] = pass_number
                     following[waiting] = t

@@ -67,7 +67,7 @@ def _nearest_on_edge(px: float, py: float, pz: float, dx: float, dy: float, dz: 
 
 
 _TRIANGLES_PER_LEAF = 4
-_STACK = 64  # a walk holds one node for each level of the tree, and one more: no tree in memory has as many
+_STACK = 64  # a walk holds one node per level of the tree, and one more
 # A ray along an edge or through a vertex must not slip between two triangles: barycentric tolerance.
 _EDGE_TOLERANCE = 1e-9
 
@@ -102,25 +102,21 @@ class SearchTree:
     def distances_mm(self, points_mm: NDArray[np.floating[Any]]) -> FloatArray:
         """(n,) float64: exact distance from each point, (n, 3), to the nearest triangle.
 
-        Infinite if there is no triangle, NaN for a point that is not finite.
+        Infinite without a triangle, NaN for a point that is not finite.
         """
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
-        order = np.argsort(_morton_codes(points), kind="stable")  # neighbours in turn walk the same nodes
+        order = np.argsort(_morton_codes(points), kind="stable")  # sorted: successive points walk the same nodes
         return np.asarray(np.sqrt(_squared_distances(points, order, self.corners_mm, self.boxes_mm)))
 
     def first_hits(self, origin: NDArray[np.floating[Any]], directions: NDArray[np.floating[Any]]) -> FloatArray:
-        """How far along its direction each ray first meets a triangle, in units of that direction's length.
+        """(n,) float64: distance of each ray's first hit, in units of its direction's length; infinite without a hit.
 
         Rays start at `origin`, (3,), and run along `directions`, (n, 3); both sides of a triangle count.
-        Returns (n,) float64, infinite where a ray meets nothing.
         """
         return self._ray_hits(origin, directions, first_only=True)[0]
 
     def crossing_counts(self, origin: NDArray[np.floating[Any]], directions: NDArray[np.floating[Any]]) -> IntArray:
-        """How many triangles each ray of `first_hits` crosses, (n,) int32.
-
-        A ray along an edge crosses both triangles there.
-        """
+        """(n,) int32: number of triangles that each ray of `first_hits` crosses; both at an edge."""
         return self._ray_hits(origin, directions, first_only=False)[1]
 
     def _ray_hits(
@@ -140,16 +136,20 @@ def _morton_codes(points: FloatArray) -> NDArray[np.uint64]:
     low = points[finite].min(axis=0)
     extent = max(float((points[finite].max(axis=0) - low).max()), 1e-300)
     steps = np.where(finite[:, None], (points - low) * ((2**21 - 1) / extent), 0.0).astype(np.uint64)
-    return _spread(steps[:, 0]) << np.uint64(2) | _spread(steps[:, 1]) << np.uint64(1) | _spread(steps[:, 2])
+    return (
+        _spread_bits(steps[:, 0]) << np.uint64(2)
+        | _spread_bits(steps[:, 1]) << np.uint64(1)
+        | _spread_bits(steps[:, 2])
+    )
 
 
-def _spread(steps: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """21 bits, each moved to where two zeros are above the one before (Anderson, "Bit twiddling hacks")."""
-    for shift, kept in (
+def _spread_bits(steps: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """21 bits with two zeros between each two of them (Anderson, "Bit twiddling hacks")."""
+    for shift, mask in (
         (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
         (2, 0x1249249249249249),
     ):  # fmt: skip
-        steps = (steps | steps << np.uint64(shift)) & np.uint64(kept)
+        steps = (steps | steps << np.uint64(shift)) & np.uint64(mask)
     return steps
 
 
@@ -199,7 +199,7 @@ def _squared_distances(
             continue
         best = np.inf
         if len(corners):
-            # The last point's triangle: a close bound at no cost.
+            # The triangle of the previous point: a close bound.
             best = nearest_on_triangle(x, y, z, corners[near], 0, 1, 2)[0]
         stack[0], gaps[0], depth = 0, _box_gap(x, y, z, boxes, 0), 1
         while depth > 0:
@@ -303,9 +303,9 @@ def _ray_meets_triangle(origin: FloatArray, direction: FloatArray, triangle: Flo
 
 
 _MESH_SAMPLES = 200_000
-_VISIBLE_SAMPLES = 60_000  # a share of so many is known to 0.2 %; rays are what takes the time
+_VISIBLE_SAMPLES = 60_000  # enough for a share to 0.2 %; rays take most of the time
 _FACES_AT_ONCE = 200_000  # some tens of megabytes
-# What the figures of `TruthScore` are named for: reports are compared by them.
+# Figures of `TruthScore` have these in their names: reports are compared by them.
 _GROSS_MM = 1.0
 _FALSE_MM = 0.5
 _WELD_MM = 1e-3
@@ -314,7 +314,7 @@ _ONE_SIGMA_PERCENT = 68.27  # of a normal distribution within one standard devia
 _BLOCK = 4096  # faces to a row of sums, which are added up in order
 _CLASSES = 4096  # of values; only one of them is sorted
 _FLAT_MM2 = 1e-9
-_ASIDE_MM = 0.05  # off vertices and edges
+_ASIDE_MM = 0.05  # from vertices and edges
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,13 +324,13 @@ class TruthScore:
     rms_mm : over the mesh's area, of distances to the true surface below 1 mm.
     p50_mm, p95_mm, p99_mm : percentiles of all those distances, by area.
     gross_fraction, false_area_05mm : share of the mesh's area that is 1 mm, more than 0.5 mm from the true surface.
-    complete_01mm, complete_03mm : share of the visible points that are covered to this tolerance: the mesh passes so
-        near to the point, and what the camera's ray to the point meets first in the mesh is so near to the surface.
+    complete_01mm, complete_03mm : share of the visible points that are covered to this tolerance: the mesh is that near
+        to the point, and the first hit of the camera's ray to the point is that near to the surface.
     extra_layer_fraction : share of the camera's rays that cross the mesh more than once.
     nonmanifold_edges, misoriented_edges, duplicate_faces, degenerate_faces : after welding vertices at 1 µm.
-    facing_camera_fraction : share of the mesh's area whose front the camera sees.
+    facing_camera_fraction : share of the mesh's area whose front faces the camera.
     error_over_sigma_p68 : 68.27 % of the vertices are at most this many of their own standard deviations from the
-        true surface: 1 if the stated uncertainty is honest. NaN if the mesh states none.
+        true surface: 1 if the stated σ is right, NaN without one.
     """
 
     rms_mm: float
@@ -350,14 +350,14 @@ class TruthScore:
     error_over_sigma_p68: float
 
     def as_dict(self) -> dict[str, float | int]:
-        """The figures under the names that a report shows."""
-        shown = {
+        """The figures under their names in reports."""
+        names = {
             "false_area_05mm": "false_area_0.5mm",
             "complete_01mm": "complete_0.1mm",
             "complete_03mm": "complete_0.3mm",
             "facing_camera_fraction": "facing_camera_area",
         }
-        return {shown.get(name, name): value for name, value in asdict(self).items()}
+        return {names.get(name, name): value for name, value in asdict(self).items()}
 
 
 def mesh_figures(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> dict[str, float | int]:
@@ -453,7 +453,7 @@ def _ray_errors(
     hit = np.isfinite(reach)
     first_mm = np.full(len(points_mm), np.inf)
     first_mm[hit] = truth.distances_mm(eye_mm + rays[hit] * reach[hit, None])
-    # A ray through a vertex or along an edge crosses several triangles of one sheet: aim beside the point.
+    # A ray through a vertex or along an edge crosses several triangles of one sheet: aim next to the point.
     layers = found.crossing_counts(eye_mm, rays + random.normal(0.0, _ASIDE_MM, rays.shape))
     return first_mm, found.distances_mm(points_mm), layers
 
@@ -461,7 +461,7 @@ def _ray_errors(
 def _areas_and_facing(
     vertices_mm: FloatArray, faces: IntArray, eye_mm: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """(F,) float64 area of each triangle and (F,) bool whether its front faces the eye, in bounded memory."""
+    """(F,) float64 area of each triangle, and (F,) bool, True if its front faces the eye; in bounded memory."""
     area_mm2, facing = np.zeros(len(faces)), np.zeros(len(faces), dtype=bool)
     for start in range(0, len(faces), _FACES_AT_ONCE):
         part = slice(start, start + _FACES_AT_ONCE)
@@ -475,7 +475,7 @@ def _areas_and_facing(
 def _sample_surface(
     vertices_mm: FloatArray, faces: IntArray, area_mm2: FloatArray, count: int, random: np.random.Generator
 ) -> FloatArray:
-    """(count, 3) float64: random points, uniform over the area of the triangles; none if there is no area.
+    """(count, 3) float64: random points, uniform over the area of the triangles; none without area.
 
     One point per equal share of the cumulated area, which spreads better than independent draws; inside its triangle
     a point is uniform (Osada et al. 2002, "Shape distributions", 3.1).
@@ -497,7 +497,7 @@ def _weld_vertices(vertices_mm: FloatArray, faces: IntArray) -> tuple[FloatArray
         cells -= cells.min(axis=0)
         extent = [int(most) + 1 for most in cells.max(axis=0)]
         if extent[0] * extent[1] * extent[2] < 2**63:
-            # One number in the order of x, y, z: sorts in a fraction of the time of rows.
+            # One number in the order of x, y, z: sorts faster than rows.
             cells = (cells[:, :1] * extent[1] + cells[:, 1:2]) * extent[2] + cells[:, 2:]
             cells = cells.ravel()
     _, first, number = np.unique(cells, axis=0, return_index=True, return_inverse=True)
@@ -517,10 +517,7 @@ def _share(true_where: NDArray[np.bool_]) -> float:
 
 
 def weighted_percentiles(values: FloatArray, weights: FloatArray, percents: tuple[float, ...], /) -> list[float]:
-    """Weighted percentiles of values, (n,); NaN if there is no weight.
-
-    Only the values of the narrow class that a percentile falls into are sorted.
-    """
+    """Weighted percentiles of values, (n,); NaN without weight. Sorts only the class that a percentile falls into."""
     if not len(values):
         return [float(np.nan)] * len(percents)
     low, high = float(values.min()), float(values.max())

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from slrig.kernels import in_bands, kernel
 from slrig.model import IntArray, Size
 
-_MOST_BANDS = 4  # each has a picture of its own, which is 8 bytes a pixel
-_FACES_AT_LEAST = 50_000  # in a band: a millisecond of work, as much as it takes to bring two pictures together
+_MAX_BANDS = 4  # each has its own buffers, 8 bytes per pixel
+_MIN_FACES = 50_000  # of a band: a millisecond of work, as much as merging two buffers
 
 
 Nearness = TypeVar("Nearness", NDArray[np.float32], NDArray[np.float64])
@@ -33,21 +33,21 @@ def rasterise(placed: NDArray[np.float32], faces: IntArray, size: Size) -> Raste
 
     Interpolates inverse depth, which is linear in the image. Skips triangles with a vertex behind the camera.
     """
-    at_least = max(_FACES_AT_LEAST, -(-len(faces) // _MOST_BANDS))
+    at_least = max(_MIN_FACES, -(-len(faces) // _MAX_BANDS))
     given = np.ascontiguousarray(placed), np.ascontiguousarray(faces), size.height_px, size.width_px
     inverse, face = merge_depth_buffers(in_bands(_z_buffer, len(faces), *given, rows_at_least=at_least))
-    unseen = inverse == 0
-    inverse[unseen] = np.nan
-    face[unseen] = -1
+    empty = inverse == 0
+    inverse[empty] = np.nan
+    face[empty] = -1
     return RasterView(np.reciprocal(inverse, out=inverse), face)
 
 
-def merge_depth_buffers(pictures: list[tuple[Nearness, IntArray]]) -> tuple[Nearness, IntArray]:
+def merge_depth_buffers(buffers: list[tuple[Nearness, IntArray]]) -> tuple[Nearness, IntArray]:
     """Merge pairs of inverse depth and triangle index, (H, W) each; empties the list to save memory."""
-    inverse, face = pictures.pop(0)
-    while pictures:
-        next_inverse, next_face = pictures.pop(0)
-        # Only what is nearer: of equally near triangles the first stays, as inside a band.
+    inverse, face = buffers.pop(0)
+    while buffers:
+        next_inverse, next_face = buffers.pop(0)
+        # Of equally near triangles the first stays, as inside a band.
         nearer = next_inverse > inverse
         np.copyto(inverse, next_inverse, where=nearer)
         np.copyto(face, next_face, where=nearer)
@@ -57,7 +57,7 @@ def merge_depth_buffers(pictures: list[tuple[Nearness, IntArray]]) -> tuple[Near
 def rasterise_normals(
     view: RasterView, placed: NDArray[np.float32], normals: NDArray[np.float32], faces: IntArray
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Normal of the visible side at every pixel, and whether that side is the front.
+    """Normal of the visible side at every pixel, and a mask of pixels that show a front.
 
     Parameters
     ----------
@@ -69,10 +69,10 @@ def rasterise_normals(
     normals : (H, W, 3) float32, in that frame, unit, reversed for backs; 0 without a triangle.
     front : (H, W) bool, the triangle is counter-clockwise in the image.
     """
-    seen, front = np.zeros((*view.face.shape, 3), dtype=np.float32), np.zeros(view.face.shape, dtype=np.bool_)
+    out, front = np.zeros((*view.face.shape, 3), dtype=np.float32), np.zeros(view.face.shape, dtype=np.bool_)
     given = np.ascontiguousarray(placed), np.ascontiguousarray(normals), np.ascontiguousarray(faces)
-    in_bands(_normals, len(seen), view.face, *given, seen, front, rows_at_least=16)
-    return seen, front
+    in_bands(_normals, len(out), view.face, *given, out, front, rows_at_least=16)
+    return out, front
 
 
 @kernel
@@ -90,7 +90,7 @@ def _z_buffer(
         left, right = max(np.ceil(min(ax, bx, cx)), 0.0), min(np.floor(max(ax, bx, cx)), width - 1.0)
         ay, by, cy = float(a[1]), float(b[1]), float(c[1])
         top, bottom = max(np.ceil(min(ay, by, cy)), 0.0), min(np.floor(max(ay, by, cy)), height - 1.0)
-        # Most triangles of a dense scan lie between pixel centres.
+        # Most triangles of a dense scan are between pixel centres.
         if not (left <= right and top <= bottom):
             continue
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
@@ -113,7 +113,7 @@ def _z_buffer(
 
 
 @kernel
-def _normals(first: int, last: int, nearest: Any, placed: Any, normals: Any, faces: Any, seen: Any, front: Any) -> None:
+def _normals(first: int, last: int, nearest: Any, placed: Any, normals: Any, faces: Any, out: Any, front: Any) -> None:
     """Normals of the rows from first to last, weighted as inverse depth is."""
     for row in range(first, last):
         for column in range(nearest.shape[1]):
@@ -123,7 +123,7 @@ def _normals(first: int, last: int, nearest: Any, placed: Any, normals: Any, fac
             a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
             ax, ay, bx, by = placed[a, 0] - column, placed[a, 1] - row, placed[b, 0] - column, placed[b, 1] - row
             cx, cy = placed[c, 0] - column, placed[c, 1] - row
-            # Twice the areas of the parts opposite the corners, positive if clockwise in the picture: a back. Divided
+            # Twice the areas of the parts opposite the corners, positive if clockwise in the image: a back. Divided
             # by depth they have the ratios of the parts of the triangle itself; their sum cancels in a unit vector.
             wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
             front[row, column] = wa + wb + wc < 0.0
@@ -135,4 +135,8 @@ def _normals(first: int, last: int, nearest: Any, placed: Any, normals: Any, fac
                     x, y, z = x + weight * nx, y + weight * ny, z + weight * nz
             length = np.sqrt(x * x + y * y + z * z)
             if length > 0.0:
-                seen[row, column, 0], seen[row, column, 1], seen[row, column, 2] = x / length, y / length, z / length
+                out[row, column, 0], out[row, column, 1], out[row, column, 2] = (
+                    x / length,
+                    y / length,
+                    z / length,
+                )

@@ -36,7 +36,7 @@ def strips(points_mm: FloatArray, runs: IntArray, /) -> IntArray:
 
 
 def strip_neighbours(faces: IntArray, runs: IntArray, point_count: int, /) -> IntArray:
-    """Adjacency of the faces that `strips` makes of these runs: equal to `neighbours`, in a fraction of its time.
+    """Adjacency of the faces that `strips` makes of these runs: equal to `neighbours`, and faster.
 
     Triangles of a strip follow one another; two strips meet in the steps of the curve that they share.
     Returns (F, 3) int32: entry k is the face across the edge opposite corner k, -1 at a boundary.
@@ -82,7 +82,7 @@ def _strip_offsets(runs: IntArray) -> NDArray[np.int64]:
 @kernel
 def _strips_kernel(begin: int, end: int, points: Any, runs: Any, firsts: Any, faces: Any) -> None:
     for s in range(begin, end):
-        # Of one type from the start, so that the rule is compiled once.
+        # Of one type, so that the rule is compiled once.
         i, last_i = np.int64(runs[s, 0]), runs[s, 1]
         j, last_j = np.int64(runs[s, 2]), runs[s, 3]
         at = firsts[s]
@@ -109,7 +109,7 @@ def _strips_kernel(begin: int, end: int, points: Any, runs: Any, firsts: Any, fa
 def _index_strip_steps(
     begin: int, end: int, faces: Any, runs: Any, firsts: Any, after_first: Any, after_second: Any
 ) -> None:
-    """Note who stands on each step, as a strip's first curve and as its second: a curve is either at most once."""
+    """Write the triangle on each step of a curve, as a strip's first curve and as its second: at most one each."""
     for s in range(begin, end):
         last_of_first = runs[s, 1]
         for face in range(firsts[s], firsts[s + 1]):
@@ -183,9 +183,9 @@ def runs_of_curve_parts(
     """
     pieces = [_pieces(along_px, begin, end, widest_gap_px) for begin, end in pairwise(offsets.tolist())]
     found = _Runs(along_px, pieces)
-    for curve, mine in enumerate(pieces):
+    for curve, own in enumerate(pieces):
         last = int(np.searchsorted(position_px, position_px[curve] + widest_step_px + 1e-9))
-        for piece in mine:
+        for piece in own:
             # Parts of the piece without a neighbour yet.
             open_px = [(-np.inf, np.inf)]
             for other in (each for there in pieces[curve + 1 : last] for each in _overlapping_pieces(there, piece)):
@@ -252,15 +252,15 @@ class _Runs:
         behind = np.minimum.accumulate(np.where(stops, points, len(taken))[::-1])[::-1]
         longer = part.copy()
         for side, sign, ends in ((0, -1, self._firsts), (1, 1, self._lasts)):
-            # Of several strips that end in one point, that which is furthest.
+            # Of several strips that end in one point, the furthest.
             order = np.lexsort((sign * self._along_px[other[:, side]], part[:, side]))
             at = part[order, side]
             furthest = np.append(at[1:] != at[:-1], True)
-            mine, at = order[furthest], at[furthest]
+            strip, at = order[furthest], at[furthest]
             free = ~taken[at - (sign < 0)] & ~ends[at]
-            mine, at = mine[free], at[free]
+            strip, at = strip[free], at[free]
             to = before[at - 1] if sign < 0 else behind[at + 1]
-            longer[mine, side] = np.where(held[to], (at + to) // 2, to)
+            longer[strip, side] = np.where(held[to], (at + to) // 2, to)
         return longer
 
 
@@ -322,23 +322,23 @@ def _overlapping_pieces(pieces: list[_Piece], piece: _Piece) -> list[_Piece]:
 
 
 def _pieces(along_px: FloatArray, begin: int, end: int, widest_gap_px: float) -> list[_Piece]:
-    # Points of a stripe keep their order, and may lie a little before the one before them.
+    # Points of a stripe keep their order, even if their places decrease a little.
     along = np.maximum.accumulate(along_px[begin:end])
     cuts = [0, *(np.flatnonzero(np.diff(along) > widest_gap_px) + 1).tolist(), end - begin]
     return [_Piece(begin + a, along[a:b]) for a, b in pairwise(cuts) if b > a]
 
 
 _BLOCK = 4096  # faces to a sum; the sums are added up in order, the same for any number of threads
-_SMALLEST_COMPONENT = 100
-"""Components of fewer triangles are dust: a few stripe points that agreed by chance."""
+_MIN_COMPONENT = 100
+"""Triangles of a component; fewer are dust of stripe points that agreed by chance."""
 
 
 @dataclass(frozen=True, slots=True)
 class InitialMesh:
     """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the eye.
     adjacency : (F, 3) int32, entry k is the face across the edge opposite corner k, -1 at a boundary.
-    strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges overlap, dust is what they leave in
-    specks of a few triangles.
+    strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges overlap, dust are the small
+    components that they leave.
     """
 
     faces: IntArray
@@ -373,38 +373,38 @@ def initial_mesh(
     """
     if runs is None:
         runs = runs_of_whole_curves(neighbouring_curves(position_px, offsets, widest_step_px=widest_step_px), offsets)
-    everything = strips(points_mm, runs)
-    adjacency = strip_neighbours(everything, runs, len(points_mm))
+    strip_faces = strips(points_mm, runs)
+    adjacency = strip_neighbours(strip_faces, runs, len(points_mm))
     at_depth_edge, at_bridge = faces_to_drop(
-        points_mm, everything, bridge_after, sampling_mm, depth_edge_ratio=depth_edge_ratio, keep_holes=keep_holes
+        points_mm, strip_faces, bridge_after, sampling_mm, depth_edge_ratio=depth_edge_ratio, keep_holes=keep_holes
     )
     connected = ~(at_depth_edge | at_bridge)
-    kept = component_sizes(everything, connected) >= _SMALLEST_COMPONENT
-    areas_mm2 = np.zeros(-(-len(everything) // _BLOCK))
-    in_bands(_facing_areas, len(areas_mm2), np.ascontiguousarray(points_mm), everything, kept, eye_mm, areas_mm2)
-    faces, across = select_faces(everything, adjacency, kept)
+    remaining = component_sizes(strip_faces, connected) >= _MIN_COMPONENT
+    areas_mm2 = np.zeros(-(-len(strip_faces) // _BLOCK))
+    in_bands(_facing_areas, len(areas_mm2), np.ascontiguousarray(points_mm), strip_faces, remaining, eye_mm, areas_mm2)
+    faces, across = select_faces(strip_faces, adjacency, remaining)
     if areas_mm2.sum() < 0:
         faces, across = np.ascontiguousarray(faces[:, ::-1]), np.ascontiguousarray(across[:, ::-1])
     return InitialMesh(
         faces=faces,
         adjacency=across,
         strip_pairs=len(runs),
-        strip_triangles=len(everything),
+        strip_triangles=len(strip_faces),
         dropped_at_depth_edges=int(np.count_nonzero(at_depth_edge)),
         dropped_at_bridges=int(np.count_nonzero(at_bridge)),
         dropped_as_dust=int(np.count_nonzero(connected)) - len(faces),
-        dropped_triangles=len(everything) - len(faces),
+        dropped_triangles=len(strip_faces) - len(faces),
     )
 
 
 @kernel
-def _facing_areas(first: int, last: int, points: Any, faces: Any, kept: Any, eye: Any, areas: Any) -> None:
+def _facing_areas(first: int, last: int, points: Any, faces: Any, mask: Any, eye: Any, areas: Any) -> None:
     """For each block of faces, twice the area that faces the eye minus the area that faces away."""
     # Blocks of one size, added up in order: the same sum for any number of threads.
     for block in range(first, last):
         total = 0.0
         for face in range(block * _BLOCK, min((block + 1) * _BLOCK, len(faces))):
-            if not kept[face]:
+            if not mask[face]:
                 continue
             a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
             ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]

@@ -14,13 +14,13 @@ from numba import config
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrink_boundary, smooth_boundary
+from slrig.meshing.boundary import boundary_point_count, max_boundary_edge_mm, shrink_boundary, smooth_boundary
 from slrig.meshing.flips import EdgeOptimisation, angle_rad, optimise_edges
 from slrig.meshing.strips import InitialMesh, initial_mesh
 from slrig.meshing.topology import used_vertices
 from slrig.model import FlipRule, FloatArray, IntArray, Mesh
 
-_BLOCK = 488  # not a power of two: rows of a page each would share their places in the cache
+_BLOCK = 488  # not a power of two: rows of a page each would share cache sets
 
 
 def vertex_normals(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> NDArray[np.float32]:
@@ -40,11 +40,11 @@ def vertex_normals(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> N
 
 
 @kernel_part
-def _weigh_normals(count: int, work: Any) -> None:
+def _weight_normals(count: int, work: Any) -> None:
     """From normals as long as twice the area, (0, 1, 2), and the dots of the edges at a and b, (3, 4), of up to _BLOCK
     triangles, their unit normals and their angles at a, b and c, (3, 4, 5).
 
-    Row r of `work` is work[r * _BLOCK :]. Nothing else stands in this loop, so that it runs in vector registers.
+    Row r of `work` is work[r * _BLOCK :]. This loop does nothing else, so that it is vectorised.
     """
     for at in range(count):
         nx, ny, nz = work[at], work[_BLOCK + at], work[2 * _BLOCK + at]
@@ -58,11 +58,11 @@ def _weigh_normals(count: int, work: Any) -> None:
 
 @kernel
 def _add_normals(begin: int, end: int, points: Any, faces: Any, parts: int, sums: Any) -> None:
-    # Each part owns a range of vertices, goes over all faces and adds to its own vertices only: every vertex has its
-    # sum taken in the order of the faces, so the result is the same for any number of threads.
+    # Each part visits all faces and adds to a range of vertices: sums are in the order of the faces, the same for any
+    # number of threads.
     for part in range(begin, end):
         low, high = len(points) * part // parts, len(points) * (part + 1) // parts
-        work, mine = np.zeros(6 * _BLOCK), np.zeros(_BLOCK, dtype=np.int32)
+        work, listed = np.zeros(6 * _BLOCK), np.zeros(_BLOCK, dtype=np.int32)
         face = 0
         while face < len(faces):
             count = 0
@@ -78,16 +78,16 @@ def _add_normals(begin: int, end: int, points: Any, faces: Any, parts: int, sums
                 work[2 * _BLOCK + count] = ux * vy - uy * vx
                 work[3 * _BLOCK + count] = ux * vx + uy * vy + uz * vz
                 work[4 * _BLOCK + count] = ux * (ux - vx) + uy * (uy - vy) + uz * (uz - vz)
-                mine[count] = face - 1
+                listed[count] = face - 1
                 count += 1
-            _weigh_normals(count, work)
+            _weight_normals(count, work)
             for at in range(count):
                 x, y, z = work[at], work[_BLOCK + at], work[2 * _BLOCK + at]
-                # A triangle without an area has no normal: it was divided by zero.
+                # A triangle without area has no normal: it was divided by zero.
                 if not x * x + y * y + z * z > 0.0:
                     continue
                 for corner in range(3):
-                    vertex, angle = faces[mine[at], corner], work[(3 + corner) * _BLOCK + at]
+                    vertex, angle = faces[listed[at], corner], work[(3 + corner) * _BLOCK + at]
                     if low <= vertex < high:
                         sums[vertex, 0] += angle * x
                         sums[vertex, 1] += angle * y
@@ -174,10 +174,10 @@ class SurfaceMesh:
     stages: tuple[MeshStage, ...]
     steps: Mapping[str, Mapping[str, object]]
 
-    def with_points(self, kept: NDArray[np.bool_], step: str, /) -> SurfaceMesh:
-        """Keep the triangles whose three points are kept, (n,) bool; `step` is the name of this step in `steps`."""
-        faces = self.faces[kept[self.faces].all(axis=1)]
-        dropped = {"points": int(np.count_nonzero(~kept)), "triangles": len(self.faces) - len(faces)}
+    def with_points(self, mask: NDArray[np.bool_], step: str, /) -> SurfaceMesh:
+        """Keep the triangles whose three points are in the mask, (n,) bool; `step` names this step in `steps`."""
+        faces = self.faces[mask[self.faces].all(axis=1)]
+        dropped = {"points": int(np.count_nonzero(~mask)), "triangles": len(self.faces) - len(faces)}
         return replace(self, faces=faces, steps={**self.steps, step: dropped})
 
 
@@ -191,13 +191,13 @@ def build_surface(
     limits: MeshingLimits,
     /,
     *,
-    entered: Callable[[str], None],
+    on_step: Callable[[str], None],
     runs: IntArray | None = None,
 ) -> SurfaceMesh:
     """Mesh the curves: strips, dropped triangles, global optimisation, boundary.
 
-    Keeps no mesh of an earlier step: with millions of triangles each takes as much memory as the points.
-    Arrays as for `initial_mesh`. entered : called with the name of each step when it begins.
+    Meshes of earlier steps are freed: with millions of triangles each takes as much memory as the points.
+    Arrays as for `initial_mesh`. on_step : called with the name of each step when it begins.
     """
     stages: list[MeshStage] = []
     steps: dict[str, Mapping[str, object]] = {}
@@ -207,7 +207,7 @@ def build_surface(
         points = stages[-1].boundary_points if adjacency is None else boundary_point_count(faces, adjacency)
         stages.append(MeshStage(name, len(faces), points))
 
-    entered(FIRST_STAGE)
+    on_step(FIRST_STAGE)
     initial = initial_mesh(
         points_mm, offsets, position_px, bridge_after, sampling_mm, eye_mm,
         widest_step_px=limits.widest_step_px, depth_edge_ratio=limits.depth_edge_ratio, keep_holes=limits.keep_holes,
@@ -217,22 +217,22 @@ def build_surface(
     add_stage(FIRST_STAGE, faces, adjacency)
     steps["initial"] = _initial_figures(initial)
     del initial
-    entered("global optimisation")
+    on_step("global optimisation")
     best = optimise_edges(points_mm, faces, rule=limits.flip_rule, adjacency=adjacency)
     faces, adjacency = best.faces, best.adjacency
     add_stage("global optimisation", faces, None)
     steps["optimisation"] = _flip_figures(best)
     del best
     if limits.smooth_boundary and len(faces):
-        entered("shrinking boundary")
-        less = shrink_boundary(points_mm, faces, longest_boundary_edge_mm(points_mm, faces), adjacency=adjacency)
+        on_step("shrinking boundary")
+        less = shrink_boundary(points_mm, faces, max_boundary_edge_mm(points_mm, faces), adjacency=adjacency)
         faces, adjacency, shrunk_triangles = less.faces, less.adjacency, less.removed_triangles
         del less
         add_stage("shrinking boundary", faces, adjacency)
-        entered("smoothing boundary")
+        on_step("smoothing boundary")
         allowed_mm = limits.depth_edge_ratio * sampling_mm
         if limits.keep_holes:
-            # Fill nothing at a bridge: gaps that were left open there stay open.
+            # Fill nothing at a bridge: gaps there stay open.
             ends = np.flatnonzero(bridge_after)
             allowed_mm[np.concatenate([ends, ends + 1])] = -np.inf
         smooth = smooth_boundary(points_mm, faces, allowed_mm, adjacency=adjacency)
@@ -240,21 +240,21 @@ def build_surface(
         added, removed_triangles, rounds = smooth.added, smooth.removed_triangles, smooth.rounds
         del smooth
         add_stage("smoothing boundary", faces, adjacency)
-        entered("optimising boundary")
+        on_step("optimising boundary")
         # Flips happen only if triangles were added, and then the arrays belong to the smoothing step.
-        mended = optimise_edges(points_mm, faces, rule=limits.flip_rule, among=added, adjacency=adjacency)
-        faces = mended.faces
+        optimised = optimise_edges(points_mm, faces, rule=limits.flip_rule, among=added, adjacency=adjacency)
+        faces = optimised.faces
         add_stage("optimising boundary", faces, None)
         steps["boundary"] = {
             "shrunk_triangles": shrunk_triangles,
             "added_triangles": int(np.count_nonzero(added)),
             "removed_triangles": removed_triangles,
             "rounds": rounds,
-            "optimisation": _flip_figures(mended),
+            "optimisation": _flip_figures(optimised),
         }
-        del mended
+        del optimised
     del adjacency
-    entered("vertex normals")
+    on_step("vertex normals")
     return SurfaceMesh(faces, vertex_normals(points_mm, faces), tuple(stages), steps)
 
 

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 
-_CROWDED, _REPEATED = 1, 2  # what is wrong with a face
+_CROWDED, _REPEATED = 1, 2  # fault of a face: at an edge, of a vertex
 
 
 @kernel
@@ -32,7 +32,7 @@ def sort_into_groups(groups: IntArray, count: int) -> tuple[IntArray, IntArray]:
         starts[group + 2] += starts[group + 1]
     members = np.zeros(len(groups), dtype=np.int32)
     for member in range(len(groups)):
-        # A group's start stands one place to the right until its members have moved it on to its end.
+        # A group's start is one place to the right until its members have moved it to its end.
         place = groups[member] + 1
         members[starts[place]] = member
         starts[place] += 1
@@ -42,14 +42,13 @@ def sort_into_groups(groups: IntArray, count: int) -> tuple[IntArray, IntArray]:
 def neighbours(faces: IntArray, *, vertex_count: int) -> IntArray:
     """Adjacency, (F, 3) int32: entry k is the face across the edge opposite corner k, -1 at a boundary.
 
-    Linear in F as long as no vertex has very many triangles. Faces may meet in a vertex alone: that makes no
-    neighbours.
+    Linear in F as long as no vertex has very many triangles. Faces that share only a vertex are not neighbours.
 
     Raises
     ------
     ValueError
-        A face names a vertex that is not there or the same one twice, or an edge is not one of a consistently wound
-        manifold: two faces run along it in the same direction. More than two faces on an edge always do.
+        A face has a missing vertex or the same one twice, or two faces run along an edge in the same direction, as on
+        every edge of more than two faces.
     """
     faces = np.ascontiguousarray(faces)
     if faces.size and (faces.min() < 0 or faces.max() >= vertex_count):
@@ -65,10 +64,10 @@ def neighbours(faces: IntArray, *, vertex_count: int) -> IntArray:
         face = int(np.flatnonzero(fault)[0])
         named = faces[face].tolist()
         message = (
-            f"face {face} {named} uses a vertex twice; take degenerate faces away first"
+            f"face {face} {named} uses a vertex twice; remove degenerate faces first"
             if fault[face] == _REPEATED
             else f"face {face} {named} shares an edge with a face that runs along it in the same direction; "
-            "take away what makes the mesh non-manifold, and wind all faces alike"
+            "remove non-manifold edges, and wind all faces alike"
         )
         raise ValueError(message)
     return across
@@ -101,8 +100,8 @@ def _neighbours(first: int, last: int, faces: Any, starts: Any, corners: Any, ac
 class OpenBorders:
     """Borders of a mesh, longest first: length_mm, area_mm2 (n,) float64; edges : their total number.
 
-    The area is that of the loop's shadow where it is largest, |½ Σ p × q| over its edges: a flat hole's own, and less
-    than what it takes to fill one that is not flat. Loops that meet in a vertex count as one.
+    The area is that of the loop's largest projection, |½ Σ p × q| over its edges: exact for a flat hole, and a lower
+    limit else. Loops that meet in a vertex count as one.
     """
 
     edges: int
@@ -118,7 +117,7 @@ def open_borders(points_mm: NDArray[np.floating[Any]], faces: IntArray) -> OpenB
     begin, end = faces[face, (corner + 1) % 3], faces[face, (corner + 2) % 3]
     graph = coo_matrix((np.ones(len(begin)), (begin, end)), shape=(len(points_mm),) * 2)
     loop = np.unique(connected_components(graph, directed=False)[1][begin], return_inverse=True)[1].ravel()
-    # Near the origin, so that large coordinates do not cancel: a closed loop's sum does not depend on it.
+    # Near the origin, to avoid cancellation: the sum over a closed loop does not depend on it.
     points = points_mm.astype(np.float64) - points_mm[begin].mean(axis=0, dtype=np.float64)
     across = np.cross(points[begin], points[end]) / 2
     area = np.linalg.norm(np.stack([np.bincount(loop, across[:, axis]) for axis in range(3)]), axis=0)
@@ -129,7 +128,7 @@ def open_borders(points_mm: NDArray[np.floating[Any]], faces: IntArray) -> OpenB
 
 @dataclass(frozen=True, slots=True)
 class TopologyCounts:
-    """Counts of what is connected, and of topological faults.
+    """Counts of vertices, edges and components, and of topological faults.
 
     vertices : those that a face uses. boundary_edges : used by one triangle; boundary_vertices : their ends.
     nonmanifold_edges : used by more than two triangles.
@@ -157,7 +156,7 @@ def duplicate_face_count(faces: IntArray) -> int:
     faces = np.ascontiguousarray(faces)
     bound = _vertex_bound(faces)
     a, b, c = faces.T
-    lowest = np.minimum(np.minimum(a, b), c)  # a tenth of the time of a minimum over an axis of three
+    lowest = np.minimum(np.minimum(a, b), c)  # a minimum over three columns is slow
     return sum(in_bands(_duplicates, bound, faces, *sort_into_groups(lowest, bound)))
 
 
@@ -226,10 +225,10 @@ def _mark(faces: IntArray, used: Any) -> None:
             used[faces[face, corner]] = True
 
 
-def select_faces(faces: IntArray, adjacency: IntArray, kept: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
-    """Selected faces, kept : (F,) bool, in order, and their neighbours in the new numbering: (K, 3) int32 each."""
-    numbers = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
-    rest = np.zeros((int(np.count_nonzero(kept)), 3), dtype=np.int32)
+def select_faces(faces: IntArray, adjacency: IntArray, mask: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
+    """Selected faces, mask : (F,) bool, in order, and their neighbours in the new numbering: (K, 3) int32 each."""
+    numbers = np.where(mask, np.cumsum(mask, dtype=np.int32) - np.int32(1), np.int32(-1))
+    rest = np.zeros((int(np.count_nonzero(mask)), 3), dtype=np.int32)
     across = np.zeros_like(rest)
     given = np.ascontiguousarray(faces), np.ascontiguousarray(adjacency)
     in_bands(_select_faces, len(faces), *given, numbers, rest, across)
@@ -262,7 +261,7 @@ def _edge_counts(
     most = 0
     for vertex in range(first, last):
         most = max(most, starts[vertex + 1] - starts[vertex])
-    # Of the half-edges at one vertex, read once: the other ends, and whether they run there from the vertex.
+    # The other ends of the half-edges at one vertex, read once, and their directions.
     ends, away = np.zeros(most, dtype=np.int32), np.zeros(most, dtype=np.int32)
     for vertex in range(first, last):
         count = starts[vertex + 1] - starts[vertex]
@@ -331,7 +330,7 @@ def _component_roots(faces: IntArray, among: Any, vertex_bound: int) -> IntArray
             else:
                 parents[first] = second
                 first = second
-    # A parent comes before its child, so one pass leaves everyone below their root.
+    # A parent comes before its child, so one pass links each vertex to its root.
     for vertex in range(vertex_bound):
         parents[vertex] = parents[parents[vertex]]
     return parents

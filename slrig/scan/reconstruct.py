@@ -253,7 +253,7 @@ def _meshed(
             flip_rule=plan.flip_rule,
             smooth_boundary=plan.smooth_boundary,
         ),
-        entered=lambda stage: entered(stage, 0.68, count),
+        on_step=lambda stage: entered(stage, 0.68, count),
         runs=beside.runs,
     )  # fmt: skip
     require_surface(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)

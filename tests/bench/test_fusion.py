@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from tests.golden.test_fusion import require_one_model
-from tests.unit.views.known_views import flange, plate_on_box, relief, star, vase
+from tests.unit.multiview.known_views import flange, plate_on_box, relief, star, vase
 
 
 @pytest.mark.parametrize(

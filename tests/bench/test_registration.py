@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray, Mesh
-from slrig.views.fusion import fused, registered_poses
-from slrig.views.registration import registered
-from slrig.views.turntable import turntable
-from tests.unit.views.known_views import Noise, star, views_of
+from slrig.multiview.fusion import PoseErrors, fuse_views
+from slrig.multiview.registration import register_views
+from slrig.multiview.turntable import turntable_poses
+from tests.unit.multiview.known_views import Noise, star, views_of
 
 TILT_DEG = 25.0  # from which the camera looks down
 
@@ -28,7 +28,7 @@ def on_turntable(subdivisions: int, pixel_mm: float) -> tuple[list[Mesh], list[F
     made = views_of(solid, ring, pixel_mm, Noise(sigma_mm=0.010, slow_mm=0.004, slow_length_mm=3.0))
     up, beside = np.array([0.0, 0.0, 1.0]), np.array([0.7, 0.7, 0.0])
     off = Rotation.from_rotvec(np.deg2rad(0.5) * np.array([0.6, 0.8, 0.0])).apply(up)
-    wrong = turntable(beside, off, angles) @ np.linalg.inv(turntable(np.zeros(3), up, angles))
+    wrong = turntable_poses(beside, off, angles) @ np.linalg.inv(turntable_poses(np.zeros(3), up, angles))
     first = np.linalg.inv(made[0].pose)
     starts = [first @ each @ view.pose for each, view in zip(wrong, made, strict=True)]
     return [view.mesh for view in made], starts
@@ -37,13 +37,13 @@ def on_turntable(subdivisions: int, pixel_mm: float) -> tuple[list[Mesh], list[F
 def test_one_model_of_eight_views_of_half_a_million_points(capsys: pytest.CaptureFixture[str]) -> None:
     """By compiled kernels; the peak is the process's, its views included."""
     small, near = on_turntable(5, 1.0)
-    fused(small, registered(small, near).poses)  # compiles
+    fuse_views(small, register_views(small, near).poses)  # compiles
     views, starts = on_turntable(7, 0.0765)
     began = time.process_time()
-    found = registered(views, starts)
+    found = register_views(views, starts)
     placed = time.process_time()
-    errors = registered_poses(found.covariance, found.middle_mm)
-    whole = fused(views, found.poses, pose_errors=errors)
+    errors = PoseErrors.from_registration(found.covariance, found.middle_mm)
+    whole = fuse_views(views, found.poses, pose_errors=errors)
     ended = time.process_time()
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     with capsys.disabled():

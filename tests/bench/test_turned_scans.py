@@ -27,7 +27,7 @@ from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, Mesh
 from tests.turned_views import displacement_mm
-from tests.unit.views.known_views import flange, plate_on_box, relief, star, vase
+from tests.unit.multiview.known_views import flange, plate_on_box, relief, star, vase
 
 DEMO = Path(__file__).parents[2] / "config" / "rigs" / "demo.toml"
 MIDDLE_MM = np.array([8.0, 0.0, 25.0])

@@ -10,8 +10,8 @@ import trimesh
 
 from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import TopologyCounts, topology_counts
-from slrig.views.fusion import fused
-from tests.unit.views.known_views import around, plate_on_box, star, torus, views_of
+from slrig.multiview.fusion import fuse_views
+from tests.unit.multiview.known_views import around, plate_on_box, star, torus, views_of
 
 # 20 mm in size; a point each 0.12 mm, so that voxels are of 0.17 mm; σ from 10 µm and 4 µm that neighbours share.
 PIXEL_MM = 0.12
@@ -26,7 +26,7 @@ def require_one_model(truth: trimesh.Trimesh, count: int) -> TopologyCounts:
     """See that views from all around make one model, better than each of them; its topology."""
     views = views_of(truth, around(count), PIXEL_MM)
     known = SearchTree.build(truth.vertices, np.asarray(truth.faces, np.int32))
-    model = fused([view.mesh for view in views], [view.pose for view in views])
+    model = fuse_views([view.mesh for view in views], [view.pose for view in views])
 
     def errors_mm(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         mesh = trimesh.Trimesh(vertices, faces, process=False)

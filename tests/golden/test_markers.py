@@ -14,7 +14,7 @@ from slrig.bundle.options import StageRecord, encode_stage, read_poses
 from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
 from slrig.model import PlaneKind, StagePlane
-from slrig.views.turntable import cut, turntable
+from slrig.multiview.turntable import cut_view, turntable_poses
 from tests.golden.test_stage import AXIS as STAGE_AXIS
 from tests.golden.test_stage import VASE, scanned
 from tests.turned_views import displacement_mm
@@ -56,9 +56,9 @@ def modelled(folder: Path, name: str, *told: str) -> tuple[dict[str, Any], list[
         app, ["model", *scans, "--output", str(output), "--stage", str(folder / "stage.json"), *told]
     )
     assert done.exit_code == 0, done.output
-    true = turntable(AXIS_POINT, AXIS, np.deg2rad(ANGLES))
+    true = turntable_poses(AXIS_POINT, AXIS, np.deg2rad(ANGLES))
     found = read_poses(output / "poses.json").poses
-    views = [cut(read_mesh(Path(scan) / "mesh.ply"), [plate]).mesh for scan in scans]
+    views = [cut_view(read_mesh(Path(scan) / "mesh.ply"), [plate]).mesh for scan in scans]
     off_mm = [displacement_mm(*each) for each in zip(views, found.values(), true, strict=True)]
     return json.loads((output / "report.json").read_bytes()), off_mm, done.stdout
 

@@ -18,10 +18,10 @@ from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
 from slrig.devices import CameraSettings, Rig, Turntable
 from slrig.model import PlaneKind, StageAxis
+from slrig.multiview.registration import register_views
+from slrig.multiview.turntable import cut_view, find_turntable_planes, turntable_poses
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
-from slrig.views.registration import registered
-from slrig.views.turntable import cut, stage_planes, turntable
 from tests.golden.test_bundles import reconstructed
 from tests.rendered_boards import board_head, board_options, board_rig, board_scene
 from tests.turned_views import displacement_mm
@@ -144,7 +144,7 @@ def scanned(
 
 def test_plate_and_wall_are_found_and_a_vase_alone_is_left_where_the_stage_put_it(tmp_path: Path) -> None:
     (empty,) = scanned(tmp_path / "empty", STAGE, [0.0])
-    planes = stage_planes(read_mesh(empty / "mesh.ply"), AXIS)
+    planes = find_turntable_planes(read_mesh(empty / "mesh.ply"), AXIS)
     for plane, kind, normal, at in zip(
         planes, (PlaneKind.PLATE, PlaneKind.BACKDROP), ([0, -1, 0], [0, 0, -1]), ([0, 26, 0], [0, 0, 52]), strict=True
     ):
@@ -153,14 +153,14 @@ def test_plate_and_wall_are_found_and_a_vase_alone_is_left_where_the_stage_put_i
         assert abs((plane.point_mm - at) @ normal) < 0.002
         assert plane.sigma_mm < 0.015
     scans = scanned(tmp_path / "views", VASE + STAGE, VIEW_ANGLES)
-    true = turntable(AXIS.point_mm, AXIS.direction, np.deg2rad(VIEW_ANGLES))
-    cuts = [cut(read_mesh(scan / "mesh.ply"), planes).mesh for scan in scans]
+    true = turntable_poses(AXIS.point_mm, AXIS.direction, np.deg2rad(VIEW_ANGLES))
+    cuts = [cut_view(read_mesh(scan / "mesh.ply"), planes).mesh for scan in scans]
     # The vase alone is left, but for the margin above the plate.
     for mesh in cuts:
         assert mesh.vertices_mm[:, 1].max() < 26 - 1.0
         assert np.linalg.norm((mesh.vertices_mm - AXIS.point_mm)[:, [0, 2]], axis=1).max() < 18
 
-    found = registered(cuts, true).poses
+    found = register_views(cuts, true).poses
     off_mm = [displacement_mm(*each) for each in zip(cuts, found, true, strict=True)]
     print(f"off by {np.round(off_mm, 4)} mm")  # noqa: T201
     assert max(off_mm) < 0.01

@@ -10,11 +10,11 @@ import pytest
 
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray
-from slrig.views.registration import registered
-from slrig.views.unknown_poses import found_starts
+from slrig.multiview.registration import register_views
+from slrig.multiview.unknown_poses import find_start_poses
 from tests.ten_objects import OBJECTS, SYMMETRIC, seen_around, seen_from
 from tests.turned_views import displacement_mm
-from tests.unit.views.known_views import View, around
+from tests.unit.multiview.known_views import View, around
 
 HELD = ("figure", "flange", "bossed box")
 ALIKE_MM = 0.002
@@ -28,8 +28,8 @@ def true_poses(views: list[View]) -> list[FloatArray]:
 
 def require_the_known_answer(views: list[View]) -> None:
     meshes, true = [view.mesh for view in views], true_poses(views)
-    found = registered(meshes, found_starts(meshes)).poses
-    known = registered(meshes, true).poses
+    found = register_views(meshes, find_start_poses(meshes)).poses
+    known = register_views(meshes, true).poses
     apart = [displacement_mm(*each) for each in zip(meshes, found, known, strict=True)]
     off = [displacement_mm(*each) for each in zip(meshes, found, true, strict=True)]
     print(f"{max(apart) * 1e3:.2f} µm from that of known starts, {max(off) * 1e3:.1f} µm from the truth")  # noqa: T201
@@ -47,7 +47,7 @@ def test_views_come_to_where_known_starts_take_them(name: str) -> None:
 def test_a_vase_is_refused_in_words() -> None:
     views = seen_around(OBJECTS[SYMMETRIC]())
     with pytest.raises(RegistrationRefusedError, match=r"one place that agrees .* is symmetric or repeats itself"):
-        found_starts([view.mesh for view in views], names=[f"turn{number}" for number in range(len(views))])
+        find_start_poses([view.mesh for view in views], names=[f"turn{number}" for number in range(len(views))])
 
 
 @pytest.mark.slow

@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray
-from slrig.views.fusion import fused, registered_poses
-from slrig.views.matching import moved
-from slrig.views.matching import turned as turned_by
-from slrig.views.registration import Registration, registered
-from slrig.views.turntable import found_axis, registered_on_stage, turntable
+from slrig.multiview.fusion import PoseErrors, fuse_views
+from slrig.multiview.matching import rotate_vectors as turned_by
+from slrig.multiview.matching import transform_points
+from slrig.multiview.registration import Registration, register_views
+from slrig.multiview.turntable import axis_from_registration, register_on_turntable, turntable_poses
 from tests.turned_views import AXIS, bumpy, displacement_mm, off_surface_mm, seen, wrong_axis
-from tests.unit.views.known_views import Noise, plate_on_box, views_of
+from tests.unit.multiview.known_views import Noise, plate_on_box, views_of
 
 UP: FloatArray = np.array([0.0, 0.0, 1.0])
 ANGLES = [45.0 * number for number in range(8)]
@@ -33,16 +33,16 @@ def test_eight_views_come_to_where_they_belong_and_are_fused_to_less_error_than_
     for seed in range(3):
         # An error of 4 µm that is alike over 3 mm, beside noise of 8 to 50 µm.
         views = turned.noisy(seed, length_mm=3.0)
-        found = registered(views, wrong_axis(ANGLES))
+        found = register_views(views, wrong_axis(ANGLES))
         wrong = [displacement_mm(*each) for each in zip(views, found.poses, turned.poses, strict=True)]
         assert max(wrong) < WITHIN_MM, np.round(wrong, 4)
         assert found.free == ()
-        axis = found_axis(found, AXIS)
+        axis = axis_from_registration(found, AXIS)
         assert axis is not None
         assert np.linalg.norm(np.cross(axis.direction, AXIS)) < np.deg2rad(0.01)
         # As a model has it: its deviations hold how well the poses are known.
-        errors = registered_poses(found.covariance, found.middle_mm)
-        whole = fused(views, found.poses, pose_errors=errors)
+        errors = PoseErrors.from_registration(found.covariance, found.middle_mm)
+        whole = fuse_views(views, found.poses, pose_errors=errors)
         assert topology_counts(whole.mesh.faces).nonmanifold_edges == 0
         ones.append(off_surface_mm(bumpy, views[0]))
         models.append(off_surface_mm(bumpy, whole.mesh))
@@ -64,14 +64,14 @@ def test_a_box_whose_sides_no_view_joins_is_as_large_as_the_stage_says() -> None
     angles, lean = np.deg2rad(ANGLES), np.deg2rad(25.0)
     turns = angles + np.deg2rad(0.03) * np.append(0.0, np.random.default_rng(1).normal(size=len(angles) - 1))
     ring = np.stack([np.cos(lean) * np.cos(turns), -np.cos(lean) * np.sin(turns), np.full(8, np.sin(lean))], axis=1)
-    poses = turntable(np.zeros(3), UP, turns)
+    poses = turntable_poses(np.zeros(3), UP, turns)
     views = []
     for view, pose in zip(views_of(box, ring, 0.7, Noise(0.010, 0.004, 3.0)), poses, strict=True):
         seen_from = np.linalg.inv(pose) @ view.pose
-        vertices, normals = moved(seen_from, view.mesh.vertices_mm), turned_by(seen_from, view.mesh.normals)
+        vertices, normals = transform_points(seen_from, view.mesh.vertices_mm), turned_by(seen_from, view.mesh.normals)
         views.append(replace(view.mesh, vertices_mm=vertices.astype("f4"), normals=normals.astype("f4")))
     off = Rotation.from_rotvec(np.deg2rad(0.5) * np.array([0.6, 0.8, 0.0])).apply(UP)
-    found, axis = registered_on_stage(views, np.array([0.7, 0.7, 0.0]), off, angles)
+    found, axis = register_on_turntable(views, np.array([0.7, 0.7, 0.0]), off, angles)
     assert found.free != ()
     assert axis is not None
     assert np.linalg.norm(np.cross(axis.direction, UP)) < np.deg2rad(0.01)
@@ -86,7 +86,7 @@ def test_stated_covariances_hold_over_seeds() -> None:
     starts = wrong_axis(ANGLES)
     over, raw = [], []
     for seed in range(SEEDS):
-        found = registered(turned.noisy(seed, length_mm=2.0), starts)
+        found = register_views(turned.noisy(seed, length_mm=2.0), starts)
         error = _motions(found, turned.poses)
         over.append(error @ np.linalg.solve(found.covariance, error) / len(error))
         raw.append(over[-1] * found.inflation**2)

@@ -76,7 +76,7 @@ def test_smoothing_keeps_what_makes_a_mesh_and_ends(
 ) -> None:
     points, faces = mesh
     before = points.copy(), faces.copy()
-    result = smooth_boundary(points, faces, np.full(len(points), allowed), psi_rad=psi, most_rounds=rounds)
+    result = smooth_boundary(points, faces, np.full(len(points), allowed), psi_rad=psi, max_rounds=rounds)
     hold_together(result.faces, result.adjacency, len(points))
     assert len(result.faces) == len(faces) - result.removed_triangles + result.added.sum()
     assert result.rounds <= rounds

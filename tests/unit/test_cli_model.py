@@ -22,14 +22,14 @@ from slrig.combine.stage import with_axis
 from slrig.devices import Rig
 from slrig.errors import ConfigError, DeviceGoneError, ServiceError
 from slrig.model import MeasuredAxis, PlaneKind, StagePlane
+from slrig.multiview import registration
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.scan.plan import ScanPlan
-from slrig.views import registration
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, seen, vase
 from tests.unit.capture.fake_rig import FakeTurntable, fake_rig
 from tests.unit.command import done, refused, slrig
-from tests.unit.views.test_stage_planes import AXIS as PLATE_AXIS
-from tests.unit.views.test_stage_planes import PLATE, WALL, joined
+from tests.unit.multiview.test_stage_planes import AXIS as PLATE_AXIS
+from tests.unit.multiview.test_stage_planes import PLATE, WALL, joined
 
 ANGLE = 40.0
 STAGE = [
@@ -200,7 +200,7 @@ def test_scans_of_unknown_places_are_placed_and_a_vase_is_refused(scans: Path, t
     assert list(read_poses(tmp_path / "model" / "poses.json").poses) == ["scan-9", "scan-10", "scan-11"]
     refused = model(scans / "vase-0.ply", scans / "vase-1.ply", "--output", tmp_path / "vase", "--unknown")
     assert (refused.exit_code, (tmp_path / "vase").exists()) == (2, False), refused.output
-    assert "or tell where to start from" in " ".join(refused.output.split())
+    assert "or state where to start from" in " ".join(refused.output.split())
 
 
 TABLE = ["--axis-point", *map(str, AXIS_POINT_MM), "--axis-direction", *map(str, AXIS)]

@@ -24,15 +24,15 @@ from slrig.jobs.database import Database
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind, JobState
 from slrig.jobs.store import JobStore
+from slrig.multiview.turntable import BoardAxis, axis_from_board, find_turntable_planes
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
-from slrig.views.turntable import BoardAxis, board_axis, stage_planes
 from tests.unit.accept.test_desk import PLAN, desk, desks, queue
 from tests.unit.api.conftest import app_of, refusal
 from tests.unit.jobs.tame_queue import TameQueue
+from tests.unit.multiview.test_stage_axis import SIX_DEG, shot
+from tests.unit.multiview.test_stage_planes import AXIS, PLATE
 from tests.unit.verify.test_verification import TAME, queue_of
-from tests.unit.views.test_stage_axis import SIX_DEG, shot
-from tests.unit.views.test_stage_planes import AXIS, PLATE
 
 __all__ = ["desk", "desks", "queue"]
 
@@ -115,7 +115,7 @@ def found(observed: list[int], _board: object, _calibration: object, angles_deg:
     names, poses, covariance = shot(SIX_DEG)
     rows = [row for each in observed for row in range(6 * each, 6 * each + 6)]
     of = [names[each] for each in observed]
-    return board_axis(of, poses[observed], covariance[rows][:, rows], USUAL_BOARD.points_mm, angles_deg)
+    return axis_from_board(of, poses[observed], covariance[rows][:, rows], USUAL_BOARD.points_mm, angles_deg)
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def stage_client(tmp_path: Path) -> Iterator[TestClient]:
         verifications=SimpleNamespace(health=lambda: (None, None, "the calibration in use")),
         store=SimpleNamespace(get=lambda _: SimpleNamespace(state=JobState.SUCCEEDED)),
         find_axis=found,
-        find_planes=lambda _mesh, _axis: stage_planes(PLATE, AXIS),
+        find_planes=lambda _mesh, _axis: find_turntable_planes(PLATE, AXIS),
     )
     with TestClient(app_of(stage.router, service)) as made:
         yield made

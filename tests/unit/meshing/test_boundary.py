@@ -8,7 +8,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrink_boundary, smooth_boundary
+from slrig.meshing.boundary import boundary_point_count, max_boundary_edge_mm, shrink_boundary, smooth_boundary
 from slrig.meshing.topology import neighbours, topology_counts
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.boundary_oracle import as_set, smoothed_by_hand
@@ -79,7 +79,7 @@ def test_a_spike_of_many_triangles_stays(triangles: int, removed: int) -> None:
     steps = np.arange(1, triangles + 1, dtype=np.int32)
     tip = np.stack([0 * steps, steps, steps + 1], axis=1)
     faces = np.concatenate([tip, 1 + grid_faces(4, triangles + 1)[:, ::-1]])
-    result = smooth_boundary(points, faces, everywhere(points), psi_rad=1.2, most_rounds=1)
+    result = smooth_boundary(points, faces, everywhere(points), psi_rad=1.2, max_rounds=1)
     assert result.removed_triangles == removed
 
 
@@ -145,7 +145,7 @@ def test_shrinking_agrees_with_dropping_until_nothing_changes() -> None:
 def test_lambda_follows_the_wider_spacing_of_sparse_curves() -> None:
     points, faces = grid(30, 6)
     points *= (6.0, 0.5, 1.0)
-    longest = longest_boundary_edge_mm(points, faces)
+    longest = max_boundary_edge_mm(points, faces)
     # Edges at a vertex inside: two of 0.5 mm along, four of 6 mm or a little more across.
     assert longest[6 * 10 + 2] == pytest.approx(4 * 6.0, rel=0.01)
     assert (longest >= 5.0).all()
@@ -164,7 +164,7 @@ def test_lambda_does_not_follow_the_long_triangles_beside_the_end_of_a_curve() -
     steps = np.concatenate(([last], np.arange(at, at + 24)))
     fan = np.stack((np.full(24, end), steps[:-1], steps[1:]), axis=1).astype(np.int32)
     points, joined = np.concatenate((points, tail)), np.concatenate((faces, fan))
-    left = shrink_boundary(points, joined, longest_boundary_edge_mm(points, joined))
+    left = shrink_boundary(points, joined, max_boundary_edge_mm(points, joined))
     # The fan goes back to where it is 5 mm long.
     corners = points[left.faces]
     assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= 5.0
@@ -176,7 +176,7 @@ def test_lambda_is_the_median_of_the_edges_at_a_vertex() -> None:
     rng = np.random.default_rng(4)
     points, faces = grid(8, 8)
     points = points * 3 + rng.normal(0, 0.8, points.shape)
-    longest = longest_boundary_edge_mm(points, faces)
+    longest = max_boundary_edge_mm(points, faces)
     inside = set(range(len(points))) - set(boundary_edges(faces).ravel().tolist())
     for v in inside:
         around = {int(w) for f in faces[(faces == v).any(axis=1)] for w in f} - {v}
@@ -195,7 +195,7 @@ def test_nothing_to_do_on_no_faces() -> None:
     points, none = np.zeros((3, 3)), faces_of()
     assert len(smooth_boundary(points, none, everywhere(points)).faces) == 0
     assert len(shrink_boundary(points, none, everywhere(points)).faces) == 0
-    assert longest_boundary_edge_mm(points, none).tolist() == [5.0] * 3
+    assert max_boundary_edge_mm(points, none).tolist() == [5.0] * 3
 
 
 def test_smoothing_agrees_with_plain_python() -> None:
@@ -208,7 +208,7 @@ def test_smoothing_agrees_with_plain_python() -> None:
         allowed = rng.uniform(1.2, 4.0, len(points))
         psi = rng.uniform(1.0, 2.2)
         rounds = int(rng.integers(1, 9))
-        result = smooth_boundary(points, faces, allowed, psi_rad=psi, most_rounds=rounds)
+        result = smooth_boundary(points, faces, allowed, psi_rad=psi, max_rounds=rounds)
         wanted = smoothed_by_hand(points, faces, allowed, psi, rounds)
         assert as_set(result.faces) == wanted.faces
         assert as_set(result.faces[result.added]) == wanted.added

@@ -188,10 +188,10 @@ def test_turns_are_limited() -> None:
     everything = optimise_edges(points, faces)
     assert len(everything.turns) > 3
     for most in range(3):
-        found = optimise_edges(points, faces, most_turns=most)
+        found = optimise_edges(points, faces, max_turns=most)
         assert found.turns == everything.turns[:most]
         assert found.ended_by == ROUND_LIMIT
-    assert optimise_edges(points, faces, most_turns=0).faces.tolist() == faces.tolist()
+    assert optimise_edges(points, faces, max_turns=0).faces.tolist() == faces.tolist()
 
 
 def test_an_optimal_mesh_has_one_turn_without_flips() -> None:

@@ -49,7 +49,7 @@ def random_triangles(count: int = 20, seed: int = 4) -> tuple[NDArray[np.float32
 def share_out(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
     """Rasterise the smallest meshes in bands, on so many threads."""
     monkeypatch.setattr(config, "NUMBA_NUM_THREADS", threads)
-    monkeypatch.setattr(rasteriser, "_FACES_AT_LEAST", 1)
+    monkeypatch.setattr(rasteriser, "_MIN_FACES", 1)
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -37,7 +37,7 @@ def meshed(points: FloatArray, offsets: IntArray, limits: MeshingLimits = LIMITS
     told: list[str] = []
     made = build_surface(
         points, offsets, np.arange(len(offsets) - 1.0), np.zeros(len(points), dtype=bool), np.ones(len(points)), EYE_MM,
-        limits, entered=told.append,
+        limits, on_step=told.append,
     )  # fmt: skip
     return made, told
 
@@ -93,7 +93,7 @@ def test_a_hole_at_a_bridge_stays_open_when_holes_are_kept() -> None:
     for keep_holes in (True, False):
         made = build_surface(
             points[keep], shorter, np.arange(len(offsets) - 1.0), bridge[keep], np.ones(int(keep.sum())), EYE_MM,
-            replace(LIMITS, keep_holes=keep_holes), entered=lambda _: None,
+            replace(LIMITS, keep_holes=keep_holes), on_step=lambda _: None,
         )  # fmt: skip
         holes[keep_holes] = 1 - topology_counts(made.faces).euler_characteristic
     assert holes == {True: 1, False: 0}

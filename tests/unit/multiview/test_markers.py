@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray
-from slrig.views.markers import MarkerFit, MarkersSeen, SeenMarker, marker_poses
-from slrig.views.turntable import turntable
+from slrig.multiview.markers import MarkerFit, MarkerObservation, MarkerObservations, marker_poses
+from slrig.multiview.turntable import turntable_poses
 from tests.turned_views import AXIS, AXIS_POINT_MM
 
-POSES = turntable(AXIS_POINT_MM, AXIS, np.deg2rad(45.0 * np.arange(8)))
+POSES = turntable_poses(AXIS_POINT_MM, AXIS, np.deg2rad(45.0 * np.arange(8)))
 NAMES = [f"view {number}" for number in range(8)]
 UP = Rotation.align_vectors([AXIS, [1.0, 0.0, 0.03]], [[0, 0, 1], [1, 0, 0]], weights=[1e6, 1])[0]
 
@@ -27,23 +27,25 @@ def plate(side_mm: float = 12.0) -> FloatArray:
     return np.asarray(UP.apply((middles[:, None] + square).reshape(-1, 3)).reshape(12, 4, 3) + AXIS_POINT_MM)
 
 
-def seen(markers: FloatArray, noise_mm: float = 0.0, *, stated_mm: float = 0.05, seed: int = 0) -> list[MarkersSeen]:
+def seen(
+    markers: FloatArray, noise_mm: float = 0.0, *, stated_mm: float = 0.05, seed: int = 0
+) -> list[MarkerObservations]:
     """Each view has the seven markers before the object, in its own frame."""
     random = np.random.default_rng(seed)
-    views: list[MarkersSeen] = []
+    views: list[MarkerObservations] = []
     for pose in POSES:
         mine = (markers - pose[:3, 3]) @ pose[:3, :3]
         nearest = np.argsort(mine.mean(axis=1)[:, 2])[:7].tolist()
         views.append(
-            {m: SeenMarker(mine[m] + random.normal(0, noise_mm, (4, 3)), np.full(4, stated_mm)) for m in nearest}
+            {m: MarkerObservation(mine[m] + random.normal(0, noise_mm, (4, 3)), np.full(4, stated_mm)) for m in nearest}
         )
     return views
 
 
-def solved(views: Sequence[MarkersSeen], *, first: int = 0) -> MarkerFit:
+def solved(views: Sequence[MarkerObservations], *, first: int = 0) -> MarkerFit:
     surface = AXIS_POINT_MM + UP.apply(np.random.default_rng(2).uniform((-20, -20, 0), (20, 20, 60), (200, 3)))
     surfaces = [(surface - pose[:3, 3]) @ pose[:3, :3] for pose in POSES[first : first + len(views)]]
-    return marker_poses(views, surfaces, names=NAMES, most_sigma_mm=1.0)
+    return marker_poses(views, surfaces, names=NAMES, max_sigma_mm=1.0)
 
 
 def motions(found: MarkerFit) -> FloatArray:
@@ -59,7 +61,7 @@ def test_poses_are_exact_without_noise_and_within_their_covariance_with_it() -> 
         found = solved(seen(plate(), 0.05, seed=seed))
         wrong = motions(found)
         over.append(wrong @ np.linalg.solve(found.covariance, wrong) / len(wrong))
-        assert found.left_out == ()
+        assert found.rejected == ()
         assert found.rms_over_sigma == pytest.approx(np.ones(8), abs=0.5)
     assert 0.7 < np.mean(over) < 1.3, over
     assert 0.01 < found.sigma_mm[1:].max() < 0.2
@@ -78,14 +80,14 @@ def test_what_moved_is_found_and_named_and_the_poses_are_right_without_it() -> N
     views[2][slid] = views[2][slid]._replace(corners_mm=views[2][slid].corners_mm + shift)
     views[5][a], views[5][b] = views[5][b], views[5][a]
     found = solved(views)
-    assert {(each.view, each.marker) for each in found.left_out} == {(2, slid), (5, a), (5, b)}
-    assert next(each.off_mm for each in found.left_out if each.view == 2) == pytest.approx(0.8, abs=0.2)
+    assert {(each.view, each.marker) for each in found.rejected} == {(2, slid), (5, a), (5, b)}
+    assert next(each.off_mm for each in found.rejected if each.view == 2) == pytest.approx(0.8, abs=0.2)
     assert slid not in found.used[2]
     wrong = motions(found)
     assert wrong @ np.linalg.solve(found.covariance, wrong) / len(wrong) < 2
     # Of two views neither is known to be the one that is right.
     found = solved(views[2:4], first=2)
-    assert {(each.view, each.marker) for each in found.left_out} == {(0, slid), (1, slid)}
+    assert {(each.view, each.marker) for each in found.rejected} == {(0, slid), (1, slid)}
 
 
 def test_views_that_share_too_little_are_named() -> None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from slrig.calibration.board import USUAL_BOARD
 from slrig.errors import StageRefusedError
 from slrig.model import FloatArray, MeasuredAxis
-from slrig.views.turntable import BoardAxis, board_axis, noted
+from slrig.multiview.turntable import BoardAxis, axis_from_board, update_axis
 
 POINT_MM = np.array([12.0, 60.0, 480.0])
 DIRECTION = np.array([0.05, -0.93, -0.36]) / np.linalg.norm([0.05, -0.93, -0.36])
@@ -44,7 +44,7 @@ def shot(
 
 
 def axis_found(angles_deg: FloatArray, seed: int = 0, told: FloatArray | None = None) -> BoardAxis:
-    return board_axis(*shot(angles_deg, seed), USUAL_BOARD.points_mm, told)
+    return axis_from_board(*shot(angles_deg, seed), USUAL_BOARD.points_mm, told)
 
 
 def off(found: MeasuredAxis, covariance: FloatArray) -> float:
@@ -61,8 +61,8 @@ def off(found: MeasuredAxis, covariance: FloatArray) -> float:
 def test_the_axis_is_off_by_what_is_stated() -> None:
     squares = []
     for seed in range(20):
-        found = axis_found(SIX_DEG, seed).found
-        squares.append(off(found.measured, found.covariance))
+        found = axis_found(SIX_DEG, seed).axis
+        squares.append(off(found.measured_axis, found.covariance))
     assert 0.7 < np.mean(squares) < 1.5
 
 
@@ -74,8 +74,8 @@ def test_what_is_left_of_each_pose_is_its_noise_and_the_angles_are_the_stages() 
 
 
 def test_the_sense_of_told_angles_is_that_of_the_axis() -> None:
-    assert axis_found(SIX_DEG).found.direction @ DIRECTION > 0.99
-    assert axis_found(SIX_DEG, told=-SIX_DEG).found.direction @ DIRECTION < -0.99
+    assert axis_found(SIX_DEG).axis.direction @ DIRECTION > 0.99
+    assert axis_found(SIX_DEG, told=-SIX_DEG).axis.direction @ DIRECTION < -0.99
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_the_sense_of_told_angles_is_that_of_the_axis() -> None:
 )
 def test_what_tells_no_axis_is_refused(angles_deg: FloatArray, slipped: tuple[slice, float], words: str) -> None:
     with pytest.raises(StageRefusedError, match=words):
-        board_axis(*shot(angles_deg, 1, slipped), USUAL_BOARD.points_mm)
+        axis_from_board(*shot(angles_deg, 1, slipped), USUAL_BOARD.points_mm)
 
 
 def measured(
@@ -106,7 +106,7 @@ def measured(
 
 
 def test_models_improve_the_axis_by_what_they_know() -> None:
-    found = noted(measured(0.1, 0.0, 0.1, 1e-3), measured(-0.01, 1e-4, 0.01, 1e-4, along_mm=80.0))
+    found = update_axis(measured(0.1, 0.0, 0.1, 1e-3), measured(-0.01, 1e-4, 0.01, 1e-4, along_mm=80.0))
     assert found.agrees
     # At its point the new axis is off by -0.002 mm, and 50 mm on by 0.005 mm more.
     assert found.moved_mm == pytest.approx(0.107, abs=1e-4)
@@ -118,7 +118,7 @@ def test_models_improve_the_axis_by_what_they_know() -> None:
 
 def test_an_axis_elsewhere_leaves_the_record_as_it_was() -> None:
     record = measured(0.0, 0.0, 0.02, 1e-4)
-    found = noted(record, measured(0.5, 0.0, 0.01, 1e-4))
+    found = update_axis(record, measured(0.5, 0.0, 0.01, 1e-4))
     assert not found.agrees
     assert found.axis is record
     assert found.sigmas > 10
@@ -127,7 +127,7 @@ def test_an_axis_elsewhere_leaves_the_record_as_it_was() -> None:
 def test_a_record_follows_a_stage_that_drifts() -> None:
     record = measured(0.0, 0.0, 0.005, 5e-5)
     for number in range(60):
-        found = noted(record, measured(0.004 * number, 0.0, 0.005, 5e-5))
+        found = update_axis(record, measured(0.004 * number, 0.0, 0.005, 5e-5))
         assert found.agrees, number
         record = found.axis
     across = np.linalg.svd(DIRECTION[None])[2][1:]

@@ -7,8 +7,8 @@ import pytest
 
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, IntArray
-from slrig.views.fusion_grid import Grid, brick_key
-from slrig.views.fusion_mesh import Net, net
+from slrig.multiview.fusion_grid import Grid, brick_key
+from slrig.multiview.fusion_mesh import SurfaceNet, extract_net
 
 # Only models of several views need these kernels.
 pytestmark = pytest.mark.slow
@@ -16,7 +16,7 @@ BRICKS = 3
 
 
 def block() -> Grid:
-    """3 x 3 x 3 bricks, as `grid_about` numbers them."""
+    """3 x 3 x 3 bricks, as `build_grid` numbers them."""
     place = np.argwhere(np.ones((BRICKS,) * 3))
     keys = np.array([brick_key(*each) for each in (place + 1).tolist()])
     around = np.full((len(keys), 27), -1, dtype=np.int32)
@@ -32,7 +32,7 @@ def flat(field: FloatArray) -> FloatArray:
     return np.ascontiguousarray(field.reshape(3, 8, 3, 8, 3, 8).transpose(0, 2, 4, 1, 3, 5)).ravel()
 
 
-def triangles(made: Net) -> IntArray:
+def triangles(made: SurfaceNet) -> IntArray:
     return made.quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
 
 
@@ -54,7 +54,7 @@ def test_a_random_field_gives_a_closed_manifold(density: float) -> None:
     field = random.uniform(0.1, 1, (24, 24, 24)) * np.where(random.uniform(size=(24, 24, 24)) < density, -1, 1)
     # Outside all about: nothing can be open.
     field[[0, -1]] = field[:, [0, -1]] = field[:, :, [0, -1]] = 1.0
-    made = net(block(), flat(field))
+    made = extract_net(block(), flat(field))
     counts = topology_counts(triangles(made))
     assert counts.edges > 10_000
     faults = (counts.boundary_edges, counts.nonmanifold_edges, counts.misoriented_edges, counts.duplicate_faces)
@@ -69,7 +69,7 @@ def test_a_ball_is_where_it_is_and_faces_outward() -> None:
     place = 0.5 * np.argwhere(np.ones((24, 24, 24))).reshape(24, 24, 24, 3)
     # The first brick is (1, 1, 1), four millimetres from the origin.
     middle = np.array([6.1, 5.8, 6.3])
-    made = net(block(), flat(np.linalg.norm(place - middle, axis=-1) - 4.0))
+    made = extract_net(block(), flat(np.linalg.norm(place - middle, axis=-1) - 4.0))
     faces = triangles(made)
     a, b, c = (made.points_mm[faces[:, k]] - middle - 4.0 for k in range(3))
     counts = topology_counts(faces)

@@ -12,10 +12,19 @@ from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import AlbedoMark, FloatArray, Mesh
 from slrig.model.surfaces import light_of, srgb_of
-from slrig.views.fusion import _FOLDED, _OUTWARD, FusedModel, PoseErrors, Rule, _halve, fused, mean_values
-from slrig.views.fusion_grid import sheets
+from slrig.multiview.fusion import (
+    _FOLDED,
+    _OUTWARD,
+    FusedModel,
+    FusionSettings,
+    PoseErrors,
+    _split_quads,
+    average_views,
+    fuse_views,
+)
+from slrig.multiview.fusion_grid import stack_views
 from tests.unit.meshing.plain import grid_faces, mesh_of
-from tests.unit.views.known_views import Noise, View, around, star, views_of
+from tests.unit.multiview.known_views import Noise, View, around, star, views_of
 
 # Only models of several views need these kernels.
 pytestmark = pytest.mark.slow
@@ -24,7 +33,7 @@ QUIET = Noise(sigma_mm=0.001, slow_mm=0.0)
 
 
 def model_of(views: list[View], *, voxel_mm: float | None = None) -> FusedModel:
-    return fused([view.mesh for view in views], [view.pose for view in views], voxel_mm=voxel_mm)
+    return fuse_views([view.mesh for view in views], [view.pose for view in views], voxel_mm=voxel_mm)
 
 
 def sheet(
@@ -59,7 +68,7 @@ def test_it_is_open_where_nothing_was_seen() -> None:
 
 def test_the_heavier_of_two_views_that_contradict_each_other_is_right() -> None:
     pose = np.eye(4)
-    model = fused([sheet(0.0), sheet(0.15, half_mm=1.6), sheet(0.002)], [pose] * 3, voxel_mm=0.5)
+    model = fuse_views([sheet(0.0), sheet(0.15, half_mm=1.6), sheet(0.002)], [pose] * 3, voxel_mm=0.5)
     inside = np.abs(model.mesh.vertices_mm[:, :2]).max(axis=1) < 1.5
     # The mean of the two that agree; the third one, 10 σ away, has no part in it and makes no surface of its own.
     assert inside.sum() > 20
@@ -67,13 +76,13 @@ def test_the_heavier_of_two_views_that_contradict_each_other_is_right() -> None:
     assert topology_counts(model.mesh.faces).components == 1
     assert (model.views[inside] == 2).all()
     # Two of equal σ: 10 µm between three corners, once or twice; what all views share does not shrink.
-    fewer = fused([sheet(0.0)], [pose], voxel_mm=0.5, shared_mm=0.02)
+    fewer = fuse_views([sheet(0.0)], [pose], voxel_mm=0.5, shared_mm=0.02)
     assert model.mesh.sigma_mm[inside].mean() == pytest.approx(0.0075 / np.sqrt(2), rel=0.2)
     assert 0.02 < fewer.mesh.sigma_mm.min() < 0.022
 
 
 def test_the_two_sides_of_a_wall_do_not_cancel() -> None:
-    model = fused([sheet(0.0), sheet(-0.6, down=True)], [np.eye(4)] * 2, voxel_mm=0.5)
+    model = fuse_views([sheet(0.0), sheet(-0.6, down=True)], [np.eye(4)] * 2, voxel_mm=0.5)
     heights = model.mesh.vertices_mm[np.abs(model.mesh.vertices_mm[:, :2]).max(axis=1) < 3, 2]
     assert np.unique(np.round(heights, 3)).tolist() == pytest.approx([-0.6, 0.0], abs=1e-3)
     assert (model.mesh.normals[:, 2] * np.where(model.mesh.vertices_mm[:, 2] > -0.3, 1, -1) > 0.9).all()
@@ -85,19 +94,19 @@ def test_colours_are_mixed_as_light_and_marked_ones_only_where_there_is_no_other
     views = [sheet(0, colour=50), sheet(0, colour=200, sigma_mm=0.02)]
     for view in views:  # most of the surface looks alike to both: they have one scale
         view.colour[np.abs(view.vertices_mm[:, 0]) > 1.9] = 100
-    mixed = fused(views, [pose] * 2, voxel_mm=0.5)
+    mixed = fuse_views(views, [pose] * 2, voxel_mm=0.5)
     inner = np.abs(mixed.mesh.vertices_mm[:, :2]).max(axis=1) < 1.2
     assert inner.sum() > 10
     weights = 1 / (np.array([0.01, 0.02]) ** 2 + mixed.correlated_mm**2)
     got = light_of(mixed.mesh.colour[inner]).mean()
     assert got == pytest.approx((weights * light).sum() / weights.sum(), rel=0.03)
-    marked = fused([sheet(0, colour=50), sheet(0, colour=255, mark=1, sigma_mm=0.002)], [pose] * 2, voxel_mm=0.5)
+    marked = fuse_views([sheet(0, colour=50), sheet(0, colour=255, mark=1, sigma_mm=0.002)], [pose] * 2, voxel_mm=0.5)
     inner = np.abs(marked.mesh.vertices_mm[:, :2]).max(axis=1) < 3
     assert (marked.mesh.colour[inner] == 50).all()
     assert not marked.mesh.mark[inner].any()
-    assert (fused([sheet(0, mark=2)], [pose], voxel_mm=0.5).mesh.mark == 2).all()
+    assert (fuse_views([sheet(0, mark=2)], [pose], voxel_mm=0.5).mesh.mark == 2).all()
     # A vertex without a normal has a neutral colour, which is none: a clipped one tells more.
-    bad = fused([sheet(0, colour=60, mark=AlbedoMark.SATURATED), sheet(0, colour=128, mark=AlbedoMark.UNKNOWN)],
+    bad = fuse_views([sheet(0, colour=60, mark=AlbedoMark.SATURATED), sheet(0, colour=128, mark=AlbedoMark.UNKNOWN)],
                 [pose] * 2, voxel_mm=0.5).mesh  # fmt: skip
     inner = np.abs(bad.vertices_mm[:, :2]).max(axis=1) < 3
     assert (bad.colour[inner] == 60).all()
@@ -137,27 +146,27 @@ def test_a_painted_ball_has_one_scale_its_own_colours_and_no_seams() -> None:
 def test_what_cannot_be_fused_is_refused() -> None:
     view, pose = sheet(0.0), np.eye(4)
     with pytest.raises(ValueError, match="one pose for each of the 1 views, found 2"):
-        fused([view], [pose, pose])
+        fuse_views([view], [pose, pose])
     with pytest.raises(ValueError, match="pose 0 is not rigid"):
-        fused([view], [np.diag([1.1, 1, 1, 1])])
-    with pytest.raises(InvalidInputError, match=r"voxel_mm: expected at least 0.08, .* 0.4 mm, found -1"):
-        fused([view], [pose], voxel_mm=-1.0)
+        fuse_views([view], [np.diag([1.1, 1, 1, 1])])
+    with pytest.raises(InvalidInputError, match=r"voxel_mm: expected at least 0.08, .* 0.4 mm apart, found -1"):
+        fuse_views([view], [pose], voxel_mm=-1.0)
     stray = view.vertices_mm.copy()
     stray[0, 0] = 1e6
     with pytest.raises(InvalidInputError, match=r"voxels of 0.1 mm are too small for views that reach over 1000004 mm"):
-        fused([replace(view, vertices_mm=stray)], [pose], voxel_mm=0.1)
+        fuse_views([replace(view, vertices_mm=stray)], [pose], voxel_mm=0.1)
     crossed = replace(view, faces=np.concatenate((view.faces, view.faces[:1])))
-    with pytest.raises(InvalidInputError, match="view 0 is no manifold"):
-        fused([crossed], [pose])
-    with pytest.raises(NothingToReconstructError, match="1 views, and none has a triangle"):
-        fused([replace(view, sigma_mm=np.full_like(view.sigma_mm, np.nan))], [pose])
+    with pytest.raises(InvalidInputError, match="view 0 is not a manifold"):
+        fuse_views([crossed], [pose])
+    with pytest.raises(NothingToReconstructError, match="found in 1 views none"):
+        fuse_views([replace(view, sigma_mm=np.full_like(view.sigma_mm, np.nan))], [pose])
 
 
 def test_the_poses_part_of_a_variance_is_that_of_all_pairs_by_matrices() -> None:
     random = np.random.default_rng(4)
     views = [sheet(0.001 * k) for k in range(4)]
     root, middle = random.normal(size=(24, 24)) * 1e-3, np.array([1.0, -2.0, 0.5])
-    seen = sheets(views, [np.eye(4)] * 4, inset_mm=0.5)
+    seen = stack_views(views, [np.eye(4)] * 4, border_limit_mm=0.5)
     points = np.array([[0.1, 0.2, 0.0], [1.3, -0.7, 0.01], [-2.1, 1.9, -0.01]])
     nearest = np.array(
         [
@@ -171,8 +180,8 @@ def test_the_poses_part_of_a_variance_is_that_of_all_pairs_by_matrices() -> None
     )
 
     def variance(covariance: FloatArray) -> FloatArray:
-        rule = Rule(0.001, 0.001, 0.0, 1.0, 0.5, PoseErrors(covariance, middle))
-        return np.asarray(mean_values(seen, points, nearest, rule, values_only=False).sigma_mm ** 2)
+        rule = FusionSettings(0.001, 0.001, 0.0, 1.0, 0.5, PoseErrors(covariance, middle))
+        return np.asarray(average_views(seen, points, nearest, rule, values_only=False).sigma_mm ** 2)
 
     normal = np.array([0.0, 0.0, 1.0])
     g = np.hstack([np.cross(points - middle, normal), np.tile(normal, (3, 1))])
@@ -188,7 +197,7 @@ def test_quadrangles_are_halved_and_judged_as_by_arrays() -> None:
     points[7], normals[11] = np.nan, np.nan
     quads = np.stack([random.permutation(60)[:4] for _ in range(500)]).astype(np.int32)
     faces, facing = np.zeros((1000, 3), np.int32), np.full(1000, 9, np.uint8)
-    _halve(0, 500, quads, points, normals, faces, facing)
+    _split_quads(0, 500, quads, points, normals, faces, facing)
 
     a, b, c, d = quads.T
     across = ((points[a] - points[c]) ** 2).sum(axis=1) <= ((points[b] - points[d]) ** 2).sum(axis=1)

@@ -1,14 +1,12 @@
-"""Surface between inside and outside voxels of a sparse grid: a dual mesh, manifold by construction.
+"""Surface net between inside and outside voxels of a sparse grid: a dual mesh, manifold by construction.
 
 Each sheet of surface in a cell is a loop through its faces and crosses some of its edges; it has one vertex, at the
 mean of the crossings (Gibson 1998, "Constrained elastic surface nets", and Nielson 2004, "Dual marching cubes"). Each
-edge of the grid that is crossed has one quadrangle of the four cells about it, if all are known in full: the surface is
-open where they are not.
+crossed edge of the grid has one quadrangle of its four cells if all their corners are known; else the surface is open.
 
-A face whose corners are inside and outside in turn can be crossed in two ways: by parting the insides, which is done
-everywhere, or the outsides. Where both crossings belong to one loop on both sides of the face, two vertices would have
-two edges with four quadrangles in common (Wenger 2013, "Isosurfaces", 3.3.5): there the outsides are parted instead,
-which makes two loops of each.
+A face with alternating corners can be crossed in two ways: by separating the inside corners, the default, or the
+outside ones. If both crossings belong to one loop on both sides of the face, two vertices would share two edges with
+four quadrangles (Wenger 2013, "Isosurfaces", 3.3.5): then the outside corners are separated, which splits the loops.
 """
 
 from __future__ import annotations
@@ -20,11 +18,11 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
-from slrig.views.fusion_grid import CELLS, Grid, cell_beside, corner_of, corners_mm
+from slrig.multiview.fusion_grid import CELLS, Grid, corner_index, corner_positions_mm, neighbour_cell
 
 _BITS = (4, 2, 1)  # of a corner of a cell: x, y, z
 _EDGES = np.array([(c, c | bit) for bit in _BITS for c in range(8) if not c & bit])
-"""(12, 2): the corners of each edge, the four along x first, then y, then z."""
+"""(12, 2): the corners of each edge: four along x, four along y, four along z."""
 _EDGE_OF = {frozenset(edge): number for number, edge in enumerate(_EDGES.tolist())}
 
 
@@ -42,8 +40,8 @@ _CORNERS_OF_FACE = np.array(_faces())
 _EDGES_OF_FACE = np.array([[_EDGE_OF[frozenset((f[k], f[(k + 1) % 4]))] for k in range(4)] for f in _faces()])
 
 
-class Net(NamedTuple):
-    """points_mm : (m, 3) float64; cells : (m,) int32, rising, of each vertex; quads : (q, 4) int32, counter-clockwise
+class SurfaceNet(NamedTuple):
+    """points_mm : (m, 3) float64; cells : (m,) int32, sorted, of each vertex; quads : (q, 4) int32, counter-clockwise
     seen from outside, where values are positive.
     """
 
@@ -52,29 +50,29 @@ class Net(NamedTuple):
     quads: IntArray
 
 
-def net(grid: Grid, values: NDArray[np.floating[Any]]) -> Net:
-    """The zero surface. values : (512 B,) float, by flat index, NaN where unknown."""
+def extract_net(grid: Grid, values: NDArray[np.floating[Any]]) -> SurfaceNet:
+    """Extract the zero surface. values : (512 B,) float, by cell index, NaN if unknown."""
     signs, flips = np.zeros(len(values), dtype=np.uint8), np.zeros(len(values), dtype=np.uint8)
     bricks = len(grid.keys)
     in_bands(_signs, bricks, grid.around, values, signs)
-    _part_outsides(grid.around, signs, flips)
+    _separate_outsides(grid.around, signs, flips)
     counts = np.zeros(len(values), dtype=np.uint8)
     in_bands(_count_loops, bricks, signs, flips, counts)
     first_vertex = np.cumsum(counts, dtype=np.int32) - counts.astype(np.int32)
     cells = np.repeat(np.arange(len(values), dtype=np.int32), counts)
     within = np.zeros((len(cells), 3))
-    in_bands(_place, bricks, grid.around, values, signs, flips, first_vertex, within)
+    in_bands(_place_vertices, bricks, grid.around, values, signs, flips, first_vertex, within)
     quads = np.concatenate(in_bands(_quads, bricks, grid.around, values, signs, flips, counts, first_vertex))
-    return Net(corners_mm(grid, cells) + grid.voxel_mm * within, cells, quads)
+    return SurfaceNet(corner_positions_mm(grid, cells) + grid.voxel_mm * within, cells, quads)
 
 
 @kernel(in_every_scan=False)
 def _signs(first: int, last: int, around: Any, values: Any, signs: Any) -> None:
-    """Bit c of a cell's sign is set where corner c is inside; 0 for cells that are not known or hold no surface."""
+    """Set bit c of a cell's sign if corner c is inside; 0 for cells with an unknown corner or without surface."""
     for cell in range(CELLS * first, CELLS * last):
         inside = 0
         for corner in range(8):
-            at = corner_of(around, cell, corner)
+            at = corner_index(around, cell, corner)
             if at < 0 or np.isnan(values[at]):
                 inside = 0
                 break
@@ -84,10 +82,10 @@ def _signs(first: int, last: int, around: Any, values: Any, signs: Any) -> None:
 
 @kernel_part
 def _loops(inside: int, flipped: int, after: Any, loops: Any) -> int:
-    """The number of the loop that crosses each edge of a cell, (12,), -1 where none does; how many there are.
+    """Write the number of the loop that crosses each edge of a cell, (12,), -1 for none, and return their number.
 
-    A loop runs with the inside on its left: on a face, seen from outside, from where the border goes out to where it
-    comes in. Bit f of `flipped` says that the outsides are parted on face f. after : (12,) int64, for work.
+    A loop runs with the inside on its left: on a face, seen from outside, from an edge that leads out to one that leads
+    in. Bit f of `flipped` is set if the outside corners are separated on face f. after : (12,) int64, scratch space.
     """
     for edge in range(12):
         after[edge] = loops[edge] = -1
@@ -121,19 +119,19 @@ def _is_one_loop(inside: int, flipped: int, face: int, after: Any, loops: Any) -
 
 
 @kernel(in_every_scan=False)
-def _part_outsides(around: Any, signs: Any, flips: Any) -> None:
-    """Set the bits of faces that both cells cross twice with one loop. Each makes more loops, so no order matters."""
+def _separate_outsides(around: Any, signs: Any, flips: Any) -> None:
+    """Set the bits of faces that both cells cross twice with one loop. The order is irrelevant: each adds loops."""
     after, loops = np.zeros(12, np.int64), np.zeros(12, np.int64)
     for cell in range(len(signs)):
         for axis in range(3):
             face = 2 * axis + 1
             first = signs[cell] >> _CORNERS_OF_FACE[face, 0] & 1
-            in_turn = signs[cell] > 0
+            alternating = signs[cell] > 0
             for k in range(1, 4):
-                in_turn &= signs[cell] >> _CORNERS_OF_FACE[face, k] & 1 == first ^ k & 1
-            if not in_turn:
+                alternating &= signs[cell] >> _CORNERS_OF_FACE[face, k] & 1 == first ^ k & 1
+            if not alternating:
                 continue
-            other = corner_of(around, cell, _BITS[axis])
+            other = corner_index(around, cell, _BITS[axis])
             if (
                 other >= 0
                 and signs[other] > 0
@@ -153,7 +151,7 @@ def _count_loops(first: int, last: int, signs: Any, flips: Any, counts: Any) -> 
 
 
 @kernel(in_every_scan=False)
-def _place(
+def _place_vertices(
     first: int, last: int, around: Any, values: Any, signs: Any, flips: Any, first_vertex: Any, within: Any
 ) -> None:  # fmt: skip
     """The mean of each loop's crossings, in voxels from the cell's lowest corner."""
@@ -170,7 +168,7 @@ def _place(
             if loop < 0:
                 continue
             low, high = _EDGES[edge]
-            begin, end = values[corner_of(around, cell, low)], values[corner_of(around, cell, high)]
+            begin, end = values[corner_index(around, cell, low)], values[corner_index(around, cell, high)]
             vertex = first_vertex[cell] + loop
             crossings[loop] += 1.0
             for axis in range(3):
@@ -191,18 +189,18 @@ def _quads(
         if np.isnan(values[voxel]):
             continue
         for axis in range(3):
-            end = corner_of(around, voxel, _BITS[axis])
+            end = corner_index(around, voxel, _BITS[axis])
             if end < 0 or np.isnan(values[end]) or (values[voxel] < 0.0) == (values[end] < 0.0):
                 continue
             u, v = (axis + 1) % 3, (axis + 2) % 3
             known = True
             for k in range(4):
-                # The cells about the edge, counter-clockwise seen from its end.
+                # The cells around the edge, counter-clockwise seen from its end.
                 back_u, back_v = k == 1 or k == 2, k >= 2
                 place[0], place[1], place[2] = voxel >> 6 & 7, voxel >> 3 & 7, voxel & 7
                 place[u] -= back_u
                 place[v] -= back_v
-                cell = cell_beside(around, voxel // CELLS, place[0], place[1], place[2])
+                cell = neighbour_cell(around, voxel // CELLS, place[0], place[1], place[2])
                 if cell < 0 or not signs[cell]:
                     known = False
                     break

@@ -7,7 +7,7 @@ import pytest
 
 from slrig.errors import StageRefusedError
 from slrig.model import FloatArray, Mesh, PlaneKind, StageAxis
-from slrig.views.turntable import cut, stage_planes
+from slrig.multiview.turntable import cut_view, find_turntable_planes
 from tests.unit.meshing.plain import grid_faces, joined, mesh_of
 
 __all__ = ["AXIS", "PLATE", "WALL", "joined"]
@@ -43,7 +43,7 @@ WALL = patch(STAGE_MM + np.array([0.0, -60.0, 90.0]), BACK, 150.0, 0.05, 1)
 
 
 def test_plate_and_backdrop_are_found_and_told_apart() -> None:
-    wall, plate = stage_planes(joined(PLATE, WALL), AXIS)
+    wall, plate = find_turntable_planes(joined(PLATE, WALL), AXIS)
     assert (wall.kind, plate.kind) == (PlaneKind.BACKDROP, PlaneKind.PLATE)
     for plane, normal, sigma_mm, through in ((wall, BACK, 0.05, WALL), (plate, UP, 0.03, PLATE)):
         assert plane.normal @ normal > np.cos(2e-4)
@@ -51,41 +51,41 @@ def test_plate_and_backdrop_are_found_and_told_apart() -> None:
         off = (through.vertices_mm - plane.point_mm) @ plane.normal
         assert abs(off.mean()) < 0.003
     assert plate.margin_mm == pytest.approx(1 + 4 * 0.03, abs=0.05)
-    assert {plane.kind for plane in stage_planes(joined(PLATE, WALL))} == {PlaneKind.BACKDROP}
+    assert {plane.kind for plane in find_turntable_planes(joined(PLATE, WALL))} == {PlaneKind.BACKDROP}
 
 
 def test_a_cut_leaves_the_object_and_says_what_went() -> None:
-    planes = stage_planes(joined(PLATE, WALL), AXIS)
+    planes = find_turntable_planes(joined(PLATE, WALL), AXIS)
     thing = ball(STAGE_MM + 15 * UP, 12.0)
-    found = cut(joined(PLATE, thing, WALL), planes)
+    found = cut_view(joined(PLATE, thing, WALL), planes)
     assert len(found.mesh.vertices_mm) == len(thing.vertices_mm)
     assert np.array_equal(found.mesh.vertices_mm[found.mesh.faces], thing.vertices_mm[thing.faces])
     assert sum(found.removed) == pytest.approx(1 - len(thing.vertices_mm) / sum(map(_count, (PLATE, thing, WALL))))
 
 
 def test_of_what_stands_on_the_plate_the_margin_alone_is_lost() -> None:
-    (plate,) = stage_planes(PLATE, AXIS)
+    (plate,) = find_turntable_planes(PLATE, AXIS)
     box_side = patch(STAGE_MM + 20 * UP, np.array([0.0, 0.6, -0.8]), 40.0, 0.0)
-    height = (cut(box_side, [plate]).mesh.vertices_mm - STAGE_MM) @ UP
+    height = (cut_view(box_side, [plate]).mesh.vertices_mm - STAGE_MM) @ UP
     assert height.min() == pytest.approx(plate.margin_mm, abs=1.0)
     assert height.max() == pytest.approx(((box_side.vertices_mm - STAGE_MM) @ UP).max())
 
 
 def test_a_plate_that_leans_is_cut_as_high_as_it_rises() -> None:
     leaning = UP + np.array([0.01, 0.0, 0.0])
-    (plate,) = stage_planes(patch(STAGE_MM, leaning / np.linalg.norm(leaning), 120.0, 0.03), AXIS)
+    (plate,) = find_turntable_planes(patch(STAGE_MM, leaning / np.linalg.norm(leaning), 120.0, 0.03), AXIS)
     assert plate.kind is PlaneKind.PLATE
     assert plate.margin_mm == pytest.approx(1.12 + 2 * 0.01 * plate.radius_mm, abs=0.1)
 
 
 def test_a_scan_without_a_plane_is_refused() -> None:
     with pytest.raises(StageRefusedError, match="no plane that holds 10% of its 6,400"):
-        stage_planes(ball(STAGE_MM, 40.0), AXIS)
+        find_turntable_planes(ball(STAGE_MM, 40.0), AXIS)
 
 
 def test_a_view_of_nothing_but_the_stage_is_refused_by_name() -> None:
     with pytest.raises(StageRefusedError, match=r"side: .* leave 0\.0% of the view \(backdrop 61%, plate 39%\)"):
-        cut(joined(PLATE, WALL), stage_planes(joined(PLATE, WALL), AXIS), name="side")
+        cut_view(joined(PLATE, WALL), find_turntable_planes(joined(PLATE, WALL), AXIS), name="side")
 
 
 def _count(mesh: Mesh) -> int:

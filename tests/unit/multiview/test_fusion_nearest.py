@@ -7,17 +7,17 @@ import pytest
 
 from slrig.meshing.quality import SearchTree
 from slrig.model import FloatArray
-from slrig.views.fusion import AGREEING_SIGMAS, PoseErrors, Rule, mean_values
-from slrig.views.fusion_grid import (
-    Sheets,
-    corners_mm,
-    grid_about,
-    nearest_to_corners,
-    nearest_within,
-    sheets,
-    wanted_corners,
+from slrig.multiview.fusion import AGREEING_SIGMAS, FusionSettings, PoseErrors, average_views
+from slrig.multiview.fusion_grid import (
+    StackedViews,
+    build_grid,
+    corner_positions_mm,
+    corners_near_surface,
+    nearest_triangles,
+    nearest_triangles_to_corners,
+    stack_views,
 )
-from tests.unit.views.known_views import around, plate_on_box, views_of
+from tests.unit.multiview.known_views import around, plate_on_box, views_of
 
 # Only models of several views need these kernels.
 pytestmark = pytest.mark.slow
@@ -25,13 +25,17 @@ VOXEL_MM = 1.1
 VIEWS = 4
 _ROOT = np.random.default_rng(3).normal(size=(6 * VIEWS, 6 * VIEWS)) * np.tile([1e-4] * 3 + [1e-3] * 3, VIEWS)[:, None]
 POSES = PoseErrors(_ROOT @ _ROOT.T, np.array([1.0, -2.0, 0.5]))
-RULE = Rule(correlated_mm=0.01, own_mm=0.006, shared_mm=0.002, beyond_mm=0.6, inset_mm=4.0, poses=POSES)
+RULE = FusionSettings(
+    correlated_mm=0.01, own_mm=0.006, shared_mm=0.002, border_reach_mm=0.6, full_weight_mm=4.0, poses=POSES
+)
 
 
 @pytest.fixture(scope="module")
-def seen() -> Sheets:
+def seen() -> StackedViews:
     views = views_of(plate_on_box(), around(VIEWS), 0.9)
-    return sheets([view.mesh for view in views], [view.pose for view in views], inset_mm=RULE.inset_mm)
+    return stack_views(
+        [view.mesh for view in views], [view.pose for view in views], border_limit_mm=RULE.full_weight_mm
+    )
 
 
 def plain_nearest(point: FloatArray, triangle: FloatArray) -> tuple[float, FloatArray]:
@@ -47,7 +51,7 @@ def plain_nearest(point: FloatArray, triangle: FloatArray) -> tuple[float, Float
     return min(found, key=lambda each: each[0])
 
 
-def plain_value(seen: Sheets, point: FloatArray, nearest: list[int]) -> tuple[float, float, int]:
+def plain_value(seen: StackedViews, point: FloatArray, nearest: list[int]) -> tuple[float, float, int]:
     """Mean value, σ and number of views, by the rules of the module's docstring."""
     rows = []
     for view, face in ((view, face) for view, face in enumerate(nearest) if face >= 0):
@@ -56,14 +60,14 @@ def plain_value(seen: Sheets, point: FloatArray, nearest: list[int]) -> tuple[fl
         normal = weights @ seen.normals[corners].astype(float)
         normal /= np.linalg.norm(normal)
         offset = point - weights @ seen.points_mm[corners]
-        inset = weights @ seen.inset_mm[corners].astype(float)
+        inset = weights @ seen.border_distance_mm[corners].astype(float)
         zero = weights == 0
         border = any(zero[k] and seen.open_edges[face] >> k & 1 for k in range(3)) or (zero.sum() == 2 and inset == 0)
         along = float(normal @ offset)
         beyond = np.sqrt(max(gap**2 - along**2, 0)) if border else 0.0
-        if beyond <= RULE.beyond_mm:
+        if beyond <= RULE.border_reach_mm:
             sigma = weights * seen.sigma_mm[corners]
-            share = max(min(inset / RULE.inset_mm, 1), 0.01)
+            share = max(min(inset / RULE.full_weight_mm, 1), 0.01)
             w = share / (sigma.sum() ** 2 + RULE.correlated_mm**2)
             value = along if border else np.copysign(gap, along)
             rows.append((value, gap, w, (sigma**2).sum(), normal, beyond, view))
@@ -87,12 +91,12 @@ def plain_value(seen: Sheets, point: FloatArray, nearest: list[int]) -> tuple[fl
     return value, float(np.sqrt(variance)), max(1, sum(row[5] == 0 for row in rows))
 
 
-def distances(seen: Sheets, view: int, points: FloatArray) -> FloatArray:
+def distances(seen: StackedViews, view: int, points: FloatArray) -> FloatArray:
     faces = seen.faces[seen.first_face[view] : seen.first_face[view + 1]]
     return SearchTree.build(seen.points_mm, faces).distances_mm(points)
 
 
-def told(seen: Sheets, points: FloatArray, nearest: np.ndarray) -> FloatArray:
+def told(seen: StackedViews, points: FloatArray, nearest: np.ndarray) -> FloatArray:
     """Distance to the triangle that is said to be nearest, infinite for none."""
     return np.array(
         [
@@ -102,14 +106,14 @@ def told(seen: Sheets, points: FloatArray, nearest: np.ndarray) -> FloatArray:
     )
 
 
-def test_the_nearest_triangle_is_that_of_the_search_tree(seen: Sheets) -> None:
-    grid = grid_about(seen, VOXEL_MM)
-    cells = wanted_corners(seen, grid)
-    corners = corners_mm(grid, cells)
-    nearest = nearest_to_corners(seen, grid, corners, cells)
+def test_the_nearest_triangle_is_that_of_the_search_tree(seen: StackedViews) -> None:
+    grid = build_grid(seen, VOXEL_MM)
+    cells = corners_near_surface(seen, grid)
+    corners = corner_positions_mm(grid, cells)
+    nearest = nearest_triangles_to_corners(seen, grid, corners, cells)
     random = np.random.default_rng(0)
     inside = corners + VOXEL_MM * random.uniform(0, 1, corners.shape)
-    within = nearest_within(seen, grid, inside, cells, reach_mm=VOXEL_MM)
+    within = nearest_triangles(seen, grid, inside, cells, reach_mm=VOXEL_MM)
     some = random.choice(len(cells), 400, replace=False)
     for view in range(len(nearest)):
         true = distances(seen, view, corners[some])
@@ -123,10 +127,10 @@ def test_the_nearest_triangle_is_that_of_the_search_tree(seen: Sheets) -> None:
         assert got == pytest.approx(np.where(true < VOXEL_MM, true, np.inf), abs=1e-9)
 
 
-def test_every_cell_that_a_triangle_passes_through_is_known_in_full(seen: Sheets) -> None:
-    grid = grid_about(seen, VOXEL_MM)
-    cells = wanted_corners(seen, grid)
-    nearest = nearest_to_corners(seen, grid, corners_mm(grid, cells), cells)
+def test_every_cell_that_a_triangle_passes_through_is_known_in_full(seen: StackedViews) -> None:
+    grid = build_grid(seen, VOXEL_MM)
+    cells = corners_near_surface(seen, grid)
+    nearest = nearest_triangles_to_corners(seen, grid, corner_positions_mm(grid, cells), cells)
     random = np.random.default_rng(1)
     weights = random.dirichlet(np.ones(3), len(seen.faces))
     steps = np.floor(
@@ -134,19 +138,21 @@ def test_every_cell_that_a_triangle_passes_through_is_known_in_full(seen: Sheets
     ) + np.argwhere(np.ones((2, 2, 2))).reshape(8, 1, 3)
     place = {
         tuple(step): at
-        for at, step in enumerate(np.rint((corners_mm(grid, cells) - grid.origin_mm) / VOXEL_MM).astype(int).tolist())
+        for at, step in enumerate(
+            np.rint((corner_positions_mm(grid, cells) - grid.origin_mm) / VOXEL_MM).astype(int).tolist()
+        )
     }
     for view in range(len(nearest)):
         for face in range(seen.first_face[view], seen.first_face[view + 1]):
             assert all(nearest[view, place[tuple(steps[corner, face].astype(int))]] >= 0 for corner in range(8))
 
 
-def test_the_mean_is_that_of_plain_numpy(seen: Sheets) -> None:
-    grid = grid_about(seen, VOXEL_MM)
-    cells = wanted_corners(seen, grid)
-    corners = corners_mm(grid, cells)
-    nearest = nearest_to_corners(seen, grid, corners, cells)
-    means = mean_values(seen, corners, nearest, RULE, values_only=False)
+def test_the_mean_is_that_of_plain_numpy(seen: StackedViews) -> None:
+    grid = build_grid(seen, VOXEL_MM)
+    cells = corners_near_surface(seen, grid)
+    corners = corner_positions_mm(grid, cells)
+    nearest = nearest_triangles_to_corners(seen, grid, corners, cells)
+    means = average_views(seen, corners, nearest, RULE, values_only=False)
     some = np.random.default_rng(2).choice(len(cells), 500, replace=False)
     expected = [plain_value(seen, corners[at], nearest[:, at].tolist()) for at in some]
     value, sigma, views = (np.array(each) for each in zip(*expected, strict=True))

@@ -10,9 +10,9 @@ import pytest
 from slrig.errors import RegistrationRefusedError
 from slrig.meshing.topology import boundary_vertices
 from slrig.model import AlbedoMark, FloatArray, Mesh
-from slrig.views.matching import side_of
-from slrig.views.registration import Motion, registered
-from slrig.views.turntable import found_axis, turntable
+from slrig.multiview.matching import prepare_view
+from slrig.multiview.registration import Motion, register_views
+from slrig.multiview.turntable import axis_from_registration, turntable_poses
 from tests.turned_views import AXIS, AXIS_POINT_MM, Turned, bumpy, displacement_mm, plane, seen, vase, wrong_axis
 from tests.unit.meshing.plain import grid_faces, mesh_of
 
@@ -27,7 +27,7 @@ def three() -> Turned:
 
 def test_three_views_come_to_where_they_belong_from_a_wrong_axis(three: Turned) -> None:
     views, starts = three.noisy(1, length_mm=2.0), wrong_axis(ANGLES)
-    found = registered(views, starts)
+    found = register_views(views, starts)
     wrong = [displacement_mm(*each) for each in zip(views, found.poses, three.poses, strict=True)]
     assert displacement_mm(views[2], starts[2], three.poses[2]) > 1.0
     assert wrong[0] == 0.0
@@ -40,7 +40,7 @@ def test_three_views_come_to_where_they_belong_from_a_wrong_axis(three: Turned) 
     assert by_pair[0, 1].overlap > by_pair[0, 2].overlap > 0.19
     assert all(0.9 < each.rms_over_sigma < 1.2 and each.closure_mm < 0.02 for each in found.pairs)
     # The stage's axis is found from the object itself.
-    axis = found_axis(found, AXIS)
+    axis = axis_from_registration(found, AXIS)
     assert axis is not None
     aside = np.cross(axis.point_mm - AXIS_POINT_MM, AXIS)
     assert np.linalg.norm(aside) < 0.01
@@ -51,7 +51,7 @@ def test_three_views_come_to_where_they_belong_from_a_wrong_axis(three: Turned) 
 def test_a_vase_may_turn_about_its_axis_and_is_held_at_the_angle_told() -> None:
     turned = seen(vase, ANGLES, pitch_mm=1.0)
     views, starts = turned.noisy(1, length_mm=2.0), wrong_axis(ANGLES)
-    found = registered(views, starts)
+    found = register_views(views, starts)
     assert [(each.view, each.motion) for each in found.free] == [(1, Motion.TURN), (2, Motion.TURN)]
     for each in found.free:
         assert np.linalg.norm(np.cross(each.direction, AXIS)) < 0.01
@@ -68,7 +68,7 @@ def test_a_vase_may_turn_about_its_axis_and_is_held_at_the_angle_told() -> None:
 def test_two_planes_have_three_free_motions(*, noisy: bool) -> None:
     turned = plane([0.0, 3.0])
     views = turned.noisy(0, length_mm=2.0) if noisy else turned.exact
-    found = registered(views, turned.poses)
+    found = register_views(views, turned.poses)
     assert sorted(each.motion for each in found.free) == [Motion.SHIFT, Motion.SHIFT, Motion.TURN]
     assert displacement_mm(turned.exact[1], found.poses[1], turned.poses[1]) < 0.01
 
@@ -76,26 +76,26 @@ def test_two_planes_have_three_free_motions(*, noisy: bool) -> None:
 def test_a_view_that_overlaps_no_other_is_named() -> None:
     turned = seen(bumpy, [0.0, 40.0, 180.0], pitch_mm=2.0)
     with pytest.raises(RegistrationRefusedError, match=r"^back: .* share more than 2% of the surface"):
-        registered(turned.exact, turned.poses, names=["front", "side", "back"])
+        register_views(turned.exact, turned.poses, names=["front", "side", "back"])
     with pytest.raises(RegistrationRefusedError, match="two views or more"):
-        registered(turned.exact[:1], turned.poses[:1])
+        register_views(turned.exact[:1], turned.poses[:1])
 
 
 def test_a_view_of_another_shape_is_named(three: Turned) -> None:
     stretched = replace(three.exact[1], vertices_mm=three.exact[1].vertices_mm * np.float32(1.03))
     views = [three.exact[0], stretched, three.exact[2]]
     with pytest.raises(RegistrationRefusedError, match=r"^side: expected a surface that agrees"):
-        registered(views, three.poses, names=["front", "side", "other side"])
+        register_views(views, three.poses, names=["front", "side", "other side"])
 
 
 def test_what_is_marked_or_lies_at_the_boundary_is_no_source(three: Turned) -> None:
     mesh = three.exact[0]
-    usable = side_of(mesh).usable
+    usable = prepare_view(mesh).usable
     assert 0 < (~usable).sum() < len(usable) / 2
     inner = ~boundary_vertices(mesh.faces, len(mesh.vertices_mm))
     mark = np.where(inner, AlbedoMark.SATURATED, AlbedoMark.NONE).astype(np.uint8)
     with pytest.raises(RegistrationRefusedError, match="none of its"):
-        registered([replace(mesh, mark=mark), mesh], [np.eye(4), np.eye(4)])
+        register_views([replace(mesh, mark=mark), mesh], [np.eye(4), np.eye(4)])
 
 
 def sheet(high: int, *, folded: bool = False) -> Mesh:
@@ -109,7 +109,7 @@ def sheet(high: int, *, folded: bool = False) -> Mesh:
 
 @pytest.mark.parametrize(("high", "rows"), [(40, 5), (20, 3), (10, 2), (6, 1)])
 def test_what_lies_beside_a_border_is_no_source_but_half_of_a_narrow_surface_is(high: int, rows: int) -> None:
-    usable = side_of(sheet(high)).usable.reshape(high, 400)
+    usable = prepare_view(sheet(high)).usable.reshape(high, 400)
     middle = np.zeros_like(usable)
     middle[rows:-rows, rows:-rows] = True
     np.testing.assert_array_equal(usable, middle)
@@ -117,8 +117,8 @@ def test_what_lies_beside_a_border_is_no_source_but_half_of_a_narrow_surface_is(
 
 @pytest.mark.parametrize(("high", "left"), [(40, [*range(5, 194), *range(205, 395)]), (10, list(range(2, 398)))])
 def test_what_lies_beside_a_sharp_bend_is_no_source_unless_there_is_little(high: int, left: list[int]) -> None:
-    assert np.flatnonzero(side_of(sheet(high, folded=True)).usable.reshape(high, 400)[high // 2]).tolist() == left
-    assert side_of(sheet(high, folded=True), whole=True).usable.reshape(high, 400)[high // 2, 1:-1].all()
+    assert np.flatnonzero(prepare_view(sheet(high, folded=True)).usable.reshape(high, 400)[high // 2]).tolist() == left
+    assert prepare_view(sheet(high, folded=True), whole=True).usable.reshape(high, 400)[high // 2, 1:-1].all()
 
 
 def _turn_about(axis: FloatArray, turn: FloatArray) -> float:
@@ -129,7 +129,7 @@ def _turn_about(axis: FloatArray, turn: FloatArray) -> float:
 
 def test_a_turntable_takes_views_back_to_the_first() -> None:
     point = np.array([1.0, 2.0, 3.0])
-    first, second = turntable(point, np.array([0.0, 0.0, 2.0]), np.deg2rad([10.0, 100.0]))
+    first, second = turntable_poses(point, np.array([0.0, 0.0, 2.0]), np.deg2rad([10.0, 100.0]))
     assert first == pytest.approx(np.eye(4))
     # What the stage turned from x to y comes back to x; the axis stays.
     assert second @ np.array([1.0, 3.0, 3.0, 1.0]) == pytest.approx([2.0, 2.0, 3.0, 1.0])
