@@ -10,13 +10,7 @@ from slrig.patterns.codes import (
     index_of_word,
     line_positions,
 )
-from slrig.patterns.sequence import (
-    SEQUENCES,
-    SequenceOptions,
-    encode,
-    merge_sequences,
-    scan_patterns,
-)
+from slrig.patterns.sequence import SEQUENCES, SequenceOptions, encode, merge_sequences, scan_patterns
 
 __all__ = [
     "MIN_BORDER_DISTANCE_PX",

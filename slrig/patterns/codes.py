@@ -24,6 +24,9 @@ from slrig.errors import PatternError
 from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Size
 from slrig.model.patterns import from_gray, to_gray
 
+MIN_BORDER_DISTANCE_PX = 3.0
+"""Least distance of a line's centre from the projector's first and last position, px: see `line_positions`."""
+
 
 def gray_bits(extent_px: int, cell_px: int, offset_px: int) -> int:
     """Return the least number of bits with a code word for every cell of positions 0 … extent − 1.
@@ -171,10 +174,6 @@ def is_whole(number: ArrayLike, pattern: LineShift, extent_px: int) -> NDArray[n
     """True for each line j that is on the projector in its full width. A line cut by the border has another centre."""
     lines = np.asarray(number)
     return np.asarray((lines >= 0) & (lines < line_count(pattern, extent_px)))
-
-
-MIN_BORDER_DISTANCE_PX = 3.0
-"""Least distance of a line's centre from the projector's first and last position, px: see `line_positions`."""
 
 
 def index_of_word(pattern: Gray) -> IntArray:

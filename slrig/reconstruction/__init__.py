@@ -12,27 +12,10 @@ from slrig.reconstruction.albedo import (
     Illumination,
     estimate_albedo,
 )
-from slrig.reconstruction.camera_response import (
-    NoiseModel,
-    estimate_noise,
-    fit_noise,
-)
-from slrig.reconstruction.correspondence import (
-    CorrespondenceLimits,
-    ProjectorPositions,
-    projector_positions,
-)
-from slrig.reconstruction.decoded_image import (
-    CodeTables,
-    ReconstructionLimits,
-)
-from slrig.reconstruction.decoding import (
-    DecodingLimits,
-    RegionMask,
-    decode,
-    lit_pixels,
-    unresolved_bits,
-)
+from slrig.reconstruction.camera_response import NoiseModel, estimate_noise, fit_noise
+from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
+from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
+from slrig.reconstruction.decoding import DecodingLimits, RegionMask, decode, lit_pixels, unresolved_bits
 from slrig.reconstruction.frames import (
     NEAR_SATURATION,
     AxisFrames,
@@ -47,13 +30,7 @@ from slrig.reconstruction.frames import (
     used_frames,
     used_shots,
 )
-from slrig.reconstruction.fusion import (
-    ExposureUse,
-    FusedFrames,
-    exposure_use,
-    fuse_colour,
-    fuse_exposures,
-)
+from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fuse_colour, fuse_exposures
 from slrig.reconstruction.merging import (
     MergedCurves,
     PairRedundancy,
@@ -62,15 +39,8 @@ from slrig.reconstruction.merging import (
     find_disagreement,
     merge_curves,
 )
-from slrig.reconstruction.phase import (
-    has_phase,
-    position_map,
-)
-from slrig.reconstruction.pipeline import (
-    CameraCurves,
-    CameraStream,
-    camera_curves,
-)
+from slrig.reconstruction.phase import has_phase, position_map
+from slrig.reconstruction.pipeline import CameraCurves, CameraStream, camera_curves
 from slrig.reconstruction.triangulation import (
     CONVERGED,
     SheetCurves,

@@ -25,10 +25,24 @@ _WIDE, _NARROW = 4, 2  # px either way
 _MARGIN_PX = 1
 # Largest distance at which a pixel without a whole window uses that of a neighbour; a straight border needs 3.
 _NEIGHBOUR_PX = 4
-_MAX_DIFFERENCE_SIGMA = (
-    3.0  # standard deviations: further apart, the windows cover two surfaces, or one that bends within the wide one
-)
+# Standard deviations: further apart, the windows cover two surfaces, or one that bends within the wide one.
+_MAX_DIFFERENCE_SIGMA = 3.0
 _DOUBT = 4.0  # squared: a shift of two standard deviations counts by half
+
+_SAMPLE_STEP = 4  # of rows and columns: neighbours are alike
+_REACH = 2  # px either way, for the slope
+_MAX_BEND_PX = 1.0  # second difference over that distance: more is two surfaces, whose light mixes
+_MAX_CONTRAST_STEP = 0.2  # change over that distance, of the brightness: edges of a print reduce the estimate
+_MIN_SAMPLES = 500
+_ITERATIONS = 4
+_MAX_RESIDUAL_SIGMA = 3.0  # standard deviations from the line: glints, and light of two surfaces
+# Chosen: standard deviation of the logarithm of the contrast, as the focus of the projector may vary with depth and
+# slope; and of that of the expected variance, for lenses more or less in focus.
+_LOG_CONTRAST_SIGMA = 0.02
+_LOG_VARIANCE_SIGMA = np.log(2)
+_MIN_VARIANCE, _MAX_VARIANCE = 1 / 12, 16.0
+"""px²: of the area of a pixel, and of a blur in which lines of 8 px vanish."""
+_STEPS = 2000  # of 0.3 % of the variance
 
 
 def correct_curvature(
@@ -223,22 +237,6 @@ def _add_column(out: Any, column: Any, d: int, reach: int, weight: float) -> Non
     """Add the part of a column to the windows at distance d from it."""
     for x in range(reach, len(out) - reach):
         out[x] += weight * column[x + d]
-
-
-_SAMPLE_STEP = 4  # of rows and columns: neighbours are alike
-_REACH = 2  # px either way, for the slope
-_MAX_BEND_PX = 1.0  # second difference over that distance: more is two surfaces, whose light mixes
-_MAX_CONTRAST_STEP = 0.2  # change over that distance, of the brightness: edges of a print reduce the estimate
-_MIN_SAMPLES = 500
-_ITERATIONS = 4
-_MAX_RESIDUAL_SIGMA = 3.0  # standard deviations from the line: glints, and light of two surfaces
-# Chosen: standard deviation of the logarithm of the contrast, as the focus of the projector may vary with depth and
-# slope; and of that of the expected variance, for lenses more or less in focus.
-_LOG_CONTRAST_SIGMA = 0.02
-_LOG_VARIANCE_SIGMA = np.log(2)
-_MIN_VARIANCE, _MAX_VARIANCE = 1 / 12, 16.0
-"""px²: of the area of a pixel, and of a blur in which lines of 8 px vanish."""
-_STEPS = 2000  # of 0.3 % of the variance
 
 
 class BlurEstimate(NamedTuple):

@@ -35,6 +35,7 @@ from slrig.model import FloatArray, IntArray, coarse_bits, telling_bits
 from slrig.reconstruction.frames import AxisFrames, Images, select_rows, stack_rows, subsample
 from slrig.reconstruction.surface_fit import stencils
 
+# Noise.
 _QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
 _MAX_SAMPLES = 200_000  # about 8000 for each bin
 _MIN_RANGE_SIGMA = 10.0  # of levels, in standard deviations of the noise, to fit a slope
@@ -48,6 +49,39 @@ _MIN_BITS = 3
 _MIN_LIT = 0.02  # of full scale, white over black
 _MIN_BIT_SWING = 0.75  # of white less black, from the middle: smaller swings are at an edge of the code
 _MEDIAN_SQUARE = 0.4549  # the median of a squared normal, of its variance
+
+# Correlation.
+_MAX_WINDOWS = 10_000  # whose mean is known to a hundredth
+_MIN_WINDOWS = 200
+_MIN_SWING = 0.8  # of the contrast: less is an edge of the code, where gamma breaks the sum
+_MIN_RATIO = 1.1  # accuracy of the noise model: independent noise gives ratios up to 1.08
+_MAX_COUNTED = 200_000  # whose mean is known to a hundredth
+
+# Compression.
+_SIDE = 8
+_FULL_SCALE = 255  # of the values that JPEG is used for
+_MAX_BLOCKS = 8000  # of all frames together: a share of blocks is then known to half a hundredth
+_MAX_STEP = 128  # of the first coefficients, which hold the stripes: no table in use has more
+_LIMITED_RANGE = 255 / 219  # factor on the steps if luma of 16..235 is stretched to 0..255
+_BIN, _QUOTIENT_BINS = 0.125, 4096  # of the magnitude of a coefficient; up to 512
+_MIN_CLUSTERING = 0.4  # mean cosine of 2π c/step: about 0 without steps, 0.66 for steps of 2 with rounded pixels
+_NEAR_ZERO = 11  # bin: up to 1.5, which rounded pixels seldom make of zero
+_MAX_ASTRAY = 0.1  # of coefficients beyond that, share that may be less than half a step
+_MIN_NONZERO = 30  # coefficients not rounded to zero
+_MIN_BEYOND = 10  # of these, number of coefficients of more than one step
+_MIN_DIFFERENT = 30  # different values: a drawing of few colours has few, and they may all be multiples
+_ROUNDING_VARIANCE = 1 / 12  # of decoded pixels, in addition to the camera's own
+_MIN_STEPS = 6  # coefficients with a step: frames without loss seem to have one at most
+
+# Gamma.
+_MIN_GAMMA = 1.2  # chosen: cameras for displays have 1.8 and more, and linear cameras give 1.00
+_MAX_GAMMA = 4.0
+_EDGE_SHARE = 0.5  # of the contrast, from its middle
+_MAX_DIFFERENCE = 0.15  # of the contrast, between a bit and its inverse: their mean is then the middle to 2 %
+_MIN_CONTRAST_LEVELS = 20.0  # of 255: white over black, so that rounding does not shift the middle
+_MIN_EDGES = 500
+_MAX_PIXELS = 200_000
+_GAMMA_ITERATIONS = 20  # each halves the interval of γ
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +279,7 @@ def _scatter_between_neighbours(
     levels, variances = [], []
     for image in images:
         across = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
-        both = across[:-2] - 2 * across[1:-1] + across[2:]
+        second_difference = across[:-2] - 2 * across[1:-1] + across[2:]
         # The mask sums to zero, so the mean of its pixels is independent of its response; the centre alone is not.
         mean = cv2.blur(image, (3, 3))[1:-1, 1:-1]
         lowest, highest = cv2.erode(image, _BOX)[1:-1, 1:-1], cv2.dilate(image, _BOX)[1:-1, 1:-1]
@@ -254,7 +288,7 @@ def _scatter_between_neighbours(
             unclipped &= where[1:-1, 1:-1]
         levels.append(mean[unclipped])
         # The squared norm of the mask is 36.
-        variances.append(both[unclipped] ** 2 * (frames.reference_repeats / 36 / _MEDIAN_SQUARE))
+        variances.append(second_difference[unclipped] ** 2 * (frames.reference_repeats / 36 / _MEDIAN_SQUARE))
     return np.concatenate(levels), np.concatenate(variances)
 
 
@@ -285,13 +319,6 @@ def _fit_model(level: NDArray[np.float32], variance: NDArray[np.float32]) -> Noi
     if slope <= 0:
         return NoiseModel(max(float(np.average(y, weights=weight)), _QUANTISATION_VARIANCE), 0.0)
     return NoiseModel(max(float(read), _QUANTISATION_VARIANCE), float(slope))
-
-
-_MAX_WINDOWS = 10_000  # whose mean is known to a hundredth
-_MIN_WINDOWS = 200
-_MIN_SWING = 0.8  # of the contrast: less is an edge of the code, where gamma breaks the sum
-_MIN_RATIO = 1.1  # accuracy of the noise model: independent noise gives ratios up to 1.08
-_MAX_COUNTED = 200_000  # whose mean is known to a hundredth
 
 
 class PixelSum(NamedTuple):
@@ -362,10 +389,10 @@ def phase_pixel_sum(frames: AxisFrames, lit: NDArray[np.bool_]) -> PixelSum:
         if lines is not None:
             return lines[0][0][rows] > lines[1][0][rows], lit[rows]
         if frames.inverses is not None:
-            against = frames.inverses[index][rows]
+            reference = frames.inverses[index][rows]
         else:
-            against = (frames.white[rows] + frames.black[rows]) / 2
-        return frames.bits[index][rows] > against, lit[rows]
+            reference = (frames.white[rows] + frames.black[rows]) / 2
+        return frames.bits[index][rows] > reference, lit[rows]
 
     def cycles_per_px(here: NDArray[np.bool_], there: NDArray[np.bool_], both: NDArray[np.bool_]) -> float:
         changes = int(np.count_nonzero((here != there) & both)) / max(int(np.count_nonzero(both)), 1)
@@ -506,22 +533,6 @@ def _window_pixels(
     return np.array([view[corner].reshape(len(corner[0]), -1) for view in views], dtype=np.float32)
 
 
-_SIDE = 8
-_FULL_SCALE = 255  # of the values that JPEG is used for
-_MAX_BLOCKS = 8000  # of all frames together: a share of blocks is then known to half a hundredth
-_MAX_STEP = 128  # of the first coefficients, which hold the stripes: no table in use has more
-_LIMITED_RANGE = 255 / 219  # factor on the steps if luma of 16..235 is stretched to 0..255
-_BIN, _QUOTIENT_BINS = 0.125, 4096  # of the magnitude of a coefficient; up to 512
-_MIN_CLUSTERING = 0.4  # mean cosine of 2π c/step: about 0 without steps, 0.66 for steps of 2 with rounded pixels
-_NEAR_ZERO = 11  # bin: up to 1.5, which rounded pixels seldom make of zero
-_MAX_ASTRAY = 0.1  # of coefficients beyond that, share that may be less than half a step
-_MIN_NONZERO = 30  # coefficients not rounded to zero
-_MIN_BEYOND = 10  # of these, number of coefficients of more than one step
-_MIN_DIFFERENT = 30  # different values: a drawing of few colours has few, and they may all be multiples
-_ROUNDING_VARIANCE = 1 / 12  # of decoded pixels, in addition to the camera's own
-_MIN_STEPS = 6  # coefficients with a step: frames without loss seem to have one at most
-
-
 def compression_loss(images: Images, code: Images, where: NDArray[np.bool_], full_scale: float) -> FloatArray:
     """(8, 8) float64: variance that compression removed from each coefficient, camera units squared; zeros without
     loss.
@@ -645,16 +656,6 @@ def _quantisation_steps(size: NDArray[np.float32]) -> FloatArray:
     return np.where(clear, step, 0.0)
 
 
-_MIN_GAMMA = 1.2  # chosen: cameras for displays have 1.8 and more, and linear cameras give 1.00
-_MAX_GAMMA = 4.0
-_EDGE_SHARE = 0.5  # of the contrast, from its middle
-_MAX_DIFFERENCE = 0.15  # of the contrast, between a bit and its inverse: their mean is then the middle to 2 %
-_MIN_CONTRAST_LEVELS = 20.0  # of 255: white over black, so that rounding does not shift the middle
-_MIN_EDGES = 500
-_MAX_PIXELS = 200_000
-_GAMMA_ITERATIONS = 20  # each halves the interval of γ
-
-
 def estimate_gamma(frames: AxisFrames) -> float:
     """Estimate gamma of a camera from the edges of the code; 1 if they do not determine it, or it is close to 1."""
     if frames.exposure_ratio != 1.0:
@@ -722,8 +723,8 @@ def _bit_edge_samples(
     clear = (white - black > _MIN_CONTRAST_LEVELS / 255 * full) & (white < clipped_at)
     found = []
     for bit, inverse in zip(direct, inverted, strict=True):
-        alike = clear & (np.abs(bit - inverse) < _MAX_DIFFERENCE * (white - black))
-        found.append(np.stack([(bit[alike] + inverse[alike]) / 2, white[alike], black[alike]]))
+        is_edge = clear & (np.abs(bit - inverse) < _MAX_DIFFERENCE * (white - black))
+        found.append(np.stack([(bit[is_edge] + inverse[is_edge]) / 2, white[is_edge], black[is_edge]]))
     return np.concatenate(found, axis=1)
 
 

@@ -26,6 +26,13 @@ from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, FrameStacks, Images, rows_per_band, stack_rows
 from slrig.reconstruction.phase import has_phase, position_map, resample_to_pixel_centres
 
+Mask = NDArray[np.bool_]
+
+_WINDOW_PX = 15
+_MIN_IN_WINDOW = 20
+_SMOOTHED_PX = 1.0
+_GRADIENT_GAIN = (8 * np.pi * _SMOOTHED_PX**4) ** -0.5  # deviation of the derivative of a Gaussian for unit noise
+
 
 @dataclass(frozen=True, slots=True)
 class EdgeCrossings:
@@ -211,14 +218,6 @@ def _cubic_root(a: float, b: float, c: float, d: float) -> float:
             return after
         at = after
     return at
-
-
-Mask = NDArray[np.bool_]
-
-_WINDOW_PX = 15
-_MIN_IN_WINDOW = 20
-_SMOOTHED_PX = 1.0
-_GRADIENT_GAIN = (8 * np.pi * _SMOOTHED_PX**4) ** -0.5  # deviation of the derivative of a Gaussian for unit noise
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,28 @@ _AMBIGUOUS_BIT = int(Refusal.AMBIGUOUS_BIT)
 _BEYOND_PROJECTOR = int(Refusal.BEYOND_PROJECTOR)
 _MAX_UNCERTAIN_BITS = 4  # each doubles the number of words to look up
 
+_REACH_PX = 8
+"""Distance of pixels on which a point depends: fits reach 2 px, filters 9 px, with little weight."""
+
+# Unresolved bits and lines.
+BLOCK_PX = 32
+"""Size of a block: small enough for an even density of the code, with hundreds of passages of each bit."""
+_MIN_PASSAGES = 48
+"""With fewer passages, a bit counts as resolved."""
+_MIN_CORRECT = 0.7
+"""Share of the passages of cells with the right change of a bit. Random bits have it in a quarter of passages."""
+_MIN_PASSAGE_PX = 2.0
+"""Mean length of a passage of both halves of a cell: each pixel then has one code edge at most."""
+_MAX_UNRESOLVED_BITS = 3
+"""If more bits were left out, the image does not show the code."""
+_MIN_FOUND = 0.5
+"""Share of the points of lines; chosen between 0.9 where lines are resolved and 0.15 where they blur into each other.
+"""
+_MIN_LINE_POINTS = 200
+"""Points to expect in a block and its neighbours; with fewer, lines count as resolved."""
+_BLOCK_ROWS_PER_BAND = 4  # rows of blocks in a band, which needs memory for each pixel
+_MAX_STEP_CELLS = 2.0  # cells from pixel to pixel; more is a depth step
+
 
 @dataclass(frozen=True, slots=True)
 class DecodingLimits:
@@ -179,10 +201,6 @@ def _decode_kernel(
                 highest[y, x] = min(high, cell_count - 1)
 
 
-_REACH_PX = 8
-"""Distance of pixels on which a point depends: fits reach 2 px, filters 9 px, with little weight."""
-
-
 @dataclass(frozen=True, slots=True)
 class RegionMask:
     """Scan region in the image of one camera.
@@ -223,25 +241,6 @@ def refuse_outside_region(code: CodeMap, region: NDArray[np.bool_]) -> CodeMap:
     outside = (cv2.dilate(region.view(np.uint8), box) == 0) & (code.refusal != Refusal.NOT_LIT)
     refusal = np.where(outside, np.uint8(Refusal.OUTSIDE_REGION), code.refusal)
     return CodeMap(np.where(outside, -1, code.lowest), np.where(outside, -1, code.highest), refusal)
-
-
-BLOCK_PX = 32
-"""Size of a block: small enough for an even density of the code, with hundreds of passages of each bit."""
-_MIN_PASSAGES = 48
-"""With fewer passages, a bit counts as resolved."""
-_MIN_CORRECT = 0.7
-"""Share of the passages of cells with the right change of a bit. Random bits have it in a quarter of passages."""
-_MIN_PASSAGE_PX = 2.0
-"""Mean length of a passage of both halves of a cell: each pixel then has one code edge at most."""
-_MAX_UNRESOLVED_BITS = 3
-"""If more bits were left out, the image does not show the code."""
-_MIN_FOUND = 0.5
-"""Share of the points of lines; chosen between 0.9 where lines are resolved and 0.15 where they blur into each other.
-"""
-_MIN_LINE_POINTS = 200
-"""Points to expect in a block and its neighbours; with fewer, lines count as resolved."""
-_BLOCK_ROWS_PER_BAND = 4  # rows of blocks in a band, which needs memory for each pixel
-_MAX_STEP_CELLS = 2.0  # cells from pixel to pixel; more is a depth step
 
 
 def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np.uint8]:
@@ -289,11 +288,11 @@ def unresolved_lines(
     columns, rows = (np.rint(points_px).astype(np.intp) // BLOCK_PX).T
     found = np.bincount(rows * expected.shape[1] + columns, minlength=expected.size).reshape(expected.shape)
     expected, found = _add_neighbours(expected), _add_neighbours(found)
-    lost = (found < _MIN_FOUND * expected) & (expected >= _MIN_LINE_POINTS)
-    if not lost.any():
+    unresolved = (found < _MIN_FOUND * expected) & (expected >= _MIN_LINE_POINTS)
+    if not unresolved.any():
         return None
     rows, columns = (np.arange(extent) // BLOCK_PX for extent in usable.shape)
-    return lost[np.ix_(rows, columns)]
+    return unresolved[np.ix_(rows, columns)]
 
 
 def _cells_per_block(code: CodeMap, usable: NDArray[np.bool_]) -> FloatArray:

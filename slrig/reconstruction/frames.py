@@ -245,7 +245,7 @@ def axis_patterns(patterns: Collection[Pattern], camera: str, axis: Axis) -> Axi
     if len(reference) < 2 and not direct & inverted:
         message = (
             f"camera '{camera}' has no white and black frames and no bit with its inverse: "
-            "nothing tells lit from dark; add a white and a black frame, or inverses"
+            "bits have no threshold; add a white and a black frame, or inverses"
         )
         raise PatternError(message)
     lines = tuple(sorted((p for p in patterns if isinstance(p, LineShift) and p.axis is axis), key=lambda p: p.shift))

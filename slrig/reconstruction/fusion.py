@@ -34,9 +34,9 @@ from slrig.reconstruction.frames import (
     used_shots,
 )
 
-# standard deviations of noise: the ratio of two exposures is then known to a twentieth at each pixel,
+# The ratio of two exposures is then known to a twentieth at each pixel, and the median of this number to 1/300.
 _MIN_CONTRAST_SIGMA = 20.0
-_MIN_LIGHT_PIXELS = 500  # and the median of so many to a three-hundredth
+_MIN_LIGHT_PIXELS = 500
 
 
 @dataclass(frozen=True, slots=True)

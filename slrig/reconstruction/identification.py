@@ -27,6 +27,8 @@ _SHORT_STRIPE = int(Refusal.SHORT_STRIPE)
 _SATURATED = int(Refusal.SATURATED)
 _MAX_GAP_POINTS = 3  # of another position, or none, that do not end a stripe
 
+_END_POINTS = 10  # r in the paper, which gives no value
+
 
 @dataclass(frozen=True, slots=True)
 class NumberedStripes:
@@ -214,9 +216,6 @@ def _identify_kernel(offsets: Any, points: Any, position: Any, cause: Any, short
 @kernel_part
 def _mark(refusal: Any, points: Any, i: int, cause: int) -> None:
     refusal[int(np.rint(points[i, 1])), int(np.rint(points[i, 0]))] = cause
-
-
-_END_POINTS = 10  # r in the paper, which gives no value
 
 
 class StripeEnsemble(NamedTuple):

@@ -23,6 +23,19 @@ from slrig.reconstruction.triangulation import SheetCurves, project
 _ALL = int(Source.ALL)
 _SAME_POINT_SIGMA = 12.0  # beyond this the cameras saw different surfaces, which must not be averaged
 
+MAP_CELLS = 6  # along each side of the map, as for residuals of a calibration
+MIN_PAIRS = 20  # the mean of a cell is then known to a quarter of the scatter
+_STEPS = 32  # segments to search for the foot of a perpendicular
+_TANGENT_REACH = 2  # points either way, for the direction of a stripe
+_OUTLIER_SIGMA = 12.0  # robust standard deviations, as for merging: further points are of different surfaces
+DEVIATIONS_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+
+MIN_POINTS = 100
+"""Common points of two cameras; fewer hardly show the same surface."""
+
+MAX_OVER_SIGMA = 3.0
+"""Beyond this the stated deviations do not explain the distances."""
+
 
 @dataclass(frozen=True, slots=True)
 class MergedCurves:
@@ -52,10 +65,7 @@ def merge_curves(parts: list[SheetCurves], centre_mm: FloatArray, /, *, widest_g
         sigmas.append(sigma)
         distances.append(distance)
     return MergedCurves(
-        result,
-        camera,
-        np.concatenate([np.zeros(0), *sigmas]),
-        np.concatenate([np.zeros(0), *distances]),
+        result, camera, np.concatenate([np.zeros(0), *sigmas]), np.concatenate([np.zeros(0), *distances])
     )
 
 
@@ -212,14 +222,6 @@ def _unmatched_kernel(a: Any, along: Any, bridge: Any, b: Any, along2: Any, wide
     return unmatched
 
 
-MAP_CELLS = 6  # along each side of the map, as for residuals of a calibration
-MIN_PAIRS = 20  # the mean of a cell is then known to a quarter of the scatter
-_STEPS = 32  # segments to search for the foot of a perpendicular
-_TANGENT_REACH = 2  # points either way, for the direction of a stripe
-_OUTLIER_SIGMA = 12.0  # robust standard deviations, as for merging: further points are of different surfaces
-DEVIATIONS_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
-
-
 @dataclass(frozen=True, slots=True)
 class StripeResiduals:
     """Redundant equation of each point of one camera whose column another camera sees, too.
@@ -274,11 +276,11 @@ def evaluate_redundancy(
     axis that numbers the sheets; widest_gap_px : as for `merge_curves`.
     """
     if len(devices) < 2:
-        return Redundancy((), "one camera and one axis of patterns: three equations for three unknowns, none to spare")
+        return Redundancy((), "one camera and one axis of patterns give three equations for three unknowns")
     if any((part.source == Source.CAMERA_CAMERA).any() for part in parts):
         reason = (
-            "the projector is not calibrated: the stripe of the second camera is spent on the depth, and the epipolar "
-            "plane chooses the point on it, so no equation is to spare"
+            "the projector is not calibrated: the stripe and the epipolar plane of the second camera are both needed "
+            "for the depth"
         )
         return Redundancy((), reason)
     found = []
@@ -420,13 +422,6 @@ def _foot(point: Any, start: int, low: int, high: int, along: Any, pixels: Any, 
         if k < low or k + 1 >= high or not _is_joined(k, along, bridge, widest):
             return -1, 0.0
     return -1, 0.0
-
-
-MIN_POINTS = 100
-"""Common points of two cameras; fewer hardly show the same surface."""
-
-MAX_OVER_SIGMA = 3.0
-"""Beyond this the stated deviations do not explain the distances."""
 
 
 @dataclass(frozen=True, slots=True)

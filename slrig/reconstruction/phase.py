@@ -23,6 +23,31 @@ from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames, rows_per_band, stack_rows
 from slrig.reconstruction.surface_fit import stencils
 
+_FITTED_PX = 5  # pixels along each side of the window of a fit
+_MAX_BEND_PX = 1.0  # projector px of second difference over six pixels: more is a step between two surfaces
+_MAX_STEP_PX = 4.0  # projector px of second difference over two pixels: more than edges of a print displace positions
+_SIXTH_GAIN = 2 * (45**2 + 9**2 + 1) / 60**2  # variance of the sixth-order difference for unit noise
+_DOUBT = 4.0  # squared: fine structure of two standard deviations counts by half
+_ITERATIONS = 2  # the second uses the slope of corrected positions
+_REACH = 5  # px either way: an edge and the surface round it
+_SMOOTHED_PX = 1.0  # about the smoothing by the fit to positions, so that the blur suits that fit
+_SURROUND_PX = 2.5
+_SAMPLE_STEP = 4  # of rows and columns: there are many edges, and each uses 121 pixels
+_GRADIENT_GAIN = (8 * np.pi * _SMOOTHED_PX**4) ** -0.5  # deviation of a smoothed derivative for unit noise
+_MIN_EDGE_SIGMA = 2.0  # least shift of an edge over its noise
+_MAX_DEVIATION = 1.5  # px² from the expected variance: further edges are of shading
+_MIN_AGREEING = 0.5  # of all edges: for shading the share is below 0.12, for prints above 0.8
+_MIN_EDGES = 30  # fewer may agree by chance
+_PRIOR_SIGMA = 0.5  # standard deviation of σ² over its expected value, for lenses more or less in focus
+
+_STEP_SIGMA_PX = (0.04, 0.015)
+"""Standard deviation by light of the other surface in the first and second pixel next to a depth step; chosen for edges
+of terraces and boxes.
+"""
+
+_SHADOW_SIGMA = 3.0
+"""Standard deviations of the camera's blur within which light fades out at a border."""
+
 
 class PositionMap(NamedTuple):
     """Projector position of one axis at every pixel.
@@ -188,24 +213,6 @@ def allocate_points(count: int) -> FittedPoints:
     """Empty output of `fit_kernel`."""
     found = np.zeros(count, dtype=np.bool_)
     return FittedPoints(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), found, np.zeros(count))
-
-
-_FITTED_PX = 5  # pixels along each side of the window of a fit
-_MAX_BEND_PX = 1.0  # projector px of second difference over six pixels: more is a step between two surfaces
-_MAX_STEP_PX = 4.0  # projector px of second difference over two pixels: more than edges of a print displace positions
-_SIXTH_GAIN = 2 * (45**2 + 9**2 + 1) / 60**2  # variance of the sixth-order difference for unit noise
-_DOUBT = 4.0  # squared: fine structure of two standard deviations counts by half
-_ITERATIONS = 2  # the second uses the slope of corrected positions
-_REACH = 5  # px either way: an edge and the surface round it
-_SMOOTHED_PX = 1.0  # about the smoothing by the fit to positions, so that the blur suits that fit
-_SURROUND_PX = 2.5
-_SAMPLE_STEP = 4  # of rows and columns: there are many edges, and each uses 121 pixels
-_GRADIENT_GAIN = (8 * np.pi * _SMOOTHED_PX**4) ** -0.5  # deviation of a smoothed derivative for unit noise
-_MIN_EDGE_SIGMA = 2.0  # least shift of an edge over its noise
-_MAX_DEVIATION = 1.5  # px² from the expected variance: further edges are of shading
-_MIN_AGREEING = 0.5  # of all edges: for shading the share is below 0.12, for prints above 0.8
-_MIN_EDGES = 30  # fewer may agree by chance
-_PRIOR_SIGMA = 0.5  # standard deviation of σ² over its expected value, for lenses more or less in focus
 
 
 def resample_to_pixel_centres(
@@ -387,12 +394,6 @@ def _edges_kernel(
             sums[y, 3] += 1
 
 
-_STEP_SIGMA_PX = (0.04, 0.015)
-"""Standard deviation by light of the other surface in the first and second pixel next to a depth step; chosen for edges
-of terraces and boxes.
-"""
-
-
 @dataclass(frozen=True, slots=True)
 class EdgeLimits:
     """Definition of a border, and distances of stripe points from it.
@@ -431,10 +432,6 @@ def near_edges(
 def near_shadows(unlit: NDArray[np.bool_], limits: EdgeLimits, /) -> NDArray[np.bool_]:
     """(H, W) bool: pixels near the border of the lit area; see `near_edges`."""
     return _dilate(_remove_specks(unlit, limits.smallest_shadow_px), limits.shadow_px)
-
-
-_SHADOW_SIGMA = 3.0
-"""Standard deviations of the camera's blur within which light fades out at a border."""
 
 
 def near_shadows_by_blur(

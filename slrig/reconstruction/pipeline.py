@@ -404,24 +404,24 @@ def _refine_identify_link(
     numbered, refusal, point_count = _chain_and_identify(
         points, code, tables.position_table, near_shadow, near_step, shortest
     )  # fmt: skip
-    lost = None
+    without_lines = None
     if tables.edge_table is not None:
         per_cell = len(points) * frames.gray.cell_px / frames.line_patterns[0].period_px
         clear = ~(near_shadow | near_step) & (True if image.region is None else image.region)
-        lost = unresolved_lines(numbered.stripes.points_px, image.code, clear, per_cell)
-    if lost is not None and tables.edge_table is not None:
+        without_lines = unresolved_lines(numbered.stripes.points_px, image.code, clear, per_cell)
+    if without_lines is not None and tables.edge_table is not None:
         # Code edges replace the lines that the camera does not resolve.
         del numbered
         report_step("locate stripes")
-        image, code = _decode_fewer_bits(image, code, lost, tables, limits)
+        image, code = _decode_fewer_bits(image, code, without_lines, tables, limits)
         middles = position_map(frames, image.position_noise, code, tables.cell_position, by_phase=False)
         shadow, step = near_edges(middles, image.unlit, cell_width_px(image), limits.edges.for_filters(scale.blur_px))
-        near_shadow, near_step = np.where(lost, shadow, near_shadow), np.where(lost, step, near_step)
+        near_shadow, near_step = np.where(without_lines, shadow, near_shadow), np.where(without_lines, step, near_step)
         del middles, shadow, step
-        edges = _locate_edges(image, lost, limits.stripes, scale.filter_px)
+        edges = _locate_edges(image, without_lines, limits.stripes, scale.filter_px)
         stacks.release()
         report_step("identify stripes")
-        points[:] = [_points_outside(points.pop(0), lost) for _ in range(len(points))] + edges
+        points[:] = [_points_outside(points.pop(0), without_lines) for _ in range(len(points))] + edges
         del edges
         numbered, refusal, point_count = _chain_and_identify(
             points, code, np.vstack([tables.position_table, tables.edge_table]), near_shadow, near_step, shortest,
@@ -445,7 +445,7 @@ def _refine_identify_link(
         refined=aligned.refined,
         disagreement_px=aligned.disagreement_px,
         unresolved=image.unresolved,
-        unresolved_lines=lost,
+        unresolved_lines=without_lines,
         compression_dn=float(np.sqrt(image.response.loss_variance)),
         noise_correlation=image.response.noise_correlation,
         gamma=image.response.gamma,
@@ -467,14 +467,18 @@ def _chain_and_identify(
 
 
 def _decode_fewer_bits(
-    image: DecodedImage, code: CodeMap, lost: NDArray[np.bool_], tables: CodeTables, limits: ReconstructionLimits
+    image: DecodedImage,
+    code: CodeMap,
+    without_lines: NDArray[np.bool_],
+    tables: CodeTables,
+    limits: ReconstructionLimits,
 ) -> tuple[DecodedImage, CodeMap]:
     """Decode without unresolved bits where lines are lost. Returns the image and `code`, both with the new cells."""
     frames, noise = image.frames, image.response.noise
     bits = unresolved_bits(frames, lit_pixels(frames, noise, limits.decoding))
-    bits[~lost] = 0
-    rows, cells = _rows_around(lost, 0), len(tables.cell_position)
-    inside = lost[rows]
+    bits[~without_lines] = 0
+    rows, cells = _rows_around(without_lines, 0), len(tables.cell_position)
+    inside = without_lines[rows]
     fewer = decode(
         frames.rows(rows), noise.rows(rows), tables.index_of_word, cells, limits.decoding, unresolved=bits[rows]
     )
@@ -492,11 +496,11 @@ def _decode_fewer_bits(
 
 
 def _locate_edges(
-    image: DecodedImage, lost: NDArray[np.bool_], limits: StripeLimits, scale_px: float
+    image: DecodedImage, without_lines: NDArray[np.bool_], limits: StripeLimits, scale_px: float
 ) -> list[LinePoints]:
     """Points of code edges where lines are lost."""
-    rows = _rows_around(lost, _REACH_PX)
-    found = code_edge_points(image.rows(rows), limits, scale_px, within=lost[rows])
+    rows = _rows_around(without_lines, _REACH_PX)
+    found = code_edge_points(image.rows(rows), limits, scale_px, within=without_lines[rows])
     return [each._replace(points_px=each.points_px + np.array([0.0, rows.start])) for each in found]
 
 
@@ -506,10 +510,10 @@ def _rows_around(mask: NDArray[np.bool_], reach: int) -> slice:
     return slice(max(int(inside[0]) - reach, 0), min(int(inside[-1]) + reach + 1, len(mask)))
 
 
-def _points_outside(points: LinePoints, lost: NDArray[np.bool_]) -> LinePoints:
+def _points_outside(points: LinePoints, mask: NDArray[np.bool_]) -> LinePoints:
     """The points of one frame where lines are resolved."""
     columns, rows = np.rint(points.points_px).astype(np.intp).T
-    outside = ~lost[rows, columns]
+    outside = ~mask[rows, columns]
     return LinePoints(*(each[outside] for each in points))
 
 

@@ -33,7 +33,7 @@ _MAX_FOR_MEDIAN = 20_000  # correlated, their median is known to a fiftieth of t
 _MIN_END_COSINE = 0.5  # cosine between a line and the direction of unusable pixels, where it ends
 _EXTENSION_PX = 0.25  # half way to the border of the last usable pixel, which is lit to its border
 _WITHIN_PX = 0.49  # from the centre of a pixel
-# more than half a pixel, so that noisy slopes of two neighbours do not both miss a line between them
+# More than half a pixel, so that noisy slopes of two neighbours do not both miss a line between them
 _CROSSING_PX = 0.62
 
 
@@ -64,7 +64,7 @@ def _find_crossings(
     # Line n, counted across the projector, is at first + n steps and in frame n mod frames.
     frame = int(np.flatnonzero(np.isfinite(position_table).any(axis=1))[0])
     first = float(known[0]) - frame * step_px
-    given = (
+    arguments = (
         measured.position,
         usable,
         code,
@@ -80,11 +80,11 @@ def _find_crossings(
     counts = np.zeros((rows, frames), dtype=np.int64)
     crossed = np.zeros(usable.shape, dtype=np.bool_)
     nowhere = np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0)
-    in_bands(_crossing_kernel, rows, *given, crossed, counts, False, *nowhere)
+    in_bands(_crossing_kernel, rows, *arguments, crossed, counts, False, *nowhere)
     borders = np.cumsum(counts.T.ravel()).reshape(frames, rows)
     total = int(borders[-1, -1]) if borders.size else 0
     crossings = np.zeros(total, dtype=np.int32), np.zeros((total, 2)), np.zeros(total)
-    in_bands(_crossing_kernel, rows, *given, crossed, np.ascontiguousarray(borders.T) - counts, True, *crossings)
+    in_bands(_crossing_kernel, rows, *arguments, crossed, np.ascontiguousarray(borders.T) - counts, True, *crossings)
     return crossings
 
 
@@ -125,13 +125,13 @@ def _crossing_kernel(
                     # Of two pixels that a line passes between, the one with the closer centre has the point.
                     nx, ny = int(np.rint(x + dx)), int(np.rint(y + dy))
                     if 1 <= nx < columns - 1 and 1 <= ny < rows - 1 and usable[ny, nx]:
-                        there = position[ny, nx]
+                        neighbour = position[ny, nx]
                         hx, hy = _gradient(position, usable, ny, nx)
                         steep = hx * hx + hy * hy
                         if steep > MIN_GRADIENT * MIN_GRADIENT and by_cell[code.lowest[ny, nx], k] == low:
-                            off_x, off_y = abs((low - there) * hx / steep), abs((low - there) * hy / steep)
-                            first_of_both = ny * columns + nx < y * columns + x
-                            if max(off_x, off_y) <= (_CROSSING_PX if first_of_both else 0.5):
+                            off_x, off_y = abs((low - neighbour) * hx / steep), abs((low - neighbour) * hy / steep)
+                            is_first = ny * columns + nx < y * columns + x
+                            if max(off_x, off_y) <= (_CROSSING_PX if is_first else 0.5):
                                 continue
                 if extension > 0:
                     # Component of the unit vector along the line towards unusable pixels, where it ends.
@@ -343,9 +343,9 @@ def _combine_kernel(
         if not valid[i] or not filter_sigma[i] < noise[i] or not clear[int(np.rint(y)), int(np.rint(x))]:
             continue
         variance = sigma[i] * sigma[i]
-        both = variance + filter_sigma[i] * filter_sigma[i]
-        if distance[i] * distance[i] < 9 * both:
-            weight = variance / max(both, 1e-30)
+        summed_variance = variance + filter_sigma[i] * filter_sigma[i]
+        if distance[i] * distance[i] < 9 * summed_variance:
+            weight = variance / max(summed_variance, 1e-30)
             points[i, 0] -= weight * distance[i] * normals[i, 0]
             points[i, 1] -= weight * distance[i] * normals[i, 1]
             sigma[i] *= np.sqrt(1 - weight)

@@ -31,6 +31,17 @@ _NEWTON_BOX = 1.1  # half a pixel more than in the first step
 _VECTOR = 4  # numbers of double precision in a vector register
 _MIN_ROWS, _MIN_POINTS = 32, 1024  # least number for one call of a kernel
 
+_MAX_TURN = np.pi / 3  # chosen; π/6 and π/2 make no difference
+_SAME_LINE_ANGLE = np.pi / 6  # as in Steger's linking
+_SAME_LINE_PX = 0.8  # a line may respond again up to 0.6 px away (`_TAYLOR_BOX`)
+_MAX_STEP_PX = 2.2  # chosen; 1.5 loses points, 3.3 makes no difference
+# Neighbours of a pixel by octant: 0 along x, 2 along y.
+_STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+_STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
+_MIN_TURN_COSINE = np.cos(_MAX_TURN)
+_SAME_LINE_COSINE = np.cos(_SAME_LINE_ANGLE)
+_HALF_OCTANT = np.tan(np.pi / 8)  # slope of the border between two octants
+
 
 def gaussian_kernels(sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Sampled Gaussian of this scale and its first two derivatives, each (2 r + 1,) float32."""
@@ -290,7 +301,7 @@ def _newton_kernel(
     flat = image.reshape(-1)
     # Whole vectors of columns: the sums of those beyond the window are not used.
     lanes = min(-(-size // _VECTOR) * _VECTOR, width)
-    furthest = len(flat) - (size - 1) * width - lanes
+    last_start = len(flat) - (size - 1) * width - lanes
     smooth, once, twice = np.zeros(lanes), np.zeros(lanes), np.zeros(lanes)
     for i in range(first, last):
         column, row = columns[i], rows[i]
@@ -300,11 +311,15 @@ def _newton_kernel(
         _centred_weights(wx, fx, sigma, whole)
         _centred_weights(wy, fy, sigma, whole)
         corner = (row - radius) * width + column - radius
-        begun = min(corner, furthest)
-        _sum_columns(flat, begun, width, wy, smooth, once, twice)
+        window_start = min(corner, last_start)
+        _sum_columns(flat, window_start, width, wy, smooth, once, twice)
         r = rx = ry = rxx = rxy = ryy = 0.0
         for k in range(size):
-            s0, s1, s2 = smooth[corner - begun + k], once[corner - begun + k], twice[corner - begun + k]
+            s0, s1, s2 = (
+                smooth[corner - window_start + k],
+                once[corner - window_start + k],
+                twice[corner - window_start + k],
+            )
             r += s0 * wx[0, k]
             rx += s0 * wx[1, k]
             rxx += s0 * wx[2, k]
@@ -393,24 +408,8 @@ def _centred_weights(out: Any, centre: float, sigma: float, whole: Any) -> None:
         two[k] = (at * at - variance) * (value * of_two)
 
 
-_MAX_TURN = np.pi / 3  # chosen; π/6 and π/2 make no difference
-_SAME_LINE_ANGLE = np.pi / 6  # as in Steger's linking
-_SAME_LINE_PX = 0.8  # a line may respond again up to 0.6 px away (`_TAYLOR_BOX`)
-_MAX_STEP_PX = 2.2  # chosen; 1.5 loses points, 3.3 makes no difference
-# Neighbours of a pixel by octant: 0 along x, 2 along y.
-_STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
-_STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
-_MIN_TURN_COSINE = np.cos(_MAX_TURN)
-_SAME_LINE_COSINE = np.cos(_SAME_LINE_ANGLE)
-_HALF_OCTANT = np.tan(np.pi / 8)  # slope of the border between two octants
-
-
 def chain_points(
-    points_px: FloatArray,
-    normals: FloatArray,
-    strength: FloatArray,
-    strong: NDArray[np.bool_],
-    shape: tuple[int, int],
+    points_px: FloatArray, normals: FloatArray, strength: FloatArray, strong: NDArray[np.bool_], shape: tuple[int, int]
 ) -> tuple[IntArray, IntArray]:
     """Link the points of one frame.
 
@@ -707,7 +706,7 @@ def normalise_line(
     black: NDArray[np.float32],
     read_variance: float,
     slope: float,
-    ends_repeats: float,
+    reference_repeats: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Normalise a line frame as `normalise` does, with the noise of line, white and black by their share in the result.
 
@@ -716,14 +715,14 @@ def normalise_line(
     """
     light, deviation = np.zeros_like(line), np.zeros_like(line)
     in_bands(
-        _normalise_line_kernel, len(line), line, white, black, read_variance, slope, ends_repeats, light, deviation
+        _normalise_line_kernel, len(line), line, white, black, read_variance, slope, reference_repeats, light, deviation
     )
     return light, deviation
 
 
 @kernel
 def _normalise_line_kernel(
-    first: int, last: int, line: Any, white: Any, black: Any, read: float, slope: float, ends_repeats: float,
+    first: int, last: int, line: Any, white: Any, black: Any, read: float, slope: float, reference_repeats: float,
     normal: Any, deviation: Any,
 ) -> None:  # fmt: skip
     for y in range(first, last):
@@ -731,8 +730,8 @@ def _normalise_line_kernel(
             contrast, above = white[y, x] - black[y, x], line[y, x] - black[y, x]
             # (I - black)/(white - black) contains 1 - light of black's noise and light of white's.
             light = min(max(above / max(contrast, np.float32(1)), np.float32(0)), np.float32(1))
-            of_white = (read + slope * max(white[y, x], np.float32(0))) / ends_repeats
-            of_black = (read + slope * max(black[y, x], np.float32(0))) / ends_repeats
+            of_white = (read + slope * max(white[y, x], np.float32(0))) / reference_repeats
+            of_black = (read + slope * max(black[y, x], np.float32(0))) / reference_repeats
             own = read + slope * max(line[y, x], np.float32(0))
             noise = np.float32(np.sqrt(own + (1 - light) ** 2 * of_black + light**2 * of_white))
             weight = _weight(contrast, noise)

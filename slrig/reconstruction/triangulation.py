@@ -16,6 +16,25 @@ from slrig.reconstruction.identification import StripeEnsemble
 _MIN_POINTS = 1024  # least number for one call of a kernel
 CONVERGED = 1e-7  # in normalised coordinates: a shorter step ends the iteration that undistorts a point
 
+_STEPS = 25  # two to four suffice, for strong lenses, too; more is a start that does not converge
+_CONVERGED_PX = 1e-5  # before the last step of Newton's method, which leaves about the square of it
+_NONE, _BEHIND_DEVICE = int(Refusal.NONE), int(Refusal.BEHIND_DEVICE)
+
+_BLOCK = 256  # points; chosen: 128 and 512 are not faster
+# Starts of rows: the point in the camera, distorted; the normal of the stripe; x and y of the ray, undistorted; the ray
+# in the projector's frame; the depth s along it; the flag that iteration continues; the point, from the camera's
+# centre; its displacement for a pixel across the stripe; the coordinate along the sheet; the depth in the projector.
+_XD, _YD, _NX, _NY, _X, _Y, _DX, _DY, _DZ, _S, _GOES_ON, _PX, _PY, _PZ, _MX, _MY, _MZ, _ALONG, _DEPTH = (
+    row * _BLOCK for row in range(19)
+)
+_ROWS = 19
+
+_MAX_POINTS = 20_000  # their median is known to a hundredth of their scatter
+_STEP = 1e-3  # of the baseline: far above rounding, and an epipolar line is straight over so short a distance
+
+_PROBE_PX = 1e-3  # far above rounding, and a point moves straight over so short a distance
+_BORDER_PX = 2.0  # beyond the projector's image; chosen: 0 and 4 make no difference
+
 
 def pack_device(device: Pinhole) -> FloatArray:
     """(22,) float64: parameters of a device for kernels."""
@@ -95,20 +114,6 @@ def _project_kernel(first: int, last: int, d: Any, points: Any, out: Any) -> Non
             xd, yd, _, _, _ = distorted(d[5:10], px / pz, py / pz)
             out[i, 0] = d[0] * xd + d[1] * yd + d[2]
             out[i, 1] = d[3] * yd + d[4]
-
-
-_STEPS = 25  # two to four suffice, for strong lenses, too; more is a start that does not converge
-_CONVERGED_PX = 1e-5  # before the last step of Newton's method, which leaves about the square of it
-_NONE, _BEHIND_DEVICE = int(Refusal.NONE), int(Refusal.BEHIND_DEVICE)
-
-_BLOCK = 256  # points; chosen: 128 and 512 are not faster
-# Starts of rows: the point in the camera, distorted; the normal of the stripe; x and y of the ray, undistorted; the ray
-# in the projector's frame; the depth s along it; the flag that iteration continues; the point, from the camera's
-# centre; its displacement for a pixel across the stripe; the coordinate along the sheet; the depth in the projector.
-_XD, _YD, _NX, _NY, _X, _Y, _DX, _DY, _DZ, _S, _GOES_ON, _PX, _PY, _PZ, _MX, _MY, _MZ, _ALONG, _DEPTH = (
-    row * _BLOCK for row in range(19)
-)
-_ROWS = 19
 
 
 def intersect_light_sheets(
@@ -207,11 +212,7 @@ def _complete_block(w: Any, count: int, camera: Any, p: Any, coded: Any, other: 
 @kernel_part(inline="always")
 def _rotate_to_world(d: Any, x: float, y: float, z: float) -> Any:
     """Rotate a direction from the device's frame to the world: Rᵀ (x, y, z)."""
-    return (
-        d[10] * x + d[13] * y + d[16] * z,
-        d[11] * x + d[14] * y + d[17] * z,
-        d[12] * x + d[15] * y + d[18] * z,
-    )
+    return (d[10] * x + d[13] * y + d[16] * z, d[11] * x + d[14] * y + d[17] * z, d[12] * x + d[15] * y + d[18] * z)
 
 
 @kernel
@@ -367,10 +368,6 @@ def _sheet_order_kernel(begin: int, end: int, offsets: Any, stripe: Any, along: 
                 bridge[filled - 1] = True
 
 
-_MAX_POINTS = 20_000  # their median is known to a hundredth of their scatter
-_STEP = 1e-3  # of the baseline: far above rounding, and an epipolar line is straight over so short a distance
-
-
 def stripe_crossing(ensemble: StripeEnsemble, camera: Pinhole, other: Pinhole, /) -> float:
     """Median sine of the angle between stripes of `camera` and epipolar lines, 0 to 1; 1 without a point.
 
@@ -393,10 +390,6 @@ def runs_down(ensemble: StripeEnsemble, /) -> bool:
     """True if the stripes run rather down the image than across it."""
     across, down = np.abs(ensemble.normals).sum(axis=0)
     return bool(across >= down)
-
-
-_PROBE_PX = 1e-3  # far above rounding, and a point moves straight over so short a distance
-_BORDER_PX = 2.0  # beyond the projector's image; chosen: 0 and 4 make no difference
 
 
 def triangulate_camera_projector(

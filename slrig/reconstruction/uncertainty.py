@@ -15,6 +15,13 @@ from slrig.model import DEVICE_PARAMETERS, Axis, Calibration, FloatArray, IntArr
 from slrig.model.lens_kernels import by_terms, distorted
 from slrig.reconstruction.triangulation import optical_depths_mm, pack_device, to_device
 
+_EACH = DEVICE_PARAMETERS
+_NODES = 10  # along each side of the volume
+_MIN_NODES = 8  # 24 displacements, to remove a rigid motion of six parameters
+_MAX_DROPPED = 0.002  # of the variance, anywhere in the volume
+_REACH = 2  # points either way, for the direction of a curve
+_CAMERA_CAMERA, _ALL = int(Source.CAMERA_CAMERA), int(Source.ALL)
+
 
 @kernel_part
 def coordinate_gradient(d: Any, a: float, b: float, x: float, y: float, z: float, out: Any) -> None:
@@ -149,14 +156,6 @@ def camera_weights(devices: Any, sizes: Any, point: Any, ray: Any, g: Any, weigh
     for index in range(len(weights)):
         weights[index] = weights[index] / total if total > 0 else 0.0
     return total
-
-
-_EACH = DEVICE_PARAMETERS
-_NODES = 10  # along each side of the volume
-_MIN_NODES = 8  # 24 displacements, to remove a rigid motion of six parameters
-_MAX_DROPPED = 0.002  # of the variance, anywhere in the volume
-_REACH = 2  # points either way, for the direction of a curve
-_CAMERA_CAMERA, _ALL = int(Source.CAMERA_CAMERA), int(Source.ALL)
 
 
 @dataclass(frozen=True, slots=True)
