@@ -101,7 +101,7 @@ def seen_object(looks: Sequence[Look], full_scale: int) -> SeenObject:
 
 
 def _noise_samples(look: Look, full_scale: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Levels and variances of single samples, as `fitted_noise` wants them: from what differs in two frames alike. The
+    """Levels and variances of single samples, as `fit_noise` wants them: from what differs in two frames alike. The
     level is that of the pixel beside it (`Sampler`): its own, of whole numbers, tells whether the two frames differ.
     """
     levels, variances = [], []

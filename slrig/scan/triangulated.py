@@ -116,7 +116,7 @@ def widest_gap_px(projector: Pinhole | None, axis: Axis) -> float:
 def _on_sheets(
     seen: CameraResult, projector: Pinhole, axis: Axis, *, told: bool
 ) -> tuple[SheetCurves, NDArray[np.uint8]]:
-    """`camera_projector`, with nothing kept of a camera that the axis tells no depth."""
+    """`triangulate_camera_projector`, with nothing kept of a camera that the axis tells no depth."""
     part, cause = triangulate_camera_projector(seen.curves.ensemble, seen.device, projector, axis)
     if told:
         return part, cause
