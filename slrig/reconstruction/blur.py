@@ -1,9 +1,9 @@
 """Blur of the camera, estimated from the lines of a scan, and the correction of curved surfaces for it.
 
 The amplitude of the first harmonic of the lines' light, over white minus black, shows the blur of both lenses. The
-projector's part is the same everywhere in its own columns. A Gaussian blur of the camera of variance σ² leaves exp(-½
-ω²σ²|g|²) where the position rises by g per pixel, ω the phase per position. On surfaces with different slopes the
-logarithm falls by ½ ω²σ² along |g|², independent of albedo, focus of the projector and noise.
+projector's part is the same everywhere in its own columns. A Gaussian blur of the camera of variance σ² leaves the
+factor exp(-½ω²σ²|g|²) where the position rises by g per pixel, ω the phase per position. On surfaces with different
+slopes the logarithm falls by ½ω²σ² along |g|², independent of albedo, focus of the projector and noise.
 """
 
 from __future__ import annotations
@@ -73,16 +73,9 @@ def correct_curvature(
 
 @kernel
 def _curvature_kernel(
-    first: int,
-    last: int,
-    position: Any,
-    sigma: Any,
-    wide: Any,
-    narrow: Any,
-    variance: float,
-    phase_variance: float,
+    first: int, last: int, position: Any, sigma: Any, wide: Any, narrow: Any, variance: float, phase_variance: float,
     out: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Subtract the shift from each position; phase_variance : ω²σ²."""
     columns = position.shape[1]
     down, broad, fine = np.zeros((3, columns)), np.zeros((5, columns)), np.zeros((5, columns))
@@ -107,16 +100,9 @@ def _curvature_kernel(
 
 @kernel
 def _border_kernel(
-    first: int,
-    last: int,
-    position: Any,
-    sigma: Any,
-    known: Any,
-    narrow: Any,
-    variance: float,
-    phase_variance: float,
+    first: int, last: int, position: Any, sigma: Any, known: Any, narrow: Any, variance: float, phase_variance: float,
     out: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Subtract the shift at the closest whole window from each position next to a border."""
     rows, columns = position.shape
     derivatives = np.zeros((5, 1))
@@ -264,10 +250,8 @@ def estimate_blur(
     height, width = measured.position.shape
 
     def shifted(rows: int, columns: int) -> tuple[slice, slice]:
-        first, second = _SAMPLE_STEP + rows, _SAMPLE_STEP + columns
-        return slice(first, height - _SAMPLE_STEP + rows, _SAMPLE_STEP), slice(
-            second, width - _SAMPLE_STEP + columns, _SAMPLE_STEP
-        )
+        step = _SAMPLE_STEP
+        return slice(step + rows, height - step + rows, step), slice(step + columns, width - step + columns, step)
 
     inner = shifted(0, 0)
     lines = np.array([image[inner] for image in frames.lines], dtype=np.float64)
@@ -292,9 +276,8 @@ def estimate_blur(
     for _ in range(_ITERATIONS):
         middle, mean = expected_fall[inliers].mean(), log_amplitude[inliers].mean()
         centred = expected_fall - middle
-        fitted = float(centred[inliers] @ (log_amplitude[inliers] - mean)) / max(
-            float(centred[inliers] @ centred[inliers]), 1e-12
-        )
+        square = float(centred[inliers] @ centred[inliers])
+        fitted = float(centred[inliers] @ (log_amplitude[inliers] - mean)) / max(square, 1e-12)
         residual = np.abs(log_amplitude - mean - fitted * centred)
         inliers = residual <= _MAX_RESIDUAL_SIGMA * 1.4826 * np.median(residual[inliers])
     expected, deviation = expected_px**2, _LOG_CONTRAST_SIGMA / max(float(expected_fall[inliers].std()), 1e-12)
@@ -302,5 +285,5 @@ def estimate_blur(
     unlikely = ((candidates - fitted) / deviation) ** 2 + (np.log(candidates / expected) / _LOG_VARIANCE_SIGMA) ** 2
     likely = float(candidates[np.argmin(unlikely)])
     # An estimate that is less certain than the prior is likely to be wrong, by the focus of the projector for example.
-    by_lines = deviation < _LOG_VARIANCE_SIGMA * likely
-    return BlurEstimate(likely**0.5 if by_lines else expected_px, from_lines=bool(by_lines))
+    from_lines = deviation < _LOG_VARIANCE_SIGMA * likely
+    return BlurEstimate(likely**0.5 if from_lines else expected_px, from_lines=bool(from_lines))

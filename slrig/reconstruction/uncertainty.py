@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -226,15 +226,7 @@ def calibration_modes(
     dropped = _MAX_DROPPED if len(names) == 1 else 0.0
     count = int((remaining > dropped * remaining[:, :1]).any(axis=0).sum())
     modes = np.concatenate([changes, -motion]) @ components[:, :count]
-    return CalibrationModes(
-        without_modes.devices,
-        without_modes.sizes_px,
-        np.ascontiguousarray(modes),
-        without_modes.middle_mm,
-        without_modes.row,
-        without_modes.second,
-        without_modes.projector,
-    )
+    return replace(without_modes, modes=np.ascontiguousarray(modes))
 
 
 def calibration_sigma(
