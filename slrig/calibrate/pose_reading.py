@@ -20,7 +20,7 @@ from slrig.calibration.boards.detection import blur_sigma_px, board_region, find
 from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.errors import PatternError, PoseRefusedError
 from slrig.model import Axis, Capture, Size
-from slrig.patterns import LEAST_FROM_BORDER_PX, cell_positions, edge_positions, index_of_word, line_positions
+from slrig.patterns import MIN_BORDER_DISTANCE_PX, cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction import (
     AxisFrames,
     CodeTables,
@@ -190,7 +190,7 @@ def code_tables(frames: AxisFrames, projector: Size) -> CodeTables:
         position = line_positions(frames.line_patterns, gray, projector)
     else:
         position = edge_positions(gray, projector)
-        inside = np.minimum(position, extent_px - 1 - position) >= LEAST_FROM_BORDER_PX
+        inside = np.minimum(position, extent_px - 1 - position) >= MIN_BORDER_DISTANCE_PX
         position = np.where(inside, position, np.nan)
     return CodeTables(index_of_word(gray), cell_positions(gray, projector), position)
 

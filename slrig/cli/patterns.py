@@ -51,7 +51,7 @@ def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
     from slrig.doctor.doctor import doctor_sequence
     from slrig.errors import UnsupportedByDeviceError
     from slrig.logs import set_up_logs_for_a_person
-    from slrig.patterns import united
+    from slrig.patterns import merge_sequences
     from slrig.scan.plan_check import pattern_sequence
 
     set_up_logs_for_a_person()
@@ -65,4 +65,4 @@ def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
         size = projector.info.size
         scans = replace(scan_plan(request, config.scan).patterns, rows=True)
         sequences = (pattern_sequence(scans, size), pattern_sequence(USUAL_PATTERNS, size), doctor_sequence(size))
-        return projector.write_patterns(united(sequences))
+        return projector.write_patterns(merge_sequences(sequences))

@@ -23,7 +23,7 @@ from slrig.calibration.boards.sightings import markers_in
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, White
 from slrig.multiview import MarkerObservation, fit_plane
-from slrig.reconstruction import project, rays
+from slrig.reconstruction import pixel_rays, project
 from slrig.scan.artefacts import MESH
 
 _REACH = 0.7
@@ -106,7 +106,7 @@ def markers_in_view(
         sigma_px = np.hypot(placed.sigma_px, FLOOR_PX)
         if not (sigma_px < WORST_SIGMA_PX).all():  # NaN where a fit failed
             continue
-        ways = rays(camera, placed.points_px)
+        ways = pixel_rays(camera, placed.points_px)
         depth = (middle - camera.centre_mm) @ normal / (ways @ normal)
         cosine = np.abs(ways @ normal) / np.linalg.norm(ways, axis=1)
         # Of three coordinates the rms: pixels move a corner within the plane, farther where it is seen at a slant, and

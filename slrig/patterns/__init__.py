@@ -1,7 +1,7 @@
-"""Pattern sequences: each encoding with its inverse."""
+"""Pattern sequences and their encodings."""
 
 from slrig.patterns.codes import (
-    LEAST_FROM_BORDER_PX,
+    MIN_BORDER_DISTANCE_PX,
     cell_centre_px,
     cell_positions,
     edge_indices,
@@ -10,16 +10,10 @@ from slrig.patterns.codes import (
     index_of_word,
     line_positions,
 )
-from slrig.patterns.sequence import (
-    SEQUENCES,
-    SequenceOptions,
-    encode,
-    scan_patterns,
-    united,
-)
+from slrig.patterns.sequence import SEQUENCES, SequenceOptions, encode, merge_sequences, scan_patterns
 
 __all__ = [
-    "LEAST_FROM_BORDER_PX",
+    "MIN_BORDER_DISTANCE_PX",
     "SEQUENCES",
     "SequenceOptions",
     "cell_centre_px",
@@ -30,6 +24,6 @@ __all__ = [
     "gray_bits",
     "index_of_word",
     "line_positions",
+    "merge_sequences",
     "scan_patterns",
-    "united",
 ]

@@ -1,6 +1,6 @@
-"""Patterns of Gray code, and the positions of its cells and of the edges between them.
+"""Patterns of Gray code and shifted lines, and the positions of cells, edges and lines.
 
-Position c (a projector column or row) lies in cell i = ⌊(c + offset)/cell⌋, whose code word is that of
+Position c (a projector column or row) is in cell i = ⌊(c + offset)/cell⌋, whose code word is that of
 `slrig.model.patterns`. Bit 0 is the most significant.
 
 Six columns, three bits, most significant first:
@@ -24,9 +24,12 @@ from slrig.errors import PatternError
 from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Size
 from slrig.model.patterns import from_gray, to_gray
 
+MIN_BORDER_DISTANCE_PX = 3.0
+"""Least distance of a line's centre from the projector's first and last position, px: see `line_positions`."""
+
 
 def gray_bits(extent_px: int, cell_px: int, offset_px: int) -> int:
-    """Return the fewest bits that give every cell touched by positions 0 … extent − 1 a code word of its own.
+    """Return the least number of bits with a code word for every cell of positions 0 … extent − 1.
 
     >>> gray_bits(1280, 4, 0)
     9
@@ -40,9 +43,10 @@ def gray_bits(extent_px: int, cell_px: int, offset_px: int) -> int:
 
 
 def require_addressable(pattern: Gray, size: Size) -> None:
-    """Refuse a code that does not fit its projector.
-    Raises PatternError: the code has too few words for the projector's cells, or the projector is so small that the
-    most significant bit never changes on it.
+    """Check that a code fits its projector.
+
+    Raises PatternError if the code has too few words for the projector's cells, or the most significant bit never
+    changes on a projector this small.
     """
     extent_px = size.along(pattern.axis)
     needed = gray_bits(extent_px, pattern.cell_px, pattern.offset_px)
@@ -65,7 +69,8 @@ def require_addressable(pattern: Gray, size: Size) -> None:
 
 def gray_profile(pattern: Gray, size: Size) -> NDArray[np.uint8]:
     """Light of one Gray bit: (1, Wp) uint8 for columns, (Hp, 1) for rows; 255 is lit, 0 dark.
-    Raises PatternError: the code does not fit the projector.
+
+    Raises PatternError if the code does not fit the projector.
     """
     require_addressable(pattern, size)
     words = to_gray((np.arange(size.along(pattern.axis)) + pattern.offset_px) // pattern.cell_px)
@@ -91,7 +96,7 @@ def cell_centre_px(index: ArrayLike, *, cell_px: int, offset_px: int) -> FloatAr
 def edge_position_px(index: ArrayLike, *, cell_px: int, offset_px: int) -> FloatArray:
     """Position of the edge between cells i − 1 and i: cell·i − offset − ½, float64.
 
-    Pixel centres lie at integers, so the edge between positions 3 and 4 is at 3.5.
+    Pixel centres are integers, so the edge between positions 3 and 4 is at 3.5.
 
     >>> edge_position_px([1, 2], cell_px=4, offset_px=0)
     array([3.5, 7.5])
@@ -108,14 +113,15 @@ def edge_indices(bit: int, bits: int) -> tuple[int, int]:
     [(4, 8), (2, 4), (1, 2)]
     """
     if not 0 <= bit < bits:
-        raise PatternError(f"a code of {bits} bits has bits 0 (most significant) to {bits - 1}; asked for bit {bit}")
+        raise PatternError(f"a code of {bits} bits has bits 0 (most significant) to {bits - 1}; found bit {bit}")
     first = int(2 ** (bits - 1 - bit))
     return first, 2 * first
 
 
 def line_profile(pattern: LineShift, size: Size) -> NDArray[np.uint8]:
     """Light of one line frame: (1, Wp) uint8 for columns, (Hp, 1) for rows; 255 is lit, 0 dark.
-    Raises PatternError: the projector is shorter than one period.
+
+    Raises PatternError if the projector is shorter than one period.
     """
     extent_px = size.along(pattern.axis)
     if extent_px < pattern.period_px:
@@ -128,14 +134,13 @@ def line_profile(pattern: LineShift, size: Size) -> NDArray[np.uint8]:
 
 
 def line_number(code_centre_px: ArrayLike, pattern: LineShift) -> NDArray[np.int64]:
-    """Which line of the frame a stripe is: j = round((x − centre_k)/n), x the middle of its Gray cell.
+    """Number of the line of a stripe: j = round((x − centre_k)/n), x the middle of its Gray cell.
 
-    Right as long as the cell that was read lies nearer than n/2 to the line: with cells of ⌊n/2⌋ a code edge may be
-    off by n/4.
+    It is correct if the decoded cell is closer than n/2 to the line: with cells of ⌊n/2⌋ a code edge may be off by n/4.
 
-    code_centre_px : middle of the decoded cell, cell·i + (cell − 1)/2 − offset (`gray.cell_centre_px`); any shape,
-    finite. Returns integers of the same shape; −1 or `line_count` and above mean a line that the projector cuts or does
-    not have.
+    code_centre_px : middle of the decoded cell, cell·i + (cell − 1)/2 − offset (`cell_centre_px`); any shape, finite.
+    Returns integers of the same shape; −1 or `line_count` and above stand for a line that is cut by the projector's
+    border or outside.
 
     >>> from slrig.model import Axis, LineShift
     >>> line_number([1.5, 9.5], LineShift(Axis.COLUMN, 1, 8))
@@ -156,7 +161,7 @@ def line_position_px(number: ArrayLike, pattern: LineShift) -> FloatArray:
 
 
 def line_count(pattern: LineShift, extent_px: int) -> int:
-    """Return how many whole lines the frame has on a projector of this extent; they are numbered from 0.
+    """Return the number of whole lines of the frame on a projector of this extent; they are numbered from 0.
 
     >>> from slrig.model import Axis, LineShift
     >>> line_count(LineShift(Axis.COLUMN, 7, 8, line_width_px=2), 16)
@@ -166,53 +171,35 @@ def line_count(pattern: LineShift, extent_px: int) -> int:
 
 
 def is_whole(number: ArrayLike, pattern: LineShift, extent_px: int) -> NDArray[np.bool_]:
-    """Whether each line j lies on the projector in its full width. A line cut by the border has another centre."""
+    """True for each line j that is on the projector in its full width. A line cut by the border has another centre."""
     lines = np.asarray(number)
     return np.asarray((lines >= 0) & (lines < line_count(pattern, extent_px)))
 
 
-LEAST_FROM_BORDER_PX = 3.0
-"""How far a line's centre has to be from the projector's first and last position, px: see `line_positions`."""
-
-
 def index_of_word(pattern: Gray) -> IntArray:
-    """(2^bits,) int32: the cell index of each code word."""
+    """(2^bits,) int32: cell index of each code word."""
     return from_gray(np.arange(2**pattern.bits)).astype(np.int32)
 
 
 def cell_count(pattern: Gray, size: Size) -> int:
-    """How many cells the projector shows, counted from cell 0. Raises PatternError when the code does not fit it."""
+    """Number of cells of the projector, from cell 0. Raises PatternError if the code does not fit it."""
     require_addressable(pattern, size)
     return (size.along(pattern.axis) - 1 + pattern.offset_px) // pattern.cell_px + 1
 
 
 def cell_positions(pattern: Gray, size: Size) -> FloatArray:
-    """(cells,) float64: the middle of each cell, px."""
+    """(cells,) float64: middle of each cell, px."""
     return cell_centre_px(np.arange(cell_count(pattern, size)), cell_px=pattern.cell_px, offset_px=pattern.offset_px)
 
 
 def line_positions(lines: Sequence[LineShift], pattern: Gray, size: Size) -> FloatArray:
-    """(frames, cells) float64: centre of the line that a stripe of this frame is when its pixel shows this cell, px.
+    """(frames, cells) float64: centre of the line of a stripe in this frame at a pixel of this cell, px.
 
-    NaN where the projector's border cuts the line, or lies nearer than LEAST_FROM_BORDER_PX to its centre. There the
-    phase of all frames lacks the light that it counts on from both sides, and white fades across the stripe that it
-    normalises: the stripe is found outwards of its place. The phase is the argument of the sum of exp(2πi c/n) over the
-    positions c whose light a pixel sees, so the lines' width does not matter. Measured on a rendered plane that is
-    larger than the projector's field, SNR 40, bias / stated deviation in camera px of lines at 1 to 5 positions from
-    the border's:
-
-    ============  ================  =========  =========  =========  =========  =========
-    lenses' blur  positions per px  1          2          3          4          5
-    ============  ================  =========  =========  =========  =========  =========
-    0.6 px        0.5               .042/.028  .003/.019  .000/.018  .001/.018  .001/.018
-    0.6 px        1.3               .149/.043  .049/.028  .000/.023  .003/.010  .000/.008
-    0.9 px        1.3               .558/.092  .129/.065  .013/.030  .011/.018  .003/.011
-    0.6 px        2.0               .123/.036  .053/.022  .026/.016  .009/.015  .001/.014
-    1.4 px        1.3               1.52/.108  .218/.031  .071/.031  .073/.038  .036/.022
-    ============  ================  =========  =========  =========  =========  =========
-
-    Leaving out 0, 1 and 2 is enough with lenses in focus and up to 1.5 positions per px. Beyond that a few more lines
-    are biased by more than they state: how far the light of a position spreads is not known here.
+    NaN where the projector's border cuts the line, or is closer than MIN_BORDER_DISTANCE_PX to its centre. There the
+    phase of all frames lacks light from one side, and white fades across the stripe: the stripe is displaced outwards.
+    The phase is the argument of the sum of exp(2πi c/n) over the positions c whose light a pixel sees, so the width of
+    lines does not matter. The limit is chosen for lenses in focus and up to 1.5 positions per camera px; at higher
+    densities or with more blur, a few more lines are biased.
     """
     middle = cell_positions(pattern, size)
     return np.stack([_line_positions(line, middle, size.along(pattern.axis)) for line in lines])
@@ -221,15 +208,15 @@ def line_positions(lines: Sequence[LineShift], pattern: Gray, size: Size) -> Flo
 def _line_positions(line: LineShift, middle: FloatArray, extent_px: int) -> FloatArray:
     number = line_number(middle, line)
     position = line_position_px(number, line)
-    inside = np.minimum(position, extent_px - 1 - position) >= LEAST_FROM_BORDER_PX
+    inside = np.minimum(position, extent_px - 1 - position) >= MIN_BORDER_DISTANCE_PX
     return np.where(is_whole(number, line, extent_px) & inside, position, np.nan)
 
 
 def edge_positions(pattern: Gray, size: Size) -> FloatArray:
-    """(bits, cells) float64: the edge that a zero crossing of this bit is when its pixel shows this cell, px.
+    """(bits, cells) float64: edge of a zero crossing of this bit at a pixel of this cell, px.
 
-    A bit changes at every 2^(s+1)-th edge only, so the nearest of those is meant: cells i - 1 and i both name edge i.
-    NaN where that edge lies on the projector's border or beyond.
+    A bit changes only at every 2^(s+1)-th edge, so the closest of those is meant: cells i - 1 and i both mean edge i.
+    NaN if that edge is on the projector's border or beyond.
     """
     cells = np.arange(cell_count(pattern, size))
     return np.stack([_edge_positions(pattern, bit, cells, size.along(pattern.axis)) for bit in range(pattern.bits)])

@@ -1,4 +1,4 @@
-"""From what a scan asks for to the patterns it plays, and from patterns to light."""
+"""Pattern sequences: the patterns of a scan by its options, and the light of patterns."""
 
 from __future__ import annotations
 
@@ -28,18 +28,16 @@ from slrig.model.patterns import FEWEST_STEPS
 from slrig.patterns.codes import gray_bits, gray_profile, line_profile
 
 GRAY_ONLY_CELL_PX = 2
-"""Where edges are all that is measured, those of 1 px blur into one another at one or two camera pixels to a cell. Of
-the rendered plane the rms is 19.2 µm with cells of 1 px and 4.2 µm with 2; behind a scaler 24.5 and 4.2. Of the demo's
-scene it is 19.1, 13.5 and 14.3 µm with 1, 2 and 3 px, and 2 px cover most."""
+"""Chosen: without lines edges are all that is measured, and those of cells of 1 px blur into each other."""
 
 
 @dataclass(frozen=True, slots=True)
 class SequenceOptions:
-    """What a named sequence plays.
+    """Patterns of a named sequence.
 
-    period_px : of the lines; steps : into how many shifts the period is divided, None for one of each pixel.
-    line_width_px : None for half of the period. inverses : whether each bit is followed by its inverse. closing : how
-    many of white and black end the sequence.
+    period_px : of the lines; steps : number of shifts of a period, None for one per pixel. line_width_px : None for
+    half of the period. inverses : True if each bit is followed by its inverse. closing : number of white and black
+    frames at the end.
     """
 
     period_px: int
@@ -54,8 +52,8 @@ SEQUENCES: Mapping[SequenceName, SequenceOptions] = {
     SequenceName.STANDARD: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=False, closing=1),
     SequenceName.ROBUST: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=True, closing=2),
 }
-"""Chosen by `tests/bench/line_sweep.py` and proven by `tests/bench/fault_campaign.py`; `slrig/scan/README.md` has what
-each costs and gives.
+"""Chosen by `tests/bench/line_sweep.py` and tested by `tests/bench/fault_campaign.py`; `slrig/scan/README.md` lists
+costs and results.
 """
 
 
@@ -76,21 +74,20 @@ def scan_patterns(
 ) -> tuple[Pattern, ...]:
     """List the patterns of one scan in the order of play.
 
-    White, black; for columns, then for rows, as far as they are asked for, code and lines; white, black again, as far
-    as `closing` says. What tells how a camera sees comes first, `telling_bits` and without inverses `telling_lines`, so
-    that stripes are found while the bits come that only number them.
+    White, black; code and lines of the requested axes, columns first; white and black again, by `closing`. Patterns
+    that show the response of the camera come first, `telling_bits` and without inverses `telling_lines`, so that
+    stripes can be located while the remaining bits, which only number them, are played.
 
-    size : the projector. line_shift : False leaves the line frames out: a Gray-only scan. period_px : n. steps : the
-    number of line frames, which divide the period evenly; None stands for n. line_width_px : of a line; None stands for
-    ⌊n/2⌋: of all widths it has the strongest first harmonic at a given exposure, 4/π of a sine's, and frames half a
-    period apart are each other's inverse. gray_cell_px : None stands for ⌊n/2⌋, or `GRAY_ONLY_CELL_PX` without line
-    shift. gray_offset_px : added to a position before it is cut into cells: moves the cell edges. rows, columns : the
-    axes to play. inverses : each bit is followed by its inverse. coloured_light : white in red, green and blue as well,
-    each between two of the last frames of code: so an old frame in the place of any of them, or of the one after it,
-    does not pass for it.
+    size : of the projector. line_shift : False for a scan without line frames. period_px : n. steps : number of line
+    frames, which divide the period evenly; None for n. line_width_px : of a line; None for ⌊n/2⌋, the width with the
+    strongest first harmonic at a given exposure, 4/π of a sine's, for which frames half a period apart are inverse to
+    each other. gray_cell_px : None for ⌊n/2⌋, or `GRAY_ONLY_CELL_PX` without line shift. gray_offset_px : added to a
+    position before division into cells; moves the cell edges. rows, columns : axes to play. inverses : follow each bit
+    by its inverse. coloured_light : add white in red, green and blue, each between two of the last code frames, so that
+    a stale frame cannot pass for one of them or for the next.
 
-    Raises PatternError: a code that cannot tell the lines of one frame apart, steps that do not divide the period, or a
-    pattern that does not fit the projector.
+    Raises PatternError if the code cannot tell the lines of one frame apart, steps do not divide the period, or a
+    pattern does not fit the projector.
 
     >>> options = dict(line_width_px=None, gray_cell_px=None, gray_offset_px=0, rows=False)
     >>> patterns = scan_patterns(Size(1280, 800), line_shift=True, period_px=8, **options)
@@ -110,22 +107,22 @@ def scan_patterns(
             f"{FEWEST_STEPS} on that divides the period, or a period that is a multiple of {max(steps, FEWEST_STEPS)}"
         )
     width_px = line_width_px if line_width_px is not None else period_px // 2
-    ends: tuple[Pattern, ...] = (White(), Black())
-    middle: list[Pattern] = []
+    reference: tuple[Pattern, ...] = (White(), Black())
+    body: list[Pattern] = []
     for axis in [each for each, played in ((Axis.COLUMN, columns), (Axis.ROW, rows)) if played]:
         shifts = range(0, period_px, period_px // steps) if line_shift else ()
         lines = [LineShift(axis, shift, period_px, width_px) for shift in shifts]
         first = list(chain.from_iterable(telling_lines(lines)))
         code = _gray_patterns(axis, size.along(axis), cell_px, gray_offset_px, inverses=inverses)
         telling = telling_bits(code[0].bits)
-        middle += [each for each in code if each.bit in telling]
-        middle += [*first, *(line for line in lines if line not in first)] if not inverses else lines
-        middle += [each for each in code if each.bit not in telling]
+        body += [each for each in code if each.bit in telling]
+        body += [*first, *(line for line in lines if line not in first)] if not inverses else lines
+        body += [each for each in code if each.bit not in telling]
     if coloured_light:
-        between = [at for at, pair in enumerate(pairwise(middle), 1) if all(isinstance(each, Gray) for each in pair)]
-        for light, at in zip((Primary("blue"), Primary("green"), Primary("red")), reversed(between), strict=False):
-            middle.insert(at, light)
-    return (*ends, *middle, *ends[:closing])
+        gaps = [index for index, pair in enumerate(pairwise(body), 1) if all(isinstance(each, Gray) for each in pair)]
+        for light, index in zip((Primary("blue"), Primary("green"), Primary("red")), reversed(gaps), strict=False):
+            body.insert(index, light)
+    return (*reference, *body, *reference[:closing])
 
 
 def _gray_patterns(axis: Axis, extent_px: int, cell_px: int, offset_px: int, *, inverses: bool) -> list[Gray]:
@@ -134,23 +131,24 @@ def _gray_patterns(axis: Axis, extent_px: int, cell_px: int, offset_px: int, *, 
     return [Gray(axis, bit, bits, cell_px, offset_px, inverted) for bit in range(bits) for inverted in kinds]
 
 
-def united(sequences: Sequence[PatternSequence]) -> PatternSequence:
-    """Return every pattern of some sequences once, in the order in which they come: what lights alike is one pattern.
-    Raises PatternError: there are none, or they are for different projectors.
+def merge_sequences(sequences: Sequence[PatternSequence]) -> PatternSequence:
+    """Return every pattern of some sequences once, in order of appearance; patterns with the same light are one.
+
+    Raises PatternError if there are none, or they are for different projectors.
     """
     sizes = {sequence.projector for sequence in sequences}
     if len(sizes) != 1:
-        raise PatternError(f"asked to unite patterns for one projector, found {len(sizes)}; encode them for one size")
-    kept: dict[tuple[tuple[int, ...], bytes], tuple[Pattern, NDArray[np.uint8]]] = {}
+        raise PatternError(f"expected patterns for one projector, found {len(sizes)}; encode them for one size")
+    unique: dict[tuple[tuple[int, ...], bytes], tuple[Pattern, NDArray[np.uint8]]] = {}
     for sequence in sequences:
         for pattern, light in zip(sequence.patterns, sequence.profiles, strict=True):
-            kept.setdefault((light.shape, light.tobytes()), (pattern, light))
-    patterns, profiles = zip(*kept.values(), strict=True)
+            unique.setdefault((light.shape, light.tobytes()), (pattern, light))
+    patterns, profiles = zip(*unique.values(), strict=True)
     return PatternSequence(sizes.pop(), patterns, profiles)
 
 
 def profile(pattern: Pattern, size: Size) -> NDArray[np.uint8]:
-    """Light of one pattern: (1, 1), (1, Wp) or (Hp, 1) uint8. Raises PatternError when it does not fit."""
+    """Light of one pattern: (1, 1), (1, Wp) or (Hp, 1) uint8. Raises PatternError if it does not fit."""
     match pattern:
         case White() | Primary():
             return np.full((1, 1), 255, dtype=np.uint8)
@@ -163,8 +161,9 @@ def profile(pattern: Pattern, size: Size) -> NDArray[np.uint8]:
 
 
 def encode(patterns: Sequence[Pattern], size: Size) -> PatternSequence:
-    """Turn patterns into light for a projector of this size; a few kilobytes, since each varies along one axis only.
-    Raises PatternError: the list is empty, or a pattern does not fit the projector.
+    """Encode patterns as light for a projector of this size; a few kilobytes, since each varies along one axis only.
+
+    Raises PatternError if the list is empty, or a pattern does not fit the projector.
     """
     if not patterns:
         raise PatternError("a sequence needs at least one pattern, found none; see scan_patterns")

@@ -1,84 +1,58 @@
-"""From frames to curves in millimetres: decoding, stripes, linking, triangulation."""
+"""From camera frames to curves in space.
+
+`pipeline` runs the steps of one camera: noise, decoding, stripes, refinement, identification and links. Then follow
+`triangulation`, `merging` of cameras and `uncertainty`; `fusion` comes before for several exposures, `albedo` after.
+"""
 
 from slrig.reconstruction.albedo import (
     BRIGHT_ALBEDO,
     BRIGHT_PERCENT,
     Albedo,
-    LitPoints,
-    LitView,
-    albedo,
+    AlbedoSamples,
+    Illumination,
+    estimate_albedo,
 )
-from slrig.reconstruction.camera import (
-    CameraCurves,
-    CameraStream,
-    camera_curves,
-)
-from slrig.reconstruction.coded import (
-    CodeTables,
-    Limits,
-)
-from slrig.reconstruction.correspondence import (
-    CorrespondenceLimits,
-    ProjectorPositions,
-    projector_positions,
-)
-from slrig.reconstruction.decoding import (
-    AskedPixels,
-    DecodingLimits,
-    decode,
-    lit_pixels,
-    unresolved_bits,
-)
+from slrig.reconstruction.camera_response import NoiseModel, estimate_noise, fit_noise
+from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
+from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
+from slrig.reconstruction.decoding import DecodingLimits, RegionMask, decode, lit_pixels, unresolved_bits
 from slrig.reconstruction.frames import (
-    NEARLY_FULL,
+    NEAR_SATURATION,
     AxisFrames,
     FrameStacks,
     Image,
     axis_frames,
     axis_patterns,
-    ends_repeats,
     exposure_count,
+    linearise,
     mean_image,
-    straight,
-    telling,
-    telling_shots,
+    reference_repeats,
+    used_frames,
+    used_shots,
 )
-from slrig.reconstruction.fusion import (
-    ExposureUse,
-    FusedFrames,
-    exposure_use,
-    fused_colour,
-    fused_frames,
-)
+from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fuse_colour, fuse_exposures
 from slrig.reconstruction.merging import (
     MergedCurves,
     PairRedundancy,
     Redundancy,
-    disagreement,
-    merged,
-    redundancy,
+    evaluate_redundancy,
+    find_disagreement,
+    merge_curves,
 )
-from slrig.reconstruction.noise import (
-    NoiseModel,
-    estimate_noise,
-    fitted_noise,
-)
-from slrig.reconstruction.phase import (
-    has_phase,
-    position_map,
-)
+from slrig.reconstruction.phase import has_phase, position_map
+from slrig.reconstruction.pipeline import CameraCurves, CameraStream, camera_curves
 from slrig.reconstruction.triangulation import (
-    SETTLED,
+    CONVERGED,
     SheetCurves,
-    camera_camera,
-    camera_projector,
     distorted_from_pixel,
-    packed,
+    optical_depths_mm,
+    pack_device,
+    pixel_rays,
     project,
-    rays,
-    selected,
+    select_points,
     stripe_crossing,
-    to_depths,
+    triangulate_camera_pair,
+    triangulate_camera_projector,
 )
 from slrig.reconstruction.uncertainty import (
     calibration_modes,
@@ -91,10 +65,10 @@ from slrig.reconstruction.uncertainty import (
 __all__ = [
     "BRIGHT_ALBEDO",
     "BRIGHT_PERCENT",
-    "NEARLY_FULL",
-    "SETTLED",
+    "CONVERGED",
+    "NEAR_SATURATION",
     "Albedo",
-    "AskedPixels",
+    "AlbedoSamples",
     "AxisFrames",
     "CameraCurves",
     "CameraStream",
@@ -104,52 +78,52 @@ __all__ = [
     "ExposureUse",
     "FrameStacks",
     "FusedFrames",
+    "Illumination",
     "Image",
-    "Limits",
-    "LitPoints",
-    "LitView",
     "MergedCurves",
     "NoiseModel",
     "PairRedundancy",
     "ProjectorPositions",
+    "ReconstructionLimits",
     "Redundancy",
+    "RegionMask",
     "SheetCurves",
-    "albedo",
     "axis_frames",
     "axis_patterns",
     "calibration_modes",
     "calibration_sigma",
-    "camera_camera",
     "camera_curves",
-    "camera_projector",
     "decode",
-    "disagreement",
     "distorted_from_pixel",
-    "ends_repeats",
+    "estimate_albedo",
     "estimate_noise",
+    "evaluate_redundancy",
     "exposure_count",
     "exposure_use",
-    "fitted_noise",
-    "fused_colour",
-    "fused_frames",
+    "find_disagreement",
+    "fit_noise",
+    "fuse_colour",
+    "fuse_exposures",
     "has_phase",
+    "linearise",
     "lit_pixels",
     "mean_image",
-    "merged",
-    "packed",
+    "merge_curves",
+    "optical_depths_mm",
+    "pack_device",
+    "pixel_rays",
     "position_map",
     "project",
     "projector_positions",
-    "rays",
-    "redundancy",
+    "reference_repeats",
     "sampling_mm",
-    "selected",
+    "select_points",
     "sigma_along_normal",
-    "straight",
     "stripe_crossing",
     "stripe_tangents",
-    "telling",
-    "telling_shots",
-    "to_depths",
+    "triangulate_camera_pair",
+    "triangulate_camera_projector",
     "unresolved_bits",
+    "used_frames",
+    "used_shots",
 ]

@@ -1,23 +1,29 @@
-"""Response of the camera, estimated from the frames: gamma, loss by compression, noise shared by neighbouring pixels.
+"""Model of one camera, estimated from the frames of a scan: noise, gamma, compression loss and noise correlation.
 
-Cameras made for displays give v = full · (light/full)^(1/γ) (Rec. 709, sRGB: γ of about 2.2 as a whole). All that is
-done with frames takes light: stripes add up with the room's light, a pixel's light is a mean over its blur. On bent
-values a stripe's first harmonic is mixed with its others, which makes waves of the surface, and a print reaches further
-over its edges than a blur can.
+Noise: variance(I) = read + slope · I, in camera units (photon transfer; EMVA 1288).
 
-The code tells γ: where a bit and its inverse are alike, at the middle of an edge, each has half of the projector's
-light, 2 m^γ = white^γ + black^γ. So do lines of half their period and their inverses (`AxisFrames.telling_lines`); and
-where there are none of these, lines whose light adds up to the middle of white and black. A lens and a projector that
-is out of focus blur light, and keep that; sharpening is the same on both sides of an edge. A projector or cable that
-blurs the signal, before the projector's own gamma, loses light at edges, which looks like γ < 1, and nothing is made
-straight then.
+Correlation: a position sums pixels (`PixelSum`). Where neighbouring pixels share noise, the variance of such a sum is
+larger than that of independent pixels.
+
+Compression: JPEG rounds the coefficients of the cosine transform to steps, which the pixels still show. The variance
+that is lost counts as noise of positions.
+
+Gamma: cameras made for displays give v = full · (light/full)^(1/γ) (Rec. 709, sRGB: γ of about 2.2 as a whole). All
+other steps need values proportional to light. The code determines γ: where a bit and its inverse are alike, at the
+middle of an edge, each has half of the projector's light, 2 m^γ = white^γ + black^γ. The same holds for lines of half
+their period and their inverses (`AxisFrames.line_pairs`), and for lines whose light adds up to the middle of white and
+black. Blur by lenses keeps that relation, and sharpening is the same on both sides of an edge. A projector or cable
+that blurs the signal before the projector's gamma loses light at edges, which looks like γ < 1; values then stay as
+they are.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
@@ -25,60 +31,368 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import FloatArray, IntArray, Refusal, coarse_bits, telling_bits
-from slrig.reconstruction.decoding import CodeMap, DecodingLimits, lit_pixels
-from slrig.reconstruction.frames import AxisFrames, FrameStacks, Images, rows_of
-from slrig.reconstruction.noise import NoiseModel, estimate_noise
+from slrig.model import FloatArray, IntArray, coarse_bits, telling_bits
+from slrig.reconstruction.frames import AxisFrames, Images, select_rows, stack_rows, subsample
 from slrig.reconstruction.surface_fit import stencils
 
-_MOST_WINDOWS = 10_000  # whose mean is known to a hundredth
-_LEAST_WINDOWS = 200
-_CLEAR_SHARE = 0.8  # of the contrast: less is an edge of the code, where a camera that bends its values breaks the sum
-_LEAST_RATIO = 1.1  # the model is no better than that; of independent noise the windows tell 0.98 to 1.08
-_FEWEST_DEVIATING_BITS = 3  # as for `noise.estimate_noise`
-_MOST_COUNTED = 200_000  # whose mean is known to a hundredth
+# Noise.
+_QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
+_MAX_SAMPLES = 200_000  # about 8000 for each bin
+_MIN_RANGE_SIGMA = 10.0  # of levels, in standard deviations of the noise, to fit a slope
+# Share of the brightest level that the darkest must be below; otherwise read noise is extrapolated, and too large.
+_DARK_SHARE = 0.25
+# Chosen. Half and double change stated errors on glossy surfaces that one exposure saturates.
+_BINS = 24
+_MIN_PER_BIN = 50
+_BOX = np.ones((3, 3), dtype=np.uint8)
+_MIN_BITS = 3
+_MIN_LIT = 0.02  # of full scale, white over black
+_MIN_BIT_SWING = 0.75  # of white less black, from the middle: smaller swings are at an edge of the code
+_MEDIAN_SQUARE = 0.4549  # the median of a squared normal, of its variance
+
+# Correlation.
+_MAX_WINDOWS = 10_000  # whose mean is known to a hundredth
+_MIN_WINDOWS = 200
+_MIN_SWING = 0.8  # of the contrast: less is an edge of the code, where gamma breaks the sum
+_MIN_RATIO = 1.1  # accuracy of the noise model: independent noise gives ratios up to 1.08
+_MAX_COUNTED = 200_000  # whose mean is known to a hundredth
+
+# Compression.
+_SIDE = 8
+_FULL_SCALE = 255  # of the values that JPEG is used for
+_MAX_BLOCKS = 8000  # of all frames together: a share of blocks is then known to half a hundredth
+_MAX_STEP = 128  # of the first coefficients, which hold the stripes: no table in use has more
+_LIMITED_RANGE = 255 / 219  # factor on the steps if luma of 16..235 is stretched to 0..255
+_BIN, _QUOTIENT_BINS = 0.125, 4096  # of the magnitude of a coefficient; up to 512
+_MIN_CLUSTERING = 0.4  # mean cosine of 2π c/step: about 0 without steps, 0.66 for steps of 2 with rounded pixels
+_NEAR_ZERO = 11  # bin: up to 1.5, which rounded pixels seldom make of zero
+_MAX_ASTRAY = 0.1  # of coefficients beyond that, share that may be less than half a step
+_MIN_NONZERO = 30  # coefficients not rounded to zero
+_MIN_BEYOND = 10  # of these, number of coefficients of more than one step
+_MIN_DIFFERENT = 30  # different values: a drawing of few colours has few, and they may all be multiples
+_ROUNDING_VARIANCE = 1 / 12  # of decoded pixels, in addition to the camera's own
+_MIN_STEPS = 6  # coefficients with a step: frames without loss seem to have one at most
+
+# Gamma.
+_MIN_GAMMA = 1.2  # chosen: cameras for displays have 1.8 and more, and linear cameras give 1.00
+_MAX_GAMMA = 4.0
+_EDGE_SHARE = 0.5  # of the contrast, from its middle
+_MAX_DIFFERENCE = 0.15  # of the contrast, between a bit and its inverse: their mean is then the middle to 2 %
+_MIN_CONTRAST_LEVELS = 20.0  # of 255: white over black, so that rounding does not shift the middle
+_MIN_EDGES = 500
+_MAX_PIXELS = 200_000
+_GAMMA_ITERATIONS = 20  # each halves the interval of γ
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """variance(I) = read_variance · read_share + slope · shot_share · I, camera units squared.
+
+    read_variance, slope : of a frame as the camera gives it. read_share, shot_share : (H, W) float32, their remaining
+    share at each pixel of fused exposures (`slrig.reconstruction.fusion`); None for frames as the camera gives them,
+    where both are 1. loss : (8, 8), result of `compression_loss` for fused or linearised frames, which do not show it
+    any more; None for others.
+    """
+
+    read_variance: float
+    slope: float
+    read_share: NDArray[np.float32] | None = None
+    shot_share: NDArray[np.float32] | None = None
+    loss: FloatArray | None = None
+
+    def variance(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(H, W) float32: expected variance of each sample of `image`."""
+        if self.read_share is None or self.shot_share is None:
+            # One array, because new memory costs more than the sums.
+            variance = np.maximum(image, 0)
+            variance *= np.float32(self.slope)
+            variance += np.float32(self.read_variance)
+            return np.asarray(variance)
+        read, shot = np.float32(self.read_variance) * self.read_share, np.float32(self.slope) * self.shot_share
+        return np.asarray(read + shot * np.maximum(image, 0), dtype=np.float32)
+
+    def variance_at(self, level: float) -> float:
+        """Variance of a sample of this level, for a frame as the camera gives it."""
+        return self.read_variance + self.slope * max(level, 0.0)
+
+    def rows(self, rows: slice | IntArray) -> NoiseModel:
+        """Select rows."""
+        return replace(
+            self, read_share=select_rows(self.read_share, rows), shot_share=select_rows(self.shot_share, rows)
+        )
+
+    def scale_variance(self, factor: float) -> NoiseModel:
+        """Multiply the variance of every sample."""
+        return replace(self, read_variance=self.read_variance * factor, slope=self.slope * factor)
+
+    def add_variance(self, variance: float) -> NoiseModel:
+        """Add variance to every sample, at all levels."""
+        return replace(self, read_variance=self.read_variance + variance)
+
+
+def estimate_noise(frames: AxisFrames) -> NoiseModel:
+    """Fit the noise model to the frames of one camera.
+
+    A bit and its inverse add up to white plus black for any code and lens, so the scatter of that sum over the bits is
+    noise alone: variance = 2 · read + slope · (white + black). A projector that spreads its signal before its gamma (a
+    scaler, a cable) breaks the sum at code edges, so only the coarser half of the bits counts, which has few edges.
+
+    Without inverses, two coarse bits that both light a pixel, or both leave it dark, differ by noise and by light
+    between the walls of a hollow. Such light adds up in lines of half their period and their inverses, or in all such
+    lines, which a scaler breaks: the smaller of both scatters is noise.
+
+    If all sums have one level, as on an even wall, or none is dark, the scatter between neighbouring pixels of the
+    black frame (Immerkær 1996, DOI 10.1006/cviu.1996.0060) adds the noise of the dark. Without code and lines of this
+    kind that scatter of white and black is all there is.
+    """
+    return fit_noise([sample_noise(frames)])
+
+
+def fit_noise(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> NoiseModel:
+    """Fit the noise model to the results of `sample_noise` for each exposure of one camera."""
+    levels, variances = zip(*samples, strict=True)
+    return _fit_model(np.concatenate(levels), np.concatenate(variances))
+
+
+def sample_noise(
+    frames: AxisFrames, where: NDArray[np.bool_] | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return (n,) levels and (n,) variances of single samples, to fit the noise model to.
+
+    where : (H, W) bool, pixels to sample; None for all.
+    """
+    coarse_count, lines = coarse_bits(len(frames.bits)), frames.line_pairs
+    if frames.inverses is not None and len(frames.bits) >= _MIN_BITS:
+        level, variance = _scatter_of_sums(
+            frames.bits[:coarse_count], frames.inverses[:coarse_count], frames.clipped_at, where
+        )
+    elif frames.lines_light_half and len(frames.bits) >= _MIN_BITS:
+        level, variance = _scatter_of_bits(frames, coarse_count, where)
+        by_lines = _scatter_of_lines(frames, where) if lines is None else _scatter_of_pairs(frames, lines, where)
+        bright = float(np.median(frames.white))
+        if _fit_model(*by_lines).variance_at(bright) < _fit_model(level, variance).variance_at(bright):
+            level, variance = by_lines
+    else:
+        return _scatter_between_neighbours(frames, where, frames.white, frames.black)
+    if len(level) and not _determines_slope(level, variance):
+        dark, dark_variance = _scatter_between_neighbours(frames, where, frames.black)
+        level, variance = np.concatenate([level, dark]), np.concatenate([variance, dark_variance])
+    return level, variance
+
+
+def _determines_slope(level: NDArray[np.float32], variance: NDArray[np.float32]) -> bool:
+    """Return True if levels differ by more than noise and some are dark, without the outermost hundredths."""
+    low, high = np.quantile(level, (0.01, 0.99))
+    return bool(high - low >= _MIN_RANGE_SIGMA * np.sqrt(np.median(variance)) and low < _DARK_SHARE * high)
+
+
+def _scatter_of_sums(
+    bits: Images, inverses: Images, clipped_at: float, where: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Levels and variances of single samples, half those of the sums."""
+    step = math.ceil(math.sqrt(bits[0].size / _MAX_SAMPLES))
+    direct, inverse = subsample(bits, step, step), subsample(inverses, step, step)
+    sums = direct + inverse
+    unclipped = (np.maximum(direct, inverse).max(axis=0) < clipped_at) & (np.minimum(direct, inverse).min(axis=0) > 0)
+    if where is not None:
+        unclipped &= where[::step, ::step]
+    count = len(sums) - 1
+    variance = sums.var(axis=0, ddof=1, dtype=np.float64)
+    # The median of a bin is below the mean of a chi-square distribution (Wilson-Hilferty).
+    variance = variance / (1 - 2 / (9 * count)) ** 3
+    return sums.mean(axis=0)[unclipped] / 2, (variance[unclipped] / 2).astype(np.float32)
+
+
+def _scatter_of_lines(
+    frames: AxisFrames, where: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Levels and variances of single samples: lines of half their period add up to white and black times half their
+    number.
+    """
+    step = math.ceil(math.sqrt(frames.white.size / _MAX_SAMPLES))
+    lines, reference = subsample(frames.lines, step, step), (frames.white + frames.black)[::step, ::step]
+    half = len(lines) / 2
+    usable = (lines.max(axis=0) < frames.clipped_at) & (lines.min(axis=0) > 0)
+    usable &= (frames.white[::step, ::step] < frames.clipped_at) & (frames.black[::step, ::step] > 0)
+    if where is not None:
+        usable &= where[::step, ::step]
+    difference = (lines.sum(axis=0) - np.float32(half) * reference)[usable]
+    return reference[usable] / 2, _variances(difference, 2 * half + 2 * half**2 / frames.reference_repeats)
+
+
+def _scatter_of_pairs(
+    frames: AxisFrames, lines: tuple[Images, Images], where: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Levels and variances of single samples: two lines and their inverses have the same sums.
+
+    Of the lit pixels, the half furthest from edges counts.
+    """
+    step = math.ceil(math.sqrt(frames.white.size / _MAX_SAMPLES))
+    direct, inverse = (subsample(images, step, step) for images in lines)
+    contrast = frames.contrast[::step, ::step]
+    usable = (np.maximum(direct, inverse).max(axis=0) < frames.clipped_at) & (
+        np.minimum(direct, inverse).min(axis=0) > 0
+    )
+    clear = np.abs(direct - inverse).min(axis=0) / np.maximum(contrast, 1)
+    lit = contrast > _MIN_LIT * frames.clipped_at
+    usable &= ~lit | (clear >= (np.median(clear[lit]) if lit.any() else 0.0))
+    if where is not None:
+        usable &= where[::step, ::step]
+    first, second = (direct + inverse)[:, usable]
+    # The level is that of white and black: the means of pairs would be whole or half numbers by their difference.
+    level = (frames.white + frames.black)[::step, ::step][usable] / 2
+    return level, _variances(first - second, 4)
+
+
+def _scatter_of_bits(
+    frames: AxisFrames, coarse_count: int, where: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Levels and variances of single samples: two coarse bits that light a pixel, and two that do not."""
+    step = math.ceil(math.sqrt(frames.white.size / _MAX_SAMPLES))
+    bits = subsample(frames.bits[:coarse_count], step, step)
+    white, black = (each[::step, ::step] for each in (frames.white, frames.black))
+    swing = (2 * bits - white - black) / np.maximum(white - black, 1)
+    usable = (bits.max(axis=0) < frames.clipped_at) & (bits.min(axis=0) > 0)
+    if where is not None:
+        usable &= where[::step, ::step]
+    levels, variances = [], []
+    for state, level in ((swing > _MIN_BIT_SWING, white), (swing < -_MIN_BIT_SWING, black)):
+        first = np.argmax(state, axis=0)
+        last = coarse_count - 1 - np.argmax(state[::-1], axis=0)
+        has_two = usable & (np.count_nonzero(state, axis=0) > 1)
+        first_bit, last_bit = (np.take_along_axis(bits, index[None], axis=0)[0][has_two] for index in (first, last))
+        levels.append(level[has_two])
+        variances.append(_variances(first_bit - last_bit, 2))
+    return np.concatenate(levels), np.concatenate(variances)
+
+
+def _variances(difference: NDArray[np.float32], samples: float) -> NDArray[np.float32]:
+    """(n,) float32: variances of single samples, for a median, from differences over this number of samples."""
+    # Whole numbers have a coarse median. Spread over their rounding interval, they have a fine one.
+    spread = difference + np.random.default_rng(0).uniform(-0.5, 0.5, len(difference)).astype(np.float32)
+    return np.asarray((spread**2 / _MEDIAN_SQUARE - 1 / 12) / samples, dtype=np.float32)
+
+
+def _scatter_between_neighbours(
+    frames: AxisFrames, where: NDArray[np.bool_] | None, *images: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    levels, variances = [], []
+    for image in images:
+        across = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
+        second_difference = across[:-2] - 2 * across[1:-1] + across[2:]
+        # The mask sums to zero, so the mean of its pixels is independent of its response; the centre alone is not.
+        mean = cv2.blur(image, (3, 3))[1:-1, 1:-1]
+        lowest, highest = cv2.erode(image, _BOX)[1:-1, 1:-1], cv2.dilate(image, _BOX)[1:-1, 1:-1]
+        unclipped = (lowest > 0) & (highest < frames.clipped_at)
+        if where is not None:
+            unclipped &= where[1:-1, 1:-1]
+        levels.append(mean[unclipped])
+        # The squared norm of the mask is 36.
+        variances.append(second_difference[unclipped] ** 2 * (frames.reference_repeats / 36 / _MEDIAN_SQUARE))
+    return np.concatenate(levels), np.concatenate(variances)
+
+
+def _fit_model(level: NDArray[np.float32], variance: NDArray[np.float32]) -> NoiseModel:
+    floor = NoiseModel(_QUANTISATION_VARIANCE, 0.0)
+    if len(level) < _MIN_PER_BIN:
+        return floor
+    # Sorted by level, a bin is a range of samples with its median level in the middle.
+    order = np.argsort(level)
+    level, variance = level[order], variance[order]
+    borders = np.unique(np.quantile(level, np.linspace(0, 1, _BINS + 1)))
+    # A sample on a border belongs to the bin above it, the largest to the last.
+    bin_ends = np.searchsorted(level, borders[1:-1], side="left")
+    points = [
+        (float(np.median(level[a:b])), float(np.median(variance[a:b])), int(b - a))
+        for a, b in pairwise([0, *bin_ends, len(level)])
+        if b - a >= _MIN_PER_BIN
+    ]
+    if not points:
+        return floor
+    x, y, weight = np.array(points).T
+    # Levels that hardly differ do not determine the slope.
+    if np.ptp(x) < _MIN_RANGE_SIGMA * np.sqrt(np.median(y)):
+        return NoiseModel(max(float(np.median(y)), _QUANTISATION_VARIANCE), 0.0)
+    # Weighted by 1/variance: the scatter of a variance grows with the variance.
+    root = np.sqrt(weight) / np.maximum(y, _QUANTISATION_VARIANCE)
+    slope, read = np.linalg.lstsq(np.stack([x, np.ones_like(x)], axis=1) * root[:, None], y * root, rcond=None)[0]
+    if slope <= 0:
+        return NoiseModel(max(float(np.average(y, weights=weight)), _QUANTISATION_VARIANCE), 0.0)
+    return NoiseModel(max(float(read), _QUANTISATION_VARIANCE), float(slope))
 
 
 class PixelSum(NamedTuple):
-    """How a position sums pixels.
+    """Weights with which a position sums pixels.
 
-    weights : (k, k) float64 with k odd. cycles_per_px : (x, y) of stripes whose phase is what the pixels tell; 0 where
-    their values themselves do. Noise at that frequency is a constant error of phase. of_swings : whether the pixels are
-    of a bit less its inverse, and not of single frames.
+    weights : (k, k) float64 with k odd. cycles_per_px : (x, y) frequency of the stripes if the pixels give their phase,
+    0 if the values themselves count. Noise at that frequency is a constant error of phase. of_bit_differences : True if
+    the pixels are differences of a bit and its inverse, False for single frames.
     """
 
     weights: FloatArray
     cycles_per_px: tuple[float, float] = (0.0, 0.0)
-    of_swings: bool = False
+    of_bit_differences: bool = False
 
-    def turned(self) -> NDArray[np.complex128]:
-        """(k, k): the weights as they apply to a frame's noise."""
+    def complex_weights(self) -> NDArray[np.complex128]:
+        """(k, k): the weights on the noise of a frame."""
         reach = len(self.weights) // 2
         y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
         across, down = self.cycles_per_px
         return np.asarray(self.weights * np.exp(-2j * np.pi * (across * x + down * y)))
 
 
-def phase_sum(frames: AxisFrames, lit: NDArray[np.bool_]) -> PixelSum:
-    """As the fit to the phase of line frames sums pixels. lit : (H, W) bool.
+@dataclass(frozen=True, slots=True)
+class CameraResponse:
+    """Noise of single samples, and how gamma, compression and correlation change it for positions.
 
-    How close lines lie is told by lines and their inverse, or by a fine bit of the code, which change their sign every
-    so many projector pixels. The finest bit may not resolve.
+    gamma : of the camera's own values; frames are linearised. loss_variance : extra variance of each sample by
+    compression, camera units squared; it displaces stripes and edges, but turns no bit over. noise_correlation :
+    factor on the variance of sums of pixels, as `noise_correlation` returns it.
     """
-    lines, period_px = frames.telling_lines, frames.line_patterns[0].period_px
+
+    noise: NoiseModel
+    gamma: float = 1.0
+    loss_variance: float = 0.0
+    noise_correlation: float = 1.0
+
+    @property
+    def position_noise(self) -> NoiseModel:
+        """Noise of positions, correlation and compression included."""
+        return self.noise.scale_variance(self.noise_correlation).add_variance(self.loss_variance)
+
+    def for_positions(
+        self, frames: AxisFrames, lit: NDArray[np.bool_], images: Images, pixel_sum: PixelSum
+    ) -> CameraResponse:
+        """Measure loss and correlation for positions that sum pixels of `images` in this way. lit : (H, W) bool."""
+        loss = frame_compression_loss(frames, lit, images) if self.noise.loss is None else self.noise.loss
+        variance = 0.0
+        if loss.any():
+            variance = equivalent_white_variance(loss, pixel_sum)
+            variance *= linearisation_gain((image[lit] for image in images), self.gamma, frames.full_scale)
+        correlation = noise_correlation(frames, self.noise, lit, pixel_sum)
+        return replace(self, loss_variance=variance, noise_correlation=correlation)
+
+
+def phase_pixel_sum(frames: AxisFrames, lit: NDArray[np.bool_]) -> PixelSum:
+    """Weights of the fit to the phase of line frames. lit : (H, W) bool.
+
+    The spacing of lines in the image is counted in lines and their inverses, or in a fine bit of the code, which change
+    sign once in a known number of projector pixels. The finest bit may not resolve.
+    """
+    lines, period_px = frames.line_pairs, frames.line_patterns[0].period_px
     index = max(len(frames.bits) - 2, 0)
     changes_px = (2 << (len(frames.bits) - 1 - index)) * frames.gray.cell_px if lines is None else period_px // 2
-    every = max(1, lit.size // _MOST_COUNTED)
+    every = max(1, lit.size // _MAX_COUNTED)
 
     def above(first: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         rows = slice(first, None if first else -1, every)
         if lines is not None:
             return lines[0][0][rows] > lines[1][0][rows], lit[rows]
         if frames.inverses is not None:
-            against = frames.inverses[index][rows]
+            reference = frames.inverses[index][rows]
         else:
-            against = (frames.white[rows] + frames.black[rows]) / 2
-        return frames.bits[index][rows] > against, lit[rows]
+            reference = (frames.white[rows] + frames.black[rows]) / 2
+        return frames.bits[index][rows] > reference, lit[rows]
 
     def cycles_per_px(here: NDArray[np.bool_], there: NDArray[np.bool_], both: NDArray[np.bool_]) -> float:
         changes = int(np.count_nonzero((here != there) & both)) / max(int(np.count_nonzero(both)), 1)
@@ -90,166 +404,157 @@ def phase_sum(frames: AxisFrames, lit: NDArray[np.bool_]) -> PixelSum:
     return PixelSum(stencils()[0][0, :25].reshape(5, 5).astype(np.float64), (across, down))
 
 
-def edge_sum(scale_px: float) -> PixelSum:
-    """As a Gaussian of this scale, which finds edges of the code, sums pixels."""
+def edge_pixel_sum(scale_px: float) -> PixelSum:
+    """Weights of a Gaussian of this scale, which finds edges of the code."""
     reach = int(np.ceil(3 * scale_px))
     gaussian = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * scale_px**2))
-    return PixelSum(np.outer(gaussian, gaussian), of_swings=True)
+    return PixelSum(np.outer(gaussian, gaussian), of_bit_differences=True)
 
 
-def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_], summed: PixelSum) -> float:
-    """Variance of sums of pixels, over what it would be by `noise` if it were independent; 1 where it is not more.
+def noise_correlation(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_], pixel_sum: PixelSum) -> float:
+    """Variance of sums of pixels over that of independent noise by `noise`; 1 if it is not larger.
 
-    where : (H, W) bool, pixels to look at. Of bits and their inverses only the coarser half counts, as for
-    `noise.estimate_noise`, and that away from their edges. Of single bits two that light the same window tell, or lines
-    of half their period, whichever tell less, as there. Otherwise, and of few windows, nothing is told.
+    where : (H, W) bool, pixels to use. Of bits and their inverses the coarser half counts, as in `estimate_noise`, away
+    from their edges. Without inverses, two bits that light the same window count, or lines of half their period,
+    whichever give less. Without either, or with few windows, the result is 1.
     """
-    count, lines = coarse_bits(len(frames.bits)), frames.telling_lines
-    corner = _windows(where, len(summed.weights))
-    if len(corner[0]) < _LEAST_WINDOWS or len(frames.bits) < _FEWEST_DEVIATING_BITS:
+    count, lines = coarse_bits(len(frames.bits)), frames.line_pairs
+    corner = _windows(where, len(pixel_sum.weights))
+    if len(corner[0]) < _MIN_WINDOWS or len(frames.bits) < _MIN_BITS:
         return 1.0
     if frames.inverses is not None:
-        direct = _seen_in(frames.bits[:count], corner, summed)
-        inverse = _seen_in(frames.inverses[:count], corner, summed)
-        contrast = _seen_in([frames.contrast], corner, summed)
-        clear = np.abs(direct - inverse) > _CLEAR_SHARE * contrast
-        ratio = _ratio_of_pairs(frames, noise, corner, summed, direct, inverse, clear, edges=False)
-    elif frames.lines_halve:
-        ratio = _ratio_of_bits(frames, noise, corner, summed, count)
+        direct = _window_pixels(frames.bits[:count], corner, pixel_sum)
+        inverse = _window_pixels(frames.inverses[:count], corner, pixel_sum)
+        contrast = _window_pixels([frames.contrast], corner, pixel_sum)
+        clear = np.abs(direct - inverse) > _MIN_SWING * contrast
+        ratio = _ratio_of_pairs(frames, noise, corner, pixel_sum, direct, inverse, clear, edges=False)
+    elif frames.lines_light_half:
+        ratio = _ratio_of_bits(frames, noise, corner, pixel_sum, count)
         if lines is None:
-            ratio = min(ratio, _ratio_of_lines(frames, noise, corner, summed))
+            ratio = min(ratio, _ratio_of_lines(frames, noise, corner, pixel_sum))
         else:
-            direct, inverse = (_seen_in(images, corner, summed) for images in lines)
+            direct, inverse = (_window_pixels(images, corner, pixel_sum) for images in lines)
             clear = np.minimum(direct, inverse) > 0
-            ratio = min(ratio, _ratio_of_pairs(frames, noise, corner, summed, direct, inverse, clear, edges=True))
+            ratio = min(ratio, _ratio_of_pairs(frames, noise, corner, pixel_sum, direct, inverse, clear, edges=True))
     else:
         return 1.0
-    return ratio if ratio >= _LEAST_RATIO else 1.0
+    return ratio if ratio >= _MIN_RATIO else 1.0
 
 
 def _ratio_of_pairs(
-    frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum,
+    frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], pixel_sum: PixelSum,
     direct: NDArray[np.float32], inverse: NDArray[np.float32], clear: NDArray[np.bool_], *, edges: bool,
 ) -> float:  # fmt: skip
-    """The ratio by windows of images and their inverses, (images, windows, k²) each, where they are clear; 1 of few.
+    """Ratio from windows of images and their inverses, (images, windows, k²) each, where they are clear; 1 if these are
+    few.
 
-    edges : there are edges within the windows, at which an image differs from its inverse by more than noise.
+    edges : True if windows contain edges, at which an image differs from its inverse by more than noise.
     """
-    # Where the dark one of both is cut off at zero, pixels and sums lose alike.
+    # If the dark one of both is cut off at zero, pixels and sums lose alike.
     clear &= np.maximum(direct, inverse) < frames.clipped_at
-    kept = clear.all(axis=(0, 2))
-    if np.count_nonzero(kept) < _LEAST_WINDOWS:
+    usable = clear.all(axis=(0, 2))
+    if np.count_nonzero(usable) < _MIN_WINDOWS:
         return 1.0
-    ends = _seen_in([noise.variance(frames.white) + noise.variance(frames.black)], corner, summed)[0, kept]
-    direct, inverse = direct[:, kept], inverse[:, kept]
-    swings = 1.0 if edges else _ratio(np.abs(direct - inverse), ends, summed)
-    return swings if summed.of_swings else max(swings, _ratio(direct + inverse, ends, summed))
+    variance = _window_pixels([noise.variance(frames.white) + noise.variance(frames.black)], corner, pixel_sum)[
+        0, usable
+    ]
+    direct, inverse = direct[:, usable], inverse[:, usable]
+    ratio = 1.0 if edges else _ratio(np.abs(direct - inverse), variance, pixel_sum)
+    return ratio if pixel_sum.of_bit_differences else max(ratio, _ratio(direct + inverse, variance, pixel_sum))
 
 
 def _ratio_of_lines(
-    frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum
+    frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], pixel_sum: PixelSum
 ) -> float:
-    """The ratio by lines that light half of their period: they add up to white and black."""
-    lines = _seen_in(frames.lines, corner, summed)
-    white, black = (_seen_in([each], corner, summed)[0] for each in (frames.white, frames.black))
-    kept = ((lines.max(axis=0) < frames.clipped_at) & (lines.min(axis=0) > 0) & (white < frames.clipped_at)).all(axis=1)
-    if np.count_nonzero(kept) < _LEAST_WINDOWS:
+    """Ratio from lines of half their period: they add up to white and black."""
+    lines = _window_pixels(frames.lines, corner, pixel_sum)
+    white, black = (_window_pixels([each], corner, pixel_sum)[0] for each in (frames.white, frames.black))
+    usable = ((lines.max(axis=0) < frames.clipped_at) & (lines.min(axis=0) > 0) & (white < frames.clipped_at)).all(
+        axis=1
+    )
+    if np.count_nonzero(usable) < _MIN_WINDOWS:
         return 1.0
     count = np.float32(len(lines))
-    steady = np.stack([2 * lines[:, kept].sum(axis=0) / count, (white + black)[kept]])
+    steady = np.stack([2 * lines[:, usable].sum(axis=0) / count, (white + black)[usable]])
     variance = noise.variance(frames.white) + noise.variance(frames.black)
-    return _ratio(steady, _seen_in([variance], corner, summed)[0, kept] * (1 / count + 1 / 2), summed)
+    return _ratio(steady, _window_pixels([variance], corner, pixel_sum)[0, usable] * (1 / count + 1 / 2), pixel_sum)
 
 
 def _ratio_of_bits(
-    frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum,
+    frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], pixel_sum: PixelSum,
     count: int,
 ) -> float:  # fmt: skip
-    """The ratio by the windows that two coarse bits light wholly."""
-    bits = _seen_in(frames.bits[:count], corner, summed)
-    white, black = (_seen_in([each], corner, summed)[0] for each in (frames.white, frames.black))
-    lit = ((2 * bits - white - black > _CLEAR_SHARE * (white - black)) & (bits < frames.clipped_at)).all(axis=2)
-    two = np.count_nonzero(lit, axis=0) > 1
-    if np.count_nonzero(two) < _LEAST_WINDOWS:
+    """Ratio from windows that two coarse bits light wholly."""
+    bits = _window_pixels(frames.bits[:count], corner, pixel_sum)
+    white, black = (_window_pixels([each], corner, pixel_sum)[0] for each in (frames.white, frames.black))
+    lit = ((2 * bits - white - black > _MIN_SWING * (white - black)) & (bits < frames.clipped_at)).all(axis=2)
+    has_two = np.count_nonzero(lit, axis=0) > 1
+    if np.count_nonzero(has_two) < _MIN_WINDOWS:
         return 1.0
-    ends = np.argmax(lit, axis=0), len(lit) - 1 - np.argmax(lit[::-1], axis=0)
-    steady = np.stack([bits[at[two], np.flatnonzero(two)] for at in ends])
-    return _ratio(steady, _seen_in([noise.variance(frames.white)], corner, summed)[0, two], summed)
+    lit_bits = np.argmax(lit, axis=0), len(lit) - 1 - np.argmax(lit[::-1], axis=0)
+    steady = np.stack([bits[index[has_two], np.flatnonzero(has_two)] for index in lit_bits])
+    return _ratio(steady, _window_pixels([noise.variance(frames.white)], corner, pixel_sum)[0, has_two], pixel_sum)
 
 
-def _ratio(steady: NDArray[np.float32], variance: NDArray[np.float32], summed: PixelSum) -> float:
-    """Variance of sums of pixels by what differs from bit to bit, over that of independent noise, at least 1.
+def _ratio(steady: NDArray[np.float32], variance: NDArray[np.float32], pixel_sum: PixelSum) -> float:
+    """Variance of sums of pixels, from differences between bits, over that of independent noise; at least 1.
 
-    steady : (bits, windows, k²); variance : (windows, k²), of its pixels by the model.
+    steady : (bits, windows, k²), the same light in each; variance : (windows, k²), by the noise model.
     """
     by_noise = steady - steady.mean(axis=0)
-    weights = summed.turned().ravel()
+    weights = pixel_sum.complex_weights().ravel()
     squares = (np.abs(weights) ** 2).astype(np.float32)
-    # In two real parts: of a complex product numpy makes all noise complex first, and calls threads that spin.
+    # In two real parts: numpy would make all noise complex first, and start threads that spin.
     parts = np.stack([weights.real, weights.imag], axis=1).astype(np.float32)
-    found = 2 * np.mean((by_noise @ parts) ** 2, dtype=np.float64)
-    # By the pixels of the windows themselves, and by the model: it takes a median, which pixels that a camera
-    # interpolated make too small, and those that scatter more count most in a sum.
-    alone = np.mean(by_noise**2 @ squares, dtype=np.float64)
+    measured = 2 * np.mean((by_noise @ parts) ** 2, dtype=np.float64)
+    # By the pixels of the windows themselves, and by the model. The median in the model is too small for interpolated
+    # pixels, and pixels that scatter more count most in a sum.
+    by_pixels = np.mean(by_noise**2 @ squares, dtype=np.float64)
     # The mean of all bits took one degree of freedom.
-    told = (1 - 1 / len(steady)) * np.mean(variance @ squares, dtype=np.float64)
-    return max([1.0, *(float(found / each) for each in (alone, told) if each > 0)])
+    by_model = (1 - 1 / len(steady)) * np.mean(variance @ squares, dtype=np.float64)
+    return max([1.0, *(float(measured / each) for each in (by_pixels, by_model) if each > 0)])
 
 
 def _windows(where: NDArray[np.bool_], side: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row and column of the upper left pixel of an even sample of windows that lie within `where`."""
+    """Row and column of the upper left pixels of an even sample of windows within `where`."""
     rows, columns = where.shape
-    step = max(1, int(np.sqrt(rows * columns / _MOST_WINDOWS)))
+    step = max(1, int(np.sqrt(rows * columns / _MAX_WINDOWS)))
     whole = cv2.erode(where.view(np.uint8), np.ones((side, side), dtype=np.uint8), anchor=(0, 0), borderValue=0)
     row, column = np.nonzero(whole[::step, ::step])
     return row * step, column * step
 
 
-def _seen_in(
-    images: Images, corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum
+def _window_pixels(
+    images: Images, corner: tuple[NDArray[np.intp], NDArray[np.intp]], pixel_sum: PixelSum
 ) -> NDArray[np.float32]:
     """(images, windows, k²) float32: the pixels of each window."""
-    sides = (len(summed.weights),) * 2
+    sides = (len(pixel_sum.weights),) * 2
     views = (np.lib.stride_tricks.sliding_window_view(image, sides) for image in images)
     return np.array([view[corner].reshape(len(corner[0]), -1) for view in views], dtype=np.float32)
 
 
-_SIDE = 8
-_FULL_SCALE = 255  # of what JPEG is used for
-_MOST_BLOCKS = 8000  # of all frames together: a share of blocks is known to half a hundredth
-_LARGEST_STEP = 128  # of the first coefficients, which hold the stripes, no table in use has more
-_LIMITED_RANGE = 255 / 219  # what stretching luma of 16..235 to 0..255 makes of the steps
-_BIN, _QUOTIENT_BINS = 0.125, 4096  # of a coefficient's size; beyond 512 there is nothing to learn
-_LEAST_CLUSTERED = 0.4  # mean cosine of 2π c/step. Rounding of pixels leaves 0.66 of steps of 2; smooth is about 0
-_NEAR_ZERO = 11  # bin: up to 1.5, which rounding of pixels seldom makes of zero
-_MOST_ASTRAY = 0.1  # of coefficients beyond that, may be less than half a step
-_LEAST_ROUNDED = 30  # coefficients that were not rounded to zero
-_LEAST_BEYOND = 10  # of which these many not to one step
-_LEAST_DIFFERENT = 30  # different values: a drawn picture of few colours has few, and they may all be multiples
-_ROUNDING_VARIANCE = 1 / 12  # of decoded pixels, once more after the camera's own
-_LEAST_STEPS = 6  # coefficients with a step; of frames without loss one at most seems to have one
-
-
 def compression_loss(images: Images, code: Images, where: NDArray[np.bool_], full_scale: float) -> FloatArray:
-    """(8, 8) float64: variance that compression left out of each coefficient, camera units squared; zeros for none.
+    """(8, 8) float64: variance that compression removed from each coefficient, camera units squared; zeros without
+    loss.
 
-    images : (H, W) each, whose loss is asked for, on average; code : (H, W) each, where the steps are looked for:
-    between lines it is dark, and coefficients of pixels that are cut off at zero are no multiples. where : (H, W) bool,
-    pixels to look at; full_scale : the value of a saturated sample. The transform keeps lengths: noise of variance v
-    in each pixel has v in each coefficient.
+    images : (H, W) each, whose mean loss is returned; code : (H, W) each, in which steps are searched. Line frames are
+    dark between lines, and coefficients of pixels cut off at zero are not multiples of the step. where : (H, W) bool,
+    pixels to use; full_scale : value of a saturated sample. The transform is orthonormal: noise of variance v in each
+    pixel has variance v in each coefficient.
     """
     loss = np.zeros((_SIDE, _SIDE))
     if full_scale > _FULL_SCALE:
         return loss
-    lit = np.argwhere(_tiles(where).all(axis=(2, 3))).astype(np.int32)
-    step = _found_steps(_sizes(code, lit, full_scale)).reshape(_SIDE, _SIDE)
-    if np.count_nonzero(step) < _LEAST_STEPS:
+    lit = np.argwhere(_blocks(where).all(axis=(2, 3))).astype(np.int32)
+    step = _quantisation_steps(_coefficient_magnitudes(code, lit, full_scale)).reshape(_SIDE, _SIDE)
+    if np.count_nonzero(step) < _MIN_STEPS:
         return loss
-    size = _sizes(images, lit, None)
-    # Means of blocks lie anywhere, and cluster for other reasons, too; tables hold much the same for them.
+    size = _coefficient_magnitudes(images, lit, None)
+    # Block means cluster for other reasons, too; tables have about the same step for them as for their neighbours.
     step[0, 0] = max(step[0, 1], step[1, 0])
     for u, v in np.ndindex(loss.shape):
-        # Steps of 1 do not show, nor that of a coefficient which is hardly ever anything but zero: tables rise.
+        # Steps of 1 are not detected, nor those of coefficients that are mostly zero: tables rise, so the neighbour's
+        # step is a lower limit.
         if step[u, v] == 0:
             step[u, v] = max(1.0, float(step[max(u - 1, 0), v]), float(step[u, max(v - 1, 0)]))
         half = step[u, v] / 2
@@ -260,50 +565,44 @@ def compression_loss(images: Images, code: Images, where: NDArray[np.bool_], ful
     return loss + _ROUNDING_VARIANCE
 
 
-def white_equivalent(loss: FloatArray, summed: PixelSum) -> float:
-    """Variance of independent pixels that errs a sum of pixels by as much as this loss does."""
-    reach = len(summed.weights) // 2
+def equivalent_white_variance(loss: FloatArray, pixel_sum: PixelSum) -> float:
+    """Variance of independent pixels that displaces a sum of pixels by as much as this loss."""
+    reach = len(pixel_sum.weights) // 2
     waves = np.einsum("ua,vb->uvab", _transform(), _transform())
-    heard = np.zeros((_SIDE, _SIDE, _SIDE + 2 * reach, _SIDE + 2 * reach), dtype=np.complex128)
-    for (row, column), weight in np.ndenumerate(summed.turned()[::-1, ::-1]):
-        heard[:, :, row : row + _SIDE, column : column + _SIDE] += weight * waves
-    power = np.sum(np.abs(heard) ** 2, axis=(2, 3))
+    response = np.zeros((_SIDE, _SIDE, _SIDE + 2 * reach, _SIDE + 2 * reach), dtype=np.complex128)
+    for (row, column), weight in np.ndenumerate(pixel_sum.complex_weights()[::-1, ::-1]):
+        response[:, :, row : row + _SIDE, column : column + _SIDE] += weight * waves
+    power = np.sum(np.abs(response) ** 2, axis=(2, 3))
     return float(np.sum(loss * power) / np.sum(power))
 
 
-def loss_variance(frames: AxisFrames, noise: NoiseModel, code: CodeMap, images: Images, summed: PixelSum) -> float:
-    """What compression adds to the variance of each sample of these images, as positions sum them; 0 for none."""
-    loss = noise.loss
-    if loss is None:
-        loss = frames_loss(frames, code.refusal != Refusal.NOT_LIT, images)
-    return white_equivalent(loss, summed) if loss.any() else 0.0
+def frame_compression_loss(frames: AxisFrames, lit: NDArray[np.bool_], images: Images | None = None) -> FloatArray:
+    """Return `compression_loss` of these images of one camera and axis; by default of the patterns that determine
+    gamma.
 
-
-def frames_loss(frames: AxisFrames, lit: NDArray[np.bool_], images: Images | None = None) -> FloatArray:
-    """`compression_loss` of these images, of one camera and axis; by default of those that tell what the camera makes
-    of light. lit : (H, W) bool.
+    lit : (H, W) bool.
     """
-    telling, lines = telling_bits(len(frames.bits)), frames.telling_lines
-    direct = [frames.bits[bit] for bit in telling] if lines is None else lines[0]
-    told_by = direct + (lines[1] if lines is not None else [])
+    bits, lines = telling_bits(len(frames.bits)), frames.line_pairs
+    direct = [frames.bits[bit] for bit in bits] if lines is None else lines[0]
+    searched = direct + (lines[1] if lines is not None else [])
     if frames.inverses is not None:
-        told_by += [frames.inverses[bit] for bit in telling]
-    return compression_loss(direct if images is None else images, told_by, lit, frames.full_scale)
+        searched += [frames.inverses[bit] for bit in bits]
+    return compression_loss(direct if images is None else images, searched, lit, frames.full_scale)
 
 
 @cache
 def _transform() -> FloatArray:
-    """(8, 8) float64: the cosine transform, orthonormal; row u is wave u."""
+    """(8, 8) float64: orthonormal cosine transform; row u is wave u."""
     u, x = np.mgrid[:_SIDE, :_SIDE]
     return np.asarray(np.where(u == 0, np.sqrt(1 / 8), 0.5) * np.cos(np.pi * (2 * x + 1) * u / 16))
 
 
 @cache
-def _steps() -> tuple[FloatArray, NDArray[np.float32], IntArray]:
-    """(s,) steps that are tried; (bins, s) float32, the cosine at each size of coefficient that does not round to zero;
-    (s,) int32, how many bins do.
+def _candidate_steps() -> tuple[FloatArray, NDArray[np.float32], IntArray]:
+    """(s,) candidate steps; (bins, s) float32, cosine at each magnitude not rounded to zero; (s,) int32, number of
+    other bins.
     """
-    whole = np.arange(2.0, _LARGEST_STEP + 1)
+    whole = np.arange(2.0, _MAX_STEP + 1)
     steps = np.concatenate([whole, whole * _LIMITED_RANGE])
     size = (np.arange(_QUOTIENT_BINS)[:, np.newaxis] + 0.5) * _BIN
     zero = size <= steps / 2
@@ -311,158 +610,135 @@ def _steps() -> tuple[FloatArray, NDArray[np.float32], IntArray]:
     return steps, cosine, np.sum(zero, axis=0, dtype=np.int32)
 
 
-def _tiles(image: NDArray[Any]) -> NDArray[Any]:
-    """(rows, columns, 8, 8): the blocks of an image, without what is left at its right and lower border."""
+def _blocks(image: NDArray[Any]) -> NDArray[Any]:
+    """(rows, columns, 8, 8): blocks of an image, without the remainder at its right and lower border."""
     rows, columns = (each // _SIDE for each in image.shape)
     whole = image[: rows * _SIDE, : columns * _SIDE]
     return whole.reshape(rows, _SIDE, columns, _SIDE).swapaxes(1, 2)
 
 
-def _sizes(images: Images, lit: IntArray, full_scale: float | None) -> NDArray[np.float32]:
-    """(n, 64): sizes of the coefficients of a sample of blocks of all images; not of those that are clipped between 0
-    and full_scale, if that is given. lit : (m, 2), row and column of the blocks to choose from.
+def _coefficient_magnitudes(images: Images, lit: IntArray, full_scale: float | None) -> NDArray[np.float32]:
+    """(n, 64): magnitudes of the coefficients of a sample of blocks of all images.
+
+    lit : (m, 2), row and column of the blocks to choose from. full_scale : leave out blocks clipped at 0 or full_scale;
+    None to use all.
     """
-    row, column = lit[:: max(1, -(-len(lit) * len(images) // _MOST_BLOCKS))].T
-    sample = np.concatenate([_tiles(image)[row, column] for image in images]).reshape(-1, _SIDE * _SIDE)
+    row, column = lit[:: max(1, -(-len(lit) * len(images) // _MAX_BLOCKS))].T
+    sample = np.concatenate([_blocks(image)[row, column] for image in images]).reshape(-1, _SIDE * _SIDE)
     if full_scale is not None:
         sample = sample[((sample > 0) & (sample < full_scale)).all(axis=1)]
     waves = np.kron(_transform(), _transform()).astype(np.float32)
     return np.asarray(np.abs(sample.astype(np.float32, copy=False) @ waves.T))
 
 
-def _found_steps(size: NDArray[np.float32]) -> FloatArray:
-    """(64,) float64: the step of each coefficient but the mean, 0 where none shows. size : (n, 64)."""
-    steps, cosine, zeros = _steps()
+def _quantisation_steps(size: NDArray[np.float32]) -> FloatArray:
+    """(64,) float64: step of each coefficient except the mean, 0 if none is detected. size : (n, 64)."""
+    steps, cosine, zeros = _candidate_steps()
     at = np.minimum((size / _BIN).astype(np.intp), _QUOTIENT_BINS - 1) + _QUOTIENT_BINS * np.arange(size.shape[1])
     counts = (
         np.bincount(at.ravel(), minlength=_QUOTIENT_BINS * size.shape[1]).reshape(-1, _QUOTIENT_BINS).astype(np.float32)
     )
     counts[:, -1] = 0
     below = np.cumsum(counts, axis=1)
-    near, all_zeros, every = below[:, _NEAR_ZERO, np.newaxis], below[:, zeros - 1], below[:, -1:]
-    # A larger step than the true one finds multiples by chance among few coefficients, and others where none can be.
-    possible = (every - all_zeros >= _LEAST_ROUNDED) & (all_zeros - near <= _MOST_ASTRAY * (every - near))
-    clustered = np.divide(counts @ cosine, every - all_zeros, out=np.zeros_like(all_zeros), where=possible)
+    near, all_zeros, total = below[:, _NEAR_ZERO, np.newaxis], below[:, zeros - 1], below[:, -1:]
+    # A larger step than the true one finds multiples by chance among few coefficients, and others where there can be
+    # none.
+    possible = (total - all_zeros >= _MIN_NONZERO) & (all_zeros - near <= _MAX_ASTRAY * (total - near))
+    clustered = np.divide(counts @ cosine, total - all_zeros, out=np.zeros_like(all_zeros), where=possible)
     best = np.argmax(clustered, axis=1)
     step = steps[best]
     centres = (np.arange(_QUOTIENT_BINS) + 0.5) * _BIN
     beyond = np.sum(counts * (centres > 1.5 * step[:, np.newaxis]), axis=1)
     different = np.sum((counts > 0) & (centres > 0.5 * step[:, np.newaxis]), axis=1)
-    clear = clustered[np.arange(len(best)), best] >= _LEAST_CLUSTERED
-    clear &= (beyond >= _LEAST_BEYOND) & (different >= _LEAST_DIFFERENT)
+    clear = clustered[np.arange(len(best)), best] >= _MIN_CLUSTERING
+    clear &= (beyond >= _MIN_BEYOND) & (different >= _MIN_DIFFERENT)
     clear[0] = False
     return np.where(clear, step, 0.0)
 
 
-_LEAST = 1.2  # chosen: cameras bend by 1.8 and more if at all, and edges of eight scenes by straight ones told 1.00
-_MOST = 4.0
-_AT_EDGE = 0.5  # of the contrast, from its middle
-_ALIKE = 0.15  # of the contrast, between a bit and its inverse: their mean is then the middle to 2 %
-_CLEAR_LEVELS = 20.0  # of 255: of white over black, so that rounding tells nothing of the middle
-_LEAST_EDGES = 500
-_MOST_PIXELS = 200_000
-_TURNS = 20  # each halves what γ may be
-
-
-def found_gamma(frames: AxisFrames) -> float:
-    """How a camera bends light into values, by the edges of the code; 1 where that is not told, or next to nothing."""
+def estimate_gamma(frames: AxisFrames) -> float:
+    """Estimate gamma of a camera from the edges of the code; 1 if they do not determine it, or it is close to 1."""
     if frames.exposure_ratio != 1.0:
         return 1.0
-    full, telling, lines = frames.full_scale, telling_bits(len(frames.bits)), frames.telling_lines
-    # Rows enough: an edge of the code crosses most of them.
-    step = max(1, frames.white.size // _MOST_PIXELS)
+    full, bit_numbers, lines = frames.full_scale, telling_bits(len(frames.bits)), frames.line_pairs
+    # Some rows are enough: an edge of the code crosses most of them.
+    step = max(1, frames.white.size // _MAX_PIXELS)
     if frames.inverses is not None:
-        pairs = [frames.bits[bit] for bit in telling], [frames.inverses[bit] for bit in telling]
+        pairs = [frames.bits[bit] for bit in bit_numbers], [frames.inverses[bit] for bit in bit_numbers]
     elif lines is not None:
         pairs = lines
-    elif frames.lines_halve:
-        found = _sums(frames, step)
+    elif frames.lines_light_half:
+        found = _line_edge_samples(frames, step)
     else:
         return 1.0
     if frames.inverses is not None or lines is not None:
         bits, inverses = ([image[::step] for image in images] for images in pairs)
-        edges = partial(_edges, bits, inverses, full, frames.clipped_at, lines is not None)
+        edges = partial(_bit_edge_samples, bits, inverses, full, frames.clipped_at, lines is not None)
         found = np.concatenate(in_bands(edges, len(bits[0])), axis=1)
     *halves, bright, dark = np.maximum(found, 0).astype(np.float64) / full
-    if len(bright) < _LEAST_EDGES:
+    if len(bright) < _MIN_EDGES:
         return 1.0
 
-    def bends_more(gamma: float) -> bool:
-        # Bent values have the middle too high, and the more so the less is made of γ.
+    def is_below(gamma: float) -> bool:
+        # Non-linear values have the middle too high, less so the closer `gamma` is.
         middle = 2 * np.mean([half**gamma for half in halves], axis=0)
         return bool(np.median((middle - bright**gamma - dark**gamma) / bright**gamma) > 0)
 
-    low, high = _LEAST, _MOST
-    if not bends_more(low):
+    low, high = _MIN_GAMMA, _MAX_GAMMA
+    if not is_below(low):
         return 1.0
-    for _ in range(_TURNS):
+    for _ in range(_GAMMA_ITERATIONS):
         gamma = float(np.sqrt(low * high))
-        if bends_more(gamma):
+        if is_below(gamma):
             low = gamma
         else:
             high = gamma
     return low
 
 
-def _sums(frames: AxisFrames, step: int) -> NDArray[np.float32]:
-    """(lines + 2, n): where one of the lines that light half of their period has an edge, in every so many rows, all of
-    them, and white and black as single bits show them.
+def _line_edge_samples(frames: AxisFrames, step: int) -> NDArray[np.float32]:
+    """(lines + 2, n): in every `step` rows, all lines at the edges of any, for lines of half their period; white and
+    black as single bits show them.
     """
     lines, bits = ([image[::step] for image in images] for images in (frames.lines, frames.bits))
-    told = [bits[bit] for bit in telling_bits(len(bits))]
-    shown, seen = rows_of(lines), rows_of(told)
-    white, black = seen.max(axis=0), seen.min(axis=0)
-    clear = (white - black > _CLEAR_LEVELS / 255 * frames.full_scale) & (white < frames.clipped_at)
-    clear &= (np.abs(2 * shown - white - black) < _AT_EDGE * (white - black)).any(axis=0)
-    return np.concatenate([shown[:, clear], [white[clear], black[clear]]])
+    selected = [bits[bit] for bit in telling_bits(len(bits))]
+    line_values, bit_values = stack_rows(lines), stack_rows(selected)
+    white, black = bit_values.max(axis=0), bit_values.min(axis=0)
+    clear = (white - black > _MIN_CONTRAST_LEVELS / 255 * frames.full_scale) & (white < frames.clipped_at)
+    clear &= (np.abs(2 * line_values - white - black) < _EDGE_SHARE * (white - black)).any(axis=0)
+    return np.concatenate([line_values[:, clear], [white[clear], black[clear]]])
 
 
-def _edges(
+def _bit_edge_samples(
     bits: Images, inverses: Images, full: float, clipped_at: float, apart: bool, first: int, last: int
 ) -> NDArray[np.float32]:
     """(3, n): at edges of the code in some rows, the mean of a bit and its inverse, white and black.
 
-    apart : where one pair has its edges, another has none.
+    apart : True if the pairs have their edges at different places.
     """
-    direct, inverted = rows_of(bits, slice(first, last)), rows_of(inverses, slice(first, last))
-    # At most bits a pixel is clear of edges. White does not tell: projectors may dim a picture that is all white.
+    direct, inverted = stack_rows(bits, slice(first, last)), stack_rows(inverses, slice(first, last))
+    # In most bits a pixel is clear of edges. White frames do not serve: projectors may dim a picture that is all white.
     bright, dark = np.maximum(direct, inverted), np.minimum(direct, inverted)
-    white, black = (bright.max(axis=0), dark.min(axis=0)) if apart else (_middle(bright), _middle(dark))
-    clear = (white - black > _CLEAR_LEVELS / 255 * full) & (white < clipped_at)
+    white, black = (bright.max(axis=0), dark.min(axis=0)) if apart else (_median_image(bright), _median_image(dark))
+    clear = (white - black > _MIN_CONTRAST_LEVELS / 255 * full) & (white < clipped_at)
     found = []
     for bit, inverse in zip(direct, inverted, strict=True):
-        alike = clear & (np.abs(bit - inverse) < _ALIKE * (white - black))
-        found.append(np.stack([(bit[alike] + inverse[alike]) / 2, white[alike], black[alike]]))
+        is_edge = clear & (np.abs(bit - inverse) < _MAX_DIFFERENCE * (white - black))
+        found.append(np.stack([(bit[is_edge] + inverse[is_edge]) / 2, white[is_edge], black[is_edge]]))
     return np.concatenate(found, axis=1)
 
 
-def _middle(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The median image; `np.median` takes twice as long for few images."""
+def _median_image(images: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Median image; `np.median` takes twice as long for few images."""
     images.sort(axis=0)
     count = len(images)
     return np.asarray((images[(count - 1) // 2] + images[count // 2]) / 2)
 
 
-def in_light(stacks: FrameStacks, limits: DecodingLimits) -> tuple[AxisFrames, NoiseModel, float]:
-    """The frames so far in proportion to light, their noise, and how the camera had bent them; `stacks` goes on so.
+def linearisation_gain(light: Iterable[NDArray[Any]], gamma: float, full_scale: float) -> float:
+    """Factor on the variance of an error by linearisation, on average: the mean square slope, 1 for γ = 1.
 
-    The noise has the loss of the camera's own values, of which `gain` makes one of light.
-    """
-    frames = stacks.frames()
-    noise, gamma = estimate_noise(frames), found_gamma(frames)
-    if gamma == 1:
-        return frames, noise, gamma
-    # What compression took is seen in its own values only.
-    loss = frames_loss(frames, lit_pixels(frames, noise, limits))
-    stacks.straighten(gamma)
-    frames = stacks.frames()
-    return frames, replace(estimate_noise(frames), loss=loss), gamma
-
-
-def gain(light: Iterable[NDArray[Any]], gamma: float, full_scale: float) -> float:
-    """By what an error's variance grew on average where values were made straight: the mean square slope, 1 for γ = 1.
-
-    light : straight values of one full scale, as many of each image. Light v^γ has the slope γ v^(γ - 1) over the
+    light : linear values of one full scale, the same number of each image. Light v^γ has the slope γ v^(γ - 1) over the
     value v.
     """
     if gamma == 1:

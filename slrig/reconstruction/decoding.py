@@ -1,9 +1,9 @@
-"""Gray-code decoding with a cause for every refused pixel, unresolved bits, and the mask of the scan region.
+"""Gray-code decoding with a cause for every refused pixel, unresolved bits and lines, and the mask of the scan region.
 
-A bit is read by comparing it with its inverse (or with the middle of white and black) against a margin that the
-noise sets. A bit inside the margin is ambiguous; the pixel is then known to an interval of cells. One such bit at
-its own code edge gives two neighbouring cells and does no harm; a finest bit lost in blur costs resolution only;
-anywhere else the interval is wide and the pixel is refused.
+A bit is read by comparing it with its inverse (or with the middle of white and black) against a margin set by noise. A
+bit inside the margin is ambiguous; the pixel then has an interval of cells. One such bit at its own code edge gives two
+neighbouring cells and does no harm; a finest bit lost in blur costs resolution only; in all other cases the interval is
+wide and the pixel is refused.
 """
 
 from __future__ import annotations
@@ -17,25 +17,46 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
 from slrig.model import FloatArray, IntArray, Refusal
-from slrig.reconstruction.frames import AxisFrames, band_rows, rows_of
-from slrig.reconstruction.noise import NoiseModel
+from slrig.reconstruction.camera_response import NoiseModel
+from slrig.reconstruction.frames import AxisFrames, rows_per_band, stack_rows
 
 _NOT_LIT = int(Refusal.NOT_LIT)
 _SATURATED = int(Refusal.SATURATED)
 _AMBIGUOUS_BIT = int(Refusal.AMBIGUOUS_BIT)
 _BEYOND_PROJECTOR = int(Refusal.BEYOND_PROJECTOR)
-_MOST_UNCERTAIN_BITS = 4  # each doubles the words that a pixel may show, all of which are looked up
+_MAX_UNCERTAIN_BITS = 4  # each doubles the number of words to look up
+
+_REACH_PX = 8
+"""Distance of pixels on which a point depends: fits reach 2 px, filters 9 px, with little weight."""
+
+# Unresolved bits and lines.
+BLOCK_PX = 32
+"""Size of a block: small enough for an even density of the code, with hundreds of passages of each bit."""
+_MIN_PASSAGES = 48
+"""With fewer passages, a bit counts as resolved."""
+_MIN_CORRECT = 0.7
+"""Share of the passages of cells with the right change of a bit. Random bits have it in a quarter of passages."""
+_MIN_PASSAGE_PX = 2.0
+"""Mean length of a passage of both halves of a cell: each pixel then has one code edge at most."""
+_MAX_UNRESOLVED_BITS = 3
+"""If more bits were left out, the image does not show the code."""
+_MIN_FOUND = 0.5
+"""Share of the points of lines; chosen between 0.9 where lines are resolved and 0.15 where they blur into each other.
+"""
+_MIN_LINE_POINTS = 200
+"""Points to expect in a block and its neighbours; with fewer, lines count as resolved."""
+_BLOCK_ROWS_PER_BAND = 4  # rows of blocks in a band, which needs memory for each pixel
+_MAX_STEP_CELLS = 2.0  # cells from pixel to pixel; more is a depth step
 
 
 @dataclass(frozen=True, slots=True)
 class DecodingLimits:
-    """When a pixel is lit and a bit is certain.
+    """Thresholds for lit pixels and certain bits.
 
-    lit_sigma : white must exceed black by this many standard deviations of their difference,
-    lit_fraction : and by this fraction of full scale.
-    bit_sigma : a bit must differ from its inverse by this many standard deviations of the difference,
-    bit_fraction : and by this fraction of the pixel's contrast.
-    widest_interval : the greatest hi - lo, in cells, that still counts as decoded.
+    lit_sigma : white must exceed black by this many standard deviations of their difference, lit_fraction : and by this
+    fraction of full scale. bit_sigma : a bit must differ from its inverse by this many standard deviations of the
+    difference, bit_fraction : and by this fraction of the pixel's contrast. widest_interval : largest hi - lo, in
+    cells, that counts as decoded.
     """
 
     lit_sigma: float = 6.0
@@ -46,7 +67,7 @@ class DecodingLimits:
 
 
 class CodeMap(NamedTuple):
-    """For each camera pixel the interval of code cells that it may show, both ends included.
+    """Interval of code cells of each camera pixel, both ends included.
 
     lowest, highest : (H, W) int32, -1 where refused; refusal : (H, W) uint8, `Refusal`.
     """
@@ -56,20 +77,20 @@ class CodeMap(NamedTuple):
     refusal: NDArray[np.uint8]
 
     def rows(self, rows: slice) -> CodeMap:
-        """Some rows of the map, to look at or to fill in."""
+        """Select rows, as views."""
         return CodeMap(self.lowest[rows], self.highest[rows], self.refusal[rows])
 
     def centre(self) -> NDArray[np.float64]:
-        """(H, W) float64: the middle of the interval in cells, NaN where refused."""
+        """(H, W) float64: middle of the interval in cells, NaN where refused."""
         middle = (self.lowest + self.highest) / 2
         return np.where(self.refusal == 0, middle, np.nan)
 
 
 def lit_pixels(frames: AxisFrames, noise: NoiseModel, limits: DecodingLimits, /) -> NDArray[np.bool_]:
-    """(H, W) bool: where white stands out of black."""
+    """(H, W) bool: True where white exceeds black significantly."""
     spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))
-    least = np.maximum(limits.lit_sigma * spread, limits.lit_fraction * frames.full_scale)
-    return np.asarray(frames.contrast > least)
+    threshold = np.maximum(limits.lit_sigma * spread, limits.lit_fraction * frames.full_scale)
+    return np.asarray(frames.contrast > threshold)
 
 
 def decode(
@@ -84,8 +105,8 @@ def decode(
 ) -> CodeMap:
     """Decode the Gray code of one axis.
 
-    index_of_word : (2^bits,) int32, the cell index of each Gray word; cell_count : cells that the projector shows.
-    unresolved : (H, W) uint8, how many of the finest bits are not read at each pixel; all are read without it.
+    index_of_word : (2^bits,) int32, cell index of each Gray word; cell_count : number of cells of the projector.
+    unresolved : (H, W) uint8, number of finest bits not to read at each pixel; None to read all.
     """
     shape = frames.white.shape
     code = CodeMap(np.full(shape, -1, np.int32), np.full(shape, -1, np.int32), np.zeros(shape, np.uint8))
@@ -96,7 +117,7 @@ def decode(
         rows = slice(first, last)
         _decode_rows(frames.rows(rows), noise.rows(rows), words, cell_count, limits, unread[rows], code.rows(rows))
 
-    in_bands(band, shape[0], rows_at_most=band_rows(frames.bits, 2 * shape[1]))
+    in_bands(band, shape[0], rows_at_most=rows_per_band(frames.bits, 2 * shape[1]))
     return code
 
 
@@ -104,31 +125,34 @@ def _decode_rows(
     frames: AxisFrames, noise: NoiseModel, words: IntArray, cell_count: int, limits: DecodingLimits,
     unread: NDArray[np.uint8], code: CodeMap,
 ) -> None:  # fmt: skip
-    """Fill in the code of some rows."""
+    """Decode some rows into `code`."""
     paired = frames.inverses is not None
-    against = rows_of(frames.inverses) if frames.inverses is not None else frames.middle[None]
+    reference = stack_rows(frames.inverses) if frames.inverses is not None else frames.middle[None]
     spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))
-    # Against the middle of white and black a bit swings half as far as against its inverse.
+    # Against the middle of white and black a bit has half the swing that it has against its inverse.
     swing = 1.0 if paired else 0.5
     margin = np.maximum(limits.bit_sigma * swing * spread, limits.bit_fraction * swing * frames.contrast)
-    if not paired and frames.lines_halve:
-        alone = np.sqrt(noise.variance(frames.white) + noise.variance(against[0]) / np.float32(len(frames.lines)))
-        margin = np.maximum(limits.bit_sigma * alone, limits.bit_fraction * swing * frames.contrast)
+    if not paired and frames.lines_light_half:
+        line_spread = np.sqrt(
+            noise.variance(frames.white) + noise.variance(reference[0]) / np.float32(len(frames.lines))
+        )
+        margin = np.maximum(limits.bit_sigma * line_spread, limits.bit_fraction * swing * frames.contrast)
     _decode_kernel(
-        0, len(unread), rows_of(frames.bits), against, paired, frames.white, lit_pixels(frames, noise, limits), unread,
+        0, len(unread), stack_rows(frames.bits), reference, paired, frames.white,
+        lit_pixels(frames, noise, limits), unread,
         margin.astype(np.float32), np.float32(frames.clipped_at), words, cell_count, limits.widest_interval, *code,
     )  # fmt: skip
 
 
 @kernel
 def _decode_kernel(
-    first: int, last: int, shown: Any, against: Any, paired: bool, white: Any, lit: Any, unread: Any, margin: Any,
-    full_scale: Any, index_of_word: Any,
-    cell_count: int, widest: int, lowest: Any, highest: Any, refusal: Any,
+    first: int, last: int, bit_images: Any, reference: Any, paired: bool, white: Any, lit: Any, unread: Any,
+    margin: Any, full_scale: Any, index_of_word: Any, cell_count: int, widest: int, lowest: Any, highest: Any,
+    refusal: Any,
 ) -> None:  # fmt: skip
-    bits, _, columns = shown.shape
+    bits, _, columns = bit_images.shape
     for y in range(first, last):
-        uncertain = np.zeros(2 * _MOST_UNCERTAIN_BITS, dtype=np.int32)
+        uncertain = np.zeros(2 * _MAX_UNCERTAIN_BITS, dtype=np.int32)
         for x in range(columns):
             if not lit[y, x]:
                 refusal[y, x] = _NOT_LIT
@@ -141,20 +165,20 @@ def _decode_kernel(
             read = bits - unread[y, x]
             clipped = False
             for b in range(bits):
-                seen = shown[b, y, x]
-                other = against[b, y, x] if paired else against[0, y, x]
-                if seen > other:
+                value = bit_images[b, y, x]
+                other = reference[b, y, x] if paired else reference[0, y, x]
+                if value > other:
                     word |= 1 << (bits - 1 - b)
-                if paired and seen >= full_scale and other >= full_scale:
+                if paired and value >= full_scale and other >= full_scale:
                     clipped = True
-                if b >= read or abs(seen - other) < margin[y, x]:
+                if b >= read or abs(value - other) < margin[y, x]:
                     if count < len(uncertain):
                         uncertain[count] = bits - 1 - b
                     count += 1
             if clipped:
                 refusal[y, x] = _SATURATED
                 continue
-            if count > min(_MOST_UNCERTAIN_BITS + unread[y, x], len(uncertain)):
+            if count > min(_MAX_UNCERTAIN_BITS + unread[y, x], len(uncertain)):
                 refusal[y, x] = _AMBIGUOUS_BIT
                 continue
             low = index_of_word[word]
@@ -177,17 +201,13 @@ def _decode_kernel(
                 highest[y, x] = min(high, cell_count - 1)
 
 
-_REACH_PX = 8
-"""What is found at a pixel depends on pixels so far away: fits reach 2 px, and filters 9 px, with next to no weight."""
-
-
 @dataclass(frozen=True, slots=True)
-class AskedPixels:
-    """What is asked of a camera.
+class RegionMask:
+    """Scan region in the image of one camera.
 
-    pixels : (H, W) bool, or None for all; lowest_px, highest_px : (H, W) float32, between which the light's position
-    lies where the pixel's ray is in the region, or None for anywhere; least_contrast : of white less black, as a share
-    of full scale.
+    pixels : (H, W) bool, or None for all; lowest_px, highest_px : (H, W) float32, range of the light position in which
+    the ray of the pixel is inside the region, or None for any; least_contrast : of white less black, as a share of full
+    scale.
     """
 
     pixels: NDArray[np.bool_] | None = None
@@ -195,150 +215,133 @@ class AskedPixels:
     highest_px: NDArray[np.float32] | None = None
     least_contrast: float = 0.0
 
-    def told(self, frames: AxisFrames, code: CodeMap, cell_position: FloatArray) -> NDArray[np.bool_]:
-        """(H, W) bool: the pixels that are asked for. One that shows no code may be.
+    def mask(self, frames: AxisFrames, code: CodeMap, cell_position: FloatArray) -> NDArray[np.bool_]:
+        """(H, W) bool: pixels of the region, pixels without code included.
 
-        cell_position : (cells,) float64, the middle of each cell of the code, px.
+        cell_position : (cells,) float64, middle of each cell of the code, px.
         """
-        asked = np.ones(code.refusal.shape, dtype=np.bool_) if self.pixels is None else self.pixels.copy()
+        inside = np.ones(code.refusal.shape, dtype=np.bool_) if self.pixels is None else self.pixels.copy()
         if self.least_contrast:
-            # What has no light at all is told as that.
+            # Unlit pixels keep their own cause.
             strong = frames.contrast >= np.float32(self.least_contrast * frames.full_scale)
-            asked &= strong | (code.refusal == Refusal.NOT_LIT)
+            inside &= strong | (code.refusal == Refusal.NOT_LIT)
         if self.lowest_px is not None and self.highest_px is not None:
             half = np.float32(frames.gray.cell_px / 2)
             position = cell_position.astype(np.float32)
             within = (position[code.lowest] - half <= self.highest_px) & (
                 position[code.highest] + half >= self.lowest_px
             )
-            asked &= within | (code.lowest < 0)
-        return asked
+            inside &= within | (code.lowest < 0)
+        return inside
 
 
-def without_others(code: CodeMap, asked: NDArray[np.bool_]) -> CodeMap:
-    """The code without the lit pixels that are not asked for, save those on which points that are asked for depend."""
+def refuse_outside_region(code: CodeMap, region: NDArray[np.bool_]) -> CodeMap:
+    """Refuse lit pixels outside the region, except those on which points inside it depend."""
     box = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), dtype=np.uint8)
-    others = (cv2.dilate(asked.view(np.uint8), box) == 0) & (code.refusal != Refusal.NOT_LIT)
-    refusal = np.where(others, np.uint8(Refusal.OUTSIDE_REGION), code.refusal)
-    return CodeMap(np.where(others, -1, code.lowest), np.where(others, -1, code.highest), refusal)
-
-
-BLOCK_PX = 32
-"""Across such a block of a usual surface the density of the code changes little, and a bit has hundreds of chances."""
-_FEWEST_CHANCES = 48
-"""Fewer tell nothing: the bit then counts as the pixels show it."""
-_LEAST_RIGHT = 0.7
-"""Of a cell's passages. Bits at random get a passage of two to four pixels right one time in four or five."""
-_LEAST_PASSAGE_PX = 2.0
-"""Of both halves of a cell: each pixel then sees one edge of the code at most."""
-_MOST_BITS = 3
-"""Where more would have to go the code itself is not seen."""
-_LEAST_FOUND = 0.5
-"""Of the lines' points. Resolved blocks of rendered plates have 0.9 to 1.0, those where lines blur into one another
-0.02 to 0.15, and where the one passes into the other 0.6."""
-_FEWEST_LINES = 200
-"""Points to be found in a block and its neighbours; fewer tell nothing."""
-_BLOCKS_AT_ONCE = 4  # rows of blocks, of which a band holds some numbers for every pixel
-_WIDEST_STEP = 2.0  # cells from pixel to pixel; more is a step of depth
+    outside = (cv2.dilate(region.view(np.uint8), box) == 0) & (code.refusal != Refusal.NOT_LIT)
+    refusal = np.where(outside, np.uint8(Refusal.OUTSIDE_REGION), code.refusal)
+    return CodeMap(np.where(outside, -1, code.lowest), np.where(outside, -1, code.highest), refusal)
 
 
 def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np.uint8]:
-    """(H, W) uint8: how many of the finest bits the camera does not resolve there.
+    """(H, W) uint8: number of finest bits that the camera does not resolve.
 
-    lit : (H, W) bool, pixels that the projector lights. Where more than 3 would have to be left out the code itself is
-    not seen, as in light from elsewhere, and 0 stands.
+    lit : (H, W) bool, pixels that the projector lights. It is 0 where more than 3 would be left out: such pixels do not
+    show the code, but light from elsewhere.
     """
     lit = lit & (frames.white < frames.clipped_at)
     bits = len(frames.bits)
-    against = frames.inverses if frames.inverses is not None else [frames.middle] * bits
+    reference = frames.inverses if frames.inverses is not None else [frames.middle] * bits
     word = np.zeros(lit.shape, dtype=np.int32)
-    for shown, other in zip(frames.bits, against, strict=True):
+    for bit_image, other in zip(frames.bits, reference, strict=True):
         word <<= 1
-        word |= shown > other
+        word |= bit_image > other
     blocks = tuple(-(-extent // BLOCK_PX) for extent in lit.shape)
     unresolved = np.zeros(blocks, dtype=np.uint8)
-    # Columns of a transposed copy lie behind one another in memory.
-    both_ways = (word, lit), (np.ascontiguousarray(word.T), np.ascontiguousarray(lit.T))
-    for finest in range(min(_MOST_BITS + 1, bits - 1)):
-        along, down = (_tally(*each, finest) for each in both_ways)
-        chances, pixels, several, right = (_with_neighbours(each) for each in along + down.swapaxes(1, 2))
-        blind = (right < _LEAST_RIGHT * several) | (pixels < _LEAST_PASSAGE_PX * chances)
-        blind &= (chances >= _FEWEST_CHANCES) & (unresolved == finest)
-        if not blind.any():
+    # Columns of a transposed copy are contiguous in memory.
+    directions = (word, lit), (np.ascontiguousarray(word.T), np.ascontiguousarray(lit.T))
+    for finest in range(min(_MAX_UNRESOLVED_BITS + 1, bits - 1)):
+        along_rows, along_columns = (_count_passages(*each, finest) for each in directions)
+        passages, pixels, long_passages, correct = (
+            _add_neighbours(each) for each in along_rows + along_columns.swapaxes(1, 2)
+        )
+        is_unresolved = (correct < _MIN_CORRECT * long_passages) | (pixels < _MIN_PASSAGE_PX * passages)
+        is_unresolved &= (passages >= _MIN_PASSAGES) & (unresolved == finest)
+        if not is_unresolved.any():
             break
-        unresolved[blind] += 1
-    unresolved[unresolved > _MOST_BITS] = 0
+        unresolved[is_unresolved] += 1
+    unresolved[unresolved > _MAX_UNRESOLVED_BITS] = 0
     rows, columns = (np.arange(extent) // BLOCK_PX for extent in lit.shape)
     return unresolved[np.ix_(rows, columns)]
 
 
-def lost_lines(
+def unresolved_lines(
     points_px: FloatArray, code: CodeMap, usable: NDArray[np.bool_], lines_per_cell: float, /
 ) -> NDArray[np.bool_] | None:
-    """(H, W) bool: where the camera does not resolve the lines that the code says are there; None if nowhere.
+    """(H, W) bool: True where the camera does not resolve the lines that the code predicts; None if nowhere.
 
-    points_px : (n, 2), the points of lines that were found and numbered; usable : (H, W) bool, where light of two
-    surfaces does not mix; lines_per_cell : frames' lines whose centres lie in one code cell. On the way along a row of
-    pixels each line makes one point, or along a column where stripes run rather across the image.
+    points_px : (n, 2), numbered points of lines; usable : (H, W) bool, pixels whose light is of one surface;
+    lines_per_cell : lines of all frames per code cell. Along a row of pixels each line makes one point, or along a
+    column if stripes run rather across the image.
     """
-    wanted = _passed(code, usable) * lines_per_cell
+    expected = _cells_per_block(code, usable) * lines_per_cell
     columns, rows = (np.rint(points_px).astype(np.intp) // BLOCK_PX).T
-    found = np.bincount(rows * wanted.shape[1] + columns, minlength=wanted.size).reshape(wanted.shape)
-    wanted, found = _with_neighbours(wanted), _with_neighbours(found)
-    lost = (found < _LEAST_FOUND * wanted) & (wanted >= _FEWEST_LINES)
-    if not lost.any():
+    found = np.bincount(rows * expected.shape[1] + columns, minlength=expected.size).reshape(expected.shape)
+    expected, found = _add_neighbours(expected), _add_neighbours(found)
+    unresolved = (found < _MIN_FOUND * expected) & (expected >= _MIN_LINE_POINTS)
+    if not unresolved.any():
         return None
     rows, columns = (np.arange(extent) // BLOCK_PX for extent in usable.shape)
-    return lost[np.ix_(rows, columns)]
+    return unresolved[np.ix_(rows, columns)]
 
 
-def _passed(code: CodeMap, usable: NDArray[np.bool_]) -> FloatArray:
-    """(block rows, block columns): cells of the code passed on the way along the rows of pixels in each block, or along
-    the columns if those are more.
+def _cells_per_block(code: CodeMap, usable: NDArray[np.bool_]) -> FloatArray:
+    """(block rows, block columns): code cells passed along the rows of pixels of each block, or along its columns if
+    these are more.
     """
     shape = code.refusal.shape
     blocks = tuple(-(-extent // BLOCK_PX) for extent in shape)
     across, down = np.zeros(blocks), np.zeros(blocks)
 
     def band(first: int, last: int) -> None:
-        # And the row above, from which the way leads into the band.
+        # With the row above, for the step into the band.
         above, begin = max(first * BLOCK_PX - 1, 0), first * BLOCK_PX
         rows = slice(above, min(last * BLOCK_PX, shape[0]))
         known = usable[rows] & (code.refusal[rows] == 0)
         cell = np.where(known, (code.lowest[rows] + code.highest[rows]).astype(np.float32) / 2, np.float32(np.nan))
-        own = cell[begin - above :]
-        across[first:last] = _in_blocks(np.diff(own, axis=1, prepend=np.float32(np.nan)))
-        down[first:last] = _in_blocks(np.diff(cell, axis=0) if begin else np.diff(cell, axis=0, prepend=cell[:1]))
+        band_cells = cell[begin - above :]
+        across[first:last] = _sum_blocks(np.diff(band_cells, axis=1, prepend=np.float32(np.nan)))
+        down[first:last] = _sum_blocks(np.diff(cell, axis=0) if begin else np.diff(cell, axis=0, prepend=cell[:1]))
 
-    in_bands(band, blocks[0], rows_at_most=_BLOCKS_AT_ONCE)
+    in_bands(band, blocks[0], rows_at_most=_BLOCK_ROWS_PER_BAND)
     return np.maximum(across, down)
 
 
-def _in_blocks(steps: NDArray[np.float32]) -> FloatArray:
-    """(block rows, block columns): cells of the code that steps from pixel to pixel pass in each block."""
+def _sum_blocks(steps: NDArray[np.float32]) -> FloatArray:
+    """(block rows, block columns): code cells passed by steps between pixels, in each block."""
     steps = np.abs(steps, out=steps)
-    steps[~(steps <= _WIDEST_STEP)] = 0
+    steps[~(steps <= _MAX_STEP_CELLS)] = 0
     rows, columns = (np.arange(0, extent, BLOCK_PX) for extent in steps.shape)
     return np.add.reduceat(np.add.reduceat(steps, rows, axis=0), columns, axis=1).astype(np.float64)
 
 
-def _tally(word: NDArray[np.int32], lit: NDArray[np.bool_], finest: int) -> NDArray[np.int64]:
-    """(4, block rows, block columns) int64: passages, their pixels, passages of several pixels, right ones."""
+def _count_passages(word: NDArray[np.int32], lit: NDArray[np.bool_], finest: int) -> NDArray[np.int64]:
+    """(4, block rows, block columns) int64: passages, their pixels, passages of several pixels, correct ones."""
     counts = np.zeros((4, *(-(-extent // BLOCK_PX) for extent in word.shape)), dtype=np.int64)
-    in_bands(_tally_kernel, counts.shape[1], word, lit, finest, counts)
+    in_bands(_passages_kernel, counts.shape[1], word, lit, finest, counts)
     return counts
 
 
-def _with_neighbours(counts: NDArray[Any]) -> NDArray[Any]:
-    """The sums over each block and the eight about it."""
+def _add_neighbours(counts: NDArray[Any]) -> NDArray[Any]:
+    """Sum of each block and its eight neighbours."""
     wide = np.pad(counts, 1)
     down = wide[:-2] + wide[1:-1] + wide[2:]
     return np.asarray(down[:, :-2] + down[:, 1:-1] + down[:, 2:])
 
 
 @kernel(in_every_scan=False)
-def _tally_kernel(first: int, last: int, word: Any, lit: Any, finest: int, counts: Any) -> None:
-    """Walk the rows of blocks; see `_tally`."""
+def _passages_kernel(first: int, last: int, word: Any, lit: Any, finest: int, counts: Any) -> None:
+    """Count along the rows of pixels: see `_count_passages`."""
     rows, columns = word.shape
     for block in range(first, last):
         for y in range(block * BLOCK_PX, min((block + 1) * BLOCK_PX, rows)):
@@ -360,7 +363,7 @@ def _tally_kernel(first: int, last: int, word: Any, lit: Any, finest: int, count
                         rose = half_here > half
                     half = half_here
                     continue
-                # A passage: from one neighbouring cell through this one to the other.
+                # A passage leads from one neighbouring cell through this one to the other.
                 if cell >= 0 and before >= 0 and here >= 0 and (before < cell) == (cell < here):
                     at = (begin + x - 1) // 2 // BLOCK_PX
                     counts[0, block, at] += 1

@@ -1,9 +1,9 @@
-"""One set of curves from several cameras, their redundancy, and their disagreement.
+"""Merging of curves from several cameras, their redundancy, and their disagreement.
 
-A projector ray meets one surface point, so on a light sheet the depth is a function of the projector row. Curves of one
-code from two cameras sample the same function: they are merged by row. Where both have it, the point is the mean
-weighted by inverse variance, and their distance, in standard deviations and in pixels, is a live check of the
-calibration; where one has it alone, it fills the gap. Never two sheets.
+A projector ray meets one surface point, so on a light sheet depth is a function of the projector row. Curves of one
+position from two cameras sample the same function, and are merged by row. Where both have it, the point is the mean
+weighted by inverse variance, and their distance, in standard deviations and in pixels, checks the calibration. Where
+only one has it, it fills the gap. The result is never two sheets.
 """
 
 from __future__ import annotations
@@ -21,16 +21,29 @@ from slrig.model import Axis, FloatArray, IntArray, Pinhole, Size, Source
 from slrig.reconstruction.triangulation import SheetCurves, project
 
 _ALL = int(Source.ALL)
-_SAME_POINT_SIGMA = 12.0  # beyond this the two saw different things; the mean would be neither
+_SAME_POINT_SIGMA = 12.0  # beyond this the cameras saw different surfaces, which must not be averaged
+
+MAP_CELLS = 6  # along each side of the map, as for residuals of a calibration
+MIN_PAIRS = 20  # the mean of a cell is then known to a quarter of the scatter
+_STEPS = 32  # segments to search for the foot of a perpendicular
+_TANGENT_REACH = 2  # points either way, for the direction of a stripe
+_OUTLIER_SIGMA = 12.0  # robust standard deviations, as for merging: further points are of different surfaces
+DEVIATIONS_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+
+MIN_POINTS = 100
+"""Common points of two cameras; fewer hardly show the same surface."""
+
+MAX_OVER_SIGMA = 3.0
+"""Beyond this the stated deviations do not explain the distances."""
 
 
 @dataclass(frozen=True, slots=True)
 class MergedCurves:
-    """Curves of all cameras, and what the redundancy says.
+    """Curves of all cameras, and the distances between them.
 
-    camera : (n,) int32, index of the camera whose pixel the point has.
-    residual_sigma : (m,) float64, distance between two cameras' points of one ray over its standard deviation.
-    residual_mm : (m,) float64, the same distance, signed towards the first camera.
+    camera : (n,) int32, index of the camera whose pixel the point has. residual_sigma : (m,) float64, distance between
+    the points of two cameras on one ray over its standard deviation. residual_mm : (m,) float64, the same distance,
+    signed towards the first camera.
     """
 
     curves: SheetCurves
@@ -39,27 +52,24 @@ class MergedCurves:
     residual_mm: FloatArray
 
 
-def merged(parts: list[SheetCurves], centre_mm: FloatArray, /, *, widest_gap_px: float) -> MergedCurves:
+def merge_curves(parts: list[SheetCurves], centre_mm: FloatArray, /, *, widest_gap_px: float) -> MergedCurves:
     """Merge the curves of several cameras along each light sheet.
 
     centre_mm : (3,) float64, the projector's centre; widest_gap_px : rows between two consecutive points of one camera
-    up to which the curve between them counts as seen.
+    up to which the curve between them counts as measured.
     """
     result, camera = parts[0], np.zeros(len(parts[0].points_mm), dtype=np.int32)
     sigmas, distances = [], []
     for index, part in enumerate(parts[1:], start=1):
-        result, camera, sigma, distance = _merged_pair(result, camera, part, index, centre_mm, widest_gap_px)
+        result, camera, sigma, distance = _merge_pair(result, camera, part, index, centre_mm, widest_gap_px)
         sigmas.append(sigma)
         distances.append(distance)
     return MergedCurves(
-        result,
-        camera,
-        np.concatenate([np.zeros(0), *sigmas]),
-        np.concatenate([np.zeros(0), *distances]),
+        result, camera, np.concatenate([np.zeros(0), *sigmas]), np.concatenate([np.zeros(0), *distances])
     )
 
 
-def _merged_pair(
+def _merge_pair(
     first: SheetCurves,
     camera: NDArray[np.int32],
     second: SheetCurves,
@@ -67,52 +77,52 @@ def _merged_pair(
     centre_mm: FloatArray,
     widest_gap_px: float,
 ) -> tuple[SheetCurves, NDArray[np.int32], FloatArray, FloatArray]:
-    first, order_first = by_row(first)
-    second, _ = by_row(second)
+    first, order_first = sort_by_row(first)
+    second, _ = sort_by_row(second)
     camera = camera[order_first]
     offset = int(first.stripe.max(initial=-1)) + 1
     positions = np.union1d(first.position_px, second.position_px)
-    a, b = _spread(first, positions), _spread(second, positions)
-    fused, spread, source, sigma, distance = _fuse_kernel(
+    a, b = _common_offsets(first, positions), _common_offsets(second, positions)
+    fused, deviation, source, sigma, distance = _fuse_kernel(
         a, first.points_mm, first.deviation_mm, first.along_px, first.source,
         b, second.points_mm, second.deviation_mm, second.along_px, second.bridge_after, centre_mm, widest_gap_px,
     )  # fmt: skip
-    alone = _alone_kernel(a, first.along_px, first.bridge_after, b, second.along_px, widest_gap_px)
-    # Concatenate, then sort each sheet by row; the sort is stable, so equal rows keep the first camera first.
+    unmatched = _unmatched_kernel(a, first.along_px, first.bridge_after, b, second.along_px, widest_gap_px)
+    # Concatenate, then sort each sheet by row. The sort is stable, so for equal rows the first camera comes first.
     curve = np.concatenate([np.repeat(np.arange(len(positions)), np.diff(a)),
-                            np.repeat(np.arange(len(positions)), np.diff(b))[alone]])  # fmt: skip
-    along = np.concatenate([first.along_px, second.along_px[alone]])
+                            np.repeat(np.arange(len(positions)), np.diff(b))[unmatched]])  # fmt: skip
+    along = np.concatenate([first.along_px, second.along_px[unmatched]])
     order = np.lexsort((along, curve))
-    bridge = np.concatenate([first.bridge_after, second.bridge_after[alone]])[order]
+    bridge = np.concatenate([first.bridge_after, second.bridge_after[unmatched]])[order]
     along = along[order]
-    stripe = np.concatenate([first.stripe, second.stripe[alone] + offset])[order]
-    # A step joins two stripes when they differ; a hole that the other camera filled is no bridge any more.
+    stripe = np.concatenate([first.stripe, second.stripe[unmatched] + offset])[order]
+    # A step joins two stripes when they differ. A hole that the other camera filled is not a bridge.
     joins = bridge | np.append(stripe[1:] != stripe[:-1], False)
     within = np.append(np.diff(curve[order]) == 0, False)
-    wide = np.append(np.diff(along), 0.0) > widest_gap_px
+    is_gap = np.append(np.diff(along), 0.0) > widest_gap_px
     result = SheetCurves(
         offsets=np.searchsorted(curve[order], np.arange(len(positions) + 1)).astype(np.int32),
         position_px=positions,
-        points_mm=np.concatenate([fused, second.points_mm[alone]])[order],
-        deviation_mm=np.concatenate([spread, second.deviation_mm[alone]])[order],
+        points_mm=np.concatenate([fused, second.points_mm[unmatched]])[order],
+        deviation_mm=np.concatenate([deviation, second.deviation_mm[unmatched]])[order],
         along_px=along,
-        pixels_px=np.concatenate([first.pixels_px, second.pixels_px[alone]])[order],
+        pixels_px=np.concatenate([first.pixels_px, second.pixels_px[unmatched]])[order],
         stripe=stripe,
-        bridge_after=joins & within & wide,
-        source=np.concatenate([source, second.source[alone]])[order],
+        bridge_after=joins & within & is_gap,
+        source=np.concatenate([source, second.source[unmatched]])[order],
     )
-    cameras = np.concatenate([camera, np.full(int(alone.sum()), index, dtype=np.int32)])[order]
-    seen = np.isfinite(sigma)
-    return result, cameras.astype(np.int32), sigma[seen], distance[seen]
+    cameras = np.concatenate([camera, np.full(int(unmatched.sum()), index, dtype=np.int32)])[order]
+    has_partner = np.isfinite(sigma)
+    return result, cameras.astype(np.int32), sigma[has_partner], distance[has_partner]
 
 
-def by_row(curves: SheetCurves, /) -> tuple[SheetCurves, NDArray[np.intp]]:
-    """The same curves, the points of each by rising `along_px`, and the order that makes them so."""
+def sort_by_row(curves: SheetCurves, /) -> tuple[SheetCurves, NDArray[np.intp]]:
+    """Return the curves with the points of each by rising `along_px`, and the order of the points."""
     order = np.lexsort((curves.along_px, curves.curve_of_point()))
-    return curves.taken(order, offsets=curves.offsets, bridge_after=curves.bridge_after[order]), order
+    return curves.take(order, offsets=curves.offsets, bridge_after=curves.bridge_after[order]), order
 
 
-def _spread(curves: SheetCurves, positions: FloatArray) -> NDArray[np.int32]:
+def _common_offsets(curves: SheetCurves, positions: FloatArray) -> NDArray[np.int32]:
     counts = np.zeros(len(positions), dtype=np.int64)
     counts[np.searchsorted(positions, curves.position_px)] = np.diff(curves.offsets)
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
@@ -144,9 +154,9 @@ def _fuse_kernel(
                 ray[c] = points[i, c] - centre[c]
                 norm += ray[c] * ray[c]
             norm = np.sqrt(norm)
-            # Errors at a given row act along the projector ray: a point displaced in the sheet slides along its
-            # curve until the row is right again, so each deviation counts with its part along the ray, corrected
-            # by the slope of the curve in that ray's direction.
+            # At a given row errors act along the projector ray: a point displaced in the sheet slides along its curve
+            # until the row is right again. So each deviation counts with its part along the ray, corrected by the slope
+            # of the curve in that direction.
             e1 = _along_ray(points, deviation, i, a[curve], a[curve + 1], ray, norm)
             e2 = _along_ray(points2, deviation2, k, b[curve], b[curve + 1], ray, norm)
             gap = 0.0
@@ -169,7 +179,7 @@ def _fuse_kernel(
 
 @kernel_part
 def _along_ray(points: Any, deviation: Any, i: int, first: int, end: int, ray: Any, norm: float) -> float:
-    """Standard deviation of the depth at a fixed row: the deviation less its slide along the curve, on the ray."""
+    """Standard deviation of the depth at a fixed row: the deviation along the ray, less its slide along the curve."""
     before, after = max(first, i - 2), min(end - 1, i + 2)
     tangent = np.zeros(3)
     length = 0.0
@@ -194,9 +204,9 @@ def _along_ray(points: Any, deviation: Any, i: int, first: int, end: int, ray: A
 
 
 @kernel(in_every_scan=False)
-def _alone_kernel(a: Any, along: Any, bridge: Any, b: Any, along2: Any, widest: float) -> Any:
-    """Points of the second camera that lie in no stretch which the first camera has."""
-    alone = np.ones(len(along2), dtype=np.bool_)
+def _unmatched_kernel(a: Any, along: Any, bridge: Any, b: Any, along2: Any, widest: float) -> Any:
+    """Points of the second camera outside the stretches of the first."""
+    unmatched = np.ones(len(along2), dtype=np.bool_)
     for curve in range(len(a) - 1):
         k = a[curve]
         last = a[curve + 1] - 1
@@ -208,26 +218,17 @@ def _alone_kernel(a: Any, along: Any, bridge: Any, b: Any, along2: Any, widest: 
             inside = along[k] <= along2[i] and k < last and along[k + 1] - along[k] <= widest and not bridge[k]
             touching = abs(along[k] - along2[i]) < 0.5 or (k < last and abs(along[k + 1] - along2[i]) < 0.5)
             if inside or touching:
-                alone[i] = False
-    return alone
-
-
-CELLS = 6  # along each side of the map, as in those of a calibration's residuals
-FEWEST_PAIRS = 20  # the mean of a cell is then known to a quarter of their scatter
-_STEPS = 32  # segments that the foot of a perpendicular is looked for on
-_TANGENT_REACH = 2  # points either way, for the direction of a stripe
-_OUTLYING = 12.0  # robust standard deviations, as for points to be merged: two different things, not one
-DEVIATIONS_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+                unmatched[i] = False
+    return unmatched
 
 
 @dataclass(frozen=True, slots=True)
-class SpareEquation:
-    """The spare equation of each point of one camera that another camera's stripe of the same column passes.
+class StripeResiduals:
+    """Redundant equation of each point of one camera whose column another camera sees, too.
 
-    residual_px : (m,) float64, in pixels of the other camera: from where this camera's point projects to the other's
-    stripe, across that stripe, positive towards higher projector positions.
-    sigma_px : (m,) float64, what the stated deviations of both stripes make of it.
-    pixels_px : (m, 2) float64, (x, y) of the point in this camera.
+    residual_px : (m,) float64, distance across the stripe in the other camera, px, from the projection of the point to
+    that stripe, positive towards higher projector positions. sigma_px : (m,) float64, its standard deviation by the
+    stated deviations of both stripes. pixels_px : (m, 2) float64, (x, y) of the point in this camera.
     """
 
     residual_px: FloatArray
@@ -237,12 +238,12 @@ class SpareEquation:
 
 @dataclass(frozen=True, slots=True)
 class PairRedundancy:
-    """The spare equation of two cameras in figures, px of `camera`'s image; the map is over `reference`'s image.
+    """Statistics of the redundant equations of two cameras, px of the image of `camera`; the map covers that of
+    `reference`.
 
-    Points further than 12 robust standard deviations from the median are two different things, not one: they are
-    counted in `outlying` and in nothing else.
-    stated_rms_px : rms that the stated deviations predict for a perfect calibration.
-    map_mean_px, map_rms_px : (6, 6) float64, NaN where fewer than 20 pairs are; map_pairs : (6, 6) int32.
+    Points further than 12 robust standard deviations from the median are of different surfaces: they count in
+    `outlying` only. stated_rms_px : rms to expect from the stated deviations with a perfect calibration. map_mean_px,
+    map_rms_px : (6, 6) float64, NaN where fewer than 20 pairs are; map_pairs : (6, 6) int32.
     """
 
     reference: str
@@ -260,120 +261,123 @@ class PairRedundancy:
 
 @dataclass(frozen=True, slots=True)
 class Redundancy:
-    """The spare equation of every pair of cameras, and, when there is none at all, the reason."""
+    """Redundancy of every pair of cameras, or the reason why there is none."""
 
     pairs: tuple[PairRedundancy, ...]
     reason: str | None
 
 
-def redundancy(
+def evaluate_redundancy(
     parts: list[SheetCurves], devices: Mapping[str, Pinhole], axis: Axis, /, *, widest_gap_px: float
 ) -> Redundancy:
-    """Evaluate the spare equation of every pair of cameras.
+    """Evaluate the redundant equations of every pair of cameras.
 
-    parts : the curves of each camera with the projector's light sheets, before they are merged, in the order of
-    `devices`; axis : the axis the sheets are numbered along; widest_gap_px : rows between two consecutive points of one
-    camera up to which the curve between them counts as seen.
+    parts : curves of each camera with the projector's light sheets, before merging, in the order of `devices`; axis :
+    axis that numbers the sheets; widest_gap_px : as for `merge_curves`.
     """
     if len(devices) < 2:
-        return Redundancy((), "one camera and one axis of patterns: three equations for three unknowns, none to spare")
+        return Redundancy((), "one camera and one axis of patterns give three equations for three unknowns")
     if any((part.source == Source.CAMERA_CAMERA).any() for part in parts):
         reason = (
-            "the projector is not calibrated: the stripe of the second camera is spent on the depth, and the epipolar "
-            "plane chooses the point on it, so no equation is to spare"
+            "the projector is not calibrated: the stripe and the epipolar plane of the second camera are both needed "
+            "for the depth"
         )
         return Redundancy((), reason)
     found = []
     names = list(devices)
     for first, second in combinations(range(len(parts)), 2):
-        spare = spare_equation(parts[first], parts[second], devices[names[second]], axis, widest_gap_px=widest_gap_px)
-        if len(spare.residual_px):
-            found.append(in_figures(spare, names[first], names[second], devices[names[first]].size))
+        residuals = stripe_residuals(
+            parts[first], parts[second], devices[names[second]], axis, widest_gap_px=widest_gap_px
+        )
+        if len(residuals.residual_px):
+            found.append(summarise_pair(residuals, names[first], names[second], devices[names[first]].size))
     return Redundancy(tuple(found), None if found else "the cameras share no point of any light sheet")
 
 
-def spare_equation(
+def stripe_residuals(
     first: SheetCurves, second: SheetCurves, other: Pinhole, axis: Axis, /, *, widest_gap_px: float
-) -> SpareEquation:
-    """Project the points of `first` into the camera `other`, and measure how far off its own stripes `second` are.
+) -> StripeResiduals:
+    """Project the points of `first` into the camera `other`, and measure the distance to its own stripes `second`.
 
-    A point belongs to the stretch of the same column that has its projector row: a row meets one surface point. From
-    there the foot of the perpendicular is looked for along the stripe, so a wrong pose of `other` moves no measurement.
-    Points on a gap or a bridge of the other camera's curve have no partner.
+    A point belongs to the stretch of the same column with its projector row, since a row meets one surface point. From
+    there the foot of the perpendicular is searched along the stripe, so a wrong pose of `other` displaces no
+    measurement. Points at a gap or bridge of the other curve have no partner.
     """
-    first, _ = by_row(first)
-    second, _ = by_row(second)
-    _, mine, theirs = np.intersect1d(first.position_px, second.position_px, return_indices=True)
+    first, _ = sort_by_row(first)
+    second, _ = sort_by_row(second)
+    _, own_index, other_index = np.intersect1d(first.position_px, second.position_px, return_indices=True)
     expected = project(other, first.points_mm)
-    # Displacements by one standard deviation, as the other camera sees them.
-    moved = project(other, first.points_mm + first.deviation_mm) - expected
-    own = project(other, second.points_mm + second.deviation_mm) - project(other, second.points_mm)
+    # Displacements by one standard deviation in the image of the other camera.
+    own_shift = project(other, first.points_mm + first.deviation_mm) - expected
+    other_shift = project(other, second.points_mm + second.deviation_mm) - project(other, second.points_mm)
     residual, sigma = (np.full(len(expected), np.nan) for _ in range(2))
     in_bands(
-        _across_kernel, len(mine), mine, first.offsets, first.along_px, expected, moved,
-        theirs, second.offsets, second.along_px, second.pixels_px, own, second.bridge_after, widest_gap_px,
+        _residual_kernel, len(own_index), own_index, first.offsets, first.along_px, expected, own_shift,
+        other_index, second.offsets, second.along_px, second.pixels_px, other_shift, second.bridge_after, widest_gap_px,
         residual, sigma,
     )  # fmt: skip
-    met = np.isfinite(residual)
-    # Walking along rising rows, higher columns are on one side, and along rising columns, higher rows on the other.
+    has_partner = np.isfinite(residual)
+    # Along rising rows, higher columns are on one side; along rising columns, higher rows on the other.
     side = 1.0 if axis is Axis.COLUMN else -1.0
-    return SpareEquation(side * residual[met], sigma[met], first.pixels_px[met])
+    return StripeResiduals(side * residual[has_partner], sigma[has_partner], first.pixels_px[has_partner])
 
 
-def in_figures(spare: SpareEquation, reference: str, camera: str, size: Size, /) -> PairRedundancy:
-    """The figures of one pair; `size` is that of the reference camera's image. At least one point is needed."""
-    residual = spare.residual_px
+def summarise_pair(residuals: StripeResiduals, reference: str, camera: str, size: Size, /) -> PairRedundancy:
+    """Statistics of one pair; `size` is that of the reference camera's image. At least one point is needed."""
+    residual = residuals.residual_px
     centre = np.median(residual)
-    spread = DEVIATIONS_PER_MEDIAN * max(np.median(np.abs(residual - centre)), np.median(spare.sigma_px))
-    same = np.abs(residual - centre) <= _OUTLYING * spread
-    kept, pixels = residual[same], spare.pixels_px[same]
-    cell = _cells(pixels[:, 1], size.height_px) * CELLS + _cells(pixels[:, 0], size.width_px)
-    count = np.bincount(cell, minlength=CELLS * CELLS)
-    enough = count >= FEWEST_PAIRS
-    sums = [np.bincount(cell, weights=values, minlength=CELLS * CELLS) for values in (kept, kept**2)]
-    mean, square = (np.where(enough, total / np.maximum(count, 1), np.nan).reshape(CELLS, CELLS) for total in sums)
+    spread = DEVIATIONS_PER_MEDIAN * max(np.median(np.abs(residual - centre)), np.median(residuals.sigma_px))
+    is_inlier = np.abs(residual - centre) <= _OUTLIER_SIGMA * spread
+    inliers, pixels = residual[is_inlier], residuals.pixels_px[is_inlier]
+    cell = _map_index(pixels[:, 1], size.height_px) * MAP_CELLS + _map_index(pixels[:, 0], size.width_px)
+    count = np.bincount(cell, minlength=MAP_CELLS * MAP_CELLS)
+    enough = count >= MIN_PAIRS
+    sums = [np.bincount(cell, weights=values, minlength=MAP_CELLS * MAP_CELLS) for values in (inliers, inliers**2)]
+    mean, square = (
+        np.where(enough, total / np.maximum(count, 1), np.nan).reshape(MAP_CELLS, MAP_CELLS) for total in sums
+    )
     return PairRedundancy(
         reference=reference,
         camera=camera,
-        pairs=len(kept),
-        outlying=len(residual) - len(kept),
-        mean_px=float(kept.mean()),
-        rms_px=float(np.sqrt((kept**2).mean())),
-        median_absolute_px=float(np.median(np.abs(kept))),
-        stated_rms_px=float(np.sqrt((spare.sigma_px[same] ** 2).mean())),
+        pairs=len(inliers),
+        outlying=len(residual) - len(inliers),
+        mean_px=float(inliers.mean()),
+        rms_px=float(np.sqrt((inliers**2).mean())),
+        median_absolute_px=float(np.median(np.abs(inliers))),
+        stated_rms_px=float(np.sqrt((residuals.sigma_px[is_inlier] ** 2).mean())),
         map_mean_px=mean,
         map_rms_px=np.sqrt(square),
-        map_pairs=count.reshape(CELLS, CELLS).astype(np.int32),
+        map_pairs=count.reshape(MAP_CELLS, MAP_CELLS).astype(np.int32),
     )
 
 
-def _cells(coordinate_px: FloatArray, extent_px: int) -> NDArray[np.int64]:
-    """(n,) int64: which of the equal parts of an image's extent each coordinate is in."""
-    return np.clip((coordinate_px + 0.5) * CELLS // extent_px, 0, CELLS - 1).astype(np.int64)
+def _map_index(coordinate_px: FloatArray, extent_px: int) -> NDArray[np.int64]:
+    """(n,) int64: index of the map cell of each coordinate."""
+    return np.clip((coordinate_px + 0.5) * MAP_CELLS // extent_px, 0, MAP_CELLS - 1).astype(np.int64)
 
 
 @kernel(in_every_scan=False)
-def _across_kernel(
-    first: int, last: int, mine: Any, a: Any, along: Any, expected: Any, moved: Any,
-    theirs: Any, b: Any, along2: Any, pixels2: Any, own: Any, bridge2: Any, widest: float,
+def _residual_kernel(
+    first: int, last: int, own_index: Any, a: Any, along: Any, expected: Any, own_shift: Any,
+    other_index: Any, b: Any, along2: Any, pixels2: Any, other_shift: Any, bridge2: Any, widest: float,
     residual: Any, sigma: Any,
 ) -> None:  # fmt: skip
     for pair in range(first, last):
-        low, high = b[theirs[pair]], b[theirs[pair] + 1]
+        low, high = b[other_index[pair]], b[other_index[pair] + 1]
         row = low
-        for i in range(a[mine[pair]], a[mine[pair] + 1]):
+        for i in range(a[own_index[pair]], a[own_index[pair] + 1]):
             while row < high - 1 and along2[row + 1] < along[i]:
                 row += 1
-            if row >= high - 1 or along2[row] > along[i] or not _joined(row, along2, bridge2, widest):
+            if row >= high - 1 or along2[row] > along[i] or not _is_joined(row, along2, bridge2, widest):
                 continue
             k, share = _foot(expected[i], row, low, high, along2, pixels2, bridge2, widest)
             if k < 0:
                 continue
             before = after = k
             for _ in range(_TANGENT_REACH):
-                if before > low and _joined(before - 1, along2, bridge2, widest):
+                if before > low and _is_joined(before - 1, along2, bridge2, widest):
                     before -= 1
-                if after + 2 < high and _joined(after + 1, along2, bridge2, widest):
+                if after + 2 < high and _is_joined(after + 1, along2, bridge2, widest):
                     after += 1
             tx, ty = pixels2[after + 1, 0] - pixels2[before, 0], pixels2[after + 1, 1] - pixels2[before, 1]
             length = np.sqrt(tx * tx + ty * ty)
@@ -383,23 +387,23 @@ def _across_kernel(
             x = pixels2[k, 0] + share * (pixels2[k + 1, 0] - pixels2[k, 0])
             y = pixels2[k, 1] + share * (pixels2[k + 1, 1] - pixels2[k, 1])
             residual[i] = nx * (x - expected[i, 0]) + ny * (y - expected[i, 1])
-            # Neighbours along a stripe share most of the light they were found in, so their errors are taken as one.
-            theirs_px = (1 - share) * abs(nx * own[k, 0] + ny * own[k, 1])
-            theirs_px += share * abs(nx * own[k + 1, 0] + ny * own[k + 1, 1])
-            sigma[i] = np.hypot(nx * moved[i, 0] + ny * moved[i, 1], theirs_px)
+            # Neighbours along a stripe share most of their light, so their errors are taken as one.
+            other_sigma = (1 - share) * abs(nx * other_shift[k, 0] + ny * other_shift[k, 1])
+            other_sigma += share * abs(nx * other_shift[k + 1, 0] + ny * other_shift[k + 1, 1])
+            sigma[i] = np.hypot(nx * own_shift[i, 0] + ny * own_shift[i, 1], other_sigma)
 
 
 @kernel_part(inline="always")
-def _joined(k: int, along: Any, bridge: Any, widest: float) -> bool:
-    """Whether the step from point k to the next one is a piece of seen curve."""
+def _is_joined(k: int, along: Any, bridge: Any, widest: float) -> bool:
+    """True if the step from point k to the next one is measured curve."""
     return not bridge[k] and along[k + 1] - along[k] <= widest
 
 
 @kernel_part
 def _foot(point: Any, start: int, low: int, high: int, along: Any, pixels: Any, bridge: Any, widest: float) -> Any:
-    """The segment of a curve that holds the foot of the perpendicular from a point, and the foot's share of it.
+    """Segment of a curve with the foot of the perpendicular from a point, and the fraction of the segment before it.
 
-    The search walks one way from segment `start`; the segment is -1 where the curve ends before the foot.
+    The search goes one way from segment `start`; the segment is -1 if the curve ends before the foot.
     """
     k = start
     way = 0
@@ -415,56 +419,50 @@ def _foot(point: Any, start: int, low: int, high: int, along: Any, pixels: Any, 
             return k, min(max(share, 0.0), 1.0)
         way = turn
         k += turn
-        if k < low or k + 1 >= high or not _joined(k, along, bridge, widest):
+        if k < low or k + 1 >= high or not _is_joined(k, along, bridge, widest):
             return -1, 0.0
     return -1, 0.0
 
 
-FEWEST_POINTS = 100
-"""That both have: with fewer they hardly see the same surface."""
-
-MOST_OVER_SIGMA = 3.0
-"""Beyond this the deviations that were stated do not explain what was found."""
-
-
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """Two cameras that contradict each other.
+    """Contradiction between two cameras.
 
-    apart_mm : median distance of their points of one projector ray, along it. over_sigma : their distances over what is
-    stated for them, as a standard deviation: 1 for cameras that agree.
+    distance_mm : median distance of their points on one projector ray. sigma_ratio : robust standard deviation of the
+    distances over the stated one; 1 for cameras that agree.
     """
 
-    apart_mm: float
-    over_sigma: float
+    distance_mm: float
+    sigma_ratio: float
 
     @property
     def sigma_mm(self) -> float:
-        """What is to be added to a point's standard deviation, in squares.
+        """Standard deviation to add to that of each point, in squares.
 
-        One of the two may be right, and the other off by all of the distance; nothing here tells which.
+        One camera may be right and the other off by the whole distance; the scan does not show which.
         """
-        return self.apart_mm
+        return self.distance_mm
 
     def __str__(self) -> str:
         return (
-            f"the cameras contradict each other: they place the surface {self.apart_mm:.3f} mm apart (median), "
-            f"{self.over_sigma:.1f} times what is stated for them. The standard deviations were widened by as much; "
+            f"the cameras contradict each other: they place the surface {self.distance_mm:.3f} mm apart (median), "
+            f"{self.sigma_ratio:.1f} times what is stated for them. The standard deviations were widened by as much; "
             "a camera has moved or the calibration is wrong: verify it (slrig verify), and calibrate again"
         )
 
 
-def disagreement(merged: MergedCurves, share_mm: FloatArray | None, /) -> Disagreement | None:
-    """How far the cameras contradict each other; None where they agree, or hardly see the same.
+def find_disagreement(merged: MergedCurves, share_mm: FloatArray | None, /) -> Disagreement | None:
+    """Compare the distances between cameras with the stated deviations; None if they agree or have few points in
+    common.
 
-    share_mm : (n,) float64, the calibration's part of each point's standard deviation, None where it states none.
+    share_mm : (n,) float64, share of the calibration in the standard deviation of each point, None if it states none.
     """
-    apart = np.abs(merged.residual_mm)
-    told = (merged.residual_sigma != 0) & np.isfinite(merged.residual_sigma)
-    if np.count_nonzero(told) < FEWEST_POINTS:
+    distance = np.abs(merged.residual_mm)
+    is_stated = (merged.residual_sigma != 0) & np.isfinite(merged.residual_sigma)
+    if np.count_nonzero(is_stated) < MIN_POINTS:
         return None
-    noise = apart[told] / np.abs(merged.residual_sigma[told])
+    noise = distance[is_stated] / np.abs(merged.residual_sigma[is_stated])
     # Each of the two has the calibration's error.
-    share = 0.0 if share_mm is None else 2**0.5 * float(np.median(share_mm))
-    over = DEVIATIONS_PER_MEDIAN * float(np.median(apart[told] / np.hypot(noise, share)))
-    return Disagreement(float(np.median(apart[told])), over) if over > MOST_OVER_SIGMA else None
+    calibration_sigma = 0.0 if share_mm is None else 2**0.5 * float(np.median(share_mm))
+    ratio = DEVIATIONS_PER_MEDIAN * float(np.median(distance[is_stated] / np.hypot(noise, calibration_sigma)))
+    return Disagreement(float(np.median(distance[is_stated])), ratio) if ratio > MAX_OVER_SIGMA else None

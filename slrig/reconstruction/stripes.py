@@ -2,7 +2,7 @@
 
 Stripes: Steger's curvilinear detector (PAMI 20(2) 1998, 113-125) with one further Newton step on kernels re-centred on
 the sub-pixel point, which removes the S-shaped error of a single Taylor step. Code edges: the zero crossing of a bit
-minus its inverse, found along its gradient by the same two steps. Both give points, normals and a standard deviation.
+minus its inverse along its gradient, by the same two steps. Both give points, normals and a standard deviation.
 """
 
 from __future__ import annotations
@@ -20,30 +20,41 @@ from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 
 RIDGE = 0
-"""Bright lines: the point where the first derivative across the line is zero."""
+"""Bright lines: points where the first derivative across the line is zero."""
 
 EDGE = 1
-"""Steps through zero: the point where the value is zero."""
+"""Steps through zero: points where the value is zero."""
 
 _SUPPORT = 3.6  # kernel radius in sigmas
-_TAYLOR_BOX = 0.6  # a point this far from the pixel centre still belongs to it; the chain drops double responses
-_NEWTON_BOX = 1.1  # half a pixel beyond the first step's
-_VECTOR = 4  # of double precision
-_ROWS, _POINTS = 32, 1024  # that are worth calling a kernel for
+_TAYLOR_BOX = 0.6  # a point this far from the pixel centre still belongs to it; chaining drops double responses
+_NEWTON_BOX = 1.1  # half a pixel more than in the first step
+_VECTOR = 4  # numbers of double precision in a vector register
+_MIN_ROWS, _MIN_POINTS = 32, 1024  # least number for one call of a kernel
+
+_MAX_TURN = np.pi / 3  # chosen; π/6 and π/2 make no difference
+_SAME_LINE_ANGLE = np.pi / 6  # as in Steger's linking
+_SAME_LINE_PX = 0.8  # a line may respond again up to 0.6 px away (`_TAYLOR_BOX`)
+_MAX_STEP_PX = 2.2  # chosen; 1.5 loses points, 3.3 makes no difference
+# Neighbours of a pixel by octant: 0 along x, 2 along y.
+_STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+_STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
+_MIN_TURN_COSINE = np.cos(_MAX_TURN)
+_SAME_LINE_COSINE = np.cos(_SAME_LINE_ANGLE)
+_HALF_OCTANT = np.tan(np.pi / 8)  # slope of the border between two octants
 
 
-def kernels(sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+def gaussian_kernels(sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Sampled Gaussian of this scale and its first two derivatives, each (2 r + 1,) float32."""
     radius = int(np.ceil(_SUPPORT * sigma_px))
-    at = np.arange(-radius, radius + 1, dtype=np.float64)
-    zero = np.exp(-(at**2) / (2 * sigma_px**2))
+    offset = np.arange(-radius, radius + 1, dtype=np.float64)
+    zero = np.exp(-(offset**2) / (2 * sigma_px**2))
     zero /= zero.sum()
-    one = at / sigma_px**2 * zero
-    one /= (one * at).sum()
-    two = (at**2 / sigma_px**4 - 1 / sigma_px**2) * zero
+    one = offset / sigma_px**2 * zero
+    one /= (one * offset).sum()
+    two = (offset**2 / sigma_px**4 - 1 / sigma_px**2) * zero
     two -= two.mean()
-    two /= (two * at**2).sum() / 2
-    # They correlate: a rising ramp gives +1 with `one`, a parabola x²/2 gives +1 with `two`.
+    two /= (two * offset**2).sum() / 2
+    # For correlation: a rising ramp gives +1 with `one`, a parabola x²/2 gives +1 with `two`.
     return zero.astype(np.float32), one.astype(np.float32), two.astype(np.float32)
 
 
@@ -57,15 +68,15 @@ def taylor_step(
     two: NDArray[np.float32],
     kind: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """One Taylor step at every lit pixel whose response exceeds `weak` times its noise.
+    """Make one Taylor step at every lit pixel whose response exceeds `weak` times its noise.
 
-    image, noise : (H, W) float32; zero, one, two : as `kernels` gives them; kind : `RIDGE` or `EDGE`.
-    Returns the offsets (H, W, 2) of the points from their pixels, x and y, and the responses (H, W), 0 where none is.
+    image, noise : (H, W) float32; zero, one, two : from `gaussian_kernels`; kind : `RIDGE` or `EDGE`. Returns the
+    offsets (H, W, 2) of the points from their pixels, x and y, and the responses (H, W), 0 without a point.
     """
     offset, response = np.zeros((*image.shape, 2), dtype=np.float32), np.zeros(image.shape, dtype=np.float32)
     in_bands(
         _taylor_kernel, len(image), image, noise, lit, weak, zero, one, two, kind, offset, response,
-        rows_at_least=_ROWS,
+        rows_at_least=_MIN_ROWS,
     )  # fmt: skip
     return offset, response
 
@@ -75,9 +86,9 @@ def _taylor_kernel(
     first: int, last: int, image: Any, noise: Any, lit: Any, weak: Any, zero: Any, one: Any, two: Any, kind: int,
     offset: Any, response: Any,
 ) -> None:  # fmt: skip
-    """Fill in offset and response, zeros so far.
+    """Fill in offset and response, which are zeros.
 
-    The filters are separable, even or odd: rows first, and then along the row, while it is in the cache.
+    The filters are separable, even or odd. Rows are filtered first, then along the row while it is in the cache.
     """
     columns = image.shape[1]
     radius = len(zero) // 2
@@ -85,7 +96,7 @@ def _taylor_kernel(
     down = np.zeros((3, columns + 2 * radius), dtype=np.float32)
     along = np.zeros((6, columns), dtype=np.float32)
     for y in range(first, last):
-        begin, end = _lit_part(lit[y])
+        begin, end = _lit_range(lit[y])
         if begin == end:
             continue
         _filter_down(image, y, radius, max(begin - radius, 0), min(end + radius, columns), g0, g1, g2, down)
@@ -117,8 +128,8 @@ def _taylor_kernel(
 
 
 @kernel_part
-def _lit_part(lit: Any) -> Any:
-    """The first lit pixel of a row, and one more than the last; twice the same where none is."""
+def _lit_range(lit: Any) -> Any:
+    """First lit pixel of a row, and last plus one; twice the same if none is lit."""
     begin, end = 0, len(lit)
     while begin < end and not lit[begin]:
         begin += 1
@@ -131,10 +142,9 @@ def _lit_part(lit: Any) -> Any:
 def _filter_down(
     image: Any, y: int, radius: int, begin: int, end: int, g0: Any, g1: Any, g2: Any, out: Any
 ) -> None:  # fmt: skip
-    """Fill (3, columns + 2 radius) with the image's rows round y, smoothed and differentiated once and twice.
+    """Fill (3, columns + 2 radius) with the image rows round y, smoothed and differentiated once and twice.
 
-    Only the columns from begin to end are filled in, and what lies beyond the image's borders, where it is reflected
-    about its outermost pixels.
+    Only columns from begin to end are filled, and the margins beyond the image, reflected about its outermost pixels.
     """
     rows, columns = image.shape
     count = end - begin
@@ -146,36 +156,36 @@ def _filter_down(
     _scale(second, count, g2[0], middle)
     first[:count] = 0
     for t in range(1, radius, 2):
-        above, below = image[_reflected(y - t, rows), begin:], image[_reflected(y + t, rows), begin:]
-        top, bottom = image[_reflected(y - t - 1, rows), begin:], image[_reflected(y + t + 1, rows), begin:]
+        above, below = image[_reflect(y - t, rows), begin:], image[_reflect(y + t, rows), begin:]
+        top, bottom = image[_reflect(y - t - 1, rows), begin:], image[_reflect(y + t + 1, rows), begin:]
         _add_two(smooth, count, g0[t], below, above, g0[t + 1], bottom, top)
         _subtract_two(first, count, g1[t], below, above, g1[t + 1], bottom, top)
         _add_two(second, count, g2[t], below, above, g2[t + 1], bottom, top)
     if radius % 2:
-        above, below = image[_reflected(y - radius, rows), begin:], image[_reflected(y + radius, rows), begin:]
+        above, below = image[_reflect(y - radius, rows), begin:], image[_reflect(y + radius, rows), begin:]
         _add(smooth, count, g0[radius], below, above)
         _subtract(first, count, g1[radius], below, above)
         _add(second, count, g2[radius], below, above)
     for k in range(3):
         for t in range(1, radius + 1):
-            out[k, radius - t] = out[k, radius + _reflected(-t, columns)]
-            out[k, radius + columns - 1 + t] = out[k, radius + _reflected(columns - 1 + t, columns)]
+            out[k, radius - t] = out[k, radius + _reflect(-t, columns)]
+            out[k, radius + columns - 1 + t] = out[k, radius + _reflect(columns - 1 + t, columns)]
 
 
 @kernel_part
 def _filter_along(down: Any, radius: int, begin: int, end: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
     """Fill (6, columns) from begin to end with r, rx, ry, rxx, rxy, ryy of one row."""
     smooth, first, second = down[0, begin:], down[1, begin:], down[2, begin:]
-    _even(out[0, begin:end], radius, g0, smooth)
-    _odd(out[1, begin:end], radius, g1, smooth)
-    _even(out[2, begin:end], radius, g0, first)
-    _even(out[3, begin:end], radius, g2, smooth)
-    _odd(out[4, begin:end], radius, g1, first)
-    _even(out[5, begin:end], radius, g0, second)
+    _filter_even(out[0, begin:end], radius, g0, smooth)
+    _filter_odd(out[1, begin:end], radius, g1, smooth)
+    _filter_even(out[2, begin:end], radius, g0, first)
+    _filter_even(out[3, begin:end], radius, g2, smooth)
+    _filter_odd(out[4, begin:end], radius, g1, first)
+    _filter_even(out[5, begin:end], radius, g0, second)
 
 
 @kernel_part
-def _even(out: Any, radius: int, weights: Any, row: Any) -> None:
+def _filter_even(out: Any, radius: int, weights: Any, row: Any) -> None:
     count = len(out)
     _scale(out, count, weights[0], row[radius:])
     for t in range(1, radius, 2):
@@ -186,7 +196,7 @@ def _even(out: Any, radius: int, weights: Any, row: Any) -> None:
 
 
 @kernel_part
-def _odd(out: Any, radius: int, weights: Any, row: Any) -> None:
+def _filter_odd(out: Any, radius: int, weights: Any, row: Any) -> None:
     count = len(out)
     out[:] = 0
     for t in range(1, radius, 2):
@@ -198,8 +208,8 @@ def _odd(out: Any, radius: int, weights: Any, row: Any) -> None:
         _subtract(out, count, weights[radius], row[2 * radius :], row)
 
 
-# Loops of five arrays at most, of which one is written: with more, the compiler gives up proving that they do not
-# overlap, and uses no vectors.
+# Loops over five arrays at most, one of them written: with more, the compiler cannot prove that they do not overlap,
+# and does not vectorise.
 @kernel_part
 def _scale(out: Any, count: int, weight: Any, row: Any) -> None:
     for x in range(count):
@@ -235,7 +245,7 @@ def _subtract_two(
 
 
 @kernel_part(inline="always")
-def _reflected(index: int, count: int) -> int:
+def _reflect(index: int, count: int) -> int:
     while index < 0 or index >= count:
         index = -index if index < 0 else 2 * (count - 1) - index
         if count == 1:
@@ -263,24 +273,24 @@ def _ridge_normal(rxx: float, rxy: float, ryy: float) -> Any:
 def newton_step(
     image: NDArray[np.float32], offset: NDArray[np.float32], columns: IntArray, rows: IntArray, sigma: float, kind: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """One Newton step from the offsets of these pixels, (n,) each, on kernels centred there.
+    """Make one Newton step from the offsets of these pixels, (n,) each, on kernels centred there.
 
-    Returns x and y (n,), px, the normal (n, 2) and the response (n,) at the start, and (n,) bool: the step stayed near.
+    Returns x and y (n,), px, normal (n, 2) and response (n,) at the start, and (n,) bool: True if the step stayed near.
     """
     count = len(columns)
     x, y, response = np.zeros(count), np.zeros(count), np.zeros(count)
-    normals, kept = np.zeros((count, 2)), np.zeros(count, dtype=np.bool_)
+    normals, valid = np.zeros((count, 2)), np.zeros(count, dtype=np.bool_)
     in_bands(
-        _newton_kernel, count, image, offset, columns, rows, sigma, kind, x, y, normals, response, kept,
-        rows_at_least=_POINTS,
+        _newton_kernel, count, image, offset, columns, rows, sigma, kind, x, y, normals, response, valid,
+        rows_at_least=_MIN_POINTS,
     )  # fmt: skip
-    return x, y, normals, response, kept
+    return x, y, normals, response, valid
 
 
 @kernel
 def _newton_kernel(
     first: int, last: int, image: Any, offset: Any, columns: Any, rows: Any, sigma: float, kind: int,
-    x_out: Any, y_out: Any, normals: Any, response: Any, kept: Any,
+    x_out: Any, y_out: Any, normals: Any, response: Any, valid: Any,
 ) -> None:  # fmt: skip
     height, width = image.shape
     radius = int(np.ceil(_SUPPORT * sigma))
@@ -289,9 +299,9 @@ def _newton_kernel(
     wx = np.zeros((3, size))
     wy = np.zeros((3, size))
     flat = image.reshape(-1)
-    # Whole vectors of columns: those beyond the window are summed, too, and nobody looks at them.
+    # Whole vectors of columns: the sums of those beyond the window are not used.
     lanes = min(-(-size // _VECTOR) * _VECTOR, width)
-    furthest = len(flat) - (size - 1) * width - lanes
+    last_start = len(flat) - (size - 1) * width - lanes
     smooth, once, twice = np.zeros(lanes), np.zeros(lanes), np.zeros(lanes)
     for i in range(first, last):
         column, row = columns[i], rows[i]
@@ -301,11 +311,15 @@ def _newton_kernel(
         _centred_weights(wx, fx, sigma, whole)
         _centred_weights(wy, fy, sigma, whole)
         corner = (row - radius) * width + column - radius
-        begun = min(corner, furthest)
-        _weighted_down(flat, begun, width, wy, smooth, once, twice)
+        window_start = min(corner, last_start)
+        _sum_columns(flat, window_start, width, wy, smooth, once, twice)
         r = rx = ry = rxx = rxy = ryy = 0.0
         for k in range(size):
-            s0, s1, s2 = smooth[corner - begun + k], once[corner - begun + k], twice[corner - begun + k]
+            s0, s1, s2 = (
+                smooth[corner - window_start + k],
+                once[corner - window_start + k],
+                twice[corner - window_start + k],
+            )
             r += s0 * wx[0, k]
             rx += s0 * wx[1, k]
             rxx += s0 * wx[2, k]
@@ -330,16 +344,16 @@ def _newton_kernel(
         x_out[i], y_out[i] = column + x, row + y
         normals[i, 0], normals[i, 1] = nx, ny
         response[i] = strength
-        kept[i] = True
+        valid[i] = True
 
 
 @kernel_part
-def _weighted_down(flat: Any, corner: int, width: int, weights: Any, smooth: Any, first: Any, second: Any) -> None:
+def _sum_columns(flat: Any, corner: int, width: int, weights: Any, smooth: Any, first: Any, second: Any) -> None:
     """Fill (lanes,) each with sums down the columns of a window, weighted with each row of weights, (3, size).
 
-    flat, corner, width : the image's pixels, the window's first among them, and the pixels of a row. The sums of
-    neighbouring columns are made side by side, in vector registers; two rows at a time after the first, for each turn
-    waits for the sums of the one before.
+    flat, corner, width : pixels of the image, index of the first of the window, and length of a row. Neighbouring
+    columns are summed together in vector registers, two rows at a time, since each iteration waits for the sums before
+    it.
     """
     lanes = len(smooth)
     line = flat[corner:]
@@ -362,10 +376,10 @@ def _weighted_down(flat: Any, corner: int, width: int, weights: Any, smooth: Any
 
 @kernel_part
 def _centred_weights(out: Any, centre: float, sigma: float, whole: Any) -> None:
-    """Fill (3, size) with Gaussian, first and second derivative weights for samples at -radius … radius.
+    """Fill (3, size) with weights of Gaussian, first and second derivative for samples at -radius … radius.
 
-    whole : (size,) the Gaussian's values when its centre is 0. About another centre f each changes by
-    exp(f k / σ²) and by a factor that all share.
+    whole : (size,) values of the Gaussian with centre 0. For another centre f each changes by exp(f k / σ²) and by a
+    common factor.
     """
     zero, one, two = out[0], out[1], out[2]
     size = len(zero)
@@ -382,7 +396,7 @@ def _centred_weights(out: Any, centre: float, sigma: float, whole: Any) -> None:
         zero[radius + k] = right
         zero[radius - k] = left
         total += right + left
-    # Dividing takes several times as long as multiplying.
+    # Division takes several times as long as multiplication.
     share = 1 / total
     of_one = share / variance
     of_two = of_one / variance
@@ -394,63 +408,47 @@ def _centred_weights(out: Any, centre: float, sigma: float, whole: Any) -> None:
         two[k] = (at * at - variance) * (value * of_two)
 
 
-_SHARPEST_TURN = np.pi / 3  # chosen; π/6 and π/2 give the same figures of a rendered vase
-_SAME_LINE_ANGLE = np.pi / 6  # as linking after Steger has it
-_SAME_LINE_PX = 0.8  # a line may answer again up to 0.6 px away (`stripes._TAYLOR_BOX`)
-_LONGEST_STEP_PX = 2.2  # chosen; 1.5 takes 61 of 239 246 triangles from a rendered vase, 3.3 changes none
-# The neighbours of a pixel, by the octant that they lie in: 0 along x, 2 along y.
-_STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
-_STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
-_SHARPEST_ALIGNED = np.cos(_SHARPEST_TURN)
-_SAME_LINE_ALIGNED = np.cos(_SAME_LINE_ANGLE)
-_HALF_OCTANT = np.tan(np.pi / 8)  # slope of the border between two octants
-
-
 def chain_points(
-    points_px: FloatArray,
-    normals: FloatArray,
-    strength: FloatArray,
-    strong: NDArray[np.bool_],
-    shape: tuple[int, int],
+    points_px: FloatArray, normals: FloatArray, strength: FloatArray, strong: NDArray[np.bool_], shape: tuple[int, int]
 ) -> tuple[IntArray, IntArray]:
     """Link the points of one frame.
 
-    points_px : (n, 2) float64 (x, y); normals : (n, 2) float64; strength : (n,) float64;
-    strong : (n,) bool, points at which a chain may start; shape : (rows, columns) of the image.
-    Returns order, the indices of the points chain by chain, and offsets (chains + 1,). A chain has two points or more.
+    points_px : (n, 2) float64 (x, y); normals : (n, 2) float64; strength : (n,) float64; strong : (n,) bool, points at
+    which a chain may start; shape : (rows, columns) of the image. Returns order, the indices of the points chain by
+    chain, and offsets (chains + 1,). A chain has two points or more.
     """
-    # Positive numbers sort as their bits do; complemented, from the largest to the smallest.
+    # Positive floats sort by their bits; complemented, from the largest to the smallest.
     keys = ~strength.astype(np.float32).view(np.uint32)
-    # With the index below them no two are equal: this sort takes a third of the time of a stable one.
+    # With the index in the lower bits no two are equal: this sort takes a third of the time of a stable one.
     by_strength = np.sort(keys.astype(np.uint64) << np.uint64(32) | np.arange(len(keys), dtype=np.uint64))
-    placed = np.concatenate([points_px, normals], axis=1)
-    order, ends = np.zeros(len(placed), dtype=np.int32), np.zeros(len(placed) + 1, dtype=np.int32)
-    count = _chain_kernel(placed, keys, strong, by_strength.astype(np.int32), shape, order, ends)
+    vectors = np.concatenate([points_px, normals], axis=1)
+    order, ends = np.zeros(len(vectors), dtype=np.int32), np.zeros(len(vectors) + 1, dtype=np.int32)
+    count = _chain_kernel(vectors, keys, strong, by_strength.astype(np.int32), shape, order, ends)
     return order[: ends[count]], ends[: count + 1]
 
 
 @kernel
 def _chain_kernel(
-    placed: Any, keys: Any, strong: Any, by_strength: Any, shape: Any, order: Any, offsets: Any
+    vectors: Any, keys: Any, strong: Any, by_strength: Any, shape: Any, order: Any, offsets: Any
 ) -> int:  # fmt: skip
     """Fill in order and offsets, and return the number of chains.
 
-    placed : (n, 4) x, y and normal of each point; keys : (n,) uint32, rising from the strongest.
+    vectors : (n, 4) x, y and normal of each point; keys : (n,) uint32, rising from the strongest.
     """
     height, width = shape
-    # at : one more than the point that a pixel holds and no chain has used; 0 for none. In tiles, see `_place`.
-    at = np.zeros(-(-height // 4) * -(-width // 4) * 16, dtype=np.int32)
-    # Whether a chain may begin at a point: to ask that takes less memory, and so less time, than to look at its pixel.
-    may_start = np.zeros(len(placed), dtype=np.bool_)
-    ahead = np.zeros(len(placed), dtype=np.int32)
-    behind = np.zeros(len(placed), dtype=np.int32)
-    for i in range(len(placed)):
-        row, column = _pixel(placed, i, height, width)
-        here = _place(row, column, width)
-        # Where two points fall into one pixel the stronger is kept, the first of equals.
-        other = at[here] - 1
+    # point_at : index + 1 of the unused point at a pixel; 0 for none. In tiles, see `_tile_index`.
+    point_at = np.zeros(-(-height // 4) * -(-width // 4) * 16, dtype=np.int32)
+    # True if a chain may start at a point. This array is smaller than `point_at`, and faster to read.
+    may_start = np.zeros(len(vectors), dtype=np.bool_)
+    ahead = np.zeros(len(vectors), dtype=np.int32)
+    behind = np.zeros(len(vectors), dtype=np.int32)
+    for i in range(len(vectors)):
+        row, column = _pixel(vectors, i, height, width)
+        here = _tile_index(row, column, width)
+        # Of two points in one pixel the stronger is used, the first of equals.
+        other = point_at[here] - 1
         if other < 0 or keys[i] < keys[other]:
-            at[here] = i + 1
+            point_at[here] = i + 1
             may_start[i] = strong[i]
             if other >= 0:
                 may_start[other] = False
@@ -458,10 +456,10 @@ def _chain_kernel(
     for start in by_strength:
         if not may_start[start]:
             continue
-        row, column = _pixel(placed, start, height, width)
-        at[_place(row, column, width)] = 0
-        forward = _trace(start, 1.0, at, height, width, placed, may_start, ahead)
-        backward = _trace(start, -1.0, at, height, width, placed, may_start, behind)
+        row, column = _pixel(vectors, start, height, width)
+        point_at[_tile_index(row, column, width)] = 0
+        forward = _trace(start, 1.0, point_at, height, width, vectors, may_start, ahead)
+        backward = _trace(start, -1.0, point_at, height, width, vectors, may_start, behind)
         if forward + backward == 0:
             continue
         for j in range(backward - 1, -1, -1):
@@ -478,26 +476,26 @@ def _chain_kernel(
 
 
 @kernel_part(inline="always")
-def _pixel(placed: Any, i: int, height: int, width: int) -> Any:
-    column = min(max(int(np.rint(placed[i, 0])), 0), width - 1)
-    row = min(max(int(np.rint(placed[i, 1])), 0), height - 1)
+def _pixel(vectors: Any, i: int, height: int, width: int) -> Any:
+    column = min(max(int(np.rint(vectors[i, 0])), 0), width - 1)
+    row = min(max(int(np.rint(vectors[i, 1])), 0), height - 1)
     return row, column
 
 
 @kernel_part(inline="always")
-def _place(row: int, column: int, width: int) -> Any:
-    """The index of a pixel in tiles of 4 x 4, each a line of the cache: neighbours are near, whichever way one goes."""
+def _tile_index(row: int, column: int, width: int) -> Any:
+    """Index of a pixel in tiles of 4 x 4, each a line of the cache, so that neighbours in all directions are near."""
     tile = (row >> 2) * ((width + 3) >> 2) + (column >> 2)
     return np.uintp((tile << 4) + ((row & 3) << 2) + (column & 3))
 
 
 @kernel_part
 def _trace(
-    start: int, sign: float, at: Any, height: int, width: int, placed: Any, may_start: Any, out: Any
+    start: int, sign: float, point_at: Any, height: int, width: int, vectors: Any, may_start: Any, out: Any
 ) -> int:  # fmt: skip
     current = start
-    row, column = _pixel(placed, current, height, width)
-    heading_x, heading_y = -sign * placed[start, 3], sign * placed[start, 2]
+    row, column = _pixel(vectors, current, height, width)
+    heading_x, heading_y = -sign * vectors[start, 3], sign * vectors[start, 2]
     count = 0
     while True:
         octant = _octant(heading_x, heading_y)
@@ -506,10 +504,10 @@ def _trace(
             y, x = row + _STEP_Y[k], column + _STEP_X[k]
             if y < 0 or x < 0 or y >= height or x >= width:
                 continue
-            here = _place(y, x, width)
-            double = at[here] - 1
-            if double >= 0 and _is_double(current, double, placed):
-                at[here] = 0
+            here = _tile_index(y, x, width)
+            double = point_at[here] - 1
+            if double >= 0 and _is_double(current, double, vectors):
+                point_at[here] = 0
                 may_start[double] = False
         best = -1
         best_cost = np.nan
@@ -520,31 +518,31 @@ def _trace(
             y, x = row + _STEP_Y[k], column + _STEP_X[k]
             if y < 0 or x < 0 or y >= height or x >= width:
                 continue
-            other = at[_place(y, x, width)] - 1
+            other = point_at[_tile_index(y, x, width)] - 1
             if other < 0:
                 continue
-            dx, dy = placed[other, 0] - placed[current, 0], placed[other, 1] - placed[current, 1]
+            dx, dy = vectors[other, 0] - vectors[current, 0], vectors[other, 1] - vectors[current, 1]
             distance = np.sqrt(dx * dx + dy * dy)
-            aligned = _alignment(placed, current, other)
-            if distance > _LONGEST_STEP_PX or aligned < _SHARPEST_ALIGNED or dx * heading_x + dy * heading_y <= 0:
+            aligned = _alignment(vectors, current, other)
+            if distance > _MAX_STEP_PX or aligned < _MIN_TURN_COSINE or dx * heading_x + dy * heading_y <= 0:
                 continue
             if best < 0:
                 best, best_distance, best_row, best_column = other, distance, y, x
                 continue
-            # Two ways to go on: now the angles themselves are needed.
+            # Two candidates: the angles themselves are needed.
             if np.isnan(best_cost):
-                best_cost = best_distance + np.arccos(_alignment(placed, current, best))
+                best_cost = best_distance + np.arccos(_alignment(vectors, current, best))
             cost = distance + np.arccos(aligned)
             if cost < best_cost:
                 best, best_cost, best_row, best_column = other, cost, y, x
         if best < 0:
             return count
         row, column = best_row, best_column
-        at[_place(row, column, width)] = 0
+        point_at[_tile_index(row, column, width)] = 0
         may_start[best] = False
         out[count] = best
         count += 1
-        tangent_x, tangent_y = -placed[best, 3], placed[best, 2]
+        tangent_x, tangent_y = -vectors[best, 3], vectors[best, 2]
         if tangent_x * heading_x + tangent_y * heading_y < 0:
             tangent_x, tangent_y = -tangent_x, -tangent_y
         heading_x, heading_y = tangent_x, tangent_y
@@ -553,7 +551,7 @@ def _trace(
 
 @kernel_part(inline="always")
 def _octant(x: float, y: float) -> int:
-    """The direction in eighths of a turn, rounded: 0 along x, 2 along y."""
+    """Direction in eighths of a turn, rounded: 0 along x, 2 along y."""
     if abs(y) <= _HALF_OCTANT * abs(x):
         return 0 if x > 0 else 4
     if abs(x) <= _HALF_OCTANT * abs(y):
@@ -564,27 +562,26 @@ def _octant(x: float, y: float) -> int:
 
 
 @kernel_part(inline="always")
-def _is_double(current: int, other: int, placed: Any) -> bool:
-    """Whether a point beside another one answers to the same line."""
-    dx, dy = placed[other, 0] - placed[current, 0], placed[other, 1] - placed[current, 1]
-    across = abs(dx * placed[current, 2] + dy * placed[current, 3])
-    return bool(across < _SAME_LINE_PX and _alignment(placed, current, other) > _SAME_LINE_ALIGNED)
+def _is_double(current: int, other: int, vectors: Any) -> bool:
+    """True if a neighbouring point is a response to the same line."""
+    dx, dy = vectors[other, 0] - vectors[current, 0], vectors[other, 1] - vectors[current, 1]
+    across = abs(dx * vectors[current, 2] + dy * vectors[current, 3])
+    return bool(across < _SAME_LINE_PX and _alignment(vectors, current, other) > _SAME_LINE_COSINE)
 
 
 @kernel_part(inline="always")
-def _alignment(placed: Any, a: int, b: int) -> float:
-    """Cosine of the angle between two points' lines."""
-    return float(min(1.0, abs(placed[a, 2] * placed[b, 2] + placed[a, 3] * placed[b, 3])))
+def _alignment(vectors: Any, a: int, b: int) -> float:
+    """Cosine of the angle between the lines of two points."""
+    return float(min(1.0, abs(vectors[a, 2] * vectors[b, 2] + vectors[a, 3] * vectors[b, 3])))
 
 
 @dataclass(frozen=True, slots=True)
 class StripeLimits:
-    """What counts as a stripe.
+    """Thresholds for stripes.
 
-    sigma_px : scale of the Gaussian; None measures the stripes and matches it, between 1 and 2.5 px.
-    strong_sigma, weak_sigma : hysteresis, in standard deviations of the response to noise alone.
-    weak_fraction : a point must reach this fraction of the image's typical response.
-    shortest_points : a stripe of fewer points is refused.
+    sigma_px : scale of the Gaussian; None matches it to the stripes, between 1 and 2.5 px. strong_sigma, weak_sigma :
+    hysteresis, in standard deviations of the response to noise. weak_fraction : least fraction of the typical response
+    of the image. shortest_points : a stripe of fewer points is refused.
     """
 
     sigma_px: float | None = None
@@ -598,9 +595,9 @@ class StripeLimits:
 class Stripes:
     """Chains of sub-pixel points. Chain i holds the points offsets[i]:offsets[i + 1], in order along the curve.
 
-    offsets : (s + 1,) int32; frame : (s,) int32, index of the line or bit frame the chain was found in.
-    points_px : (n, 2) float64, (x, y) in the camera image; normals : (n, 2) float64, unit, across the curve.
-    sigma_px : (n,) float64, standard deviation across the curve from noise.
+    offsets : (s + 1,) int32; frame : (s,) int32, index of the line or bit frame of the chain. points_px : (n, 2)
+    float64, (x, y) in the camera image; normals : (n, 2) float64, unit, across the curve. sigma_px : (n,) float64,
+    standard deviation across the curve from noise.
     """
 
     offsets: IntArray
@@ -616,8 +613,8 @@ class Stripes:
 class LinePoints(NamedTuple):
     """Sub-pixel points of one line or bit frame, not yet linked.
 
-    points_px, normals, sigma_px : as in `Stripes`; strength : (n,) float64, the filter's response;
-    strong : (n,) bool, points at which a stripe may begin.
+    points_px, normals, sigma_px : as in `Stripes`; strength : (n,) float64, response of the filter; strong : (n,) bool,
+    points at which a stripe may begin.
     """
 
     points_px: FloatArray
@@ -626,16 +623,16 @@ class LinePoints(NamedTuple):
     strong: NDArray[np.bool_]
     sigma_px: FloatArray
 
-    def first(self, count: int) -> LinePoints:
-        """The first so many of them."""
+    def head(self, count: int) -> LinePoints:
+        """The first `count` points."""
         return LinePoints(
             self.points_px[:count], self.normals[:count], self.strength[:count], self.strong[:count],
             self.sigma_px[:count],
         )  # fmt: skip
 
 
-def chained(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
-    """The points of each frame linked along their lines; all chains as one value, frame by frame.
+def chain_stripes(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
+    """Link the points of each frame along their lines, and return all chains, frame by frame.
 
     shape : (rows, columns) of the image.
     """
@@ -643,18 +640,18 @@ def chained(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
     def chain(first: int, last: int) -> list[tuple[IntArray, IntArray]]:
         return [chain_points(*each[:4], shape) for each in frames[first:last]]
 
-    # What chaining makes on the way is large, and so are the points: these are moved once, when all places are known.
+    # Points are copied once, when all indices are known, since they and the chains are large.
     chains = [each for band in in_bands(chain, len(frames)) for each in band]
-    ends = np.cumsum([0, *(len(order) for order, _ in chains)])
-    count = int(ends[-1])
+    borders = np.cumsum([0, *(len(order) for order, _ in chains)])
+    count = int(borders[-1])
     points_px, normals, sigma_px = np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count)
 
     def gather(first: int, last: int) -> None:
         for index in range(first, last):
-            given, order, part = frames[index], chains[index][0], slice(ends[index], ends[index + 1])
-            np.take(given.points_px, order, axis=0, out=points_px[part], mode="clip")
-            np.take(given.normals, order, axis=0, out=normals[part], mode="clip")
-            np.take(given.sigma_px, order, out=sigma_px[part], mode="clip")
+            points, order, part = frames[index], chains[index][0], slice(borders[index], borders[index + 1])
+            np.take(points.points_px, order, axis=0, out=points_px[part], mode="clip")
+            np.take(points.normals, order, axis=0, out=normals[part], mode="clip")
+            np.take(points.sigma_px, order, out=sigma_px[part], mode="clip")
 
     in_bands(gather, len(frames))
     lengths = [np.diff(offsets) for _, offsets in chains]
@@ -663,31 +660,31 @@ def chained(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
     return Stripes(offsets, frame, points_px, normals, sigma_px)
 
 
-def gathered(
+def gather_points(
     order: IntArray, points_px: FloatArray, normals: FloatArray, sigma_px: FloatArray, /
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points, normals and deviations at the indices `order`."""
     return np.take(points_px, order, axis=0), np.take(normals, order, axis=0), np.take(sigma_px, order)
 
 
-def normalised(
+def normalise(
     image: NDArray[np.float32], black: NDArray[np.float32], contrast: NDArray[np.float32], noise: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Light relative to white, free of albedo, and its noise.
+    """Return light relative to white, without albedo, and its noise.
 
-    (I - black)/(white - black), damped to zero where the contrast is not above the noise.
-    noise : (H, W) float32, standard deviation of I - black, camera units.
+    (I - black)/(white - black), damped to zero where the contrast does not exceed the noise. noise : (H, W) float32,
+    standard deviation of I - black, camera units.
     """
     light, deviation = np.zeros_like(image), np.zeros_like(image)
-    in_bands(normalised_kernel, len(image), image, black, contrast, noise, light, deviation)
+    in_bands(normalise_kernel, len(image), image, black, contrast, noise, light, deviation)
     return light, deviation
 
 
 @kernel(in_every_scan=False)
-def normalised_kernel(
+def normalise_kernel(
     first: int, last: int, image: Any, black: Any, contrast: Any, noise: Any, light: Any, deviation: Any
 ) -> None:
-    """Fill in light and deviation: see `normalised`."""
+    """Fill in light and deviation: see `normalise`."""
     for y in range(first, last):
         for x in range(image.shape[1]):
             weight = _weight(contrast[y, x], noise[y, x])
@@ -697,43 +694,44 @@ def normalised_kernel(
 
 @kernel_part(inline="always")
 def _weight(contrast: Any, noise: Any) -> Any:
-    """1/contrast, damped to zero where the contrast is not above the noise."""
+    """1/contrast, damped to zero where the contrast does not exceed the noise."""
     damping = np.float32(3) * noise
     squared = contrast * contrast + damping * damping
     return contrast / squared if squared > 0 else np.float32(0)
 
 
-def normalised_line(
+def normalise_line(
     line: NDArray[np.float32],
     white: NDArray[np.float32],
     black: NDArray[np.float32],
     read_variance: float,
     slope: float,
-    ends_repeats: float,
+    reference_repeats: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A line frame as `normalised` gives it, with the noise of line, white and black counted, as the light has it.
+    """Normalise a line frame as `normalise` does, with the noise of line, white and black by their share in the result.
 
-    read_variance, slope : of the camera's noise; ends_repeats : how many frames the mean white and black are of.
+    read_variance, slope : of the camera's noise; reference_repeats : number of frames that white and black are means
+    of.
     """
     light, deviation = np.zeros_like(line), np.zeros_like(line)
     in_bands(
-        _normalised_line_kernel, len(line), line, white, black, read_variance, slope, ends_repeats, light, deviation
+        _normalise_line_kernel, len(line), line, white, black, read_variance, slope, reference_repeats, light, deviation
     )
     return light, deviation
 
 
 @kernel
-def _normalised_line_kernel(
-    first: int, last: int, line: Any, white: Any, black: Any, read: float, slope: float, ends_repeats: float,
+def _normalise_line_kernel(
+    first: int, last: int, line: Any, white: Any, black: Any, read: float, slope: float, reference_repeats: float,
     normal: Any, deviation: Any,
 ) -> None:  # fmt: skip
     for y in range(first, last):
         for x in range(line.shape[1]):
             contrast, above = white[y, x] - black[y, x], line[y, x] - black[y, x]
-            # (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
+            # (I - black)/(white - black) contains 1 - light of black's noise and light of white's.
             light = min(max(above / max(contrast, np.float32(1)), np.float32(0)), np.float32(1))
-            of_white = (read + slope * max(white[y, x], np.float32(0))) / ends_repeats
-            of_black = (read + slope * max(black[y, x], np.float32(0))) / ends_repeats
+            of_white = (read + slope * max(white[y, x], np.float32(0))) / reference_repeats
+            of_black = (read + slope * max(black[y, x], np.float32(0))) / reference_repeats
             own = read + slope * max(line[y, x], np.float32(0))
             noise = np.float32(np.sqrt(own + (1 - light) ** 2 * of_black + light**2 * of_white))
             weight = _weight(contrast, noise)
@@ -741,8 +739,8 @@ def _normalised_line_kernel(
             deviation[y, x] = noise * abs(weight)
 
 
-def measured_sigma_px(image: NDArray[np.float32], noise: NDArray[np.float32], lit: NDArray[np.bool_]) -> float:
-    """Standard deviation of the stripes' cross-section, px: the median over the clear points of one frame.
+def stripe_sigma_px(image: NDArray[np.float32], noise: NDArray[np.float32], lit: NDArray[np.bool_]) -> float:
+    """Standard deviation of the cross-section of the stripes, px: median over the clear points of one frame.
 
     For a Gaussian bar smoothed to scale S the response is -r/S² at the centre, so S² = -r/r_nn.
     """
@@ -769,27 +767,27 @@ def line_points(
     *,
     sigma_px: float,
 ) -> LinePoints:
-    """Points of one frame, and how sure they are.
+    """Points of one frame, with their standard deviations.
 
-    kind : `RIDGE` or `EDGE`; image, noise : (H, W) float32; lit : (H, W) bool, pixels that can hold a point;
+    kind : `RIDGE` or `EDGE`; image, noise : (H, W) float32; lit : (H, W) bool, pixels that can contain a point;
     sigma_px : scale of the Gaussian.
     """
-    # Standard deviation of the response to noise alone, over that of the noise: ∫ g_xx² = 3/(16 π σ⁶) for the ridge
-    # response, ∫ g_x² = 1/(8 π σ⁴) for the gradient. Of the numerator of the last step: ∫ g_x², and ∫ g² = 1/(4 π σ²).
+    # Standard deviation of the response to noise over that of the noise: ∫ g_xx² = 3/(16 π σ⁶) for the ridge response,
+    # ∫ g_x² = 1/(8 π σ⁴) for the gradient. For the numerator of the last step: ∫ g_x², and ∫ g² = 1/(4 π σ²).
     gradient_noise = np.sqrt(1 / (8 * np.pi)) / sigma_px**2
     if kind == RIDGE:
         response_noise, gain = np.sqrt(3 / (16 * np.pi)) / sigma_px**3, gradient_noise
     else:
         response_noise, gain = gradient_noise, np.sqrt(1 / (4 * np.pi)) / sigma_px
     weakest = np.float32(limits.weak_sigma * response_noise)
-    offset, strength = taylor_step(image, noise, lit, weakest, *kernels(sigma_px), kind)
+    offset, strength = taylor_step(image, noise, lit, weakest, *gaussian_kernels(sigma_px), kind)
     rows, columns, height = _responses_kernel(strength)
     if len(height):
-        counts = height > limits.weak_fraction * np.percentile(height, 90)
-        rows, columns = rows[counts], columns[counts]
-    x, y, normals, response, kept = newton_step(image, offset, columns, rows, sigma_px, kind)
+        significant = height > limits.weak_fraction * np.percentile(height, 90)
+        rows, columns = rows[significant], columns[significant]
+    x, y, normals, response, valid = newton_step(image, offset, columns, rows, sigma_px, kind)
     strongest = np.float32(limits.strong_sigma * response_noise)
-    return LinePoints(*_kept_kernel(kept, x, y, normals, response, noise, rows, columns, gain, strongest))
+    return LinePoints(*_points_kernel(valid, x, y, normals, response, noise, rows, columns, gain, strongest))
 
 
 stripe_points = partial(line_points, RIDGE)
@@ -819,20 +817,20 @@ def _responses_kernel(strength: Any) -> Any:
 
 
 @kernel
-def _kept_kernel(
-    kept: Any, x: Any, y: Any, normals: Any, response: Any, noise: Any, rows: Any, columns: Any, gain: float,
+def _points_kernel(
+    valid: Any, x: Any, y: Any, normals: Any, response: Any, noise: Any, rows: Any, columns: Any, gain: float,
     weakest: float,
 ) -> Any:  # fmt: skip
-    """What `LinePoints` holds, of the points that are kept: gain and weakest make noise a deviation and a threshold."""
+    """Fields of `LinePoints` for the valid points; gain and weakest convert noise to a deviation and a threshold."""
     total = 0
-    for i in range(len(kept)):
-        total += kept[i]
+    for i in range(len(valid)):
+        total += valid[i]
     points, across = np.zeros((total, 2)), np.zeros((total, 2))
     strength, sigma = np.zeros(total), np.zeros(total)
     strong = np.zeros(total, dtype=np.bool_)
     at = 0
-    for i in range(len(kept)):
-        if kept[i]:
+    for i in range(len(valid)):
+        if valid[i]:
             points[at, 0], points[at, 1] = x[i], y[i]
             across[at, 0], across[at, 1] = normals[i, 0], normals[i, 1]
             strength[at] = response[i]

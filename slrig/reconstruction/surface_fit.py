@@ -1,4 +1,4 @@
-"""Least squares for a small surface of a position map: points where it has a wanted value."""
+"""Least-squares fit of a small surface to a position map, and the points at which it has a given value."""
 
 from __future__ import annotations
 
@@ -10,37 +10,36 @@ from numpy.typing import NDArray
 from slrig.kernels import kernel, kernel_part
 
 _REACH = 2  # pixels either way: 5 x 5
-# Chosen. A rendered vase has an error of 9.9 µm rms with both, of 12.0 and 9.2 µm with half and double the first, and
-# of 10.5 and 11.5 µm with half and double the second.
+# Chosen: half and double both increase the error of curved surfaces.
 _QUADRATIC_SCALE_PX = 1.1
 _LINEAR_SCALE_PX = 0.9
-_LEAST_FOR_LINEAR = 5  # pixels: two more than a plane has numbers, to tell its scatter by
-_LONGEST_MOVE_PX = 1.0  # chosen; half and double change the rms error of a rendered vase by 2 and 1 %
-LEAST_GRADIENT = 0.05  # projector px per camera px; the deviation of a point is that of the position over it
-_LEAST_FREEDOM = 0.5  # with less the residuals tell nothing of the scatter, and the noise stands
+_MIN_FOR_PLANE = 5  # pixels: two more than a plane has parameters, to measure the scatter
+_MAX_MOVE_PX = 1.0  # chosen; half and double change errors by 1 to 2 %
+MIN_GRADIENT = 0.05  # projector px per camera px; the deviation of a point is that of the position over it
+_MIN_FREEDOM = 0.5  # with less, residuals do not measure the scatter, and noise alone counts
 _PIXELS = (2 * _REACH + 1) ** 2
 _LANES = 32  # 25 pixels, or points side by side: whole vectors
-POINTS = 1024  # that are worth calling the kernel for
+MIN_POINTS = 1024  # least number for one call of the kernel
 
-# Rows of the working memory of points side by side: the surface's six coefficients, then these.
+# Rows of the working memory of points side by side: the six coefficients of the surface, then these.
 _X, _Y, _NOISE, _MISFIT, _VALUE = 6, 7, 8, 9, 10
 _VARIANCE = _VALUE + _PIXELS
 _ROWS = _VARIANCE + _PIXELS
 
-# Rows of what is worked out in double precision: where each point is, the gradient there, and the value wanted.
+# Rows in double precision: position of each point, gradient there, and target value.
 _AT_X, _AT_Y, _ALONG_X, _ALONG_Y, _WANTED = 0, 1, 2, 3, 4
 
 
 def stencils() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], float]:
     """Weighted least squares of a quadratic surface on 5 x 5 pixels, row by row, padded to whole vectors.
 
-    Two (6, 32) float32: coefficients of 1, x, y, x², xy, y² as weighted sums of the pixels, and those terms at them.
-    (32,) float32: the weight of each pixel where a plane is fitted instead. And the sum of squared residuals to expect
-    of pixels of unit variance: a weighted fit leaves more scatter than 25 - 6, with the hat matrix H the trace of
-    (1 - H)ᵀ(1 - H).
+    Returns two (6, 32) float32: coefficients of 1, x, y, x², xy, y² as weighted sums of the pixels, and those terms at
+    them; (32,) float32: weight of each pixel in the fit of a plane; and the expected sum of squared residuals for
+    pixels of unit variance. For a weighted fit it exceeds 25 - 6: with the hat matrix H it is the trace of (1 - H)ᵀ(1 -
+    H).
     """
-    at = np.arange(-_REACH, _REACH + 1, dtype=np.float64)
-    y, x = (a.ravel() for a in np.meshgrid(at, at, indexing="ij"))
+    offset = np.arange(-_REACH, _REACH + 1, dtype=np.float64)
+    y, x = (a.ravel() for a in np.meshgrid(offset, offset, indexing="ij"))
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     weight = np.exp(-(x * x + y * y) / (2 * _QUADRATIC_SCALE_PX**2))
     sums = np.linalg.solve((basis * weight) @ basis.T, basis * weight)
@@ -57,28 +56,28 @@ def fit_kernel(
     first: int, last: int, position: Any, sigma: Any, usable: Any, whole: Any, stencils: Any, basis: Any, plane: Any,
     whole_freedom: float, starts: Any, targets: Any, fitted: Any,
 ) -> None:  # fmt: skip
-    """Fill in `phase.FittedPoints`, zeros so far: where a local surface has the wanted positions.
+    """Fill in `phase.FittedPoints`, zeros so far: points where a local surface has the target positions.
 
     A quadratic surface is fitted to the 5 x 5 pixels round the start with Gaussian weights, a plane where pixels are
-    missing; pixels that others in between separate from the start are left out. From the start the point moves along
-    the gradient by Newton's method. Its deviation along the normal is that of noise or of the pixels' scatter about
-    the surface, whichever is larger. usable : (H, W) bool, pixels whose light is of one surface.
-    whole : (H, W) uint8, pixels whose 5 x 5 neighbours are all usable; stencils, basis, plane, whole_freedom : as
-    `stencils` returns them. Sums over pixels are of differences from the middle one, small enough for single precision.
+    missing. Pixels that unusable ones separate from the start are left out. From the start the point moves along the
+    gradient by Newton's method. Its deviation along the normal is that by noise or by the pixels' scatter about the
+    surface, whichever is larger. usable : (H, W) bool, pixels whose light is of one surface. whole : (H, W) uint8,
+    pixels whose 5 x 5 neighbours are all usable; stencils, basis, plane, whole_freedom : from `stencils`. Sums over
+    pixels are of differences from the middle one, small enough for single precision.
     """
     points, normals, deviation, found, by_noise = fitted
     rows, columns = position.shape
     flat_position, flat_sigma = position.reshape(-1), sigma.reshape(-1)
-    # A small image of pixels, for one point whose neighbours are not all usable.
+    # Window of one point with unusable neighbours.
     value = np.zeros(_LANES, dtype=np.float32)
     variance_at = np.ones(_LANES, dtype=np.float32)
     member = np.zeros(_LANES, dtype=np.float32)
     gains = np.zeros((6, _LANES), dtype=np.float32)
-    # Points whose neighbours are all usable, side by side, so that they are worked off in vector registers.
+    # Points with usable neighbours only, side by side for vector registers.
     work = np.zeros(_ROWS * _LANES, dtype=np.float32)
     precise = np.zeros(5 * _LANES)
     which = np.zeros(_LANES, dtype=np.int64)
-    waiting = np.int64(0)  # and no literal, for which the parts would be compiled once more
+    waiting = np.int64(0)  # not a literal, for which functions would be compiled once more
     for i in range(first, last):
         points[i, 0], points[i, 1] = starts[i, 0], starts[i, 1]
         if np.isnan(targets[i]):
@@ -107,7 +106,7 @@ def fit_kernel(
                 )  # fmt: skip
                 waiting = np.int64(0)
             continue
-        members = _members(position, sigma, usable, iy, ix, value, variance_at, member)
+        members = _connected_pixels(position, sigma, usable, iy, ix, value, variance_at, member)
         if not _plane_gains(member, members, plane, basis, gains):
             continue
         f0 = f1 = f2 = np.float32(0)
@@ -115,7 +114,7 @@ def fit_kernel(
             f0 += gains[0, j] * value[j]
             f1 += gains[1, j] * value[j]
             f2 += gains[2, j] * value[j]
-        x, y, gx, gy = _solved(
+        x, y, gx, gy = _solve_position(
             f0, f1, f2, np.float32(0), np.float32(0), np.float32(0),
             starts[i, 0] - ix, starts[i, 1] - iy, targets[i] - origin,
         )  # fmt: skip
@@ -127,7 +126,9 @@ def fit_kernel(
             residual = value[j] - (f0 + f1 * basis[1, j] + f2 * basis[2, j])
             misfit += member[j] * residual * residual / variance_at[j]
         freedom = _plane_freedom(member, members, gains, basis)
-        _put(i, ix, iy, x, y, gx, gy, noise, misfit, freedom, starts, points, normals, deviation, found, by_noise)
+        _store_point(
+            i, ix, iy, x, y, gx, gy, noise, misfit, freedom, starts, points, normals, deviation, found, by_noise
+        )
     _fit_side_by_side(
         work, precise, waiting, which, stencils, basis, whole_freedom,
         starts, points, normals, deviation, found, by_noise,
@@ -141,18 +142,17 @@ def _fit_side_by_side(
 ) -> None:  # fmt: skip
     """Fit a quadratic surface to each of the first `count` columns of `work`: the points `which`.
 
-    Row r of `work` is work[r * _LANES :], and so with `precise`. Lanes beyond `count` hold anything, and nobody looks
-    at them.
+    Row r of `work` is work[r * _LANES :], and likewise for `precise`. Lanes beyond `count` have arbitrary values.
     """
-    _surface_of(work, stencils)
+    _fit_surfaces(work, stencils)
     _solve_side_by_side(work, precise)
     for lane in range(_LANES):
         work[_X * _LANES + lane] = precise[_AT_X * _LANES + lane]
         work[_Y * _LANES + lane] = precise[_AT_Y * _LANES + lane]
-    _scatter_of(work, stencils, basis)
+    _measure_scatter(work, stencils, basis)
     for lane in range(count):
         i = which[lane]
-        _put(
+        _store_point(
             i, int(np.rint(starts[i, 0])), int(np.rint(starts[i, 1])),
             precise[_AT_X * _LANES + lane], precise[_AT_Y * _LANES + lane],
             precise[_ALONG_X * _LANES + lane], precise[_ALONG_Y * _LANES + lane],
@@ -161,14 +161,14 @@ def _fit_side_by_side(
         )  # fmt: skip
 
 
-# Nothing else stands in these loops, and one array holds all: so the compiler sees that rows do not overlap.
+# These loops use one array only: the compiler then sees that rows do not overlap.
 @kernel_part
-def _surface_of(work: Any, stencils: Any) -> None:
-    """Rows 0 to 5: the coefficients of 1, x, y, x², xy, y²."""
+def _fit_surfaces(work: Any, stencils: Any) -> None:
+    """Rows 0 to 5: coefficients of 1, x, y, x², xy, y²."""
     work[: 6 * _LANES] = 0
     for k in range(6):
         sums = work[k * _LANES : (k + 1) * _LANES]
-        # Five pixels, a row, at a time: the sums are then fetched and put back a fifth as often.
+        # Five pixels, a row, at a time: sums are loaded and stored a fifth as often.
         for j in range(0, _PIXELS, 5):
             w0, w1, w2, w3, w4 = (
                 stencils[k, j], stencils[k, j + 1], stencils[k, j + 2], stencils[k, j + 3], stencils[k, j + 4]
@@ -182,8 +182,8 @@ def _surface_of(work: Any, stencils: Any) -> None:
 
 
 @kernel_part
-def _scatter_of(work: Any, stencils: Any, basis: Any) -> None:
-    """Rows _NOISE and _MISFIT: variance of the surface at (_X, _Y), and the residuals' squares over their variances."""
+def _measure_scatter(work: Any, stencils: Any, basis: Any) -> None:
+    """Rows _NOISE and _MISFIT: variance of the surface at (_X, _Y), and squared residuals over their variances."""
     work[_NOISE * _LANES : (_MISFIT + 1) * _LANES] = 0
     for j in range(_PIXELS):
         w0, w1, w2 = stencils[0, j], stencils[1, j], stencils[2, j]
@@ -207,7 +207,7 @@ def _scatter_of(work: Any, stencils: Any, basis: Any) -> None:
 
 @kernel_part
 def _solve_side_by_side(work: Any, precise: Any) -> None:
-    """`_solved` of every lane, without a jump: what has come to its end is kept from there on."""
+    """Do `_solve_position` in every lane without branches: lanes that have converged no longer change."""
     for lane in range(_LANES):
         f0, f1, f2 = float(work[lane]), float(work[_LANES + lane]), float(work[2 * _LANES + lane])
         f3, f4, f5 = float(work[3 * _LANES + lane]), float(work[4 * _LANES + lane]), float(work[5 * _LANES + lane])
@@ -220,7 +220,7 @@ def _solve_side_by_side(work: Any, precise: Any) -> None:
             slope_y = f2 + f4 * x + 2.0 * f5 * y
             gx, gy = slope_x if moves else gx, slope_y if moves else gy
             squared = gx * gx + gy * gy
-            moves = moves & (not squared < LEAST_GRADIENT * LEAST_GRADIENT)
+            moves = moves & (not squared < MIN_GRADIENT * MIN_GRADIENT)
             miss = (f0 + f1 * x + f2 * y + f3 * x * x + f4 * x * y + f5 * y * y - target) / squared
             next_x, next_y = x - miss * gx, y - miss * gy
             x, y = next_x if moves else x, next_y if moves else y
@@ -230,14 +230,14 @@ def _solve_side_by_side(work: Any, precise: Any) -> None:
 
 
 @kernel_part(inline="always")
-def _solved(f0: Any, f1: Any, f2: Any, f3: Any, f4: Any, f5: Any, x: float, y: float, target: float) -> Any:
+def _solve_position(f0: Any, f1: Any, f2: Any, f3: Any, f4: Any, f5: Any, x: float, y: float, target: float) -> Any:
     """Move (x, y) along the gradient to where the surface is `target`: x, y and the gradient before the last step."""
     gx = gy = 0.0
     for _ in range(3):
         gx = f1 + 2.0 * f3 * x + f4 * y
         gy = f2 + f4 * x + 2.0 * f5 * y
         squared = gx * gx + gy * gy
-        if squared < LEAST_GRADIENT * LEAST_GRADIENT:
+        if squared < MIN_GRADIENT * MIN_GRADIENT:
             break
         miss = (f0 + f1 * x + f2 * y + f3 * x * x + f4 * x * y + f5 * y * y - target) / squared
         x -= miss * gx
@@ -248,16 +248,16 @@ def _solved(f0: Any, f1: Any, f2: Any, f3: Any, f4: Any, f5: Any, x: float, y: f
 
 
 @kernel_part(inline="always")
-def _put(
+def _store_point(
     i: int, ix: int, iy: int, x: float, y: float, gx: float, gy: float, noise: float, misfit: float, freedom: float,
     starts: Any, points: Any, normals: Any, deviation: Any, found: Any, by_noise: Any,
 ) -> None:  # fmt: skip
-    """Take point i as found, at (x, y) from the pixel (ix, iy), unless it moved too far or the surface is too flat."""
+    """Store point i at (x, y) from the pixel (ix, iy), unless it moved too far or the surface is too flat."""
     gradient = np.sqrt(gx * gx + gy * gy)
     mx, my = x + ix - starts[i, 0], y + iy - starts[i, 1]
-    if not gradient >= LEAST_GRADIENT or not mx * mx + my * my <= _LONGEST_MOVE_PX * _LONGEST_MOVE_PX:
+    if not gradient >= MIN_GRADIENT or not mx * mx + my * my <= _MAX_MOVE_PX * _MAX_MOVE_PX:
         return
-    excess = max(1.0, misfit / freedom) if freedom > _LEAST_FREEDOM else 1.0
+    excess = max(1.0, misfit / freedom) if freedom > _MIN_FREEDOM else 1.0
     variance = noise * excess
     if not variance < np.inf:
         return
@@ -269,18 +269,18 @@ def _put(
 
 
 @kernel_part
-def _members(
+def _connected_pixels(
     position: Any, sigma: Any, usable: Any, iy: int, ix: int, value: Any, variance_at: Any, member: Any
 ) -> int:
-    """Fill in the pixels of the 5 x 5 that nothing separates from the middle, and return how many they are."""
+    """Fill in the pixels of the 5 x 5 that are connected with the middle, and return their number."""
     members = 0
     for j in range(_PIXELS):
         dy, dx = j // 5 - 2, j % 5 - 2
-        # The pixel on the way to one two steps away; one step away is its own.
+        # The pixel half way to one two steps away; itself if it is one step away.
         half_y = dy // 2 if dy >= 0 else -(-dy // 2)
         half_x = dx // 2 if dx >= 0 else -(-dx // 2)
-        on_the_way = _reached(usable, iy, ix, half_y, half_x)
-        if on_the_way and _reached(usable, iy + half_y, ix + half_x, dy - half_y, dx - half_x):
+        on_the_way = _is_reachable(usable, iy, ix, half_y, half_x)
+        if on_the_way and _is_reachable(usable, iy + half_y, ix + half_x, dy - half_y, dx - half_x):
             s = sigma[iy + dy, ix + dx]
             value[j] = position[iy + dy, ix + dx] - position[iy, ix]
             variance_at[j] = s * s
@@ -294,8 +294,10 @@ def _members(
 
 
 @kernel_part(inline="always")
-def _reached(usable: Any, y: int, x: int, dy: int, dx: int) -> bool:
-    """Whether a step of one pixel or none ends on a usable one; a slanting step must not squeeze between two others."""
+def _is_reachable(usable: Any, y: int, x: int, dy: int, dx: int) -> bool:
+    """True if a step of at most one pixel ends on a usable one; a diagonal step must not pass between two unusable
+    ones.
+    """
     return usable[y + dy, x + dx] and (dy == 0 or dx == 0 or usable[y + dy, x] or usable[y, x + dx])
 
 
@@ -319,11 +321,11 @@ def _plane_freedom(member: Any, members: int, gains: Any, basis: Any) -> float:
 
 @kernel_part
 def _plane_gains(member: Any, members: int, plane: Any, basis: Any, gains: Any) -> bool:
-    """Fill the first three rows of gains with those of a weighted plane; False when the pixels fix none.
+    """Fill the first three rows of gains with those of a weighted plane; False if the pixels do not determine one.
 
     plane : (32,) float32, weight of each pixel.
     """
-    if members < _LEAST_FOR_LINEAR:
+    if members < _MIN_FOR_PLANE:
         return False
     s0 = s1 = s2 = s3 = s4 = s5 = np.float32(0)
     for j in range(_LANES):

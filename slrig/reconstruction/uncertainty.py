@@ -1,9 +1,9 @@
-"""Standard deviation of points in space: noise, sensitivity of the triangulation, share of the calibration."""
+"""Standard deviation of points in space: noise, sensitivity of the triangulation, and share of the calibration."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,18 @@ from slrig.errors import CalibrationError
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import DEVICE_PARAMETERS, Axis, Calibration, FloatArray, IntArray, Pinhole, Source
 from slrig.model.lens_kernels import by_terms, distorted
-from slrig.reconstruction.triangulation import packed, to_depths, to_device
+from slrig.reconstruction.triangulation import optical_depths_mm, pack_device, to_device
+
+_EACH = DEVICE_PARAMETERS
+_NODES = 10  # along each side of the volume
+_MIN_NODES = 8  # 24 displacements, to remove a rigid motion of six parameters
+_MAX_DROPPED = 0.002  # of the variance, anywhere in the volume
+_REACH = 2  # points either way, for the direction of a curve
+_CAMERA_CAMERA, _ALL = int(Source.CAMERA_CAMERA), int(Source.ALL)
 
 
 @kernel_part
-def gradient(d: Any, a: float, b: float, x: float, y: float, z: float, out: Any) -> None:
+def coordinate_gradient(d: Any, a: float, b: float, x: float, y: float, z: float, out: Any) -> None:
     """Fill out (3,) with ∂(a u + b v)/∂X, X in the world."""
     xc, yc, zc = to_device(d, x, y, z)
     xn, yn = xc / zc, yc / zc
@@ -59,36 +66,36 @@ def add_parameters(d: Any, a: float, b: float, x: float, y: float, z: float, out
 
 
 @kernel_part
-def pixel_squares(d: Any, size: Any, x: float, y: float, z: float, direction: Any, g: Any) -> float:
-    """How far, in pixels, squared, the image of a point moves when it moves along a direction; 0 out of the image."""
+def squared_image_motion(d: Any, size: Any, x: float, y: float, z: float, direction: Any, g: Any) -> float:
+    """Squared motion of the image of a point, px², for a motion of the point along a direction; 0 outside the image."""
     xc, yc, zc = to_device(d, x, y, z)
     if zc <= 0:
         return 0.0
     xd, yd, xx, xy, yy = distorted(d[5:10], xc / zc, yc / zc)
     u, v = d[0] * xd + d[1] * yd + d[2], d[3] * yd + d[4]
-    # Beyond the radius at which its distortion turns back a lens sees nothing.
+    # Beyond the radius at which its distortion stops rising, a lens images nothing.
     if not (-0.5 < u < size[0] - 0.5 and -0.5 < v < size[1] - 0.5 and xx * yy - xy * xy > 0):
         return 0.0
     total = 0.0
     for k in range(2):
-        gradient(d, 1.0 - k, 1.0 * k, x, y, z, g)
+        coordinate_gradient(d, 1.0 - k, 1.0 * k, x, y, z, g)
         along = g[0] * direction[0] + g[1] * direction[1] + g[2] * direction[2]
         total += along * along
     return total
 
 
 @kernel_part
-def add_row(
+def add_sensitivity(
     devices: Any, camera: int, other: int, a: float, b: float, share: float, point: Any, normal: Any, g: Any, out: Any
 ) -> bool:
-    """Add to out (15 d,) how the point moves along the normal by each parameter; False if nothing determines it.
+    """Add to out (15 d,) the motion of the point along the normal by each parameter; False if nothing determines it.
 
-    The third equation is a u + b v of the device `other`. g : (3, 3), to work in.
+    The third equation is a u + b v of the device `other`. g : (3, 3) working memory.
     """
     x, y, z = point[0], point[1], point[2]
-    gradient(devices[camera], 1.0, 0.0, x, y, z, g[0])
-    gradient(devices[camera], 0.0, 1.0, x, y, z, g[1])
-    gradient(devices[other], a, b, x, y, z, g[2])
+    coordinate_gradient(devices[camera], 1.0, 0.0, x, y, z, g[0])
+    coordinate_gradient(devices[camera], 0.0, 1.0, x, y, z, g[1])
+    coordinate_gradient(devices[other], a, b, x, y, z, g[2])
     r, s, t = g[0], g[1], g[2]
     st0, st1, st2 = s[1] * t[2] - s[2] * t[1], s[2] * t[0] - s[0] * t[2], s[0] * t[1] - s[1] * t[0]
     tr0, tr1, tr2 = t[1] * r[2] - t[2] * r[1], t[2] * r[0] - t[0] * r[2], t[0] * r[1] - t[1] * r[0]
@@ -108,8 +115,8 @@ def add_row(
 
 
 @kernel_part
-def across(devices: Any, second: int, point: Any, tangent: Any, g: Any) -> Any:
-    """The direction across the stripe in the second camera's image, a unit vector.
+def stripe_normal(devices: Any, second: int, point: Any, tangent: Any, g: Any) -> Any:
+    """Direction across the stripe in the second camera's image, a unit vector.
 
     Without a tangent, along the epipolar line of the first camera's ray.
     """
@@ -123,8 +130,8 @@ def across(devices: Any, second: int, point: Any, tangent: Any, g: Any) -> Any:
         x = point[0] + d[10] * d[19] + d[13] * d[20] + d[16] * d[21]
         y = point[1] + d[11] * d[19] + d[14] * d[20] + d[17] * d[21]
         z = point[2] + d[12] * d[19] + d[15] * d[20] + d[18] * d[21]
-    gradient(devices[second], 1.0, 0.0, point[0], point[1], point[2], g[0])
-    gradient(devices[second], 0.0, 1.0, point[0], point[1], point[2], g[1])
+    coordinate_gradient(devices[second], 1.0, 0.0, point[0], point[1], point[2], g[0])
+    coordinate_gradient(devices[second], 0.0, 1.0, point[0], point[1], point[2], g[1])
     u = g[0, 0] * x + g[0, 1] * y + g[0, 2] * z
     v = g[1, 0] * x + g[1, 1] * y + g[1, 2] * z
     length = np.sqrt(u * u + v * v)
@@ -134,38 +141,32 @@ def across(devices: Any, second: int, point: Any, tangent: Any, g: Any) -> Any:
 
 
 @kernel_part
-def shares_of_mean(devices: Any, sizes: Any, point: Any, ray: Any, g: Any, shares: Any) -> float:
-    """Fill shares with each camera's part in the mean of all that see a point; their sum before, 0 if none does."""
+def camera_weights(devices: Any, sizes: Any, point: Any, ray: Any, g: Any, weights: Any) -> float:
+    """Fill weights with the share of each camera in the mean of all that see a point; return their sum before, 0 for
+    none.
+    """
     p = devices[len(devices) - 1]
     for k in range(3):
         # From the projector's centre, -Rᵀ t, to the point.
         ray[k] = point[k] + p[10 + k] * p[19] + p[13 + k] * p[20] + p[16 + k] * p[21]
     total = 0.0
-    for index in range(len(shares)):
-        shares[index] = pixel_squares(devices[index], sizes[index], point[0], point[1], point[2], ray, g[0])
-        total += shares[index]
-    for index in range(len(shares)):
-        shares[index] = shares[index] / total if total > 0 else 0.0
+    for index in range(len(weights)):
+        weights[index] = squared_image_motion(devices[index], sizes[index], point[0], point[1], point[2], ray, g[0])
+        total += weights[index]
+    for index in range(len(weights)):
+        weights[index] = weights[index] / total if total > 0 else 0.0
     return total
-
-
-_EACH = DEVICE_PARAMETERS
-_NODES = 10  # along each side of the volume
-_FEWEST_NODES = 8  # 24 displacements, to take a rigid motion of six numbers out of
-_DROPPED = 0.002  # of the variance, at any place in the volume
-_REACH = 2  # points either way, for the direction of a curve
-_CAMERA_CAMERA, _ALL = int(Source.CAMERA_CAMERA), int(Source.ALL)
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationModes:
-    """The independent ways in which a calibration may be wrong, ready for the points of a scan.
+    """Independent modes of the error of a calibration.
 
-    devices : (d, 22) float64, the scan's cameras in order, then the projector, if it is calibrated (`projector`);
-    sizes_px : (d, 2) float64, width and height of each. modes : (15 d + 6, r) float64, the change of every parameter by
-    one standard deviation of each mode, then the rigid motion that is taken out: a translation, mm, and a turn about
-    `middle_mm`, (3,), rad. row : whether light is numbered by rows. second : the camera that the first one is paired
-    with where the projector is not calibrated.
+    devices : (d, 22) float64, cameras of the scan in order, then the projector, if it is calibrated (`projector`);
+    sizes_px : (d, 2) float64, width and height of each. modes : (15 d + 6, r) float64, change of every parameter by one
+    standard deviation of each mode, then the rigid motion to remove: a translation, mm, and a rotation about
+    `middle_mm`, (3,), rad. row : True if light is numbered by rows. second : camera that the first one is paired with
+    if the projector is not calibrated.
     """
 
     devices: FloatArray
@@ -180,9 +181,9 @@ class CalibrationModes:
 def calibration_modes(
     calibration: Calibration, names: Sequence[str], axis: Axis, /, *, second: int = 1
 ) -> CalibrationModes | None:
-    """The modes of a calibration for a scan with the cameras `names`; None if it states no covariance.
+    """Modes of a calibration for a scan with the cameras `names`; None if it states no covariance.
 
-    axis : the axis that points are triangulated by; second : index of the second camera, without a projector.
+    axis : axis of triangulation; second : index of the second camera, without a projector.
 
     Raises
     ------
@@ -192,16 +193,16 @@ def calibration_modes(
     solved = calibration.solved
     if solved is None:
         return None
-    known = list(calibration.cameras)
-    order = [known.index(name) for name in names]
+    calibrated = list(calibration.cameras)
+    order = [calibrated.index(name) for name in names]
     pinholes = [calibration.cameras[name] for name in names]
     if calibration.projector is not None:
-        order.append(len(known))
+        order.append(len(calibrated))
         pinholes.append(calibration.projector)
-    taken = np.concatenate([np.arange(_EACH * index, _EACH * (index + 1)) for index in order])
-    changes = _modes_of(solved.covariance[np.ix_(taken, taken)])
-    bare = CalibrationModes(
-        devices=np.stack([packed(each) for each in pinholes]),
+    parameters = np.concatenate([np.arange(_EACH * index, _EACH * (index + 1)) for index in order])
+    changes = _covariance_modes(solved.covariance[np.ix_(parameters, parameters)])
+    without_modes = CalibrationModes(
+        devices=np.stack([pack_device(each) for each in pinholes]),
         sizes_px=np.array([[each.size.width_px, each.size.height_px] for each in pinholes], dtype=np.float64),
         modes=np.zeros((len(changes) + 6, 0)),
         middle_mm=solved.volume_mm.mean(axis=0),
@@ -209,25 +210,23 @@ def calibration_modes(
         second=second,
         projector=calibration.projector is not None,
     )
-    places, moves = _sampled(bare, solved.volume_mm)
+    places, moves = _sample_volume(without_modes, solved.volume_mm)
     rigid = np.zeros((len(places), 3, 6))
     rigid[:, :, :3] = np.eye(3)
     for k in range(3):
-        rigid[:, :, 3 + k] = np.cross(np.eye(3)[k], places - bare.middle_mm)
+        rigid[:, :, 3 + k] = np.cross(np.eye(3)[k], places - without_modes.middle_mm)
     fields = (moves @ changes).reshape(3 * len(places), -1)
     motion = np.linalg.lstsq(rigid.reshape(-1, 6), fields, rcond=None)[0]
     fields = fields - rigid.reshape(-1, 6) @ motion
-    # Principal components: the last ones hold little of the variance, and those that matter nowhere go.
-    turn = np.linalg.svd(fields, full_matrices=False)[2].T
-    variance = ((fields @ turn) ** 2).reshape(len(places), 3, -1).sum(axis=1)
-    left = np.cumsum(variance[:, ::-1], axis=1)[:, ::-1]
-    # With several cameras the places tell how the mean of their points moves, and not how each one's or a stripe does.
-    dropped = _DROPPED if len(names) == 1 else 0.0
-    count = int((left > dropped * left[:, :1]).any(axis=0).sum())
-    modes = np.concatenate([changes, -motion]) @ turn[:, :count]
-    return CalibrationModes(
-        bare.devices, bare.sizes_px, np.ascontiguousarray(modes), bare.middle_mm, bare.row, bare.second, bare.projector
-    )
+    # Principal components: the last ones have little of the variance and are dropped.
+    components = np.linalg.svd(fields, full_matrices=False)[2].T
+    variance = ((fields @ components) ** 2).reshape(len(places), 3, -1).sum(axis=1)
+    remaining = np.cumsum(variance[:, ::-1], axis=1)[:, ::-1]
+    # With several cameras the places show the motion of the mean of their points, but not of each or of a stripe.
+    dropped = _MAX_DROPPED if len(names) == 1 else 0.0
+    count = int((remaining > dropped * remaining[:, :1]).any(axis=0).sum())
+    modes = np.concatenate([changes, -motion]) @ components[:, :count]
+    return replace(without_modes, modes=np.ascontiguousarray(modes))
 
 
 def calibration_sigma(
@@ -239,12 +238,12 @@ def calibration_sigma(
     tangents: FloatArray,
     /,
 ) -> FloatArray:
-    """(n,) float64: standard deviation along the surface normal that the calibration makes, mm.
+    """(n,) float64: standard deviation along the surface normal by the calibration, mm.
 
-    points_mm : (n, 3); normals : (n, 3), unit; source : (n,) `Source`; camera : (n,), index of the camera that has the
-    point. tangents : (n, 3), the direction of the stripe in space, needed of points of two cameras only; without one
-    the stripe is taken to run straight across the epipolar line. Where no triangle gives a normal, the standard
-    deviation along the viewing ray stands, which is an upper bound but for a small part.
+    points_mm : (n, 3); normals : (n, 3), unit; source : (n,) `Source`; camera : (n,), index of the camera of the point.
+    tangents : (n, 3), direction of the stripe in space, needed for points of two cameras only; without it the stripe is
+    assumed perpendicular to the epipolar line. Without a normal, the standard deviation along the viewing ray is
+    returned, practically an upper bound.
     """
     sigma = np.zeros(len(points_mm))
     in_bands(
@@ -255,76 +254,80 @@ def calibration_sigma(
 
 
 def stripe_tangents(points_mm: FloatArray, offsets: IntArray, bridge_after: NDArray[np.bool_], /) -> FloatArray:
-    """(n, 3) float64: the direction of each curve at its points, over two points either way; not a unit vector.
+    """(n, 3) float64: direction of each curve at its points, over two points either way; not a unit vector.
 
-    NaN for a point that no step but bridges joins to another one.
+    NaN for a point that only bridges join to another one.
     """
     tangents = np.full((len(points_mm), 3), np.nan)
     in_bands(_tangent_kernel, len(offsets) - 1, points_mm, offsets, bridge_after, tangents)
     return tangents
 
 
-def _modes_of(covariance: FloatArray) -> FloatArray:
-    """(p, k): M with M Mᵀ = covariance, by way of correlations: focal lengths and angles differ by many orders."""
+def _covariance_modes(covariance: FloatArray) -> FloatArray:
+    """(p, k): M with M Mᵀ = covariance, computed from correlations: focal lengths and angles differ by many orders."""
     deviation = np.sqrt(np.clip(np.diagonal(covariance), 0, None))
     scale = np.where(deviation > 0, deviation, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values > 0
-    return np.asarray(deviation[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+    positive = values > 0
+    return np.asarray(deviation[:, None] * vectors[:, positive] * np.sqrt(values[positive]))
 
 
-def _sampled(modes: CalibrationModes, volume_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Places (n, 3) in the volume that the devices see, and by how much each parameter moves them, (n, 3, 15 d)."""
+def _sample_volume(modes: CalibrationModes, volume_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places (n, 3) in the volume that the devices see, and their motion by each parameter, (n, 3, 15 d)."""
     shares = (np.arange(_NODES) + 0.5) / _NODES
     axes = [low + shares * (high - low) for low, high in volume_mm.T]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     moves = np.zeros((len(places), 3, len(modes.modes) - 6))
-    seen = np.zeros(len(places), dtype=np.bool_)
-    _sample_kernel(modes.devices, modes.sizes_px, modes.row, modes.second, modes.projector, places, moves, seen)
-    if np.count_nonzero(seen) < _FEWEST_NODES:
+    visible = np.zeros(len(places), dtype=np.bool_)
+    _sample_kernel(modes.devices, modes.sizes_px, modes.row, modes.second, modes.projector, places, moves, visible)
+    if np.count_nonzero(visible) < _MIN_NODES:
         low, high = (", ".join(f"{value:.0f}" for value in corner) for corner in volume_mm)
         message = (
             f"solved.volume_mm: expected a box that the devices see, found ({low}) to ({high}) mm, of which they see "
             "nothing; calibrate again, or leave `solved` out"
         )
         raise CalibrationError(message)
-    return places[seen], moves[seen]
+    return places[visible], moves[visible]
 
 
 @kernel(in_every_scan=False)
 def _sample_kernel(
-    devices: Any, sizes: Any, row: bool, second: int, projector: bool, places: Any, moves: Any, seen: Any
+    devices: Any, sizes: Any, row: bool, second: int, projector: bool, places: Any, moves: Any, visible: Any
 ) -> None:
     last = len(devices) - 1
     g = np.zeros((3, 3))
     ray = np.zeros(3)
-    shares = np.zeros(last)
+    weights = np.zeros(last)
     axis = np.zeros(3)
-    one = np.zeros(3)
-    one[0] = 1.0
-    none = np.full(3, np.nan)
+    first_axis = np.zeros(3)
+    first_axis[0] = 1.0
+    no_tangent = np.full(3, np.nan)
     a, b = 0.0 if row else 1.0, 1.0 if row else 0.0
     for i in range(len(places)):
         point = places[i]
         if projector:
-            lit = pixel_squares(devices[last], sizes[last], point[0], point[1], point[2], one, g[0]) > 0
-            seen[i] = lit and shares_of_mean(devices, sizes, point, ray, g, shares) > 0
+            lit = squared_image_motion(devices[last], sizes[last], point[0], point[1], point[2], first_axis, g[0]) > 0
+            visible[i] = lit and camera_weights(devices, sizes, point, ray, g, weights) > 0
         else:
-            seen[i] = pixel_squares(devices[0], sizes[0], point[0], point[1], point[2], one, g[0]) > 0
-            seen[i] &= pixel_squares(devices[second], sizes[second], point[0], point[1], point[2], one, g[0]) > 0
-            if seen[i]:
-                a, b = across(devices, second, point, none, g)
-        if not seen[i]:
+            visible[i] = squared_image_motion(devices[0], sizes[0], point[0], point[1], point[2], first_axis, g[0]) > 0
+            visible[i] &= (
+                squared_image_motion(devices[second], sizes[second], point[0], point[1], point[2], first_axis, g[0]) > 0
+            )
+            if visible[i]:
+                a, b = stripe_normal(devices, second, point, no_tangent, g)
+        if not visible[i]:
             continue
         for k in range(3):
             axis[:] = 0.0
             axis[k] = 1.0
             if not projector:
-                seen[i] &= add_row(devices, 0, second, a, b, 1.0, point, axis, g, moves[i, k])
+                visible[i] &= add_sensitivity(devices, 0, second, a, b, 1.0, point, axis, g, moves[i, k])
                 continue
             for camera in range(last):
-                if shares[camera] > 0:
-                    seen[i] &= add_row(devices, camera, last, a, b, shares[camera], point, axis, g, moves[i, k])
+                if weights[camera] > 0:
+                    visible[i] &= add_sensitivity(
+                        devices, camera, last, a, b, weights[camera], point, axis, g, moves[i, k]
+                    )
 
 
 @kernel(in_every_scan=False)
@@ -336,7 +339,7 @@ def _sigma_kernel(
     parameters = _EACH * len(devices)
     g = np.zeros((3, 3))
     ray = np.zeros(3)
-    shares = np.zeros(last)
+    weights = np.zeros(last)
     normal = np.zeros(3)
     line = np.zeros(parameters + 6)
     total = np.zeros(modes.shape[1])
@@ -352,18 +355,18 @@ def _sigma_kernel(
             for k in range(3):
                 normal[k] = ray[k] / np.sqrt(length)
         line[:] = 0.0
-        good = True
+        valid = True
         if source[i] == _CAMERA_CAMERA:
-            a, b = across(devices, second, point, tangents[i], g)
-            good = add_row(devices, 0, second, a, b, 1.0, point, normal, g, line)
+            a, b = stripe_normal(devices, second, point, tangents[i], g)
+            valid = add_sensitivity(devices, 0, second, a, b, 1.0, point, normal, g, line)
         else:
             a, b = 0.0 if row else 1.0, 1.0 if row else 0.0
-            if source[i] == _ALL and shares_of_mean(devices, sizes, point, ray, g, shares) > 0:
+            if source[i] == _ALL and camera_weights(devices, sizes, point, ray, g, weights) > 0:
                 for index in range(last):
-                    if shares[index] > 0:
-                        good &= add_row(devices, index, last, a, b, shares[index], point, normal, g, line)
+                    if weights[index] > 0:
+                        valid &= add_sensitivity(devices, index, last, a, b, weights[index], point, normal, g, line)
             else:
-                good = add_row(devices, camera[i], last, a, b, 1.0, point, normal, g, line)
+                valid = add_sensitivity(devices, camera[i], last, a, b, 1.0, point, normal, g, line)
         x, y, z = point[0] - middle[0], point[1] - middle[1], point[2] - middle[2]
         for k in range(3):
             line[parameters + k] = normal[k]
@@ -378,7 +381,7 @@ def _sigma_kernel(
         squares = 0.0
         for k in range(len(total)):
             squares += total[k] * total[k]
-        sigma[i] = np.sqrt(squares) if good else np.nan
+        sigma[i] = np.sqrt(squares) if valid else np.nan
 
 
 @kernel(in_every_scan=False)
@@ -399,8 +402,8 @@ def _tangent_kernel(first: int, last: int, points: Any, offsets: Any, bridge: An
 def sigma_along_normal(deviation_mm: FloatArray, normals: NDArray[np.float32]) -> FloatArray:
     """(n,) float64: standard deviation along the surface normal, mm.
 
-    deviation_mm : (n, 3), displacement for one standard deviation; normals : (n, 3), unit. Where no triangle gives a
-    normal the whole displacement stands: an upper bound.
+    deviation_mm : (n, 3), displacement for one standard deviation; normals : (n, 3), unit. Without a normal the whole
+    displacement is returned, an upper bound.
     """
     sigma = np.zeros(len(deviation_mm))
     in_bands(_along_normal, len(sigma), deviation_mm, normals, sigma)
@@ -410,17 +413,17 @@ def sigma_along_normal(deviation_mm: FloatArray, normals: NDArray[np.float32]) -
 def sampling_mm(
     points_mm: FloatArray, camera: Pinhole, projector: Pinhole | None, axis: Axis, step_px: float | FloatArray
 ) -> FloatArray:
-    """(n,) float64: how far apart the rig samples a surface that faces it, mm.
+    """(n,) float64: distance between samples of a surface that faces the rig, mm.
 
-    The larger of a camera pixel at the point's depth and, with a projector, of `step_px` of its columns, or rows where
-    `axis` says so; (n,) where it varies. Each is measured along that axis: an array of mirrors may be addressed twice
-    as finely in one.
+    The larger of a camera pixel at the depth of the point and, with a projector, of `step_px` of its columns, or rows
+    for that axis; (n,) if it varies. Each is measured along that axis: mirror arrays may have twice the resolution in
+    one.
     """
     k = 0 if axis is Axis.COLUMN else 1
-    pixel = to_depths(camera, points_mm) / camera.matrix[k, k]
+    pixel = optical_depths_mm(camera, points_mm) / camera.matrix[k, k]
     if projector is None:
         return np.asarray(pixel * step_px)
-    return np.asarray(np.maximum(pixel, step_px * to_depths(projector, points_mm) / projector.matrix[k, k]))
+    return np.asarray(np.maximum(pixel, step_px * optical_depths_mm(projector, points_mm) / projector.matrix[k, k]))
 
 
 @kernel

@@ -10,7 +10,7 @@ import tifffile
 from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray
-from slrig.reconstruction import to_depths
+from slrig.reconstruction import optical_depths_mm
 from slrig.ros_messages import POINT_FIELDS, point_table
 from slrig.scan.organised import OrganisedCloud
 
@@ -73,7 +73,7 @@ def encode_depth_tiff(cloud: OrganisedCloud) -> bytes:
 def depths_mm(cloud: OrganisedCloud) -> FloatArray:
     """(H, W) float64: depth of each point along the camera's optical axis, NaN for none."""
     points = cloud.points_mm.reshape(-1, 3).astype(np.float64)
-    return to_depths(cloud.device, points).reshape(cloud.cause.shape)
+    return optical_depths_mm(cloud.device, points).reshape(cloud.cause.shape)
 
 
 def encode_pcd(cloud: OrganisedCloud) -> bytes:

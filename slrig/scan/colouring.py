@@ -14,11 +14,11 @@ from slrig.reconstruction import (
     BRIGHT_ALBEDO,
     BRIGHT_PERCENT,
     Albedo,
-    LitPoints,
-    LitView,
+    AlbedoSamples,
+    Illumination,
     MergedCurves,
     SheetCurves,
-    albedo,
+    estimate_albedo,
 )
 from slrig.scan.stream import CameraResult
 
@@ -47,16 +47,18 @@ def coloured(
     """Colour each point by the camera that it counts as seen by. normals : (n, 3), unit, NaN where not known."""
     curves, nowhere = joined.curves, np.zeros(len(joined.camera), dtype=np.bool_)
     border = nowhere if projector is None else _at_border(curves, projector, axis)
-    points = LitPoints(
+    points = AlbedoSamples(
         curves.points_mm, normals, curves.pixels_px, joined.camera, curves.source == Source.ALL, border
     )  # fmt: skip
-    views = [LitView(seen.device, seen.contrast, seen.clipped, seen.curves.refusal == Refusal.NONE) for seen in cameras]
+    views = [
+        Illumination(seen.device, seen.contrast, seen.clipped, seen.curves.refusal == Refusal.NONE) for seen in cameras
+    ]
     if projector is None:
-        found = albedo(points, views, None)
+        found = estimate_albedo(points, views, None)
     else:
         channels = max(view.contrast.shape[2] for view in views)
         shares = None if light is None else light.light(places_px(curves, axis), projector.size, channels)
-        found = albedo(points, views, projector.centre_mm, light=shares)
+        found = estimate_albedo(points, views, projector.centre_mm, light=shares)
     colour = srgb_of(found.value)
     colour[found.mark == AlbedoMark.UNKNOWN] = _NEUTRAL
     return Coloured(np.repeat(colour, 3, axis=1) if colour.shape[1] == 1 else colour, found.mark, found)

@@ -29,7 +29,7 @@ from slrig.reconstruction import (
     decode,
     estimate_noise,
     exposure_count,
-    fused_frames,
+    fuse_exposures,
     lit_pixels,
     position_map,
     unresolved_bits,
@@ -144,7 +144,7 @@ def _decoded(capture: Capture, camera: str, axis: Axis, folder: Path) -> Decoded
 
 def _frames(capture: Capture, camera: str, axis: Axis) -> tuple[AxisFrames, NoiseModel]:
     if exposure_count({shot.exposure_s for shot in capture.shots if shot.camera == camera}) > 1:
-        fused = fused_frames(capture, camera, axis)
+        fused = fuse_exposures(capture, camera, axis)
         return fused.frames, fused.noise
     frames = axis_frames(capture, camera, axis)
     return frames, estimate_noise(frames)

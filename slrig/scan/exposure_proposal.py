@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slrig.capture import LEAST_CLEAR, LEAST_CLEAR_DN, NEARLY_FULL, Chosen, Samples
 from slrig.errors import ConfigError
-from slrig.reconstruction import NoiseModel, fitted_noise
+from slrig.reconstruction import NoiseModel, fit_noise
 
 DECODED_CLEAR = 7.0
 """Noises that white lies above black where a pixel is decoded. On dark and mixed rendered reliefs, at nine exposures,
@@ -85,7 +85,7 @@ class SeenObject:
 def seen_object(looks: Sequence[Look], full_scale: int) -> SeenObject:
     """Sum up the looks of one camera, one at least, in any order."""
     rising = tuple(sorted(looks, key=lambda look: look.exposure_s))
-    noise = fitted_noise(_noise_samples(look, full_scale) for look in rising)
+    noise = fit_noise(_noise_samples(look, full_scale) for look in rising)
     shape, full = rising[0].white.shape[1], NEARLY_FULL * full_scale
     # DN per second; of what every look saturates so much is known.
     lit, rate = np.zeros(shape, np.bool_), np.full(shape, full / rising[0].exposure_s)
@@ -101,7 +101,7 @@ def seen_object(looks: Sequence[Look], full_scale: int) -> SeenObject:
 
 
 def _noise_samples(look: Look, full_scale: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Levels and variances of single samples, as `fitted_noise` wants them: from what differs in two frames alike. The
+    """Levels and variances of single samples, as `fit_noise` wants them: from what differs in two frames alike. The
     level is that of the pixel beside it (`Sampler`): its own, of whole numbers, tells whether the two frames differ.
     """
     levels, variances = [], []

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from slrig.errors import ConfigError
 from slrig.model import Axis, CameraFormat, FloatArray, Pinhole, Pixels, Refusal, Region, Shot, Size
-from slrig.reconstruction import AskedPixels, CameraCurves, SheetCurves, project, rays, selected, to_depths
+from slrig.reconstruction import (
+    CameraCurves,
+    RegionMask,
+    SheetCurves,
+    optical_depths_mm,
+    pixel_rays,
+    project,
+    select_points,
+)
 
 Sample = TypeVar("Sample", bound=np.generic)
 
@@ -37,7 +45,7 @@ class FramePart:
 
     rows: slice
     columns: slice
-    asked: AskedPixels
+    asked: RegionMask
     whole: CameraFormat
 
     @property
@@ -60,13 +68,13 @@ class FramePart:
     def curves(self, found: CameraCurves) -> CameraCurves:
         """The same curves in the pixels of the whole frame."""
         origin = np.array([self.columns.start, self.rows.start], dtype=np.float64)
-        unresolved, lost = found.unresolved, found.lost_lines
+        unresolved, lost = found.unresolved, found.unresolved_lines
         return replace(
             found,
             ensemble=found.ensemble._replace(points_px=found.ensemble.points_px + origin),
             refusal=self.placed(found.refusal, Refusal.OUTSIDE_REGION),
             unresolved=None if unresolved is None else self.placed(unresolved),
-            lost_lines=None if lost is None else self.placed(lost, beyond=False),
+            unresolved_lines=None if lost is None else self.placed(lost, beyond=False),
         )
 
 
@@ -97,13 +105,13 @@ def frame_part(
     lowest = highest = None
     if region.box_mm is not None or region.depth_mm is not None:
         y, x = np.mgrid[rows, columns].astype(np.float64)
-        directions = rays(device, np.stack([x.ravel(), y.ravel()], axis=1))
+        directions = pixel_rays(device, np.stack([x.ravel(), y.ravel()], axis=1))
         near, far = _stretch(region, device, directions)
         exact &= (near < far).reshape(exact.shape)
         if projector is not None:
             ends = _light(near, far, directions, device, projector, axis)
             lowest, highest = (each.reshape(exact.shape) for each in ends)
-    asked = AskedPixels(exact, lowest, highest, region.least_contrast or 0.0)
+    asked = RegionMask(exact, lowest, highest, region.least_contrast or 0.0)
     return FramePart(rows, columns, asked, form)
 
 
@@ -112,7 +120,7 @@ def limited(
 ) -> tuple[SheetCurves, NDArray[np.uint8]]:
     """The points of a camera that the region holds, and its refusals, (H, W), with the others among them."""
     kept = within(region, curves.points_mm, curves.pixels_px, refusal, device)
-    return selected(curves, kept), marked(refusal, curves.pixels_px, kept)
+    return select_points(curves, kept), marked(refusal, curves.pixels_px, kept)
 
 
 def within(
@@ -128,7 +136,7 @@ def within(
         least, most = np.array(region.box_mm)
         kept &= ((points_mm >= least) & (points_mm <= most)).all(axis=1)
     if region.depth_mm is not None:
-        depth = to_depths(device, points_mm)
+        depth = optical_depths_mm(device, points_mm)
         kept &= (depth >= region.depth_mm[0]) & (depth <= region.depth_mm[1])
     return np.asarray(kept)
 

@@ -17,7 +17,7 @@ from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing import merge_depth_buffers
 from slrig.model import IntArray, Mesh, Pinhole
 from slrig.model.lens_kernels import distorted, undistorted
-from slrig.reconstruction import SETTLED, distorted_from_pixel, packed, project
+from slrig.reconstruction import CONVERGED, distorted_from_pixel, pack_device, project
 
 NO_SURFACE = "no_surface"
 """Why a pixel has no point that the camera's map of causes has none for: no triangle lies on its ray. A hole of the
@@ -64,8 +64,8 @@ def organised(
     seen = np.ascontiguousarray(mesh.vertices_mm.astype(np.float64) @ device.rotation.T + device.translation_mm)
     at_home = replace(device, rotation=np.eye(3), translation_mm=np.zeros(3))
     sight, faces = np.zeros((high, wide, 2)), np.ascontiguousarray(mesh.faces)
-    in_bands(_sighted, high, packed(at_home), sight, rows_at_least=_ROWS_AT_LEAST)
-    given = packed(at_home), seen, project(at_home, seen), faces, sight
+    in_bands(_sighted, high, pack_device(at_home), sight, rows_at_least=_ROWS_AT_LEAST)
+    given = pack_device(at_home), seen, project(at_home, seen), faces, sight
     at_least = max(_FACES_AT_LEAST, -(-len(faces) // _MOST_BANDS))
     _, face = merge_depth_buffers(in_bands(_nearest, len(faces), *given, rows_at_least=at_least))
     cause = np.where((refused == 0) & (face < 0), np.uint8(len(causes)), refused)
@@ -100,9 +100,9 @@ def _sighted(first: int, last: int, d: Any, sight: Any) -> None:
         for column in range(sight.shape[1]):
             xd, yd = distorted_from_pixel(d, column, row)
             # As far from the last pixel as that was from the one before: one step of Newton's method is then enough.
-            nextx, nexty = undistorted(d[5:10], xd, yd, x + dx, y + dy, SETTLED)
+            nextx, nexty = undistorted(d[5:10], xd, yd, x + dx, y + dy, CONVERGED)
             if np.isnan(nextx):
-                nextx, nexty = undistorted(d[5:10], xd, yd, xd, yd, SETTLED)
+                nextx, nexty = undistorted(d[5:10], xd, yd, xd, yd, CONVERGED)
             dx, dy = (nextx - x, nexty - y) if not np.isnan(x) else (0.0, 0.0)
             x, y = nextx, nexty
             sight[row, column, 0], sight[row, column, 1] = x, y

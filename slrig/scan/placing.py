@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import Pinhole, Size
-from slrig.reconstruction import project, to_depths
+from slrig.reconstruction import optical_depths_mm, project
 
 _AT_ONCE = 65_536  # vertices: what is float64 in between stays below 4 MB
 
@@ -32,5 +32,5 @@ def placed_vertices(vertices_mm: NDArray[np.floating[Any]], device: Pinhole) -> 
         part = slice(start, start + _AT_ONCE)
         points = vertices_mm[part].astype(np.float64)
         placed[part, :2] = project(device, points)
-        placed[part, 2] = to_depths(device, points)
+        placed[part, 2] = optical_depths_mm(device, points)
     return placed

@@ -29,7 +29,7 @@ from slrig.reconstruction import (
     MergedCurves,
     calibration_modes,
     calibration_sigma,
-    disagreement,
+    find_disagreement,
     project,
     sampling_mm,
     sigma_along_normal,
@@ -262,7 +262,7 @@ def _meshed(
     share = _calibration_share(walked.devices, found, axis, surface.normals)
     if share is not None:
         sigma = np.hypot(sigma, share)
-    apart = disagreement(joined_curves, share)
+    apart = find_disagreement(joined_curves, share)
     if apart is not None:
         sigma = np.hypot(sigma, apart.sigma_mm)
     limit_mm = None if plan.region is None else plan.region.most_sigma_mm

@@ -36,8 +36,7 @@ from slrig.model import (
 from slrig.model.header import CaptureHeader
 from slrig.patterns import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction import (
-    NEARLY_FULL,
-    AskedPixels,
+    NEAR_SATURATION,
     AxisFrames,
     CameraCurves,
     CameraStream,
@@ -46,19 +45,20 @@ from slrig.reconstruction import (
     FrameStacks,
     FusedFrames,
     Image,
-    Limits,
+    ReconstructionLimits,
+    RegionMask,
     axis_frames,
     axis_patterns,
     camera_curves,
-    ends_repeats,
     exposure_count,
     exposure_use,
-    fused_colour,
-    fused_frames,
+    fuse_colour,
+    fuse_exposures,
+    linearise,
     mean_image,
-    straight,
-    telling,
-    telling_shots,
+    reference_repeats,
+    used_frames,
+    used_shots,
 )
 from slrig.scan.light_axis import chosen_axis
 from slrig.scan.limited import FramePart, frame_part
@@ -151,13 +151,13 @@ class ScanStream:
             curves, frames, fused = camera.finish()
             part, used = camera.part, curves.refusal == Refusal.NONE
             white, black = (camera.colour(each, fused) for each in (White(), Black()))
-            clipped = frames.white >= NEARLY_FULL * frames.clipped_at
+            clipped = frames.white >= NEAR_SATURATION * frames.clipped_at
             if white is None or black is None:
                 white, black = frames.white[..., None], frames.black[..., None]
             elif fused is None:
-                clipped |= white.max(axis=2) >= NEARLY_FULL * frames.full_scale
+                clipped |= white.max(axis=2) >= NEAR_SATURATION * frames.full_scale
             # They are as the camera gave them.
-            white, black = (straight(each[..., ::-1], curves.gamma, frames.full_scale) for each in (white, black))
+            white, black = (linearise(each[..., ::-1], curves.gamma, frames.full_scale) for each in (white, black))
             contrast, shown = (
                 white - black,
                 np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
@@ -214,7 +214,7 @@ class _CameraFrames:
         self._lights: defaultdict[Pattern, list[Shot]] = defaultdict(list)
         listed = [index for index, camera in header.frames if camera == name]
         shown = [header.patterns[index] for index in listed]
-        tells = telling(shown, [None] * len(shown))
+        tells = used_frames(shown, [None] * len(shown))
         self._waiting = Counter(index for index, used in zip(listed, tells, strict=True) if used)
         used = [header.patterns[index] for index in self._waiting.elements()]
         self._wanted = Counter(used)
@@ -226,13 +226,15 @@ class _CameraFrames:
                 patterns,
                 form.size.shape,
                 full_scale=float(form.full_scale),
-                ends_repeats=ends_repeats(used, axis),
+                reference_repeats=reference_repeats(used, axis),
             )
             tables = _tables(patterns.gray, patterns.lines, header.projector)
-            self._stream = CameraStream(stacks, tables, Limits(), entered=self._entered, asked=self._asked)
+            self._stream = CameraStream(
+                stacks, tables, ReconstructionLimits(), report_step=self._entered, region=self._asked
+            )
 
     @property
-    def _asked(self) -> AskedPixels | None:
+    def _asked(self) -> RegionMask | None:
         return None if self.part is None else self.part.asked
 
     @property
@@ -265,15 +267,17 @@ class _CameraFrames:
             return *self._stream.finish(), None
         header, fused = self._header, None
         capture = Capture(header.projector, header.patterns, header.cameras, tuple(self._kept))
-        for shot in telling_shots(capture, self._name):
+        for shot in used_shots(capture, self._name):
             self._keep_colour(shot)
         if exposure_count([shot.exposure_s for shot in self._kept]) > 1:
-            fused = fused_frames(capture, self._name, self._axis)
+            fused = fuse_exposures(capture, self._name, self._axis)
             frames, noise = fused.frames, fused.noise
         else:
             frames, noise = axis_frames(capture, self._name, self._axis), None
         tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
-        curves = camera_curves(frames, tables, Limits(), entered=self._entered, noise=noise, asked=self._asked)
+        curves = camera_curves(
+            frames, tables, ReconstructionLimits(), report_step=self._entered, noise=noise, region=self._asked
+        )
         return curves, frames, fused
 
     def _keep_colour(self, shot: Shot) -> None:
@@ -293,7 +297,7 @@ class _CameraFrames:
         if len(groups) < len(fused.exposures_s):
             return None
         images = [[image for each, image in found if alike[each] == time_s] for time_s in groups]
-        return fused_colour(images, fused, float(self._header.cameras[self._name].full_scale))
+        return fuse_colour(images, fused, float(self._header.cameras[self._name].full_scale))
 
     def _by_lights(self, pattern: White | Black) -> list[tuple[float | None, Pixels]]:
         """Frames in colour, of grey ones: white is one in each of the projector's lights, black is dark in all."""
@@ -369,6 +373,6 @@ def _tables(gray: Gray, lines: tuple[LineShift, ...], size: Size) -> CodeTables:
     return CodeTables(
         index_of_word=index_of_word(gray),
         cell_position=cell_positions(gray, size),
-        position_of=line_positions(lines, gray, size) if lines else edge_positions(gray, size),
-        edges_of=edge_positions(gray, size) if lines else None,
+        position_table=line_positions(lines, gray, size) if lines else edge_positions(gray, size),
+        edge_table=edge_positions(gray, size) if lines else None,
     )

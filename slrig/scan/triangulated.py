@@ -19,12 +19,12 @@ from slrig.reconstruction import (
     MergedCurves,
     Redundancy,
     SheetCurves,
-    camera_camera,
-    camera_projector,
-    merged,
-    redundancy,
-    selected,
+    evaluate_redundancy,
+    merge_curves,
+    select_points,
     stripe_crossing,
+    triangulate_camera_pair,
+    triangulate_camera_projector,
 )
 from slrig.scan.limited import limited
 from slrig.scan.report import lit_share
@@ -76,22 +76,22 @@ def triangulated(
             for index, seen in enumerate(told):
                 parts[index], told[index] = _limited(region, seen, parts[index])
         gap = widest_gap_px(projector, axis)
-        spare = redundancy(parts, devices, axis, widest_gap_px=gap)
-        joined = merged(parts, projector.centre_mm, widest_gap_px=gap)
+        spare = evaluate_redundancy(parts, devices, axis, widest_gap_px=gap)
+        joined = merge_curves(parts, projector.centre_mm, widest_gap_px=gap)
         return Triangulated(joined, spare, _without_points(told), share_across(axis, list(devices.values()), projector))
     first, *others = cameras
     mine = first.curves.ensemble
     crossing = [stripe_crossing(mine, first.device, seen.device) for seen in others]
     steep = [index for index, share in enumerate(crossing) if share >= _STEEP_ENOUGH * max(crossing)]
-    pairs = {i: camera_camera(mine, others[i].curves.ensemble, first.device, others[i].device) for i in steep}
+    pairs = {i: triangulate_camera_pair(mine, others[i].curves.ensemble, first.device, others[i].device) for i in steep}
     second = max(pairs, key=lambda index: len(pairs[index].points_mm))
     best = pairs[second]
     if region is not None:
         best, first = _limited(region, first, best)
         cameras = [first, *others]
     gap = widest_gap_px(None, axis)
-    spare = redundancy([best], devices, axis, widest_gap_px=gap)
-    joined = merged([best], first.device.centre_mm, widest_gap_px=gap)
+    spare = evaluate_redundancy([best], devices, axis, widest_gap_px=gap)
+    joined = merge_curves([best], first.device.centre_mm, widest_gap_px=gap)
     return Triangulated(joined, spare, _without_points(cameras), crossing[second], 1 + second)
 
 
@@ -116,12 +116,12 @@ def widest_gap_px(projector: Pinhole | None, axis: Axis) -> float:
 def _on_sheets(
     seen: CameraResult, projector: Pinhole, axis: Axis, *, told: bool
 ) -> tuple[SheetCurves, NDArray[np.uint8]]:
-    """`camera_projector`, with nothing kept of a camera that the axis tells no depth."""
-    part, cause = camera_projector(seen.curves.ensemble, seen.device, projector, axis)
+    """`triangulate_camera_projector`, with nothing kept of a camera that the axis tells no depth."""
+    part, cause = triangulate_camera_projector(seen.curves.ensemble, seen.device, projector, axis)
     if told:
         return part, cause
     return (
-        selected(part, np.zeros(len(part.points_mm), dtype=np.bool_)),
+        select_points(part, np.zeros(len(part.points_mm), dtype=np.bool_)),
         np.where(cause == Refusal.NONE, np.uint8(Refusal.SHEET_SEEN_ALONG), cause),
     )
 
@@ -203,8 +203,8 @@ def _steps_px(curves: CameraCurves, step_px: float, cell_px: float) -> NDArray[n
     if curves.unresolved is None:
         return None
     edges_px = np.float32(cell_px) * np.exp2(curves.unresolved, dtype=np.float32)
-    if curves.lost_lines is not None:
-        return np.where(curves.lost_lines, edges_px, np.float32(step_px))
+    if curves.unresolved_lines is not None:
+        return np.where(curves.unresolved_lines, edges_px, np.float32(step_px))
     return edges_px if curves.unresolved.any() else None
 
 
@@ -231,7 +231,7 @@ def unresolved_notes(cameras: Sequence[CameraResult], step_px: float, cell_px: f
     """One sentence for each camera that does not resolve the finest patterns on a part of what is lit."""
     notes = []
     for seen in cameras:
-        share = lit_share(seen.curves, seen.curves.lost_lines)
+        share = lit_share(seen.curves, seen.curves.unresolved_lines)
         if share >= _WORTH_TELLING:
             notes.append(
                 f"camera '{seen.name}' does not resolve the shifted lines on {share:.0%} of what is lit: the edges of "
@@ -239,7 +239,7 @@ def unresolved_notes(cameras: Sequence[CameraResult], step_px: float, cell_px: f
                 f"{step_px:g}. Look at focus and resolution, or play lines further apart: "
                 f"{setting('line_shift_period_px')}"
             )
-        elif seen.curves.unresolved is not None and seen.curves.lost_lines is None:
+        elif seen.curves.unresolved is not None and seen.curves.unresolved_lines is None:
             share = lit_share(seen.curves, seen.curves.unresolved > 0)
             if share >= _WORTH_TELLING:
                 notes.append(

@@ -24,9 +24,9 @@ from simulated_rig.scene import Scene, surface_of
 from slrig.model import Axis, CameraFormat, Capture, FloatArray, Gray, LineShift, PatternSequence, Shot
 from slrig.patterns.codes import cell_positions, index_of_word, line_positions
 from slrig.patterns.sequence import encode, scan_patterns
-from slrig.reconstruction.camera import CameraCurves, camera_curves
-from slrig.reconstruction.coded import CodeTables, Limits
+from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
 from slrig.reconstruction.frames import axis_frames
+from slrig.reconstruction.pipeline import CameraCurves, camera_curves
 from tests.light_bound import ExposedView, pixel_bound, stripe_bound
 from tests.unit.reconstruction.builders import rms
 
@@ -217,7 +217,7 @@ def _curves(rig: Rig, exposed: ExposedView, means: list[NDArray[np.float32]], rn
         cell_positions(gray, sequence.projector),
         line_positions(frames.line_patterns, gray, sequence.projector),
     )
-    return camera_curves(frames, tables, Limits(), entered=lambda _stage: None)
+    return camera_curves(frames, tables, ReconstructionLimits(), report_step=lambda _stage: None)
 
 
 def _bounds(rig: Rig, exposed: ExposedView) -> dict[str, FloatArray]:

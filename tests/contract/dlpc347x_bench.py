@@ -9,7 +9,7 @@ from drivers.dlpc347x.bus import Bus
 from drivers.dlpc347x.options import EngineOptions
 from drivers.dlpc347x.projector import LightEngine
 from slrig.model import Pixels, Size
-from slrig.patterns.sequence import united
+from slrig.patterns.sequence import merge_sequences
 from tests.contract.dlpc347x_device import Fake347x
 from tests.contract.suite import Bench, BenchHead, WiredTable, whole_scan
 
@@ -41,6 +41,6 @@ def bench(_: Path) -> Bench:
     """The contract suite's bench, its flash written once."""
     table = Table()
     projector = table.opened()
-    projector.write_patterns(united([whole_scan(MIRRORS, rows=True)]))
+    projector.write_patterns(merge_sequences([whole_scan(MIRRORS, rows=True)]))
     projector.close()
     return Bench(table.connected, whole_scan(MIRRORS))

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from slrig.reconstruction.identification import CodedStripes, link
+from slrig.reconstruction.identification import NumberedStripes, link_stripes
 from tests.unit.reconstruction.builders import stripes_of
 
 # A choice between two that are closer than this is one of rounding.
@@ -134,7 +134,7 @@ def stripes(draw: st.DrawFn) -> list[Stripe]:
 def test_linking_is_the_papers_procedure(drawn: list[Stripe]) -> None:
     points, numbers, bridges = linked_by_the_paper(drawn)
     chains = [np.array([[point.real, point.imag] for point in stripe]) for stripe in drawn]
-    ensemble = link(CodedStripes(stripes_of(chains), np.full(len(chains), 7.0)))
+    ensemble = link_stripes(NumberedStripes(stripes_of(chains), np.full(len(chains), 7.0)))
     assert ensemble.points_px.tolist() == [[point.real, point.imag] for point in points]
     assert ensemble.stripe.tolist() == numbers
     assert ensemble.bridge_after.tolist() == bridges
@@ -152,6 +152,6 @@ def test_a_curve_does_not_depend_on_the_order_or_the_direction_in_which_stripes_
     curves = []
     for each in (drawn, shuffled):
         chains = [np.array([[point.real, point.imag] for point in stripe]) for stripe in each]
-        curves.append(link(CodedStripes(stripes_of(chains), np.full(len(chains), 7.0))))
+        curves.append(link_stripes(NumberedStripes(stripes_of(chains), np.full(len(chains), 7.0))))
     np.testing.assert_array_equal(curves[0].points_px, curves[1].points_px)
     np.testing.assert_array_equal(curves[0].bridge_after, curves[1].bridge_after)

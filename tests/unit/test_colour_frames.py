@@ -21,8 +21,8 @@ from slrig.errors import BundleError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, CameraFormat, Capture, Gray, PatternSequence, Pixels, Primary, Shot, Size, White
 from slrig.model.header import CaptureHeader
 from slrig.patterns.sequence import encode
-from slrig.reconstruction.fusion import FusedFrames, fused_colour
-from slrig.reconstruction.noise import NoiseModel
+from slrig.reconstruction.camera_response import NoiseModel
+from slrig.reconstruction.fusion import FusedFrames, fuse_colour
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import in_colour
 from slrig.scan.stream import CameraResult, ScanStream
@@ -255,4 +255,4 @@ def test_a_channel_that_the_longest_exposure_clips_comes_from_the_others() -> No
     # Light of the longest exposure's units: blue everywhere within scale, green beyond the longest, red beyond both.
     light: NDArray[np.float64] = np.array([[[100.0, 400.0, 4000.0]]])
     frames = [[np.clip(light * share, 0, 255).astype(np.uint8)] for share in (1.0, 0.25)]
-    np.testing.assert_allclose(fused_colour(frames, fused([1.0, 0.25]), 255.0), [[[100.0, 400.0, 255 * 4.0]]])
+    np.testing.assert_allclose(fuse_colour(frames, fused([1.0, 0.25]), 255.0), [[[100.0, 400.0, 255 * 4.0]]])

@@ -8,7 +8,7 @@ import pytest
 from slrig.errors import PatternError
 from slrig.model import Axis, FloatArray, Gray, LineShift, Size
 from slrig.patterns.codes import (
-    LEAST_FROM_BORDER_PX,
+    MIN_BORDER_DISTANCE_PX,
     cell_count,
     cell_positions,
     edge_positions,
@@ -49,7 +49,7 @@ def cells_shown(code: Gray, size: Size) -> list[int]:
 
 
 def is_inside(centre_px: float, extent_px: int) -> bool:
-    return LEAST_FROM_BORDER_PX <= centre_px <= extent_px - 1 - LEAST_FROM_BORDER_PX
+    return MIN_BORDER_DISTANCE_PX <= centre_px <= extent_px - 1 - MIN_BORDER_DISTANCE_PX
 
 
 def lit_runs(pattern: LineShift, size: Size) -> list[FloatArray]:

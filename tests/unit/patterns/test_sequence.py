@@ -10,7 +10,7 @@ import pytest
 
 from slrig.errors import PatternError
 from slrig.model import Axis, Black, Gray, LineShift, Pattern, Primary, Size, White
-from slrig.patterns.sequence import encode, scan_patterns, united
+from slrig.patterns.sequence import encode, merge_sequences, scan_patterns
 
 
 def patterns_of(
@@ -103,7 +103,7 @@ def test_sequences_are_united_with_each_light_once_in_the_order_it_comes() -> No
     size = Size(64, 48)
     columns, both = (encode(patterns_of(size, rows=rows), size) for rows in (False, True))
     fine = encode(patterns_of(size, line_shift=False, gray_cell_px=1), size)
-    whole = united([columns, both, fine])
+    whole = merge_sequences([columns, both, fine])
     assert whole.patterns[:18] == columns.patterns[:18]
     lights = [whole.image(index).tobytes() for index in range(len(whole))]
     assert len(set(lights)) == len(lights)
@@ -115,6 +115,6 @@ def test_sequences_are_united_with_each_light_once_in_the_order_it_comes() -> No
 
 def test_sequences_of_different_projectors_are_not_united() -> None:
     with pytest.raises(PatternError, match="found 2"):
-        united([encode((White(),), size) for size in (Size(64, 48), Size(64, 30))])
+        merge_sequences([encode((White(),), size) for size in (Size(64, 48), Size(64, 30))])
     with pytest.raises(PatternError, match="found 0"):
-        united([])
+        merge_sequences([])

@@ -13,12 +13,12 @@ from slrig.model import AlbedoMark, FloatArray, Pinhole, Size
 from slrig.reconstruction.albedo import (
     BRIGHT_ALBEDO,
     BRIGHT_PERCENT,
-    LEAST_COSINE,
+    MIN_COSINE,
     Albedo,
-    LitPoints,
-    LitView,
-    albedo,
-    sampled,
+    AlbedoSamples,
+    Illumination,
+    estimate_albedo,
+    sample_contrast,
 )
 from tests.unit.reconstruction import builders
 from tests.unit.reconstruction.builders import PROJECTOR, Sphere, opencv_rays
@@ -55,14 +55,14 @@ def normals_of(points_mm: FloatArray) -> FloatArray:
     return np.asarray(outward / np.linalg.norm(outward, axis=1, keepdims=True))
 
 
-def seen_by(device: Pinhole, gain: float = 1.0, channels: int = 1) -> LitView:
+def seen_by(device: Pinhole, gain: float = 1.0, channels: int = 1) -> Illumination:
     """The ball before a camera whose values are `gain` times as large as another's."""
     rows, columns = np.indices(SHAPE).reshape(2, -1).astype(np.float64)
     points = on_ball(device, np.stack([columns, rows], axis=1))
     decoded = np.isfinite(points[:, 0])
     light = np.zeros((len(points), channels), dtype=np.float32)
     light[decoded] = gain * 1e7 * lit(points[decoded])[:, None] * tint(points[decoded], channels)
-    return LitView(device, light.reshape(*SHAPE, channels), np.zeros(SHAPE, np.bool_), decoded.reshape(SHAPE))
+    return Illumination(device, light.reshape(*SHAPE, channels), np.zeros(SHAPE, np.bool_), decoded.reshape(SHAPE))
 
 
 def on_ball(device: Pinhole, pixels_px: FloatArray) -> FloatArray:
@@ -71,7 +71,7 @@ def on_ball(device: Pinhole, pixels_px: FloatArray) -> FloatArray:
         return BALL.seen_along(device.centre_mm, opencv_rays(device, pixels_px))
 
 
-def points_in(*views: LitView, shared: bool = True, count: int = 3000) -> LitPoints:
+def points_in(*views: Illumination, shared: bool = True, count: int = 3000) -> AlbedoSamples:
     """Random points that each camera sees, lit; those of the first are seen by all others as well."""
     random = np.random.default_rng(1)
     parts, pixels = [], []
@@ -80,13 +80,13 @@ def points_in(*views: LitView, shared: bool = True, count: int = 3000) -> LitPoi
         some = random.choice(len(rows), count)
         places = np.stack([columns, rows], axis=1)[some] + random.uniform(-0.5, 0.5, (count, 2))
         points = on_ball(view.device, places)
-        kept = lit(points) * np.linalg.norm(PROJECTOR.centre_mm - points, axis=1) ** 2 > 1.2 * LEAST_COSINE
+        kept = lit(points) * np.linalg.norm(PROJECTOR.centre_mm - points, axis=1) ** 2 > 1.2 * MIN_COSINE
         parts.append(points[kept])
         pixels.append(places[kept])
     points, counts = np.concatenate(parts), [len(part) for part in parts]
     camera = np.repeat(np.arange(len(views), dtype=np.int32), counts)
     nowhere: NDArray[np.bool_] = np.zeros(len(points), dtype=np.bool_)
-    return LitPoints(points, normals_of(points), np.concatenate(pixels), camera, (camera == 0) & shared, nowhere)
+    return AlbedoSamples(points, normals_of(points), np.concatenate(pixels), camera, (camera == 0) & shared, nowhere)
 
 
 def relative_error(found: Albedo, truth: FloatArray) -> float:
@@ -100,13 +100,13 @@ def relative_error(found: Albedo, truth: FloatArray) -> float:
 def test_albedo_is_what_the_ball_is_painted_with(channels: int) -> None:
     view = seen_by(CAMERA, channels=channels)
     points = points_in(view)
-    found = albedo(points, [view], PROJECTOR.centre_mm)
+    found = estimate_albedo(points, [view], PROJECTOR.centre_mm)
     assert found.value.shape == (len(points.camera), channels)
     assert (found.mark == AlbedoMark.NONE).all()
     # One scale for all channels: their ratios are colour.
     assert relative_error(found, tint(points.points_mm, channels)) < 0.003
     assert np.percentile(found.value.max(axis=1), BRIGHT_PERCENT) == pytest.approx(BRIGHT_ALBEDO, rel=1e-3)
-    brightness = albedo(points, [view], None)
+    brightness = estimate_albedo(points, [view], None)
     assert relative_error(brightness, tint(points.points_mm, channels)) > 0.15
     assert (brightness.mark == AlbedoMark.SHADED).all()
 
@@ -114,10 +114,10 @@ def test_albedo_is_what_the_ball_is_painted_with(channels: int) -> None:
 def test_places_between_pixels_are_those_of_opencv() -> None:
     random = np.random.default_rng(2)
     image = random.random((40, 50, 2)).astype(np.float32)
-    view = LitView(CAMERA, image, random.random((40, 50)) > 0.9, np.ones((40, 50), np.bool_))
+    view = Illumination(CAMERA, image, random.random((40, 50)) > 0.9, np.ones((40, 50), np.bool_))
     # OpenCV knows places to a thirty-second of a pixel.
     places = random.integers(-20, 32 * 51, (3000, 2)) / 32
-    seen, clipped = sampled(view, places)
+    seen, clipped = sample_contrast(view, places)
     maps = places.astype(np.float32)[:, None]
     expected = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     np.testing.assert_allclose(seen, expected[:, 0], atol=1e-6)
@@ -130,7 +130,7 @@ def test_cameras_of_different_gain_come_to_one_scale_by_what_both_see(order: tup
     both = [seen_by(CAMERA), seen_by(OTHER_CAMERA, gain=3.7)]
     views = [both[index] for index in order]
     points = points_in(*views)
-    found = albedo(points, views, PROJECTOR.centre_mm)
+    found = estimate_albedo(points, views, PROJECTOR.centre_mm)
     expected = 1 / 3.7 if order == (0, 1) else 3.7
     assert found.gains.ravel() == pytest.approx([1, expected], rel=2e-3)
     assert found.shared[1] > 1000
@@ -140,7 +140,7 @@ def test_cameras_of_different_gain_come_to_one_scale_by_what_both_see(order: tup
 def test_cameras_that_see_nothing_in_common_come_to_the_same_median() -> None:
     views = [seen_by(CAMERA), seen_by(OTHER_CAMERA, gain=3.7)]
     points = points_in(*views, shared=False)
-    found = albedo(points, views, PROJECTOR.centre_mm)
+    found = estimate_albedo(points, views, PROJECTOR.centre_mm)
     assert found.shared == (0, 0)
     assert np.median(found.value[points.camera == 1]) == pytest.approx(np.median(found.value[points.camera == 0]))
 
@@ -151,7 +151,7 @@ def test_the_gain_is_not_that_of_what_is_clipped_or_of_another_surface() -> None
     contrast = np.where(bright[..., None], np.float32(50), views[1].contrast)
     views[1] = replace(views[1], contrast=contrast, clipped=bright)
     points = points_in(*views)
-    found = albedo(points, views, PROJECTOR.centre_mm)
+    found = estimate_albedo(points, views, PROJECTOR.centre_mm)
     assert found.gains[1, 0] == pytest.approx(0.5, rel=5e-3)
 
 
@@ -168,10 +168,10 @@ def test_marks_name_the_first_cause() -> None:
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     aside = np.cross(towards, (0, 1, 0))
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
-    cosines = np.array([[LEAST_COSINE - 0.01], [-0.3]])
+    cosines = np.array([[MIN_COSINE - 0.01], [-0.3]])
     normals[4:6] = cosines * towards + np.sqrt(1 - cosines**2) * aside
     border[[0, 5, 6]] = True
-    found = albedo(
+    found = estimate_albedo(
         replace(points, normals=normals, border=border), [replace(view, clipped=clipped)], PROJECTOR.centre_mm
     )
     names = [AlbedoMark(mark).name for mark in found.mark[:8].tolist()]
@@ -180,7 +180,7 @@ def test_marks_name_the_first_cause() -> None:
     assert np.isfinite(np.delete(found.value, (2, 3), axis=0)).all()
     # Flat light does not make a point as bright as it likes.
     seen = (
-        sampled(view, points.pixels_px[4:6])[0]
+        sample_contrast(view, points.pixels_px[4:6])[0]
         * np.linalg.norm(PROJECTOR.centre_mm - points.points_mm[4:6], axis=1)[:, None] ** 2
     )
     assert found.value[4] / found.value[5] == pytest.approx(seen[0] / seen[1], rel=1e-5)
@@ -194,7 +194,7 @@ def test_the_scale_is_that_of_points_without_a_mark() -> None:
     bright = replace(
         view, contrast=view.contrast * np.where(shining, 40, 1).astype(np.float32)[..., None], clipped=shining
     )
-    found = albedo(points, [bright], PROJECTOR.centre_mm)
+    found = estimate_albedo(points, [bright], PROJECTOR.centre_mm)
     sound = found.value[found.mark == AlbedoMark.NONE]
     assert 500 < len(sound) < 0.8 * len(points.camera)
     assert np.percentile(sound, BRIGHT_PERCENT) == pytest.approx(BRIGHT_ALBEDO, rel=1e-3)
@@ -203,12 +203,12 @@ def test_the_scale_is_that_of_points_without_a_mark() -> None:
 def test_a_scan_of_marked_points_or_of_none_has_a_scale_all_the_same() -> None:
     view = seen_by(CAMERA)
     points = points_in(view, count=50)
-    found = albedo(points, [replace(view, clipped=np.ones(SHAPE, np.bool_))], PROJECTOR.centre_mm)
+    found = estimate_albedo(points, [replace(view, clipped=np.ones(SHAPE, np.bool_))], PROJECTOR.centre_mm)
     assert (found.mark == AlbedoMark.SATURATED).all()
     assert np.isfinite(found.value).all()
-    none = LitPoints(*(getattr(points, name)[:0] for name in LitPoints.__slots__))
-    assert albedo(none, [view], PROJECTOR.centre_mm).value.shape == (0, 1)
-    assert albedo(none, [view, view], None).value.shape == (0, 1)
+    none = AlbedoSamples(*(getattr(points, name)[:0] for name in AlbedoSamples.__slots__))
+    assert estimate_albedo(none, [view], PROJECTOR.centre_mm).value.shape == (0, 1)
+    assert estimate_albedo(none, [view, view], None).value.shape == (0, 1)
 
 
 def test_an_uneven_projector_is_made_up_for() -> None:
@@ -218,5 +218,5 @@ def test_an_uneven_projector_is_made_up_for() -> None:
     uneven = replace(view, contrast=np.asarray(view.contrast * (1 + row / SHAPE[0]), dtype=np.float32))
     light = 1 + points.pixels_px[:, 1] / SHAPE[0]
     truth = tint(points.points_mm)
-    assert relative_error(albedo(points, [uneven], PROJECTOR.centre_mm), truth) > 0.05
-    assert relative_error(albedo(points, [uneven], PROJECTOR.centre_mm, light=light[:, None]), truth) < 0.003
+    assert relative_error(estimate_albedo(points, [uneven], PROJECTOR.centre_mm), truth) > 0.05
+    assert relative_error(estimate_albedo(points, [uneven], PROJECTOR.centre_mm, light=light[:, None]), truth) < 0.003

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from slrig.model import Axis, FloatArray, LineShift
-from slrig.reconstruction.blur import ToldBlur, told_blur
+from slrig.reconstruction.blur import BlurEstimate, estimate_blur
 from slrig.reconstruction.phase import PositionMap
 from tests.unit.reconstruction.builders import code_frames
 
@@ -25,7 +25,7 @@ def told(
     noise_dn: float = 1.0,
     expected_px: float = EXPECTED_PX,
     print_ratio: float = 1.0,
-) -> ToldBlur:
+) -> BlurEstimate:
     """Of a surface that rises by `slopes` from its left to its right, behind a projector's blur of focus_px."""
     rng = np.random.default_rng(4)
     slope = np.interp(np.arange(SHAPE[1] * FINE) / FINE, np.linspace(0, SHAPE[1], len(slopes)), slopes)
@@ -46,19 +46,19 @@ def told(
     frames = code_frames(bits=white[None], lines=np.array(lines), line_patterns=patterns, white=white, black=black)
     at = position[FINE // 2 :: FINE, FINE // 2 :: FINE].astype(np.float32)
     seen_at = PositionMap(at, np.full_like(at, 0.02))
-    return told_blur(frames, seen_at, np.ones(SHAPE, dtype=np.bool_), expected_px)
+    return estimate_blur(frames, seen_at, np.ones(SHAPE, dtype=np.bool_), expected_px)
 
 
 @pytest.mark.parametrize(("blur_px", "focus_px"), [(0.4, 0.3), (0.65, 1.5), (1.4, 1.5)])
 def test_lines_tell_the_blur_whatever_the_projectors(blur_px: float, focus_px: float) -> None:
     blur = told(blur_px, np.array([0.5, 1.9, 0.8, 1.5]), focus_px)
-    assert blur.by_lines
+    assert blur.from_lines
     assert blur.sigma_px**2 == pytest.approx(blur_px**2, abs=0.1)
 
 
 def test_few_slopes_tell_of_a_camera_out_of_focus_all_the_same() -> None:
     blur = told(1.25, np.array([0.7, 1.3]))
-    assert blur.by_lines
+    assert blur.from_lines
     assert blur.sigma_px**2 == pytest.approx(1.25**2, rel=0.1)
 
 

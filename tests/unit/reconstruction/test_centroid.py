@@ -12,11 +12,11 @@ from slrig.kernels import in_bands
 from slrig.model import FloatArray
 from slrig.reconstruction.phase import (
     PositionMap,
-    _beyond_quadratic,
+    _edge_stencil,
     _edges_kernel,
     _shift_kernel,
-    at_pixel_centres,
-    third_order_px,
+    centroid_residual_px,
+    resample_to_pixel_centres,
 )
 from tests.unit.reconstruction.builders import grid
 
@@ -61,7 +61,7 @@ def test_an_edge_of_the_albedo_bends_the_position_half_as_much(dark: float, brig
     position = 40 + slope * x
     measured, white = seen_through_blur(np.where(x < 30.3, dark, bright), position)
     true = position[FINE // 2 :: FINE]
-    centred = at_pixel_centres(
+    centred = resample_to_pixel_centres(
         PositionMap(as_map(measured), as_map(0 * measured)), as_map(white * 20), NOISELESS, BLUR_PX
     )
     before, after = np.abs(measured - true)[5:-5], np.abs(centred.position[2] - true)[5:-5]
@@ -76,7 +76,7 @@ def test_smooth_texture_of_seven_to_one_bends_it_a_tenth_as_much() -> None:
     position = 40 + 1.2 * x
     measured, white = seen_through_blur(7 ** (0.5 + 0.5 * np.sin(x / 1.5)), position)
     true = position[FINE // 2 :: FINE]
-    centred = at_pixel_centres(
+    centred = resample_to_pixel_centres(
         PositionMap(as_map(measured), as_map(0 * measured)), as_map(white * 20), NOISELESS, BLUR_PX
     )
     before, after = np.abs(measured - true)[5:-5], np.abs(centred.position[2] - true)[5:-5]
@@ -89,14 +89,16 @@ def test_noise_of_white_and_black_hardly_enters() -> None:
     shape = (80, 90)
     position = (40 + 1.2 * np.arange(90.0) + np.zeros(shape)).astype(np.float32)
     white = (100 + random.normal(0, 3, shape)).astype(np.float32)
-    told = at_pixel_centres(
+    told = resample_to_pixel_centres(
         PositionMap(position, 0 * position), white, np.full(shape, 3, dtype=np.float32), BLUR_PX
     ).position
-    untold = at_pixel_centres(PositionMap(position, 0 * position), white, 0 * white, BLUR_PX).position
+    untold = resample_to_pixel_centres(PositionMap(position, 0 * position), white, 0 * white, BLUR_PX).position
     assert np.std(told - position) < 0.6 * np.std(untold - position)
     # A texture well above the noise is undone all the same.
     white = (100 * np.exp(0.3 * np.sin(np.arange(90.0) / 2)) + random.normal(0, 1, shape)).astype(np.float32)
-    found = at_pixel_centres(PositionMap(position, 0 * position), white, np.ones(shape, dtype=np.float32), BLUR_PX)
+    found = resample_to_pixel_centres(
+        PositionMap(position, 0 * position), white, np.ones(shape, dtype=np.float32), BLUR_PX
+    )
     wanted = BLUR_PX**2 * 1.2 * 0.15 * np.cos(np.arange(90.0) / 2)
     inner = slice(5, -5)
     moved = (position - found.position)[:, inner]
@@ -110,14 +112,14 @@ def test_what_the_first_order_leaves_at_an_edge_out_of_focus_is_stated(blur_px: 
     position = 40 + slope * x
     measured, white = seen_through_blur(np.where(x < 30.3, 1.0, 7.0), position, blur_px)
     seen = PositionMap(as_map(measured), as_map(0 * measured))
-    centred = at_pixel_centres(seen, as_map(20 * white), NOISELESS, blur_px)
+    centred = resample_to_pixel_centres(seen, as_map(20 * white), NOISELESS, blur_px)
     usable = np.ones(seen.position.shape, dtype=np.bool_)
-    stated = third_order_px(seen, centred, usable, blur_px, PERIOD_PX)[2]
+    stated = centroid_residual_px(seen, centred, usable, blur_px, PERIOD_PX)[2]
     left = (centred.position[2] - position[FINE // 2 :: FINE]) / slope
     at_edge = slice(24, 37)
     assert 0.5 < np.sqrt(np.mean(stated[at_edge] ** 2) / np.mean(left[at_edge] ** 2)) < 1.2
     assert stated[45:].max() < 1e-3
-    assert not third_order_px(seen, centred, ~usable, blur_px, PERIOD_PX).any()
+    assert not centroid_residual_px(seen, centred, ~usable, blur_px, PERIOD_PX).any()
 
 
 @pytest.mark.parametrize("blur_px", [0.4, 0.65, 0.9])
@@ -130,7 +132,7 @@ def test_edges_of_a_print_tell_how_wide_the_blur_is(blur_px: float) -> None:
     clear = np.ones(contrast.shape, dtype=np.bool_)
     expected_px = 0.65
     told, untold = (
-        at_pixel_centres(seen, contrast, quiet, expected_px, **known).position[12, 5:-5]
+        resample_to_pixel_centres(seen, contrast, quiet, expected_px, **known).position[12, 5:-5]
         for known in ({"clear": clear}, {})
     )
     # As much blur as displaces positions so far.
@@ -138,7 +140,7 @@ def test_edges_of_a_print_tell_how_wide_the_blur_is(blur_px: float) -> None:
     ratio = np.abs(seen.position[12, 5:-5] - told)[far > 0.05] / far[far > 0.05]
     assert expected_px * np.sqrt(np.median(ratio)) == pytest.approx(blur_px, rel=0.15)
     # Where nothing is clear of shadows, what is expected stands.
-    unclear = at_pixel_centres(seen, contrast, quiet, expected_px, clear=~clear).position[12, 5:-5]
+    unclear = resample_to_pixel_centres(seen, contrast, quiet, expected_px, clear=~clear).position[12, 5:-5]
     np.testing.assert_array_equal(unclear, untold)
 
 
@@ -150,8 +152,8 @@ def test_shading_that_follows_the_surface_tells_no_blur() -> None:
     random = np.random.default_rng(2)
     position = (40 + 1.1 * x + 0.1 * y + 0.1 * flutes + random.normal(0, 0.01, x.shape)).astype(np.float32)
     seen, quiet = PositionMap(position, np.full_like(position, 0.01)), np.full_like(position, 0.1)
-    known = at_pixel_centres(seen, contrast, quiet, BLUR_PX).position
-    told = at_pixel_centres(seen, contrast, quiet, BLUR_PX, clear=np.ones(x.shape, dtype=np.bool_)).position
+    known = resample_to_pixel_centres(seen, contrast, quiet, BLUR_PX).position
+    told = resample_to_pixel_centres(seen, contrast, quiet, BLUR_PX, clear=np.ones(x.shape, dtype=np.bool_)).position
     np.testing.assert_array_equal(told, known)
 
 
@@ -216,7 +218,7 @@ def test_the_shift_is_that_of_the_rule() -> None:
 
 
 def test_what_edges_tell_of_the_blur_is_that_of_the_rule() -> None:
-    stencil, expected = _beyond_quadratic(), 0.42
+    stencil, expected = _edge_stencil(), 0.42
     for seed in range(3):
         (position, sigma), contrast, deviation = seen_print(seed)
         shift = shift_of(position, contrast, deviation)
@@ -246,7 +248,7 @@ def test_what_edges_tell_of_the_blur_is_that_of_the_rule() -> None:
 
 
 def test_the_weights_see_nothing_of_a_quadratic_surface() -> None:
-    stencil = _beyond_quadratic()
+    stencil = _edge_stencil()
     x, y = grid(stencil.shape)
     for each in (np.ones_like(x), x, y, x * x, x * y, y * y):
         assert abs(np.sum(stencil * each)) < 1e-9

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from slrig.model import FloatArray
 from slrig.reconstruction.stripes import (
-    _LONGEST_STEP_PX,
+    _MAX_STEP_PX,
+    _MAX_TURN,
     _SAME_LINE_ANGLE,
     _SAME_LINE_PX,
-    _SHARPEST_TURN,
     chain_points,
 )
 
@@ -174,7 +174,7 @@ def walked(found: Found, strong: NDArray[np.bool_]) -> list[list[int]]:
                     continue
                 step = points[other] - points[current]
                 length, angle = float(np.hypot(*step)), turning(current, other)
-                if length <= _LONGEST_STEP_PX and angle <= _SHARPEST_TURN and float(step @ heading) > 0:
+                if length <= _MAX_STEP_PX and angle <= _MAX_TURN and float(step @ heading) > 0:
                     choices.append((length + angle, rank, other))
             if not choices:
                 return path

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.reconstruction.camera_response import PixelSum, compression_loss, white_equivalent
+from slrig.reconstruction.camera_response import PixelSum, compression_loss, equivalent_white_variance
 
 SIDE = 400
 EVERYWHERE = np.ones((SIDE, SIDE), dtype=np.bool_)
@@ -57,7 +57,7 @@ def test_the_loss_is_told_by_the_decoded_pixels(quality: int, colour: bool, limi
     told, found = compression_loss([seen], [seen], EVERYWHERE, 255.0), loss_in_fact(before, seen)
     for cycles_per_px in ((0.0, 0.0), (1 / 7.3, 0.0)):
         summed = PixelSum(np.outer([1, 2, 3, 2, 1], [1, 2, 3, 2, 1]) / 81, cycles_per_px)
-        ratio = white_equivalent(told, summed) / white_equivalent(found, summed)
+        ratio = equivalent_white_variance(told, summed) / equivalent_white_variance(found, summed)
         assert 0.4 < ratio < 1.25
 
 
@@ -114,9 +114,9 @@ def test_what_pixels_err_by_errs_their_weighted_sum(cycles_per_px: tuple[float, 
     turned = errors * np.exp(-2j * np.pi * (cycles_per_px[0] * x + cycles_per_px[1] * y))
     sums = cv2.filter2D(turned.real, -1, weights) + 1j * cv2.filter2D(turned.imag, -1, weights)
     found = float(np.mean(np.abs(sums[8:-8, 8:-8]) ** 2))
-    told = white_equivalent(loss, PixelSum(weights, cycles_per_px)) * float(np.sum(weights**2))
+    told = equivalent_white_variance(loss, PixelSum(weights, cycles_per_px)) * float(np.sum(weights**2))
     assert told == pytest.approx(found, rel=0.05)
 
 
 def test_independent_pixels_are_their_own_equivalent() -> None:
-    assert white_equivalent(np.full((8, 8), 2.5), PixelSum(np.ones((3, 3)), (0.1, 0.0))) == pytest.approx(2.5)
+    assert equivalent_white_variance(np.full((8, 8), 2.5), PixelSum(np.ones((3, 3)), (0.1, 0.0))) == pytest.approx(2.5)

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve
 
 from slrig.model import FloatArray
-from slrig.reconstruction.camera_response import PixelSum, edge_sum, shared_noise
+from slrig.reconstruction.camera_response import NoiseModel, PixelSum, edge_pixel_sum, estimate_noise, noise_correlation
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from tests.unit.reconstruction.builders import code_frames, grid
 
 SHAPE = (300, 400)
@@ -57,7 +56,7 @@ def by_sums(kernel: FloatArray, summed: PixelSum) -> float:
     return float(np.sum(np.abs(both) ** 2) / (np.sum(summed.weights**2) * np.sum(kernel**2)))
 
 
-@pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_sum(1.0)], ids=["phases", "values", "edges"])
+@pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_pixel_sum(1.0)], ids=["phases", "values", "edges"])
 @pytest.mark.parametrize(
     "kernel",
     [SMOOTH, ((0, 0, 0), (0.25, 0.5, 0.25), (0, 0, 0))],
@@ -67,20 +66,20 @@ def test_sums_err_more_by_noise_that_neighbours_share(kernel: Kernel, summed: Pi
     frames = noisy(kernel)
     expected = by_sums(np.array(kernel), summed)
     assert expected > 1.4
-    assert shared_noise(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(expected, rel=0.08)
+    assert noise_correlation(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(expected, rel=0.08)
 
 
-@pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_sum(1.0)], ids=["phases", "values", "edges"])
+@pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_pixel_sum(1.0)], ids=["phases", "values", "edges"])
 def test_independent_noise_stays_as_it_is(summed: PixelSum) -> None:
     frames = noisy(ALONE)
-    assert shared_noise(frames, estimate_noise(frames), EVERYWHERE, summed) == 1.0
+    assert noise_correlation(frames, estimate_noise(frames), EVERYWHERE, summed) == 1.0
 
 
 def test_rows_that_err_as_a_whole_are_told() -> None:
     frames = noisy(ALONE, rows=1.0)
     # Of the sums' variance, rows add Σ over rows of (Σ over columns of w)², a quarter as strong as pixels' noise.
     rows = np.sum(STENCIL.sum(axis=1) ** 2) / np.sum(STENCIL**2)
-    found = shared_noise(frames, estimate_noise(frames), EVERYWHERE, PixelSum(STENCIL))
+    found = noise_correlation(frames, estimate_noise(frames), EVERYWHERE, PixelSum(STENCIL))
     assert found == pytest.approx((4 + rows) / 5, rel=0.1)
 
 
@@ -90,14 +89,14 @@ def test_lamps_that_a_bit_shares_with_its_inverse_err_frames_but_not_their_diffe
     lamp = 3.0 * np.random.default_rng(6).standard_normal((BITS, 1, 1)).astype(np.float32)
     lit = replace(frames, bits=frames.bits + lamp, inverses=frames.inverses + lamp)
     noise = NoiseModel(4.0, 0.0)
-    assert shared_noise(lit, noise, EVERYWHERE, edge_sum(1.0)) == 1.0
-    assert shared_noise(lit, noise, EVERYWHERE, PixelSum(STENCIL)) > 10.0
+    assert noise_correlation(lit, noise, EVERYWHERE, edge_pixel_sum(1.0)) == 1.0
+    assert noise_correlation(lit, noise, EVERYWHERE, PixelSum(STENCIL)) > 10.0
 
 
 def test_a_model_that_is_too_small_is_made_up_for_and_one_too_large_is_not() -> None:
     frames = noisy(ALONE)
-    assert shared_noise(frames, NoiseModel(2.0, 0.0), EVERYWHERE, PHASES) == pytest.approx(2.0, rel=0.05)
-    assert shared_noise(frames, NoiseModel(8.0, 0.0), EVERYWHERE, PHASES) == 1.0
+    assert noise_correlation(frames, NoiseModel(2.0, 0.0), EVERYWHERE, PHASES) == pytest.approx(2.0, rel=0.05)
+    assert noise_correlation(frames, NoiseModel(8.0, 0.0), EVERYWHERE, PHASES) == 1.0
 
 
 def test_edges_of_the_code_do_not_count_where_they_break_the_sum() -> None:
@@ -109,15 +108,15 @@ def test_edges_of_the_code_do_not_count_where_they_break_the_sum() -> None:
     at_edges = np.abs(np.diff(bits, axis=2, append=bits[:, :, -1:])) > 60
     broken[at_edges] = 110
     inverses = np.where(at_edges, 110, frames.inverses).astype(np.float32)
-    found = shared_noise(replace(frames, bits=broken, inverses=inverses), NoiseModel(4.0, 0.0), EVERYWHERE, PHASES)
+    found = noise_correlation(replace(frames, bits=broken, inverses=inverses), NoiseModel(4.0, 0.0), EVERYWHERE, PHASES)
     assert found == 1.0
 
 
 def test_what_tells_nothing_changes_nothing() -> None:
     frames = noisy(SMOOTH)
     noise = estimate_noise(frames)
-    assert shared_noise(replace(frames, inverses=None), noise, EVERYWHERE, PHASES) == 1.0
-    assert shared_noise(frames, noise, ~EVERYWHERE, PHASES) == 1.0
-    assert shared_noise(noisy(ALONE, bits=2), noise, EVERYWHERE, PHASES) == 1.0
+    assert noise_correlation(replace(frames, inverses=None), noise, EVERYWHERE, PHASES) == 1.0
+    assert noise_correlation(frames, noise, ~EVERYWHERE, PHASES) == 1.0
+    assert noise_correlation(noisy(ALONE, bits=2), noise, EVERYWHERE, PHASES) == 1.0
     clipped = replace(frames, full_scale=100.0)
-    assert shared_noise(clipped, noise, EVERYWHERE, PHASES) == 1.0
+    assert noise_correlation(clipped, noise, EVERYWHERE, PHASES) == 1.0

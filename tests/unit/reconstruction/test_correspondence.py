@@ -13,17 +13,17 @@ from scipy.special import ndtr
 from slrig.model import Axis, FloatArray, Gray, LineShift, Pattern, Size
 from slrig.patterns.codes import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.patterns.sequence import profile
-from slrig.reconstruction.coded import CodeTables
+from slrig.reconstruction.camera_response import NoiseModel
 from slrig.reconstruction.correspondence import (
     CorrespondenceLimits,
     ProjectorPositions,
     edge_crossings,
-    near_print,
+    near_print_edges,
     projector_positions,
 )
+from slrig.reconstruction.decoded_image import CodeTables
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.noise import NoiseModel
 from tests.unit.reconstruction.builders import code_frames
 
 PROJECTOR = Size(256, 64)
@@ -166,7 +166,7 @@ def root(values: FloatArray) -> float:
 @pytest.mark.parametrize("down", [False, True])
 def test_crossings_are_those_of_plain_numpy(down: bool) -> None:
     frames = Wall(blur_px=0.9).frames(noise=NOISE)
-    code, edges = decoded(frames, NOISE), tables(frames).position_of
+    code, edges = decoded(frames, NOISE), tables(frames).position_table
     asked = INSIDE & (np.arange(SHAPE[1]) % 41 > 2) & (np.arange(SHAPE[0])[:, None] < 7)
     wanted = np.array(list(crossings_by_numpy(frames, code, edges, asked, NOISE)))
     assert len(wanted) > 300
@@ -242,10 +242,10 @@ def test_pixels_beside_an_edge_of_the_print_are_left_out() -> None:
 def test_even_paper_has_no_edges_of_print_however_dark_and_noisy() -> None:
     rng = np.random.default_rng(3)
     contrast = (8.0 + 2.0 * rng.normal(size=(120, 120))).astype(np.float32)
-    near = near_print(contrast, np.full_like(contrast, 2.0), 0.8, CorrespondenceLimits())
+    near = near_print_edges(contrast, np.full_like(contrast, 2.0), 0.8, CorrespondenceLimits())
     assert near.mean() < 0.01
     contrast[:, 60:] += 150
-    near = near_print(contrast, np.full_like(contrast, 2.0), 0.8, CorrespondenceLimits())
+    near = near_print_edges(contrast, np.full_like(contrast, 2.0), 0.8, CorrespondenceLimits())
     assert near[:, 58:62].all()
     assert not near[:, 75:].any()
 

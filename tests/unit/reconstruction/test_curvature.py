@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from slrig.model import FloatArray
-from slrig.reconstruction.blur import freed_of_curvature
+from slrig.reconstruction.blur import correct_curvature
 from slrig.reconstruction.phase import PositionMap
 
 FINE = 8
@@ -43,7 +43,7 @@ def seen_through_blur(position: FloatArray) -> tuple[FloatArray, FloatArray]:
 def freed(position: FloatArray, sigma_px: float = 0.001, usable: NDArray[np.bool_] | None = None) -> FloatArray:
     everywhere = np.ones(position.shape, dtype=np.bool_) if usable is None else usable
     seen = PositionMap(position.astype(np.float32), np.full(position.shape, sigma_px, dtype=np.float32))
-    return freed_of_curvature(seen, everywhere, BLUR_PX**2, PERIOD_PX).position.astype(np.float64)
+    return correct_curvature(seen, everywhere, BLUR_PX**2, PERIOD_PX).position.astype(np.float64)
 
 
 @pytest.mark.parametrize(("right", "down"), [(1.1, 0.2), (0.3, -0.9), (2.4, 0.5)])

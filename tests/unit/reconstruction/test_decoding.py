@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from slrig.model import Axis, Gray, IntArray, Refusal
 from slrig.patterns.codes import index_of_word
+from slrig.reconstruction.camera_response import NoiseModel
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.noise import NoiseModel
 from tests.unit.reconstruction.builders import code_frames
 
 BITS = 6

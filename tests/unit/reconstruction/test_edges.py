@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray
-from slrig.reconstruction.phase import EdgeLimits, PositionMap, near_edges, near_shadows, near_shadows_of
+from slrig.reconstruction.phase import EdgeLimits, PositionMap, near_edges, near_shadows, near_shadows_by_blur
 from tests.unit.reconstruction.builders import grid
 
 SHAPE = (30, 40)
@@ -142,7 +142,7 @@ def test_shadows_reach_further_by_a_camera_out_of_focus() -> None:
     unlit = np.zeros((40, 40), dtype=np.bool_)
     unlit[:, :10] = True
     usual = near_shadows(unlit, EdgeLimits())
-    assert near_shadows_of(0.65, usual, unlit, EdgeLimits()) is usual
-    wider = near_shadows_of(1.5, usual, unlit, EdgeLimits())
+    assert near_shadows_by_blur(0.65, usual, unlit, EdgeLimits()) is usual
+    wider = near_shadows_by_blur(1.5, usual, unlit, EdgeLimits())
     assert (usual.sum(axis=1) == 12).all()
     assert (wider.sum(axis=1) == 14).all()

@@ -20,7 +20,7 @@ from slrig.model import (
     Size,
     White,
 )
-from slrig.reconstruction.frames import Images, axis_frames, rows_of, sampled
+from slrig.reconstruction.frames import Images, axis_frames, stack_rows, subsample
 
 CAMERA = CameraFormat(Size(3, 2), 8)
 BITS = [Gray(Axis.COLUMN, bit, 2) for bit in range(2)]
@@ -84,9 +84,9 @@ def test_rows_of_frames_are_those_of_all_images() -> None:
     assert some.inverses is not None
     for images in (some.bits, some.inverses, some.lines):
         assert {image.shape for image in images} == {(1, frames.white.shape[1])}
-    assert rows_of(frames.lines, slice(1, 2)).dtype == np.float32
+    assert stack_rows(frames.lines, slice(1, 2)).dtype == np.float32
     assert first_pixels(some.bits) == first_pixels(frames.bits)
-    assert sampled(frames.bits, 2, 3).shape == (2, -(-frames.white.shape[0] // 2), -(-frames.white.shape[1] // 3))
+    assert subsample(frames.bits, 2, 3).shape == (2, -(-frames.white.shape[0] // 2), -(-frames.white.shape[1] // 3))
 
 
 def test_only_the_axis_and_the_camera_asked_for_are_taken() -> None:
@@ -105,7 +105,7 @@ def test_repeats_at_one_exposure_are_averaged() -> None:
     assert (frames.white == np.float32(204)).all()
     twice = axis_frames(capture_of(*ENDS, *plain(*BITS), *plain(*BITS, value=60), *ENDS), "eye", Axis.COLUMN)
     assert (np.array(twice.bits) == np.float32(55)).all()
-    assert (frames.ends_repeats, twice.ends_repeats) == (1.0, 1.0)
+    assert (frames.reference_repeats, twice.reference_repeats) == (1.0, 1.0)
 
 
 def test_white_and_black_that_close_a_sequence_are_evidence_only() -> None:
@@ -118,13 +118,13 @@ def test_white_and_black_that_close_a_sequence_are_evidence_only() -> None:
     # Of a sequence that is played twice everything counts, and twice as much of the ends where it is closed, too.
     twice = axis_frames(capture_of(*ENDS, *plain(*BITS), *closing, *ENDS, *plain(*BITS), *closing), "eye", Axis.COLUMN)
     assert (twice.white == 210).all()
-    assert twice.ends_repeats == 2.0
+    assert twice.reference_repeats == 2.0
 
 
 @pytest.mark.parametrize("opening", [2, 3])
 def test_ends_that_are_shown_several_times_before_the_code_have_less_noise(opening: int) -> None:
     frames = axis_frames(capture_of(*(ENDS * opening), *plain(*BITS), *ENDS), "eye", Axis.COLUMN)
-    assert frames.ends_repeats == opening
+    assert frames.reference_repeats == opening
 
 
 def test_a_bit_shown_only_inverted_is_turned_back() -> None:

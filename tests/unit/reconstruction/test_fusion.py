@@ -25,10 +25,10 @@ from slrig.model import (
     White,
 )
 from slrig.patterns.codes import cell_positions, index_of_word
+from slrig.reconstruction.camera_response import NoiseModel, estimate_noise
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, axis_frames
-from slrig.reconstruction.fusion import FusedFrames, exposure_use, fused_frames
-from slrig.reconstruction.noise import NoiseModel, estimate_noise
+from slrig.reconstruction.fusion import FusedFrames, exposure_use, fuse_exposures
 from slrig.reconstruction.phase import position_map
 
 PERIOD, BITS = 8, 5
@@ -108,7 +108,7 @@ NOISY = Plate(steps(), pedestal=5.0)
 
 
 def fused(plate: Plate = PLATE, *, seed: int | None = 1, exposures_s: Sequence[float] = EXPOSURES_S) -> FusedFrames:
-    return fused_frames(plate.capture(exposures_s, seed=seed), "eye", COLUMN)
+    return fuse_exposures(plate.capture(exposures_s, seed=seed), "eye", COLUMN)
 
 
 def position_of(frames: AxisFrames, noise: NoiseModel, plate: Plate) -> tuple[FloatArray, FloatArray]:
@@ -133,7 +133,7 @@ def test_what_is_clipped_in_a_long_exposure_comes_from_the_short_ones() -> None:
     assert np.abs(told.frames.contrast / truth - 1)[truth > 40].max() < 0.12
     assert np.abs(np.median(told.frames.contrast / truth, axis=0) - 1).max() < 0.04
     assert told.frames.exposure_ratio == pytest.approx(16, rel=0.01)
-    assert told.frames.ends_repeats == 2.0
+    assert told.frames.reference_repeats == 2.0
 
 
 def without(capture: Capture, keep: Callable[[Shot], bool]) -> Capture:
@@ -150,7 +150,7 @@ def decoded(frames: AxisFrames, noise: NoiseModel) -> NDArray[np.uint8]:
 
 def test_a_pixel_that_every_exposure_clips_is_refused_as_saturated_and_one_that_any_shows_is_not() -> None:
     plate = Plate(steps() * np.where(np.arange(SHAPE[1]) < 150, 1.0, 20.0), line=0.4)
-    told = fused_frames(unpaired(plate.capture(seed=1)), "eye", COLUMN)
+    told = fuse_exposures(unpaired(plate.capture(seed=1)), "eye", COLUMN)
     refusal = decoded(told.frames, told.noise)
     assert (refusal[:, 150:] == Refusal.SATURATED).all()
     assert np.mean(refusal[:, :150] == Refusal.NONE) > 0.98
@@ -174,7 +174,7 @@ def test_a_pixel_that_every_exposure_clips_is_refused_as_saturated_and_one_that_
 )
 def test_the_same_exposures_in_all_frames_of_a_pixel_keep_lines_where_they_are(plate: Plate) -> None:
     capture = plate.capture()
-    told = fused_frames(capture, "eye", COLUMN)
+    told = fuse_exposures(capture, "eye", COLUMN)
     peak = plate.brightness * plate.light(0.08)
     bright = (peak > 900) & (peak < 3500)
     assert np.count_nonzero(bright) > 3000
@@ -255,9 +255,9 @@ def test_the_use_of_each_exposure_is_told_from_short_to_long() -> None:
 
 def test_the_order_in_which_exposures_come_and_how_exactly_they_are_named_does_not_matter() -> None:
     capture = PLATE.capture(seed=2)
-    told = fused_frames(capture, "eye", COLUMN)
+    told = fuse_exposures(capture, "eye", COLUMN)
     jittered = tuple(replace(s, exposure_s=(s.exposure_s or 0) * (1 + 1e-4 * (s.pattern % 3))) for s in capture.shots)
-    again = fused_frames(replace(capture, shots=jittered[::-1]), "eye", COLUMN)
+    again = fuse_exposures(replace(capture, shots=jittered[::-1]), "eye", COLUMN)
     for name in ("white", "black", "bits", "lines"):
         np.testing.assert_array_equal(getattr(told.frames, name), getattr(again.frames, name))
 
@@ -284,12 +284,12 @@ REFUSED: Mapping[str, tuple[Callable[[Capture], Capture], Sequence[str]]] = {
 def test_a_bracket_that_is_not_whole_is_refused_in_words_that_help(case: str) -> None:
     change, words = REFUSED[case]
     with pytest.raises(PatternError) as caught:
-        fused_frames(change(PLATE.capture()), "eye", COLUMN)
+        fuse_exposures(change(PLATE.capture()), "eye", COLUMN)
     for word in words:
         assert word in str(caught.value)
 
 
 def test_a_bracket_without_inverses_is_fused_as_well() -> None:
-    told = fused_frames(unpaired(PLATE.capture(seed=4)), "eye", COLUMN)
+    told = fuse_exposures(unpaired(PLATE.capture(seed=4)), "eye", COLUMN)
     assert told.frames.inverses is None
     assert np.mean(decoded(told.frames, told.noise) == Refusal.NONE) > 0.95

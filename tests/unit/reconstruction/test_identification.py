@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slrig.model import FloatArray, IntArray, Refusal
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.identification import CodedStripes, identify
+from slrig.reconstruction.identification import NumberedStripes, identify_stripes
 from slrig.reconstruction.stripes import Stripes
 from tests.unit.reconstruction.builders import stripes_of
 
@@ -58,12 +58,12 @@ def down(rows: range) -> FloatArray:
 
 def numbered(
     seen: Image, stripes: Stripes, *, shortest: int = 5, positions: FloatArray = POSITIONS
-) -> tuple[CodedStripes, NDArray[np.uint8]]:
+) -> tuple[NumberedStripes, NDArray[np.uint8]]:
     code = CodeMap(seen.lowest, seen.highest, seen.refusal)
-    return identify(stripes, code, positions, seen.near_shadow, seen.near_step, shortest_points=shortest)
+    return identify_stripes(stripes, code, positions, seen.near_shadow, seen.near_step, shortest_points=shortest)
 
 
-def runs(coded: CodedStripes) -> list[tuple[float, list[int]]]:
+def runs(coded: NumberedStripes) -> list[tuple[float, list[int]]]:
     """(position, rows) of each stripe."""
     edges = coded.stripes.offsets
     rows = np.rint(coded.stripes.points_px[:, 1]).astype(int)

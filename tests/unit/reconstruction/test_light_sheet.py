@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Size, lens
 from slrig.model.lens_kernels import undistorted
 from slrig.reconstruction.identification import StripeEnsemble
-from slrig.reconstruction.triangulation import normalised_from_pixel, on_light_sheets, packed
+from slrig.reconstruction.triangulation import intersect_light_sheets, normalised_from_pixel, pack_device
 from tests.unit.reconstruction.builders import ensemble_of, looking
 
 LENGTHS = (1, 3, 255, 256, 257, 600)  # of curves: blocks that are full, and what is left over
@@ -47,7 +47,7 @@ def depth_on_sheet(
     across = int(axis is Axis.ROW)
     middle = projector.matrix[:2, 2].copy()
     middle[across] = position
-    tangent = normalised_from_pixel(packed(projector), *middle)[across]
+    tangent = normalised_from_pixel(pack_device(projector), *middle)[across]
     from_plane = projector.rotation[across] - tangent * projector.rotation[2]
     ahead = projector.rotation @ ray
     s = -(from_plane @ origin_mm + projector.translation_mm[across] - tangent * projector.translation_mm[2])
@@ -98,7 +98,7 @@ def scattered(seed: int) -> StripeEnsemble:
 def test_blocks_of_points_give_what_each_point_gives(seed: int, axis: Axis) -> None:
     camera, projector = rig(seed, axis)
     ensemble = scattered(seed)
-    points, _, _, cause = on_light_sheets(ensemble, camera, projector, axis)
+    points, _, _, cause = intersect_light_sheets(ensemble, camera, projector, axis)
     with np.errstate(all="ignore"):
         expected, why, steps = one_by_one(ensemble, camera, projector, axis)
     # Easy points, slow ones, and such as have no ray lie side by side.

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from slrig.model import Axis, FloatArray
-from slrig.reconstruction.identification import CodedStripes, StripeEnsemble, link
-from slrig.reconstruction.triangulation import camera_projector
+from slrig.reconstruction.identification import NumberedStripes, StripeEnsemble, link_stripes
+from slrig.reconstruction.triangulation import triangulate_camera_projector
 from tests.unit.reconstruction.builders import CAMERA, PROJECTOR, opencv_pixels, opencv_rays, stripes_of
 
 
 def linked(*stripes: FloatArray, position_px: list[float] | None = None) -> StripeEnsemble:
-    return link(CodedStripes(stripes_of(list(stripes)), np.array(position_px or [7.0] * len(stripes))))
+    return link_stripes(NumberedStripes(stripes_of(list(stripes)), np.array(position_px or [7.0] * len(stripes))))
 
 
 def down(x: float, rows: range, *, lean: float = 0.0) -> FloatArray:
@@ -57,7 +57,7 @@ def test_one_light_on_a_step_makes_two_stripes_and_one_curve_along_its_sheet(
     np.testing.assert_array_equal(ensemble.points_px, np.concatenate([above, below]))
     assert np.flatnonzero(ensemble.bridge_after).tolist() == [len(above) - 1]
     # In space the curve runs down the sheet: every point at its own row of the projector, in order.
-    sheet, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    sheet, _ = triangulate_camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     assert len(sheet.points_mm) == len(ensemble.points_px)
     assert (np.diff(sheet.along_px) > 0).all()
     assert np.flatnonzero(sheet.bridge_after).tolist() == [len(above) - 1]
@@ -68,7 +68,7 @@ def test_a_cliff_can_mislead_the_papers_rule_and_the_light_sheet_knows_the_order
     above, below = lit_plate(0.0, np.arange(20.0, 110.0, 0.4)), lit_plate(-60.0, np.arange(112.0, 230.0, 0.4))
     ensemble = linked(above, below, position_px=[COLUMN, COLUMN])
     assert points_between(ensemble) == [(above[-1].tolist(), below[-1].tolist())]
-    sheet, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    sheet, _ = triangulate_camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     np.testing.assert_array_equal(sheet.pixels_px, np.concatenate([above, below]))
     assert np.flatnonzero(sheet.bridge_after).tolist() == [len(above) - 1]
 
@@ -76,7 +76,7 @@ def test_a_cliff_can_mislead_the_papers_rule_and_the_light_sheet_knows_the_order
 def test_adjacent_pixels_of_two_stripes_may_be_far_apart_in_space_and_are_joined_by_a_bridge() -> None:
     # Figure 2 (b, c): the far plate's stripe ends beside the near one's; neighbours in the image, 60 mm apart in depth.
     near, far = lit_plate(-60.0, np.arange(20.0, 110.0, 0.4)), lit_plate(0.0, np.arange(110.4, 200.0, 0.4))
-    sheet, _ = camera_projector(linked(near, far, position_px=[COLUMN] * 2), CAMERA, PROJECTOR, Axis.COLUMN)
+    sheet, _ = triangulate_camera_projector(linked(near, far, position_px=[COLUMN] * 2), CAMERA, PROJECTOR, Axis.COLUMN)
     (at,) = np.flatnonzero(sheet.bridge_after)
     assert np.linalg.norm(sheet.points_mm[at + 1] - sheet.points_mm[at]) > 59
 
@@ -95,7 +95,7 @@ def test_points_keep_their_normals_and_deviations() -> None:
     angles = np.linspace(0, 1, 35)
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     stripes = stripes_of(chains, normals=[normals[:15], normals[15:]])
-    ensemble = link(CodedStripes(stripes, np.array([7.0, 7.0])))
+    ensemble = link_stripes(NumberedStripes(stripes, np.array([7.0, 7.0])))
     for point, normal, sigma in zip(ensemble.points_px, ensemble.normals, ensemble.sigma_px, strict=True):
         (source,) = np.flatnonzero((stripes.points_px == point).all(axis=1))
         np.testing.assert_array_equal(normal, stripes.normals[source])
@@ -103,6 +103,6 @@ def test_points_keep_their_normals_and_deviations() -> None:
 
 
 def test_nothing_links_to_nothing() -> None:
-    ensemble = link(CodedStripes(stripes_of([]), np.zeros(0)))
+    ensemble = link_stripes(NumberedStripes(stripes_of([]), np.zeros(0)))
     assert ensemble.offsets.tolist() == [0]
     assert len(ensemble.position_px) == len(ensemble.points_px) == 0

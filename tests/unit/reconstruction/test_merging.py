@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from slrig.model import Axis, FloatArray, Pinhole, Source
 from slrig.reconstruction.merging import (
-    FEWEST_POINTS,
+    MIN_POINTS,
     Disagreement,
     MergedCurves,
-    _alone_kernel,
     _fuse_kernel,
-    disagreement,
-    merged,
+    _unmatched_kernel,
+    find_disagreement,
+    merge_curves,
 )
-from slrig.reconstruction.triangulation import SheetCurves, camera_projector
+from slrig.reconstruction.triangulation import SheetCurves, triangulate_camera_projector
 from tests.unit.reconstruction.builders import BALL, CAMERA, OTHER_CAMERA, PROJECTOR, seen_on_ball
 
 COLUMNS = [120.0, 140.0, 160.0, 180.0]
@@ -42,11 +42,11 @@ def seen(
     """What one camera triangulates of the ball."""
     columns = COLUMNS if columns is None else columns
     stripes = seen_on_ball(camera, columns, rows, sigma_px=sigma_px, noise_px=noise_px, seed=seed)
-    return camera_projector(stripes, camera, PROJECTOR, Axis.COLUMN)[0]
+    return triangulate_camera_projector(stripes, camera, PROJECTOR, Axis.COLUMN)[0]
 
 
 def both(first: SheetCurves, second: SheetCurves) -> MergedCurves:
-    return merged([first, second], PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
+    return merge_curves([first, second], PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
 
 
 def require_one_sheet(result: SheetCurves) -> None:
@@ -66,7 +66,7 @@ def along_ray_mm(points: FloatArray) -> FloatArray:
 
 def test_one_camera_is_passed_through() -> None:
     only = seen(CAMERA, ROWS)
-    result = merged([only], PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
+    result = merge_curves([only], PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
     assert result.curves is only
     assert (result.camera == 0).all()
     assert len(result.residual_sigma) == len(result.residual_mm) == 0
@@ -123,7 +123,7 @@ def test_what_each_camera_sees_alone_is_joined_by_a_bridge() -> None:
 def test_three_cameras_are_merged_one_after_the_other() -> None:
     third = replace(CAMERA, translation_mm=CAMERA.translation_mm + np.array([15.0, 0.0, 0.0]))
     parts = [seen(CAMERA, ROWS[ROWS < 90]), seen(OTHER_CAMERA, ROWS[ROWS < 140] + 0.2), seen(third, ROWS + 0.5)]
-    result = merged(parts, PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
+    result = merge_curves(parts, PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
     require_one_sheet(result.curves)
     assert set(result.camera.tolist()) == {0, 1, 2}
     assert np.abs(BALL.distance_mm(result.curves.points_mm)).max() < 2e-4
@@ -208,7 +208,7 @@ def test_points_of_one_ray_are_averaged_by_their_variances(pair: tuple[Sheet, Sh
 
 def test_points_are_alone_where_the_first_camera_has_no_stretch(pair: tuple[Sheet, Sheet]) -> None:
     first, second = pair
-    alone = _alone_kernel(first.offsets, first.along, first.bridge, second.offsets, second.along, GAP_PX)
+    alone = _unmatched_kernel(first.offsets, first.along, first.bridge, second.offsets, second.along, GAP_PX)
     for curve in range(len(first.offsets) - 1):
         rows = first.along[first.offsets[curve] : first.offsets[curve + 1]]
         bridge = first.bridge[first.offsets[curve] : first.offsets[curve + 1]]
@@ -237,29 +237,29 @@ def share(value_mm: float) -> FloatArray:
 
 @pytest.mark.parametrize("outlying", [0.0, 0.2])
 def test_cameras_that_agree_within_their_noise_say_nothing(outlying: float) -> None:
-    assert disagreement(met(0.0, outlying=outlying), None) is None
-    assert disagreement(met(0.0, outlying=outlying), share(0.1)) is None
+    assert find_disagreement(met(0.0, outlying=outlying), None) is None
+    assert find_disagreement(met(0.0, outlying=outlying), share(0.1)) is None
 
 
 @pytest.mark.parametrize("offset_mm", [0.5, -0.5])
 def test_cameras_that_contradict_each_other_are_told_by_how_much(offset_mm: float) -> None:
-    found = disagreement(met(offset_mm, outlying=0.1), None)
+    found = find_disagreement(met(offset_mm, outlying=0.1), None)
     assert found is not None
-    assert found.apart_mm == pytest.approx(0.5, rel=0.02)
+    assert found.distance_mm == pytest.approx(0.5, rel=0.02)
     # 25 deviations apart, on the scale on which noise alone has 1.
-    assert found.over_sigma == pytest.approx(1.4826 * 25, rel=0.03)
-    assert found.sigma_mm == found.apart_mm
+    assert found.sigma_ratio == pytest.approx(1.4826 * 25, rel=0.03)
+    assert found.sigma_mm == found.distance_mm
     assert "0.50" in str(found)
     assert "calibrate again" in str(found)
 
 
 def test_an_error_that_the_calibration_states_is_no_contradiction() -> None:
-    assert disagreement(met(0.2), share(0.15)) is None
-    assert isinstance(disagreement(met(0.2), share(0.02)), Disagreement)
+    assert find_disagreement(met(0.2), share(0.15)) is None
+    assert isinstance(find_disagreement(met(0.2), share(0.02)), Disagreement)
 
 
 def test_few_points_that_both_see_say_nothing() -> None:
-    assert disagreement(met(0.5, points=FEWEST_POINTS - 1), None) is None
+    assert find_disagreement(met(0.5, points=MIN_POINTS - 1), None) is None
     nothing = met(0.0)
     same = MergedCurves(nothing.curves, nothing.camera, 0 * nothing.residual_sigma, 0 * nothing.residual_mm)
-    assert disagreement(same, None) is None
+    assert find_disagreement(same, None) is None

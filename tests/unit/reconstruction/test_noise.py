@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray
+from slrig.reconstruction.camera_response import NoiseModel, estimate_noise
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from tests.unit.reconstruction.builders import code_frames, grid
 
 SHAPE = (240, 320)
@@ -144,7 +144,7 @@ def test_an_evenly_lit_wall_tells_its_noise_in_the_dark_as_well(read_variance: f
             black=seen(dark, repeats),
             full_scale=4095.0,
         ),
-        ends_repeats=float(repeats),
+        reference_repeats=float(repeats),
     )
     model = estimate_noise(frames)
     for level in (15.0, 100.0, 190.0):

@@ -9,7 +9,7 @@ import pytest
 
 from slrig.model import FloatArray, Pinhole, Size
 from slrig.reconstruction.identification import StripeEnsemble
-from slrig.reconstruction.triangulation import project, rays, runs_down, stripe_crossing, to_depths
+from slrig.reconstruction.triangulation import optical_depths_mm, pixel_rays, project, runs_down, stripe_crossing
 from tests.unit.reconstruction.builders import (
     CAMERA,
     OTHER_CAMERA,
@@ -44,7 +44,7 @@ def points_before(device: Pinhole, *, count: int = 400) -> FloatArray:
 @DEVICES
 def test_rays_are_those_of_opencv(device: Pinhole) -> None:
     pixels = pixels_of(device.size)
-    np.testing.assert_allclose(rays(device, pixels), opencv_rays(device, pixels), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(pixel_rays(device, pixels), opencv_rays(device, pixels), rtol=0, atol=1e-12)
 
 
 @DEVICES
@@ -55,7 +55,7 @@ def test_projections_are_those_of_opencv(device: Pinhole) -> None:
 
 def test_a_ray_has_unit_depth() -> None:
     pixels = pixels_of(CAMERA.size)
-    depth = to_depths(CAMERA, CAMERA.centre_mm + 37.5 * rays(CAMERA, pixels))
+    depth = optical_depths_mm(CAMERA, CAMERA.centre_mm + 37.5 * pixel_rays(CAMERA, pixels))
     np.testing.assert_allclose(depth, 37.5, rtol=1e-12)
 
 
@@ -69,7 +69,7 @@ def test_skew_shears_columns_by_rows_and_is_undone() -> None:
     expected = straight.copy()
     expected[:, 0] += 12.5 * (straight[:, 1] - matrix[1, 2]) / matrix[1, 1]
     np.testing.assert_allclose(project(skewed, points), expected, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(rays(skewed, expected), opencv_rays(CAMERA, straight), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(pixel_rays(skewed, expected), opencv_rays(CAMERA, straight), rtol=0, atol=1e-12)
 
 
 def test_a_point_behind_the_device_has_no_pixel() -> None:
@@ -81,9 +81,9 @@ def test_a_point_behind_the_device_has_no_pixel() -> None:
 
 
 def test_unmeasured_stays_unmeasured() -> None:
-    assert np.isnan(rays(CAMERA, np.array([[np.nan, 3.0]]))).all()
+    assert np.isnan(pixel_rays(CAMERA, np.array([[np.nan, 3.0]]))).all()
     assert np.isnan(project(CAMERA, np.array([[np.nan, 0.0, 0.0]]))).all()
-    assert np.isnan(to_depths(CAMERA, np.array([[np.nan, 0.0, 0.0]]))).all()
+    assert np.isnan(optical_depths_mm(CAMERA, np.array([[np.nan, 0.0, 0.0]]))).all()
 
 
 @pytest.mark.parametrize("beyond_px", [30.0, 80.0, 700.0])
@@ -92,8 +92,8 @@ def test_a_pixel_that_the_lens_cannot_light_has_no_ray(beyond_px: float) -> None
     barrel = replace(CAMERA, distortion=np.array([-0.3, 0.0, 0.0, 0.0, 0.0]))
     edge = barrel.matrix[0, 2] + 0.7027 * barrel.matrix[0, 0]
     row = barrel.matrix[1, 2]
-    assert np.isfinite(rays(barrel, np.array([[edge - beyond_px, row]]))).all()
-    assert np.isnan(rays(barrel, np.array([[edge + beyond_px, row]]))).all()
+    assert np.isfinite(pixel_rays(barrel, np.array([[edge - beyond_px, row]]))).all()
+    assert np.isnan(pixel_rays(barrel, np.array([[edge + beyond_px, row]]))).all()
 
 
 ABOVE = looking(

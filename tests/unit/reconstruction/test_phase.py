@@ -15,11 +15,18 @@ from scipy.stats import chi2
 
 from slrig.kernels import in_bands
 from slrig.model import Axis, FloatArray, LineShift
+from slrig.reconstruction.camera_response import NoiseModel
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.phase import FittedPoints, PositionMap, has_phase, no_points, position_map, windows
-from slrig.reconstruction.surface_fit import POINTS, fit_kernel
+from slrig.reconstruction.phase import (
+    FittedPoints,
+    PositionMap,
+    allocate_points,
+    fit_arguments,
+    has_phase,
+    position_map,
+)
+from slrig.reconstruction.surface_fit import MIN_POINTS, fit_kernel
 from tests.unit.reconstruction.builders import bars, cells_of, code_frames, grid, nearest_lines
 
 SHAPE = (60, 80)
@@ -192,10 +199,10 @@ def fitted_points(
     seen: PositionMap, usable: NDArray[np.bool_], starts_px: FloatArray, targets_px: FloatArray
 ) -> FittedPoints:
     """Points of the image at which a local surface of the position map has the wanted positions."""
-    fitted = no_points(len(starts_px))
+    fitted = allocate_points(len(starts_px))
     in_bands(
-        fit_kernel, len(starts_px), *windows(seen, usable), np.ascontiguousarray(starts_px),
-        np.asarray(targets_px, dtype=np.float64), fitted, rows_at_least=POINTS,
+        fit_kernel, len(starts_px), *fit_arguments(seen, usable), np.ascontiguousarray(starts_px),
+        np.asarray(targets_px, dtype=np.float64), fitted, rows_at_least=MIN_POINTS,
     )  # fmt: skip
     return fitted
 

@@ -10,15 +10,15 @@ import pytest
 
 from slrig.model import Axis, FloatArray, Pinhole, Size, Source
 from slrig.reconstruction.merging import (
-    CELLS,
-    FEWEST_PAIRS,
+    MAP_CELLS,
+    MIN_PAIRS,
     PairRedundancy,
-    SpareEquation,
-    in_figures,
-    redundancy,
-    spare_equation,
+    StripeResiduals,
+    evaluate_redundancy,
+    stripe_residuals,
+    summarise_pair,
 )
-from slrig.reconstruction.triangulation import SheetCurves, camera_projector
+from slrig.reconstruction.triangulation import SheetCurves, triangulate_camera_projector
 from tests.unit.reconstruction.builders import (
     BALL,
     CAMERA,
@@ -60,11 +60,11 @@ def seen(
 ) -> SheetCurves:
     """What a camera triangulates of the ball with the pose it is believed to have."""
     stripes = seen_on_ball(camera, COLUMNS, rows, sigma_px=noise_px or 0.01, noise_px=noise_px, seed=seed)
-    return camera_projector(stripes, believed or camera, PROJECTOR, Axis.COLUMN)[0]
+    return triangulate_camera_projector(stripes, believed or camera, PROJECTOR, Axis.COLUMN)[0]
 
 
-def both(first: SheetCurves, second: SheetCurves, *, other: Pinhole = OTHER_CAMERA) -> SpareEquation:
-    return spare_equation(first, second, other, Axis.COLUMN, widest_gap_px=GAP_PX)
+def both(first: SheetCurves, second: SheetCurves, *, other: Pinhole = OTHER_CAMERA) -> StripeResiduals:
+    return stripe_residuals(first, second, other, Axis.COLUMN, widest_gap_px=GAP_PX)
 
 
 @by_kernel
@@ -118,9 +118,11 @@ def test_rows_of_light_count_towards_higher_rows() -> None:
     def rows_seen(camera: Pinhole, believed: Pinhole) -> SheetCurves:
         lit = [lit_row(row, along) for row in columns]
         pixels = [opencv_pixels(camera, each) for each in lit]
-        return camera_projector(ensemble_of(pixels, columns, normal=(0.0, 1.0)), believed, PROJECTOR, Axis.ROW)[0]
+        return triangulate_camera_projector(
+            ensemble_of(pixels, columns, normal=(0.0, 1.0)), believed, PROJECTOR, Axis.ROW
+        )[0]
 
-    spare = spare_equation(
+    spare = stripe_residuals(
         rows_seen(CAMERA, CAMERA), rows_seen(OTHER_CAMERA, above), above, Axis.ROW, widest_gap_px=GAP_PX
     )
     point = lit_row(100.0, along[:1])
@@ -149,14 +151,16 @@ def test_sheets_that_one_camera_has_alone_are_left_out() -> None:
     first, second = seen(CAMERA), seen(OTHER_CAMERA)
     apart = replace(second, position_px=second.position_px + 1)
     assert len(both(first, apart).residual_px) == 0
-    found = redundancy([first, apart], {"left": CAMERA, "right": OTHER_CAMERA}, Axis.COLUMN, widest_gap_px=GAP_PX)
+    found = evaluate_redundancy(
+        [first, apart], {"left": CAMERA, "right": OTHER_CAMERA}, Axis.COLUMN, widest_gap_px=GAP_PX
+    )
     assert found.pairs == ()
     assert found.reason == "the cameras share no point of any light sheet"
 
 
 def figures(residual: FloatArray, pixels: FloatArray, sigma: float = 0.02) -> PairRedundancy:
-    spare = SpareEquation(residual, np.full(len(residual), sigma), pixels)
-    return in_figures(spare, "left", "right", Size(600, 480))
+    spare = StripeResiduals(residual, np.full(len(residual), sigma), pixels)
+    return summarise_pair(spare, "left", "right", Size(600, 480))
 
 
 def test_the_map_tells_each_cell_of_the_reference_image_apart() -> None:
@@ -164,15 +168,15 @@ def test_the_map_tells_each_cell_of_the_reference_image_apart() -> None:
     pixels = rng.uniform([-0.5, -0.5], [599.5, 479.5], (20_000, 2))
     cell = np.stack([(pixels[:, 1] + 0.5) // 80, (pixels[:, 0] + 0.5) // 100], axis=1).astype(int)
     residual = 0.1 * cell[:, 0] + 0.01 * cell[:, 1] + rng.normal(0, 0.02, len(cell))
-    kept = ~((cell[:, 0] == 2) & (cell[:, 1] == 3)) | (np.cumsum((cell == (2, 3)).all(axis=1)) < FEWEST_PAIRS)
+    kept = ~((cell[:, 0] == 2) & (cell[:, 1] == 3)) | (np.cumsum((cell == (2, 3)).all(axis=1)) < MIN_PAIRS)
     made = figures(residual[kept], pixels[kept])
     assert made.outlying == 0
-    for row in range(CELLS):
-        for column in range(CELLS):
+    for row in range(MAP_CELLS):
+        for column in range(MAP_CELLS):
             mine = residual[kept & (cell == (row, column)).all(axis=1)]
             assert made.map_pairs[row, column] == len(mine)
             if (row, column) == (2, 3):
-                assert len(mine) == FEWEST_PAIRS - 1
+                assert len(mine) == MIN_PAIRS - 1
                 assert np.isnan(made.map_mean_px[row, column])
                 assert np.isnan(made.map_rms_px[row, column])
             else:
@@ -197,12 +201,12 @@ def test_points_of_two_different_things_are_counted_and_left_out() -> None:
 @by_kernel
 def test_without_a_spare_equation_the_reason_is_told() -> None:
     part = seen(CAMERA)
-    alone = redundancy([part], {"left": CAMERA}, Axis.COLUMN, widest_gap_px=GAP_PX)
+    alone = evaluate_redundancy([part], {"left": CAMERA}, Axis.COLUMN, widest_gap_px=GAP_PX)
     assert alone.pairs == ()
     assert "one camera" in (alone.reason or "")
     stereo = replace(part, source=np.full(len(part.source), Source.CAMERA_CAMERA, dtype=np.uint8))
     devices = {"left": CAMERA, "right": OTHER_CAMERA}
-    spent = redundancy([stereo], devices, Axis.COLUMN, widest_gap_px=GAP_PX)
+    spent = evaluate_redundancy([stereo], devices, Axis.COLUMN, widest_gap_px=GAP_PX)
     assert spent.pairs == ()
     assert "projector is not calibrated" in (spent.reason or "")
 
@@ -212,7 +216,7 @@ def test_three_cameras_make_three_pairs() -> None:
     third = turned(CAMERA, degrees=(0.0, 0.0, 3.0))
     devices = {"left": CAMERA, "right": OTHER_CAMERA, "third": third}
     parts = [seen(device) for device in devices.values()]
-    found = redundancy(parts, devices, Axis.COLUMN, widest_gap_px=GAP_PX)
+    found = evaluate_redundancy(parts, devices, Axis.COLUMN, widest_gap_px=GAP_PX)
     assert [(pair.reference, pair.camera) for pair in found.pairs] == [
         ("left", "right"), ("left", "third"), ("right", "third"),
     ]  # fmt: skip

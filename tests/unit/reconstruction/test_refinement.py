@@ -12,14 +12,14 @@ from scipy.spatial import cKDTree
 
 from slrig.model import Axis, FloatArray, IntArray, LineShift
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.phase import PositionMap, beside_steps_px, no_points
-from slrig.reconstruction.refinement import Refinement, _crossings, _nothing_taken, refined
-from slrig.reconstruction.stripes import LinePoints, chained
+from slrig.reconstruction.phase import PositionMap, allocate_points, step_sigma_px
+from slrig.reconstruction.refinement import Refinement, _allocate_marks, _find_crossings, refine_points
+from slrig.reconstruction.stripes import LinePoints, chain_stripes
 from tests.unit.reconstruction.builders import cells_of, grid, nearest_lines
 
 SHAPE = (60, 80)
 LINES = tuple(LineShift(Axis.COLUMN, shift, 8, 1) for shift in range(8))
-_, POSITION_OF = nearest_lines(LINES, 4, 400)
+_, POSITION_TABLE = nearest_lines(LINES, 4, 400)
 EVERYWHERE = np.ones(SHAPE, dtype=np.bool_)
 Surface = Callable[[FloatArray, FloatArray], FloatArray]
 
@@ -52,8 +52,8 @@ def line_crossings(
     seen: PositionMap, usable: NDArray[np.bool_], code: CodeMap, position_of: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Where lines cross pixels, by the position map alone: frame (n,) int32, starts_px (n, 2) and targets_px (n,)."""
-    begun = _nothing_taken(len(position_of), usable.shape)
-    return _crossings(seen, usable, code, position_of, 1, *begun, no_points(0), np.zeros(0))
+    begun = _allocate_marks(len(position_of), usable.shape)
+    return _find_crossings(seen, usable, code, position_of, 1, *begun, allocate_points(0), np.zeros(0))
 
 
 NONE = points_at(np.zeros((0, 2)))
@@ -72,7 +72,7 @@ def test_every_pixel_that_a_line_crosses_is_a_start(slope: float, angle_rad: flo
     rng = np.random.default_rng(4)
     usable = np.asarray(rng.random(SHAPE) >= 0.3)
     code = CodeMap(code.lowest, code.highest + (rng.random(SHAPE) < 0.1), code.refusal)
-    frame, starts, targets = line_crossings(here, usable, code, POSITION_OF)
+    frame, starts, targets = line_crossings(here, usable, code, POSITION_TABLE)
     p = here.position.astype(np.float64)
     inner = (slice(1, -1), slice(1, -1))
     left, right = (slice(1, -1), slice(None, -2)), (slice(1, -1), slice(2, None))
@@ -86,8 +86,8 @@ def test_every_pixel_that_a_line_crosses_is_a_start(slope: float, angle_rad: flo
     rows, columns = np.mgrid[1 : SHAPE[0] - 1, 1 : SHAPE[1] - 1]
     sure = possible = 0
     for k in range(8):
-        line = POSITION_OF[k][code.lowest[inner]]
-        one = usable[inner] & (line == POSITION_OF[k][code.highest[inner]])
+        line = POSITION_TABLE[k][code.lowest[inner]]
+        one = usable[inner] & (line == POSITION_TABLE[k][code.highest[inner]])
         with np.errstate(divide="ignore", invalid="ignore"):
             dx, dy = (line - p[inner]) * gx / (gx**2 + gy**2), (line - p[inner]) * gy / (gx**2 + gy**2)
         across = np.maximum(np.abs(dx), np.abs(dy))
@@ -130,7 +130,7 @@ def test_points_of_the_filter_move_onto_their_lines_and_say_how_far(slope: float
     here, code = mapped(surface, noise=0.002 * abs(slope))
     rng = np.random.default_rng(6)
     across = np.sign(slope) * np.array([math.cos(angle_rad), math.sin(angle_rad)])
-    frame, starts, targets = line_crossings(here, EVERYWHERE, code, POSITION_OF)
+    frame, starts, targets = line_crossings(here, EVERYWHERE, code, POSITION_TABLE)
     inside = ((starts > 4) & (starts < [SHAPE[1] - 5, SHAPE[0] - 5])).all(axis=1)
     exact = starts - ((surface(*starts.T) - targets) / abs(slope))[:, None] * across
     planted = [0.0, 0.1, 0.0, -0.05, 0.0, 0.0, 0.0, 0.0]
@@ -139,7 +139,7 @@ def test_points_of_the_filter_move_onto_their_lines_and_say_how_far(slope: float
         mine = exact[(frame == k) & inside]
         found.append(points_at(mine + (shift + rng.normal(0, 0.02, len(mine)))[:, None] * across))
     found[5] = NONE
-    refinement = refined([*found], here, EVERYWHERE, code, POSITION_OF, 1)
+    refinement = refine_points([*found], here, EVERYWHERE, code, POSITION_TABLE, 1)
     for k, misses in enumerate(on_lines(refinement, surface, slope)):
         assert len(misses) >= len(found[k].points_px)
         # Lines of other pixels that the code calls by the same cell are refused before; the rest is on its line.
@@ -158,19 +158,19 @@ def test_points_of_the_filter_move_onto_their_lines_and_say_how_far(slope: float
 def test_a_sample_tells_of_the_light_and_the_map_gives_all_points() -> None:
     surface = tilted(0.9, 0.3)
     here, code = mapped(surface, noise=0.002)
-    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)
+    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_TABLE)
     rows = (np.rint(starts[:, 1]) % 8 == 0) & (starts[:, 1] > 4) & (starts[:, 1] < SHAPE[0] - 5)
     across = np.array([math.cos(0.3), math.sin(0.3)])
     found = [points_at(starts[(frame == k) & rows] + 0.05 * (k == 2) * across) for k in range(8)]
     usable = EVERYWHERE.copy()
     usable[30:] = False
     held: list[str] = []
-    sampled = refined(
-        [*found], here, usable, code, POSITION_OF, 1, sampled=True, steady=lambda: held.append("given back")
+    sampled = refine_points(
+        [*found], here, usable, code, POSITION_TABLE, 1, sampled=True, release_lines=lambda: held.append("given back")
     )
     assert held == ["given back"]
     assert sampled.disagreement_px[2] == pytest.approx(-0.05, abs=0.02)
-    every = refined([NONE] * 8, here, usable, code, POSITION_OF, 1)
+    every = refine_points([NONE] * 8, here, usable, code, POSITION_TABLE, 1)
     for one, other, misses in zip(sampled.points, every.points, on_lines(sampled, surface, 0.9), strict=True):
         # Where a line passes between two pixels, one of them has the point; nowhere is none.
         assert np.max(cKDTree(one.points_px).query(other.points_px)[0]) < 1.0
@@ -184,14 +184,14 @@ def test_a_sample_tells_of_the_light_and_the_map_gives_all_points() -> None:
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_no_pixel_holds_two_points_of_one_line(slope: float, angle_rad: float, share: float) -> None:
     here, code = mapped(tilted(slope, angle_rad), noise=0.03)
-    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)
+    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_TABLE)
     rng = np.random.default_rng(7)
     # A filter gives a pixel no more than one point.
     pixels = np.rint(starts).astype(int) @ [1, 1000] + 1_000_000 * frame
     _, first = np.unique(pixels, return_index=True)
     first = first[rng.random(len(first)) < share]
     found = [points_at(starts[first][frame[first] == k]) for k in range(8)]
-    stripes = chained(refined([*found], here, EVERYWHERE, code, POSITION_OF, 1).points, SHAPE)
+    stripes = chain_stripes(refine_points([*found], here, EVERYWHERE, code, POSITION_TABLE, 1).points, SHAPE)
     frame = np.repeat(stripes.frame, np.diff(stripes.offsets))
     at = np.column_stack([np.rint(stripes.points_px).astype(int), frame])
     assert len(at) > 1400
@@ -207,7 +207,7 @@ def test_squeezed_stripes_that_no_filter_tells_apart_are_added(slope: float, ang
     surface = tilted(slope, angle_rad)
     here, code = mapped(surface, noise=0.02)
     x, y = grid(SHAPE)
-    refinement = refined([NONE] * 8, here, EVERYWHERE, code, POSITION_OF, 1)
+    refinement = refine_points([NONE] * 8, here, EVERYWHERE, code, POSITION_TABLE, 1)
     truth = surface(x, y)
     inner = np.zeros(SHAPE, dtype=np.bool_)
     inner[4:-4, 4:-4] = True
@@ -223,18 +223,18 @@ def test_squeezed_stripes_that_no_filter_tells_apart_are_added(slope: float, ang
     assert np.isnan(refinement.disagreement_px).all()
 
 
-@pytest.mark.parametrize("moved", [True, False])
-def test_points_are_held_once(*, moved: bool) -> None:
+@pytest.mark.parametrize("accepted", [True, False])
+def test_points_are_held_once(*, accepted: bool) -> None:
     here, code = mapped(tilted(0.9, 0.3))
-    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)
+    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_TABLE)
     given = [points_at(starts[frame == k]) for k in range(8)]
     found = given.copy()
-    limit_px = math.inf if moved else -1.0
-    refinement = refined(found, here, EVERYWHERE, code, POSITION_OF, 1, largest_disagreement_px=limit_px)
+    limit_px = math.inf if accepted else -1.0
+    refinement = refine_points(found, here, EVERYWHERE, code, POSITION_TABLE, 1, max_disagreement_px=limit_px)
     assert found == []
-    assert refinement.moved == moved
+    assert refinement.accepted == accepted
     assert len(refinement.points) == 8
-    assert all(one is other for one, other in zip(refinement.points, given, strict=True)) != moved
+    assert all(one is other for one, other in zip(refinement.points, given, strict=True)) != accepted
 
 
 def test_mixed_light_and_pixels_of_two_lines_give_no_points() -> None:
@@ -243,15 +243,15 @@ def test_mixed_light_and_pixels_of_two_lines_give_no_points() -> None:
     usable = ~np.asarray((x >= 30) & (x < 36))
     two = (y >= 20) & (y < 24)
     code = CodeMap(np.where(two, code.lowest - 2, code.lowest).astype(np.int32), code.highest, code.refusal)
-    frame, starts, _ = line_crossings(here, EVERYWHERE, cells_of(here.position.astype(np.float64), 4), POSITION_OF)
+    frame, starts, _ = line_crossings(here, EVERYWHERE, cells_of(here.position.astype(np.float64), 4), POSITION_TABLE)
     found = [points_at(starts[frame == k]) for k in range(8)]
-    refinement = refined([*found], here, usable, code, POSITION_OF, 1)
+    refinement = refine_points([*found], here, usable, code, POSITION_TABLE, 1)
     lost = 0
     for k, points in enumerate(refinement.points):
         columns, rows = np.rint(points.points_px).astype(int).T
         assert usable[rows, columns].all()
         began = np.rint(found[k].points_px).astype(int)
-        single = POSITION_OF[k][code.lowest] == POSITION_OF[k][code.highest]
+        single = POSITION_TABLE[k][code.lowest] == POSITION_TABLE[k][code.highest]
         lost += int((~single[began[:, 1], began[:, 0]]).sum())
         # A start one pixel off may still end there.
         assert (~single[rows, columns]).mean() < 0.03
@@ -263,8 +263,8 @@ def test_points_beside_a_step_stay_and_state_what_light_of_the_other_side_does()
     step = np.zeros(SHAPE, dtype=np.bool_)
     step[:, 40] = True
     usable = ~step
-    plain = refined([NONE] * 8, here, usable, code, POSITION_OF, 1)
-    stated = refined([NONE] * 8, here, usable, code, POSITION_OF, 1, displaced_px=beside_steps_px(step))
+    plain = refine_points([NONE] * 8, here, usable, code, POSITION_TABLE, 1)
+    stated = refine_points([NONE] * 8, here, usable, code, POSITION_TABLE, 1, extra_sigma_px=step_sigma_px(step))
     beside = 0
     for one, other in zip(plain.points, stated.points, strict=True):
         np.testing.assert_array_equal(one.points_px, other.points_px)
@@ -278,10 +278,10 @@ def test_points_beside_a_step_stay_and_state_what_light_of_the_other_side_does()
 
 def test_points_too_coarse_to_use_are_left_out() -> None:
     here, code = mapped(tilted(0.9, 0.3), noise=0.3)
-    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)
+    frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_TABLE)
     found = [points_at(starts[frame == k]) for k in range(8)]
-    every = refined([*found], here, EVERYWHERE, code, POSITION_OF, 1)
-    fewer = refined([*found], here, EVERYWHERE, code, POSITION_OF, 1, coarsest_px=0.15)
+    every = refine_points([*found], here, EVERYWHERE, code, POSITION_TABLE, 1)
+    fewer = refine_points([*found], here, EVERYWHERE, code, POSITION_TABLE, 1, coarsest_px=0.15)
     assert 0 < sum(len(each.points_px) for each in fewer.points) < sum(len(each.points_px) for each in every.points)
     assert max(each.sigma_px.max() for each in fewer.points) < 0.15
     assert max(each.sigma_px.max() for each in every.points) < 0.5

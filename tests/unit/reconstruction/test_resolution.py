@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from slrig.model import Axis, Gray, Size
 from slrig.patterns.codes import gray_profile
-from slrig.reconstruction.decoding import BLOCK_PX, CodeMap, _passed, _tally, lost_lines, unresolved_bits
+from slrig.reconstruction.decoding import (
+    BLOCK_PX,
+    CodeMap,
+    _cells_per_block,
+    _count_passages,
+    unresolved_bits,
+    unresolved_lines,
+)
 from slrig.reconstruction.frames import AxisFrames
 
 PROJECTOR = Size(1024, 32)
@@ -104,7 +111,7 @@ def test_the_tally_is_that_of_plain_python() -> None:
                 several = len(pixels) > 1
                 right = several and steps == [1 if before[0] < cell else -1]
                 expected[:, 0, block] += (1, len(pixels), several, right)
-        np.testing.assert_array_equal(_tally(word, lit, finest), expected)
+        np.testing.assert_array_equal(_count_passages(word, lit, finest), expected)
 
 
 def lines_of(column: NDArray[np.float64], period_px: float) -> tuple[CodeMap, NDArray[np.float64]]:
@@ -126,14 +133,14 @@ def test_lines_are_lost_where_less_than_half_of_their_points_are_found(down: boo
         points = points[:, ::-1]
         code = CodeMap(code.lowest.T.copy(), code.highest.T.copy(), code.refusal.T.copy())
     every = np.ones(code.refusal.shape, dtype=np.bool_)
-    assert lost_lines(points, code, every, 4.0) is None
-    assert lost_lines(points[kept], code, every, 4.0 / 3) is None
-    lost = lost_lines(points[kept], code, every, 4.0)
+    assert unresolved_lines(points, code, every, 4.0) is None
+    assert unresolved_lines(points[kept], code, every, 4.0 / 3) is None
+    lost = unresolved_lines(points[kept], code, every, 4.0)
     assert lost is not None
     lost = lost.T if down else lost
     assert not lost[:, : 128 - BLOCK_PX].any()
     assert lost[:, 128 + BLOCK_PX :].all()
-    assert lost_lines(points[kept], code, ~every, 4.0) is None
+    assert unresolved_lines(points[kept], code, ~every, 4.0) is None
 
 
 @pytest.mark.parametrize("down", [False, True])
@@ -151,5 +158,5 @@ def test_cells_passed_are_counted_in_each_block(*, down: bool) -> None:
             if min(above, left) >= 0 and known[above, left]:
                 step = abs(int(twice[y, x]) - int(twice[above, left])) / 2
                 expected[way, y // BLOCK_PX, x // BLOCK_PX] += step if step <= 2 else 0
-    passed = _passed(CodeMap(twice // 2, twice - twice // 2, refusal), usable)
+    passed = _cells_per_block(CodeMap(twice // 2, twice - twice // 2, refusal), usable)
     np.testing.assert_array_equal(passed, expected.max(axis=0))

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from slrig.model import FloatArray
-from slrig.reconstruction.camera_response import found_gamma, gain, in_light
+from slrig.reconstruction.camera_response import estimate_gamma, linearisation_gain
+from slrig.reconstruction.decoded_image import linearise_frames
 from slrig.reconstruction.decoding import DecodingLimits
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
 from tests.unit.reconstruction.builders import code_frames, grid
@@ -60,7 +61,7 @@ def seen_by(
     ids=["1.8", "2.6", "2.2, bright room", "2.6, bright room", "1.8, dark plate"],
 )
 def test_edges_of_the_code_tell_how_values_are_bent(gamma: float, seen: dict[str, Any]) -> None:
-    assert found_gamma(seen_by(gamma, **seen)) == pytest.approx(gamma, rel=0.05)
+    assert estimate_gamma(seen_by(gamma, **seen)) == pytest.approx(gamma, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -69,27 +70,28 @@ def test_edges_of_the_code_tell_how_values_are_bent(gamma: float, seen: dict[str
     ids=["as it is", "sharpened", "behind a scaler", "in a bright room"],
 )
 def test_values_in_proportion_to_light_stay_as_they_are(seen: dict[str, Any]) -> None:
-    assert found_gamma(seen_by(1.0, **seen)) == 1.0
+    assert estimate_gamma(seen_by(1.0, **seen)) == 1.0
 
 
 def test_a_projector_that_dims_all_white_pictures_bends_nothing() -> None:
     linear = seen_by(1.0)
-    assert found_gamma(replace(linear, white=0.7 * linear.white)) == 1.0
+    assert estimate_gamma(replace(linear, white=0.7 * linear.white)) == 1.0
 
 
 def test_frames_that_do_not_tell_are_left_alone() -> None:
     bent = seen_by(2.2)
-    assert found_gamma(replace(bent, inverses=None)) == 1.0
-    assert found_gamma(replace(bent, exposure_ratio=4.0)) == 1.0
+    assert estimate_gamma(replace(bent, inverses=None)) == 1.0
+    assert estimate_gamma(replace(bent, exposure_ratio=4.0)) == 1.0
     assert bent.inverses is not None
     dark = np.stack([bent.bits, bent.inverses]) / np.float32(20)
-    assert found_gamma(replace(bent, bits=dark[0], inverses=dark[1])) == 1.0
+    assert estimate_gamma(replace(bent, bits=dark[0], inverses=dark[1])) == 1.0
 
 
 def test_straight_frames_are_those_of_a_straight_camera() -> None:
     bent, linear = seen_by(2.2), seen_by(1.0)
-    frames, noise, gamma = in_light(FrameStacks.of(bent), DecodingLimits())
-    assert gamma == pytest.approx(2.2, rel=0.03)
+    frames, response = linearise_frames(FrameStacks.from_frames(bent), DecodingLimits())
+    noise = response.noise
+    assert response.gamma == pytest.approx(2.2, rel=0.03)
     # A level of the camera is up to two of light: 1/2.2 of the full scale is one in the middle.
     np.testing.assert_allclose(frames.white, linear.white, atol=8)
     np.testing.assert_allclose(frames.bits, linear.bits, atol=8)
@@ -104,4 +106,4 @@ def test_errors_grow_as_the_slope_of_light_over_values(gamma: float) -> None:
     seen = value + random.normal(0, 0.5, value.shape)
     light, wanted = (FULL * (each / FULL) ** gamma for each in (seen, value))
     grown = float(np.mean((light - wanted) ** 2)) / 0.25
-    assert gain([wanted.astype(np.float32)], gamma, FULL) == pytest.approx(grown, rel=0.02)
+    assert linearisation_gain([wanted.astype(np.float32)], gamma, FULL) == pytest.approx(grown, rel=0.02)

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import Axis
-from slrig.reconstruction.triangulation import SheetCurves, ordered_along_sheet, selected
+from slrig.reconstruction.triangulation import SheetCurves, order_along_sheet, select_points
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from tests.unit.reconstruction.builders import CAMERA, PROJECTOR
 
@@ -58,7 +58,7 @@ def keeping(count: int, *left_out: int) -> NDArray[np.bool_]:
 
 def test_points_are_left_out_with_all_that_belongs_to_them() -> None:
     curves = curves_of([(0, [1.0, 2.0, 3.0])], [(1, [1.0, 2.0])])
-    kept = selected(curves, keeping(5, 1, 3))
+    kept = select_points(curves, keeping(5, 1, 3))
     assert told(kept) == [0, 2, 101]
     assert kept.offsets.tolist() == [0, 2, 3]
     np.testing.assert_array_equal(kept.deviation_mm[:, 0], [1000, 1002, 1101])
@@ -92,7 +92,7 @@ def test_a_bridge_is_carried_to_the_last_point_before_it_that_stays_and_never_ou
     curves: list[Curve], left_out: list[int], bridges: list[int]
 ) -> None:
     made = curves_of(*curves)
-    kept = selected(made, keeping(len(made.points_mm), *left_out))
+    kept = select_points(made, keeping(len(made.points_mm), *left_out))
     assert np.flatnonzero(kept.bridge_after).tolist() == bridges
 
 
@@ -116,23 +116,23 @@ def test_stripes_of_a_curve_follow_one_another_by_row(
     curves: list[Curve], points: list[int], bridges: list[int]
 ) -> None:
     made = curves_of(*curves)
-    ordered = ordered_along_sheet(made)
+    ordered = order_along_sheet(made)
     assert told(ordered) == points
     assert ordered.offsets.tolist() == made.offsets.tolist()
     assert np.flatnonzero(ordered.bridge_after).tolist() == bridges
     np.testing.assert_array_equal(ordered.deviation_mm, ordered.points_mm + 1000)
     # What is in order is left as it is.
-    again = ordered_along_sheet(ordered)
+    again = order_along_sheet(ordered)
     assert told(again) == points
     np.testing.assert_array_equal(again.bridge_after, ordered.bridge_after)
 
 
 def test_keeping_everything_or_nothing() -> None:
     curves = curves_of([(0, [1.0, 2.0]), (1, [5.0, 6.0])], [(2, [1.0])])
-    same = selected(curves, keeping(5))
+    same = select_points(curves, keeping(5))
     assert told(same) == told(curves)
     np.testing.assert_array_equal(same.bridge_after, curves.bridge_after)
-    none = selected(curves, np.zeros(5, dtype=np.bool_))
+    none = select_points(curves, np.zeros(5, dtype=np.bool_))
     assert none.offsets.tolist() == [0, 0, 0]
     assert len(none.points_mm) == len(none.bridge_after) == 0
 

@@ -20,8 +20,8 @@ from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
     Stripes,
-    chained,
-    kernels,
+    chain_stripes,
+    gaussian_kernels,
     newton_step,
     stripe_points,
     taylor_step,
@@ -39,7 +39,7 @@ def found(
     limits: StripeLimits | None = None,
     lit: NDArray[np.bool_] | None = None,
 ) -> Stripes:
-    return chained([points_of(image, noise=noise, limits=limits, lit=lit)], image.shape)
+    return chain_stripes([points_of(image, noise=noise, limits=limits, lit=lit)], image.shape)
 
 
 def points_of(
@@ -83,7 +83,7 @@ def test_the_first_step_is_stegers_equation(kind: int, sigma: float, shape: tupl
     image = gaussian_filter(rng.normal(0, 1, shape), 0.8).astype(np.float32)
     noise = rng.uniform(0.01, 0.05, image.shape).astype(np.float32)
     lit = np.asarray(rng.random(image.shape) < 0.9)
-    sampled = kernels(sigma)
+    sampled = gaussian_kernels(sigma)
     offset, strength = taylor_step(image, noise, lit, np.float32(2.0), *sampled, kind)
     zero, one, two = (kernel.astype(np.float64) for kernel in sampled)
     orders = ((zero, zero), (one, zero), (zero, one), (two, zero), (one, one), (zero, two))
@@ -166,11 +166,13 @@ def test_the_second_step_is_a_correlation_with_kernels_centred_on_the_point(kind
 def test_unlit_margins_change_nothing_between_them(kind: int, shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(6)
     image, noise = rng.normal(0, 1, shape).astype(np.float32), np.full(shape, 0.1, dtype=np.float32)
-    everywhere = taylor_step(image, noise, np.ones(shape, dtype=np.bool_), np.float32(0.5), *kernels(1.2), kind)
+    everywhere = taylor_step(
+        image, noise, np.ones(shape, dtype=np.bool_), np.float32(0.5), *gaussian_kernels(1.2), kind
+    )
     for begin, end in ((0, 3), (2, 4), (shape[1] - 1, shape[1]), (shape[1] // 2, shape[1] - 1)):
         lit = np.zeros(shape, dtype=np.bool_)
         lit[3:-1, begin:end] = rng.uniform(0, 1, (16, end - begin)) > 0.3
-        offset, response = taylor_step(image, noise, lit, np.float32(0.5), *kernels(1.2), kind)
+        offset, response = taylor_step(image, noise, lit, np.float32(0.5), *gaussian_kernels(1.2), kind)
         np.testing.assert_array_equal(response, np.where(lit, everywhere[1], 0))
         np.testing.assert_array_equal(offset, np.where(lit[..., None], everywhere[0], 0))
 
@@ -253,7 +255,7 @@ def test_stripes_of_several_frames_stand_in_the_frames_order() -> None:
     x, _ = grid(SHAPE)
     one, two = gaussian_stripe(x - 30.2, 1.2), gaussian_stripe(x - 20.4, 1.2) + gaussian_stripe(x - 55.3, 1.2)
     parts = [points_of(image) for image in (one, np.zeros_like(one), two)]
-    stripes = chained(parts, SHAPE)
+    stripes = chain_stripes(parts, SHAPE)
     assert stripes.frame.tolist() == [0, 2, 2]
     assert stripes.offsets.dtype == stripes.frame.dtype == np.int32
     np.testing.assert_array_equal(np.diff(stripes.offsets), 70)

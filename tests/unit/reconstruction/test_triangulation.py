@@ -9,7 +9,7 @@ import pytest
 
 from slrig.model import Axis, FloatArray, Pinhole, Refusal, Size, Source
 from slrig.reconstruction.identification import StripeEnsemble
-from slrig.reconstruction.triangulation import camera_projector
+from slrig.reconstruction.triangulation import triangulate_camera_projector
 from tests.unit.reconstruction.builders import (
     BALL,
     CAMERA,
@@ -38,7 +38,7 @@ def one_point_each(points_mm: FloatArray, *, axis: Axis = Axis.COLUMN) -> tuple[
 @pytest.mark.parametrize("axis", list(Axis))
 def test_points_seen_through_two_distorted_lenses_come_back(axis: Axis) -> None:
     ensemble, truth = one_point_each(scattered_points(), axis=axis)
-    curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, axis)
+    curves, _ = triangulate_camera_projector(ensemble, CAMERA, PROJECTOR, axis)
     assert len(curves.points_mm) == len(truth)
     np.testing.assert_allclose(curves.points_mm, truth, rtol=0, atol=1e-6)
     along = opencv_pixels(PROJECTOR, truth)[:, 1 if axis is Axis.COLUMN else 0]
@@ -53,16 +53,16 @@ def test_a_strongly_distorted_projector_is_met_exactly() -> None:
     lit = opencv_pixels(strong, points)
     order = np.argsort(lit[:, 0])
     ensemble = ensemble_of(list(opencv_pixels(CAMERA, points)[order][:, None, :]), lit[order, 0].tolist())
-    curves, _ = camera_projector(ensemble, CAMERA, strong, Axis.COLUMN)
+    curves, _ = triangulate_camera_projector(ensemble, CAMERA, strong, Axis.COLUMN)
     np.testing.assert_allclose(curves.points_mm, points[order], rtol=0, atol=1e-6)
-    plain, _ = camera_projector(ensemble, CAMERA, replace(strong, distortion=np.zeros(5)), Axis.COLUMN)
+    plain, _ = triangulate_camera_projector(ensemble, CAMERA, replace(strong, distortion=np.zeros(5)), Axis.COLUMN)
     assert np.abs(plain.points_mm - points[order][: len(plain.points_mm)]).max() > 1.0
 
 
 def test_curves_on_a_ball_lie_on_the_ball_in_order_of_rows() -> None:
     rows = np.arange(60.0, 180.0, 1.7)
     columns = [100.0, 131.5, 160.0, 190.25]
-    curves, _ = camera_projector(seen_on_ball(CAMERA, columns, rows), CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, _ = triangulate_camera_projector(seen_on_ball(CAMERA, columns, rows), CAMERA, PROJECTOR, Axis.COLUMN)
     assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 1e-6
     assert curves.position_px.tolist() == columns
     assert np.diff(curves.offsets).tolist() == [len(rows)] * 4
@@ -79,11 +79,15 @@ def test_the_deviation_is_how_far_the_point_moves_with_its_stripe() -> None:
         normals=np.stack([np.cos(angle), np.sin(angle)], axis=1),
         sigma_px=rng.uniform(0.01, 0.05, len(ensemble.points_px)),
     )
-    curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, _ = triangulate_camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     moved = []
     for sign in (1, -1):
         aside = ensemble.points_px + sign * ensemble.sigma_px[:, None] * ensemble.normals
-        moved.append(camera_projector(ensemble._replace(points_px=aside), CAMERA, PROJECTOR, Axis.COLUMN)[0].points_mm)
+        moved.append(
+            triangulate_camera_projector(ensemble._replace(points_px=aside), CAMERA, PROJECTOR, Axis.COLUMN)[
+                0
+            ].points_mm
+        )
     np.testing.assert_allclose(curves.deviation_mm, (moved[0] - moved[1]) / 2, rtol=1e-3, atol=1e-7)
     # Depth resolution of the rig: Z²/(f b) per pixel.
     assert 0.5 < np.linalg.norm(curves.deviation_mm, axis=1).mean() / (0.03 * 520**2 / (1400 * 150)) < 2.0
@@ -101,7 +105,7 @@ def test_nothing_is_met_where_the_projectors_lens_has_turned_back() -> None:
         assert ((at > 0) & (at < [319, 239])).all()
         order = np.argsort(at[:, 0])
         ensemble = ensemble_of(list(opencv_pixels(camera, points)[order][:, None, :]), at[order, 0].tolist())
-        curves, cause = camera_projector(ensemble, camera, barrel, Axis.COLUMN)
+        curves, cause = triangulate_camera_projector(ensemble, camera, barrel, Axis.COLUMN)
         assert set(cause.tolist()) == {Refusal.NONE if lit else Refusal.NO_INTERSECTION}
         np.testing.assert_allclose(curves.points_mm, points[order][: 9 * lit], rtol=0, atol=1e-6)
 
@@ -112,7 +116,7 @@ def test_a_ray_that_runs_along_its_light_sheet_meets_it_nowhere() -> None:
                        np.array([0.0, 0.0, 400.0]))  # fmt: skip
     ahead = replace(straight, translation_mm=np.array([0.0, 0.0, 300.0]))
     ensemble = ensemble_of([np.array([[320.0, 200.0], [320.0, 300.0], [350.0, 240.0]])], [320.0])
-    curves, cause = camera_projector(ensemble, straight, ahead, Axis.COLUMN)
+    curves, cause = triangulate_camera_projector(ensemble, straight, ahead, Axis.COLUMN)
     # The third ray leaves the sheet at the camera's own centre.
     assert cause.tolist() == [Refusal.NO_INTERSECTION, Refusal.NO_INTERSECTION, Refusal.BEHIND_DEVICE]
     assert len(curves.points_mm) == 0
@@ -122,7 +126,7 @@ def test_points_lit_by_no_row_of_the_projector_are_left_out() -> None:
     # A projector half as high would not have lit rows below its last.
     rows = np.arange(60.0, 180.0, 5.0)
     cut = replace(PROJECTOR, size=replace(PROJECTOR.size, height_px=121))
-    curves, cause = camera_projector(seen_on_ball(CAMERA, [140.0, 160.0], rows), CAMERA, cut, Axis.COLUMN)
+    curves, cause = triangulate_camera_projector(seen_on_ball(CAMERA, [140.0, 160.0], rows), CAMERA, cut, Axis.COLUMN)
     kept = rows[rows < 120 + 2]
     np.testing.assert_allclose(curves.along_px, np.tile(kept, 2), atol=1e-6)
     expected = np.where(rows < 120 + 2, Refusal.NONE, Refusal.OFF_PROJECTOR)
@@ -132,7 +136,7 @@ def test_points_lit_by_no_row_of_the_projector_are_left_out() -> None:
 def test_unmeasured_pixels_give_no_points() -> None:
     ensemble = seen_on_ball(CAMERA, [140.0], np.arange(60.0, 180.0, 5.0))
     ensemble.points_px[3] = np.nan
-    curves, cause = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, cause = triangulate_camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     assert cause.tolist() == [Refusal.NO_INTERSECTION if index == 3 else Refusal.NONE for index in range(24)]
     assert len(curves.points_mm) == 23
     assert np.isfinite(curves.points_mm).all()
@@ -141,7 +145,7 @@ def test_unmeasured_pixels_give_no_points() -> None:
 def test_bridges_are_kept_and_stripes_follow_by_row() -> None:
     rows = np.concatenate([np.arange(60.0, 80.0), np.arange(120.0, 150.0), np.arange(95.0, 110.0)])
     ensemble = seen_on_ball(CAMERA, [140.0], rows)
-    curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, _ = triangulate_camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     np.testing.assert_allclose(curves.along_px, np.sort(rows), atol=1e-6)
     assert curves.stripe.tolist() == [0] * 20 + [2] * 15 + [1] * 30
     assert np.flatnonzero(curves.bridge_after).tolist() == [19, 34]

@@ -196,7 +196,7 @@ def without(*kinds: str, bit: int | None = None) -> Callable[[Shot, Capture], Sh
         (flat(0), NothingToReconstructError, "no pixel could be decoded.*lens cap"),
         (flat(255), NothingToReconstructError, "no pixel could be decoded.*lens cap"),
         (without(bit=2), PatternError, r"bits \[2\]"),
-        (without("white", "inverse"), PatternError, "nothing tells lit from dark"),
+        (without("white", "inverse"), PatternError, "bits have no threshold"),
     ],
     ids=["dark", "bright", "a missing bit", "no white and no inverses"],
 )

@@ -9,9 +9,9 @@ import pytest
 
 from slrig.meshing.surface import compact_mesh
 from slrig.model import AlbedoMark, Axis, FloatArray, Mesh, Pinhole, Refusal, Size
-from slrig.reconstruction.camera import CameraCurves
+from slrig.reconstruction.camera_response import NoiseModel
 from slrig.reconstruction.identification import StripeEnsemble
-from slrig.reconstruction.noise import NoiseModel
+from slrig.reconstruction.pipeline import CameraCurves
 from slrig.scan.colouring import Coloured, albedo_report, coloured
 from slrig.scan.stream import CameraResult
 from slrig.scan.triangulated import Triangulated, triangulated, widest_gap_px

@@ -25,7 +25,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.model import Axis, Black, Gray, LineShift, Pattern, PatternSequence, Primary, Size, White
-from slrig.patterns.sequence import encode, scan_patterns, united
+from slrig.patterns.sequence import encode, merge_sequences, scan_patterns
 from tests.contract.dlpc347x_bench import MIRRORS
 from tests.contract.dlpc350_device import WHITE
 from tests.unit.drivers.pattern_engine.engine_bench import Bench347x
@@ -226,7 +226,7 @@ def scanned(size: Size, *, period_px: int = 16) -> PatternSequence:
     patterns = scan_patterns(
         size, line_shift=True, period_px=period_px, line_width_px=2, gray_cell_px=8, gray_offset_px=0, rows=True
     )
-    return united([encode(patterns, size)])
+    return merge_sequences([encode(patterns, size)])
 
 
 def as_compiled(pattern: Pattern) -> tuple[bool, bool, int]:

@@ -26,9 +26,9 @@ from slrig.model import (
 )
 from slrig.patterns.codes import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.patterns.sequence import scan_patterns
-from slrig.reconstruction.camera import CameraCurves, CameraStream, camera_curves
-from slrig.reconstruction.coded import CodeTables, Limits
-from slrig.reconstruction.frames import FrameStacks, axis_frames, axis_patterns, ends_repeats, telling_shots
+from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
+from slrig.reconstruction.frames import FrameStacks, axis_frames, axis_patterns, reference_repeats, used_shots
+from slrig.reconstruction.pipeline import CameraCurves, CameraStream, camera_curves
 from tests.unit.reconstruction.builders import grid, rms, seen_by_camera
 
 CAMERA = Size(210, 100)
@@ -63,7 +63,7 @@ def patterns(
 
 
 def walk(
-    capture: Capture, *, limits: Limits | None = None, edges: bool = False, axis: Axis = Axis.COLUMN
+    capture: Capture, *, limits: ReconstructionLimits | None = None, edges: bool = False, axis: Axis = Axis.COLUMN
 ) -> tuple[CameraCurves, list[str]]:
     frames, projector = axis_frames(capture, "eye", axis), capture.projector
     lines = frames.line_patterns
@@ -74,7 +74,7 @@ def walk(
         edge_positions(frames.gray, projector) if edges else None,
     )
     stages: list[str] = []
-    return camera_curves(frames, tables, limits or Limits(), entered=stages.append), stages
+    return camera_curves(frames, tables, limits or ReconstructionLimits(), report_step=stages.append), stages
 
 
 def errors_px(curves: CameraCurves, scene: Scene) -> FloatArray:
@@ -113,27 +113,27 @@ def test_code_edges_stand_for_lines_where_those_are_not_resolved() -> None:
         shots.append(replace(shot, image=image))
     blurred = replace(capture, shots=tuple(shots))
     alone, _ = walk(blurred)
-    assert alone.lost_lines is None
+    assert alone.unresolved_lines is None
     assert (alone.ensemble.points_px[:, 0] > 130).sum() < 200
     curves, stages = walk(blurred, edges=True)
     code = next(pattern for pattern in capture.patterns if isinstance(pattern, Gray))
-    assert curves.lost_lines is not None
-    assert not curves.lost_lines[:, :64].any()
-    assert curves.lost_lines[:, 160:].all()
+    assert curves.unresolved_lines is not None
+    assert not curves.unresolved_lines[:, :64].any()
+    assert curves.unresolved_lines[:, 160:].all()
     column = np.repeat(curves.ensemble.position_px, np.diff(curves.ensemble.offsets))
     x, y = np.rint(curves.ensemble.points_px).astype(int).T
-    lost = curves.lost_lines[y, x]
+    lost = curves.unresolved_lines[y, x]
     # Edges lie between columns, four of them apart, and lines at them. A point may lie in the next pixel.
     assert set(np.unique(column[lost])) <= set(edge_positions(code, PROJECTOR).ravel())
     assert (column[~lost] % 1 == 0).mean() > 0.99
-    assert lost.sum() > 0.8 * curves.lost_lines.sum() * 0.52 / 4
+    assert lost.sum() > 0.8 * curves.unresolved_lines.sum() * 0.52 / 4
     errors = errors_px(curves, slope)
     assert rms(errors[lost]) < 0.05
     assert rms(errors[~lost]) < 0.03
     assert stages[-3:] == ["locate stripes", "identify stripes", "link stripes"]
     sharp, _ = walk(capture, edges=True)
     plain, _ = walk(capture)
-    assert sharp.lost_lines is None
+    assert sharp.unresolved_lines is None
     assert sharp.ensemble.points_px.tobytes() == plain.ensemble.points_px.tobytes()
 
 
@@ -223,17 +223,19 @@ def test_a_dark_room_gives_no_curves() -> None:
 
 def streamed(capture: Capture, order: Sequence[int], entered: Callable[[str], None] = lambda _: None) -> CameraCurves:
     """The curves by the frames that tell, as they come in this order."""
-    shots = telling_shots(capture, "eye")
+    shots = used_shots(capture, "eye")
     shown = [capture.patterns[shot.pattern] for shot in shots]
     patterns = axis_patterns(shown, "eye", Axis.COLUMN)
-    stacks = FrameStacks(patterns, CAMERA.shape, full_scale=255.0, ends_repeats=ends_repeats(shown, Axis.COLUMN))
+    stacks = FrameStacks(
+        patterns, CAMERA.shape, full_scale=255.0, reference_repeats=reference_repeats(shown, Axis.COLUMN)
+    )
     lines = patterns.lines
     tables = CodeTables(
         index_of_word(patterns.gray),
         cell_positions(patterns.gray, PROJECTOR),
         line_positions(lines, patterns.gray, PROJECTOR) if lines else edge_positions(patterns.gray, PROJECTOR),
     )
-    stream = CameraStream(stacks, tables, Limits(), entered=entered)
+    stream = CameraStream(stacks, tables, ReconstructionLimits(), report_step=entered)
     for index in order:
         entered(f"frame {index}")
         stream.take(shown[index], shots[index].image)
@@ -252,7 +254,7 @@ def require_equal(one: CameraCurves, other: CameraCurves) -> None:
 def test_frames_that_come_one_by_one_in_any_order_give_the_same_bits(line_shift: bool) -> None:
     capture = rendered(cliff, patterns(line_shift=line_shift, cell_px=None if line_shift else 2))
     wanted = walk(capture)[0]
-    count = len(telling_shots(capture, "eye"))
+    count = len(used_shots(capture, "eye"))
     for order in (range(count - 1, -1, -1), np.random.default_rng(4).permutation(count).tolist()):
         got = streamed(capture, order)
         require_equal(got, wanted)
@@ -276,7 +278,7 @@ def test_stripes_are_located_before_the_bits_come_that_only_number_them(
     capture = replace(capture, shots=tuple(replace(shot, image=seen(shot.image)) for shot in capture.shots))
     bits = [pattern.bit for pattern in capture.patterns if isinstance(pattern, Gray)]
     assert bits == [0, 0, 1, 1, 2, 2, 5, 5, 6, 6, 3, 3, 4, 4]
-    count = len(telling_shots(capture, "eye"))
+    count = len(used_shots(capture, "eye"))
     told: list[str] = []
     got, wanted = streamed(capture, range(count), told.append), walk(capture)[0]
     stages = ["measure noise", *["locate stripes"] * 8, "decode", "refine stripes", "identify stripes", "link stripes"]
@@ -288,17 +290,17 @@ def test_stripes_are_located_before_the_bits_come_that_only_number_them(
         for each in (other, wanted):
             assert each.ensemble.points_px.tobytes() == got.ensemble.points_px.tobytes()
             assert each.ensemble.sigma_px.tobytes() == got.ensemble.sigma_px.tobytes()
-            assert (each.gamma, each.compression_dn, each.shared_noise) == (
-                got.gamma, got.compression_dn, got.shared_noise
+            assert (each.gamma, each.compression_dn, each.noise_correlation) == (
+                got.gamma, got.compression_dn, got.noise_correlation
             )  # fmt: skip
     assert (got.gamma > 2) == (seen is bent)
     assert (got.compression_dn > 1) == (seen is compressed)
-    assert (got.shared_noise > 2) == (seen is compressed)
+    assert (got.noise_correlation > 2) == (seen is compressed)
 
 
 def test_a_stream_that_lacks_a_frame_says_which() -> None:
     capture = rendered(slope, patterns())
-    count = len(telling_shots(capture, "eye"))
+    count = len(used_shots(capture, "eye"))
     with pytest.raises(PatternError, match=r"1 of the frames announced did not come: LineShift\(.*shift=7"):
         streamed(capture, range(count - 1))
 
@@ -343,7 +345,7 @@ def test_refined_points_are_no_worse_than_those_of_their_own_frame(slope: float)
     capture = seen_tilted(slope, 0.2, blur_px=0.9 * slope, noise=1.5)
     found = []
     # This camera has no blur that would mix the albedo of neighbouring pixels.
-    for limits in (Limits(camera_blur_px=0.0), Limits(largest_disagreement_px=-1.0)):
+    for limits in (ReconstructionLimits(camera_blur_px=0.0), ReconstructionLimits(max_disagreement_px=-1.0)):
         curves, _ = walk(capture, limits=limits)
         # Where the filter's window is whole; beside the image's border only a fit gives points.
         at = curves.ensemble.points_px
@@ -395,11 +397,11 @@ def test_light_that_changes_in_one_frame_leaves_each_stripe_as_its_own_frame_sho
     curves, _ = walk(capture)
     assert not curves.refined
     assert np.nanmax(np.abs(curves.disagreement_px)) > 0.03
-    unrefined, _ = walk(capture, limits=Limits(largest_disagreement_px=-1.0))
+    unrefined, _ = walk(capture, limits=ReconstructionLimits(max_disagreement_px=-1.0))
     require_equal(curves, unrefined)
     # What stays of the change is what it does to its own frame's stripes.
     assert rms(misses_px(curves, 0.7, 0.3)) < 0.03
-    trusting, _ = walk(capture, limits=Limits(largest_disagreement_px=math.inf))
+    trusting, _ = walk(capture, limits=ReconstructionLimits(max_disagreement_px=math.inf))
     assert trusting.refined
     assert rms(misses_px(trusting, 0.7, 0.3)) > 0.03
 
