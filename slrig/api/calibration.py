@@ -158,7 +158,7 @@ def fetch_board(
     are those of POST /calibration.
     """
     # Late: what draws a PDF takes a while to load.
-    from slrig.calibration.boards.printing import board_pdf
+    from slrig.calibration.printing import board_pdf
 
     board = Board(kind, columns, rows, square_mm, marker_mm, dictionary)
     name = f"board-{kind}-{columns}x{rows}-{square_mm:g}mm.pdf"

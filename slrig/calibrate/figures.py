@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.calibrate.solving import CalibrationResult
 from slrig.calibration.board import Board
-from slrig.calibration.poses.coverage import attitude
+from slrig.calibration.poses.guidance import attitude
 from slrig.calibration.solution import PARAMETERS, PROJECTOR, BoardPose, DeviceResiduals
 from slrig.model import Calibration, FloatArray, Pinhole, Size
 from slrig.model.lens import LENS_TERMS

@@ -17,8 +17,8 @@ from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import Judgement, Setting, Standing
 from slrig.calibration.judging.verdict import board_words
 from slrig.calibration.poses.checks import judge_pose
-from slrig.calibration.poses.coverage import Advice, Coverage, coverage, next_move
-from slrig.calibration.poses.rough import rig_guess
+from slrig.calibration.poses.guidance import Advice, Coverage, coverage, next_move
+from slrig.calibration.poses.initial import rig_guess
 
 _ANSWER = (
     "warnings",

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slrig.calibrate.pose_frames import Image, Mask, window_about
-from slrig.calibration.board import Board
-from slrig.calibration.boards.detection import find_board, placed_again
-from slrig.calibration.observations import BoardView
+from slrig.calibration.board import Board, BoardView
+from slrig.calibration.detection.detection import find_board, placed_again
 from slrig.errors import PoseRefusedError
 from slrig.model import FloatArray
 

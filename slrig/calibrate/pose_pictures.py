@@ -14,11 +14,10 @@ from slrig.bundle.description import read_description
 from slrig.bundle.images import read_pages
 from slrig.calibrate.solving import ReadPose
 from slrig.calibrate.tools import Setting
-from slrig.calibration.board import Board
-from slrig.calibration.observations import PoseObservation
+from slrig.calibration.board import Board, PoseObservation
 from slrig.calibration.poses.checks import coverage_picture, pose_picture
-from slrig.calibration.poses.coverage import coverage
-from slrig.calibration.poses.rough import lit_board
+from slrig.calibration.poses.guidance import coverage
+from slrig.calibration.poses.initial import lit_board
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Pixels, Size, White

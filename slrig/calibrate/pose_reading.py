@@ -15,9 +15,14 @@ from slrig.bundle import read_capture
 from slrig.calibrate.pose_frames import PoseFrames, coded_axes, cut_capture, pose_frames, window_about
 from slrig.calibrate.pose_movement import differ, moved_px
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.board import Board
-from slrig.calibration.boards.detection import blur_sigma_px, board_region, find_board, light_squares, square_interior
-from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
+from slrig.calibration.board import COLUMN, ROW, Board, BoardView, Correspondences, PoseObservation, ViewFigures
+from slrig.calibration.detection.detection import (
+    blur_sigma_px,
+    board_region,
+    find_board,
+    light_squares,
+    square_interior,
+)
 from slrig.errors import PatternError, PoseRefusedError
 from slrig.model import Axis, Capture, Size
 from slrig.patterns import LEAST_FROM_BORDER_PX, cell_positions, edge_positions, index_of_word, line_positions

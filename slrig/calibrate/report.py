@@ -15,7 +15,7 @@ from slrig.calibrate.words import rounded
 from slrig.calibration.board import Board
 from slrig.calibration.judging.verdict import board_words
 from slrig.calibration.poses.checks import pose_picture
-from slrig.calibration.poses.rough import lit_board
+from slrig.calibration.poses.initial import lit_board
 from slrig.calibration.solution import PROJECTOR, device_title
 from slrig.model import Pixels
 from slrig.reports.drawing import legend

@@ -80,7 +80,7 @@ def board_option(
     board = Board(BoardKind(kind), *counted, square_mm, marker_mm, dictionary)
     if board.kind is BoardKind.CHARUCO:
         # OpenCV knows whether there is such a dictionary, with markers enough. Late, for it takes a while to load.
-        from slrig.calibration.boards.printing import charuco_board
+        from slrig.calibration.printing import charuco_board
 
         charuco_board(board)
     return board
@@ -102,7 +102,7 @@ def write_board(board: Board, output: Path, *, page: str) -> None:
     StorageError
         The file cannot be written.
     """
-    from slrig.calibration.boards.printing import board_pdf, board_svg, solve_command
+    from slrig.calibration.printing import board_pdf, board_svg, solve_command
 
     kind = output.suffix.lower()
     if kind not in (".pdf", ".svg"):

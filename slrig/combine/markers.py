@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle.description import DESCRIPTION
 from slrig.bundle.reading import open_bundle
-from slrig.calibration.boards.corner_fit import (
+from slrig.calibration.detection.corners import (
     FLOOR_PX,
     WORST_SIGMA_PX,
     FittedPlaces,
@@ -18,8 +18,8 @@ from slrig.calibration.boards.corner_fit import (
     fitted_corners,
     patch_offsets,
 )
-from slrig.calibration.boards.printing import marker_dictionary
-from slrig.calibration.boards.sightings import markers_in
+from slrig.calibration.detection.diagnosis import markers_in
+from slrig.calibration.printing import marker_dictionary
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, White
 from slrig.reconstruction import project, rays

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.lattice import equivalent_views
-from slrig.calibration.boards.printing import FIT, PAGES_MM, artwork, board_svg
-from slrig.calibration.observations import BoardView
+from slrig.calibration.board import Board, BoardKind, BoardView
+from slrig.calibration.detection.lattice import equivalent_views
+from slrig.calibration.printing import FIT, PAGES_MM, artwork, board_svg
 from slrig.errors import CalibrationError
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slrig.calibration.board import PRINT_SIGMA, Board
 from slrig.calibration.judging.comparison import OddEven
-from slrig.calibration.poses.coverage import Coverage, place_words
+from slrig.calibration.poses.guidance import Coverage, place_words
 from slrig.calibration.solution import (
     CELLS,
     PARAMETERS,

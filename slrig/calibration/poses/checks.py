@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.calibration.board import Board
-from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
-from slrig.calibration.poses.coverage import (
+from slrig.calibration.board import Board, BoardView, PoseObservation, ViewFigures
+from slrig.calibration.poses.guidance import (
     FOCAL_KNOWN,
     Advice,
     Attitude,
@@ -21,7 +20,7 @@ from slrig.calibration.poses.coverage import (
     coverage,
     next_move,
 )
-from slrig.calibration.poses.rough import RigGuess, rig_guess, within
+from slrig.calibration.poses.initial import RigGuess, rig_guess, within
 from slrig.calibration.solution import CELLS, PROJECTOR, device_title
 from slrig.errors import CalibrationError
 from slrig.model import FloatArray, Pixels, Size

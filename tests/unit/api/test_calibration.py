@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from slrig.bundle.calibration import write_calibration
 from slrig.calibration.board import USUAL_BOARD, Board, BoardKind
-from slrig.calibration.boards.printing import board_pdf
+from slrig.calibration.printing import board_pdf
 from slrig.errors import SolveRefusedError
 from slrig.model import Size
 from slrig.scan.plan_check import pattern_sequence

@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 
 from slrig.calibrate.solving import CalibrationResult, ReadPose
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import Board, BoardKind, BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.calibration.displacement import RigidMotion
 from slrig.calibration.judging.comparison import OddEven
 from slrig.calibration.judging.verdict import verdict
-from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
-from slrig.calibration.poses.coverage import coverage
+from slrig.calibration.poses.guidance import coverage
 from slrig.calibration.solution import (
     CELLS,
     PARAMETERS,

@@ -14,9 +14,8 @@ from slrig.calibrate.pose_frames import bundle_device_sizes
 from slrig.calibrate.pose_movement import moved_px
 from slrig.calibrate.pose_reading import read_captured, read_pose
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.detection import board_region, find_board
-from slrig.calibration.observations import COLUMN, ROW, Correspondences
+from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, Correspondences
+from slrig.calibration.detection.detection import board_region, find_board
 from slrig.calibration.poses.checks import LIMITS
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import PatternError, PoseRefusedError

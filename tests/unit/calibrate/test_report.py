@@ -21,11 +21,10 @@ from slrig.calibrate.pose_judging import judgement, summary
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
 from slrig.calibrate.tools import Setting
-from slrig.calibration.board import BoardShape
+from slrig.calibration.board import BoardShape, ViewFigures
 from slrig.calibration.health.verification import verify_by_board
 from slrig.calibration.judging.comparison import comparison
 from slrig.calibration.judging.verdict import Grade
-from slrig.calibration.observations import ViewFigures
 from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import tell_result
 from slrig.errors import CalibrationError

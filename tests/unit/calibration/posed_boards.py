@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import PoseObservation, ViewFigures
+from slrig.calibration.board import Board, BoardKind, PoseObservation, ViewFigures
 from slrig.calibration.solution import PROJECTOR, BoardPose
 from slrig.model import Calibration, FloatArray, Pinhole, Size
 from tests.unit.calibration.synthetic import CHESSBOARD as CHESSBOARD

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import Board, BoardKind, PoseObservation, ViewFigures
 from slrig.calibration.health.verification import Health, HealthState, Verification, judged
-from slrig.calibration.observations import PoseObservation, ViewFigures
 from slrig.devices import Rig
 from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.data_folder import DataFolder

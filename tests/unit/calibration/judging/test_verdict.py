@@ -19,7 +19,7 @@ from slrig.calibration.judging.verdict import (
     unattended_faults,
     verdict,
 )
-from slrig.calibration.poses.coverage import Coverage, coverage
+from slrig.calibration.poses.guidance import Coverage, coverage
 from slrig.calibration.solution import (
     PARAMETERS,
     PROJECTOR,

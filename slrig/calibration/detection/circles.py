@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slrig.calibration.board import Board
-from slrig.calibration.boards.corner_fit import (
+from slrig.calibration.board import Board, BoardView
+from slrig.calibration.detection.corners import (
     FLOOR_PX,
     WORST_SIGMA_PX,
     BoardMap,
@@ -25,7 +25,8 @@ from slrig.calibration.boards.corner_fit import (
     fitted_map,
     patch_offsets,
 )
-from slrig.calibration.boards.lattice import (
+from slrig.calibration.detection.diagnosis import UNMIRRORED, half_words, other_words, unclear_words
+from slrig.calibration.detection.lattice import (
     Blobs,
     Lattice,
     dark_blobs,
@@ -35,8 +36,6 @@ from slrig.calibration.boards.lattice import (
     pointing_right,
     right_handed,
 )
-from slrig.calibration.boards.sightings import UNMIRRORED, half_words, other_words, unclear_words
-from slrig.calibration.observations import BoardView
 from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray
 
@@ -49,7 +48,7 @@ _MOST_SPOTS = 2
 
 
 def circles_view(grey: Grey, board: Board) -> BoardView:
-    """See `slrig.calibration.boards.detection.find_board`."""
+    """See `slrig.calibration.detection.detection.find_board`."""
     blobs = dark_blobs(grey.eight, most=board.corner_count)
     lattice = lattice_of(blobs.points_px)
     if lattice is not None and not of_circles(grey.level, lattice):
@@ -86,7 +85,7 @@ def placed_circles(level: FloatArray, board: Board, rough_px: FloatArray, blobs:
 
 
 def circles_again(grey: Grey, board: Board, view: BoardView) -> BoardView:
-    """See `slrig.calibration.boards.detection.placed_again`."""
+    """See `slrig.calibration.detection.detection.placed_again`."""
     places = board.points_mm[:, :2] / board.square_mm
     board_map = fitted_map(places[view.corner], view.points_px)
     found = None

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import PoseObservation
-from slrig.calibration.poses.rough import (
+from slrig.calibration.board import Board, BoardKind, PoseObservation
+from slrig.calibration.poses.initial import (
     FEWEST_CORNERS,
     LEAST_SIGMA_PX,
     LENS,

@@ -10,14 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.detection import find_board
-from slrig.calibration.boards.lattice import equivalent_views, turned_half
-from slrig.calibration.boards.printing import FIT, PAGES_MM, artwork, board_pdf, board_svg, charuco_board
-from slrig.calibration.observations import BoardView
+from slrig.calibration.board import Board, BoardKind, BoardView
+from slrig.calibration.detection.detection import find_board
+from slrig.calibration.detection.lattice import equivalent_views, turned_half
+from slrig.calibration.printing import FIT, PAGES_MM, artwork, board_pdf, board_svg, charuco_board
 from slrig.cli.boards import board_option
 from slrig.errors import CalibrationError
-from tests.unit.calibration.boards.painted import board_points
+from tests.unit.calibration.painted import board_points
 
 pdfium = pytest.importorskip("pypdfium2", reason="needs the test extra: pip install -e '.[test]'")
 

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.calibration.board import Board
-from slrig.calibration.observations import COLUMN, BoardView, Correspondences, PoseObservation
+from slrig.calibration.board import COLUMN, Board, BoardView, Correspondences, PoseObservation
 from slrig.calibration.solution import PROJECTOR, BoardPose
 from slrig.model import FloatArray, Size
 

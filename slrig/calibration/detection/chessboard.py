@@ -8,20 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.calibration.board import Board
-from slrig.calibration.boards.corner_fit import Grey, PlacedCorners, fitted_map, placed_corners
-from slrig.calibration.boards.lattice import (
-    Lattice,
-    beside,
-    chessboard_lattice,
-    grown_lattice,
-    half_turn_looks_same,
-    holds_markers,
-    pointing_right,
-    right_handed,
-)
-from slrig.calibration.boards.printing import charuco_board
-from slrig.calibration.boards.sightings import (
+from slrig.calibration.board import Board, BoardView
+from slrig.calibration.detection.corners import Grey, PlacedCorners, fitted_map, placed_corners
+from slrig.calibration.detection.diagnosis import (
     UNMIRRORED,
     fitting_width,
     half_words,
@@ -33,7 +22,17 @@ from slrig.calibration.boards.sightings import (
     stands_light_first,
     unclear_words,
 )
-from slrig.calibration.observations import BoardView
+from slrig.calibration.detection.lattice import (
+    Lattice,
+    beside,
+    chessboard_lattice,
+    grown_lattice,
+    half_turn_looks_same,
+    holds_markers,
+    pointing_right,
+    right_handed,
+)
+from slrig.calibration.printing import charuco_board
 from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray, IntArray
 
@@ -42,7 +41,7 @@ _LEAST_FOUND = 0.8
 
 
 def chessboard_view(grey: Grey, board: Board) -> BoardView:
-    """See `slrig.calibration.boards.detection.find_board`."""
+    """See `slrig.calibration.detection.detection.find_board`."""
     lattice = _lattice(grey, board)
     if lattice is None or not _is_all_of(lattice, board):
         raise PoseRefusedError(_cause(grey, board, lattice))
@@ -153,7 +152,7 @@ _SHARE_OFF = 0.06
 
 
 def charuco_view(grey: Grey, board: Board) -> BoardView:
-    """See `slrig.calibration.boards.detection.find_board`."""
+    """See `slrig.calibration.detection.detection.find_board`."""
     outlines, ids = markers_in(grey.eight, str(board.dictionary))
     if len(ids) < _FEWEST_MARKERS:
         raise PoseRefusedError(_nothing(grey, board))

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
+from slrig.calibration.board import Board, BoardKind, BoardView, PoseObservation, ViewFigures
 from slrig.calibration.poses import checks
 from slrig.calibration.poses.checks import PoseAnswer, check_same_devices, coverage_picture, judge_pose, pose_picture
-from slrig.calibration.poses.coverage import (
+from slrig.calibration.poses.guidance import (
     GOALS,
     Advice,
     _cells,
@@ -25,7 +24,7 @@ from slrig.calibration.poses.coverage import (
     full_turn_deg,
     next_move,
 )
-from slrig.calibration.poses.rough import rig_guess
+from slrig.calibration.poses.initial import rig_guess
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose
 from slrig.errors import CalibrationError
 from slrig.model import FloatArray, Pinhole, Size

@@ -2,7 +2,7 @@
 its print and its paper.
 
 Grids and markers are found by OpenCV, on an image brought to 8 bits; every corner and circle is then placed by a fit to
-its own pixels of the image as it is (`slrig.calibration.boards.corner_fit`).
+its own pixels of the image as it is (`slrig.calibration.detection.corners`).
 """
 
 from __future__ import annotations
@@ -13,12 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.circles import circle_blur_px, circles_again, circles_view
-from slrig.calibration.boards.corner_fit import BoardMap, Grey, fitted_map, placed_corners
-from slrig.calibration.boards.markers import charuco_view, chessboard_view
-from slrig.calibration.boards.printing import artwork
-from slrig.calibration.observations import BoardView
+from slrig.calibration.board import Board, BoardKind, BoardView
+from slrig.calibration.detection.chessboard import charuco_view, chessboard_view
+from slrig.calibration.detection.circles import circle_blur_px, circles_again, circles_view
+from slrig.calibration.detection.corners import BoardMap, Grey, fitted_map, placed_corners
+from slrig.calibration.printing import artwork
 from slrig.model import FloatArray
 
 Mask = NDArray[np.bool_]
@@ -54,13 +53,13 @@ def find_board(image: NDArray[Any], board: Board, /, *, full_scale: float) -> Bo
     which the camera clips. A chessboard and circles are found whole or not at all; a ChArUco board may reach out of the
     image. A corner that cannot be placed (dirt, a finger) is left out.
 
-    A board that looks the same turned by half a turn (see `slrig.calibration.boards.lattice`) is numbered so that its
+    A board that looks the same after half a turn (`slrig.calibration.detection.lattice`) is numbered so that its
     x axis points to the right in this image; another camera, or a board held the other way round, may then give the
     other numbering of the same print.
 
     A coordinate's deviation is sqrt(e^2 (J^T J)^-1 + floor^2), with e the rms residual of the corner's own fit and J
     the derivative of its model, so that noise, contrast, blur and size of the squares are all in it; the floor stands
-    for what a fit cannot see of itself (FLOOR_PX in `slrig.calibration.boards.corner_fit`).
+    for what a fit cannot see of itself (FLOOR_PX in `slrig.calibration.detection.corners`).
 
     Raises
     ------

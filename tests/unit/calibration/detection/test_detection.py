@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.detection import (
+from slrig.calibration.board import Board, BoardKind, BoardView
+from slrig.calibration.detection.detection import (
     blur_sigma_px,
     board_region,
     find_board,
@@ -26,10 +26,9 @@ from slrig.calibration.boards.detection import (
     placed_again,
     square_interior,
 )
-from slrig.calibration.boards.lattice import equivalent_views
-from slrig.calibration.observations import BoardView
+from slrig.calibration.detection.lattice import equivalent_views
 from slrig.errors import PoseRefusedError
-from tests.unit.calibration.boards.painted import Eye, Print, as_8_bit, board_points, looking, painted
+from tests.unit.calibration.painted import Eye, Print, as_8_bit, board_points, looking, painted
 
 CHARUCO = Board(BoardKind.CHARUCO, 7, 5, 14.0)
 CHESSBOARD = Board(BoardKind.CHESSBOARD, 8, 5, 14.0)

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.corner_fit import Grey
-from slrig.calibration.boards.lattice import chessboard_lattice, circle_lattice, holds_markers
-from slrig.calibration.boards.printing import charuco_board, marker_dictionary
+from slrig.calibration.detection.corners import Grey
+from slrig.calibration.detection.lattice import chessboard_lattice, circle_lattice, holds_markers
+from slrig.calibration.printing import charuco_board, marker_dictionary
 from slrig.errors import setting
 from slrig.model import FloatArray, IntArray
 

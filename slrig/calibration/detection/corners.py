@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import BoardView
+from slrig.calibration.board import Board, BoardKind, BoardView
 from slrig.model import FloatArray, IntArray
 
 _CUBIC, _QUADRATIC = 30, 14
@@ -367,7 +366,7 @@ def fitted_circles(
 
     shape : (n, 2, 2) float64, symmetric: |shape @ (p - centre)| = 1 on the outline. The other arguments are those of
     `fitted_corners`. Returns the places and the fitted shapes, (n, 2, 2) float64. An ellipse's centre is not where the
-    circle's centre is seen: see `slrig.calibration.boards.circles`.
+    circle's centre is seen: see `slrig.calibration.detection.circles`.
     """
     places, q = _fitted(_circle_model, shape[:, [0, 0, 1], [0, 1, 1]], image, start_px, usable, half_px)
     return places, np.stack([q[:, [2, 3]], q[:, [3, 4]]], axis=1)

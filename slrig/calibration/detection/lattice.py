@@ -26,9 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.corner_fit import BoardMap, Grey, PlacedCorners, fitted_map, placed_corners
-from slrig.calibration.observations import BoardView
+from slrig.calibration.board import Board, BoardKind, BoardView
+from slrig.calibration.detection.corners import BoardMap, Grey, PlacedCorners, fitted_map, placed_corners
 from slrig.model import FloatArray, IntArray
 
 _MARGIN = 1.3
