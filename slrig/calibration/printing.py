@@ -1,6 +1,6 @@
-"""Boards to print in true size: artwork, and pages as SVG or PDF with rulers that check the printer.
+"""Boards to print in true size, on pages in SVG or PDF with scales that check the printer.
 
-Everything is drawn in vectors, from one list of shapes in millimetres from the page's upper left corner.
+Vector graphics from one list of shapes, in millimetres from the page's upper left corner.
 """
 
 from __future__ import annotations
@@ -23,19 +23,18 @@ from slrig.errors import CalibrationError
 from slrig.model import FloatArray, IntArray
 
 CIRCLE_RADIUS = 0.5
-"""A printed circle's radius over `square_mm`, the distance of two rows. Detection takes circles of any radius."""
+"""Radius of a printed circle over `square_mm`. Detection accepts other radii."""
 
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_") and name.upper() == name))
-"""OpenCV's marker dictionaries, by name."""
+"""Names of OpenCV's marker dictionaries."""
 
 
 @dataclass(frozen=True, slots=True)
 class Artwork:
-    """The dark shapes of a board. Everything else is paper.
+    """Dark shapes of a board on paper.
 
-    rectangles_mm : (n, 2, 2) float64, the least and the greatest (x, y) of each; group : (n,) int32, rising,
-    rectangles of one number belong in one path, so that no seam shows where they touch: 0 the squares, then one number
-    for each marker.
+    rectangles_mm : (n, 2, 2) float64, least and greatest (x, y) of each; group : (n,) int32, ascending: 0 for the
+    squares, then one number per marker. Rectangles of one group share a path, so that no seam shows between them.
     circles_mm : (m, 3) float64, x, y, radius.
     """
 
@@ -45,10 +44,10 @@ class Artwork:
 
 
 def artwork(board: Board, *, light_first: bool = False) -> Artwork:
-    """Every dark shape of a board: the squares (the one up and left of corner 0 is dark, unless `light_first`), the
-    markers, the circles.
+    """Dark squares, marker cells and circles of a board. The square up and left of corner 0 is dark, unless
+    `light_first`.
 
-    Raises CalibrationError where OpenCV has no such dictionary, or it has fewer markers than the board needs.
+    Raises CalibrationError where OpenCV has no such dictionary, or it has too few markers for the board.
     """
     no_rectangles, no_circles = np.zeros((0, 2, 2)), np.zeros((0, 3))
     if board.kind is BoardKind.CIRCLES:
@@ -60,37 +59,37 @@ def artwork(board: Board, *, light_first: bool = False) -> Artwork:
     least = np.column_stack([column[dark], row[dark]]) - 1.0
     shapes = [np.stack([least, least + 1], axis=1) * board.square_mm]
     if board.kind is BoardKind.CHARUCO:
-        shapes += _markers(board, light_first)
+        shapes += _marker_cells(board, light_first)
     group = np.repeat(np.arange(len(shapes), dtype=np.int32), [len(shape) for shape in shapes])
     return Artwork(np.concatenate(shapes), group, no_circles)
 
 
 def charuco_board(board: Board, *, light_first: bool = False) -> Any:
-    """OpenCV's own description of a ChArUco board: `cv2.aruco.CharucoBoard`, its origin one square up and left of ours.
+    """OpenCV's `cv2.aruco.CharucoBoard` of a ChArUco board, its origin one square up and left of corner 0.
 
-    light_first : the layout of OpenCV before 4.6 (`setLegacyPattern`); another one only where the number of rows of
-    squares is even.
+    light_first : the layout of OpenCV before 4.6 (`setLegacyPattern`), which differs only for an even number of rows of
+    squares.
 
-    Raises CalibrationError where OpenCV has no such dictionary, or it has fewer markers than the board needs.
+    Raises CalibrationError where OpenCV has no such dictionary, or it has too few markers for the board.
     """
     markers = marker_dictionary(str(board.dictionary))
-    needed, held = (board.columns + 1) * (board.rows + 1) // 2, len(markers.bytesList)
-    if needed > held:
+    needed, available = (board.columns + 1) * (board.rows + 1) // 2, len(markers.bytesList)
+    if needed > available:
         message = (
-            f"the board: {board.title} needs {needed} markers and {board.dictionary} has {held}: "
-            "take fewer corners, or a dictionary of more markers, DICT_5X5_1000 for one"
+            f"the board: {board.title} needs {needed} markers and {board.dictionary} has {available}: "
+            "choose fewer corners, or a dictionary with more markers, such as DICT_5X5_1000"
         )
         raise CalibrationError(message)
     squares = (board.columns + 1, board.rows + 1)
-    described = cv2.aruco.CharucoBoard(squares, board.square_mm, float(board.marker_mm or 0), markers)
-    described.setLegacyPattern(light_first)
-    return described
+    layout = cv2.aruco.CharucoBoard(squares, board.square_mm, float(board.marker_mm or 0), markers)
+    layout.setLegacyPattern(light_first)
+    return layout
 
 
 def marker_dictionary(name: str) -> Any:
-    """OpenCV's dictionary of markers of this name: `cv2.aruco.Dictionary`.
+    """OpenCV's `cv2.aruco.Dictionary` of this name.
 
-    Raises CalibrationError where there is none of this name.
+    Raises CalibrationError where OpenCV has none of this name.
     """
     if name not in DICTIONARIES:
         message = f"the board: OpenCV has no dictionary {name!r}; it has {', '.join(DICTIONARIES)}"
@@ -98,55 +97,55 @@ def marker_dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def _markers(board: Board, light_first: bool) -> list[FloatArray]:
-    """The dark cells of each marker, runs within a row joined: (n, 2, 2) float64 each, mm."""
-    described = charuco_board(board, light_first=light_first)
-    dictionary = described.getDictionary()
+def _marker_cells(board: Board, light_first: bool) -> list[FloatArray]:
+    """(n, 2, 2) float64 mm per marker: its dark cells, joined to runs within a row."""
+    layout = charuco_board(board, light_first=light_first)
+    dictionary = layout.getDictionary()
     cells = int(dictionary.markerSize) + 2
     shapes = []
-    for number, corners in zip(described.getIds().ravel(), described.getObjPoints(), strict=True):
+    for number, corners in zip(layout.getIds().ravel(), layout.getObjPoints(), strict=True):
         dark: NDArray[np.bool_] = cv2.aruco.generateImageMarker(dictionary, int(number), cells) == 0
         origin = np.asarray(corners, dtype=np.float64)[0, :2] - board.square_mm
-        runs = [(row, *run) for row in range(cells) for run in _runs(dark[row])]
-        shape = np.array([[(first, row), (beyond, row + 1)] for row, first, beyond in runs], dtype=np.float64)
+        runs = [(row, *run) for row in range(cells) for run in _dark_runs(dark[row])]
+        shape = np.array([[(first, row), (end, row + 1)] for row, first, end in runs], dtype=np.float64)
         shapes.append(origin + shape * (float(board.marker_mm or 0) / cells))
     return shapes
 
 
-def _runs(dark: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """The first cell of each run of dark cells, and the one beyond its last."""
+def _dark_runs(dark: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Index of the first cell of each run of dark cells, and of the cell after its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], dark, [False]]).astype(np.int8)))
-    return [(int(first), int(beyond)) for first, beyond in edges.reshape(-1, 2)]
+    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
 
 
 PAGES_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
 """Width and height of pages by name, upright."""
 
 FIT = "fit"
-"""The page that is as large as the board needs."""
+"""Name of a page that is as large as the board requires."""
 
 _MARGIN_MM = 6.0
 _QUIET_MM = 5.0
 _RULER_MM = 9.0
 _LINE_MM = 3.6
 _FONT_MM = 2.6
-_LETTER = 0.53
-"""Width of a letter of the font over its size, on average and a little more."""
-_LEAST_WIDTH_MM = 90.0
-"""Of a page that is made to fit: a line of the foot wants some room."""
+_LETTER_WIDTH = 0.53
+"""Mean width of a letter over the font size, rounded up."""
+_MIN_WIDTH_MM = 90.0
+"""Least width of a page made to fit, for the lines of the footer."""
 _STROKE_MM = 0.15
 _BORDER_GREY, _INK_GREY = 0.8, 0.25
 
 
 class _Text(NamedTuple):
-    """x_mm, y_mm : of the line's start, or its middle; turned : written upwards."""
+    """A line of text. x_mm, y_mm : its start, or its middle where centred; vertical : written upwards."""
 
     text: str
     x_mm: float
     y_mm: float
     size_mm: float
     centred: bool = False
-    turned: bool = False
+    vertical: bool = False
 
 
 class _Line(NamedTuple):
@@ -159,7 +158,7 @@ class _Line(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Page:
-    """rectangles_mm : per shape, (n, 2, 2), drawn as one path; circles_mm : (m, 3), x, y, radius."""
+    """Contents of a page. rectangles_mm : per path, (n, 2, 2); circles_mm : (m, 3), x, y, radius."""
 
     width_mm: float
     height_mm: float
@@ -173,41 +172,41 @@ class _Page:
 def board_svg(board: Board, *, page: str = "A4") -> str:
     """A page with the board as an SVG document, to be printed at 100 %.
 
-    page : A4, A3, letter; `fit`, a page as large as the board needs; or WIDTHxHEIGHT in mm, 600x400. A page is turned
-    on its side where the board needs it.
+    page : A4, A3, letter; `fit`, as large as the board requires; or WIDTHxHEIGHT in mm (600x400). Pages are used
+    upright or on their side.
 
     Raises
     ------
     CalibrationError
-        There is no such page, or the board does not fit on it.
+        The page is not known, or the board does not fit on it.
     """
-    drawn = _laid_out(board, page)
-    width, height = _number(drawn.width_mm), _number(drawn.height_mm)
+    content = _lay_out_page(board, page)
+    width, height = _format_mm(content.width_mm), _format_mm(content.height_mm)
     parts = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" '
         f'viewBox="0 0 {width} {height}">',
-        f"<title>{html.escape(drawn.title)}</title>",
+        f"<title>{html.escape(content.title)}</title>",
         f'<rect width="{width}" height="{height}" fill="#fff"/>',
     ]
-    for shape in drawn.rectangles_mm:
+    for shape in content.rectangles_mm:
         path = "".join(
-            f"M{_number(x)} {_number(y)}H{_number(to_x)}V{_number(to_y)}H{_number(x)}Z"
+            f"M{_format_mm(x)} {_format_mm(y)}H{_format_mm(to_x)}V{_format_mm(to_y)}H{_format_mm(x)}Z"
             for (x, y), (to_x, to_y) in shape
         )
         parts.append(f'<path d="{path}" fill="#000"/>')
     parts += [
-        f'<circle cx="{_number(x)}" cy="{_number(y)}" r="{_number(radius)}" fill="#000"/>'
-        for x, y, radius in drawn.circles_mm
+        f'<circle cx="{_format_mm(x)}" cy="{_format_mm(y)}" r="{_format_mm(radius)}" fill="#000"/>'
+        for x, y, radius in content.circles_mm
     ]
-    for line in drawn.lines:
-        x, y, to_x, to_y = (_number(place) for place in line[:4])
+    for line in content.lines:
+        x, y, to_x, to_y = (_format_mm(place) for place in line[:4])
         stroke = f'stroke="{_colour(line.grey)}" stroke-width="{_STROKE_MM}"'
         parts.append(f'<line x1="{x}" y1="{y}" x2="{to_x}" y2="{to_y}" {stroke}/>')
-    for text in drawn.texts:
-        x, y, size = (_number(place) for place in text[1:4])
+    for text in content.texts:
+        x, y, size = (_format_mm(place) for place in text[1:4])
         anchor = ' text-anchor="middle"' if text.centred else ""
-        turn = f' transform="rotate(-90 {x} {y})"' if text.turned else ""
+        turn = f' transform="rotate(-90 {x} {y})"' if text.vertical else ""
         parts.append(
             f'<text x="{x}" y="{y}" font-family="Helvetica, Arial, sans-serif" font-size="{size}" '
             f'fill="{_colour(_INK_GREY)}"{anchor}{turn}>{html.escape(text.text)}</text>'
@@ -216,171 +215,173 @@ def board_svg(board: Board, *, page: str = "A4") -> str:
 
 
 def board_pdf(board: Board, *, page: str = "A4") -> bytes:
-    """The same page as a PDF document. The same board and page give the same bytes.
+    """The same page as a PDF document. Equal boards and pages give equal bytes.
 
     Raises CalibrationError as `board_svg` does.
     """
     from reportlab.lib.units import mm
     from reportlab.pdfgen.canvas import Canvas
 
-    drawn = _laid_out(board, page)
-    held = io.BytesIO()
-    canvas = Canvas(held, pagesize=(drawn.width_mm * mm, drawn.height_mm * mm), invariant=1)
-    canvas.setTitle(drawn.title)
+    content = _lay_out_page(board, page)
+    buffer = io.BytesIO()
+    canvas = Canvas(buffer, pagesize=(content.width_mm * mm, content.height_mm * mm), invariant=1)
+    canvas.setTitle(content.title)
     canvas.setCreator("slrig")
-    # No scaling as the print dialogue's first choice: most readers heed it.
+    # Most readers then offer printing without scaling first.
     canvas.setViewerPreference("PrintScaling", "None")
-    top_mm = drawn.height_mm
+    top_mm = content.height_mm
     canvas.setFillGray(0)
-    for shape in drawn.rectangles_mm:
+    for shape in content.rectangles_mm:
         path = canvas.beginPath()
         for (x, y), (to_x, to_y) in shape:
             path.rect(x * mm, (top_mm - to_y) * mm, (to_x - x) * mm, (to_y - y) * mm)
         canvas.drawPath(path, stroke=0, fill=1)
-    for x, y, radius in drawn.circles_mm:
+    for x, y, radius in content.circles_mm:
         canvas.circle(x * mm, (top_mm - y) * mm, radius * mm, stroke=0, fill=1)
     canvas.setLineWidth(_STROKE_MM * mm)
-    for line in drawn.lines:
+    for line in content.lines:
         canvas.setStrokeGray(line.grey)
         canvas.line(line.x_mm * mm, (top_mm - line.y_mm) * mm, line.to_x_mm * mm, (top_mm - line.to_y_mm) * mm)
     canvas.setFillGray(_INK_GREY)
-    for text in drawn.texts:
+    for text in content.texts:
         canvas.saveState()
         canvas.translate(text.x_mm * mm, (top_mm - text.y_mm) * mm)
-        canvas.rotate(90 if text.turned else 0)
+        canvas.rotate(90 if text.vertical else 0)
         canvas.setFont("Helvetica", text.size_mm * mm)
         (canvas.drawCentredString if text.centred else canvas.drawString)(0, 0, text.text)
         canvas.restoreState()
     canvas.save()
-    return held.getvalue()
+    return buffer.getvalue()
 
 
 def solve_command(board: Board) -> str:
     """The command that calibrates from poses of this board."""
-    charuco = board.kind is BoardKind.CHARUCO
-    further = f" --marker-mm {board.marker_mm:g} --dictionary {board.dictionary}" if charuco else ""
+    is_charuco = board.kind is BoardKind.CHARUCO
+    marker_options = f" --marker-mm {board.marker_mm:g} --dictionary {board.dictionary}" if is_charuco else ""
     return (
         f"slrig calibrate solve FOLDER --board {board.kind} --corners {board.columns}x{board.rows} "
-        f"--square-mm {board.square_mm:g}{further} --measured-mm X Y "
+        f"--square-mm {board.square_mm:g}{marker_options} --measured-mm X Y "
         "--output calibration.json"
     )
 
 
-def _laid_out(board: Board, page: str) -> _Page:
-    """The page: the board in its quiet zone, a ruler left of it and one below, text at the foot."""
+def _lay_out_page(board: Board, page: str) -> _Page:
+    """Place the board in its quiet zone, a scale left of it and one below, and text at the bottom."""
     (left, top), (right, bottom) = board.print_mm
-    wide_mm, high_mm = float(right - left), float(bottom - top)
-    width_mm, height_mm = _page_mm(board, page)
-    needed, texts = _needed_mm(board, width_mm), _foot(board, width_mm)
-    # The board stands in the middle of what rulers and text leave.
-    x_mm = _MARGIN_MM + _RULER_MM + _QUIET_MM + (width_mm - needed[0]) / 2
-    y_mm = _MARGIN_MM + _QUIET_MM + (height_mm - needed[1]) / 2
+    board_width_mm, board_height_mm = float(right - left), float(bottom - top)
+    width_mm, height_mm = _page_size_mm(board, page)
+    required_mm, footer = _required_size_mm(board, width_mm), _footer_lines(board, width_mm)
+    # The board is centred in the space that scales and text leave.
+    x_mm = _MARGIN_MM + _RULER_MM + _QUIET_MM + (width_mm - required_mm[0]) / 2
+    y_mm = _MARGIN_MM + _QUIET_MM + (height_mm - required_mm[1]) / 2
     art = artwork(board)
     origin = [x_mm - left, y_mm - top]
     shapes = [art.rectangles_mm[art.group == group] + origin for group in range(int(art.group.max(initial=-1)) + 1)]
     circles = art.circles_mm + np.array([*origin, 0.0])
-    below_mm = y_mm + high_mm + _QUIET_MM
-    (west, north), (east, south) = (x_mm - _QUIET_MM, y_mm - _QUIET_MM), (x_mm + wide_mm + _QUIET_MM, below_mm)
+    west, north = x_mm - _QUIET_MM, y_mm - _QUIET_MM
+    east, south = x_mm + board_width_mm + _QUIET_MM, y_mm + board_height_mm + _QUIET_MM
     border = [(west, north), (east, north), (east, south), (west, south), (west, north)]
-    lines = [_Line(*one, *other, _BORDER_GREY) for one, other in pairwise(border)]
-    foot_mm = height_mm - _MARGIN_MM - _LINE_MM * (len(texts) - 0.75)
-    written = [_Text(text, _MARGIN_MM, foot_mm + _LINE_MM * index, _FONT_MM) for index, text in enumerate(texts)]
+    lines = [_Line(*start, *end, _BORDER_GREY) for start, end in pairwise(border)]
+    footer_mm = height_mm - _MARGIN_MM - _LINE_MM * (len(footer) - 0.75)
+    texts = [_Text(text, _MARGIN_MM, footer_mm + _LINE_MM * index, _FONT_MM) for index, text in enumerate(footer)]
     across_mm, down_mm = board.rulers_mm
-    for upright, start_x, start_y, length_mm in (
-        (False, x_mm, below_mm + 1.0, across_mm),
-        (True, x_mm - _QUIET_MM - 1.0, y_mm, down_mm),
+    for vertical, start_x, start_y, length_mm in (
+        (False, x_mm, south + 1.0, across_mm),
+        (True, west - 1.0, y_mm, down_mm),
     ):
-        ticks, numbers = _ruler(start_x, start_y, length_mm, upright=upright)
+        ticks, numbers = _ruler(start_x, start_y, length_mm, vertical=vertical)
         lines += ticks
-        written += numbers
-    return _Page(width_mm, height_mm, f"slrig: {board.title}", shapes, circles, lines, written)
+        texts += numbers
+    return _Page(width_mm, height_mm, f"slrig: {board.title}", shapes, circles, lines, texts)
 
 
-def _foot(board: Board, width_mm: float) -> list[str]:
-    """The lines at the foot of a page of this width: what the board is, how to print it, how to calibrate with it."""
-    said = (
+def _footer_lines(board: Board, width_mm: float) -> list[str]:
+    """Lines of text for a page of this width: the board, how to print it and how to calibrate with it."""
+    texts = (
         f"slrig: {board.description}",
         "Print at 100 % (actual size). Hold a ruler to both scales, and give their lengths as measured.",
         solve_command(board),
     )
-    letters = max(20, int((width_mm - 2 * _MARGIN_MM) / (_LETTER * _FONT_MM)))
-    return [line for text in said for line in textwrap.wrap(text, letters, break_on_hyphens=False)]
+    letters = max(20, int((width_mm - 2 * _MARGIN_MM) / (_LETTER_WIDTH * _FONT_MM)))
+    return [line for text in texts for line in textwrap.wrap(text, letters, break_on_hyphens=False)]
 
 
-def _needed_mm(board: Board, width_mm: float) -> tuple[float, float]:
-    """Width and height, mm, that the board needs with margins, quiet zone, rulers and its foot on a page this wide."""
-    wide_mm, high_mm = (board.print_mm[1] - board.print_mm[0]).tolist()
+def _required_size_mm(board: Board, width_mm: float) -> tuple[float, float]:
+    """Width and height of the board with margins, quiet zone, scales and the footer of a page of this width."""
+    board_width_mm, board_height_mm = (board.print_mm[1] - board.print_mm[0]).tolist()
     around_mm = 2 * _MARGIN_MM + 2 * _QUIET_MM + _RULER_MM
-    return wide_mm + around_mm, high_mm + around_mm + _LINE_MM * len(_foot(board, width_mm))
+    return board_width_mm + around_mm, board_height_mm + around_mm + _LINE_MM * len(_footer_lines(board, width_mm))
 
 
-def _page_mm(board: Board, page: str) -> tuple[float, float]:
-    """Width and height of the page, mm, turned on its side where the board needs that."""
+def _page_size_mm(board: Board, page: str) -> tuple[float, float]:
+    """Width and height of the page, upright or on its side as the board requires."""
     if page == FIT:
-        width_mm = max(_needed_mm(board, _LEAST_WIDTH_MM)[0], _LEAST_WIDTH_MM)
-        return width_mm, _needed_mm(board, width_mm)[1]
-    sides = _sides_mm(page)
-    turned = _turned_to_fit(board, sides)
-    if turned is not None:
-        return turned
+        width_mm = max(_required_size_mm(board, _MIN_WIDTH_MM)[0], _MIN_WIDTH_MM)
+        return width_mm, _required_size_mm(board, width_mm)[1]
+    sides = _parse_page_mm(page)
+    oriented_mm = _oriented_page_mm(board, sides)
+    if oriented_mm is not None:
+        return oriented_mm
     squares = ((board.print_mm[1] - board.print_mm[0]) / board.square_mm).tolist()
     largest = 0.0
     for width_mm, height_mm in (sides, sides[::-1]):
-        needed = _needed_mm(board, width_mm)
-        spare = (width_mm - needed[0], height_mm - needed[1])
+        required_mm = _required_size_mm(board, width_mm)
+        spare = (width_mm - required_mm[0], height_mm - required_mm[1])
         largest = max(largest, board.square_mm + min(spare[0] / squares[0], spare[1] / squares[1]))
     largest = math.floor(10 * largest + 1e-9) / 10
     advice = f"the largest square that fits there is {largest:g} mm" if largest > 0 else "no square fits there"
-    other = [name for name in PAGES_MM if _turned_to_fit(board, PAGES_MM[name])]
-    if other:
-        advice += f"; it fits on {' and '.join(other)}"
-    needed = _needed_mm(board, max(sides))
+    other_pages = [name for name in PAGES_MM if _oriented_page_mm(board, PAGES_MM[name])]
+    if other_pages:
+        advice += f"; it fits on {' and '.join(other_pages)}"
+    required_mm = _required_size_mm(board, max(sides))
     message = (
-        f"the board: {board.title} needs a page of {needed[0]:.0f} x {needed[1]:.0f} mm with its rulers, and {page} "
-        f"has {sides[0]:g} x {sides[1]:g} mm: {advice}; page {FIT} (--page {FIT}) is as large as it needs"
+        f"the board: {board.title} needs {required_mm[0]:.0f} x {required_mm[1]:.0f} mm with its scales, and {page} "
+        f"has {sides[0]:g} x {sides[1]:g} mm: {advice}; page {FIT} (--page {FIT}) is as large as required"
     )
     raise CalibrationError(message)
 
 
-def _turned_to_fit(board: Board, sides: tuple[float, float]) -> tuple[float, float] | None:
-    """The page upright or on its side, whichever is as the board is and holds it; None where neither does."""
-    wide_mm, high_mm = (board.print_mm[1] - board.print_mm[0]).tolist()
-    for width_mm, height_mm in sorted((sides, sides[::-1]), reverse=wide_mm > high_mm):
-        needed = _needed_mm(board, width_mm)
-        if needed[0] <= width_mm and needed[1] <= height_mm:
+def _oriented_page_mm(board: Board, sides: tuple[float, float]) -> tuple[float, float] | None:
+    """The page in the orientation of the board if it fits, else in the other one; None if it fits in neither."""
+    board_width_mm, board_height_mm = (board.print_mm[1] - board.print_mm[0]).tolist()
+    for width_mm, height_mm in sorted((sides, sides[::-1]), reverse=board_width_mm > board_height_mm):
+        required_mm = _required_size_mm(board, width_mm)
+        if required_mm[0] <= width_mm and required_mm[1] <= height_mm:
             return width_mm, height_mm
     return None
 
 
-def _sides_mm(page: str) -> tuple[float, float]:
-    named = {name.lower(): sides for name, sides in PAGES_MM.items()}.get(page.lower())
-    if named is not None:
-        return named
-    given = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
-    if given is None:
+def _parse_page_mm(page: str) -> tuple[float, float]:
+    sides = {name.lower(): sides for name, sides in PAGES_MM.items()}.get(page.lower())
+    if sides is not None:
+        return sides
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
+    if match is None:
         message = f"the page: expected {', '.join(PAGES_MM)}, {FIT} or WIDTHxHEIGHT in mm (600x400), found {page!r}"
         raise CalibrationError(message)
-    return float(given[1]), float(given[2])
+    return float(match[1]), float(match[2])
 
 
-def _ruler(x_mm: float, y_mm: float, length: int, *, upright: bool) -> tuple[list[_Line], list[_Text]]:
-    """A scale in mm from (x_mm, y_mm): to the right, its ticks downwards, or downwards, its ticks to the left."""
+def _ruler(x_mm: float, y_mm: float, length: int, *, vertical: bool) -> tuple[list[_Line], list[_Text]]:
+    """A scale in mm from (x_mm, y_mm): to the right with ticks downwards, or downwards with ticks to the left."""
     ticks, numbers = [], []
 
     def place(along: float, away: float) -> tuple[float, float]:
-        return (x_mm - away, y_mm + along) if upright else (x_mm + along, y_mm + away)
+        return (x_mm - away, y_mm + along) if vertical else (x_mm + along, y_mm + away)
 
-    for at in range(length + 1):
-        tick = 4.0 if at % 10 == 0 else 3.0 if at % 5 == 0 else 2.0
-        ticks.append(_Line(*place(at, 0), *place(at, tick), 0.0))
-        if at % 10 == 0:
-            told = f"{at} mm" if at == length - length % 10 else str(at)
-            numbers.append(_Text(told, *place(at, 4.7 if upright else 6.7), 2.2, centred=True, turned=upright))
+    for tick_mm in range(length + 1):
+        tick = 4.0 if tick_mm % 10 == 0 else 3.0 if tick_mm % 5 == 0 else 2.0
+        ticks.append(_Line(*place(tick_mm, 0), *place(tick_mm, tick), 0.0))
+        if tick_mm % 10 == 0:
+            label = f"{tick_mm} mm" if tick_mm == length - length % 10 else str(tick_mm)
+            numbers.append(
+                _Text(label, *place(tick_mm, 4.7 if vertical else 6.7), 2.2, centred=True, vertical=vertical)
+            )
     return [*ticks, _Line(x_mm, y_mm, *place(length, 0), 0.0)], numbers
 
 
-def _number(value: float) -> str:
-    """Millimetres to a tenth of a micrometre, without needless zeros."""
+def _format_mm(value: float) -> str:
+    """Millimetres to a tenth of a micrometre, without trailing zeros."""
     return f"{value:.4f}".rstrip("0").rstrip(".")
 
 

@@ -1,10 +1,10 @@
-"""Asymmetric circles: the spots by OpenCV (`SimpleBlobDetector`), each circle by a fit, and its true centre.
+"""Asymmetric circles: spots by OpenCV (`SimpleBlobDetector`), a fit to each circle, and its true centre.
 
-A circle is seen as an ellipse, and the ellipse's centre is not where the circle's centre is seen: under perspective it
-lies farther away from the camera, and a lens moves it too. The map from the board to the image, fitted to all centres,
-says by how much: it takes the outline of each circle into the image, an ellipse is fitted to that, and the distance of
-the ellipse's centre from the mapped centre is taken off what was measured. The map was fitted to shifted centres, so
-this is done again until nothing changes. The printed circles' radius is measured in passing.
+A circle appears as an ellipse. Under perspective and through a lens, the ellipse's centre is not the image of the
+circle's centre. The map from board to image, fitted to all centres, gives the difference: it maps the outline of each
+circle into the image, an ellipse is fitted to it, and the offset of the ellipse's centre from the mapped centre is
+subtracted from the measured point. The map is then fitted again, a fixed number of times. The radius of the printed
+circles is estimated too.
 """
 
 from __future__ import annotations
@@ -16,136 +16,143 @@ import numpy as np
 
 from slrig.calibration.board import Board, BoardView
 from slrig.calibration.detection.corners import (
-    FLOOR_PX,
-    WORST_SIGMA_PX,
+    MAX_SIGMA_PX,
+    SIGMA_FLOOR_PX,
     BoardMap,
-    FittedPlaces,
-    Grey,
-    fitted_circles,
-    fitted_map,
+    GreyImage,
+    PointFit,
+    fit_board_map,
+    fit_circles,
     patch_offsets,
 )
-from slrig.calibration.detection.diagnosis import UNMIRRORED, half_words, other_words, unclear_words
+from slrig.calibration.detection.diagnosis import (
+    MIRROR_REMEDY,
+    explain_other_board,
+    explain_partial_board,
+    explain_unclear_board,
+)
 from slrig.calibration.detection.lattice import (
     Blobs,
     Lattice,
-    dark_blobs,
-    half_turn_looks_same,
-    lattice_of,
-    of_circles,
-    pointing_right,
-    right_handed,
+    build_circle_lattice,
+    detect_dark_blobs,
+    has_half_turn_symmetry,
+    is_circle_lattice,
+    make_right_handed,
+    orient_x_right,
 )
 from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray
 
-_TURNS = 3
+_CENTRE_ITERATIONS = 3
 _RING_PX, _RING_BLURS = 4.0, 3.2
-_OUTLINE = 48
-_LEAST_FOUND = 0.8
-_SMALL_PX = 4.0
-_MOST_SPOTS = 2
+_OUTLINE_POINTS = 48
+_MIN_FOUND_FRACTION = 0.8
+_MIN_RADIUS_PX = 4.0
+_MAX_SPOT_RATIO = 2
 
 
-def circles_view(grey: Grey, board: Board) -> BoardView:
-    """See `slrig.calibration.detection.detection.find_board`."""
-    blobs = dark_blobs(grey.eight, most=board.corner_count)
-    lattice = lattice_of(blobs.points_px)
-    if lattice is not None and not of_circles(grey.level, lattice):
+def find_circles(grey: GreyImage, board: Board) -> BoardView:
+    """Find asymmetric circles in an image. See `slrig.calibration.detection.detection.find_board`."""
+    blobs = detect_dark_blobs(grey.image_8bit, expected_count=board.corner_count)
+    lattice = build_circle_lattice(blobs.points_px)
+    if lattice is not None and not is_circle_lattice(grey.level, lattice):
         lattice = None
-    rough_px = None if lattice is None else _grid(lattice, board)
+    rough_px = None if lattice is None else _order_circles(lattice, board)
     if lattice is None or rough_px is None:
-        raise PoseRefusedError(_cause(grey, board, blobs, lattice))
-    view = placed_circles(grey.level, board, rough_px, blobs)
+        raise PoseRefusedError(_explain_circles(grey, board, blobs, lattice))
+    view = refine_circles(grey.level, board, rough_px, blobs)
     found = 0 if view is None else len(view.corner)
-    if view is None or found < _LEAST_FOUND * board.corner_count:
-        raise PoseRefusedError(unclear_words(grey, board, found, "circles"))
+    if view is None or found < _MIN_FOUND_FRACTION * board.corner_count:
+        raise PoseRefusedError(explain_unclear_board(grey, board, found, "circles"))
     return view
 
 
-def placed_circles(level: FloatArray, board: Board, rough_px: FloatArray, blobs: Blobs) -> BoardView | None:
-    """Every circle's true centre from rough ones, (n, 2) px, all of the board's and in its order. None if it fails."""
-    places = board.points_mm[:, :2] / board.square_mm
-    board_map = fitted_map(places, rough_px)
+def refine_circles(level: FloatArray, board: Board, rough_px: FloatArray, blobs: Blobs) -> BoardView | None:
+    """Refine every circle's centre from rough ones, (n, 2) px, of the whole board in its order. None if it fails."""
+    positions = board.points_mm[:, :2] / board.square_mm
+    board_map = fit_board_map(positions, rough_px)
     if board_map is None:
         return None
-    radius = _first_radius(board_map, places, rough_px, blobs)
-    fit, radius = _ellipses(level, board_map, places, rough_px, radius)
-    good = np.isfinite(fit.sigma_px) & (fit.sigma_px < WORST_SIGMA_PX)
+    radius = _initial_radius(board_map, positions, rough_px, blobs)
+    fit, radius = _fit_ellipses(level, board_map, positions, rough_px, radius)
+    valid = np.isfinite(fit.sigma_px) & (fit.sigma_px < MAX_SIGMA_PX)
     centres_px = fit.points_px.copy()
-    for _ in range(_TURNS):
-        board_map = fitted_map(places[good], centres_px[good])
+    for _ in range(_CENTRE_ITERATIONS):
+        board_map = fit_board_map(positions[valid], centres_px[valid])
         if board_map is None:
             return None
-        centres_px = fit.points_px - _ellipse_shift(board_map, places, radius)
-        aside = np.linalg.norm(centres_px - board_map(places), axis=1)
-        good &= aside < max(1.5, 5 * float(np.median(aside[good])))
-    corner = np.flatnonzero(good).astype(np.int32)
-    return BoardView(corner, centres_px[good], np.hypot(fit.sigma_px[good], FLOOR_PX))
+        centres_px = fit.points_px - _ellipse_shift(board_map, positions, radius)
+        distance = np.linalg.norm(centres_px - board_map(positions), axis=1)
+        valid &= distance < max(1.5, 5 * float(np.median(distance[valid])))
+    corner = np.flatnonzero(valid).astype(np.int32)
+    return BoardView(corner, centres_px[valid], np.hypot(fit.sigma_px[valid], SIGMA_FLOOR_PX))
 
 
-def circles_again(grey: Grey, board: Board, view: BoardView) -> BoardView:
-    """See `slrig.calibration.detection.detection.placed_again`."""
-    places = board.points_mm[:, :2] / board.square_mm
-    board_map = fitted_map(places[view.corner], view.points_px)
+def refine_circles_view(grey: GreyImage, board: Board, view: BoardView) -> BoardView:
+    """Refine the circles of a view in another image. See `slrig.calibration.detection.detection.refine_view`."""
+    positions = board.points_mm[:, :2] / board.square_mm
+    board_map = fit_board_map(positions[view.corner], view.points_px)
     found = None
     if board_map is not None:
-        blobs = dark_blobs(grey.eight, most=board.corner_count)
-        found = placed_circles(grey.level, board, board_map(places), blobs)
+        blobs = detect_dark_blobs(grey.image_8bit, expected_count=board.corner_count)
+        found = refine_circles(grey.level, board, board_map(positions), blobs)
     return BoardView(np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0)) if found is None else found
 
 
 def circle_blur_px(level: FloatArray, view: BoardView, board: Board) -> FloatArray:
     """(n,) float64: standard deviation of the blur of each circle's outline."""
-    places = board.points_mm[view.corner, :2] / board.square_mm
-    board_map = fitted_map(places, view.points_px)
+    positions = board.points_mm[view.corner, :2] / board.square_mm
+    board_map = fit_board_map(positions, view.points_px)
     if board_map is None:
         return np.full(len(view.corner), np.nan)
-    eight = np.clip(255 * level / max(float(np.percentile(level, 99.9)), 1e-9), 0, 255).astype(np.uint8)
-    radius = _first_radius(board_map, places, view.points_px, dark_blobs(eight, most=board.corner_count))
-    fit, _ = _ellipses(level, board_map, places, view.points_px, radius)
+    image_8bit = np.clip(255 * level / max(float(np.percentile(level, 99.9)), 1e-9), 0, 255).astype(np.uint8)
+    radius = _initial_radius(
+        board_map, positions, view.points_px, detect_dark_blobs(image_8bit, expected_count=board.corner_count)
+    )
+    fit, _ = _fit_ellipses(level, board_map, positions, view.points_px, radius)
     return np.where(np.isfinite(fit.sigma_px), fit.blur_px, np.nan)
 
 
-def _grid(lattice: Lattice, board: Board) -> FloatArray | None:
-    """(n, 2) float64: the centres in the board's own order; None where the lattice is no such board.
+def _order_circles(lattice: Lattice, board: Board) -> FloatArray | None:
+    """(n, 2) float64: the centres in the order of the board; None where the lattice is another board.
 
-    Raises PoseRefusedError where left and right are changed over.
+    Raises PoseRefusedError where left and right are swapped.
     """
-    points_px = _matched(lattice, board, mirrored=False)
+    points_px = _match_board(lattice, board, mirrored=False)
     if points_px is None:
-        points_px = _by_opencv(lattice, board)
+        points_px = _find_with_opencv(lattice, board)
     if points_px is None:
-        if _matched(lattice, board, mirrored=True) is not None:
-            message = f"a mirrored print: this {board.title} is in view, left and right changed over: {UNMIRRORED}"
+        if _match_board(lattice, board, mirrored=True) is not None:
+            message = f"a mirrored print: this {board.title} is in view with left and right swapped: {MIRROR_REMEDY}"
             raise PoseRefusedError(message)
         return None
-    return pointing_right(points_px, board)
+    return orient_x_right(points_px, board)
 
 
-def _matched(lattice: Lattice, board: Board, *, mirrored: bool) -> FloatArray | None:
+def _match_board(lattice: Lattice, board: Board, *, mirrored: bool) -> FloatArray | None:
     """(n, 2) float64: the lattice's points in the board's order, if it is the whole board and nothing else."""
     across, down = (np.round(board.points_mm[:, :2] / board.square_mm)).astype(int).T
-    wanted = {place: index for index, place in enumerate(zip(across.tolist(), down.tolist(), strict=True))}
-    if len(lattice.places) != len(wanted):
+    board_index = {place: index for index, place in enumerate(zip(across.tolist(), down.tolist(), strict=True))}
+    if len(lattice.positions) != len(board_index):
         return None
-    places: Any = lattice.places * [-1, 1] if mirrored else lattice.places
+    positions: Any = lattice.positions * [-1, 1] if mirrored else lattice.positions
     for _ in range(4):
-        places = np.column_stack([-places[:, 1], places[:, 0]])
-        order = [wanted.get((x, y), -1) for x, y in (places - places.min(axis=0)).tolist()]
+        positions = np.column_stack([-positions[:, 1], positions[:, 0]])
+        order = [board_index.get((x, y), -1) for x, y in (positions - positions.min(axis=0)).tolist()]
         if min(order) >= 0:
-            points_px = np.zeros((len(wanted), 2))
+            points_px = np.zeros((len(board_index), 2))
             points_px[order] = lattice.points_px
             return points_px
     return None
 
 
-def _by_opencv(lattice: Lattice, board: Board) -> FloatArray | None:
-    """(n, 2) float64: the same by `findCirclesGrid`, which can leave out spots that are no circles of the board.
+def _find_with_opencv(lattice: Lattice, board: Board) -> FloatArray | None:
+    """(n, 2) float64: the same by `findCirclesGrid`, which can leave out other spots.
 
-    It is given few enough spots that it ends soon: among thousands it takes minutes.
+    Only for few spots: among thousands OpenCV takes minutes.
     """
-    if not board.corner_count < len(lattice.points_px) <= _MOST_SPOTS * board.corner_count:
+    if not board.corner_count < len(lattice.points_px) <= _MAX_SPOT_RATIO * board.corner_count:
         return None
     candidates: Any = lattice.points_px.astype(np.float32).reshape(-1, 1, 2)
     parameters = cv2.CirclesGridFinderParameters()
@@ -154,99 +161,98 @@ def _by_opencv(lattice: Lattice, board: Board) -> FloatArray | None:
     if not found:
         return None
     grid = np.asarray(centres, dtype=np.float64).reshape(board.rows, board.columns, 2)
-    if right_handed(grid) is not grid and half_turn_looks_same(board):
+    if make_right_handed(grid) is not grid and has_half_turn_symmetry(board):
         return None
-    # With an odd number of rows the print is its own mirror image, the last row in the first one's place.
-    return right_handed(grid).reshape(-1, 2)
+    # With an odd number of rows the print is its own mirror image with the rows in reverse order.
+    return make_right_handed(grid).reshape(-1, 2)
 
 
-def _first_radius(board_map: BoardMap, places: FloatArray, points_px: FloatArray, blobs: Blobs) -> float:
-    """The circles' radius over `square_mm`, from the size of the spots nearest to them."""
-    scale = np.sqrt(np.abs(np.linalg.det(board_map.jacobian(places, step=0.05))))
+def _initial_radius(board_map: BoardMap, positions: FloatArray, points_px: FloatArray, blobs: Blobs) -> float:
+    """Radius of the circles over `square_mm`, from the nearest spots."""
+    scale = np.sqrt(np.abs(np.linalg.det(board_map.jacobian(positions, step=0.05))))
     if not len(blobs.points_px):
         return 0.5
-    apart = np.linalg.norm(blobs.points_px[None] - points_px[:, None], axis=2)
-    radius = blobs.radius_px[apart.argmin(axis=1)] / scale
-    return float(np.clip(np.median(radius[apart.min(axis=1) < 0.3 * scale] if len(radius) else 0.5), 0.1, 0.7))
+    distance = np.linalg.norm(blobs.points_px[None] - points_px[:, None], axis=2)
+    radius = blobs.radius_px[distance.argmin(axis=1)] / scale
+    return float(np.clip(np.median(radius[distance.min(axis=1) < 0.3 * scale] if len(radius) else 0.5), 0.1, 0.7))
 
 
-def _ellipses(
-    level: FloatArray, board_map: BoardMap, places: FloatArray, rough_px: FloatArray, radius: float
-) -> tuple[FittedPlaces, float]:
-    """The ellipse of each circle, and the circles' radius over `square_mm` that they tell of."""
-    slope = board_map.jacobian(places, step=0.05)
+def _fit_ellipses(
+    level: FloatArray, board_map: BoardMap, positions: FloatArray, rough_px: FloatArray, radius: float
+) -> tuple[PointFit, float]:
+    """Fit the ellipse of each circle. Returns the fit and the circles' radius over `square_mm`."""
+    slope = board_map.jacobian(positions, step=0.05)
     ring_px = _RING_PX
     while True:
         left, sizes, _ = np.linalg.svd(slope * radius)
         shape = np.einsum("nij,nj,nkj->nik", left, 1 / sizes, left)
         half_px = int(np.clip(np.ceil(sizes[:, 0].max() + ring_px), 4, 90))
         offsets = patch_offsets(half_px) + (np.round(rough_px) - rough_px)[:, None]
-        out = np.linalg.norm(np.einsum("nij,nmj->nmi", shape, offsets), axis=-1)
-        from_outline = np.abs(out - 1) * sizes.min(axis=1)[:, None]
-        # Half way to the nearest other circle, which stands a diagonal of `square_mm` away.
-        usable = (out * radius < 0.95 * np.sqrt(0.5)) & (from_outline < ring_px)
-        fit, shapes = fitted_circles(level, rough_px, shape, usable, half_px=half_px)
-        good = np.isfinite(fit.sigma_px) & (fit.sigma_px < WORST_SIGMA_PX)
-        if not good.any():
+        relative_radius = np.linalg.norm(np.einsum("nij,nmj->nmi", shape, offsets), axis=-1)
+        outline_distance = np.abs(relative_radius - 1) * sizes.min(axis=1)[:, None]
+        # Half way to the nearest other circle, at a diagonal of `square_mm`.
+        usable = (relative_radius * radius < 0.95 * np.sqrt(0.5)) & (outline_distance < ring_px)
+        fit, shapes = fit_circles(level, rough_px, shape, usable, half_px=half_px)
+        valid = np.isfinite(fit.sigma_px) & (fit.sigma_px < MAX_SIGMA_PX)
+        if not valid.any():
             return fit, radius
         area = np.abs(np.linalg.det(shapes)) * np.abs(np.linalg.det(slope))
-        radius = float(np.median(1 / np.sqrt(area[good])))
-        needed_px = min(_RING_BLURS * float(np.median(fit.blur_px[good])), float(np.median(sizes)))
-        if ring_px > _RING_PX or needed_px <= ring_px:
+        radius = float(np.median(1 / np.sqrt(area[valid])))
+        required_px = min(_RING_BLURS * float(np.median(fit.blur_px[valid])), float(np.median(sizes)))
+        if ring_px > _RING_PX or required_px <= ring_px:
             return fit, radius
-        ring_px = needed_px
+        ring_px = required_px
 
 
-def _ellipse_shift(board_map: BoardMap, places: FloatArray, radius: float) -> FloatArray:
-    """(n, 2) float64, px: from each circle's centre as it is seen to the centre of the ellipse that it is seen as."""
-    angle = np.arange(_OUTLINE) * (2 * np.pi / _OUTLINE)
-    outline = places[:, None] + radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    seen = board_map(places)
-    off = board_map(outline) - seen[:, None]
-    scale = np.sqrt((off**2).mean(axis=(1, 2)))[:, None]
-    x, y = off[..., 0] / scale, off[..., 1] / scale
-    # a x^2 + b x y + c y^2 + d x + e y = 1; its centre is where both derivatives vanish.
+def _ellipse_shift(board_map: BoardMap, positions: FloatArray, radius: float) -> FloatArray:
+    """(n, 2) float64, px: from the image of each circle's centre to the centre of its ellipse."""
+    angle = np.arange(_OUTLINE_POINTS) * (2 * np.pi / _OUTLINE_POINTS)
+    outline = positions[:, None] + radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    mapped = board_map(positions)
+    offset = board_map(outline) - mapped[:, None]
+    scale = np.sqrt((offset**2).mean(axis=(1, 2)))[:, None]
+    x, y = offset[..., 0] / scale, offset[..., 1] / scale
+    # a x^2 + b x y + c y^2 + d x + e y = 1, with its centre where both derivatives vanish.
     design = np.stack([x * x, x * y, y * y, x, y], axis=-1)
-    conic = np.matmul(np.linalg.pinv(design), np.ones((len(places), _OUTLINE, 1)))[..., 0]
+    conic = np.matmul(np.linalg.pinv(design), np.ones((len(positions), _OUTLINE_POINTS, 1)))[..., 0]
     a, b, c, d, e = conic.T
-    bends = np.stack([np.stack([2 * a, b], axis=-1), np.stack([b, 2 * c], axis=-1)], axis=-2)
-    centre = np.linalg.solve(bends, -np.stack([d, e], axis=-1)[..., None])[..., 0]
+    hessian = np.stack([np.stack([2 * a, b], axis=-1), np.stack([b, 2 * c], axis=-1)], axis=-2)
+    centre = np.linalg.solve(hessian, -np.stack([d, e], axis=-1)[..., None])[..., 0]
     return np.asarray(centre * scale)
 
 
-def _another(board: Board, seen: Lattice) -> str:
-    found, wanted = sorted((seen.columns, seen.rows)), sorted((2 * board.columns, board.rows))
+def _explain_other_circles(board: Board, lattice: Lattice) -> str:
+    """Describe the difference between the circles in view and the board, and what to do."""
+    found, expected = sorted((lattice.columns, lattice.rows)), sorted((2 * board.columns, board.rows))
     if found == sorted((2 * board.rows, board.columns)):
         return (
             f"another board: expected circles in {board.rows} rows of {board.columns}, found {board.columns} rows of "
-            f"{board.rows}: turn them round, {setting('corners')} {board.rows}x{board.columns} (circles in a row, "
-            "then rows)"
+            f"{board.rows}: swap them, {setting('corners')} {board.rows}x{board.columns} (circles in a row, then rows)"
         )
     return (
-        f"another board: expected circles in {board.rows} rows of {board.columns}, found a grid of circles over "
-        f"{found[1]} by {found[0]} half distances where this one goes over {wanted[1]} by {wanted[0]}: take the other "
-        f"board, or give its circles as {setting('corners')} (circles in a row, then rows), or take away what covers a "
-        "part"
+        f"another board: expected circles in {board.rows} rows of {board.columns} ({expected[1]} by {expected[0]} half "
+        f"distances), found a grid of {found[1]} by {found[0]} half distances: use the other board, give the circles "
+        f"of this one as {setting('corners')} (circles in a row, then rows), or uncover its covered part"
     )
 
 
-def _cause(grey: Grey, board: Board, blobs: Blobs, seen: Lattice | None) -> str:
-    """Why these circles are not found."""
-    other = other_words(grey, board)
-    if other or seen is None:
-        return other or f"no {board.title} found: {grey.likely_cause()}"
-    sides = seen.cut_sides(grey.level.shape)
-    full = (seen.columns * seen.rows + 1) // 2
-    extent = {seen.columns, seen.rows}
-    if not seen.fits_in(board) or (
-        extent != {2 * board.columns, board.rows} and len(seen.places) >= full - 1 and not sides
+def _explain_circles(grey: GreyImage, board: Board, blobs: Blobs, lattice: Lattice | None) -> str:
+    """Describe why these circles are not found, and what to do."""
+    other_board = explain_other_board(grey, board)
+    if other_board or lattice is None:
+        return other_board or f"no {board.title} found: {grey.likely_cause()}"
+    clipped_sides = lattice.clipped_sides(grey.level.shape)
+    complete_count = (lattice.columns * lattice.rows + 1) // 2
+    extent = {lattice.columns, lattice.rows}
+    if not lattice.may_be_part_of(board) or (
+        extent != {2 * board.columns, board.rows} and len(lattice.positions) >= complete_count - 1 and not clipped_sides
     ):
-        return _another(board, seen)
-    part = f"{len(seen.places)} of {board.corner_count} circles"
+        return _explain_other_circles(board, lattice)
+    part = f"{len(lattice.positions)} of {board.corner_count} circles"
     radius = float(np.median(blobs.radius_px))
-    if radius < _SMALL_PX and not sides:
+    if radius < _MIN_RADIUS_PX and not clipped_sides:
         return (
-            f"{board.title}: only {part} are found, and they are {2 * radius:.0f} pixels wide: bring the board closer, "
-            f"{2 * _SMALL_PX:.0f} pixels are the least"
+            f"{board.title}: only {part} are found, {2 * radius:.0f} pixels wide: bring the board closer, until they "
+            f"are {2 * _MIN_RADIUS_PX:.0f} pixels wide or more"
         )
-    return half_words(part, sides)
+    return explain_partial_board(part, clipped_sides)

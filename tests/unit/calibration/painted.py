@@ -36,7 +36,7 @@ class Eye:
     def principal(self) -> tuple[float, float]:
         return self.centre_px or ((self.width - 1) / 2, (self.height - 1) / 2)
 
-    def seen(self, points_mm: Array) -> Array:
+    def project(self, points_mm: Array) -> Array:
         """(n, 2): where points of the board, (n, 3), are seen."""
         x, y, z = self.rotation @ points_mm.T + self.translation_mm[:, None]
         u, v = _bent(x / z, y / z, self.distortion)

@@ -12,7 +12,7 @@ import pytest
 
 from slrig.calibration.board import Board, BoardKind, BoardView
 from slrig.calibration.detection.detection import find_board
-from slrig.calibration.detection.lattice import equivalent_views, turned_half
+from slrig.calibration.detection.lattice import equivalent_numberings, rotate_half_turn
 from slrig.calibration.printing import FIT, PAGES_MM, artwork, board_pdf, board_svg, charuco_board
 from slrig.cli.boards import board_option
 from slrig.errors import CalibrationError
@@ -199,7 +199,7 @@ def _whole(board: Board) -> BoardView:
     ids=str,
 )
 def test_a_print_has_as_many_numberings_as_sides_from_which_it_looks_the_same(board: Board, numberings: int) -> None:
-    views = equivalent_views(_whole(board), board)
+    views = equivalent_numberings(_whole(board), board)
     assert len(views) == numberings
     for view in views:
         # The same points, and a turn of the board takes its places to them: no reflection.
@@ -215,11 +215,11 @@ def test_turning_by_half_twice_changes_nothing_and_a_one_sided_board_is_not_turn
     board = Board(BoardKind.CHESSBOARD, 7, 9, 10.0)
     view = _whole(board)
     part = BoardView(view.corner[3:40], view.points_px[3:40], view.sigma_px[3:40])
-    again = turned_half(turned_half(part, board), board)
+    again = rotate_half_turn(rotate_half_turn(part, board), board)
     assert np.array_equal(again.corner, part.corner)
     assert np.array_equal(again.points_px, part.points_px)
     with pytest.raises(ValueError, match="one numbering"):
-        turned_half(_whole(Board(BoardKind.CIRCLES, 4, 11, 10.0)), Board(BoardKind.CIRCLES, 4, 11, 10.0))
+        rotate_half_turn(_whole(Board(BoardKind.CIRCLES, 4, 11, 10.0)), Board(BoardKind.CIRCLES, 4, 11, 10.0))
 
 
 def test_the_options_of_a_command_describe_a_board() -> None:
@@ -257,7 +257,7 @@ def test_every_dictionary_named_is_one_of_opencvs() -> None:
 def test_readings_of_both_scales_make_the_board_what_its_print_is() -> None:
     board = Board(BoardKind.CHARUCO, 11, 8, 12.0)
     assert board.rulers_mm == (140, 100)
-    read = board.as_read(140.7, 99.9)
+    read = board.as_measured(140.7, 99.9)
     assert read.square_mm == pytest.approx(12 * 1.005)
     assert read.marker_mm == pytest.approx(9 * 1.005)
     assert read.aspect == pytest.approx(0.999 / 1.005)
@@ -265,8 +265,8 @@ def test_readings_of_both_scales_make_the_board_what_its_print_is() -> None:
     assert (width, height) == (pytest.approx(120 * 1.005), pytest.approx(84 * 0.999))
     # A steel ruler's tenth of a millimetre over each of the lengths.
     assert read.square_sigma == pytest.approx(np.sqrt((0.1 / 140) ** 2 / 2 + (0.1 / 100) ** 2 / 2))
-    assert board.as_read(140.7, 99.9, square_sigma=2e-4).square_sigma == 2e-4
+    assert board.as_measured(140.7, 99.9, square_sigma=2e-4).square_sigma == 2e-4
     with pytest.raises(CalibrationError, match="the scale below the board is 140 mm long in print, read as 100 mm"):
-        board.as_read(100, 100)
-    with pytest.raises(CalibrationError, match="square_sigma: expected a share"):
+        board.as_measured(100, 100)
+    with pytest.raises(CalibrationError, match="square_sigma: expected a relative deviation"):
         Board(BoardKind.CHARUCO, 11, 8, 12.0, square_sigma=0.1)

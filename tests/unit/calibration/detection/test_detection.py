@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from slrig.calibration.board import Board, BoardKind, BoardView
 from slrig.calibration.detection.detection import (
-    blur_sigma_px,
-    board_region,
+    board_mask,
     find_board,
-    light_squares,
-    placed_again,
-    square_interior,
+    interior_mask,
+    measure_blur_px,
+    paper_mask,
+    refine_view,
 )
-from slrig.calibration.detection.lattice import equivalent_views
+from slrig.calibration.detection.lattice import equivalent_numberings
 from slrig.errors import PoseRefusedError
 from tests.unit.calibration.painted import Eye, Print, as_8_bit, board_points, looking, painted
 
@@ -69,7 +69,7 @@ def eye(board: Board, **further: Any) -> Eye:
 
 
 @cache
-def shot(board: Board, seen_by: Eye | None = None, *, noise: float = NOISE, **look: Any) -> NDArray[np.uint8]:
+def shoot(board: Board, seen_by: Eye | None = None, *, noise: float = NOISE, **look: Any) -> NDArray[np.uint8]:
     image = painted(board, seen_by or eye(board), **({"samples": 4} | look))
     found = as_8_bit(image + np.random.default_rng(1).normal(0, noise, image.shape))
     found.flags.writeable = False
@@ -77,7 +77,7 @@ def shot(board: Board, seen_by: Eye | None = None, *, noise: float = NOISE, **lo
 
 
 def misses(view: BoardView, board: Board, seen_by: Eye) -> NDArray[np.float64]:
-    return view.points_px - seen_by.seen(board_points(board)[view.corner])
+    return view.points_px - seen_by.project(board_points(board)[view.corner])
 
 
 @pytest.mark.parametrize(("board", "look"), [slow(*KINDS[0]), *KINDS[1:]], ids=title)
@@ -96,7 +96,7 @@ def test_corners_lie_where_they_are_within_what_they_state(
     seen_by = eye(board, tilt_deg=tilt_deg, **FINE)
     # Four samples a side leave edges of their own making, of a size with what is measured here.
     shaded = replace(look, shading=(0.4, -0.3))
-    image = shot(board, seen_by, blur_px=blur_px, noise=noise, look=shaded, samples=7)
+    image = shoot(board, seen_by, blur_px=blur_px, noise=noise, look=shaded, samples=7)
     view = find_board(image, board, full_scale=255)
     assert view.light_first is look.light_first
     assert len(view.corner) == board.corner_count
@@ -113,7 +113,7 @@ def test_corners_lie_where_they_are_within_what_they_state(
 @pytest.mark.parametrize("radius", [0.3, 0.4, 0.6])
 def test_circles_of_any_radius_are_found(radius: float) -> None:
     seen_by = eye(CIRCLES, **FINE)
-    view = find_board(shot(CIRCLES, seen_by, look=Print(circle_radius=radius)), CIRCLES, full_scale=255)
+    view = find_board(shoot(CIRCLES, seen_by, look=Print(circle_radius=radius)), CIRCLES, full_scale=255)
     assert len(view.corner) == CIRCLES.corner_count
     assert np.sqrt((misses(view, CIRCLES, seen_by) ** 2).mean()) < 0.02
 
@@ -122,7 +122,7 @@ def test_circles_of_any_radius_are_found(radius: float) -> None:
 @pytest.mark.parametrize(("board", "look"), [slow(*KINDS[0]), *KINDS[1:3], slow(*KINDS[3])], ids=title)
 def test_a_board_with_one_numbering_has_it_however_it_is_held(board: Board, look: Print, roll_deg: float) -> None:
     seen_by = eye(board, roll_deg=roll_deg)
-    view = find_board(shot(board, seen_by, look=look), board, full_scale=255)
+    view = find_board(shoot(board, seen_by, look=look), board, full_scale=255)
     assert np.abs(misses(view, board, seen_by)).max() < 0.1
 
 
@@ -130,8 +130,8 @@ def test_a_board_with_one_numbering_has_it_however_it_is_held(board: Board, look
 @pytest.mark.parametrize("board", [Board(BoardKind.CHESSBOARD, 7, 5, 14.0), slow(EVEN_CIRCLES)], ids=title)
 def test_a_board_with_two_numberings_has_the_true_one_among_them(board: Board, roll_deg: float) -> None:
     seen_by = eye(board, roll_deg=roll_deg)
-    view = find_board(shot(board, seen_by), board, full_scale=255)
-    worst = [np.abs(misses(each, board, seen_by)).max() for each in equivalent_views(view, board)]
+    view = find_board(shoot(board, seen_by), board, full_scale=255)
+    worst = [np.abs(misses(each, board, seen_by)).max() for each in equivalent_numberings(view, board)]
     assert min(worst) < 0.1
     assert max(worst) > 10
     grid = view.points_px.reshape(board.rows, board.columns, 2)
@@ -148,7 +148,7 @@ def test_any_depth_of_image_gives_the_same_corners(full_scale: float) -> None:
 
 
 def test_a_dim_image_is_enough_and_its_corners_say_so() -> None:
-    bright = find_board(shot(CHARUCO, noise=0.002), CHARUCO, full_scale=255)
+    bright = find_board(shoot(CHARUCO, noise=0.002), CHARUCO, full_scale=255)
     dim = painted(CHARUCO, eye(CHARUCO), samples=4) * 0.08
     dim_view = find_board(as_8_bit(dim + np.random.default_rng(1).normal(0, 0.002, dim.shape)), CHARUCO, full_scale=255)
     assert np.median(dim_view.sigma_px) > 2 * np.median(bright.sigma_px)
@@ -157,11 +157,11 @@ def test_a_dim_image_is_enough_and_its_corners_say_so() -> None:
 @pytest.mark.parametrize("look", [Print(), OLD], ids=title)
 def test_a_part_of_a_charuco_board_is_enough(look: Print) -> None:
     seen_by = eye(CHARUCO, shift_mm=(45.0, 20.0))
-    view = find_board(shot(CHARUCO, seen_by, look=look), CHARUCO, full_scale=255)
+    view = find_board(shoot(CHARUCO, seen_by, look=look), CHARUCO, full_scale=255)
     assert view.light_first is look.light_first
     assert 8 <= len(view.corner) < CHARUCO.corner_count
     assert np.abs(misses(view, CHARUCO, seen_by)).max() < 0.06
-    places = seen_by.seen(board_points(CHARUCO))
+    places = seen_by.project(board_points(CHARUCO))
     within = ((places > 8) & (places < np.array([seen_by.width, seen_by.height]) - 9)).all(axis=1)
     assert set(np.flatnonzero(within)) - set(view.corner.tolist()) == set()
 
@@ -169,8 +169,8 @@ def test_a_part_of_a_charuco_board_is_enough(look: Print) -> None:
 @pytest.mark.parametrize(("board", "look"), [(CHARUCO, OLD), *(slow(*each) for each in KINDS[:3])], ids=title)
 def test_corners_are_placed_again_after_a_small_movement(board: Board, look: Print) -> None:
     before, after = eye(board), eye(board, shift_mm=(0.1, -0.05))
-    view = find_board(shot(board, before, look=look), board, full_scale=255)
-    again = placed_again(shot(board, after, look=look), view, board, full_scale=255)
+    view = find_board(shoot(board, before, look=look), board, full_scale=255)
+    again = refine_view(shoot(board, after, look=look), view, board, full_scale=255)
     assert again.light_first is look.light_first
     assert again.corner.tolist() == view.corner.tolist()
     assert np.abs(misses(again, board, after).mean(axis=0)).max() < 0.02 < np.abs(misses(again, board, before)).max()
@@ -178,7 +178,7 @@ def test_corners_are_placed_again_after_a_small_movement(board: Board, look: Pri
 
 def test_boards_of_an_odd_number_of_rows_of_squares_have_one_layout() -> None:
     odd = Board(BoardKind.CHARUCO, 7, 4, 14.0)
-    assert not find_board(shot(odd), odd, full_scale=255).light_first
+    assert not find_board(shoot(odd), odd, full_scale=255).light_first
 
 
 def test_the_old_layout_is_opencvs_own_print() -> None:
@@ -193,28 +193,28 @@ def test_the_old_layout_is_opencvs_own_print() -> None:
     assert np.abs(view.points_px - expected).max() < 0.05
 
 
-def refused(image: NDArray[np.uint8], board: Board, words: str) -> None:
-    with pytest.raises(PoseRefusedError, match=words):
+def assert_refused(image: NDArray[np.uint8], board: Board, message: str) -> None:
+    with pytest.raises(PoseRefusedError, match=message):
         find_board(image, board, full_scale=255)
 
 
 @pytest.mark.parametrize("board", [CHARUCO, slow(CHESSBOARD), slow(CIRCLES)], ids=title)
 def test_nothing_in_view_is_refused_with_the_likely_cause(board: Board) -> None:
     random = np.random.default_rng(3)
-    refused(as_8_bit(random.normal(0.4, 0.02, (320, 400))), board, "not in view")
-    refused(as_8_bit(random.normal(0.01, 0.003, (320, 400))), board, "too dark")
-    refused(as_8_bit(random.normal(0.4, 0.001, (320, 400))), board, "no contrast")
-    refused(as_8_bit(20 * painted(board, eye(board), samples=1)), board, "clipped to white")
+    assert_refused(as_8_bit(random.normal(0.4, 0.02, (320, 400))), board, "not in view")
+    assert_refused(as_8_bit(random.normal(0.01, 0.003, (320, 400))), board, "too dark")
+    assert_refused(as_8_bit(random.normal(0.4, 0.001, (320, 400))), board, "no contrast")
+    assert_refused(as_8_bit(20 * painted(board, eye(board), samples=1)), board, "clipped to white")
 
 
 @pytest.mark.parametrize(("board", "blur_px"), [(CHARUCO, 9.0), slow(CHESSBOARD, 11.0)], ids=title)
 def test_a_board_out_of_focus_is_refused(board: Board, blur_px: float) -> None:
     seen_by = eye(board, **FINE) if board is CHESSBOARD else eye(board)
-    refused(shot(board, seen_by, blur_px=blur_px, samples=2), board, "out of focus")
+    assert_refused(shoot(board, seen_by, blur_px=blur_px, samples=2), board, "out of focus")
 
 
 @pytest.mark.parametrize(
-    ("asked", "there", "words"),
+    ("asked", "there", "message"),
     [
         slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 7, 11.0), "another board.*found a chessboard of 10 x 7"),
         slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 5, 11.0), "another board.*found a chessboard of 10 x 5"),
@@ -226,41 +226,43 @@ def test_a_board_out_of_focus_is_refused(board: Board, blur_px: float) -> None:
         slow(CHARUCO, CIRCLES, "another board.*circles"),
         (CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, dictionary="DICT_4X4_100"), "another board.*DICT_4X4"),
         slow(CHARUCO, Board(BoardKind.CHARUCO, 9, 6, 12.0), "another board.*marker .* is in view.*9 corners in a row"),
-        (CHARUCO, Board(BoardKind.CHARUCO, 5, 4, 16.0), "another board.*do not stand.*5 corners in a row"),
-        slow(CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, marker_mm=7.7), "another board.*0.5. of a square wide"),
+        (CHARUCO, Board(BoardKind.CHARUCO, 5, 4, 16.0), "another board.*are not in the order.*5 corners in a row"),
+        slow(
+            CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, marker_mm=7.7), "another board.*of a square wide.*found 0.5"
+        ),
         slow(CIRCLES, Board(BoardKind.CIRCLES, 4, 9, 9.0), "another board.*7 rows of 4"),
         slow(CIRCLES, Board(BoardKind.CIRCLES, 5, 7, 9.0), "another board.*7 rows of 4"),
         slow(CIRCLES, CHESSBOARD, "another board.*chessboard of 8 x 5"),
     ],
     ids=title,
 )
-def test_another_board_is_refused_and_named(asked: Board, there: Board, words: str) -> None:
-    refused(shot(there, eye(there, **FINE)), asked, words)
+def test_another_board_is_refused_and_named(asked: Board, there: Board, message: str) -> None:
+    assert_refused(shoot(there, eye(there, **FINE)), asked, message)
 
 
-@pytest.mark.parametrize(("count", "words"), [(15, "another board.*found 15 of DICT_4X4"), slow(8, "not in view")])
-def test_markers_in_no_board_s_order_are_named_if_they_are_a_dozen(count: int, words: str) -> None:
+@pytest.mark.parametrize(("count", "message"), [(15, "another board.*found 15 of DICT_4X4"), slow(8, "not in view")])
+def test_markers_in_no_board_s_order_are_named_if_they_are_a_dozen(count: int, message: str) -> None:
     """Single markers are read into anything."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     image = np.full((320, 400), 190, np.uint8)
     for place, number in enumerate(np.random.default_rng(7).permutation(50)[:count].tolist()):
         top, left = 20 + 100 * (place // 5), 15 + 76 * (place % 5)
         image[top : top + 60, left : left + 60] = cv2.aruco.generateImageMarker(dictionary, number, 60)
-    refused(image, CHARUCO, words)
+    assert_refused(image, CHARUCO, message)
 
 
 @pytest.mark.parametrize("there", [CHARUCO, slow(CIRCLES)], ids=title)
 def test_corners_that_were_given_the_wrong_way_round_are_named(there: Board) -> None:
     asked = Board(there.kind, there.rows, there.columns, there.square_mm)
-    words = f"another board.*turn them round, corners .--corners. {there.columns}x{there.rows}"
-    refused(shot(there, eye(there)), asked, words)
+    message = f"another board.*swap them, corners .--corners. {there.columns}x{there.rows}"
+    assert_refused(shoot(there, eye(there)), asked, message)
 
 
 def test_a_chessboard_is_the_same_whichever_way_round_its_corners_are_given() -> None:
     seen_by = eye(CHESSBOARD)
     turned = Board(BoardKind.CHESSBOARD, CHESSBOARD.rows, CHESSBOARD.columns, CHESSBOARD.square_mm)
-    view = find_board(shot(CHESSBOARD, seen_by), turned, full_scale=255)
-    truth = seen_by.seen(board_points(CHESSBOARD))
+    view = find_board(shoot(CHESSBOARD, seen_by), turned, full_scale=255)
+    truth = seen_by.project(board_points(CHESSBOARD))
     nearest = np.linalg.norm(view.points_px[:, None] - truth, axis=2)
     assert nearest.min(axis=1).max() < 0.1
     # A turned board, and no mirrored one: the print's neighbours are neighbours, in right-handed order.
@@ -273,17 +275,17 @@ def test_a_chessboard_is_the_same_whichever_way_round_its_corners_are_given() ->
 
 @pytest.mark.parametrize("board", [CHARUCO, slow(EVEN_CIRCLES)], ids=title)
 def test_a_mirrored_print_is_refused(board: Board) -> None:
-    refused(shot(board, look=Print(mirrored=True)), board, "mirrored print.*without mirroring")
+    assert_refused(shoot(board, look=Print(mirrored=True)), board, "mirrored print.*without mirroring")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("board", [CHESSBOARD, CIRCLES], ids=title)
 def test_a_mirrored_print_that_is_its_own_mirror_image_does_no_harm(board: Board) -> None:
     seen_by = eye(board)
-    view = find_board(shot(board, seen_by, look=Print(mirrored=True)), board, full_scale=255)
+    view = find_board(shoot(board, seen_by, look=Print(mirrored=True)), board, full_scale=255)
     width = 2 * board.columns if board.kind is BoardKind.CIRCLES else board.columns
     places = board_points(board) * [-1, 1, 1] + [(width - 1) * board.square_mm, 0, 0]
-    truth = seen_by.seen(places)
+    truth = seen_by.project(places)
     apart = np.linalg.norm(view.points_px[:, None] - truth, axis=2).min(axis=1)
     assert apart.max() < 0.1
 
@@ -302,15 +304,15 @@ def test_half_a_board_is_refused_with_the_side_that_cuts_it_off(
     board: Board, shift_mm: tuple[float, float], side: str
 ) -> None:
     seen_by = eye(board, shift_mm=shift_mm, roll_deg=0.0, tilt_deg=(5.0, 5.0))
-    refused(shot(board, seen_by), board, f"half a board.*{side} side.*fully into view, or use a ChArUco")
+    assert_refused(shoot(board, seen_by), board, f"half a board.*{side} side.*whole board into view, or use a ChArUco")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("board", [CHESSBOARD, CIRCLES], ids=title)
 def test_a_covered_board_is_refused(board: Board) -> None:
-    image = shot(board, eye(board, roll_deg=0.0, tilt_deg=(5.0, 5.0))).copy()
+    image = shoot(board, eye(board, roll_deg=0.0, tilt_deg=(5.0, 5.0))).copy()
     image[:, 250:] = 90
-    refused(image, board, "take away what covers")
+    assert_refused(image, board, "remove what covers")
 
 
 def light_to(towards_deg: float, squares: float) -> tuple[float, float, float]:
@@ -325,7 +327,7 @@ def light_to(towards_deg: float, squares: float) -> tuple[float, float, float]:
 def test_light_that_ends_near_the_print_makes_no_other_board(towards: tuple[float, float]) -> None:
     """Lit and unlit paper alternate with the outermost squares there, as on a board with a line more."""
     seen_by = eye(CHESSBOARD)
-    view = find_board(shot(CHESSBOARD, seen_by, look=Print(lit=light_to(*towards))), CHESSBOARD, full_scale=255)
+    view = find_board(shoot(CHESSBOARD, seen_by, look=Print(lit=light_to(*towards))), CHESSBOARD, full_scale=255)
     assert len(view.corner) >= CHESSBOARD.corner_count - 3
     assert np.abs(misses(view, CHESSBOARD, seen_by)).max() < 0.15
 
@@ -340,7 +342,7 @@ def test_a_board_that_the_light_ends_on_is_numbered_rightly_or_refused_in_the_ri
         )
         look = Print(lit=light_to(rng.uniform(0, 360), rng.uniform(-2.0, 1.2)))
         try:
-            view = find_board(shot(CHESSBOARD, seen_by, look=look), CHESSBOARD, full_scale=255)
+            view = find_board(shoot(CHESSBOARD, seen_by, look=look), CHESSBOARD, full_scale=255)
         except PoseRefusedError as refusal:
             refusals.append(str(refusal))
             continue
@@ -349,23 +351,23 @@ def test_a_board_that_the_light_ends_on_is_numbered_rightly_or_refused_in_the_ri
         assert (np.abs(misses(view, CHESSBOARD, seen_by)).max(axis=1) < 0.15 + 5 * view.sigma_px).all(), number
     assert found >= 4
     assert len(refusals) >= 4
-    assert all("most likely the projector's picture ends on the board" in words for words in refusals)
+    assert all("most likely the projector's image ends on the board" in message for message in refusals)
 
 
 def test_too_little_of_a_charuco_board_is_refused() -> None:
-    image = shot(CHARUCO, eye(CHARUCO, roll_deg=0.0, tilt_deg=(5.0, 5.0))).copy()
+    image = shoot(CHARUCO, eye(CHARUCO, roll_deg=0.0, tilt_deg=(5.0, 5.0))).copy()
     image[:, 150:] = 90
-    refused(image, CHARUCO, "too little of the charuco")
+    assert_refused(image, CHARUCO, "too little of the charuco")
 
 
 @pytest.mark.parametrize("look", [slow(Print()), OLD], ids=title)
 def test_markers_that_stand_so_in_both_layouts_are_too_little(look: Print) -> None:
     """All markers but those of one row are covered: a step of one square aside they are the other layout's."""
     straight = looking(CHARUCO, distance_mm=205.0)
-    image = shot(CHARUCO, straight, look=look).copy()
-    row = straight.seen(np.array([[0.0, 1.3 * 14, 0.0], [0.0, 2.7 * 14, 0.0]]))[:, 1].astype(int)
+    image = shoot(CHARUCO, straight, look=look).copy()
+    row = straight.project(np.array([[0.0, 1.3 * 14, 0.0], [0.0, 2.7 * 14, 0.0]]))[:, 1].astype(int)
     image[: row[0] - 7], image[row[1] + 7 :] = 90, 90
-    refused(image, CHARUCO, "too little of the charuco")
+    assert_refused(image, CHARUCO, "too little of the charuco")
 
 
 @pytest.mark.parametrize(("board", "look"), [*(slow(*each) for each in KINDS[:3]), KINDS[3]], ids=title)
@@ -375,9 +377,9 @@ def test_masks_follow_the_print(board: Board, look: Print) -> None:
     bare = replace(look, paper_squares=0.0, beyond=0.4)
     image = painted(board, seen_by, blur_px=0.0, samples=4, look=bare)
     view = find_board(painted(board, seen_by, samples=4, look=look), board, full_scale=1.0)
-    region = board_region(view, board, size)
-    light = light_squares(view, board, size)
-    inner = square_interior(view, board, size, margin_px=1.5)
+    region = board_mask(view, board, size)
+    light = paper_mask(view, board, size)
+    inner = interior_mask(view, board, size, margin_px=1.5)
     on_print = np.abs(image - 0.4) > 1e-6
     assert np.mean(region == on_print) > 0.99
     # Away from edges each mask is right without an exception.
@@ -393,11 +395,11 @@ def test_masks_follow_the_print(board: Board, look: Print) -> None:
 @pytest.mark.parametrize(("board", "look"), [slow(*KINDS[0]), KINDS[1], slow(*KINDS[2]), KINDS[3]], ids=title)
 @pytest.mark.parametrize("blur_px", [slow(0.7), 1.3])
 def test_the_blur_is_measured(board: Board, look: Print, blur_px: float) -> None:
-    image = shot(board, eye(board, distance_mm=170.0, tilt_deg=(5.0, 5.0)), blur_px=blur_px, look=look)
+    image = shoot(board, eye(board, distance_mm=170.0, tilt_deg=(5.0, 5.0)), blur_px=blur_px, look=look)
     view = find_board(image, board, full_scale=255)
     # A pixel's own extent blurs by 1/sqrt(12).
     expected = np.hypot(blur_px, 12**-0.5)
-    assert blur_sigma_px(image, view, board, full_scale=255) == pytest.approx(expected, rel=0.12)
+    assert measure_blur_px(image, view, board, full_scale=255) == pytest.approx(expected, rel=0.12)
 
 
 def test_an_image_that_is_none_is_a_fault_of_the_caller() -> None:
@@ -418,7 +420,7 @@ def test_a_board_is_found_or_refused_in_the_time_of_a_few_filters(asked: Board, 
         size: dict[str, Any] = {"width": 1280, "height": 1024, "focal_px": 1600.0}
         wrong = Board(there.kind, there.columns + 2, there.rows + 2, 0.8 * there.square_mm)
         shown = there if there == asked else wrong
-        image = shot(shown, eye(shown, **size))
+        image = shoot(shown, eye(shown, **size))
 
     def filters() -> None:
         for _ in range(4):

@@ -9,22 +9,22 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.calibration.board import Board, BoardKind, BoardView, PoseObservation, ViewFigures
+from slrig.calibration.board import Board, BoardKind, BoardView, PoseObservation, ViewQuality
 from slrig.calibration.poses import checks
-from slrig.calibration.poses.checks import PoseAnswer, check_same_devices, coverage_picture, judge_pose, pose_picture
+from slrig.calibration.poses.checks import PoseAssessment, check_pose, check_same_devices, draw_coverage, draw_pose
 from slrig.calibration.poses.guidance import (
     GOALS,
     Advice,
-    _cells,
-    _reach,
+    _cell_sigma_px,
+    _lens_sensitivity,
+    advise_pose,
     attitude,
     board_rotation,
-    cells_of,
+    count_per_cell,
     coverage,
-    full_turn_deg,
-    next_move,
+    symmetry_angle_deg,
 )
-from slrig.calibration.poses.initial import rig_guess
+from slrig.calibration.poses.initial import estimate_rig
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose
 from slrig.errors import CalibrationError
 from slrig.model import FloatArray, Pinhole, Size
@@ -66,7 +66,7 @@ def _followed(shooting: Shooting, advice: Advice) -> BoardPose:
 
 def test_cells_count_points_where_they_lie() -> None:
     points_px = np.array([[-0.4, -0.4], [59.4, 0.0], [59.6, 0.0], [359.4, 239.4], [359.6, 0.0], [-0.6, 5.0]])
-    cells = cells_of(points_px, Size(360, 240))
+    cells = count_per_cell(points_px, Size(360, 240))
     assert cells[0, 0] == 2
     assert cells[0, 1] == 1
     assert cells[5, 5] == 1
@@ -101,8 +101,8 @@ def test_a_turn_is_clockwise_in_the_picture() -> None:
 
 def test_a_board_that_looks_the_same_after_half_a_turn_needs_no_such_turn() -> None:
     alike = Board(BoardKind.CHESSBOARD, 9, 7, 12.0)
-    assert full_turn_deg(alike) == 180
-    assert full_turn_deg(CHESSBOARD) == full_turn_deg(Board(BoardKind.CHARUCO, 9, 7, 12.0)) == 360
+    assert symmetry_angle_deg(alike) == 180
+    assert symmetry_angle_deg(CHESSBOARD) == symmetry_angle_deg(Board(BoardKind.CHARUCO, 9, 7, 12.0)) == 360
     for board, turns in ((alike, 1), (Board(BoardKind.CHARUCO, 9, 7, 12.0), 2)):
         shooting = rig_of("left", board=board)
         board_pose = [held(board, tilt=(20.0, 0.0)), held(board, tilt=(0.0, 20.0), in_plane_deg=180.0)]
@@ -114,14 +114,14 @@ def test_the_guess_finds_the_devices_from_a_few_poses() -> None:
     shooting = rig_of()
     poses = _first(shooting)
     poses.append(shooting.shot("pose_03", held(CHESSBOARD, tilt=(-30.0, 15.0), middle_mm=(60.0, 40.0, 540.0))))
-    guess = rig_guess(poses, CHESSBOARD, shooting.sizes)
+    guess = estimate_rig(poses, CHESSBOARD, shooting.sizes)
     for name, guessed in guess.devices.items():
         truth = shooting.devices[name]
         assert guessed.matrix[0, 0] == pytest.approx(truth.matrix[0, 0], rel=0.03), name
         assert guessed.poses.keys() == {"pose_00", "pose_01", "pose_02", "pose_03"}
     # A lens shift beyond the image's edge is seen from the first poses on.
     assert guess.devices[PROJECTOR].matrix[1, 2] == pytest.approx(860, abs=40)
-    way = guess.relative("left", "right")
+    way = guess.relative_pose("left", "right")
     assert way is not None
     assert way.translation_mm == pytest.approx(shooting.devices["right"].translation_mm, abs=3.0)
 
@@ -132,7 +132,7 @@ def test_a_wide_lens_is_guessed_too() -> None:
     shooting = Shooting(CHESSBOARD, {"left": wide})
     tilts = ((0.0, 0.0), (25.0, 0.0), (0.0, -25.0), (-30.0, 15.0))
     poses = shots(shooting, [held(CHESSBOARD, tilt=tilt, middle_mm=(0.0, 0.0, 200.0)) for tilt in tilts])
-    found = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    found = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert found.matrix[0, 0] == pytest.approx(500, rel=0.03)
 
 
@@ -140,12 +140,12 @@ def test_a_wide_lens_is_guessed_too() -> None:
 def test_a_guess_holds_with_parallel_poses_and_with_none(count: int) -> None:
     shooting = rig_of("left")
     poses = shots(shooting, [held(CHESSBOARD, middle_mm=(20.0 * index, 0.0, 600.0)) for index in range(count)])
-    guess = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    guess = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert np.isfinite(guess.information).all()
     assert guess.focal_sigma > 0.15
     found = coverage(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert np.isnan(found.distance_mm).all()
-    assert next_move(poses, CHESSBOARD, shooting.sizes).words
+    assert advise_pose(poses, CHESSBOARD, shooting.sizes).text
 
 
 def test_coverage_counts_cells_depths_tilts_and_turns() -> None:
@@ -163,7 +163,7 @@ def test_coverage_counts_cells_depths_tilts_and_turns() -> None:
     assert left.tilted == (2, 2)
     assert left.turns == 3
     assert left.distance_mm == pytest.approx((540.0, 660.0), rel=0.01)
-    wanted = sum((cells_of(pose.views["left"].points_px, Size(1280, 1024)) > 0).astype(int) for pose in poses)
+    wanted = sum((count_per_cell(pose.views["left"].points_px, Size(1280, 1024)) > 0).astype(int) for pose in poses)
     assert np.array_equal(left.cells, wanted)
     assert left.share == pytest.approx((left.cells > 0).mean())
 
@@ -192,19 +192,19 @@ def test_open_goals_are_named() -> None:
 
 def test_nothing_shot_yet_says_how_to_begin() -> None:
     shooting = rig_of()
-    advice = next_move([], CHESSBOARD, shooting.sizes)
-    assert "middle of the picture of camera 'left'" in advice.words
-    assert "projector" in advice.words
+    advice = advise_pose([], CHESSBOARD, shooting.sizes)
+    assert "middle of the image of camera 'left'" in advice.text
+    assert "projector" in advice.text
     assert not advice.enough
 
 
 def test_advice_names_place_tilt_and_reason_and_shows_the_outline() -> None:
     shooting = rig_of()
     poses = _first(shooting)
-    advice = next_move(poses, CHESSBOARD, shooting.sizes)
-    assert "move the board to the" in advice.words
-    assert "edge 30° towards the camera" in advice.words
-    assert "not covered yet" in advice.words
+    advice = advise_pose(poses, CHESSBOARD, shooting.sizes)
+    assert "move the board to the" in advice.text
+    assert "edge 30° towards the camera" in advice.text
+    assert "not covered yet" in advice.text
     assert advice.camera is not None
     then = shooting.shot("pose_03", _followed(shooting, advice))
     outer = then.views[advice.camera].points_px[[0, 10, 87, 77]]
@@ -252,7 +252,7 @@ def test_the_advised_pose_lowers_the_real_error_of_the_worst_cell_more_than_one_
         held(CHESSBOARD, tilt=(15.0, 15.0), middle_mm=(15.0, 10.0, 605.0)),
     ]
     poses = shots(shooting, board_pose)
-    advice = next_move(poses, CHESSBOARD, shooting.sizes)
+    advice = advise_pose(poses, CHESSBOARD, shooting.sizes)
     seeds = range(100, 106)
     without = np.sqrt((_errors_px(shooting, board_pose, seeds) ** 2).mean())
     lazy = held(CHESSBOARD, tilt=(15.0, -10.0), middle_mm=(-10.0, 15.0, 600.0))
@@ -278,8 +278,8 @@ def test_the_stated_uncertainty_is_that_of_repeated_solves() -> None:
     ]
     poses = shots(shooting, board_pose)
     poses = [pose for pose in poses if pose.views]
-    guess = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
-    stated = np.sqrt(2) * _cells(guess.information[None], _reach(guess)).max()
+    guess = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    stated = np.sqrt(2) * _cell_sigma_px(guess.information[None], _lens_sensitivity(guess)).max()
     found = np.sqrt(
         (
             _errors_px(shooting, [each for each in board_pose if shooting.shot("x", each).views], range(200, 210)) ** 2
@@ -305,7 +305,7 @@ def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Bo
     figures = {name: SHARP for name in only if name != PROJECTOR}
     random = np.random.default_rng(7)
     poses = _first(shooting)
-    advice = next_move(poses, board, shooting.sizes)
+    advice = advise_pose(poses, board, shooting.sizes)
     worst = [max(advice.worst_px.values())]
     while not advice.enough:
         assert len(poses) < 25
@@ -316,18 +316,18 @@ def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Bo
         middle = exact.rotation @ board.points_mm.mean(axis=0) + exact.translation_mm
         by_hand = BoardPose(loose, middle * 1.03 - loose @ board.points_mm.mean(axis=0))
         pose = shooting.shot(f"pose_{len(poses):02d}", by_hand)
-        answer = judge_pose(pose, figures, poses, board, shooting.sizes)
+        answer = check_pose(pose, figures, poses, board, shooting.sizes)
         assert answer.accepted, answer.refusals  # what is advised is never refused
         poses.append(pose)
         advice = answer.advice
         worst.append(max(advice.worst_px.values()))
-    assert GOALS.fewest <= len(poses) <= 25
+    assert GOALS.min_poses <= len(poses) <= 25
     found = coverage(poses, board, shooting.sizes)
     assert found.missing == ()
-    assert advice.words.startswith("enough")
+    assert advice.text.startswith("enough")
     for each in found.devices.values():
         assert each.share >= 0.8
-    assert worst[-1] <= GOALS.sigma_px < worst[0]
+    assert worst[-1] <= GOALS.max_sigma_px < worst[0]
 
 
 # ---- What a person reads after a pose: each bad one is refused or warned of, with its cause and the cure
@@ -341,14 +341,14 @@ NAN = float("nan")
 @pytest.fixture
 def without_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is said of the next pose, which takes longer than all checks."""
-    monkeypatch.setattr(checks, "next_move", lambda *_, **__: None)
+    monkeypatch.setattr(checks, "advise_pose", lambda *_, **__: None)
 
 
 def judged(
-    pose: PoseObservation, shooter: Shooting, earlier: list[PoseObservation], figures: ViewFigures = SHARP
-) -> PoseAnswer:
+    pose: PoseObservation, shooter: Shooting, earlier: list[PoseObservation], figures: ViewQuality = SHARP
+) -> PoseAssessment:
     """The answer to a pose; figures : of the left camera."""
-    return judge_pose(pose, {"left": figures, "right": SHARP}, earlier, shooter.board, shooter.sizes)
+    return check_pose(pose, {"left": figures, "right": SHARP}, earlier, shooter.board, shooter.sizes)
 
 
 def test_a_good_pose_is_accepted_and_measured() -> None:
@@ -363,7 +363,7 @@ def test_a_good_pose_is_accepted_and_measured() -> None:
     assert answer.tilt_deg["left"] == pytest.approx(steep_deg, abs=1.0)
     assert answer.distance_mm["left"] == pytest.approx(570.0, rel=0.01)
     assert answer.coverage.poses == ("pose_00", "pose_01", "pose_02", "pose_03")
-    assert "move the board" in answer.advice.words
+    assert "move the board" in answer.advice.text
 
 
 @pytest.mark.usefixtures("without_advice")
@@ -392,11 +392,11 @@ def test_a_first_pose_has_a_tilt_and_no_distance_while_the_focal_length_is_unkno
         (replace(SHARP, saturated=0.01), [], ["saturated"]),
         (replace(SHARP, contrast=0.15), [], ["too little light"]),
         (replace(SHARP, decoded=0.3), [], ["decoded light"]),
-        (ViewFigures(NAN, NAN, NAN, NAN, NAN), [], []),
+        (ViewQuality(NAN, NAN, NAN, NAN, NAN), [], []),
     ],
 )
 def test_how_a_pose_was_shot_refuses_or_warns_with_cause_and_cure(
-    figures: ViewFigures, refusals: list[str], warnings: list[str]
+    figures: ViewQuality, refusals: list[str], warnings: list[str]
 ) -> None:
     shooter = rig_of("left")
     answer = judged(shooter.shot("pose_03", GOOD), shooter, _first(shooter), figures)
@@ -473,8 +473,8 @@ def test_a_capture_from_another_rig_is_named_with_all_its_differences() -> None:
     with pytest.raises(CalibrationError, match="pose_04 was captured with another rig") as caught:
         check_same_devices("pose_04", other, rig)
     words = str(caught.value)
-    assert "camera 'left' has 1920 x 1080 pixels, expected 1280 x 1024" in words
-    assert "the projector has 1280 x 800 pixels" in words
+    assert "expected 1280 x 1024 pixels of camera 'left', found 1920 x 1080" in words
+    assert "of the projector, found 1280 x 800" in words
     assert "camera 'right' is missing" in words
     assert "camera 'middle' is not one of the rig's" in words
 
@@ -500,7 +500,7 @@ def test_a_coverage_picture_fills_covered_cells_and_shows_where_to_go() -> None:
     poses = shots(shooting, [held(CHESSBOARD, tilt=tilt, middle_mm=(-60.0, -50.0, 700.0)) for tilt in tilts])
     found = coverage(poses, CHESSBOARD, shooting.sizes).devices["left"]
     points = [pose.views["left"].points_px for pose in poses]
-    plain = coverage_picture(found, points, SIZE)
+    plain = draw_coverage(found, points, SIZE)
     assert plain.shape == (512, 640, 3)
     assert plain.dtype == np.uint8
     for row in range(6):
@@ -508,7 +508,7 @@ def test_a_coverage_picture_fills_covered_cells_and_shows_where_to_go() -> None:
             red, green, _ = _cell(plain, row, column)
             assert (green - red > 10) == bool(found.cells[row, column]), (row, column)
     outline = np.array([[900.0, 700.0], [1200.0, 700.0], [1200.0, 900.0], [900.0, 900.0]])
-    guided = coverage_picture(found, points, SIZE, outline_px=outline)
+    guided = draw_coverage(found, points, SIZE, outline_px=outline)
     changed = np.argwhere((guided != plain).any(axis=2))
     # Half as large as the image: the frame and its marked corner lie at half the coordinates.
     assert changed[:, 1].min() == pytest.approx(450, abs=8)
@@ -523,10 +523,10 @@ def test_a_pose_picture_marks_the_corners_on_the_stretched_frame(colour: bool) -
     frame = np.full(SIZE.shape, 400, dtype=np.uint16)  # of a 12-bit camera, dark
     frame[500, 600] = 4000
     image = np.repeat(frame[:, :, None], 3, axis=2) if colour else frame
-    bare = pose_picture(image, None, CHESSBOARD)
+    bare = draw_pose(image, None, CHESSBOARD)
     assert bare.shape == (512, 640, 3)
     assert int(np.median(bare)) == 235
-    marked = pose_picture(image, view, CHESSBOARD)
+    marked = draw_pose(image, view, CHESSBOARD)
     changed = np.argwhere((marked != bare).any(axis=2))[:, ::-1]
     for point in view.points_px / 2:
         assert np.abs(changed - point).max(axis=1).min() < 5

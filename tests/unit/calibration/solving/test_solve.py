@@ -311,7 +311,7 @@ def test_a_ruler_makes_a_wrong_print_right() -> None:
     across, down = CHESSBOARD.rulers_mm
     recipe = printed(0.98, 0.99)
     observations, truth = made(recipe)
-    told = CHESSBOARD.as_read(round(0.98 * across, 1), round(0.99 * down, 1))
+    told = CHESSBOARD.as_measured(round(0.98 * across, 1), round(0.99 * down, 1))
     read = Observations(told, observations.cameras, observations.projector, observations.poses)
     solution = solve(read)
     stated = expected_error(solution, read)
