@@ -131,10 +131,16 @@ class Board:
         return np.array([(-1.0, -1.0), (across, self.rows)]) * self.square_mm * [1.0, self.aspect]
 
     @property
+    def print_size_mm(self) -> tuple[float, float]:
+        """Width and height of the print."""
+        width_mm, height_mm = (self.print_mm[1] - self.print_mm[0]).tolist()
+        return width_mm, height_mm
+
+    @property
     def rulers_mm(self) -> tuple[int, int]:
         """Lengths of the scales that `slrig calibrate board` prints below the board and left of it."""
-        wide_mm, high_mm = (self.print_mm[1] - self.print_mm[0]).tolist()
-        return _ruler_length_mm(wide_mm), _ruler_length_mm(high_mm)
+        width_mm, height_mm = self.print_size_mm
+        return _ruler_length_mm(width_mm), _ruler_length_mm(height_mm)
 
     def as_measured(self, across_mm: float, down_mm: float, /, *, square_sigma: float | None = None) -> Board:
         """The board in its printed size, from readings of the two printed scales from end to end.
@@ -216,6 +222,11 @@ class BoardView:
     points_px: FloatArray
     sigma_px: FloatArray
     light_first: bool = False
+
+    @classmethod
+    def empty(cls) -> BoardView:
+        """A view without corners."""
+        return cls(np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0))
 
     def __post_init__(self) -> None:
         count = len(self.corner)

@@ -106,16 +106,12 @@ def _marker_cells(board: Board, light_first: bool) -> list[FloatArray]:
     for number, corners in zip(layout.getIds().ravel(), layout.getObjPoints(), strict=True):
         dark: NDArray[np.bool_] = cv2.aruco.generateImageMarker(dictionary, int(number), cells) == 0
         origin = np.asarray(corners, dtype=np.float64)[0, :2] - board.square_mm
-        runs = [(row, *run) for row in range(cells) for run in _dark_runs(dark[row])]
-        shape = np.array([[(first, row), (end, row + 1)] for row, first, end in runs], dtype=np.float64)
+        # Each run starts at one edge and ends at the next.
+        row, edge = np.nonzero(np.diff(np.pad(dark.astype(np.int8), ((0, 0), (1, 1)))))
+        row, first, end = row[::2], edge[::2], edge[1::2]
+        shape = np.stack([np.column_stack([first, row]), np.column_stack([end, row + 1])], axis=1)
         shapes.append(origin + shape * (float(board.marker_mm or 0) / cells))
     return shapes
-
-
-def _dark_runs(dark: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Index of the first cell of each run of dark cells, and of the cell after its last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], dark, [False]]).astype(np.int8)))
-    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
 
 
 PAGES_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
@@ -267,17 +263,16 @@ def solve_command(board: Board) -> str:
 
 def _lay_out_page(board: Board, page: str) -> _Page:
     """Place the board in its quiet zone, a scale left of it and one below, and text at the bottom."""
-    (left, top), (right, bottom) = board.print_mm
-    board_width_mm, board_height_mm = float(right - left), float(bottom - top)
+    board_width_mm, board_height_mm = board.print_size_mm
     width_mm, height_mm = _page_size_mm(board, page)
     required_mm, footer = _required_size_mm(board, width_mm), _footer_lines(board, width_mm)
     # The board is centred in the space that scales and text leave.
     x_mm = _MARGIN_MM + _RULER_MM + _QUIET_MM + (width_mm - required_mm[0]) / 2
     y_mm = _MARGIN_MM + _QUIET_MM + (height_mm - required_mm[1]) / 2
     art = artwork(board)
-    origin = [x_mm - left, y_mm - top]
+    origin = np.array([x_mm, y_mm]) - board.print_mm[0]
     shapes = [art.rectangles_mm[art.group == group] + origin for group in range(int(art.group.max(initial=-1)) + 1)]
-    circles = art.circles_mm + np.array([*origin, 0.0])
+    circles = art.circles_mm + np.append(origin, 0.0)
     west, north = x_mm - _QUIET_MM, y_mm - _QUIET_MM
     east, south = x_mm + board_width_mm + _QUIET_MM, y_mm + board_height_mm + _QUIET_MM
     border = [(west, north), (east, north), (east, south), (west, south), (west, north)]
@@ -285,13 +280,10 @@ def _lay_out_page(board: Board, page: str) -> _Page:
     footer_mm = height_mm - _MARGIN_MM - _LINE_MM * (len(footer) - 0.75)
     texts = [_Text(text, _MARGIN_MM, footer_mm + _LINE_MM * index, _FONT_MM) for index, text in enumerate(footer)]
     across_mm, down_mm = board.rulers_mm
-    for vertical, start_x, start_y, length_mm in (
-        (False, x_mm, south + 1.0, across_mm),
-        (True, west - 1.0, y_mm, down_mm),
-    ):
-        ticks, numbers = _ruler(start_x, start_y, length_mm, vertical=vertical)
-        lines += ticks
-        texts += numbers
+    across = _ruler(x_mm, south + 1.0, across_mm, vertical=False)
+    down = _ruler(west - 1.0, y_mm, down_mm, vertical=True)
+    lines += across[0] + down[0]
+    texts += across[1] + down[1]
     return _Page(width_mm, height_mm, f"slrig: {board.title}", shapes, circles, lines, texts)
 
 
@@ -308,7 +300,7 @@ def _footer_lines(board: Board, width_mm: float) -> list[str]:
 
 def _required_size_mm(board: Board, width_mm: float) -> tuple[float, float]:
     """Width and height of the board with margins, quiet zone, scales and the footer of a page of this width."""
-    board_width_mm, board_height_mm = (board.print_mm[1] - board.print_mm[0]).tolist()
+    board_width_mm, board_height_mm = board.print_size_mm
     around_mm = 2 * _MARGIN_MM + 2 * _QUIET_MM + _RULER_MM
     return board_width_mm + around_mm, board_height_mm + around_mm + _LINE_MM * len(_footer_lines(board, width_mm))
 
@@ -322,12 +314,12 @@ def _page_size_mm(board: Board, page: str) -> tuple[float, float]:
     oriented_mm = _oriented_page_mm(board, sides)
     if oriented_mm is not None:
         return oriented_mm
-    squares = ((board.print_mm[1] - board.print_mm[0]) / board.square_mm).tolist()
+    columns, rows = (extent / board.square_mm for extent in board.print_size_mm)
     largest = 0.0
     for width_mm, height_mm in (sides, sides[::-1]):
         required_mm = _required_size_mm(board, width_mm)
-        spare = (width_mm - required_mm[0], height_mm - required_mm[1])
-        largest = max(largest, board.square_mm + min(spare[0] / squares[0], spare[1] / squares[1]))
+        spare_mm = min((width_mm - required_mm[0]) / columns, (height_mm - required_mm[1]) / rows)
+        largest = max(largest, board.square_mm + spare_mm)
     largest = math.floor(10 * largest + 1e-9) / 10
     advice = f"the largest square that fits there is {largest:g} mm" if largest > 0 else "no square fits there"
     other_pages = [name for name in PAGES_MM if _oriented_page_mm(board, PAGES_MM[name])]
@@ -343,7 +335,7 @@ def _page_size_mm(board: Board, page: str) -> tuple[float, float]:
 
 def _oriented_page_mm(board: Board, sides: tuple[float, float]) -> tuple[float, float] | None:
     """The page in the orientation of the board if it fits, else in the other one; None if it fits in neither."""
-    board_width_mm, board_height_mm = (board.print_mm[1] - board.print_mm[0]).tolist()
+    board_width_mm, board_height_mm = board.print_size_mm
     for width_mm, height_mm in sorted((sides, sides[::-1]), reverse=board_width_mm > board_height_mm):
         required_mm = _required_size_mm(board, width_mm)
         if required_mm[0] <= width_mm and required_mm[1] <= height_mm:
@@ -352,9 +344,9 @@ def _oriented_page_mm(board: Board, sides: tuple[float, float]) -> tuple[float, 
 
 
 def _parse_page_mm(page: str) -> tuple[float, float]:
-    sides = {name.lower(): sides for name, sides in PAGES_MM.items()}.get(page.lower())
-    if sides is not None:
-        return sides
+    for name, sides in PAGES_MM.items():
+        if name.lower() == page.lower():
+            return sides
     match = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
     if match is None:
         message = f"the page: expected {', '.join(PAGES_MM)}, {FIT} or WIDTHxHEIGHT in mm (600x400), found {page!r}"

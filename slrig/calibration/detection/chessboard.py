@@ -110,9 +110,9 @@ def _order_corners(level: FloatArray, board: Board, lattice: Lattice) -> FloatAr
 
 def _first_is_dark(level: FloatArray, grid: FloatArray) -> bool:
     """True if the square below and right of corner 0, and so the one up and left of it, is dark."""
-    middles = np.round((grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4).astype(np.int64)
+    centres = np.round((grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4).astype(np.int64)
     height, width = level.shape
-    found = level[np.clip(middles[..., 1], 0, height - 1), np.clip(middles[..., 0], 0, width - 1)]
+    found = level[np.clip(centres[..., 1], 0, height - 1), np.clip(centres[..., 0], 0, width - 1)]
     row, column = np.indices(found.shape)
     even = (row + column) % 2 == 0
     return bool(np.median(found[even]) < np.median(found[~even]))
@@ -131,8 +131,8 @@ def _explain_chessboard(grey: GreyImage, board: Board, lattice: Lattice | None) 
         return explain_partial_board(part, clipped_sides, is_dark=lattice.has_dark_side(grey.level))
     return (
         f"another board: expected {board.columns} x {board.rows} inner corners, found a chessboard of "
-        f"{max(lattice.columns, lattice.rows)} x {min(lattice.columns, lattice.rows)}: use the other board, or give "
-        f"the corners of this one as {setting('corners')} (those inside, where four squares meet)"
+        f"{lattice.size_text}: use the other board, or give the corners of this one as {setting('corners')} (those "
+        "inside, where four squares meet)"
     )
 
 
@@ -168,18 +168,16 @@ def find_charuco(grey: GreyImage, board: Board) -> BoardView:
     found = 0 if numbers is None else len(numbers)
     if found < 4:
         raise PoseRefusedError(_explain_few_corners(grey, board, found, len(ids)))
-    corner = np.asarray(numbers).ravel().astype(np.int32)
-    order = np.argsort(corner)
-    rough = np.asarray(corners, dtype=np.float64).reshape(-1, 2)[order]
-    refined = refine_corners(grey.level, board, corner[order], rough, light_first=light_first)
+    rough_px = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    refined = refine_corners(grey.level, board, np.asarray(numbers).ravel(), rough_px, light_first=light_first)
     previous_count = 0
     while refined is not None and len(refined.view.corner) > previous_count:
         previous_count = len(refined.view.corner)
         refined = _add_neighbours(grey.level, board, refined)
-    if refined is None or not _is_sufficient(board, refined.view.corner):
-        raise PoseRefusedError(
-            _explain_few_corners(grey, board, 0 if refined is None else len(refined.view.corner), len(ids))
-        )
+    corner = np.zeros(0, dtype=np.int32) if refined is None else refined.view.corner
+    spans = [len(np.unique(each)) for each in np.divmod(corner, board.columns)]
+    if refined is None or len(corner) < _MIN_CHARUCO_CORNERS or min(spans) < 2:
+        raise PoseRefusedError(_explain_few_corners(grey, board, len(corner), len(ids)))
     return refined.view
 
 
@@ -192,22 +190,16 @@ def _add_neighbours(level: FloatArray, board: Board, refined: RefinedCorners) ->
     if not inside.any():
         return refined
     corner = np.concatenate([refined.view.corner, neighbours[inside]])
-    rough = np.concatenate([refined.view.points_px, predicted[inside]])
-    order = np.argsort(corner)
-    extended = refine_corners(level, board, corner[order], rough[order], light_first=refined.view.light_first)
+    rough_px = np.concatenate([refined.view.points_px, predicted[inside]])
+    extended = refine_corners(level, board, corner, rough_px, light_first=refined.view.light_first)
     if extended is None:
         return refined
     # Accept a predicted corner only if its fit is about as good as those of the found ones.
     is_old = np.isin(extended.view.corner, refined.view.corner)
-    good = is_old | (extended.view.sigma_px < 3 * np.median(refined.view.sigma_px))
+    valid = is_old | (extended.view.sigma_px < 3 * np.median(refined.view.sigma_px))
     view = extended.view
-    view = BoardView(view.corner[good], view.points_px[good], view.sigma_px[good], view.light_first)
-    return RefinedCorners(view, extended.board_map, extended.blur_px[good])
-
-
-def _is_sufficient(board: Board, corner: IntArray) -> bool:
-    row, column = np.divmod(corner, board.columns)
-    return len(corner) >= _MIN_CHARUCO_CORNERS and len(np.unique(row)) > 1 and len(np.unique(column)) > 1
+    view = BoardView(view.corner[valid], view.points_px[valid], view.sigma_px[valid], view.light_first)
+    return RefinedCorners(view, extended.board_map, extended.blur_px[valid])
 
 
 def _reject_other_board(board: Board, layout: Any, ids: IntArray, outlines: FloatArray) -> None:
@@ -215,29 +207,29 @@ def _reject_other_board(board: Board, layout: Any, ids: IntArray, outlines: Floa
     marker_count = (board.columns + 1) * (board.rows + 1) // 2
     is_foreign = ids >= marker_count
     if is_foreign.sum() >= 2 or (is_foreign.any() and len(ids) < _MIN_LAYOUT_MARKERS):
-        columns = matching_columns(ids, outlines)
         message = (
             f"another board: {board.title} has the markers 0 to {marker_count - 1} of {board.dictionary}, and marker "
-            f"{ids.max()} is in view{_suggest_corners(board, columns)}"
+            f"{ids.max()} is in view{_suggest_corners(board, ids, outlines)}"
         )
         raise PoseRefusedError(message)
     if len(ids) < _MIN_LAYOUT_MARKERS:
         return
     ids, outlines = ids[~is_foreign], outlines[~is_foreign]
-    positions = np.asarray(layout.getObjPoints(), dtype=np.float64)[ids, :, :2] / board.square_mm
+    positions = (np.asarray(layout.getObjPoints(), dtype=np.float64)[ids, :, :2] / board.square_mm).mean(axis=1)
     centres = outlines.mean(axis=1)
-    if homography_residual_px(positions.mean(axis=1), centres) > 0.3 * marker_side_px(outlines):
-        columns = matching_columns(ids, outlines)
+    if homography_residual_px(positions, centres) > 0.3 * marker_side_px(outlines):
         message = (
             f"another board: the markers of {board.dictionary} in view are not in the order of a {board.title}"
-            f"{_suggest_corners(board, columns)}"
+            f"{_suggest_corners(board, ids, outlines)}"
         )
         raise PoseRefusedError(message)
-    board_map = fit_board_map(positions.mean(axis=1), centres)
+    board_map = fit_board_map(positions, centres)
     if board_map is None:
         return
-    square_px = np.sqrt(np.abs(np.linalg.det(board_map.jacobian(positions.mean(axis=1), step=0.05))))
-    ratio = float(np.median(np.sqrt(np.abs(_signed_area(outlines))) / square_px))
+    square_px = np.sqrt(np.abs(np.linalg.det(board_map.jacobian(positions, step=0.05))))
+    x, y = outlines[..., 0], outlines[..., 1]
+    area_px = np.abs(0.5 * (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1))
+    ratio = float(np.median(np.sqrt(area_px) / square_px))
     expected = float(board.marker_mm or 0) / board.square_mm
     if abs(ratio - expected) > _MARKER_RATIO_TOLERANCE + 1.5 / float(np.median(square_px)):
         message = (
@@ -248,14 +240,9 @@ def _reject_other_board(board: Board, layout: Any, ids: IntArray, outlines: Floa
         raise PoseRefusedError(message)
 
 
-def _signed_area(outlines: FloatArray) -> FloatArray:
-    """(n,) float64: area of each quadrilateral, px^2, negative where it runs the other way round."""
-    x, y = outlines[..., 0], outlines[..., 1]
-    return np.asarray(0.5 * (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1))
-
-
-def _suggest_corners(board: Board, columns: int | None) -> str:
-    """Describe what to do about another board. columns : corners per row of the board in view, None if unknown."""
+def _suggest_corners(board: Board, ids: IntArray, outlines: FloatArray) -> str:
+    """Describe what to do about the board of these markers, which is another one."""
+    columns = matching_columns(ids, outlines)
     if columns == board.rows != board.columns:
         return (
             f": the board in view has {board.rows} corners in a row and {board.columns} rows: swap them, "

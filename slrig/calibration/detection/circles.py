@@ -16,7 +16,6 @@ import numpy as np
 
 from slrig.calibration.board import Board, BoardView
 from slrig.calibration.detection.corners import (
-    MAX_SIGMA_PX,
     SIGMA_FLOOR_PX,
     BoardMap,
     GreyImage,
@@ -76,7 +75,7 @@ def refine_circles(level: FloatArray, board: Board, rough_px: FloatArray, blobs:
         return None
     radius = _initial_radius(board_map, positions, rough_px, blobs)
     fit, radius = _fit_ellipses(level, board_map, positions, rough_px, radius)
-    valid = np.isfinite(fit.sigma_px) & (fit.sigma_px < MAX_SIGMA_PX)
+    valid = fit.is_valid
     centres_px = fit.points_px.copy()
     for _ in range(_CENTRE_ITERATIONS):
         board_map = fit_board_map(positions[valid], centres_px[valid])
@@ -97,7 +96,7 @@ def refine_circles_view(grey: GreyImage, board: Board, view: BoardView) -> Board
     if board_map is not None:
         blobs = detect_dark_blobs(grey.image_8bit, expected_count=board.corner_count)
         found = refine_circles(grey.level, board, board_map(positions), blobs)
-    return BoardView(np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0)) if found is None else found
+    return BoardView.empty() if found is None else found
 
 
 def circle_blur_px(level: FloatArray, view: BoardView, board: Board) -> FloatArray:
@@ -107,9 +106,8 @@ def circle_blur_px(level: FloatArray, view: BoardView, board: Board) -> FloatArr
     if board_map is None:
         return np.full(len(view.corner), np.nan)
     image_8bit = np.clip(255 * level / max(float(np.percentile(level, 99.9)), 1e-9), 0, 255).astype(np.uint8)
-    radius = _initial_radius(
-        board_map, positions, view.points_px, detect_dark_blobs(image_8bit, expected_count=board.corner_count)
-    )
+    blobs = detect_dark_blobs(image_8bit, expected_count=board.corner_count)
+    radius = _initial_radius(board_map, positions, view.points_px, blobs)
     fit, _ = _fit_ellipses(level, board_map, positions, view.points_px, radius)
     return np.where(np.isfinite(fit.sigma_px), fit.blur_px, np.nan)
 
@@ -122,12 +120,10 @@ def _order_circles(lattice: Lattice, board: Board) -> FloatArray | None:
     points_px = _match_board(lattice, board, mirrored=False)
     if points_px is None:
         points_px = _find_with_opencv(lattice, board)
-    if points_px is None:
-        if _match_board(lattice, board, mirrored=True) is not None:
-            message = f"a mirrored print: this {board.title} is in view with left and right swapped: {MIRROR_REMEDY}"
-            raise PoseRefusedError(message)
-        return None
-    return orient_x_right(points_px, board)
+    if points_px is None and _match_board(lattice, board, mirrored=True) is not None:
+        message = f"a mirrored print: this {board.title} is in view with left and right swapped: {MIRROR_REMEDY}"
+        raise PoseRefusedError(message)
+    return None if points_px is None else orient_x_right(points_px, board)
 
 
 def _match_board(lattice: Lattice, board: Board, *, mirrored: bool) -> FloatArray | None:
@@ -193,7 +189,7 @@ def _fit_ellipses(
         # Half way to the nearest other circle, at a diagonal of `square_mm`.
         usable = (relative_radius * radius < 0.95 * np.sqrt(0.5)) & (outline_distance < ring_px)
         fit, shapes = fit_circles(level, rough_px, shape, usable, half_px=half_px)
-        valid = np.isfinite(fit.sigma_px) & (fit.sigma_px < MAX_SIGMA_PX)
+        valid = fit.is_valid
         if not valid.any():
             return fit, radius
         area = np.abs(np.linalg.det(shapes)) * np.abs(np.linalg.det(slope))

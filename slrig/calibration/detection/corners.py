@@ -82,8 +82,7 @@ def fit_board_map(positions: FloatArray, points_px: FloatArray) -> BoardMap | No
     if homography is None or not np.isfinite(homography).all():
         return None
     homography = np.asarray(homography, dtype=np.float64)
-    steps = np.array([len(np.unique(np.round(positions[:, axis], 6))) for axis in (0, 1)])
-    grid_steps = int(steps.min())
+    grid_steps = min(len(np.unique(np.round(positions[:, axis], 6))) for axis in (0, 1))
     degree = 3 if len(positions) >= _MIN_CUBIC_POINTS else 2 if len(positions) >= _MIN_QUADRATIC_POINTS else 0
     degree = min(degree, grid_steps - 1) if grid_steps >= _MIN_GRID_STEPS else 0
     projected = _apply_homography(homography, positions)
@@ -96,9 +95,8 @@ def fit_board_map(positions: FloatArray, points_px: FloatArray) -> BoardMap | No
         projected = _apply_homography(homography, positions)
         terms = _polynomial_terms((projected - centre) / half_extent, degree)
         deviation = points_px - projected - terms @ coefficients
-        design = np.concatenate([_homography_jacobian(homography, positions), terms], axis=2).reshape(
-            -1, 8 + len(coefficients)
-        )
+        design = np.concatenate([_homography_jacobian(homography, positions), terms], axis=2)
+        design = design.reshape(-1, 8 + len(coefficients))
         scale = np.maximum(np.linalg.norm(design, axis=0), 1e-12)
         step, *_ = np.linalg.lstsq(design / scale, deviation.ravel(), rcond=1e-9)
         step = step / scale
@@ -153,9 +151,8 @@ class GreyImage:
 
     @classmethod
     def from_pixels(cls, image: NDArray[Any], full_scale: float) -> GreyImage:
-        """Build from pixels (H, W) that clip at full_scale.
-
-        Raises ValueError for small, coloured or non-finite images.
+        """Build from pixels (H, W) that clip at full_scale. Raises ValueError for a small, coloured or non-finite
+        image.
         """
         if image.ndim != 2 or min(image.shape) < 16 or not full_scale > 0:
             message = f"expected a grey image of 16 x 16 pixels or more, found {image.shape}, full scale {full_scale:g}"
@@ -250,6 +247,11 @@ class PointFit:
     blur_px: FloatArray
     residual: FloatArray
 
+    @property
+    def is_valid(self) -> NDArray[np.bool_]:
+        """(n,) bool: False where the fit failed or is too uncertain."""
+        return np.isfinite(self.sigma_px) & (self.sigma_px < MAX_SIGMA_PX)
+
 
 @dataclass(frozen=True, slots=True)
 class RefinedCorners:
@@ -264,12 +266,13 @@ def refine_corners(
     level: FloatArray, board: Board, corner: IntArray, rough_px: FloatArray, *, light_first: bool = False,
     keep_disturbed: bool = False,
 ) -> RefinedCorners | None:  # fmt: skip
-    """Refine corners of a chessboard or ChArUco board from rough positions. Corners whose fit fails are left out; None
-    if too few remain.
+    """Refine corners of a chessboard or ChArUco board from rough positions. None if too few of the fits succeed.
 
-    level : (H, W) float64; corner : (n,) int32, ascending; rough_px : (n, 2) float64; light_first : as in `BoardView`;
+    level : (H, W) float64; corner : (n,) int; rough_px : (n, 2) float64; light_first : as in `BoardView`;
     keep_disturbed : keep corners that the end of the light or the like disturbs.
     """
+    order = np.argsort(corner)
+    corner, rough_px = corner[order].astype(np.int32), rough_px[order]
     squares = board.points_mm[:, :2] / board.square_mm
     for repeated in (False, True):
         board_map = fit_board_map(squares[corner], rough_px)
@@ -278,11 +281,11 @@ def refine_corners(
         fit = _fit_at_corners(level, board, corner, rough_px, board_map, light_first)
         if fit is None:
             return None
-        good = np.isfinite(fit.sigma_px) & (fit.sigma_px < MAX_SIGMA_PX)
-        if good.any() and not keep_disturbed:
-            good &= fit.residual < _MAX_RESIDUAL_RATIO * np.median(fit.residual[good])
-        corner, rough_px = corner[good], fit.points_px[good]
-        sigma, blur = fit.sigma_px[good], fit.blur_px[good]
+        valid = fit.is_valid
+        if valid.any() and not keep_disturbed:
+            valid &= fit.residual < _MAX_RESIDUAL_RATIO * np.median(fit.residual[valid])
+        corner, rough_px = corner[valid], fit.points_px[valid]
+        sigma, blur = fit.sigma_px[valid], fit.blur_px[valid]
         if len(corner) < 4:
             return None
         consistent = _map_inliers(squares[corner], rough_px)
@@ -292,13 +295,13 @@ def refine_corners(
     final = fit_board_map(squares[corner], rough_px)
     if final is None:
         return None
-    view = BoardView(corner.astype(np.int32), rough_px, np.hypot(sigma, SIGMA_FLOOR_PX), light_first)
+    view = BoardView(corner, rough_px, np.hypot(sigma, SIGMA_FLOOR_PX), light_first)
     return RefinedCorners(view, final, blur)
 
 
-def _map_inliers(squares: FloatArray, points_px: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _map_inliers(squares: FloatArray, points_px: FloatArray) -> NDArray[np.bool_]:
     """(n,) bool: points within a few times the median distance from the map fitted to all."""
-    inliers = np.ones(len(points_px), dtype=bool)
+    inliers: NDArray[np.bool_] = np.ones(len(points_px), dtype=bool)
     for _ in range(3):
         board_map = fit_board_map(squares[inliers], points_px[inliers])
         if board_map is None:

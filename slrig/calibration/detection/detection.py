@@ -40,9 +40,7 @@ def refine_view(image: NDArray[Any], view: BoardView, board: Board, /, *, full_s
     if board.kind is BoardKind.CIRCLES:
         return refine_circles_view(grey, board, view)
     refined = refine_corners(grey.level, board, view.corner, view.points_px, light_first=view.light_first)
-    if refined is None:
-        return BoardView(np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0))
-    return refined.view
+    return BoardView.empty() if refined is None else refined.view
 
 
 def find_board(image: NDArray[Any], board: Board, /, *, full_scale: float) -> BoardView:

@@ -50,19 +50,17 @@ class MarkerSet:
 
 def identify_markers(grey: GreyImage, *, excluded: str | None = None) -> MarkerSet | None:
     """Identify the markers in view: of the first dictionary with a dozen of them in the layout of a ChArUco board, else
-    of the dictionary with most of them.
+    of the dictionary with most of them; None unless they are in that layout or a dozen, as single ones may be
+    misreadings.
 
-    None unless they are in that layout or a dozen: single markers may be misreadings. excluded : a dictionary whose
-    family is left out.
+    excluded : a dictionary whose family is left out.
     """
     image, _ = grey.downscale(_SEARCH_PX)
-    names = [
-        name
-        for name in _LARGEST_DICTIONARIES
-        if excluded is None or _dictionary_family(name) != _dictionary_family(excluded)
-    ]
+    family = None if excluded is None else _dictionary_family(excluded)
     best: MarkerSet | None = None
-    for name in names:
+    for name in _LARGEST_DICTIONARIES:
+        if _dictionary_family(name) == family:
+            continue
         outlines, ids = detect_markers(image, name)
         count = len(np.unique(ids))
         if count < _MIN_MARKERS or (best is not None and count <= best.count):
@@ -89,7 +87,6 @@ def _dictionary_family(dictionary: str) -> str:
 
 def explain_other_board(grey: GreyImage, board: Board) -> str | None:
     """Describe a board of another kind or with other markers in view, and what to do; None where there is none."""
-    found, kind = None, ""
     lattice = find_chessboard_lattice(grey) if board.kind is not BoardKind.CHESSBOARD else None
     # Six dictionaries take longer than all other checks, so a plain chessboard is checked first.
     is_plain = lattice is not None and not has_markers(grey.level, lattice)
@@ -100,23 +97,15 @@ def explain_other_board(grey: GreyImage, board: Board) -> str | None:
             f"a smaller dictionary of its family: give that one as {setting('dictionary')}, or use the other board"
         )
     if markers is not None:
-        kind = "charuco"
+        kind = BoardKind.CHARUCO
         found = f"the markers of a ChArUco board ({markers.dictionary}, greatest number {markers.max_id})"
     elif lattice is not None:
-        kind = "chessboard"
-        found = (
-            f"a chessboard of {max(lattice.columns, lattice.rows)} x {min(lattice.columns, lattice.rows)} inner corners"
-        )
+        kind, found = BoardKind.CHESSBOARD, f"a chessboard of {lattice.size_text} inner corners"
     # Squares are round in a blurred image.
-    if (
-        found is None
-        and board.kind is not BoardKind.CIRCLES
-        and not grey.is_blurred()
-        and find_circle_lattice(grey) is not None
-    ):
-        kind, found = "circles", "rows of circles"
-    if found is None:
+    elif board.kind is BoardKind.CIRCLES or grey.is_blurred() or find_circle_lattice(grey) is None:
         return None
+    else:
+        kind, found = BoardKind.CIRCLES, "rows of circles"
     expected = board.title if board.kind is BoardKind.CIRCLES else f"a {board.title}"
     return f"another board: expected {expected}, found {found}: give {setting('kind')} {kind}, or use the other board"
 
@@ -160,13 +149,12 @@ def homography_residual_px(positions: FloatArray, points_px: FloatArray, *, medi
 
     Without `median`, the rms distance of all points, which also shows outliers that a median ignores.
     """
-    homography = (
-        cv2.findHomography(positions, points_px, cv2.LMEDS if median else 0)[0] if len(positions) >= 4 else None
-    )
+    method = cv2.LMEDS if median else 0
+    homography = cv2.findHomography(positions, points_px, method)[0] if len(positions) >= 4 else None
     if homography is None:
         return float("inf")
-    off = cv2.perspectiveTransform(positions.astype(np.float64)[:, None], homography)[:, 0] - points_px
-    return float(np.median(np.linalg.norm(off, axis=1)) if median else np.sqrt((off**2).sum(axis=1).mean()))
+    residual = cv2.perspectiveTransform(positions.astype(np.float64)[:, None], homography)[:, 0] - points_px
+    return float(np.median(np.linalg.norm(residual, axis=1)) if median else np.sqrt((residual**2).sum(axis=1).mean()))
 
 
 def marker_side_px(outlines: FloatArray) -> float:
@@ -176,9 +164,7 @@ def marker_side_px(outlines: FloatArray) -> float:
 
 def detect_light_first(board: Board, ids: IntArray, outlines: FloatArray) -> bool | None:
     """True if markers, (n,) with outlines (n, 4, 2) px, have the layout of OpenCV before 4.6, with a light square up
-    and left of corner 0; None where they fit both layouts, which are one square apart.
-
-    An odd number of rows of squares has only one layout.
+    and left of corner 0; None where they fit both layouts. An odd number of rows of squares has only one layout.
     """
     if board.rows % 2 == 0:
         return False
@@ -194,23 +180,16 @@ def detect_light_first(board: Board, ids: IntArray, outlines: FloatArray) -> boo
 
 
 def matching_columns(ids: IntArray, outlines: FloatArray) -> int | None:
-    """Corners per row of the ChArUco board that fits markers, (n,) with outlines (n, 4, 2) px; None where this is
-    unclear.
-    """
+    """Corners per row of the ChArUco board that fits markers, (n,) with outlines (n, 4, 2) px; None if unclear."""
     centres = outlines.mean(axis=1)
     if len(ids) < _MIN_LAYOUT_MARKERS:
         return None
     residuals = {}
     for columns in _COLUMN_RANGE:
-        row, column = _marker_squares(columns + 1, int(ids.max()) + 1)
-        residuals[columns] = homography_residual_px(np.column_stack([column, row])[ids].astype(np.float64), centres)
+        # Markers are in the light squares, counted row by row.
+        row, column = np.mgrid[: 2 * (int(ids.max()) + 1) // (columns + 1) + 2, : columns + 1]
+        light = (row + column) % 2 == 1
+        squares = np.column_stack([column[light], row[light]])[ids].astype(np.float64)
+        residuals[columns] = homography_residual_px(squares, centres)
     best_columns = min(residuals, key=lambda columns: residuals[columns])
-    side = marker_side_px(outlines)
-    return best_columns if residuals[best_columns] < 0.15 * side else None
-
-
-def _marker_squares(width: int, count: int) -> tuple[IntArray, IntArray]:
-    """Row and column, in squares, of the first markers of a board this many squares wide: its light squares."""
-    row, column = np.mgrid[: 2 * count // width + 2, :width]
-    light = (row + column) % 2 == 1
-    return row[light][:count].astype(np.int32), column[light][:count].astype(np.int32)
+    return best_columns if residuals[best_columns] < 0.15 * marker_side_px(outlines) else None

@@ -2,9 +2,10 @@
 
 - A ChArUco board has one numbering, given by its markers.
 - A chessboard whose columns and rows of corners add up to an odd number (11 x 8) has one: the square up and left of
-corner 0 is dark. If the sum is even (7 x 9), it looks the same after half a turn; with equal and even columns and rows,
-after every quarter turn. - Asymmetric circles with an odd number of rows (4 x 11) have one numbering; with an even
-number they look the same after half a turn.
+  corner 0 is dark. If the sum is even (7 x 9), it looks the same after half a turn; with equal and even columns and
+  rows, after every quarter turn.
+- Asymmetric circles with an odd number of rows (4 x 11) have one numbering; with an even number they look the same
+  after half a turn.
 
 A mirrored chessboard is a chessboard, and mirrored circles with an odd number of rows are such circles: their corners
 keep their positions. Mirrored circles with an even number of rows and mirrored ChArUco boards are other boards and are
@@ -39,14 +40,28 @@ _CLIP_DISTANCE = 1.8
 
 @dataclass(frozen=True, slots=True)
 class Lattice:
-    """A grid in view. columns, rows : its extent, of circles in steps of half their distance within a row; points_px :
-    (n, 2) float64; positions : (n, 2) int, column and row of each point.
+    """A grid in view.
+
+    columns, rows : its extent, of circles in steps of half their distance within a row; points_px : (n, 2) float64;
+    positions : (n, 2) int32, column and row of each point.
     """
 
     columns: int
     rows: int
     points_px: FloatArray
     positions: IntArray
+
+    @classmethod
+    def from_positions(cls, points_px: FloatArray, positions: IntArray) -> Lattice | None:
+        """Build from the column and row of each point, from any origin. None for fewer than three columns or rows."""
+        positions = positions - positions.min(axis=0)
+        columns, rows = (int(extent) + 1 for extent in positions.max(axis=0))
+        return None if min(columns, rows) < 3 else cls(columns, rows, points_px, positions.astype(np.int32))
+
+    @property
+    def size_text(self) -> str:
+        """Its columns and rows, the greater number first."""
+        return f"{max(self.columns, self.rows)} x {min(self.columns, self.rows)}"
 
     def may_be_part_of(self, board: Board) -> bool:
         """True if it may be a part of the board, in either orientation."""
@@ -59,8 +74,8 @@ class Lattice:
         return fit_board_map(self.positions.astype(np.float64), self.points_px)
 
     def is_complete(self, level: FloatArray) -> bool:
-        """True if a chessboard ends on all four sides: beyond its outermost squares is paper as light as its light
-        squares. False where this cannot be measured.
+        """True if a chessboard ends on all four sides: beyond it is paper as light as its light squares. False if
+        unknown.
         """
         return all(float((side > _LIGHT_LEVEL).mean()) > 0.85 for side in self._levels_outside(level))
 
@@ -69,8 +84,8 @@ class Lattice:
         return any(float((side < _DARK_LEVEL).mean()) > 0.6 for side in self._levels_outside(level))
 
     def _levels_outside(self, level: FloatArray) -> list[FloatArray]:
-        """(n,) float64 for each of the four sides: grey levels beyond the outermost squares of a chessboard, 0 as its
-        dark squares and 1 as its light ones; NaN outside the image, and for all where there is no map.
+        """(n,) float64 for each side: grey levels beyond the outermost squares of a chessboard, 0 as its dark squares
+        and 1 as its light ones; NaN outside the image, and everywhere without a map.
         """
         board_map = self.board_map()
         if board_map is None:
@@ -87,11 +102,11 @@ class Lattice:
         board_map = self.board_map()
         if board_map is None:
             return []
-        least, most = self.positions.min(axis=0), self.positions.max(axis=0)
-        x, y = np.arange(least[0], most[0] + 1.0), np.arange(least[1], most[1] + 1.0)
+        first, last = self.positions.min(axis=0), self.positions.max(axis=0)
+        x, y = np.arange(first[0], last[0] + 1.0), np.arange(first[1], last[1] + 1.0)
         height, width = shape[:2]
         sides = []
-        for line in _border_lines(least - _CLIP_DISTANCE, most + _CLIP_DISTANCE, x, y):
+        for line in _border_lines(first - _CLIP_DISTANCE, last + _CLIP_DISTANCE, x, y):
             beyond_x, beyond_y = board_map(line).T
             outside = {
                 "left": beyond_x < 0, "right": beyond_x > width - 1,
@@ -103,9 +118,9 @@ class Lattice:
         return sides
 
 
-def _border_lines(least: FloatArray, most: FloatArray, x: NDArray[Any], y: NDArray[Any]) -> list[FloatArray]:
+def _border_lines(first: FloatArray, last: FloatArray, x: NDArray[Any], y: NDArray[Any]) -> list[FloatArray]:
     """Four lines of positions (n, 2): at the least and the greatest x, then at the least and the greatest y."""
-    ends = np.stack([least, most])
+    ends = np.stack([first, last])
     return [_mesh_points(at, y) for at in ends[:, :1]] + [_mesh_points(x, at) for at in ends[:, 1:]]
 
 
@@ -115,9 +130,7 @@ def _mesh_points(x: NDArray[Any], y: NDArray[Any]) -> FloatArray:
 
 
 def make_right_handed(grid: FloatArray) -> FloatArray:
-    """Return a grid of points (rows, columns, 2) in which x turns to y clockwise, as on a print seen from its front:
-    with its rows reversed if necessary.
-    """
+    """Return a grid of points (rows, columns, 2) with its rows reversed unless x turns to y clockwise in the image."""
     across, down = (grid[:, -1] - grid[:, 0]).mean(axis=0), (grid[-1] - grid[0]).mean(axis=0)
     return grid[::-1] if across[0] * down[1] - across[1] * down[0] < 0 else grid
 
@@ -149,10 +162,8 @@ def has_half_turn_symmetry(board: Board) -> bool:
 def rotate_half_turn(view: BoardView, board: Board) -> BoardView:
     """Number the corners from the other end of the print: number k becomes n - 1 - k.
 
-    This turns the board's frame by half a turn about the centre of its corners: (x, y) becomes (X - x, Y - y), X and Y
-    the greatest coordinates of any corner. Correspondences of light stay the same.
-
-    Raises ValueError where the board has no such symmetry.
+    The board's frame turns about the centre of its corners: (x, y) becomes (X - x, Y - y), X and Y the greatest
+    coordinates of any corner. Raises ValueError where the board has no such symmetry.
     """
     if not has_half_turn_symmetry(board):
         message = f"{board.title} looks different after half a turn: it has one numbering"
@@ -174,21 +185,16 @@ def equivalent_numberings(view: BoardView, board: Board) -> tuple[BoardView, ...
 
 def orient_x_right(points_px: FloatArray, board: Board) -> FloatArray:
     """Order all corners of a print with symmetry, (n, 2), so that the x axis points most to the right in the image."""
+
+    def x_direction(view: BoardView) -> tuple[float, float]:
+        grid = view.points_px.reshape(board.rows, board.columns, 2)
+        direction = (grid[:, -1] - grid[:, 0]).mean(axis=0)
+        direction = direction / max(float(np.hypot(*direction)), 1e-12)
+        return round(float(direction[0]), 9), float(direction[1])
+
     every_corner = np.arange(board.corner_count, dtype=np.int32)
     whole = BoardView(every_corner, points_px, np.zeros(len(points_px)))
-    views = equivalent_numberings(whole, board)
-    directions = [_x_direction(view.points_px, board) for view in views]
-    best = max(
-        range(len(views)), key=lambda index: (round(float(directions[index][0]), 9), float(directions[index][1]))
-    )
-    return views[best].points_px
-
-
-def _x_direction(points_px: FloatArray, board: Board) -> FloatArray:
-    """(2,) float64: direction of the board's x axis in the image, of unit length."""
-    grid = points_px.reshape(board.rows, board.columns, 2)
-    direction = (grid[:, -1] - grid[:, 0]).mean(axis=0)
-    return np.asarray(direction / max(float(np.hypot(*direction)), 1e-12))
+    return max(equivalent_numberings(whole, board), key=x_direction).points_px
 
 
 def _renumber(view: BoardView, corner: IntArray) -> BoardView:
@@ -247,23 +253,20 @@ def is_circle_lattice(level: FloatArray, lattice: Lattice) -> bool:
     board_map = lattice.board_map()
     if board_map is None:
         return False
-    centres = _levels_around(level, board_map, lattice, np.zeros((1, 2)))
-    gaps = _levels_around(level, board_map, lattice, np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]))
-    tips = _levels_around(
-        level, board_map, lattice, np.array([(0.45, 0.45), (0.45, -0.45), (-0.45, 0.45), (-0.45, -0.45)])
-    )
+
+    def levels_at(*offsets: tuple[float, float]) -> FloatArray:
+        levels = sample_nearest(level, board_map(lattice.positions[:, None] + np.array(offsets)).reshape(-1, 2))
+        return levels[np.isfinite(levels)]
+
+    centres = levels_at((0.0, 0.0))
+    gaps = levels_at((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+    tips = levels_at((0.45, 0.45), (0.45, -0.45), (-0.45, 0.45), (-0.45, -0.45))
     halfway = (np.median(centres) + np.median(gaps)) / 2
     return bool(
         np.mean(centres < halfway) > _MIN_CLEAR_FRACTION
         and np.mean(gaps > halfway) > _MIN_CLEAR_FRACTION
         and np.mean(tips > halfway) > _MIN_LIGHT_TIP_FRACTION
     )
-
-
-def _levels_around(level: FloatArray, board_map: BoardMap, lattice: Lattice, offsets: FloatArray) -> FloatArray:
-    """(n,) float64: grey levels at these offsets from every spot, without those outside the image."""
-    found = sample_nearest(level, board_map(lattice.positions[:, None] + offsets).reshape(-1, 2))
-    return found[np.isfinite(found)]
 
 
 def build_circle_lattice(points_px: FloatArray) -> Lattice | None:
@@ -275,19 +278,14 @@ def build_circle_lattice(points_px: FloatArray) -> Lattice | None:
     index, steps = connect_neighbours(points_px)
     if len(index) < _MIN_LATTICE_POINTS:
         return None
-    positions = np.column_stack([steps.sum(axis=1), steps[:, 1] - steps[:, 0]])
-    positions -= positions.min(axis=0)
-    columns, rows = (int(extent) + 1 for extent in positions.max(axis=0))
-    if min(columns, rows) < 3:
-        return None
-    return Lattice(columns, rows, points_px[index], positions.astype(np.int32))
+    return Lattice.from_positions(points_px[index], np.column_stack([steps.sum(axis=1), steps[:, 1] - steps[:, 0]]))
 
 
 def connect_neighbours(points_px: FloatArray) -> tuple[NDArray[np.int64], IntArray]:
     """Find the largest set of points of which each is a neighbour of another in one of two directions.
 
     Returns their indices, (m,) int64, and the number of steps along the two directions, right-handed, from the first
-    point, (m, 2) int32. Both are empty where there is no such set.
+    point, (m, 2) int32; both may be empty.
     """
     best: dict[int, tuple[int, int]] = {}
     if len(points_px) >= _MIN_LATTICE_POINTS:
@@ -327,11 +325,8 @@ def _grow_from_seed(points: FloatArray, tree: KDTree, seed: int, near: NDArray[n
             step = sign * (one, two)[axis]
             position = (a + sign, b) if axis == 0 else (a, b + sign)
             distance, found = tree.query(points[index] + step)
-            if (
-                position in occupied
-                or int(found) in positions
-                or distance > _MAX_STEP_DEVIATION * float(np.hypot(*step))
-            ):
+            is_far = distance > _MAX_STEP_DEVIATION * float(np.hypot(*step))
+            if is_far or position in occupied or int(found) in positions:
                 continue
             positions[int(found)] = position
             occupied.add(position)
@@ -342,12 +337,12 @@ def _grow_from_seed(points: FloatArray, tree: KDTree, seed: int, near: NDArray[n
 
 _SEARCHES_PX = (640, 1280)
 _SADDLE_BLUR_PX, _MIN_SADDLE_STRENGTH, _MAX_SADDLES = 1.5, 0.1, 1500
-_VIRTUAL_SIDE = 60
-_MIN_CHESSBOARD_CORNERS = 9
-_MAX_GROWTH_STEPS = 2 * _VIRTUAL_SIDE
+_SIDE = 60
+_MIN_CORNERS = 9
+_MAX_GROWTH_STEPS = 2 * _SIDE
 _MIN_CROSSING_FRACTION = 0.4
 """Least fraction of the seed's corners that must be crossings."""
-_VIRTUAL_BOARD = Board(BoardKind.CHESSBOARD, _VIRTUAL_SIDE, _VIRTUAL_SIDE, 1.0)
+_VIRTUAL_BOARD = Board(BoardKind.CHESSBOARD, _SIDE, _SIDE, 1.0)
 """A board larger than any seed: corners in view get numbers of it, starting in its middle."""
 _MIN_CROSSING_STRENGTH = 0.5
 """Least strength of a crossing over the median. Where three squares of four are light it is half or less."""
@@ -365,7 +360,7 @@ def find_chessboard_lattice(grey: GreyImage) -> Lattice | None:
         image, factor = grey.downscale(longest_px)
         saddles = _find_saddles(image)
         index, steps = connect_neighbours(saddles)
-        if len(index) >= _MIN_CHESSBOARD_CORNERS and (np.ptp(steps, axis=0) < _VIRTUAL_SIDE - 4).all():
+        if len(index) >= _MIN_CORNERS and (np.ptp(steps, axis=0) < _SIDE - 4).all():
             lattice = grow_chessboard(grey.level, (saddles[index] + 0.5) / factor - 0.5, steps)
             if lattice is not None:
                 return lattice
@@ -375,9 +370,7 @@ def find_chessboard_lattice(grey: GreyImage) -> Lattice | None:
 
 
 def _find_saddles(image: NDArray[np.uint8]) -> FloatArray:
-    """(n, 2) float64: the strongest saddle points of an image, where the determinant of the second derivatives is most
-    negative.
-    """
+    """(n, 2) float64: the strongest saddle points, where the determinant of the second derivatives is most negative."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _SADDLE_BLUR_PX)
     by_xx, by_yy = cv2.Sobel(smooth, cv2.CV_32F, 2, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 2)
     strength = cv2.Sobel(smooth, cv2.CV_32F, 1, 1) ** 2 - by_xx * by_yy
@@ -390,17 +383,10 @@ def _find_saddles(image: NDArray[np.uint8]) -> FloatArray:
 def grow_chessboard(level: FloatArray, points_px: FloatArray, steps: IntArray) -> Lattice | None:
     """Grow the chessboard around a seed of corners, (n, 2) px, with column and row of each, (n, 2) int.
 
-    Seed corners that are no crossings are dropped. None where too few remain, or the squares are circles.
+    Drops seed corners without a crossing. None where too few remain, or the squares are circles.
     """
-    column, row = (steps - steps.min(axis=0) + (_VIRTUAL_SIDE - 1 - np.ptp(steps, axis=0)) // 2).T
-    order = np.argsort(row * _VIRTUAL_SIDE + column)
-    refined = refine_corners(
-        level,
-        _VIRTUAL_BOARD,
-        (row * _VIRTUAL_SIDE + column)[order].astype(np.int32),
-        points_px[order],
-        keep_disturbed=True,
-    )
+    column, row = (steps - steps.min(axis=0) + (_SIDE - 1 - np.ptp(steps, axis=0)) // 2).T
+    refined = refine_corners(level, _VIRTUAL_BOARD, row * _SIDE + column, points_px, keep_disturbed=True)
     for growth_step in range(_MAX_GROWTH_STEPS):
         if refined is None:
             return None
@@ -412,19 +398,16 @@ def grow_chessboard(level: FloatArray, points_px: FloatArray, steps: IntArray) -
         strength = (polarity * crossing).min(axis=1)
         median_strength = float(np.nanmedian(strength))
         is_crossing = strength > _MIN_CROSSING_STRENGTH * median_strength
-        if not median_strength > 0 or is_crossing.sum() < max(
-            _MIN_CHESSBOARD_CORNERS, 0 if growth_step else _MIN_CROSSING_FRACTION * len(points_px)
-        ):
+        min_count = max(_MIN_CORNERS, 0 if growth_step else _MIN_CROSSING_FRACTION * len(points_px))
+        if not median_strength > 0 or is_crossing.sum() < min_count:
             return None
-        neighbours = neighbour_corners(corner[is_crossing], _VIRTUAL_SIDE, _VIRTUAL_SIDE)
+        neighbours = neighbour_corners(corner[is_crossing], _SIDE, _SIDE)
         predicted = refined.board_map(_virtual_position(neighbours))
-        is_new = (polarity * _crossing_steps(level, refined.board_map, neighbours)).min(
-            axis=1
-        ) > _MIN_CROSSING_STRENGTH * median_strength
+        strength = (polarity * _crossing_steps(level, refined.board_map, neighbours)).min(axis=1)
+        is_new = strength > _MIN_CROSSING_STRENGTH * median_strength
         all_corners = np.concatenate([corner[is_crossing], neighbours[is_new]])
-        rough = np.concatenate([points[is_crossing], predicted[is_new]])
-        order = np.argsort(all_corners)
-        grown = refine_corners(level, _VIRTUAL_BOARD, all_corners[order], rough[order], keep_disturbed=True)
+        rough_px = np.concatenate([points[is_crossing], predicted[is_new]])
+        grown = refine_corners(level, _VIRTUAL_BOARD, all_corners, rough_px, keep_disturbed=True)
         if grown is None or set(grown.view.corner.tolist()) <= set(corner.tolist()):
             return _build_chessboard_lattice(level, grown)
         refined = grown
@@ -434,16 +417,11 @@ def grow_chessboard(level: FloatArray, points_px: FloatArray, steps: IntArray) -
 def _build_chessboard_lattice(level: FloatArray, refined: RefinedCorners | None) -> Lattice | None:
     if refined is None or _has_round_squares(level, refined.board_map, refined.view.corner):
         return None
-    row, column = np.divmod(refined.view.corner, _VIRTUAL_SIDE)
-    positions = np.column_stack([column, row]).astype(np.int32)
+    positions = _virtual_position(refined.view.corner).astype(np.int32)
     inside = _without_sparse_borders(positions)
-    if inside.sum() < _MIN_CHESSBOARD_CORNERS:
+    if inside.sum() < _MIN_CORNERS:
         return None
-    positions = positions[inside] - positions[inside].min(axis=0)
-    columns, rows = (int(extent) + 1 for extent in positions.max(axis=0))
-    if min(columns, rows) < 3:
-        return None
-    return Lattice(columns, rows, refined.view.points_px[inside], positions)
+    return Lattice.from_positions(refined.view.points_px[inside], positions[inside])
 
 
 def _without_sparse_borders(positions: IntArray) -> NDArray[np.bool_]:
@@ -454,9 +432,9 @@ def _without_sparse_borders(positions: IntArray) -> NDArray[np.bool_]:
     """
     remaining = np.ones(len(positions), dtype=np.bool_)
     while remaining.any():
-        least, most = positions[remaining].min(axis=0), positions[remaining].max(axis=0)
-        lines = [remaining & (positions[:, axis] == end[axis]) for axis in (0, 1) for end in (least, most)]
-        lengths = np.repeat((most - least + 1)[::-1], 2)
+        first, last = positions[remaining].min(axis=0), positions[remaining].max(axis=0)
+        lines = [remaining & (positions[:, axis] == end[axis]) for axis in (0, 1) for end in (first, last)]
+        lengths = np.repeat((last - first + 1)[::-1], 2)
         sparse = [line for line, length in zip(lines, lengths, strict=True) if 2 * line.sum() < length]
         if not sparse:
             break
@@ -465,7 +443,7 @@ def _without_sparse_borders(positions: IntArray) -> NDArray[np.bool_]:
 
 
 def _virtual_position(corner: IntArray) -> FloatArray:
-    row, column = np.divmod(corner, _VIRTUAL_SIDE)
+    row, column = np.divmod(corner, _SIDE)
     return np.column_stack([column, row]).astype(np.float64)
 
 
@@ -475,23 +453,23 @@ def _crossing_steps(level: FloatArray, board_map: BoardMap, corner: IntArray) ->
     """
     centres = _virtual_position(corner)[:, None] + _SQUARE_CENTRES
     squares = sample_nearest(level, board_map(centres[:, :, None] + _SQUARE_SAMPLES))
-    middle, spread = squares.mean(axis=-1), squares.std(axis=-1).mean(axis=-1)
-    row, column = np.divmod(corner, _VIRTUAL_SIDE)
+    mean, spread = squares.mean(axis=-1), squares.std(axis=-1).mean(axis=-1)
+    row, column = np.divmod(corner, _SIDE)
     sign = np.where((row + column) % 2 == 0, 1.0, -1.0)[:, None]
-    steps = sign * np.stack([middle[:, i] - middle[:, j] for i in (0, 1) for j in (2, 3)], axis=1)
+    steps = sign * np.stack([mean[:, i] - mean[:, j] for i in (0, 1) for j in (2, 3)], axis=1)
     return np.asarray(np.sign(steps) * np.maximum(np.abs(steps) - spread[:, None], 0))
 
 
 def _has_round_squares(level: FloatArray, board_map: BoardMap, corner: IntArray) -> bool:
     """True if the dark squares are light at their tips, as circles are."""
     centres = _virtual_position(corner) + 0.5
-    middles = sample_nearest(level, board_map(centres))
+    centre_levels = sample_nearest(level, board_map(centres))
     tips = sample_nearest(level, board_map(centres[:, None] + _SQUARE_TIPS)).mean(axis=1)
-    good = np.isfinite(middles) & np.isfinite(tips)
-    if good.sum() < 4:
+    valid = np.isfinite(centre_levels) & np.isfinite(tips)
+    if valid.sum() < 4:
         return False
-    threshold = (np.percentile(middles[good], 90) + np.percentile(middles[good], 10)) / 2
-    dark = good & (middles < threshold)
+    threshold = (np.percentile(centre_levels[valid], 90) + np.percentile(centre_levels[valid], 10)) / 2
+    dark = valid & (centre_levels < threshold)
     return bool(dark.any() and np.median(tips[dark]) > threshold)
 
 
