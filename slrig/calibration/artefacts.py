@@ -159,10 +159,7 @@ def find_balls(points_mm: FloatArray, normals: FloatArray, diameter_mm: float, c
 
     points_mm, normals : (n, 3) float64, outward normals. Each normal votes for the centre one radius below its point.
 
-    Raises
-    ------
-    NothingToReconstructError
-        There are fewer balls of that size.
+    Raises NothingToReconstructError where there are fewer balls of that size.
     """
     radius_mm = diameter_mm / 2
     unused = np.ones(len(points_mm), dtype=bool)
@@ -183,10 +180,7 @@ def find_balls(points_mm: FloatArray, normals: FloatArray, diameter_mm: float, c
 def find_plane(points_mm: FloatArray, normals: FloatArray, length_mm: float) -> ArtefactPoints:
     """Find the points on the plane that holds most points; points_mm, normals : (n, 3) float64.
 
-    Raises
-    ------
-    NothingToReconstructError
-        No plane holds enough points.
+    Raises NothingToReconstructError where no plane holds enough points.
     """
     rng = np.random.default_rng(0)
     step = max(len(points_mm) // _MAX_VOTERS, 1)

@@ -39,6 +39,9 @@ _MIN_MARKER_RATIO, _MAX_MARKER_RATIO = 0.1, 0.99
 _MIN_CORNERS, _MAX_CORNERS = 3, 60
 _MIN_SQUARE_MM, _MAX_SQUARE_MM = 0.1, 1000.0
 
+COLUMN, ROW = 0, 1
+"""Axis of a projector coordinate."""
+
 
 class BoardKind(StrEnum):
     """Pattern of a board."""
@@ -65,10 +68,7 @@ class Board:
     of two circles in one row. marker_mm, dictionary : ChArUco boards only. square_sigma : relative standard deviation
     of the print's width, and independently of its height. aspect : height of a square over its width.
 
-    Raises
-    ------
-    CalibrationError
-        A value is out of range.
+    Raises CalibrationError if a value is out of range.
     """
 
     kind: BoardKind
@@ -147,10 +147,7 @@ class Board:
 
         square_sigma : relative standard deviation of the readings; None: that of a steel ruler.
 
-        Raises
-        ------
-        CalibrationError
-            A reading deviates from the printed length by more than any printer does.
+        Raises CalibrationError if a reading deviates from the printed length by more than any printer does.
         """
         faults = [
             f"the scale {where} the board is {printed_mm} mm long in print, read as {read_mm:g} mm"
@@ -203,10 +200,6 @@ def _ruler_length_mm(space_mm: float) -> int:
 
 DEFAULT_BOARD = Board(BoardKind.CHARUCO, 11, 8, 12.0)
 """12 x 9 squares of 12 mm, which fit on A4 and letter paper with their scales."""
-
-
-COLUMN, ROW = 0, 1
-"""Axis of a projector coordinate."""
 
 
 @dataclass(frozen=True, slots=True)

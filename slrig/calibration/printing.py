@@ -27,6 +27,21 @@ CIRCLE_RADIUS = 0.5
 
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_") and name.upper() == name))
 """Names of OpenCV's marker dictionaries."""
+PAGES_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
+"""Width and height of pages by name, upright."""
+FIT = "fit"
+"""Name of a page that is as large as the board requires."""
+_MARGIN_MM = 6.0
+_QUIET_MM = 5.0
+_RULER_MM = 9.0
+_LINE_MM = 3.6
+_FONT_MM = 2.6
+_LETTER_WIDTH = 0.53
+"""Mean width of a letter over the font size, rounded up."""
+_MIN_WIDTH_MM = 90.0
+"""Least width of a page made to fit, for the lines of the footer."""
+_STROKE_MM = 0.15
+_BORDER_GREY, _INK_GREY = 0.8, 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,25 +129,6 @@ def _marker_cells(board: Board, light_first: bool) -> list[FloatArray]:
     return shapes
 
 
-PAGES_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
-"""Width and height of pages by name, upright."""
-
-FIT = "fit"
-"""Name of a page that is as large as the board requires."""
-
-_MARGIN_MM = 6.0
-_QUIET_MM = 5.0
-_RULER_MM = 9.0
-_LINE_MM = 3.6
-_FONT_MM = 2.6
-_LETTER_WIDTH = 0.53
-"""Mean width of a letter over the font size, rounded up."""
-_MIN_WIDTH_MM = 90.0
-"""Least width of a page made to fit, for the lines of the footer."""
-_STROKE_MM = 0.15
-_BORDER_GREY, _INK_GREY = 0.8, 0.25
-
-
 class _Text(NamedTuple):
     """A line of text. x_mm, y_mm : its start, or its middle where centred; vertical : written upwards."""
 
@@ -171,10 +167,7 @@ def board_svg(board: Board, *, page: str = "A4") -> str:
     page : A4, A3, letter; `fit`, as large as the board requires; or WIDTHxHEIGHT in mm (600x400). Pages are used
     upright or on their side.
 
-    Raises
-    ------
-    CalibrationError
-        The page is not known, or the board does not fit on it.
+    Raises CalibrationError if the page is not known, or the board does not fit on it.
     """
     content = _lay_out_page(board, page)
     width, height = _format_mm(content.width_mm), _format_mm(content.height_mm)

@@ -38,6 +38,10 @@ from slrig.model import FloatArray, IntArray
 
 _QUICK_PX = 800
 _MIN_FOUND_FRACTION = 0.8
+_MIN_CHARUCO_CORNERS = 8
+"""Fewest corners of a ChArUco board in view, over two rows and two columns at least."""
+_MIN_MARKERS, _MIN_LAYOUT_MARKERS = 3, 8
+_MARKER_RATIO_TOLERANCE = 0.06
 
 
 def find_chessboard(grey: GreyImage, board: Board) -> BoardView:
@@ -143,13 +147,6 @@ def _explain_markers(grey: GreyImage, board: Board) -> str:
         f"another board: expected a {board.title}, found a chessboard with {found}: give {setting('kind')} "
         "charuco, or use a plain chessboard"
     )
-
-
-_MIN_CHARUCO_CORNERS = 8
-"""Fewest corners of a ChArUco board in view, over two rows and two columns at least."""
-
-_MIN_MARKERS, _MIN_LAYOUT_MARKERS = 3, 8
-_MARKER_RATIO_TOLERANCE = 0.06
 
 
 def find_charuco(grey: GreyImage, board: Board) -> BoardView:

@@ -35,6 +35,27 @@ _MIN_GRID_STEPS = 3
 """Fewest distinct columns and rows for any polynomial terms."""
 _MAP_ITERATIONS = 4
 _HORIZON = 1e-9
+_DARK_LEVEL, _MIN_CONTRAST, _MAX_CLIPPED_FRACTION = 0.06, 0.04, 0.15
+_DEFOCUSED_PX = 4.0
+SIGMA_FLOOR_PX = 0.003
+"""Least standard deviation of a coordinate: the error that remains on noiseless images."""
+MAX_SIGMA_PX = 0.5
+"""A point with a larger standard deviation was not found."""
+_MIN_HALF_PX, _MAX_HALF_PX = 3, 12
+_PATCH_SQUARES = 0.45
+_MIN_SIDE_PX = 4.0
+_MAP_TOLERANCE_PX = 1.5
+_MAX_RESIDUAL_RATIO = 4.0
+"""A corner whose residual over the view's median exceeds this is disturbed by something else: the end of the light, a
+shadow, a reflection, dirt."""
+_FIT_ITERATIONS = 20
+_CONVERGED_PX = 1e-4
+_MAX_DAMPING = 1e4
+_MIN_BLUR_PX, _MAX_BLUR_PX = 0.25, 20.0
+_ROOT_2 = float(np.sqrt(2))
+_ERF_SLOPE = float(np.sqrt(2 / np.pi))
+_Model = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""From parameters (n, k) and pixels (n, m, 2) to grey levels (n, m) and their derivatives (n, m, k)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,10 +159,6 @@ def _polynomial_terms(normalised: FloatArray, degree: int) -> FloatArray:
     return np.stack([to_x, to_y], axis=-2)
 
 
-_DARK_LEVEL, _MIN_CONTRAST, _MAX_CLIPPED_FRACTION = 0.06, 0.04, 0.15
-_DEFOCUSED_PX = 4.0
-
-
 @dataclass(frozen=True, slots=True)
 class GreyImage:
     """A grey image. level : (H, W) float64, 1 is full scale; image_8bit : (H, W) uint8, its middle 99.8 % stretched."""
@@ -210,30 +227,6 @@ class GreyImage:
         low, high = np.percentile(self.level, [1, 99])
         steepest = float(np.percentile(slope, 99.9))
         return float((high - low) / max(steepest * np.sqrt(2 * np.pi), 1e-9))
-
-
-SIGMA_FLOOR_PX = 0.003
-"""Least standard deviation of a coordinate: the error that remains on noiseless images."""
-
-MAX_SIGMA_PX = 0.5
-"""A point with a larger standard deviation was not found."""
-
-_MIN_HALF_PX, _MAX_HALF_PX = 3, 12
-_PATCH_SQUARES = 0.45
-_MIN_SIDE_PX = 4.0
-_MAP_TOLERANCE_PX = 1.5
-_MAX_RESIDUAL_RATIO = 4.0
-"""A corner whose residual over the view's median exceeds this is disturbed by something else: the end of the light, a
-shadow, a reflection, dirt."""
-_FIT_ITERATIONS = 20
-_CONVERGED_PX = 1e-4
-_MAX_DAMPING = 1e4
-_MIN_BLUR_PX, _MAX_BLUR_PX = 0.25, 20.0
-_ROOT_2 = float(np.sqrt(2))
-_ERF_SLOPE = float(np.sqrt(2 / np.pi))
-
-_Model = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""From parameters (n, k) and pixels (n, m, 2) to grey levels (n, m) and their derivatives (n, m, k)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,28 @@ _LIGHT_LEVEL, _DARK_LEVEL = 0.7, 0.2
 """Least level of lit paper and greatest level without light, on the scale from dark (0) to light squares (1)."""
 _CLIP_DISTANCE = 1.8
 """A grid is clipped where the squares around its next corner would not all be in the image."""
+_MIN_BLOB_AREA_PX = 25.0
+_MIN_LATTICE_POINTS = 9
+_MAX_BLOBS = 5000
+_MAX_SEEDS = 12
+_MIN_CLEAR_FRACTION, _MIN_LIGHT_TIP_FRACTION = 0.85, 0.6
+"""Least fractions of positions with the grey level expected of circles; blur makes some tips of squares light."""
+_MAX_STEP_DEVIATION = 0.3
+"""Largest deviation of a spot from the position predicted by its neighbours, in steps of the lattice."""
+_SEARCHES_PX = (640, 1280)
+_SADDLE_BLUR_PX, _MIN_SADDLE_STRENGTH, _MAX_SADDLES = 1.5, 0.1, 1500
+_SIDE = 60
+_MIN_CORNERS = 9
+_MAX_GROWTH_STEPS = 2 * _SIDE
+_MIN_CROSSING_FRACTION = 0.4
+"""Least fraction of the seed's corners that must be crossings."""
+_VIRTUAL_BOARD = Board(BoardKind.CHESSBOARD, _SIDE, _SIDE, 1.0)
+"""A board larger than any seed: corners in view get numbers of it, starting in its middle."""
+_MIN_CROSSING_STRENGTH = 0.5
+"""Least strength of a crossing over the median. Where three squares of four are light it is half or less."""
+_SQUARE_CENTRES = np.array([(-0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (0.5, -0.5)])
+_SQUARE_SAMPLES = np.array([(x, y) for x in (-0.22, 0.0, 0.22) for y in (-0.22, 0.0, 0.22)])
+_SQUARE_TIPS = np.array([(-0.4, -0.4), (0.4, -0.4), (-0.4, 0.4), (0.4, 0.4)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,16 +224,6 @@ def _renumber(view: BoardView, corner: IntArray) -> BoardView:
     return BoardView(corner[order].astype(np.int32), view.points_px[order], view.sigma_px[order], view.light_first)
 
 
-_MIN_BLOB_AREA_PX = 25.0
-_MIN_LATTICE_POINTS = 9
-_MAX_BLOBS = 5000
-_MAX_SEEDS = 12
-_MIN_CLEAR_FRACTION, _MIN_LIGHT_TIP_FRACTION = 0.85, 0.6
-"""Least fractions of positions with the grey level expected of circles; blur makes some tips of squares light."""
-_MAX_STEP_DEVIATION = 0.3
-"""Largest deviation of a spot from the position predicted by its neighbours, in steps of the lattice."""
-
-
 @dataclass(frozen=True, slots=True)
 class Blobs:
     """Spots: points_px (n, 2) float64, radius_px (n,) float64."""
@@ -333,22 +345,6 @@ def _grow_from_seed(points: FloatArray, tree: KDTree, seed: int, near: NDArray[n
             measured = sign * (points[found] - points[index])
             queue.append((int(found), measured, two) if axis == 0 else (int(found), one, measured))
     return positions
-
-
-_SEARCHES_PX = (640, 1280)
-_SADDLE_BLUR_PX, _MIN_SADDLE_STRENGTH, _MAX_SADDLES = 1.5, 0.1, 1500
-_SIDE = 60
-_MIN_CORNERS = 9
-_MAX_GROWTH_STEPS = 2 * _SIDE
-_MIN_CROSSING_FRACTION = 0.4
-"""Least fraction of the seed's corners that must be crossings."""
-_VIRTUAL_BOARD = Board(BoardKind.CHESSBOARD, _SIDE, _SIDE, 1.0)
-"""A board larger than any seed: corners in view get numbers of it, starting in its middle."""
-_MIN_CROSSING_STRENGTH = 0.5
-"""Least strength of a crossing over the median. Where three squares of four are light it is half or less."""
-_SQUARE_CENTRES = np.array([(-0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (0.5, -0.5)])
-_SQUARE_SAMPLES = np.array([(x, y) for x in (-0.22, 0.0, 0.22) for y in (-0.22, 0.0, 0.22)])
-_SQUARE_TIPS = np.array([(-0.4, -0.4), (0.4, -0.4), (-0.4, 0.4), (0.4, 0.4)])
 
 
 def find_chessboard_lattice(grey: GreyImage) -> Lattice | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 
 import cv2
@@ -32,6 +32,26 @@ MAX_FOCAL_SIGMA = 0.15
 """Distances are NaN while the relative deviation of the focal length is larger."""
 
 _MIN_LIT_SAMPLES = 3
+_TILT_DEG = 30.0
+"""Tilt of advised poses: the middle of the range that counts."""
+_TILTS = ((0.0, 0.0), (_TILT_DEG, 0.0), (-_TILT_DEG, 0.0), (0.0, _TILT_DEG), (0.0, -_TILT_DEG))
+_TURNS_DEG = (0.0, 35.0, 90.0)
+_DISTANCE_FACTORS = (0.85, 1.0, 1.17)
+_LARGE_DISTANCE_FACTORS = (1.4, 1.8, 2.4)
+_MARGIN = 0.015
+_FILLED_WIDTH = 0.55
+"""Fraction of the image's width that the first pose should fill."""
+_CENTRING_ITERATIONS = 4
+_MIN_NEW_CELLS = 2
+_SAME_DISTANCE = 0.04
+_SAME_TURN_DEG = 10.0
+_MIN_TILT_DEG = 5.0
+_MAX_STATED_SIGMA_PX = 10.0
+_MAX_REASONS = 3
+_MAX_CANDIDATE_CORNERS = 30
+_MIN_DEPTH_RANGE = 0.1
+_MIN_GAIN = 0.03
+"""Least relative decrease of the worst cell's uncertainty that is worth another pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,19 +129,17 @@ def coverage(
     poses: Sequence[PoseObservation], board: Board, sizes: Mapping[str, Size], *, rig: RigEstimate | None = None
 ) -> Coverage:
     """Measure the coverage of each device of `sizes` (cameras by name, and PROJECTOR where one is calibrated)."""
-    known = estimate_rig(poses, board, sizes) if rig is None else rig
+    rig = estimate_rig(poses, board, sizes) if rig is None else rig
     centre_mm = board.points_mm.mean(axis=0)
     devices = {}
     for name, size in sizes.items():
-        device = known.devices[name]
-        cells = np.zeros((CELLS, CELLS), dtype=np.int32)
-        for pose in poses:
-            cells += _covered_cells(pose, name, size, known)
-        reachable = _reachable_cells(known, name) | (cells > 0)
+        device = rig.devices[name]
+        cells = sum((_covered_cells(pose, name, size, rig) for pose in poses), np.zeros((CELLS, CELLS), dtype=np.int32))
+        reachable = _reachable_cells(rig, name) | (cells > 0)
         attitudes = {each: attitude(board_pose, centre_mm) for each, board_pose in device.poses.items()}
         distances = [each.distance_mm for each in attitudes.values()]
         turns = [each.turn_deg for each in attitudes.values()]
-        is_focal_known = bool(distances) and device.focal_sigma <= MAX_FOCAL_SIGMA
+        is_scaled = bool(distances) and device.focal_sigma <= MAX_FOCAL_SIGMA
         devices[name] = DeviceCoverage(
             cells,
             reachable,
@@ -129,7 +147,7 @@ def coverage(
             len(distinct_depths(distances)),
             count_tilted(attitudes.values()),
             len(distinct_turns(turns, symmetry_angle_deg(board))),
-            (min(distances), max(distances)) if is_focal_known else (float("nan"), float("nan")),
+            (min(distances), max(distances)) if is_scaled else (float("nan"), float("nan")),
             float((cells > 0)[reachable].mean()),
         )
     names = tuple(pose.name for pose in poses)
@@ -150,13 +168,13 @@ def attitude(board_pose: BoardPose, centre_mm: FloatArray) -> Attitude:
     """Return the attitude of a board from its pose in the device's frame. centre_mm : of the board in its own frame."""
     normal, x_axis = board_pose.rotation[:, 2], board_pose.rotation[:, 0]
     centre = board_pose.rotation @ centre_mm + board_pose.translation_mm
-    sight = float(abs(normal @ centre) / np.linalg.norm(centre))
-    return Attitude(
-        (float(np.degrees(np.arctan2(-normal[1], normal[2]))), float(np.degrees(np.arctan2(normal[0], normal[2])))),
-        float(np.degrees(np.arctan2(x_axis[1], x_axis[0]))),
-        float(centre[2]),
-        float(np.degrees(np.arccos(min(1.0, sight)))),
-    )
+    cosine = float(abs(normal @ centre) / np.linalg.norm(centre))
+    angles = [
+        np.arctan2(-normal[1], normal[2]), np.arctan2(normal[0], normal[2]), np.arctan2(x_axis[1], x_axis[0]),
+        np.arccos(min(1.0, cosine)),
+    ]  # fmt: skip
+    tilt_x, tilt_y, turn_deg, incidence_deg = (float(np.degrees(angle)) for angle in angles)
+    return Attitude((tilt_x, tilt_y), turn_deg, float(centre[2]), incidence_deg)
 
 
 def distinct_depths(distances_mm: Sequence[float]) -> list[float]:
@@ -218,9 +236,7 @@ def describe_place(place: tuple[int, int]) -> str:
     across, down = {-1: "left", 0: "", 1: "right"}[place[0]], {-1: "upper", 0: "", 1: "lower"}[place[1]]
     if across and down:
         return f"{down} {across} corner"
-    if across or down:
-        return f"{across or down} edge"
-    return "middle"
+    return f"{across or down} edge" if across or down else "middle"
 
 
 def _covered_cells(pose: PoseObservation, name: str, size: Size, rig: RigEstimate) -> IntArray:
@@ -285,26 +301,6 @@ def _open_goals(count: int, devices: Mapping[str, DeviceCoverage]) -> list[str]:
     return missing
 
 
-_TILT_DEG = 30.0
-"""Tilt of advised poses: the middle of the range that counts."""
-
-_TILTS = ((0.0, 0.0), (_TILT_DEG, 0.0), (-_TILT_DEG, 0.0), (0.0, _TILT_DEG), (0.0, -_TILT_DEG))
-_TURNS_DEG = (0.0, 35.0, 90.0)
-_DISTANCE_FACTORS = (0.85, 1.0, 1.17)
-_LARGE_DISTANCE_FACTORS = (1.4, 1.8, 2.4)
-_MARGIN = 0.015
-_FILLED_WIDTH = 0.55
-"""Fraction of the image's width that the first pose should fill."""
-
-_CENTRING_ITERATIONS = 4
-_MIN_NEW_CELLS = 2
-_SAME_DISTANCE = 0.04
-_SAME_TURN_DEG = 10.0
-_MIN_TILT_DEG = 5.0
-_MAX_STATED_SIGMA_PX = 10.0
-_MAX_REASONS = 3
-
-
 @dataclass(frozen=True, slots=True)
 class PoseCandidate:
     """A pose to hold the board in, described for one camera.
@@ -338,9 +334,9 @@ def pose_candidates(
 
 def initial_distance_mm(device: DeviceEstimate, board: Board) -> float:
     """Return the distance at which the board fills about half of the image."""
-    extent = board.points_mm.max(axis=0) - board.points_mm.min(axis=0)
-    across = extent[0] * device.matrix[0, 0] / device.size.width_px
-    down = extent[1] * device.matrix[1, 1] / device.size.height_px
+    width_mm, height_mm, _ = np.ptp(board.points_mm, axis=0)
+    across = width_mm * device.matrix[0, 0] / device.size.width_px
+    down = height_mm * device.matrix[1, 1] / device.size.height_px
     return float(max(across, down) / _FILLED_WIDTH)
 
 
@@ -376,12 +372,6 @@ def sample_corners(board: Board, max_count: int) -> FloatArray:
     return np.asarray(grid[np.ix_(rows, columns)].reshape(-1, 3), dtype=np.float64)
 
 
-def outer_corners(board: Board) -> FloatArray:
-    """(4, 3) float64: the outer four corners, clockwise in the print from corner 0."""
-    grid = board.points_mm.reshape(board.rows, board.columns, 3)
-    return np.asarray([grid[0, 0], grid[0, -1], grid[-1, -1], grid[-1, 0]], dtype=np.float64)
-
-
 def _place_candidates(
     device: DeviceEstimate, board: Board, distances_mm: Sequence[float], upright_deg: float
 ) -> list[PoseCandidate]:
@@ -391,8 +381,9 @@ def _place_candidates(
     depth = np.array([kind[3] for kind in kinds])
     turns = {(tilt, turn): board_rotation(tilt, upright_deg + turn) for tilt in _TILTS for turn in _TURNS_DEG}
     rotation = np.stack([turns[kind[1], kind[2]] for kind in kinds])
-    corners = outer_corners(board) - board.points_mm.mean(axis=0)
-    rotated = np.einsum("cij,nj->cni", rotation, corners)
+    last = board.corner_count - 1
+    outer_mm = board.points_mm[[0, board.columns - 1, last, last - board.columns + 1]]
+    rotated = np.einsum("cij,nj->cni", rotation, outer_mm - board.points_mm.mean(axis=0))
     centre = np.column_stack([np.zeros((len(kinds), 2)), depth])
     extent = np.array([device.size.width_px, device.size.height_px], dtype=np.float64)
     focal = np.array([device.matrix[0, 0], device.matrix[1, 1]])
@@ -505,33 +496,6 @@ def describe_reasons(
     return "; ".join(parts) if parts else "it is the most informative pose now"
 
 
-def describe_first_pose(cameras: Sequence[str], *, has_projector: bool) -> str:
-    """Describe what to do before the first pose."""
-    other_cameras = " and visible to the others" if len(cameras) > 1 else ""
-    light = ", lit by the projector" if has_projector else ""
-    return (
-        f"hold the board in the middle of the image of camera '{cameras[0]}', facing it{other_cameras}{light}, near "
-        "enough to fill about half of the image: the first pose shows its size and distance"
-    )
-
-
-def describe_completion(covered: Coverage, worst: Mapping[str, float]) -> str:
-    """Describe that the set is complete, or why more poses are of no use."""
-    count = len(covered.poses)
-    sigmas = ", ".join(f"{device_title(name)} to ±{sigma:.2g} px" for name, sigma in worst.items())
-    if covered.missing:
-        missing = "; ".join(covered.missing)
-        return f"{count} poses, and more hardly help. Still open: {missing}. Solve, and read the verdict"
-    remark = "" if max(worst.values(), default=np.inf) <= GOALS.max_sigma_px else ", and another would hardly help"
-    return f"enough: {count} poses determine {sigmas} in its worst place{remark}; solve now"
-
-
-_MAX_CANDIDATE_CORNERS = 30
-_MIN_DEPTH_RANGE = 0.1
-_MIN_GAIN = 0.03
-"""Least relative decrease of the worst cell's uncertainty that is worth another pose."""
-
-
 @dataclass(frozen=True, slots=True)
 class Advice:
     """Advice on the next pose.
@@ -544,11 +508,11 @@ class Advice:
 
     text: str
     enough: bool
-    camera: str | None
-    outline_px: FloatArray
-    candidate: PoseCandidate | None
-    worst_px: Mapping[str, float]
-    expected_px: Mapping[str, float]
+    camera: str | None = None
+    outline_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    candidate: PoseCandidate | None = None
+    worst_px: Mapping[str, float] = field(default_factory=dict)
+    expected_px: Mapping[str, float] = field(default_factory=dict)
 
 
 def advise_pose(
@@ -567,8 +531,7 @@ def advise_pose(
     covered = coverage(poses, board, sizes, rig=rig) if covered is None else covered
     cameras = [name for name in sizes if name != PROJECTOR and rig.devices[name].poses]
     if not cameras:
-        text = describe_first_pose([name for name in sizes if name != PROJECTOR], has_projector=PROJECTOR in sizes)
-        return Advice(text, False, None, np.zeros((0, 2)), None, {}, {})
+        return _first_advice(sizes)
     devices = {name: device for name, device in rig.devices.items() if device.poses}
     sensitivity = {name: _lens_sensitivity(device) for name, device in devices.items()}
     worst = {
@@ -602,7 +565,8 @@ def advise_pose(
     expected = {name: float(after[name][best]) for name in devices}
     move = describe_move(candidates[best], camera, attitudes[-1], upright_deg, symmetry_angle_deg(board))
     reasons = describe_reasons(camera, advanced[best], worst, expected, _worst_place(devices, sensitivity, worst))
-    return Advice(f"{move}: {reasons}", False, camera, candidates[best].outline_px, candidates[best], worst, expected)
+    candidate = candidates[best]
+    return Advice(f"{move}: {reasons}", False, camera, candidate.outline_px, candidate, worst, expected)
 
 
 @dataclass(frozen=True, slots=True)
@@ -726,5 +690,25 @@ def _worst_place(
     return name, (int(column) // third - 1, int(row) // third - 1)
 
 
+def _first_advice(sizes: Mapping[str, Size]) -> Advice:
+    """Return the advice before the first pose."""
+    cameras = [name for name in sizes if name != PROJECTOR]
+    others = " and visible to the others" if len(cameras) > 1 else ""
+    light = ", lit by the projector" if PROJECTOR in sizes else ""
+    text = (
+        f"hold the board in the middle of the image of camera '{cameras[0]}', facing it{others}{light}, near enough to "
+        "fill about half of the image: the first pose shows its size and distance"
+    )
+    return Advice(text, enough=False)
+
+
 def _completion_advice(covered: Coverage, worst: Mapping[str, float]) -> Advice:
-    return Advice(describe_completion(covered, worst), True, None, np.zeros((0, 2)), None, worst, {})
+    """Return the advice to solve, since the set is complete or more poses would hardly help."""
+    count = len(covered.poses)
+    sigmas = ", ".join(f"{device_title(name)} to ±{sigma:.2g} px" for name, sigma in worst.items())
+    remark = "" if max(worst.values(), default=np.inf) <= GOALS.max_sigma_px else ", and another would hardly help"
+    text = f"enough: {count} poses determine {sigmas} in its worst place{remark}; solve now"
+    if covered.missing:
+        missing = "; ".join(covered.missing)
+        text = f"{count} poses, and more hardly help. Still open: {missing}. Solve, and read the verdict"
+    return Advice(text, enough=True, worst_px=worst)

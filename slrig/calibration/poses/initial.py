@@ -26,6 +26,21 @@ _MAX_DEVIATIONS = 3.0
 _MIN_SPREAD_PX = 0.5
 MIN_SIGMA_PX = 0.03
 """Least standard deviation of a corner, even if the detector states less."""
+LENS_TERM_COUNT = 8
+"""Number of lens parameters in an estimate: fx, fy, cx, cy, k1, k2, p1, p2."""
+MIN_CORNERS = 6
+_MAX_CORNERS = 40
+_NOMINAL_FOCAL = 1.2
+"""Prior focal length over the image's width: a field of view of 45°."""
+_FOCAL_RANGE = (0.3, 12.0)
+_STEPS = 12
+_CONVERGED = 1e-4
+_MAX_POSES_FOR_ALL_STARTS = 6
+_SIGMA_FOCAL = 0.7
+_SIGMA_ASPECT = 0.02
+_SIGMA_CENTRE = 0.1
+_SIGMA_SHIFTED_CENTRE = 1.0
+_SIGMA_TERMS = (0.3, 0.6, 0.005, 0.005)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,20 +98,20 @@ def projector_homography(light: Correspondences) -> FloatArray | None:
     rows[along_column, 0:3] = points[along_column]
     rows[~along_column, 3:6] = points[~along_column]
     rows[:, 6:9] = -position[:, None] * points
-    keep = np.ones(len(points), dtype=bool)
+    inliers = np.ones(len(points), dtype=bool)
     homography = np.eye(3)
     for _ in range(_MAP_ITERATIONS):
-        _, vectors = np.linalg.eigh(rows[keep].T @ rows[keep])
+        _, vectors = np.linalg.eigh(rows[inliers].T @ rows[inliers])
         homography = vectors[:, 0].reshape(3, 3)
         depth = points @ homography[2]
         if not (np.abs(depth) > 1e-9).all():
             return None
         deviation = np.abs(np.where(along_column, points @ homography[0], points @ homography[1]) / depth - position)
-        spread = 1.4826 * float(np.median(deviation[keep]))
-        inliers = deviation <= max(_MAX_DEVIATIONS * spread, _MIN_SPREAD_PX * float(in_projector[0, 0]))
-        if inliers.sum() < 2 * _MIN_SAMPLES or (inliers == keep).all():
+        spread = 1.4826 * float(np.median(deviation[inliers]))
+        updated = deviation <= max(_MAX_DEVIATIONS * spread, _MIN_SPREAD_PX * float(in_projector[0, 0]))
+        if updated.sum() < 2 * _MIN_SAMPLES or (updated == inliers).all():
             break
-        keep = inliers
+        inliers = updated
     return np.asarray(np.linalg.inv(in_projector) @ homography @ in_camera, dtype=np.float64)
 
 
@@ -131,26 +146,6 @@ def _normalisation(centre: FloatArray, spread: float) -> FloatArray:
     """(3, 3): the similarity that centres points at the origin with unit spread, to condition the linear solve."""
     spread = max(spread, 1e-6)
     return np.array([[1 / spread, 0, -centre[0] / spread], [0, 1 / spread, -centre[1] / spread], [0, 0, 1]])
-
-
-LENS_TERM_COUNT = 8
-"""Number of lens parameters in an estimate: fx, fy, cx, cy, k1, k2, p1, p2."""
-
-MIN_CORNERS = 6
-_MAX_CORNERS = 40
-_NOMINAL_FOCAL = 1.2
-"""Prior focal length over the image's width: a field of view of 45°."""
-
-_FOCAL_RANGE = (0.3, 12.0)
-_STEPS = 12
-_CONVERGED = 1e-4
-_MAX_POSES_FOR_ALL_STARTS = 6
-
-_SIGMA_FOCAL = 0.7
-_SIGMA_ASPECT = 0.02
-_SIGMA_CENTRE = 0.1
-_SIGMA_SHIFTED_CENTRE = 1.0
-_SIGMA_TERMS = (0.3, 0.6, 0.005, 0.005)
 
 
 @dataclass(frozen=True, slots=True)

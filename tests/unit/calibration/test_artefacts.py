@@ -39,7 +39,7 @@ def cap(
 
 @pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.floats(5.0, 40.0), st.floats(-200.0, 200.0), st.floats(300.0, 900.0))
-def test_an_exact_ball_is_found_exactly(seed: int, radius_mm: float, x_mm: float, z_mm: float) -> None:
+def test_an_exact_ball_is_fitted_exactly(seed: int, radius_mm: float, x_mm: float, z_mm: float) -> None:
     points = cap(300, centre_mm=(x_mm, 12.0, z_mm), radius_mm=radius_mm, sigma_mm=0.0, seed=seed)
     found = fit_sphere(points)
     np.testing.assert_allclose(found.centre_mm, (x_mm, 12.0, z_mm), atol=1e-7)
@@ -139,7 +139,7 @@ def test_two_balls_before_a_wall_are_found() -> None:
     assert abs(np.linalg.norm(ends[0] - ends[1]) - 100.0) < 0.003
 
 
-def test_a_third_ball_is_missed_in_words() -> None:
+def test_a_missing_ball_is_reported() -> None:
     points, normals, _ = scene()
     with pytest.raises(NothingToReconstructError, match=r"expected 3 balls of 30 mm, found 2"):
         find_balls(points, normals, 30.0, 3)
@@ -168,7 +168,7 @@ def test_a_missing_plane_is_reported() -> None:
         find_plane(np.zeros((0, 3)), np.zeros((0, 3)), 240.0)
 
 
-def test_a_rod_at_the_ball_is_counted_apart_and_a_point_far_off_is_not() -> None:
+def test_a_rod_at_the_ball_is_counted_separately_from_outliers() -> None:
     points, normals = ball(3000, 0.0, 1)
     centre = np.array((0.0, 5.0, 500.0))
     # A rod of half the ball's radius, from the ball's side outwards.

@@ -97,7 +97,7 @@ def test_both_scales_are_true(board: Board, page: str, size_mm: tuple[float, flo
     assert size_mm[1] > down[-1]
 
 
-def test_a_page_says_what_it_is_and_how_to_go_on() -> None:
+def test_a_page_names_the_board_and_the_command() -> None:
     _, _, text = painted_page(board_pdf(Board(BoardKind.CHARUCO, 11, 8, 12.0)), 1.0)
     words = " ".join(text.split())
     assert "11 x 8 inner corners, squares of 12 mm, markers of 9 mm from DICT_5X5_250" in words
@@ -112,7 +112,7 @@ def test_the_same_board_gives_the_same_bytes() -> None:
     assert board_svg(board) == board_svg(board)
 
 
-def test_a_page_made_to_fit_holds_small_and_huge_boards_and_all_their_words() -> None:
+def test_a_page_made_to_fit_holds_small_and_huge_boards_and_their_texts() -> None:
     for board in (Board(BoardKind.CHARUCO, 3, 3, 4.0), Board(BoardKind.CHESSBOARD, 11, 8, 60.0)):
         _, (width, height), text = painted_page(board_pdf(board, page=FIT), 1.0)
         assert min(width, height) > 0
@@ -131,7 +131,7 @@ def test_a_board_too_large_for_the_page_is_refused_with_the_largest_square_that_
 
 
 @pytest.mark.parametrize("page", ["A5", "210", "axb", ""])
-def test_a_page_that_is_none_is_refused(page: str) -> None:
+def test_an_unknown_page_is_refused(page: str) -> None:
     with pytest.raises(CalibrationError, match="expected A4, A3, letter, fit or WIDTHxHEIGHT"):
         board_svg(Board(BoardKind.CHESSBOARD, 7, 9, 10.0), page=page)
     assert PAGES_MM["A4"] == (210.0, 297.0)
@@ -198,7 +198,7 @@ def _whole(board: Board) -> BoardView:
     ],
     ids=str,
 )
-def test_a_print_has_as_many_numberings_as_sides_from_which_it_looks_the_same(board: Board, numberings: int) -> None:
+def test_a_print_has_as_many_numberings_as_symmetries(board: Board, numberings: int) -> None:
     views = equivalent_numberings(_whole(board), board)
     assert len(views) == numberings
     for view in views:
@@ -211,7 +211,7 @@ def test_a_print_has_as_many_numberings_as_sides_from_which_it_looks_the_same(bo
         assert np.linalg.det(turn[:2]) == pytest.approx(1.0)
 
 
-def test_turning_by_half_twice_changes_nothing_and_a_one_sided_board_is_not_turned() -> None:
+def test_two_half_turns_change_nothing_and_need_a_symmetry() -> None:
     board = Board(BoardKind.CHESSBOARD, 7, 9, 10.0)
     view = _whole(board)
     part = BoardView(view.corner[3:40], view.points_px[3:40], view.sigma_px[3:40])
@@ -243,7 +243,7 @@ def test_the_options_of_a_command_describe_a_board() -> None:
         (("charuco", "11x8", 12.0, 9.0, "DICT_4X4_50"), "needs 54 markers and DICT_4X4_50 has 50"),
     ],
 )
-def test_options_that_describe_no_board_are_refused(options: tuple[str, str, float], words: str) -> None:
+def test_options_of_an_invalid_board_are_refused(options: tuple[str, str, float], words: str) -> None:
     with pytest.raises(CalibrationError, match=words):
         board_option(*options)
 
@@ -254,7 +254,7 @@ def test_every_dictionary_named_is_one_of_opencvs() -> None:
     assert cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11).markerSize == 6
 
 
-def test_readings_of_both_scales_make_the_board_what_its_print_is() -> None:
+def test_ruler_readings_correct_the_size_of_a_board() -> None:
     board = Board(BoardKind.CHARUCO, 11, 8, 12.0)
     assert board.rulers_mm == (140, 100)
     read = board.as_measured(140.7, 99.9)

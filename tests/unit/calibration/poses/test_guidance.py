@@ -64,7 +64,7 @@ def _followed(shooting: Shooting, advice: Advice) -> BoardPose:
     return BoardPose(rotation, camera.rotation.T @ (board_pose.translation_mm - camera.translation_mm))
 
 
-def test_cells_count_points_where_they_lie() -> None:
+def test_points_are_counted_per_cell() -> None:
     points_px = np.array([[-0.4, -0.4], [59.4, 0.0], [59.6, 0.0], [359.4, 239.4], [359.6, 0.0], [-0.6, 5.0]])
     cells = count_per_cell(points_px, Size(360, 240))
     assert cells[0, 0] == 2
@@ -76,7 +76,7 @@ def test_cells_count_points_where_they_lie() -> None:
 @pytest.mark.parametrize(
     ("tilt", "near"), [((30.0, 0.0), "top"), ((-30.0, 0.0), "bottom"), ((0.0, 30.0), "right"), ((0.0, -30.0), "left")]
 )
-def test_a_tilt_is_named_by_the_edge_that_comes_nearer(tilt: tuple[float, float], near: str) -> None:
+def test_the_sign_of_a_tilt_is_that_of_the_nearer_edge(tilt: tuple[float, float], near: str) -> None:
     board_pose = held(CHESSBOARD, tilt=tilt)
     found = attitude(board_pose, CHESSBOARD.points_mm.mean(axis=0))
     assert found.tilt_deg == pytest.approx(tilt, abs=1e-6)
@@ -91,7 +91,7 @@ def test_a_tilt_is_named_by_the_edge_that_comes_nearer(tilt: tuple[float, float]
     assert np.allclose(board_rotation(tilt, 20.0), turned(*tilt, 20.0))
 
 
-def test_a_turn_is_clockwise_in_the_picture() -> None:
+def test_a_turn_is_clockwise_in_the_image() -> None:
     board_pose = held(CHESSBOARD, in_plane_deg=30.0)
     assert attitude(board_pose, np.zeros(3)).turn_deg == pytest.approx(30.0)
     # y runs down: after a clockwise turn, the board's right end lies lower in the picture than its left one.
@@ -99,7 +99,7 @@ def test_a_turn_is_clockwise_in_the_picture() -> None:
     assert ends[1, 1] > ends[0, 1]
 
 
-def test_a_board_that_looks_the_same_after_half_a_turn_needs_no_such_turn() -> None:
+def test_a_half_turn_does_not_count_for_a_symmetric_board() -> None:
     alike = Board(BoardKind.CHESSBOARD, 9, 7, 12.0)
     assert symmetry_angle_deg(alike) == 180
     assert symmetry_angle_deg(CHESSBOARD) == symmetry_angle_deg(Board(BoardKind.CHARUCO, 9, 7, 12.0)) == 360
@@ -110,7 +110,7 @@ def test_a_board_that_looks_the_same_after_half_a_turn_needs_no_such_turn() -> N
         assert coverage(poses, board, shooting.sizes).devices["left"].turns == turns
 
 
-def test_the_guess_finds_the_devices_from_a_few_poses() -> None:
+def test_devices_are_estimated_from_a_few_poses() -> None:
     shooting = rig_of()
     poses = _first(shooting)
     poses.append(shooting.shot("pose_03", held(CHESSBOARD, tilt=(-30.0, 15.0), middle_mm=(60.0, 40.0, 540.0))))
@@ -126,7 +126,7 @@ def test_the_guess_finds_the_devices_from_a_few_poses() -> None:
     assert way.translation_mm == pytest.approx(shooting.devices["right"].translation_mm, abs=3.0)
 
 
-def test_a_wide_lens_is_guessed_too() -> None:
+def test_a_wide_lens_is_estimated() -> None:
     """A fit that starts from the usual lens alone ends at twice its focal length."""
     wide = device(Size(1280, 1024), 500.0, (650.0, 500.0), (0.0,) * 5, BoardPose(np.eye(3), np.zeros(3)))
     shooting = Shooting(CHESSBOARD, {"left": wide})
@@ -137,7 +137,7 @@ def test_a_wide_lens_is_guessed_too() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_a_guess_holds_with_parallel_poses_and_with_none(count: int) -> None:
+def test_an_estimate_exists_for_parallel_poses_and_for_none(count: int) -> None:
     shooting = rig_of("left")
     poses = shots(shooting, [held(CHESSBOARD, middle_mm=(20.0 * index, 0.0, 600.0)) for index in range(count)])
     guess = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
@@ -190,7 +190,7 @@ def test_open_goals_are_named() -> None:
     assert "80% wanted" in text
 
 
-def test_nothing_shot_yet_says_how_to_begin() -> None:
+def test_advice_before_the_first_pose() -> None:
     shooting = rig_of()
     advice = advise_pose([], CHESSBOARD, shooting.sizes)
     assert "middle of the image of camera 'left'" in advice.text
@@ -198,7 +198,7 @@ def test_nothing_shot_yet_says_how_to_begin() -> None:
     assert not advice.enough
 
 
-def test_advice_names_place_tilt_and_reason_and_shows_the_outline() -> None:
+def test_advice_names_place_tilt_and_reason_with_an_outline() -> None:
     shooting = rig_of()
     poses = _first(shooting)
     advice = advise_pose(poses, CHESSBOARD, shooting.sizes)
@@ -344,7 +344,7 @@ def without_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checks, "advise_pose", lambda *_, **__: None)
 
 
-def judged(
+def check(
     pose: PoseObservation, shooter: Shooting, earlier: list[PoseObservation], figures: ViewQuality = SHARP
 ) -> PoseAssessment:
     """The answer to a pose; figures : of the left camera."""
@@ -353,7 +353,7 @@ def judged(
 
 def test_a_good_pose_is_accepted_and_measured() -> None:
     shooter = rig_of("left", "right", PROJECTOR)
-    answer = judged(shooter.shot("pose_03", GOOD), shooter, _first(shooter))
+    answer = check(shooter.shot("pose_03", GOOD), shooter, _first(shooter))
     assert answer.accepted
     assert answer.refusals == answer.warnings == ()
     assert answer.corners_found == {"left": 88, "right": 88}
@@ -369,12 +369,12 @@ def test_a_good_pose_is_accepted_and_measured() -> None:
 @pytest.mark.usefixtures("without_advice")
 def test_a_first_pose_has_a_tilt_and_no_distance_while_the_focal_length_is_unknown() -> None:
     shooter = rig_of("left", "right", PROJECTOR)
-    facing = judged(shooter.shot("pose_00", held(CHESSBOARD)), shooter, [])
+    facing = check(shooter.shot("pose_00", held(CHESSBOARD)), shooter, [])
     assert facing.accepted
     assert np.isnan(facing.distance_mm["left"])
     assert facing.tilt_deg["left"] < 12
-    steep = judged(shooter.shot("pose_00", held(CHESSBOARD, tilt=(68.0, 0.0))), shooter, [])
-    assert any("too steeply" in words for words in steep.refusals)
+    steep = check(shooter.shot("pose_00", held(CHESSBOARD, tilt=(68.0, 0.0))), shooter, [])
+    assert any("too steeply" in text for text in steep.refusals)
 
 
 @pytest.mark.usefixtures("without_advice")
@@ -395,15 +395,15 @@ def test_a_first_pose_has_a_tilt_and_no_distance_while_the_focal_length_is_unkno
         (ViewQuality(NAN, NAN, NAN, NAN, NAN), [], []),
     ],
 )
-def test_how_a_pose_was_shot_refuses_or_warns_with_cause_and_cure(
+def test_image_quality_refuses_or_warns_with_cause_and_remedy(
     figures: ViewQuality, refusals: list[str], warnings: list[str]
 ) -> None:
     shooter = rig_of("left")
-    answer = judged(shooter.shot("pose_03", GOOD), shooter, _first(shooter), figures)
+    answer = check(shooter.shot("pose_03", GOOD), shooter, _first(shooter), figures)
     assert answer.accepted is not bool(refusals)
     for found, expected in ((answer.refusals, refusals), (answer.warnings, warnings)):
         assert len(found) == bool(expected)
-        assert all(words in found[0] for words in expected)
+        assert all(text in found[0] for text in expected)
         assert all(each.startswith("camera 'left'") for each in found)
     # What was refused is not counted as covered.
     assert len(answer.coverage.poses) == 3 + answer.accepted
@@ -411,7 +411,7 @@ def test_how_a_pose_was_shot_refuses_or_warns_with_cause_and_cure(
 
 @pytest.mark.usefixtures("without_advice")
 @pytest.mark.parametrize(
-    ("pose", "corners", "accepted", "words"),
+    ("pose", "corners", "accepted", "parts"),
     [
         (first_poses(CHESSBOARD)[1], 88, False, ["the same as pose_01"]),
         (held(CHESSBOARD, tilt=(20.0, 0.0), middle_mm=(15.0, 5.0, 590.0)), 88, True, ["nearly the same as pose_01"]),
@@ -427,31 +427,31 @@ def test_how_a_pose_was_shot_refuses_or_warns_with_cause_and_cure(
     ],
     ids=["same", "near", "steep", "small", "few corners", "a part"],
 )
-def test_how_a_board_is_held_refuses_or_warns(pose: BoardPose, corners: int, accepted: bool, words: list[str]) -> None:
+def test_the_board_s_attitude_refuses_or_warns(pose: BoardPose, corners: int, accepted: bool, parts: list[str]) -> None:
     shooter = rig_of("left", board=CHESSBOARD if corners == 88 else CHARUCO)
     shot = shooter.shot("pose_03", pose)
     whole = shot.views["left"]
     view = BoardView(whole.corner[:corners], whole.points_px[:corners], whole.sigma_px[:corners])
-    answer = judged(replace(shot, views={"left": view}), shooter, _first(shooter))
+    answer = check(replace(shot, views={"left": view}), shooter, _first(shooter))
     assert answer.accepted is accepted
-    told = answer.warnings if accepted else answer.refusals
-    assert any(all(part in each for part in words) for each in told), told
+    messages = answer.warnings if accepted else answer.refusals
+    assert any(all(part in each for part in parts) for each in messages), messages
 
 
 @pytest.mark.usefixtures("without_advice")
 def test_a_board_that_not_every_device_sees_is_warned_of_or_refused() -> None:
     shooter = rig_of("left", "right", PROJECTOR)
     pose, earlier = shooter.shot("pose_03", GOOD), _first(shooter)
-    missed = judged(replace(pose, views={"left": pose.views["left"]}), shooter, earlier)
+    missed = check(replace(pose, views={"left": pose.views["left"]}), shooter, earlier)
     assert missed.accepted
-    assert any("camera 'right' does not see the board" in words for words in missed.warnings)
-    nowhere = judged(replace(pose, views={}), shooter, earlier)
+    assert any("camera 'right' does not see the board" in text for text in missed.warnings)
+    nowhere = check(replace(pose, views={}), shooter, earlier)
     assert not nowhere.accepted
-    assert any("no camera sees the board" in words for words in nowhere.refusals)
+    assert any("no camera sees the board" in text for text in nowhere.refusals)
     dark = replace(pose, correspondences={})
-    assert any("no light of the projector" in words for words in judged(dark, shooter, earlier).refusals)
+    assert any("no light of the projector" in text for text in check(dark, shooter, earlier).refusals)
     # Where no projector is calibrated, none is needed.
-    assert judged(dark, rig_of("left", "right"), earlier).accepted
+    assert check(dark, rig_of("left", "right"), earlier).accepted
 
 
 @pytest.mark.usefixtures("without_advice")
@@ -459,11 +459,11 @@ def test_a_board_parallel_to_all_earlier_ones_is_warned_of_and_a_tilted_one_is_n
     shooter = rig_of("left")
     places = [(0.0, 0.0, 600.0), (50.0, 30.0, 560.0), (-50.0, -30.0, 640.0)]
     poses = shots(shooter, [held(CHESSBOARD, middle_mm=each) for each in places])
-    answer = judged(poses[2], shooter, poses[:2])
+    answer = check(poses[2], shooter, poses[:2])
     assert answer.accepted
-    assert any("parallel to all 2 earlier poses" in words and "tilt" in words for words in answer.warnings)
+    assert any("parallel to all 2 earlier poses" in text and "tilt" in text for text in answer.warnings)
     tilted = shooter.shot("pose_03", held(CHESSBOARD, tilt=(25.0, 0.0)))
-    assert not any("parallel" in words for words in judged(tilted, shooter, poses).warnings)
+    assert not any("parallel" in text for text in check(tilted, shooter, poses).warnings)
 
 
 def test_a_capture_from_another_rig_is_named_with_all_its_differences() -> None:
@@ -472,11 +472,11 @@ def test_a_capture_from_another_rig_is_named_with_all_its_differences() -> None:
     other = {"left": Size(1920, 1080), "middle": Size(1280, 1024), PROJECTOR: Size(1280, 800)}
     with pytest.raises(CalibrationError, match="pose_04 was captured with another rig") as caught:
         check_same_devices("pose_04", other, rig)
-    words = str(caught.value)
-    assert "expected 1280 x 1024 pixels of camera 'left', found 1920 x 1080" in words
-    assert "of the projector, found 1280 x 800" in words
-    assert "camera 'right' is missing" in words
-    assert "camera 'middle' is not one of the rig's" in words
+    text = str(caught.value)
+    assert "expected 1280 x 1024 pixels of camera 'left', found 1920 x 1080" in text
+    assert "of the projector, found 1280 x 800" in text
+    assert "camera 'right' is missing" in text
+    assert "camera 'middle' is not one of the rig's" in text
 
 
 # ---- Pictures of a calibration: what is drawn lies where it should
@@ -494,7 +494,7 @@ def _cell(picture: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], row: int, co
     return [int(each) for each in colours[counts.argmax()]]
 
 
-def test_a_coverage_picture_fills_covered_cells_and_shows_where_to_go() -> None:
+def test_a_coverage_picture_fills_covered_cells_and_draws_the_outline() -> None:
     shooting = rig_of()
     tilts = ((0.0, 0.0), (20.0, 0.0))
     poses = shots(shooting, [held(CHESSBOARD, tilt=tilt, middle_mm=(-60.0, -50.0, 700.0)) for tilt in tilts])
