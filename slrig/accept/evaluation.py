@@ -13,14 +13,14 @@ from pydantic import BeforeValidator
 
 from slrig.accept.plan import AcceptancePlan, Artefact, Limits, Quantity, Step
 from slrig.calibration.artefacts import (
+    ArtefactPoints,
     FittedPlane,
     FittedSphere,
-    OnArtefact,
-    ball_points,
     dispersion_mm,
-    fitted_plane,
-    fitted_sphere,
-    plane_points,
+    find_balls,
+    find_plane,
+    fit_plane,
+    fit_sphere,
 )
 from slrig.errors import NothingToReconstructError
 from slrig.model import FloatArray, Mesh
@@ -36,8 +36,8 @@ class Reading:
     step : name of the position; take : how many times it was measured before. errors_mm : by quantity. noise_mm : root
     mean square of the standard deviations that the scan states for the points used; sigma_mm, dispersion_mm : standard
     deviation of their distances from the fit, and the shell that holds 95 % of them. used : points on the artefact, all
-    of which count, rim and oblique ones among them; turned : as of `OnArtefact`; rejected_share : of those used, left
-    out of the fit as furthest off.
+    of which count, rim and oblique ones among them; turned : as `ArtefactPoints.misoriented`; rejected_share : of those
+    used, left out of the fit as furthest off.
     """
 
     step: str
@@ -88,7 +88,7 @@ def reading(mesh: Mesh, step: Step, take: int, plan: AcceptancePlan) -> tuple[Re
     sigma = mesh.sigma_mm.astype(np.float64)
     try:
         parts = _parts(points, normals, step, plan)
-        fit = fitted_plane if step.artefact is Artefact.PLANE else fitted_sphere
+        fit = fit_plane if step.artefact is Artefact.PLANE else fit_sphere
         fits: list[FittedSphere | FittedPlane] = [fit(points[each.points]) for each in parts]
     except NothingToReconstructError as cause:
         message = f"{step.name}: {cause}"
@@ -108,18 +108,18 @@ def reading(mesh: Mesh, step: Step, take: int, plan: AcceptancePlan) -> tuple[Re
         sigma_mm=float(np.std(off)),
         dispersion_mm=dispersion_mm(off),
         used=len(used),
-        turned=sum(each.turned for each in parts),
+        turned=sum(each.misoriented for each in parts),
         rejected_share=sum(each.rejected for each in fits) / len(used),
     )
     return found, Evidence(points, artefact, distances, sigma)
 
 
-def _parts(points: FloatArray, normals: FloatArray, step: Step, plan: AcceptancePlan) -> list[OnArtefact]:
+def _parts(points: FloatArray, normals: FloatArray, step: Step, plan: AcceptancePlan) -> list[ArtefactPoints]:
     if step.artefact is Artefact.PLANE:
-        return [plane_points(points, normals, max(plan.artefacts.plane_mm))]
+        return [find_plane(points, normals, max(plan.artefacts.plane_mm))]
     if step.artefact is Artefact.SPHERE:
-        return ball_points(points, normals, plan.artefacts.diameter.value_mm, 1)
-    return ball_points(points, normals, plan.artefacts.ball_mm, 2)
+        return find_balls(points, normals, plan.artefacts.diameter.value_mm, 1)
+    return find_balls(points, normals, plan.artefacts.ball_mm, 2)
 
 
 def _off(points: FloatArray, fit: FittedSphere | FittedPlane) -> FloatArray:

@@ -18,7 +18,7 @@ from slrig.accept.store import HTML, JSON, kept_points, points_file
 from slrig.accept.uncertainty import FORMULA
 from slrig.accept.verdicts import AcceptanceResult
 from slrig.bundle.storage import write_file
-from slrig.calibration.artefacts import REJECTED_SHARE
+from slrig.calibration.artefacts import MAX_REJECTED_FRACTION
 from slrig.model import FloatArray, Pinhole, Pixels
 from slrig.reports.drawing import WIDTH, drawing, legend, path, polygon, ramp, shape
 from slrig.reports.page import filled, jpeg_uri
@@ -65,7 +65,7 @@ def document(result: AcceptanceResult) -> dict[str, object]:
         "artefacts": artefacts,
         "notes": plan.notes,
         "rules": {
-            "rejected_share_at_most": REJECTED_SHARE,
+            "rejected_share_at_most": MAX_REJECTED_FRACTION,
             "repeats": plan.repeats,
         },
         "quantities": [
@@ -134,7 +134,7 @@ def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evide
         rule=RULE,
         formula=FORMULA,
         sides_mm=tuple(plan.volume_mm[1] - plan.volume_mm[0]),
-        rejected_share=REJECTED_SHARE,
+        rejected_share=MAX_REJECTED_FRACTION,
         words={step.name: step.words for step in plan.steps},
         # Of each artefact that was measured: its readings, and the error of the brightest colour of its pictures.
         measured={

@@ -12,7 +12,7 @@ from slrig.accept.evaluation import Reading, errors_by_step
 from slrig.accept.plan import AcceptancePlan, Quantity
 from slrig.accept.scale import Scale, scale_by_bar
 from slrig.accept.uncertainty import ErrorUncertainty, error_uncertainty
-from slrig.calibration.artefacts import Decision, decision
+from slrig.calibration.artefacts import Decision, decide
 from slrig.model import Calibration
 
 
@@ -79,7 +79,7 @@ def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePl
     uncertainty = error_uncertainty(quantity, plan.artefacts)
     return Verdict(
         quantity, error, limit, worst.step, worst.take, uncertainty, *_scatter(quantity, having),
-        decision(error, limit, uncertainty.expanded_mm),
+        decide(error, limit, uncertainty.expanded_mm),
     )  # fmt: skip
 
 

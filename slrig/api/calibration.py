@@ -39,7 +39,7 @@ from slrig.calibrate.calibrating import EXPORTS
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import USUAL_PATTERNS, PoseRecord, SessionRecord, pose_of
 from slrig.calibrate.store import REPORT, picture_name
-from slrig.calibration.board import USUAL_BOARD, Board, BoardKind
+from slrig.calibration.board import DEFAULT_BOARD, Board, BoardKind
 from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
 
 IMPORT_PATH = "/calibration/import"
@@ -92,7 +92,7 @@ def open_calibration(
         key: getattr(USUAL_PATTERNS, key) for key in ("rows", "sequence") if getattr(request.patterns, key) is None
     }
     patterns = replace(patterns, **usual, codes=request.projector)
-    board = USUAL_BOARD if request.board is None else request.board.board()
+    board = DEFAULT_BOARD if request.board is None else request.board.board()
     record = service.calibrations.open(board, label=request.label, patterns=patterns)
     response.headers["Location"] = f"/calibration/{record.id}"
     return _answered(service, record)
@@ -143,10 +143,10 @@ async def import_calibration(
 
 @router.get("/board.pdf", response_class=Response, responses=file_of("application/pdf"))
 def fetch_board(
-    kind: BoardKind = USUAL_BOARD.kind,
-    columns: CornerCount = USUAL_BOARD.columns,
-    rows: CornerCount = USUAL_BOARD.rows,
-    square_mm: Millimetres = USUAL_BOARD.square_mm,
+    kind: BoardKind = DEFAULT_BOARD.kind,
+    columns: CornerCount = DEFAULT_BOARD.columns,
+    rows: CornerCount = DEFAULT_BOARD.rows,
+    square_mm: Millimetres = DEFAULT_BOARD.square_mm,
     marker_mm: Millimetres | None = None,
     dictionary: Annotated[SafeText, Query(min_length=1, max_length=64)] | None = None,
     page: Annotated[
@@ -158,7 +158,7 @@ def fetch_board(
     are those of POST /calibration.
     """
     # Late: what draws a PDF takes a while to load.
-    from slrig.calibration.boards.printing import board_pdf
+    from slrig.calibration.printing import board_pdf
 
     board = Board(kind, columns, rows, square_mm, marker_mm, dictionary)
     name = f"board-{kind}-{columns}x{rows}-{square_mm:g}mm.pdf"

@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator, Field
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, filled
 from slrig.bundle.validation import FreeText, SafeText, Strict
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, plain
-from slrig.calibration.board import USUAL_BOARD, BoardKind, BoardShape
+from slrig.calibration.board import DEFAULT_BOARD, BoardKind, BoardShape
 from slrig.jobs.records import JobState
 from slrig.scan.plan import PatternPlan
 from slrig.schedule.task_options import BoardOptions
@@ -56,7 +56,7 @@ class BoardRequest(BoardOptions):
 class CalibrationRequest(Strict):
     """A calibration session. An empty request opens one for the usual board."""
 
-    board: BoardRequest | None = Field(default=None, description=f"Default: {USUAL_BOARD.description}")
+    board: BoardRequest | None = Field(default=None, description=f"Default: {DEFAULT_BOARD.description}")
     label: FreeText | None = None
     patterns: PatternRequest = Field(
         default_factory=PatternRequest,

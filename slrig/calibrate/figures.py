@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.calibrate.solving import CalibrationResult
 from slrig.calibration.board import Board
-from slrig.calibration.poses.coverage import attitude
+from slrig.calibration.poses import attitude
 from slrig.calibration.solution import PARAMETERS, PROJECTOR, BoardPose, DeviceResiduals
 from slrig.model import Calibration, FloatArray, Pinhole, Size
 from slrig.model.lens import LENS_TERMS
@@ -141,7 +141,7 @@ def pose_figures(result: CalibrationResult, board: Board, names: Sequence[str]) 
         if (pose := solution.poses.get(name)) is not None:
             turned, moved_mm = first.rotation @ pose.rotation, first.rotation @ pose.translation_mm
             seen = attitude(BoardPose(turned, moved_mm + first.translation_mm), middle_mm)
-            tilt, distance = seen.steep_deg, seen.distance_mm
+            tilt, distance = seen.incidence_deg, seen.distance_mm
         found.append(PoseFigures(name, rms, tilt, distance, solution.outliers.get(name, "")))
     return tuple(found)
 

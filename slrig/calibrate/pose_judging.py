@@ -16,9 +16,7 @@ from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import Judgement, Setting, Standing
 from slrig.calibration.judging.verdict import board_words
-from slrig.calibration.poses.checks import judge_pose
-from slrig.calibration.poses.coverage import Advice, Coverage, coverage, next_move
-from slrig.calibration.poses.rough import rig_guess
+from slrig.calibration.poses import Advice, Coverage, advise_pose, check_pose, coverage, estimate_rig
 
 _ANSWER = (
     "warnings",
@@ -31,7 +29,7 @@ _ANSWER = (
     "saturated",
     "moved_px",
 )
-"""Fields of `slrig.calibration.poses.checks.PoseAnswer` that belong to the pose alone."""
+"""Fields of `slrig.calibration.poses.checks.PoseAssessment` that belong to the pose alone."""
 
 _CHECK = ("poses", "difference_mm", "stated_mm", "ratio", "chance", "fits", "words")
 """Fields of `slrig.calibration.judging.comparison.OddEven`, whose `motion` stands beside them."""
@@ -40,16 +38,16 @@ _CHECK = ("poses", "difference_mm", "stated_mm", "ratio", "chance", "fits", "wor
 def judgement(pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> Judgement:
     """Return what to tell of a pose, the accepted ones before it at hand."""
     observations = [each.observation for each in earlier]
-    found = judge_pose(pose.observation, pose.figures, observations, setting.board, setting.sizes)
+    found = check_pose(pose.observation, pose.figures, observations, setting.board, setting.sizes)
     return Judgement(found.refusals, _fields(found, *_ANSWER), _standing(found.coverage, found.advice))
 
 
 def standing(poses: Sequence[ReadPose], setting: Setting) -> Standing:
     """Return what the accepted poses cover, and what to move next."""
     observations = [each.observation for each in poses]
-    guess = rig_guess(observations, setting.board, setting.sizes)
-    covered = coverage(observations, setting.board, setting.sizes, guess=guess)
-    return _standing(covered, next_move(observations, setting.board, setting.sizes, guess=guess, covered=covered))
+    guess = estimate_rig(observations, setting.board, setting.sizes)
+    covered = coverage(observations, setting.board, setting.sizes, rig=guess)
+    return _standing(covered, advise_pose(observations, setting.board, setting.sizes, rig=guess, covered=covered))
 
 
 def summary(result: CalibrationResult) -> Mapping[str, Any]:
@@ -113,8 +111,8 @@ def warm() -> None:
 def _standing(found: Coverage, advice: Advice) -> Standing:
     shown = ("cells", "reachable", "share", "depths", "tilted", "turns", "distance_mm")
     devices = {name: _fields(each, *shown) for name, each in found.devices.items()}
-    told = _fields(advice, "words", "enough", "camera", "outline_px", "worst_px", "expected_px")
-    return Standing({**_fields(found, "poses", "missing"), "devices": devices}, told)
+    told = _fields(advice, "enough", "camera", "outline_px", "worst_px", "expected_px")
+    return Standing({**_fields(found, "poses", "missing"), "devices": devices}, {"words": advice.text, **told})
 
 
 def _fields(value: object, *names: str) -> dict[str, Any]:

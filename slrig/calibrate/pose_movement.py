@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slrig.calibrate.pose_frames import Image, Mask, window_about
-from slrig.calibration.board import Board
-from slrig.calibration.boards.detection import find_board, placed_again
-from slrig.calibration.observations import BoardView
+from slrig.calibration.board import Board, BoardView
+from slrig.calibration.detection import find_board, refine_view
 from slrig.errors import PoseRefusedError
 from slrig.model import FloatArray
 
@@ -73,7 +72,7 @@ def _as_a_whole(views: Sequence[Image], view: BoardView, board: Board, full_scal
     which too few corners can be placed are left out.
     """
     chosen = sorted({0, len(views) // 2, len(views) - 1})
-    before, *after = (placed_again(views[at], view, board, full_scale=full_scale) for at in chosen)
+    before, *after = (refine_view(views[at], view, board, full_scale=full_scale) for at in chosen)
     return [moved for each in after if (moved := _moved_together(before, each)) is not None]
 
 

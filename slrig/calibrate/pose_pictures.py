@@ -14,11 +14,8 @@ from slrig.bundle.description import read_description
 from slrig.bundle.images import read_pages
 from slrig.calibrate.solving import ReadPose
 from slrig.calibrate.tools import Setting
-from slrig.calibration.board import Board
-from slrig.calibration.observations import PoseObservation
-from slrig.calibration.poses.checks import coverage_picture, pose_picture
-from slrig.calibration.poses.coverage import coverage
-from slrig.calibration.poses.rough import lit_board
+from slrig.calibration.board import Board, PoseObservation
+from slrig.calibration.poses import coverage, draw_coverage, draw_pose, projector_view
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Pixels, Size, White
@@ -29,7 +26,7 @@ _MOST_LIGHT_SHOWN = 400
 def pose_png(bundle: Path, camera: str, reading: ReadPose | None, board: Board) -> bytes:
     """Return what a camera saw of a pose: its white frame, and the corners if any were found. Raises BundleError."""
     view = None if reading is None else reading.observation.views.get(camera)
-    return _png(pose_picture(white_frame(bundle, camera), view, board))
+    return _png(draw_pose(white_frame(bundle, camera), view, board))
 
 
 def white_frame(bundle: Path, camera: str) -> Pixels:
@@ -57,13 +54,13 @@ def coverage_png(setting: Setting, device: str, poses: Sequence[ReadPose], next_
     outline = next_move.get("outline_px") if next_move.get("camera") == device else None
     outline_px = np.asarray(outline, dtype=np.float64) if outline else None
     points = [_points_px(each, device, size) for each in observations]
-    return _png(coverage_picture(covered.devices[device], points, size, outline_px=outline_px))
+    return _png(draw_coverage(covered.devices[device], points, size, outline_px=outline_px))
 
 
 def _points_px(pose: PoseObservation, device: str, size: Size) -> FloatArray:
     """(n, 2) float64: the corners that a camera saw, or some of the pixels by which the projector lit the board."""
     if device == PROJECTOR:
-        lit = lit_board(pose, size).positions_px
+        lit = projector_view(pose, size).positions_px
         return lit[:: max(len(lit) // _MOST_LIGHT_SHOWN, 1)]
     view = pose.views.get(device)
     return np.zeros((0, 2)) if view is None else view.points_px

@@ -15,9 +15,8 @@ from slrig.bundle import read_capture
 from slrig.calibrate.pose_frames import PoseFrames, coded_axes, cut_capture, pose_frames, window_about
 from slrig.calibrate.pose_movement import differ, moved_px
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.board import Board
-from slrig.calibration.boards.detection import blur_sigma_px, board_region, find_board, light_squares, square_interior
-from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
+from slrig.calibration.board import COLUMN, ROW, Board, BoardView, Correspondences, PoseObservation, ViewQuality
+from slrig.calibration.detection import board_mask, find_board, interior_mask, measure_blur_px, paper_mask
 from slrig.errors import PatternError, PoseRefusedError
 from slrig.model import Axis, Capture, Size
 from slrig.patterns import MIN_BORDER_DISTANCE_PX, cell_positions, edge_positions, index_of_word, line_positions
@@ -75,7 +74,7 @@ def read_captured(capture: Capture, board: Board, name: str) -> ReadPose:
         Frames of a code are missing.
     """
     views: dict[str, BoardView] = {}
-    figures: dict[str, ViewFigures] = {}
+    figures: dict[str, ViewQuality] = {}
     light: dict[str, Correspondences] = {}
     unseen: list[str] = []
     unread: list[str] = []
@@ -115,8 +114,8 @@ class _Seen:
         self._full_scale = full_scale
         shape = frames.clipped.shape
         self._shape = (shape[0], shape[1])
-        self.region = board_region(view, board, self._shape)
-        self.blur_px = blur_sigma_px(frames.white, view, board, full_scale=full_scale)
+        self.region = board_mask(view, board, self._shape)
+        self.blur_px = measure_blur_px(frames.white, view, board, full_scale=full_scale)
         told = self.blur_px if np.isfinite(self.blur_px) else _USUAL_BLUR_PX
         self._used_blur_px = float(np.clip(told, _USUAL_BLUR_PX, _MOST_BLUR_PX))
 
@@ -147,18 +146,18 @@ class _Seen:
             )
         return tuple(found)
 
-    def figures(self, light: tuple[ProjectorPositions, ...]) -> ViewFigures:
+    def figures(self, light: tuple[ProjectorPositions, ...]) -> ViewQuality:
         """How well the camera saw the board."""
         frames = self._frames
-        paper = light_squares(self._view, self._board, self._shape)
-        clear = square_interior(self._view, self._board, self._shape, margin_px=2 * self._used_blur_px)
+        paper = paper_mask(self._view, self._board, self._shape)
+        clear = interior_mask(self._view, self._board, self._shape, margin_px=2 * self._used_blur_px)
         bright = paper & clear if (paper & clear).any() else paper
         if frames.black is not None:
             contrast = _median(frames.white[bright] - frames.black[bright])
         else:
             dark = self.region & ~paper & clear
             contrast = _median(frames.white[bright]) - _median(frames.white[dark])
-        return ViewFigures(
+        return ViewQuality(
             moved_px=moved_px(frames.views, self._view, self._board, self.region, self._full_scale),
             saturated=float(frames.clipped[self.region].mean()) if self.region.any() else float("nan"),
             contrast=contrast / self._full_scale,

@@ -14,8 +14,7 @@ from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.words import rounded
 from slrig.calibration.board import Board
 from slrig.calibration.judging.verdict import board_words
-from slrig.calibration.poses.checks import pose_picture
-from slrig.calibration.poses.rough import lit_board
+from slrig.calibration.poses import draw_pose, projector_view
 from slrig.calibration.solution import PROJECTOR, device_title
 from slrig.model import Pixels
 from slrig.reports.drawing import legend
@@ -96,7 +95,7 @@ def _pictures(
     for pose in shown:
         for camera, picture in pictures.get(pose.name, {}).items():
             words = f"{pose.name}, {device_title(camera)}" + (" — left out" if pose.left_out else "")
-            drawn = pose_picture(picture, views.get(pose.name, {}).get(camera), board, width_px=_PICTURE_PX)
+            drawn = draw_pose(picture, views.get(pose.name, {}).get(camera), board, width_px=_PICTURE_PX)
             yield jpeg_uri(drawn[..., ::-1], _QUALITY), words
 
 
@@ -104,7 +103,7 @@ def _coverage(result: CalibrationResult, poses: Sequence[ReadPose], board: Board
     device = named_devices(result.calibration)[name]
     used = [pose.observation for pose in poses if pose.observation.name not in result.solution.outliers]
     if name == PROJECTOR:
-        parts = [lit_board(pose, device.size).positions_px for pose in used]
+        parts = [projector_view(pose, device.size).positions_px for pose in used]
     else:
         parts = [pose.views[name].points_px for pose in used if name in pose.views]
     points = np.concatenate([np.zeros((0, 2)), *parts])

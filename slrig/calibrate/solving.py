@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from uuid import uuid4
 
-from slrig.calibration.board import Board, BoardShape
+from slrig.calibration.board import Board, BoardShape, Observations, PoseObservation, ViewQuality
 from slrig.calibration.judging.comparison import OddEven, odd_even
 from slrig.calibration.judging.verdict import Verdict, check_scale, verdict
-from slrig.calibration.observations import Observations, PoseObservation, ViewFigures
-from slrig.calibration.poses.coverage import Coverage, coverage
+from slrig.calibration.poses import Coverage, coverage
 from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
 from slrig.errors import CalibrationError, SolveRefusedError
 from slrig.jobs.records import utc_now
@@ -25,7 +24,7 @@ class ReadPose:
     """One pose, as it was read: its observation, and how well each camera saw it."""
 
     observation: PoseObservation
-    figures: Mapping[str, ViewFigures]
+    figures: Mapping[str, ViewQuality]
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from slrig.calibration.board import Board
+from slrig.calibration.board import Board, PoseObservation
 from slrig.calibration.health.drift import board_poses
-from slrig.calibration.observations import PoseObservation
 from slrig.model import Calibration
 from slrig.multiview import BoardAxis, axis_from_board
 

@@ -28,7 +28,7 @@ from slrig.bundle.calibration import read_calibration
 from slrig.bundle.storage import sync_folder, sync_tree, write_durably, write_file
 from slrig.calibrate.records import SessionRecord, session_from_json, session_json
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
+from slrig.calibration.board import BoardView, Correspondences, PoseObservation, ViewQuality
 from slrig.errors import CalibrationError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import BUNDLE, DataFolder
@@ -225,7 +225,7 @@ class CalibrationStore:
         self.discard(gone)
 
 
-_READ_PARTS: dict[str, type[Any]] = {"view": BoardView, "light": Correspondences, "figures": ViewFigures}
+_READ_PARTS: dict[str, type[Any]] = {"view": BoardView, "light": Correspondences, "figures": ViewQuality}
 
 
 def reading_bytes(pose: ReadPose) -> bytes:

@@ -1,9 +1,8 @@
-"""Which points of a scan lie on an artefact, the sphere or plane fitted to them, and the decision.
+"""Fit of spheres and planes to the points of an artefact in a scan, and the decision about its errors.
 
-After VDI/VDE 2634 part 2 and ISO 10360-13; no conformity is claimed. A sphere or plane is fitted by least squares of
-the distances to it; at most three points in a thousand, those that lie furthest off, are left out, and how many is
-said. All else that was measured on the artefact counts, at a rim and at a grazing view as elsewhere: whoever scans a
-part gets those points, too.
+After VDI/VDE 2634 part 2 and ISO 10360-13; no conformity is claimed. Least squares of the distances; at most three
+points in a thousand, those with the largest distances, are rejected and counted. All other measured points of the
+artefact count, also at its rim and at grazing views.
 """
 
 from __future__ import annotations
@@ -18,26 +17,26 @@ from numpy.typing import NDArray
 from slrig.errors import NothingToReconstructError
 from slrig.model import FloatArray
 
-REJECTED_SHARE = 0.003
-"""At most this share of the points is left out (VDI/VDE 2634-2)."""
+MAX_REJECTED_FRACTION = 0.003
+"""Largest fraction of points that is rejected (VDI/VDE 2634-2)."""
 
-FEWEST_POINTS = 100
-_DISPERSED = 0.95
-_MOST_VOTES = 20_000
-_VOTE_REACH = 0.08  # of the radius: how far the centres that single normals point at may lie from one another
-_SHELL = 0.05  # of the radius: what lies nearer to the sphere is taken for a part of it
-_SLAB = 0.01  # of the plane's length: as for the sphere
-_ROUNDS = 4
+MIN_POINTS = 100
+_DISPERSION_FRACTION = 0.95
+_MAX_VOTERS = 20_000
+_VOTE_RADIUS = 0.08  # of the ball's radius: spread of the centres that single normals point at
+_SHELL_DEPTH = 0.05  # of the ball's radius: points that are nearer to the sphere belong to it
+_SLAB_DEPTH = 0.01  # of the plane's length: points that are nearer to the plane belong to it
+_ITERATIONS = 4
 _TRIALS = 200
-_TILT_COSINE = np.cos(np.deg2rad(15.0))
-_TURNED_COSINE = np.cos(np.deg2rad(45.0))
-"""What faces so differently is another thing that touches the artefact: a rod or a foot of up to half a ball's radius
-leaves the ball at 60 degrees or more. Noise turns few points so far, and how many is said."""
+_MIN_FACING_COSINE = np.cos(np.deg2rad(15.0))
+_MIN_SURFACE_COSINE = np.cos(np.deg2rad(45.0))
+"""Points that face farther away belong to another object that touches the artefact: a rod or foot of up to half a
+ball's radius leaves the ball at 60 degrees or more. Noise turns few normals so far."""
 
 
 @dataclass(frozen=True, slots=True)
 class FittedSphere:
-    """A sphere fitted to points. centre_mm : (3,); distances_mm : (n,) of the points kept, outwards positive."""
+    """A sphere fitted to points. centre_mm : (3,); distances_mm : (n,) of the inliers, positive outwards."""
 
     centre_mm: FloatArray
     radius_mm: float
@@ -47,7 +46,7 @@ class FittedSphere:
 
 @dataclass(frozen=True, slots=True)
 class FittedPlane:
-    """A plane fitted to points. normal : (3,), unit; distances_mm : (n,) of the points kept, along it."""
+    """A plane fitted to points. normal : (3,), unit; distances_mm : (n,) of the inliers, along the normal."""
 
     centre_mm: FloatArray
     normal: FloatArray
@@ -55,25 +54,25 @@ class FittedPlane:
     rejected: int
 
 
-class OnArtefact(NamedTuple):
-    """Indices of the points on an artefact, (n,), and how many more lie as near to it, but face quite differently."""
+class ArtefactPoints(NamedTuple):
+    """Indices of the points on an artefact, (n,), and the number of points that are as near but face another way."""
 
     points: NDArray[np.intp]
-    turned: int
+    misoriented: int
 
 
 class Decision(StrEnum):
-    """Whether an error keeps to its limit, given how well it is known (ISO 14253-1)."""
+    """Decision about an error and its limit, given the measurement uncertainty (ISO 14253-1)."""
 
     PASSES = "passes"
     FAILS = "fails"
     UNDECIDED = "undecided"
 
 
-def decision(error_mm: float, limit_mm: float, uncertainty_mm: float) -> Decision:
-    """Passes if |error| is below the limit by the expanded uncertainty (k = 2), fails if above it by as much.
+def decide(error_mm: float, limit_mm: float, uncertainty_mm: float) -> Decision:
+    """Pass if |error| is below the limit by the expanded uncertainty (k = 2), fail if it is above by as much.
 
-    >>> decision(-0.012, 0.02, 0.003).value, decision(0.019, 0.02, 0.003).value, decision(0.03, 0.02, 0.003).value
+    >>> decide(-0.012, 0.02, 0.003).value, decide(0.019, 0.02, 0.003).value, decide(0.03, 0.02, 0.003).value
     ('passes', 'undecided', 'fails')
     """
     if abs(error_mm) <= limit_mm - uncertainty_mm:
@@ -81,174 +80,167 @@ def decision(error_mm: float, limit_mm: float, uncertainty_mm: float) -> Decisio
     return Decision.FAILS if abs(error_mm) > limit_mm + uncertainty_mm else Decision.UNDECIDED
 
 
-def fitted_sphere(points_mm: FloatArray) -> FittedSphere:
-    """Least squares of the radial distances, radius free; points (n, 3) mm. Raises NothingToReconstructError."""
+def fit_sphere(points_mm: FloatArray) -> FittedSphere:
+    """Fit a sphere of free radius to points (n, 3) mm. Raises NothingToReconstructError where there are too few."""
     _require_enough(points_mm, "a sphere")
     centre, radius = _sphere(points_mm)
-    kept = _kept(np.linalg.norm(points_mm - centre, axis=1) - radius)
-    centre, radius = _sphere(points_mm[kept])
-    distances = np.linalg.norm(points_mm[kept] - centre, axis=1) - radius
-    return FittedSphere(centre, radius, distances, int((~kept).sum()))
+    inliers = _inliers(np.linalg.norm(points_mm - centre, axis=1) - radius)
+    centre, radius = _sphere(points_mm[inliers])
+    distances = np.linalg.norm(points_mm[inliers] - centre, axis=1) - radius
+    return FittedSphere(centre, radius, distances, int((~inliers).sum()))
 
 
-def fitted_plane(points_mm: FloatArray) -> FittedPlane:
-    """Least squares of the distances; points (n, 3) mm. Raises NothingToReconstructError."""
+def fit_plane(points_mm: FloatArray) -> FittedPlane:
+    """Fit a plane to points (n, 3) mm. Raises NothingToReconstructError where there are too few."""
     _require_enough(points_mm, "a plane")
     centre, normal = _plane(points_mm)
-    kept = _kept((points_mm - centre) @ normal)
-    centre, normal = _plane(points_mm[kept])
-    return FittedPlane(centre, normal, (points_mm[kept] - centre) @ normal, int((~kept).sum()))
+    inliers = _inliers((points_mm - centre) @ normal)
+    centre, normal = _plane(points_mm[inliers])
+    return FittedPlane(centre, normal, (points_mm[inliers] - centre) @ normal, int((~inliers).sum()))
 
 
 def dispersion_mm(distances_mm: FloatArray) -> float:
-    """The width of the narrowest shell that holds 95 % of the distances (D95 %, ISO 10360-13)."""
-    rising = np.sort(distances_mm)
-    inside = int(np.ceil(_DISPERSED * len(rising)))
-    return float((rising[inside - 1 :] - rising[: len(rising) - inside + 1]).min())
+    """Width of the narrowest shell that holds 95 % of the distances (D95 %, ISO 10360-13)."""
+    ordered = np.sort(distances_mm)
+    inside = int(np.ceil(_DISPERSION_FRACTION * len(ordered)))
+    return float((ordered[inside - 1 :] - ordered[: len(ordered) - inside + 1]).min())
 
 
 def _sphere(points_mm: FloatArray) -> tuple[FloatArray, float]:
-    # The algebraic sphere, |p|² = 2 c·p + (r² - |c|²), about the middle, is near enough to start from.
-    middle = points_mm.mean(axis=0)
-    about = points_mm - middle
-    system = np.column_stack([2 * about, np.ones(len(about))])
-    solved = np.linalg.lstsq(system, (about**2).sum(axis=1), rcond=None)[0]
-    start = np.append(solved[:3], np.sqrt(max(solved[3] + solved[:3] @ solved[:3], 1e-12)))
+    # Start from the algebraic sphere about the centroid, |p|² = 2 c·p + (r² - |c|²).
+    centroid = points_mm.mean(axis=0)
+    relative = points_mm - centroid
+    system = np.column_stack([2 * relative, np.ones(len(relative))])
+    algebraic = np.linalg.lstsq(system, (relative**2).sum(axis=1), rcond=None)[0]
+    start = np.append(algebraic[:3], np.sqrt(max(algebraic[3] + algebraic[:3] @ algebraic[:3], 1e-12)))
 
     def distances(parameters: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.norm(about - parameters[:3], axis=1) - parameters[3])
+        return np.asarray(np.linalg.norm(relative - parameters[:3], axis=1) - parameters[3])
 
-    def slopes(parameters: FloatArray) -> FloatArray:
-        outwards = about - parameters[:3]
+    def jacobian(parameters: FloatArray) -> FloatArray:
+        outwards = relative - parameters[:3]
         outwards /= np.linalg.norm(outwards, axis=1)[:, None]
-        return np.column_stack([-outwards, -np.ones(len(about))])
+        return np.column_stack([-outwards, -np.ones(len(relative))])
 
-    # Late: the service knows the values of this module, and loads no solver.
+    # Imported here: the service imports this module and needs no solver.
     from scipy.optimize import least_squares
 
-    found = least_squares(distances, start, jac=slopes, method="lm", xtol=1e-12, ftol=1e-12).x
-    return middle + found[:3], float(found[3])
+    found = least_squares(distances, start, jac=jacobian, method="lm", xtol=1e-12, ftol=1e-12).x
+    return centroid + found[:3], float(found[3])
 
 
 def _plane(points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     centre = points_mm.mean(axis=0)
-    about = points_mm - centre
-    # The eigenvector of the least eigenvalue of the scatter: the direction in which the points spread least.
-    return centre, np.linalg.eigh(about.T @ about)[1][:, 0]
+    relative = points_mm - centre
+    # Eigenvector of the least eigenvalue of the scatter matrix: the direction of least spread.
+    return centre, np.linalg.eigh(relative.T @ relative)[1][:, 0]
 
 
-def _kept(distances_mm: FloatArray) -> NDArray[np.bool_]:
-    """(n,) bool: all but the points that may be left out."""
-    count = int(REJECTED_SHARE * len(distances_mm))
-    kept = np.ones(len(distances_mm), dtype=bool)
+def _inliers(distances_mm: FloatArray) -> NDArray[np.bool_]:
+    """(n,) bool: False for the points with the largest distances, up to MAX_REJECTED_FRACTION."""
+    count = int(MAX_REJECTED_FRACTION * len(distances_mm))
+    inliers = np.ones(len(distances_mm), dtype=bool)
     if count:
-        kept[np.argpartition(np.abs(distances_mm), -count)[-count:]] = False
-    return kept
+        inliers[np.argpartition(np.abs(distances_mm), -count)[-count:]] = False
+    return inliers
 
 
 def _require_enough(points_mm: FloatArray, what: str) -> None:
-    if len(points_mm) < FEWEST_POINTS:
+    if len(points_mm) < MIN_POINTS:
         message = (
-            f"{what} is fitted to {FEWEST_POINTS} points or more, found {len(points_mm)}; bring the artefact into view "
-            "of camera and projector, and matt"
+            f"{what} is fitted to {MIN_POINTS} points or more, found {len(points_mm)}; bring the artefact into view "
+            "of camera and projector, and make it matt"
         )
         raise NothingToReconstructError(message)
 
 
-def ball_points(points_mm: FloatArray, normals: FloatArray, diameter_mm: float, count: int) -> list[OnArtefact]:
-    """The points on each of `count` balls of one diameter, the ball with most points first.
+def find_balls(points_mm: FloatArray, normals: FloatArray, diameter_mm: float, count: int) -> list[ArtefactPoints]:
+    """Find the points on each of `count` balls of one diameter, the ball with most points first.
 
-    points_mm, normals : (n, 3) float64, the normals outwards. Each normal points back to its ball's centre, one radius
-    below the surface: where most of them meet is a centre. What then lies within a twentieth of the radius of the
-    sphere is on it, however far off its noise put it.
+    points_mm, normals : (n, 3) float64, outward normals. Each normal votes for the centre one radius below its point.
 
-    Raises
-    ------
-    NothingToReconstructError
-        There are fewer balls of that size.
+    Raises NothingToReconstructError where there are fewer balls of that size.
     """
     radius_mm = diameter_mm / 2
-    left = np.ones(len(points_mm), dtype=bool)
-    found: list[OnArtefact] = []
+    unused = np.ones(len(points_mm), dtype=bool)
+    found: list[ArtefactPoints] = []
     for number in range(count):
-        inside = _ball(points_mm, normals, radius_mm, left)
+        inside = _find_ball(points_mm, normals, radius_mm, unused)
         if inside is None:
             message = (
                 f"expected {count} ball{'s' if count > 1 else ''} of {diameter_mm:g} mm, found {number}; bring the "
-                "artefact wholly into view, matt, and name its certified diameter"
+                "whole artefact into view, make it matt, and give its certified diameter"
             )
             raise NothingToReconstructError(message)
         found.append(inside)
-        left[inside.points] = False
+        unused[inside.points] = False
     return sorted(found, key=lambda ball: len(ball.points), reverse=True)
 
 
-def plane_points(points_mm: FloatArray, normals: FloatArray, length_mm: float) -> OnArtefact:
-    """The points on the plane that most points lie on; points_mm, normals : (n, 3) float64.
+def find_plane(points_mm: FloatArray, normals: FloatArray, length_mm: float) -> ArtefactPoints:
+    """Find the points on the plane that holds most points; points_mm, normals : (n, 3) float64.
 
-    What lies within a hundredth of the plane's length of it is on it.
-
-    Raises
-    ------
-    NothingToReconstructError
-        No plane holds enough of them.
+    Raises NothingToReconstructError where no plane holds enough points.
     """
     rng = np.random.default_rng(0)
-    step = max(len(points_mm) // _MOST_VOTES, 1)
+    step = max(len(points_mm) // _MAX_VOTERS, 1)
     sparse, facing = points_mm[::step], normals[::step]
     extent_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0))) if len(points_mm) else 0.0
-    most, best = 0, (np.zeros(3), np.zeros(3))
+    max_votes, best = 0, (np.zeros(3), np.zeros(3))
     for seed in rng.integers(0, max(len(sparse), 1), _TRIALS if len(sparse) else 0):
         off = np.abs((sparse - sparse[seed]) @ facing[seed])
-        votes = int(((off < 0.004 * extent_mm) & (facing @ facing[seed] > _TILT_COSINE)).sum())
-        if votes > most:
-            most, best = votes, (sparse[seed], facing[seed])
-    near = np.abs((points_mm - best[0]) @ best[1]) < _SLAB * length_mm
+        votes = int(((off < 0.004 * extent_mm) & (facing @ facing[seed] > _MIN_FACING_COSINE)).sum())
+        if votes > max_votes:
+            max_votes, best = votes, (sparse[seed], facing[seed])
+    near = np.abs((points_mm - best[0]) @ best[1]) < _SLAB_DEPTH * length_mm
     chosen = np.flatnonzero(near)
-    for _ in range(_ROUNDS):
-        if len(chosen) < FEWEST_POINTS:
+    for _ in range(_ITERATIONS):
+        if len(chosen) < MIN_POINTS:
             message = (
-                f"expected a plane, found {len(chosen)} points on one; bring it into view, matt, and fill the view"
+                f"expected a plane, found {len(chosen)} points on one; bring it into view, make it matt, and fill the "
+                "view with it"
             )
             raise NothingToReconstructError(message)
-        plane = fitted_plane(points_mm[chosen])
-        near = np.abs((points_mm - plane.centre_mm) @ plane.normal) < _SLAB * length_mm
-        chosen = np.flatnonzero(near & (np.abs(normals @ plane.normal) > _TURNED_COSINE))
-    return OnArtefact(chosen, int(near.sum()) - len(chosen))
+        plane = fit_plane(points_mm[chosen])
+        near = np.abs((points_mm - plane.centre_mm) @ plane.normal) < _SLAB_DEPTH * length_mm
+        chosen = np.flatnonzero(near & (np.abs(normals @ plane.normal) > _MIN_SURFACE_COSINE))
+    return ArtefactPoints(chosen, int(near.sum()) - len(chosen))
 
 
-def _ball(points_mm: FloatArray, normals: FloatArray, radius_mm: float, left: NDArray[np.bool_]) -> OnArtefact | None:
-    candidates = np.flatnonzero(left)
-    voters = candidates[:: max(len(candidates) // _MOST_VOTES, 1)]
+def _find_ball(
+    points_mm: FloatArray, normals: FloatArray, radius_mm: float, unused: NDArray[np.bool_]
+) -> ArtefactPoints | None:
+    candidates = np.flatnonzero(unused)
+    voters = candidates[:: max(len(candidates) // _MAX_VOTERS, 1)]
     if len(voters) == 0:
         return None
     votes = points_mm[voters] - radius_mm * normals[voters]
-    # Late: as in `_sphere`.
+    # Imported here as in `_sphere`.
     from scipy.spatial import cKDTree
 
     tree = cKDTree(votes)
-    reach_mm = _VOTE_REACH * radius_mm
+    reach_mm = _VOTE_RADIUS * radius_mm
     counts = tree.query_ball_point(votes[::10], reach_mm, return_length=True)
     centre = votes[::10][int(np.argmax(counts))]
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         near = tree.query_ball_point(centre, reach_mm)
         if not near:
             return None
         centre = votes[near].mean(axis=0)
-    nominal_mm, shell_mm = radius_mm, _SHELL * radius_mm
+    nominal_mm, shell_mm = radius_mm, _SHELL_DEPTH * radius_mm
     near, inside = candidates, candidates
-    for turn in range(_ROUNDS):
+    for iteration in range(_ITERATIONS):
         outwards = points_mm[candidates] - centre
         distance = np.linalg.norm(outwards, axis=1)
-        along = (outwards * normals[candidates]).sum(axis=1) / np.maximum(distance, 1e-12)
+        facing_cosine = (outwards * normals[candidates]).sum(axis=1) / np.maximum(distance, 1e-12)
         close = np.abs(distance - radius_mm) < shell_mm
-        # The centre that votes found is a rough one: at first, only what faces as the ball does tells a better one.
-        facing = along > (_TURNED_COSINE if turn else _TILT_COSINE)
+        # The centre from the votes is rough: the first fit uses only points that face as the ball does.
+        facing = facing_cosine > (_MIN_SURFACE_COSINE if iteration else _MIN_FACING_COSINE)
         near, inside = candidates[close], candidates[close & facing]
-        if len(inside) < FEWEST_POINTS:
+        if len(inside) < MIN_POINTS:
             return None
-        fit = fitted_sphere(points_mm[inside])
+        fit = fit_sphere(points_mm[inside])
         centre, radius_mm = fit.centre_mm, fit.radius_mm
-        if abs(radius_mm - nominal_mm) > _SHELL * nominal_mm:
+        if abs(radius_mm - nominal_mm) > _SHELL_DEPTH * nominal_mm:
             return None
-    return OnArtefact(inside, len(near) - len(inside))
+    return ArtefactPoints(inside, len(near) - len(inside))

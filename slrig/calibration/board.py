@@ -1,46 +1,50 @@
-"""Calibration boards: what is printed on them, and where each of their corners lies.
+"""Calibration boards, and the observations of one in cameras and projector.
 
-A board's own frame lies in its plane: the origin at corner 0, x to the right and y down as one looks at the print, z
-away from the one who looks. Corners count from left to right, then from top to bottom.
+Frame of a board: in the plane of the print, origin at corner 0, x to the right, y down, z away from the viewer of the
+print. Corners are numbered from left to right, then from top to bottom.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slrig.errors import CalibrationError
-from slrig.model import FloatArray
+from slrig.model import FloatArray, IntArray, Size
 
-DICTIONARY = "DICT_5X5_250"
-"""The markers of a ChArUco board, unless another dictionary of OpenCV is named."""
+DEFAULT_DICTIONARY = "DICT_5X5_250"
+"""OpenCV's marker dictionary of a ChArUco board, unless another one is named."""
 
-MARKER_SHARE = 0.75
-"""A marker's side over the square that it lies in, unless given."""
+MARKER_RATIO = 0.75
+"""Default side of a marker over the side of a square."""
 
 PRINT_SIGMA = 0.001
-"""Standard deviation of a print's width and of its height, over themselves, unless a certificate or a ruler says more:
-from dry to humid air bond paper grows by 0.1 to 0.2 % along its grain and by 0.2 to 0.4 % across it (usual figures of
-paper makers), and a room's air holds a part of that."""
+"""Relative standard deviation of a print's width and height without a certificate or a ruler reading: from dry to humid
+air, bond paper grows by 0.1 to 0.4 %, of which the air in a room causes a part."""
 
-_READING_MM = 0.1
-"""Standard deviation of a length as a steel ruler tells it: an eighth of a mm either way at each end, evenly spread."""
-_LONGEST_RULER_MM = 300
-_MOST_OFF = 0.05
-"""A scale that is read as further off its print was not read at its ends."""
+_RULER_SIGMA_MM = 0.1
+"""Standard deviation of a length read from a steel ruler, with an error of up to an eighth of a mm at each end."""
+_MAX_RULER_MM = 300
+_MAX_SCALE_ERROR = 0.05
+"""Largest relative deviation of a printed scale. A larger one is a wrong reading."""
 
-_LEAST_MARKER, _MOST_MARKER = 0.1, 0.99
-"""Of a square's side. Smaller ones no camera reads; larger ones touch, and to OpenCV's 32 bits are the square."""
+_MIN_MARKER_RATIO, _MAX_MARKER_RATIO = 0.1, 0.99
+"""Limits of a marker's side over the square's. No camera reads smaller ones; larger ones touch each other."""
 
-_FEWEST, _MOST = 3, 60
-_LEAST_MM, _MOST_MM = 0.1, 1000.0
+_MIN_CORNERS, _MAX_CORNERS = 3, 60
+_MIN_SQUARE_MM, _MAX_SQUARE_MM = 0.1, 1000.0
+
+COLUMN, ROW = 0, 1
+"""Axis of a projector coordinate."""
 
 
 class BoardKind(StrEnum):
-    """What is printed."""
+    """Pattern of a board."""
 
     CHARUCO = "charuco"
     CHESSBOARD = "chessboard"
@@ -48,7 +52,7 @@ class BoardKind(StrEnum):
 
 
 class BoardShape(StrEnum):
-    """What a solve takes the board for. auto : flat, unless held-out poses are better with a bent one."""
+    """Shape of the board in a solve. auto : flat, unless held-out poses are predicted better with a bent board."""
 
     AUTO = "auto"
     FLAT = "flat"
@@ -57,18 +61,14 @@ class BoardShape(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A board. A frozen value that travels from a request to the solve.
+    """A calibration board.
 
-    columns, rows : inner corners of a ChArUco board or chessboard; of asymmetric circles, the circles of one row, and
-    the rows (OpenCV's 4 x 11). square_mm : side of a square; of circles, the distance of two neighbouring rows, which
-    is half of that of two circles in one row. marker_mm, dictionary : of a ChArUco board only. square_sigma : standard
-    deviation of the print's width, and independently of its height, over themselves. aspect : a square's height over
-    its width; square_mm is its width.
+    columns, rows : inner corners of a ChArUco board or chessboard; of asymmetric circles, circles per row and rows
+    (OpenCV's 4 x 11). square_mm : width of a square; of circles, the distance of neighbouring rows, half the distance
+    of two circles in one row. marker_mm, dictionary : ChArUco boards only. square_sigma : relative standard deviation
+    of the print's width, and independently of its height. aspect : height of a square over its width.
 
-    Raises
-    ------
-    CalibrationError
-        No such board can be printed or told apart.
+    Raises CalibrationError if a value is out of range.
     """
 
     kind: BoardKind
@@ -83,25 +83,27 @@ class Board:
     def __post_init__(self) -> None:
         charuco = self.kind is BoardKind.CHARUCO
         if charuco and self.marker_mm is None:
-            object.__setattr__(self, "marker_mm", MARKER_SHARE * self.square_mm)
+            object.__setattr__(self, "marker_mm", MARKER_RATIO * self.square_mm)
         if charuco and self.dictionary is None:
-            object.__setattr__(self, "dictionary", DICTIONARY)
+            object.__setattr__(self, "dictionary", DEFAULT_DICTIONARY)
         faults = []
-        if not (_FEWEST <= self.columns <= _MOST and _FEWEST <= self.rows <= _MOST):
-            faults.append(f"expected {_FEWEST} to {_MOST} corners each way, found {self.columns} x {self.rows}")
-        if not _LEAST_MM <= self.square_mm <= _MOST_MM:
-            faults.append(f"square_mm: expected {_LEAST_MM:g} to {_MOST_MM:g} mm, found {self.square_mm:g}")
-        if not 0 < self.square_sigma <= _MOST_OFF:
+        if not (_MIN_CORNERS <= self.columns <= _MAX_CORNERS and _MIN_CORNERS <= self.rows <= _MAX_CORNERS):
             faults.append(
-                f"square_sigma: expected a share of a square's side above 0 and up to {_MOST_OFF:g}, 0.001 for a "
+                f"expected {_MIN_CORNERS} to {_MAX_CORNERS} corners each way, found {self.columns} x {self.rows}"
+            )
+        if not _MIN_SQUARE_MM <= self.square_mm <= _MAX_SQUARE_MM:
+            faults.append(f"square_mm: expected {_MIN_SQUARE_MM:g} to {_MAX_SQUARE_MM:g} mm, found {self.square_mm:g}")
+        if not 0 < self.square_sigma <= _MAX_SCALE_ERROR:
+            faults.append(
+                f"square_sigma: expected a relative deviation above 0 and up to {_MAX_SCALE_ERROR:g}, 0.001 for a "
                 f"print, found {self.square_sigma:g}"
             )
-        if not abs(self.aspect - 1) <= 2 * _MOST_OFF:
+        if not abs(self.aspect - 1) <= 2 * _MAX_SCALE_ERROR:
             faults.append(f"aspect: expected a square's height over its width, about 1, found {self.aspect:g}")
-        if charuco and not _LEAST_MARKER <= (self.marker_mm or 0) / self.square_mm <= _MOST_MARKER:
+        if charuco and not _MIN_MARKER_RATIO <= (self.marker_mm or 0) / self.square_mm <= _MAX_MARKER_RATIO:
             faults.append(
-                f"marker_mm: expected {_LEAST_MARKER:g} to {_MOST_MARKER:g} of the square's {self.square_mm:g} mm, "
-                f"found {self.marker_mm:g}"
+                f"marker_mm: expected {_MIN_MARKER_RATIO:g} to {_MAX_MARKER_RATIO:g} of the square's "
+                f"{self.square_mm:g} mm, found {self.marker_mm:g}"
             )
         if not charuco and (self.marker_mm is not None or self.dictionary is not None):
             faults.append(f"marker_mm and dictionary belong to a ChArUco board, and this is a board of {self.kind}")
@@ -111,12 +113,12 @@ class Board:
 
     @property
     def corner_count(self) -> int:
-        """How many corners (circles) there are."""
+        """Number of corners (circles)."""
         return self.columns * self.rows
 
     @property
     def points_mm(self) -> FloatArray:
-        """(n, 3) float64: every corner (the centre of every circle) in the board's frame."""
+        """(n, 3) float64: every corner (centre of every circle) in the board's frame."""
         row, column = np.divmod(np.arange(self.corner_count), self.columns)
         across = 2 * column + row % 2 if self.kind is BoardKind.CIRCLES else column
         flat = np.column_stack([across, self.aspect * row, np.zeros_like(row)])
@@ -124,49 +126,54 @@ class Board:
 
     @property
     def print_mm(self) -> FloatArray:
-        """(2, 2) float64: the least and the greatest (x, y) of what is printed, in the board's frame."""
+        """(2, 2) float64: least and greatest (x, y) of the print, in the board's frame."""
         across = 2 * self.columns if self.kind is BoardKind.CIRCLES else self.columns
         return np.array([(-1.0, -1.0), (across, self.rows)]) * self.square_mm * [1.0, self.aspect]
 
     @property
+    def print_size_mm(self) -> tuple[float, float]:
+        """Width and height of the print."""
+        width_mm, height_mm = (self.print_mm[1] - self.print_mm[0]).tolist()
+        return width_mm, height_mm
+
+    @property
     def rulers_mm(self) -> tuple[int, int]:
-        """Lengths of the scales that are printed below the board and left of it, as `slrig calibrate board` does."""
-        wide_mm, high_mm = (self.print_mm[1] - self.print_mm[0]).tolist()
-        return _ruler_mm(wide_mm), _ruler_mm(high_mm)
+        """Lengths of the scales that `slrig calibrate board` prints below the board and left of it."""
+        width_mm, height_mm = self.print_size_mm
+        return _ruler_length_mm(width_mm), _ruler_length_mm(height_mm)
 
-    def as_read(self, across_mm: float, down_mm: float, /, *, square_sigma: float | None = None) -> Board:
-        """The board as its print turned out, by what is read from end to end of the two printed scales.
+    def as_measured(self, across_mm: float, down_mm: float, /, *, square_sigma: float | None = None) -> Board:
+        """The board in its printed size, from readings of the two printed scales from end to end.
 
-        square_sigma : how sure the readings are; None takes them for those of a steel ruler.
+        square_sigma : relative standard deviation of the readings; None: that of a steel ruler.
 
-        Raises
-        ------
-        CalibrationError
-            A reading is further off than any printer is.
+        Raises CalibrationError if a reading deviates from the printed length by more than any printer does.
         """
         faults = [
             f"the scale {where} the board is {printed_mm} mm long in print, read as {read_mm:g} mm"
             for where, printed_mm, read_mm in zip(
                 ("below", "left of"), self.rulers_mm, (across_mm, down_mm), strict=True
             )
-            if not abs(read_mm / printed_mm - 1) <= _MOST_OFF
+            if not abs(read_mm / printed_mm - 1) <= _MAX_SCALE_ERROR
         ]
         if faults:
             message = (
-                f"{'; '.join(faults)}: read each from its first to its last tick; print again at 100 % if it is so"
+                f"{'; '.join(faults)}: read each from its first to its last tick; if it is right, print again at 100 %"
             )
             raise CalibrationError(message)
-        wide, high = (read / printed for read, printed in zip((across_mm, down_mm), self.rulers_mm, strict=True))
-        marker_mm = None if self.marker_mm is None else self.marker_mm * wide
-        by_ruler = float(np.sqrt(np.mean([(_READING_MM / printed) ** 2 for printed in self.rulers_mm])))
-        sigma = by_ruler if square_sigma is None else square_sigma
+        width_scale, height_scale = across_mm / self.rulers_mm[0], down_mm / self.rulers_mm[1]
+        ruler_sigma = float(np.sqrt(np.mean([(_RULER_SIGMA_MM / printed) ** 2 for printed in self.rulers_mm])))
         return replace(
-            self, square_mm=self.square_mm * wide, marker_mm=marker_mm, square_sigma=sigma, aspect=high / wide
+            self,
+            square_mm=self.square_mm * width_scale,
+            marker_mm=None if self.marker_mm is None else self.marker_mm * width_scale,
+            square_sigma=ruler_sigma if square_sigma is None else square_sigma,
+            aspect=height_scale / width_scale,
         )
 
     @property
     def title(self) -> str:
-        """A few words for it.
+        """Kind, corners and square size.
 
         >>> Board(BoardKind.CHESSBOARD, 11, 8, 12.0).title
         'chessboard 11x8, 12 mm'
@@ -175,7 +182,7 @@ class Board:
 
     @property
     def description(self) -> str:
-        """What it is, in full.
+        """Full description, with markers.
 
         >>> Board(BoardKind.CHARUCO, 11, 8, 12.0).description
         'charuco, 11 x 8 inner corners, squares of 12 mm, markers of 9 mm from DICT_5X5_250'
@@ -186,10 +193,100 @@ class Board:
         return f"{self.kind}, {self.columns} x {self.rows} inner corners, squares of {self.square_mm:g} mm{markers}"
 
 
-def _ruler_mm(room_mm: float) -> int:
-    """How long a scale is that has so much room: whole centimetres, if there is one."""
-    return min(_LONGEST_RULER_MM, 10 * math.floor(room_mm / 10)) if room_mm >= 10 else math.floor(room_mm)
+def _ruler_length_mm(space_mm: float) -> int:
+    """Length of the scale that fits in a space: whole centimetres from 10 mm on."""
+    return min(_MAX_RULER_MM, 10 * math.floor(space_mm / 10)) if space_mm >= 10 else math.floor(space_mm)
 
 
-USUAL_BOARD = Board(BoardKind.CHARUCO, 11, 8, 12.0)
-"""The board that is meant where none is named: 12 x 9 squares, which fit on A4 and letter paper with their rulers."""
+DEFAULT_BOARD = Board(BoardKind.CHARUCO, 11, 8, 12.0)
+"""12 x 9 squares of 12 mm, which fit on A4 and letter paper with their scales."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardView:
+    """Corners of the board in one camera's image.
+
+    corner : (n,) int32, numbers in ascending order; points_px : (n, 2) float64; sigma_px : (n,) float64, standard
+    deviation of a coordinate, from the detector. light_first : the square up and left of corner 0 is light, as in
+    ChArUco boards of OpenCV before 4.6 with an even number of rows of squares.
+    """
+
+    corner: IntArray
+    points_px: FloatArray
+    sigma_px: FloatArray
+    light_first: bool = False
+
+    @classmethod
+    def empty(cls) -> BoardView:
+        """A view without corners."""
+        return cls(np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0))
+
+    def __post_init__(self) -> None:
+        count = len(self.corner)
+        if self.points_px.shape != (count, 2) or self.sigma_px.shape != (count,):
+            message = f"a view of {count} corners, {self.points_px.shape} points and {self.sigma_px.shape} deviations"
+            raise ValueError(message)
+
+
+@dataclass(frozen=True, slots=True)
+class Correspondences:
+    """Projector coordinates of camera pixels on the board, one coordinate each.
+
+    pixels_px : (n, 2) float64, (x, y) in the camera; axis : (n,) uint8, COLUMN or ROW; position_px : (n,) float64, that
+    coordinate in the projector; sigma_px : (n,) float64, its standard deviation from noise, projector pixels. A pixel
+    with both coordinates appears twice.
+    """
+
+    pixels_px: FloatArray
+    axis: NDArray[np.uint8]
+    position_px: FloatArray
+    sigma_px: FloatArray
+
+    def __post_init__(self) -> None:
+        count = len(self.axis)
+        if self.pixels_px.shape != (count, 2) or self.position_px.shape != (count,) or self.sigma_px.shape != (count,):
+            message = (
+                f"correspondences: {count} axes, {self.pixels_px.shape} pixels, {self.position_px.shape} positions"
+            )
+            raise ValueError(message)
+
+
+@dataclass(frozen=True, slots=True)
+class ViewQuality:
+    """Image quality of the board in one camera and pose. NaN where not measured.
+
+    moved_px : greatest rms displacement of the corners from the first frame; inf where the board is lost.
+    saturated : fraction of the board's pixels that are clipped in the white frame.
+    contrast : median of white minus black on the board's light squares over full scale; without a projector, light
+    squares minus dark ones.
+    sharpness_px : standard deviation of the blur across the edges of the squares, camera pixels.
+    decoded : fraction of the board's lit pixels that were decoded along both axes; NaN without a projector.
+    """
+
+    moved_px: float
+    saturated: float
+    contrast: float
+    sharpness_px: float
+    decoded: float
+
+
+@dataclass(frozen=True, slots=True)
+class PoseObservation:
+    """One pose of the board. views, correspondences : by camera; the latter are empty without a projector."""
+
+    name: str
+    views: Mapping[str, BoardView]
+    correspondences: Mapping[str, Correspondences] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """All poses of one board in one rig: the input of a solve. projector : None where none is calibrated.
+
+    The frame of the first camera becomes the world.
+    """
+
+    board: Board
+    cameras: Mapping[str, Size]
+    projector: Size | None
+    poses: tuple[PoseObservation, ...]

@@ -9,7 +9,7 @@ from pathlib import Path
 import typer
 
 from slrig.bundle.storage import write_file
-from slrig.calibration.board import USUAL_BOARD, Board, BoardKind
+from slrig.calibration.board import DEFAULT_BOARD, Board, BoardKind
 from slrig.cli.options import BoardOptions
 from slrig.disk import refusals_of
 from slrig.errors import CalibrationError
@@ -35,16 +35,16 @@ def chosen_board(asked: BoardOptions) -> Board:
             ),
             asked,
         )
-    usual = (USUAL_BOARD.columns, USUAL_BOARD.rows)
-    if asked.kind not in (None, USUAL_BOARD.kind) or (asked.corners is not None and _counted(asked.corners) != usual):
+    usual = (DEFAULT_BOARD.columns, DEFAULT_BOARD.rows)
+    if asked.kind not in (None, DEFAULT_BOARD.kind) or (asked.corners is not None and _counted(asked.corners) != usual):
         message = (
             f"Which board? Missing: {', '.join(missing)}. Name all of it, as --board chessboard --corners 9x6 "
-            f"--square-mm 20, or nothing for the usual one: {USUAL_BOARD.description}"
+            f"--square-mm 20, or nothing for the usual one: {DEFAULT_BOARD.description}"
         )
         raise CalibrationError(message)
-    square_mm = USUAL_BOARD.square_mm if asked.square_mm is None else asked.square_mm
-    corners = f"{USUAL_BOARD.columns}x{USUAL_BOARD.rows}"
-    board = _as_printed(board_option(USUAL_BOARD.kind, corners, square_mm, asked.marker_mm, asked.dictionary), asked)
+    square_mm = DEFAULT_BOARD.square_mm if asked.square_mm is None else asked.square_mm
+    corners = f"{DEFAULT_BOARD.columns}x{DEFAULT_BOARD.rows}"
+    board = _as_printed(board_option(DEFAULT_BOARD.kind, corners, square_mm, asked.marker_mm, asked.dictionary), asked)
     typer.echo(f"board     {board.description} (--board, --corners and --square-mm name another)", err=True)
     return board
 
@@ -53,7 +53,9 @@ def _as_printed(board: Board, asked: BoardOptions) -> Board:
     """The board with what was said of the size of its print."""
     if asked.square_sigma is not None:
         board = replace(board, square_sigma=asked.square_sigma)
-    return board if asked.measured_mm is None else board.as_read(*asked.measured_mm, square_sigma=asked.square_sigma)
+    return (
+        board if asked.measured_mm is None else board.as_measured(*asked.measured_mm, square_sigma=asked.square_sigma)
+    )
 
 
 def board_option(
@@ -80,7 +82,7 @@ def board_option(
     board = Board(BoardKind(kind), *counted, square_mm, marker_mm, dictionary)
     if board.kind is BoardKind.CHARUCO:
         # OpenCV knows whether there is such a dictionary, with markers enough. Late, for it takes a while to load.
-        from slrig.calibration.boards.printing import charuco_board
+        from slrig.calibration.printing import charuco_board
 
         charuco_board(board)
     return board
@@ -102,7 +104,7 @@ def write_board(board: Board, output: Path, *, page: str) -> None:
     StorageError
         The file cannot be written.
     """
-    from slrig.calibration.boards.printing import board_pdf, board_svg, solve_command
+    from slrig.calibration.printing import board_pdf, board_svg, solve_command
 
     kind = output.suffix.lower()
     if kind not in (".pdf", ".svg"):

@@ -17,7 +17,7 @@ from slrig.bundle import read_calibration, write_calibration, write_opencv_calib
 from slrig.bundle.storage import write_file
 from slrig.calibrate.pose_frames import bundle_device_sizes
 from slrig.calibration.board import Board, BoardShape
-from slrig.calibration.poses.checks import check_same_devices
+from slrig.calibration.poses import check_same_devices
 from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import checked, tell_check, tell_result
 from slrig.cli.display import ProgressDisplay, counted, print_json, progress_shown

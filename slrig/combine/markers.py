@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from slrig.bundle.description import DESCRIPTION
 from slrig.bundle.reading import open_bundle
-from slrig.calibration.boards.corner_fit import (
-    FLOOR_PX,
-    WORST_SIGMA_PX,
-    FittedPlaces,
-    Grey,
-    fitted_corners,
+from slrig.calibration.detection import (
+    MAX_SIGMA_PX,
+    SIGMA_FLOOR_PX,
+    GreyImage,
+    PointFit,
+    detect_markers,
+    fit_corners,
     patch_offsets,
 )
-from slrig.calibration.boards.printing import marker_dictionary
-from slrig.calibration.boards.sightings import markers_in
+from slrig.calibration.printing import marker_dictionary
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, White
 from slrig.multiview import MarkerObservation, fit_plane
@@ -89,8 +89,8 @@ def markers_in_view(
     image: Pixels, camera: Pinhole, full_scale: float, mesh: Mesh, dictionary: str
 ) -> Iterator[tuple[int, MarkerObservation]]:
     """The markers of one frame, (H, W), whose pixels clip at `full_scale`; see `markers_of`."""
-    grey = Grey.of(image, full_scale)
-    outlines, numbers = markers_in(grey.eight, dictionary)
+    grey = GreyImage.from_pixels(image, full_scale)
+    outlines, numbers = detect_markers(grey.image_8bit, dictionary)
     modules = int(marker_dictionary(dictionary).markerSize) + 2
     vertices = mesh.vertices_mm.astype(np.float64)
     places = project(camera, vertices)
@@ -103,8 +103,8 @@ def markers_in_view(
         # Of a plane by n points, where these end: of its middle and two tilts, 1 / n each.
         off_mm *= np.sqrt(3 * _ALIKE / len(mine))
         placed = _placed(grey.level, rough, modules)
-        sigma_px = np.hypot(placed.sigma_px, FLOOR_PX)
-        if not (sigma_px < WORST_SIGMA_PX).all():  # NaN where a fit failed
+        sigma_px = np.hypot(placed.sigma_px, SIGMA_FLOOR_PX)
+        if not (sigma_px < MAX_SIGMA_PX).all():  # NaN where a fit failed
             continue
         ways = pixel_rays(camera, placed.points_px)
         depth = (middle - camera.centre_mm) @ normal / (ways @ normal)
@@ -116,7 +116,7 @@ def markers_in_view(
         yield number, MarkerObservation(camera.centre_mm + depth[:, None] * ways, sigma)
 
 
-def _placed(level: FloatArray, rough: FloatArray, modules: int) -> FittedPlaces:
+def _placed(level: FloatArray, rough: FloatArray, modules: int) -> PointFit:
     """A marker's corners (4, 2), which OpenCV gives clockwise, by a fit to the pixels about each."""
     # Columns: one module along the side that follows a corner, and one along the side before it.
     slope = np.stack([np.roll(rough, -1, axis=0) - rough, np.roll(rough, 1, axis=0) - rough], axis=2) / modules
@@ -124,7 +124,7 @@ def _placed(level: FloatArray, rough: FloatArray, modules: int) -> FittedPlaces:
     offsets = patch_offsets(half) + (np.round(rough) - rough)[:, None]
     usable = np.abs(np.einsum("nij,nmj->nmi", np.linalg.inv(slope), offsets)).max(axis=2) < _REACH
     sides = slope.transpose(0, 2, 1) * np.array([[1.0], [-1.0]])
-    return fitted_corners(level, rough, sides, usable, half_px=half, outer=True)
+    return fit_corners(level, rough, sides, usable, half_px=half, outer=True)
 
 
 def _inside(outline: FloatArray, places: FloatArray) -> NDArray[np.bool_]:

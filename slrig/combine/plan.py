@@ -24,7 +24,7 @@ MOST_UNKNOWN = 24
 """Views whose poses are to be found: eight take 15 to 20 s, and the time grows with their square."""
 
 MARKER_DICTIONARY = "DICT_5X5_250"
-"""That of the boards, see `slrig.calibration.board.DICTIONARY`."""
+"""That of the boards, see `slrig.calibration.board.DEFAULT_DICTIONARY`."""
 
 MOST_VIEWS = 72
 """Of a model that is shot: one every 5°, closer than which neighbours tell the same."""

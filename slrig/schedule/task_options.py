@@ -35,7 +35,9 @@ class BoardOptions(Strict):
         board = Board(
             self.kind, columns, rows, self.square_mm, self.marker_mm, self.dictionary, sigma, self.aspect
         )  # fmt: skip
-        return board if self.measured_mm is None else board.as_read(*self.measured_mm, square_sigma=self.square_sigma)
+        return (
+            board if self.measured_mm is None else board.as_measured(*self.measured_mm, square_sigma=self.square_sigma)
+        )
 
 
 class VerificationOptions(Strict):

@@ -39,7 +39,7 @@ FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 # Only a terminal shows these messages: of commands, of the start of the service, and on printed boards.
 OF_THE_COMMAND_LINE = (
     "slrig/cli", "slrig/api", "slrig/doctor", "slrig/jobs/data_folder.py", "slrig/jobs/database.py",
-    "slrig/calibration/boards/printing.py", "slrig/importers", "slrig/errors.py",
+    "slrig/calibration/printing.py", "slrig/importers", "slrig/errors.py",
     "drivers/screen/refusals.py",  # options of xrandr
 )  # fmt: skip
 OF_OTHER_PROGRAMS = ("v4l2-ctl", "xrandr", "udevadm", "{command}")

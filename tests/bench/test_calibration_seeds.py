@@ -28,8 +28,7 @@ import pytest
 
 from simulated_rig.options import HeadOptions
 from slrig.calibrate.pose_reading import read_pose
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import Observations
+from slrig.calibration.board import Board, BoardKind, Observations
 from slrig.calibration.solution import Solution
 from slrig.calibration.solving.projection import difference
 from slrig.calibration.solving.solve import solve

@@ -14,7 +14,7 @@ from slrig.accept.positions import acceptance_plan, rig_volume_mm
 from slrig.accept.running import run_acceptance
 from slrig.accept.scene import scripted_config
 from slrig.accept.verdicts import AcceptanceResult
-from slrig.calibration.artefacts import Decision, fitted_sphere
+from slrig.calibration.artefacts import Decision, fit_sphere
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.errors import NothingToReconstructError
@@ -103,7 +103,7 @@ def test_the_whole_test_of_a_rendered_rig_reports_the_errors_that_there_are(tmp_
             assert float(true.std()) == pytest.approx(each.sigma_mm, rel=0.35)
         if Quantity.SPACING in each.errors_mm:
             assert abs(each.errors_mm[Quantity.SPACING]) <= plan.diagonal_mm / 20_000
-            ends = [fitted_sphere(points[kept["artefact"] == ball]).centre_mm for ball in (1, 2)]
+            ends = [fit_sphere(points[kept["artefact"] == ball]).centre_mm for ball in (1, 2)]
             rendered = [step.centre_mm + side * plan.artefacts.distance.value_mm / 2 * step.axis for side in (-1, 1)]
             # Balls of 30 pixels' radius are seen too deep beside their rims, where light grazes: 27 to 34 µm, alike
             # at both ends of a bar.

@@ -19,8 +19,7 @@ from slrig.bundle.calibration import write_calibration
 from slrig.calibrate.pose_frames import bundle_device_sizes
 from slrig.calibrate.pose_reading import read_pose
 from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import COLUMN, ROW, Correspondences
+from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, Correspondences
 from slrig.calibration.solution import PARAMETERS, PROJECTOR
 from slrig.cli.commands import app
 from slrig.model import FloatArray

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.lattice import equivalent_views
-from slrig.calibration.boards.printing import FIT, PAGES_MM, artwork, board_svg
-from slrig.calibration.observations import BoardView
+from slrig.calibration.board import Board, BoardKind, BoardView
+from slrig.calibration.detection.lattice import equivalent_numberings
+from slrig.calibration.printing import FIT, PAGES_MM, artwork, board_svg
 from slrig.errors import CalibrationError
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -62,9 +61,9 @@ def test_numberings_come_back_to_where_they_began(board: Board, seed: int) -> No
     random = np.random.default_rng(seed)
     corner = np.flatnonzero(random.random(board.corner_count) < 0.7).astype(np.int32)
     view = BoardView(corner, random.random((len(corner), 2)), random.random(len(corner)))
-    views = equivalent_views(view, board)
+    views = equivalent_numberings(view, board)
     numbers = {tuple(each.corner.tolist()) for each in views}
     for each in views:
         assert (np.diff(each.corner) > 0).all()
-        again = {tuple(other.corner.tolist()) for other in equivalent_views(each, board)}
+        again = {tuple(other.corner.tolist()) for other in equivalent_numberings(each, board)}
         assert again == numbers

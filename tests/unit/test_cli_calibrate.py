@@ -17,7 +17,7 @@ from typer.testing import Result
 from slrig.api.calibration_schemas import ComparisonBody
 from slrig.bundle import read_calibration, read_opencv_calibration, write_calibration, write_opencv_calibration
 from slrig.calibrate.pose_judging import summary
-from slrig.calibration.board import USUAL_BOARD, BoardShape
+from slrig.calibration.board import DEFAULT_BOARD, BoardShape
 from slrig.cli.calibrate_walk import Walk, opened
 from slrig.cli.calibration_screen import tell_result
 from slrig.cli.commands import INTERRUPTED
@@ -257,9 +257,9 @@ def test_board_that_is_not_named_is_the_usual_one(tmp_path: Path) -> None:
         assert sheet.read_bytes() == whole.read_bytes()
         assert f"--corners 11x8 --square-mm {square_mm}" in sheet.read_text(encoding="utf-8")
     told = " ".join(run("board", "--help").stdout.replace("│", " ").split())
-    assert f"Default: {USUAL_BOARD.kind}." in told
-    assert f"as {USUAL_BOARD.columns}x{USUAL_BOARD.rows} (default)" in told
-    assert f"measured on the print (default {USUAL_BOARD.square_mm:g})" in told
+    assert f"Default: {DEFAULT_BOARD.kind}." in told
+    assert f"as {DEFAULT_BOARD.columns}x{DEFAULT_BOARD.rows} (default)" in told
+    assert f"measured on the print (default {DEFAULT_BOARD.square_mm:g})" in told
 
 
 def test_screen_fits_on_one_and_holds_the_figures() -> None:

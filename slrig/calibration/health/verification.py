@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slrig.calibration.board import Board
+from slrig.calibration.board import COLUMN, ROW, Board, Correspondences, PoseObservation
 from slrig.calibration.displacement import cell_centres, modes_of, moved_points, rigid_free
 from slrig.calibration.health.drift import (
     ALIKE,
@@ -27,7 +27,6 @@ from slrig.calibration.health.drift import (
     rival_words,
     rivals,
 )
-from slrig.calibration.observations import COLUMN, ROW, Correspondences, PoseObservation
 from slrig.calibration.solution import CELLS, PARAMETERS, PROJECTOR, BoardPose, covariance_of, device_title, devices_of
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, IntArray, Pinhole, Size

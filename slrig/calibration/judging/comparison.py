@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
+from slrig.calibration.board import COLUMN, ROW, Observations
 from slrig.calibration.displacement import (
     Moved,
     RigidMotion,
@@ -24,7 +25,6 @@ from slrig.calibration.displacement import (
     stated_deviation,
     without_rigid_motion,
 )
-from slrig.calibration.observations import COLUMN, ROW, Observations
 from slrig.calibration.solution import (
     PROJECTOR,
     ExpectedError,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slrig.calibration.board import PRINT_SIGMA, Board
 from slrig.calibration.judging.comparison import OddEven
-from slrig.calibration.poses.coverage import Coverage, place_words
+from slrig.calibration.poses import Coverage, describe_place
 from slrig.calibration.solution import (
     CELLS,
     PARAMETERS,
@@ -444,7 +444,7 @@ def _residual_shape(name: str, residuals: DeviceResiduals) -> Iterator[Judgement
         worst = float(length[row, column])
         ratio = worst / residuals.rms_px
         if ratio > LIMITS["bias_ratio"].good and worst > _LEAST_BIAS_PX:
-            where = place_words((int(column) * 3 // CELLS - 1, int(row) * 3 // CELLS - 1))
+            where = describe_place((int(column) * 3 // CELLS - 1, int(row) * 3 // CELLS - 1))
             words = (
                 f"{title}: in the {where} the residuals lean by {worst:.2g} px to one side, as much as their rms of "
                 f"{residuals.rms_px:.2g} px: the lens model does not fit there, or the board is bent; add poses there"
@@ -525,7 +525,7 @@ def _emptiest(empty: NDArray[np.bool_]) -> str:
     third = CELLS // 3
     counts: FloatArray = empty.reshape(3, third, 3, third).sum(axis=(1, 3)).astype(np.float64)
     row, column = np.unravel_index(int(np.argmax(counts)), counts.shape)
-    return place_words((int(column) - 1, int(row) - 1))
+    return describe_place((int(column) - 1, int(row) - 1))
 
 
 def _worst_pose(residuals: DeviceResiduals) -> tuple[str, float] | None:

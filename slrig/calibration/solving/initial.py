@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import rq
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import COLUMN, ROW, BoardView, Observations
+from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, BoardView, Observations
 from slrig.calibration.solving.projection import LEAST_CORNERS, Measurements, device_row, pose_row
 from slrig.errors import SolveRefusedError
 from slrig.model import FloatArray, Size

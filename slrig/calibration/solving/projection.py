@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slrig.calibration.observations import Correspondences, Observations
+from slrig.calibration.board import Correspondences, Observations
 from slrig.calibration.solution import PARAMETERS, BoardPose
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray, Pinhole, Size

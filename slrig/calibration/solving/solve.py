@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from slrig.calibration.board import Board, BoardShape
-from slrig.calibration.observations import Observations
+from slrig.calibration.board import Board, BoardShape, Observations
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardSize, DeviceResiduals, Solution, device_title, scale_mode
 from slrig.calibration.solving.adjustment import (
     Fit,

@@ -11,8 +11,8 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.bundle.calibration import write_calibration
-from slrig.calibration.board import USUAL_BOARD, Board, BoardKind
-from slrig.calibration.boards.printing import board_pdf
+from slrig.calibration.board import DEFAULT_BOARD, Board, BoardKind
+from slrig.calibration.printing import board_pdf
 from slrig.errors import SolveRefusedError
 from slrig.model import Size
 from slrig.scan.plan_check import pattern_sequence
@@ -295,7 +295,7 @@ def test_unknown_calibration_pose_camera_or_device_is_not_found(calibrating: Tes
 def test_sheet_of_a_board_is_what_the_command_writes(client: TestClient) -> None:
     found = client.get("/calibration/board.pdf")
     assert (found.status_code, found.headers["content-type"]) == (200, "application/pdf")
-    assert found.content == board_pdf(USUAL_BOARD)
+    assert found.content == board_pdf(DEFAULT_BOARD)
     asked = {"kind": "chessboard", "columns": "7", "rows": "5", "square_mm": "24.5", "page": "A3"}
     found = client.get("/calibration/board.pdf", params=asked)
     assert found.content == board_pdf(Board(BoardKind.CHESSBOARD, 7, 5, 24.5), page="A3")

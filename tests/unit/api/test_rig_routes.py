@@ -17,7 +17,7 @@ from slrig.accept.desk import AcceptanceDesk
 from slrig.api import acceptance as router_module
 from slrig.api import health, stage
 from slrig.calibrate.records import PoseRecord, SessionRecord
-from slrig.calibration.board import USUAL_BOARD
+from slrig.calibration.board import DEFAULT_BOARD
 from slrig.combine.stage import StageStore
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
@@ -115,7 +115,7 @@ def found(observed: list[int], _board: object, _calibration: object, angles_deg:
     names, poses, covariance = shot(SIX_DEG)
     rows = [row for each in observed for row in range(6 * each, 6 * each + 6)]
     of = [names[each] for each in observed]
-    return axis_from_board(of, poses[observed], covariance[rows][:, rows], USUAL_BOARD.points_mm, angles_deg)
+    return axis_from_board(of, poses[observed], covariance[rows][:, rows], DEFAULT_BOARD.points_mm, angles_deg)
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def stage_client(tmp_path: Path) -> Iterator[TestClient]:
     folder = DataFolder(tmp_path / "data")
     folder.scan(SCAN).mkdir(parents=True)
     (folder.scan(SCAN) / "mesh.ply").write_bytes(b"of the empty stage")
-    session = SessionRecord(1, SESSION, POSES[0].created_at, "rig", board=USUAL_BOARD, poses=POSES)
+    session = SessionRecord(1, SESSION, POSES[0].created_at, "rig", board=DEFAULT_BOARD, poses=POSES)
     readings = [SimpleNamespace(observation=number) for number in range(6)]
     service = SimpleNamespace(
         folder=folder,

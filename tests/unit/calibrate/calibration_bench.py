@@ -18,9 +18,8 @@ from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import CalibrationTools, Judgement, Setting, Standing
-from slrig.calibration.board import Board, BoardKind, BoardShape
+from slrig.calibration.board import Board, BoardKind, BoardShape, BoardView, PoseObservation, ViewQuality
 from slrig.calibration.judging.comparison import comparison
-from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
 from slrig.devices import Rig
 from slrig.errors import PoseRefusedError
 from slrig.jobs.records import JobKind
@@ -115,7 +114,7 @@ class TameCalibrating:
             raise PoseRefusedError(message)
         count = board.corner_count
         view = BoardView(np.arange(count, dtype=np.int32), board.points_mm[:, :2].copy(), np.full(count, 0.05))
-        return ReadPose(PoseObservation(name, {"cam0": view}), {"cam0": ViewFigures(0.01, 0.0, 0.4, 1.0, np.nan)})
+        return ReadPose(PoseObservation(name, {"cam0": view}), {"cam0": ViewQuality(0.01, 0.0, 0.4, 1.0, np.nan)})
 
     def _judge(self, pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> Judgement:
         assert setting.board == BOARD

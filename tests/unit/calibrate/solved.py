@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 
 from slrig.calibrate.solving import CalibrationResult, ReadPose
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import Board, BoardKind, BoardView, Correspondences, PoseObservation, ViewQuality
 from slrig.calibration.displacement import RigidMotion
 from slrig.calibration.judging.comparison import OddEven
 from slrig.calibration.judging.verdict import verdict
-from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
-from slrig.calibration.poses.coverage import coverage
+from slrig.calibration.poses.guidance import coverage
 from slrig.calibration.solution import (
     CELLS,
     PARAMETERS,
@@ -111,7 +110,7 @@ def read_poses() -> dict[str, ReadPose]:
             np.full(2 * len(seen), NOISE_PX[PROJECTOR]),
         )
         observation = PoseObservation(name, {"left": BoardView(seen, noisy, np.full(len(seen), 0.03))}, {"left": light})
-        figures = ViewFigures(
+        figures = ViewQuality(
             moved_px=0.01 + 0.002 * number,
             saturated=0.001,
             contrast=0.62,

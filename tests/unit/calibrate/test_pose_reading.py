@@ -14,9 +14,8 @@ from slrig.calibrate.pose_frames import bundle_device_sizes
 from slrig.calibrate.pose_movement import moved_px
 from slrig.calibrate.pose_reading import read_captured, read_pose
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.detection import board_region, find_board
-from slrig.calibration.observations import COLUMN, ROW, Correspondences
+from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, Correspondences
+from slrig.calibration.detection.detection import board_mask, find_board
 from slrig.calibration.poses.checks import LIMITS
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import PatternError, PoseRefusedError
@@ -172,7 +171,7 @@ def test_board_moved_by_two_squares_does_not_look_as_if_it_stood_still() -> None
     there = standing.shifted((2 * BOARD.square_mm, 0.0, 0.0))
     frames = [shot(each, patterns=ENDS).shots[0].image.astype(np.float32) for each in (standing, there)]
     view = find_board(frames[0], BOARD, full_scale=255.0)
-    region = board_region(view, BOARD, (frames[0].shape[0], frames[0].shape[1]))
+    region = board_mask(view, BOARD, (frames[0].shape[0], frames[0].shape[1]))
     assert moved_px(frames, view, BOARD, region, 255.0) == pytest.approx(36.0 * 570 / 605, rel=0.1)
 
 

@@ -21,11 +21,10 @@ from slrig.calibrate.pose_judging import judgement, summary
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
 from slrig.calibrate.tools import Setting
-from slrig.calibration.board import BoardShape
+from slrig.calibration.board import BoardShape, ViewQuality
 from slrig.calibration.health.verification import verify_by_board
 from slrig.calibration.judging.comparison import comparison
 from slrig.calibration.judging.verdict import Grade
-from slrig.calibration.observations import ViewFigures
 from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import tell_result
 from slrig.errors import CalibrationError
@@ -310,7 +309,7 @@ def test_report_of_cameras_alone_needs_no_projector_and_keeps_their_capitals() -
 
 
 SIZE = Size(1280, 1024)
-FIGURES = ViewFigures(moved_px=0.01, saturated=0.0, contrast=0.6, sharpness_px=1.1, decoded=float("nan"))
+FIGURES = ViewQuality(moved_px=0.01, saturated=0.0, contrast=0.6, sharpness_px=1.1, decoded=float("nan"))
 
 
 @cache

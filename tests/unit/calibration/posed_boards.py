@@ -7,15 +7,14 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import PoseObservation, ViewFigures
+from slrig.calibration.board import Board, BoardKind, PoseObservation, ViewQuality
 from slrig.calibration.solution import PROJECTOR, BoardPose
 from slrig.model import Calibration, FloatArray, Pinhole, Size
 from tests.unit.calibration.synthetic import CHESSBOARD as CHESSBOARD
 from tests.unit.calibration.synthetic import Recipe, observed
 
 CHARUCO = Board(BoardKind.CHARUCO, 11, 8, 12.0)
-SHARP = ViewFigures(moved_px=0.02, saturated=0.0, contrast=0.5, sharpness_px=0.8, decoded=0.9)
+SHARP = ViewQuality(moved_px=0.02, saturated=0.0, contrast=0.5, sharpness_px=0.8, decoded=0.9)
 
 
 def looking(

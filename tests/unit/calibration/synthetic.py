@@ -9,8 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, Observations, PoseObservation
+from slrig.calibration.board import (
+    COLUMN,
+    ROW,
+    Board,
+    BoardKind,
+    BoardView,
+    Correspondences,
+    Observations,
+    PoseObservation,
+)
 from slrig.calibration.solution import PROJECTOR
 from slrig.model import Calibration, FloatArray, Pinhole, Size
 

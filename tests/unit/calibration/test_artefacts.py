@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from slrig.calibration.artefacts import (
-    REJECTED_SHARE,
+    MAX_REJECTED_FRACTION,
     Decision,
-    ball_points,
-    decision,
+    decide,
     dispersion_mm,
-    fitted_plane,
-    fitted_sphere,
-    plane_points,
+    find_balls,
+    find_plane,
+    fit_plane,
+    fit_sphere,
 )
 from slrig.errors import NothingToReconstructError
 from slrig.model import FloatArray
@@ -39,9 +39,9 @@ def cap(
 
 @pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.floats(5.0, 40.0), st.floats(-200.0, 200.0), st.floats(300.0, 900.0))
-def test_an_exact_ball_is_found_exactly(seed: int, radius_mm: float, x_mm: float, z_mm: float) -> None:
+def test_an_exact_ball_is_fitted_exactly(seed: int, radius_mm: float, x_mm: float, z_mm: float) -> None:
     points = cap(300, centre_mm=(x_mm, 12.0, z_mm), radius_mm=radius_mm, sigma_mm=0.0, seed=seed)
-    found = fitted_sphere(points)
+    found = fit_sphere(points)
     np.testing.assert_allclose(found.centre_mm, (x_mm, 12.0, z_mm), atol=1e-7)
     assert found.radius_mm == pytest.approx(radius_mm, abs=1e-7)
     assert np.ptp(found.distances_mm) + dispersion_mm(found.distances_mm) < 1e-6
@@ -51,12 +51,12 @@ def test_probing_of_pure_noise_is_what_theory_says() -> None:
     # Trimming 0.3 % of normal noise leaves a range of about 5.9 deviations; 95 % lie within 3.92.
     sigma_mm = 0.01
     points = cap(20_000, centre_mm=(0.0, 0.0, 500.0), radius_mm=20.0, sigma_mm=sigma_mm, seed=3)
-    found = fitted_sphere(points)
+    found = fit_sphere(points)
     assert np.ptp(found.distances_mm) / sigma_mm == pytest.approx(5.9, abs=0.15)
     assert dispersion_mm(found.distances_mm) / sigma_mm == pytest.approx(3.92, abs=0.08)
     assert np.std(found.distances_mm) / sigma_mm == pytest.approx(1.0, abs=0.03)
     assert abs(2 * found.radius_mm - 40.0) < 0.002
-    assert found.rejected / len(points) == pytest.approx(REJECTED_SHARE, abs=1e-4)
+    assert found.rejected / len(points) == pytest.approx(MAX_REJECTED_FRACTION, abs=1e-4)
 
 
 def test_a_bowed_plane_has_the_range_of_its_bow() -> None:
@@ -64,7 +64,7 @@ def test_a_bowed_plane_has_the_range_of_its_bow() -> None:
     bow = 0.04 * (x / 100) ** 2
     turn = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
     points = np.column_stack([x.ravel(), y.ravel(), bow.ravel()]) @ turn.T + (10.0, 20.0, 600.0)
-    found = fitted_plane(points)
+    found = fit_plane(points)
     assert np.ptp(found.distances_mm) == pytest.approx(0.04, rel=0.02)
     assert abs(found.normal @ turn[:, 2]) == pytest.approx(1.0, abs=1e-6)
 
@@ -72,14 +72,14 @@ def test_a_bowed_plane_has_the_range_of_its_bow() -> None:
 def test_far_outliers_are_left_out_and_counted() -> None:
     points = cap(4000, centre_mm=(0.0, 0.0, 500.0), radius_mm=20.0, sigma_mm=0.001, seed=7)
     points[:10] *= 1.01
-    found = fitted_sphere(points)
+    found = fit_sphere(points)
     assert found.rejected == 12
     assert np.ptp(found.distances_mm) < 0.01
 
 
 def test_too_few_points_are_refused() -> None:
     with pytest.raises(NothingToReconstructError, match="found 99"):
-        fitted_plane(np.zeros((99, 3)))
+        fit_plane(np.zeros((99, 3)))
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_too_few_points_are_refused() -> None:
     ],
 )
 def test_the_rule_of_decision(error_mm: float, uncertainty_mm: float, told: Decision) -> None:
-    assert decision(error_mm, 0.02, uncertainty_mm) is told
+    assert decide(error_mm, 0.02, uncertainty_mm) is told
 
 
 def ball(count: int, x_mm: float, seed: int) -> tuple[FloatArray, FloatArray]:
@@ -131,20 +131,20 @@ def scene() -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
 
 def test_two_balls_before_a_wall_are_found() -> None:
     points, normals, owner = scene()
-    (first, _), (second, _) = ball_points(points, normals, 30.0, 2)
+    (first, _), (second, _) = find_balls(points, normals, 30.0, 2)
     assert (owner[first] == 1).mean() > 0.999
     assert (owner[second] == 2).mean() > 0.999
     assert len(first) > 0.98 * 6000
-    ends = [fitted_sphere(points[each]).centre_mm for each in (first, second)]
+    ends = [fit_sphere(points[each]).centre_mm for each in (first, second)]
     assert abs(np.linalg.norm(ends[0] - ends[1]) - 100.0) < 0.003
 
 
-def test_a_third_ball_is_missed_in_words() -> None:
+def test_a_missing_ball_is_reported() -> None:
     points, normals, _ = scene()
     with pytest.raises(NothingToReconstructError, match=r"expected 3 balls of 30 mm, found 2"):
-        ball_points(points, normals, 30.0, 3)
+        find_balls(points, normals, 30.0, 3)
     with pytest.raises(NothingToReconstructError, match=r"expected 1 ball of 80 mm, found 0"):
-        ball_points(points, normals, 80.0, 1)
+        find_balls(points, normals, 80.0, 1)
 
 
 @pytest.mark.parametrize("tilt_deg", [pytest.param(0.0, marks=pytest.mark.slow), 25.0])
@@ -152,23 +152,23 @@ def test_the_wall_is_found_behind_the_balls(tilt_deg: float) -> None:
     points, normals, owner = scene()
     points, normals = points.copy(), normals.copy()
     points[owner == 0], normals[owner == 0] = wall(tilt_deg)
-    chosen, turned = plane_points(points, normals, 240.0)
+    chosen, turned = find_plane(points, normals, 240.0)
     assert turned == 0
     assert (owner[chosen] == 0).all()
     assert len(chosen) > 0.99 * (owner == 0).sum()
     true = np.array((np.sin(np.deg2rad(tilt_deg)), 0, np.cos(np.deg2rad(tilt_deg))))
-    assert abs(fitted_plane(points[chosen]).normal @ true) > 1 - 1e-8
+    assert abs(fit_plane(points[chosen]).normal @ true) > 1 - 1e-8
 
 
 def test_a_missing_plane_is_reported() -> None:
     points, normals = ball(400, 0.0, 1)
     with pytest.raises(NothingToReconstructError, match="expected a plane"):
-        plane_points(points[:90], normals[:90], 240.0)
+        find_plane(points[:90], normals[:90], 240.0)
     with pytest.raises(NothingToReconstructError, match="expected a plane"):
-        plane_points(np.zeros((0, 3)), np.zeros((0, 3)), 240.0)
+        find_plane(np.zeros((0, 3)), np.zeros((0, 3)), 240.0)
 
 
-def test_a_rod_at_the_ball_is_counted_apart_and_a_point_far_off_is_not() -> None:
+def test_a_rod_at_the_ball_is_counted_separately_from_outliers() -> None:
     points, normals = ball(3000, 0.0, 1)
     centre = np.array((0.0, 5.0, 500.0))
     # A rod of half the ball's radius, from the ball's side outwards.
@@ -179,7 +179,7 @@ def test_a_rod_at_the_ball_is_counted_apart_and_a_point_far_off_is_not() -> None
     # Of the ball's own points some lie half a millimetre off, fifty times their noise.
     far = np.arange(0, 3000, 10)
     points[far] += 0.5 * normals[far]
-    ((found, turned),) = ball_points(np.vstack([points, rod]), np.vstack([normals, outwards]), 30.0, 1)
+    ((found, turned),) = find_balls(np.vstack([points, rod]), np.vstack([normals, outwards]), 30.0, 1)
     assert np.array_equal(found, np.arange(3000))
     assert turned == pytest.approx(touching, abs=40)
     assert touching > 100

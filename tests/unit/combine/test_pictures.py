@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from slrig.calibration.boards.printing import marker_dictionary
+from slrig.calibration.printing import marker_dictionary
 from slrig.combine.markers import bundle_of, markers_in_view
 from slrig.combine.pictures import six_sides_png
 from slrig.errors import BundleError

@@ -18,8 +18,7 @@ from slrig.accept.desk import AcceptanceDesk
 from slrig.accept.evaluation import Reading
 from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.pose_shooting import PoseRequest
-from slrig.calibration.board import Board
-from slrig.calibration.observations import PoseObservation
+from slrig.calibration.board import Board, PoseObservation
 from slrig.combine.desk import ModelDesk
 from slrig.combine.plan import ModelPlan, StatedAxis, TurntablePoses
 from slrig.combine.stage import StageStore

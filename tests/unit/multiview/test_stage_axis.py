@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slrig.calibration.board import USUAL_BOARD
+from slrig.calibration.board import DEFAULT_BOARD
 from slrig.errors import StageRefusedError
 from slrig.model import FloatArray, MeasuredAxis
 from slrig.multiview.turntable import BoardAxis, axis_from_board, update_axis
@@ -44,7 +44,7 @@ def shot(
 
 
 def axis_found(angles_deg: FloatArray, seed: int = 0, told: FloatArray | None = None) -> BoardAxis:
-    return axis_from_board(*shot(angles_deg, seed), USUAL_BOARD.points_mm, told)
+    return axis_from_board(*shot(angles_deg, seed), DEFAULT_BOARD.points_mm, told)
 
 
 def off(found: MeasuredAxis, covariance: FloatArray) -> float:
@@ -90,7 +90,7 @@ def test_the_sense_of_told_angles_is_that_of_the_axis() -> None:
 )
 def test_what_tells_no_axis_is_refused(angles_deg: FloatArray, slipped: tuple[slice, float], words: str) -> None:
     with pytest.raises(StageRefusedError, match=words):
-        axis_from_board(*shot(angles_deg, 1, slipped), USUAL_BOARD.points_mm)
+        axis_from_board(*shot(angles_deg, 1, slipped), DEFAULT_BOARD.points_mm)
 
 
 def measured(

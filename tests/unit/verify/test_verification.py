@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import Board, BoardKind, PoseObservation, ViewQuality
 from slrig.calibration.health.verification import Health, HealthState, Verification, judged
-from slrig.calibration.observations import PoseObservation, ViewFigures
 from slrig.devices import Rig
 from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.data_folder import DataFolder
@@ -53,11 +52,11 @@ def capture(_rig: Rig, _plan: object, folder: Path, /, **_options: object) -> Ta
 
 def read(folder: Path, _board: Board, name: str) -> ReadPose:
     assert (folder / "frames").exists()
-    return ReadPose(PoseObservation(name, {}), {"left": ViewFigures(0.02, 0.0, 0.5, 0.7, 1.0)})
+    return ReadPose(PoseObservation(name, {}), {"left": ViewQuality(0.02, 0.0, 0.5, 0.7, 1.0)})
 
 
 def moving(_folder: Path, _board: Board, name: str) -> ReadPose:
-    return ReadPose(PoseObservation(name, {}), {"left": ViewFigures(0.9, 0.0, 0.5, 0.7, 1.0)})
+    return ReadPose(PoseObservation(name, {}), {"left": ViewQuality(0.9, 0.0, 0.5, 0.7, 1.0)})
 
 
 def look(_poses: Sequence[Any], _board: Board, _calibration: Calibration) -> Verification:

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation
+from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, BoardView, Correspondences, PoseObservation
 from slrig.calibration.solution import PROJECTOR
 from slrig.model import Calibration, FloatArray, Pinhole, Solved
 from tests.unit.calibration.perturbed import (

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, Correspondences, Observations, PoseObservation
 from slrig.calibration.displacement import modes_of, moved_points, rigid_free, without_rigid_motion
 from slrig.calibration.judging.comparison import comparison, expected_error, odd_even, volume_of
 from slrig.calibration.judging.verdict import Grade, verdict
-from slrig.calibration.observations import COLUMN, ROW, Correspondences, Observations, PoseObservation
 from slrig.calibration.solution import BoardPose, Half, Solution
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved

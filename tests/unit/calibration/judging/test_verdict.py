@@ -19,7 +19,7 @@ from slrig.calibration.judging.verdict import (
     unattended_faults,
     verdict,
 )
-from slrig.calibration.poses.coverage import Coverage, coverage
+from slrig.calibration.poses.guidance import Coverage, coverage
 from slrig.calibration.solution import (
     PARAMETERS,
     PROJECTOR,
@@ -373,7 +373,7 @@ def test_a_schedule_puts_a_calibration_in_use_only_if_its_scale_is_vouched_for()
     assert "nothing vouches for the scale" in words
     certified = replace(CHESSBOARD, square_sigma=1e-4)
     assert unattended_faults(solution, certified, None) == ()
-    assert unattended_faults(solution, CHESSBOARD.as_read(*CHESSBOARD.rulers_mm), None) == ()
+    assert unattended_faults(solution, CHESSBOARD.as_measured(*CHESSBOARD.rulers_mm), None) == ()
     wrong = ScaleCheck(True, 0.009, 1e-4, ("everything is 0.90% larger",))
     assert unattended_faults(solution, certified, wrong) == ("everything is 0.90% larger",)
     stretched = replace(solution, size=BoardSize(0.001, 0.002, 1e-4))

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import COLUMN, Observations
+from slrig.calibration.board import COLUMN, Board, BoardKind, Observations
 from slrig.calibration.solving.adjustment import (
     CAUCHY,
     Deviations,

@@ -8,10 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from slrig.calibration.board import BoardShape
+from slrig.calibration.board import BoardShape, Observations
 from slrig.calibration.judging.comparison import expected_error
 from slrig.calibration.judging.verdict import judged_size
-from slrig.calibration.observations import Observations
 from slrig.calibration.solution import CELLS, LEAST_HALVED, PROJECTOR, DeviceResiduals, ExpectedError, Solution
 from slrig.calibration.solving.adjustment import LENS_SIGMA, Fit, Problem, fitted
 from slrig.calibration.solving.held_out import allowing_for, folds_of, halves_of
@@ -312,7 +311,7 @@ def test_a_ruler_makes_a_wrong_print_right() -> None:
     across, down = CHESSBOARD.rulers_mm
     recipe = printed(0.98, 0.99)
     observations, truth = made(recipe)
-    told = CHESSBOARD.as_read(round(0.98 * across, 1), round(0.99 * down, 1))
+    told = CHESSBOARD.as_measured(round(0.98 * across, 1), round(0.99 * down, 1))
     read = Observations(told, observations.cameras, observations.projector, observations.poses)
     solution = solve(read)
     stated = expected_error(solution, read)

@@ -1,7 +1,7 @@
-"""Boards painted through a pinhole with a lens, for tests that need to know where every corner really is.
+"""Boards painted through a pinhole camera with a lens, for tests that need the true position of every corner.
 
-Shares no geometry with slrig: each pixel's ray is made straight by iteration and met with the board's plane, the print
-is sampled several times within the pixel, then blurred and given noise.
+Independent of slrig's geometry: each pixel's ray is undistorted by iteration and intersected with the board's plane,
+the print is sampled several times within the pixel, then blurred, and noise is added.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
-    """A camera before a board: X_camera = rotation @ X_board + translation_mm."""
+class PaintedCamera:
+    """A camera in front of a board: X_camera = rotation @ X_board + translation_mm."""
 
     rotation: Array
     translation_mm: Array
@@ -36,17 +36,17 @@ class Eye:
     def principal(self) -> tuple[float, float]:
         return self.centre_px or ((self.width - 1) / 2, (self.height - 1) / 2)
 
-    def seen(self, points_mm: Array) -> Array:
-        """(n, 2): where points of the board, (n, 3), are seen."""
+    def project(self, points_mm: Array) -> Array:
+        """(n, 2): image of points of the board, (n, 3)."""
         x, y, z = self.rotation @ points_mm.T + self.translation_mm[:, None]
-        u, v = _bent(x / z, y / z, self.distortion)
+        u, v = _distort(x / z, y / z, self.distortion)
         return np.column_stack([self.focal_px * u + self.principal[0], self.focal_px * v + self.principal[1]])
 
 
 @dataclass(frozen=True)
-class Print:
-    """How a board is printed and lit. lit : a direction on the board, degrees from its x axis, how far that way the
-    projector's picture reaches, in squares from corner 0, and the share of its light that there is beyond.
+class PrintStyle:
+    """Print and light of a board. lit : a direction on the board, degrees from its x axis, extent of the light in that
+    direction, in squares from corner 0, and the fraction of light beyond.
     """
 
     white: float = 0.75
@@ -61,27 +61,27 @@ class Print:
     lit: tuple[float, float, float] | None = None
 
 
-def looking(
+def camera_at(
     board: Board,
     *,
     distance_mm: float,
     tilt_deg: tuple[float, float] = (0.0, 0.0),
     roll_deg: float = 0.0,
     shift_mm: tuple[float, float] = (0.0, 0.0),
-    **eye: object,
-) -> Eye:
-    """An eye that has the board's middle before it, turned about x, then y, then the viewing direction."""
-    middle = board_points(board).mean(axis=0)
+    **options: object,
+) -> PaintedCamera:
+    """A camera in front of the board's centre, rotated about x, then y, then the viewing direction."""
+    centre = board_points(board).mean(axis=0)
     a, b, c = np.radians([*tilt_deg, roll_deg])
     about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
     about_z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
     rotation = about_z @ about_y @ about_x
-    return Eye(rotation, np.array([*shift_mm, distance_mm]) - rotation @ middle, **eye)  # type: ignore[arg-type]
+    return PaintedCamera(rotation, np.array([*shift_mm, distance_mm]) - rotation @ centre, **options)  # type: ignore[arg-type]
 
 
 def board_points(board: Board) -> Array:
-    """(n, 3): corners (centres) of the board, written out a second time."""
+    """(n, 3): corners (centres) of the board, computed independently."""
     points = []
     for row in range(board.rows):
         for column in range(board.columns):
@@ -90,28 +90,28 @@ def board_points(board: Board) -> Array:
     return np.array(points)
 
 
-def painted(
+def paint(
     board: Board,
-    eye: Eye,
+    camera: PaintedCamera,
     /,
     *,
-    look: Print | None = None,
+    style: PrintStyle | None = None,
     blur_px: float = 0.7,
     noise: float = 0.0,
     seed: int = 0,
     samples: int = 5,
 ) -> Array:
-    """(H, W) float64, 0 to 1 and not clipped: the board as the eye sees it; `noise` is white and Gaussian."""
-    look = look or Print()
-    rows, columns = np.mgrid[: eye.height, : eye.width].astype(np.float64)
-    place = _on_board(eye)
+    """(H, W) float64, 0 to 1 and not clipped: the board in the camera's image; `noise` is white and Gaussian."""
+    style = style or PrintStyle()
+    rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+    place = _board_positions(camera)
     by_column = np.stack([np.gradient(each, axis=1) for each in place])
     by_row = np.stack([np.gradient(each, axis=0) for each in place])
-    image = _reflectance(board, look, *place)
-    # Only where the print changes within two pixels is more than one sample needed.
+    image = _reflectance(board, style, *place)
+    # Several samples only where the print changes within two pixels.
     edge = ndimage.maximum_filter(image, 5) != ndimage.minimum_filter(image, 5)
     total = np.zeros(int(edge.sum()))
-    # No two samples in one row or column: an edge along the rows is as well sampled as any other.
+    # No two samples in one row or column, so that edges in all directions are sampled alike.
     count = samples**2
     stride = min(
         (step for step in range(1, count + 1) if math.gcd(step, count) == 1), key=lambda g: abs(g - 0.62 * count)
@@ -119,11 +119,11 @@ def painted(
     for index in range(count):
         across, down = (index + 0.5) / count - 0.5, (index * stride % count + 0.5) / count - 0.5
         x, y = place[:, edge] + across * by_column[:, edge] + down * by_row[:, edge]
-        total += _reflectance(board, look, x, y)
+        total += _reflectance(board, style, x, y)
     image[edge] = total / samples**2
     if blur_px > 0:
         image = ndimage.gaussian_filter(image, blur_px, mode="nearest", truncate=6)
-    light = 1 + look.shading[0] * (columns / eye.width - 0.5) + look.shading[1] * (rows / eye.height - 0.5)
+    light = 1 + style.shading[0] * (columns / camera.width - 0.5) + style.shading[1] * (rows / camera.height - 0.5)
     image = image * light
     if noise:
         image = image + np.random.default_rng(seed).normal(0, noise, image.shape)
@@ -131,12 +131,12 @@ def painted(
 
 
 def as_8_bit(image: Array) -> NDArray[np.uint8]:
-    """The image as a camera of 8 bits gives it."""
+    """The image in 8 bits."""
     return np.clip(np.round(image * 255), 0, 255).astype(np.uint8)
 
 
-def _bent(x: Array, y: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
-    """Brown's lens: straight directions to bent ones."""
+def _distort(x: Array, y: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
+    """Brown's lens: undistorted to distorted directions."""
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -147,51 +147,51 @@ def _bent(x: Array, y: Array, distortion: tuple[float, ...]) -> tuple[Array, Arr
 
 
 @cache
-def _on_board(eye: Eye) -> Array:
-    """(2, H, W): where each pixel's ray meets the board's plane."""
-    rows, columns = np.mgrid[: eye.height, : eye.width].astype(np.float64)
-    u, v = (columns - eye.principal[0]) / eye.focal_px, (rows - eye.principal[1]) / eye.focal_px
+def _board_positions(camera: PaintedCamera) -> Array:
+    """(2, H, W): intersection of each pixel's ray with the board's plane."""
+    rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
+    u, v = (columns - camera.principal[0]) / camera.focal_px, (rows - camera.principal[1]) / camera.focal_px
     x, y = u.copy(), v.copy()
-    for _ in range(60 if any(eye.distortion) else 0):
-        bent_x, bent_y = _bent(x, y, eye.distortion)
-        off_x, off_y = u - bent_x, v - bent_y
+    for _ in range(60 if any(camera.distortion) else 0):
+        distorted_x, distorted_y = _distort(x, y, camera.distortion)
+        off_x, off_y = u - distorted_x, v - distorted_y
         x, y = x + off_x, y + off_y
         if max(np.abs(off_x).max(), np.abs(off_y).max()) < 1e-10:
             break
-    normal = eye.rotation[:, 2]
-    depth = (normal @ eye.translation_mm) / (normal[0] * x + normal[1] * y + normal[2])
-    point = np.stack([x * depth, y * depth, depth]) - eye.translation_mm[:, None, None]
-    return np.asarray(np.einsum("ki,khw->ihw", eye.rotation[:, :2], point))
+    normal = camera.rotation[:, 2]
+    depth = (normal @ camera.translation_mm) / (normal[0] * x + normal[1] * y + normal[2])
+    point = np.stack([x * depth, y * depth, depth]) - camera.translation_mm[:, None, None]
+    return np.asarray(np.einsum("ki,khw->ihw", camera.rotation[:, :2], point))
 
 
-def _reflectance(board: Board, look: Print, x_mm: Array, y_mm: Array) -> Array:
-    """How light the board is at places of its plane."""
+def _reflectance(board: Board, style: PrintStyle, x_mm: Array, y_mm: Array) -> Array:
+    """Reflectance of the board at positions of its plane."""
     across, down = x_mm / board.square_mm, y_mm / board.square_mm
     circles = board.kind is BoardKind.CIRCLES
     width, height = (2 * board.columns, board.rows) if circles else (board.columns, board.rows)
-    if look.mirrored:
+    if style.mirrored:
         across = (width - 1) - across
-    border = look.paper_squares
+    border = style.paper_squares
     paper = (across > -1 - border) & (across < width + border) & (down > -1 - border) & (down < height + border)
-    dark = _circles(board, look, across, down) if circles else _squares(board, across, down, int(look.light_first))
-    if look.swapped:
+    dark = _circles(board, style, across, down) if circles else _squares(board, across, down, int(style.light_first))
+    if style.swapped:
         dark = ~dark & (across > -1) & (across < width) & (down > -1) & (down < height)
-    image = np.where(paper, np.where(dark, look.dark, look.white), look.beyond)
-    if look.lit is not None:
-        towards, reach, share = np.radians(look.lit[0]), look.lit[1], look.lit[2]
-        # In the board's own places, so that a mirrored print is lit from the same side.
+    image = np.where(paper, np.where(dark, style.dark, style.white), style.beyond)
+    if style.lit is not None:
+        towards, reach, share = np.radians(style.lit[0]), style.lit[1], style.lit[2]
+        # In the board's own frame, so that a mirrored print is lit from the same side.
         ahead = np.cos(towards) * x_mm / board.square_mm + np.sin(towards) * down
         image = np.where(ahead < reach, image, share * image)
     return np.asarray(image, dtype=np.float64)
 
 
-def _circles(board: Board, look: Print, across: Array, down: Array) -> NDArray[np.bool_]:
+def _circles(board: Board, style: PrintStyle, across: Array, down: Array) -> NDArray[np.bool_]:
     dark = np.zeros(across.shape, dtype=bool)
     # Two lattices of spacing (2, 2), the second shifted by (1, 1).
     for shift in (0, 1):
         column = np.clip(np.round((across - shift) / 2), 0, board.columns - 1)
         row = np.clip(np.round((down - shift) / 2), 0, (board.rows - 1 - shift) // 2)
-        dark |= np.hypot(across - shift - 2 * column, down - shift - 2 * row) < look.circle_radius
+        dark |= np.hypot(across - shift - 2 * column, down - shift - 2 * row) < style.circle_radius
     return dark
 
 

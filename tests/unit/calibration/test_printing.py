@@ -10,14 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.detection import find_board
-from slrig.calibration.boards.lattice import equivalent_views, turned_half
-from slrig.calibration.boards.printing import FIT, PAGES_MM, artwork, board_pdf, board_svg, charuco_board
-from slrig.calibration.observations import BoardView
+from slrig.calibration.board import Board, BoardKind, BoardView
+from slrig.calibration.detection.detection import find_board
+from slrig.calibration.detection.lattice import equivalent_numberings, rotate_half_turn
+from slrig.calibration.printing import FIT, PAGES_MM, artwork, board_pdf, board_svg, charuco_board
 from slrig.cli.boards import board_option
 from slrig.errors import CalibrationError
-from tests.unit.calibration.boards.painted import board_points
+from tests.unit.calibration.painted import board_points
 
 pdfium = pytest.importorskip("pypdfium2", reason="needs the test extra: pip install -e '.[test]'")
 
@@ -98,7 +97,7 @@ def test_both_scales_are_true(board: Board, page: str, size_mm: tuple[float, flo
     assert size_mm[1] > down[-1]
 
 
-def test_a_page_says_what_it_is_and_how_to_go_on() -> None:
+def test_a_page_names_the_board_and_the_command() -> None:
     _, _, text = painted_page(board_pdf(Board(BoardKind.CHARUCO, 11, 8, 12.0)), 1.0)
     words = " ".join(text.split())
     assert "11 x 8 inner corners, squares of 12 mm, markers of 9 mm from DICT_5X5_250" in words
@@ -113,7 +112,7 @@ def test_the_same_board_gives_the_same_bytes() -> None:
     assert board_svg(board) == board_svg(board)
 
 
-def test_a_page_made_to_fit_holds_small_and_huge_boards_and_all_their_words() -> None:
+def test_a_page_made_to_fit_holds_small_and_huge_boards_and_their_texts() -> None:
     for board in (Board(BoardKind.CHARUCO, 3, 3, 4.0), Board(BoardKind.CHESSBOARD, 11, 8, 60.0)):
         _, (width, height), text = painted_page(board_pdf(board, page=FIT), 1.0)
         assert min(width, height) > 0
@@ -132,7 +131,7 @@ def test_a_board_too_large_for_the_page_is_refused_with_the_largest_square_that_
 
 
 @pytest.mark.parametrize("page", ["A5", "210", "axb", ""])
-def test_a_page_that_is_none_is_refused(page: str) -> None:
+def test_an_unknown_page_is_refused(page: str) -> None:
     with pytest.raises(CalibrationError, match="expected A4, A3, letter, fit or WIDTHxHEIGHT"):
         board_svg(Board(BoardKind.CHESSBOARD, 7, 9, 10.0), page=page)
     assert PAGES_MM["A4"] == (210.0, 297.0)
@@ -199,8 +198,8 @@ def _whole(board: Board) -> BoardView:
     ],
     ids=str,
 )
-def test_a_print_has_as_many_numberings_as_sides_from_which_it_looks_the_same(board: Board, numberings: int) -> None:
-    views = equivalent_views(_whole(board), board)
+def test_a_print_has_as_many_numberings_as_symmetries(board: Board, numberings: int) -> None:
+    views = equivalent_numberings(_whole(board), board)
     assert len(views) == numberings
     for view in views:
         # The same points, and a turn of the board takes its places to them: no reflection.
@@ -212,15 +211,15 @@ def test_a_print_has_as_many_numberings_as_sides_from_which_it_looks_the_same(bo
         assert np.linalg.det(turn[:2]) == pytest.approx(1.0)
 
 
-def test_turning_by_half_twice_changes_nothing_and_a_one_sided_board_is_not_turned() -> None:
+def test_two_half_turns_change_nothing_and_need_a_symmetry() -> None:
     board = Board(BoardKind.CHESSBOARD, 7, 9, 10.0)
     view = _whole(board)
     part = BoardView(view.corner[3:40], view.points_px[3:40], view.sigma_px[3:40])
-    again = turned_half(turned_half(part, board), board)
+    again = rotate_half_turn(rotate_half_turn(part, board), board)
     assert np.array_equal(again.corner, part.corner)
     assert np.array_equal(again.points_px, part.points_px)
     with pytest.raises(ValueError, match="one numbering"):
-        turned_half(_whole(Board(BoardKind.CIRCLES, 4, 11, 10.0)), Board(BoardKind.CIRCLES, 4, 11, 10.0))
+        rotate_half_turn(_whole(Board(BoardKind.CIRCLES, 4, 11, 10.0)), Board(BoardKind.CIRCLES, 4, 11, 10.0))
 
 
 def test_the_options_of_a_command_describe_a_board() -> None:
@@ -244,7 +243,7 @@ def test_the_options_of_a_command_describe_a_board() -> None:
         (("charuco", "11x8", 12.0, 9.0, "DICT_4X4_50"), "needs 54 markers and DICT_4X4_50 has 50"),
     ],
 )
-def test_options_that_describe_no_board_are_refused(options: tuple[str, str, float], words: str) -> None:
+def test_options_of_an_invalid_board_are_refused(options: tuple[str, str, float], words: str) -> None:
     with pytest.raises(CalibrationError, match=words):
         board_option(*options)
 
@@ -255,10 +254,10 @@ def test_every_dictionary_named_is_one_of_opencvs() -> None:
     assert cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11).markerSize == 6
 
 
-def test_readings_of_both_scales_make_the_board_what_its_print_is() -> None:
+def test_ruler_readings_correct_the_size_of_a_board() -> None:
     board = Board(BoardKind.CHARUCO, 11, 8, 12.0)
     assert board.rulers_mm == (140, 100)
-    read = board.as_read(140.7, 99.9)
+    read = board.as_measured(140.7, 99.9)
     assert read.square_mm == pytest.approx(12 * 1.005)
     assert read.marker_mm == pytest.approx(9 * 1.005)
     assert read.aspect == pytest.approx(0.999 / 1.005)
@@ -266,8 +265,8 @@ def test_readings_of_both_scales_make_the_board_what_its_print_is() -> None:
     assert (width, height) == (pytest.approx(120 * 1.005), pytest.approx(84 * 0.999))
     # A steel ruler's tenth of a millimetre over each of the lengths.
     assert read.square_sigma == pytest.approx(np.sqrt((0.1 / 140) ** 2 / 2 + (0.1 / 100) ** 2 / 2))
-    assert board.as_read(140.7, 99.9, square_sigma=2e-4).square_sigma == 2e-4
+    assert board.as_measured(140.7, 99.9, square_sigma=2e-4).square_sigma == 2e-4
     with pytest.raises(CalibrationError, match="the scale below the board is 140 mm long in print, read as 100 mm"):
-        board.as_read(100, 100)
-    with pytest.raises(CalibrationError, match="square_sigma: expected a share"):
+        board.as_measured(100, 100)
+    with pytest.raises(CalibrationError, match="square_sigma: expected a relative deviation"):
         Board(BoardKind.CHARUCO, 11, 8, 12.0, square_sigma=0.1)

@@ -9,23 +9,22 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
+from slrig.calibration.board import Board, BoardKind, BoardView, PoseObservation, ViewQuality
 from slrig.calibration.poses import checks
-from slrig.calibration.poses.checks import PoseAnswer, check_same_devices, coverage_picture, judge_pose, pose_picture
-from slrig.calibration.poses.coverage import (
+from slrig.calibration.poses.checks import PoseAssessment, check_pose, check_same_devices, draw_coverage, draw_pose
+from slrig.calibration.poses.guidance import (
     GOALS,
     Advice,
-    _cells,
-    _reach,
+    _cell_sigma_px,
+    _lens_sensitivity,
+    advise_pose,
     attitude,
     board_rotation,
-    cells_of,
+    count_per_cell,
     coverage,
-    full_turn_deg,
-    next_move,
+    symmetry_angle_deg,
 )
-from slrig.calibration.poses.rough import rig_guess
+from slrig.calibration.poses.initial import estimate_rig
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose
 from slrig.errors import CalibrationError
 from slrig.model import FloatArray, Pinhole, Size
@@ -65,9 +64,9 @@ def _followed(shooting: Shooting, advice: Advice) -> BoardPose:
     return BoardPose(rotation, camera.rotation.T @ (board_pose.translation_mm - camera.translation_mm))
 
 
-def test_cells_count_points_where_they_lie() -> None:
+def test_points_are_counted_per_cell() -> None:
     points_px = np.array([[-0.4, -0.4], [59.4, 0.0], [59.6, 0.0], [359.4, 239.4], [359.6, 0.0], [-0.6, 5.0]])
-    cells = cells_of(points_px, Size(360, 240))
+    cells = count_per_cell(points_px, Size(360, 240))
     assert cells[0, 0] == 2
     assert cells[0, 1] == 1
     assert cells[5, 5] == 1
@@ -77,7 +76,7 @@ def test_cells_count_points_where_they_lie() -> None:
 @pytest.mark.parametrize(
     ("tilt", "near"), [((30.0, 0.0), "top"), ((-30.0, 0.0), "bottom"), ((0.0, 30.0), "right"), ((0.0, -30.0), "left")]
 )
-def test_a_tilt_is_named_by_the_edge_that_comes_nearer(tilt: tuple[float, float], near: str) -> None:
+def test_the_sign_of_a_tilt_is_that_of_the_nearer_edge(tilt: tuple[float, float], near: str) -> None:
     board_pose = held(CHESSBOARD, tilt=tilt)
     found = attitude(board_pose, CHESSBOARD.points_mm.mean(axis=0))
     assert found.tilt_deg == pytest.approx(tilt, abs=1e-6)
@@ -92,7 +91,7 @@ def test_a_tilt_is_named_by_the_edge_that_comes_nearer(tilt: tuple[float, float]
     assert np.allclose(board_rotation(tilt, 20.0), turned(*tilt, 20.0))
 
 
-def test_a_turn_is_clockwise_in_the_picture() -> None:
+def test_a_turn_is_clockwise_in_the_image() -> None:
     board_pose = held(CHESSBOARD, in_plane_deg=30.0)
     assert attitude(board_pose, np.zeros(3)).turn_deg == pytest.approx(30.0)
     # y runs down: after a clockwise turn, the board's right end lies lower in the picture than its left one.
@@ -100,10 +99,10 @@ def test_a_turn_is_clockwise_in_the_picture() -> None:
     assert ends[1, 1] > ends[0, 1]
 
 
-def test_a_board_that_looks_the_same_after_half_a_turn_needs_no_such_turn() -> None:
+def test_a_half_turn_does_not_count_for_a_symmetric_board() -> None:
     alike = Board(BoardKind.CHESSBOARD, 9, 7, 12.0)
-    assert full_turn_deg(alike) == 180
-    assert full_turn_deg(CHESSBOARD) == full_turn_deg(Board(BoardKind.CHARUCO, 9, 7, 12.0)) == 360
+    assert symmetry_angle_deg(alike) == 180
+    assert symmetry_angle_deg(CHESSBOARD) == symmetry_angle_deg(Board(BoardKind.CHARUCO, 9, 7, 12.0)) == 360
     for board, turns in ((alike, 1), (Board(BoardKind.CHARUCO, 9, 7, 12.0), 2)):
         shooting = rig_of("left", board=board)
         board_pose = [held(board, tilt=(20.0, 0.0)), held(board, tilt=(0.0, 20.0), in_plane_deg=180.0)]
@@ -111,42 +110,42 @@ def test_a_board_that_looks_the_same_after_half_a_turn_needs_no_such_turn() -> N
         assert coverage(poses, board, shooting.sizes).devices["left"].turns == turns
 
 
-def test_the_guess_finds_the_devices_from_a_few_poses() -> None:
+def test_devices_are_estimated_from_a_few_poses() -> None:
     shooting = rig_of()
     poses = _first(shooting)
     poses.append(shooting.shot("pose_03", held(CHESSBOARD, tilt=(-30.0, 15.0), middle_mm=(60.0, 40.0, 540.0))))
-    guess = rig_guess(poses, CHESSBOARD, shooting.sizes)
+    guess = estimate_rig(poses, CHESSBOARD, shooting.sizes)
     for name, guessed in guess.devices.items():
         truth = shooting.devices[name]
         assert guessed.matrix[0, 0] == pytest.approx(truth.matrix[0, 0], rel=0.03), name
         assert guessed.poses.keys() == {"pose_00", "pose_01", "pose_02", "pose_03"}
     # A lens shift beyond the image's edge is seen from the first poses on.
     assert guess.devices[PROJECTOR].matrix[1, 2] == pytest.approx(860, abs=40)
-    way = guess.relative("left", "right")
+    way = guess.relative_pose("left", "right")
     assert way is not None
     assert way.translation_mm == pytest.approx(shooting.devices["right"].translation_mm, abs=3.0)
 
 
-def test_a_wide_lens_is_guessed_too() -> None:
+def test_a_wide_lens_is_estimated() -> None:
     """A fit that starts from the usual lens alone ends at twice its focal length."""
     wide = device(Size(1280, 1024), 500.0, (650.0, 500.0), (0.0,) * 5, BoardPose(np.eye(3), np.zeros(3)))
     shooting = Shooting(CHESSBOARD, {"left": wide})
     tilts = ((0.0, 0.0), (25.0, 0.0), (0.0, -25.0), (-30.0, 15.0))
     poses = shots(shooting, [held(CHESSBOARD, tilt=tilt, middle_mm=(0.0, 0.0, 200.0)) for tilt in tilts])
-    found = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    found = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert found.matrix[0, 0] == pytest.approx(500, rel=0.03)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_a_guess_holds_with_parallel_poses_and_with_none(count: int) -> None:
+def test_an_estimate_exists_for_parallel_poses_and_for_none(count: int) -> None:
     shooting = rig_of("left")
     poses = shots(shooting, [held(CHESSBOARD, middle_mm=(20.0 * index, 0.0, 600.0)) for index in range(count)])
-    guess = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    guess = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert np.isfinite(guess.information).all()
     assert guess.focal_sigma > 0.15
     found = coverage(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert np.isnan(found.distance_mm).all()
-    assert next_move(poses, CHESSBOARD, shooting.sizes).words
+    assert advise_pose(poses, CHESSBOARD, shooting.sizes).text
 
 
 def test_coverage_counts_cells_depths_tilts_and_turns() -> None:
@@ -164,7 +163,7 @@ def test_coverage_counts_cells_depths_tilts_and_turns() -> None:
     assert left.tilted == (2, 2)
     assert left.turns == 3
     assert left.distance_mm == pytest.approx((540.0, 660.0), rel=0.01)
-    wanted = sum((cells_of(pose.views["left"].points_px, Size(1280, 1024)) > 0).astype(int) for pose in poses)
+    wanted = sum((count_per_cell(pose.views["left"].points_px, Size(1280, 1024)) > 0).astype(int) for pose in poses)
     assert np.array_equal(left.cells, wanted)
     assert left.share == pytest.approx((left.cells > 0).mean())
 
@@ -191,21 +190,21 @@ def test_open_goals_are_named() -> None:
     assert "80% wanted" in text
 
 
-def test_nothing_shot_yet_says_how_to_begin() -> None:
+def test_advice_before_the_first_pose() -> None:
     shooting = rig_of()
-    advice = next_move([], CHESSBOARD, shooting.sizes)
-    assert "middle of the picture of camera 'left'" in advice.words
-    assert "projector" in advice.words
+    advice = advise_pose([], CHESSBOARD, shooting.sizes)
+    assert "middle of the image of camera 'left'" in advice.text
+    assert "projector" in advice.text
     assert not advice.enough
 
 
-def test_advice_names_place_tilt_and_reason_and_shows_the_outline() -> None:
+def test_advice_names_place_tilt_and_reason_with_an_outline() -> None:
     shooting = rig_of()
     poses = _first(shooting)
-    advice = next_move(poses, CHESSBOARD, shooting.sizes)
-    assert "move the board to the" in advice.words
-    assert "edge 30° towards the camera" in advice.words
-    assert "not covered yet" in advice.words
+    advice = advise_pose(poses, CHESSBOARD, shooting.sizes)
+    assert "move the board to the" in advice.text
+    assert "edge 30° towards the camera" in advice.text
+    assert "not covered yet" in advice.text
     assert advice.camera is not None
     then = shooting.shot("pose_03", _followed(shooting, advice))
     outer = then.views[advice.camera].points_px[[0, 10, 87, 77]]
@@ -253,7 +252,7 @@ def test_the_advised_pose_lowers_the_real_error_of_the_worst_cell_more_than_one_
         held(CHESSBOARD, tilt=(15.0, 15.0), middle_mm=(15.0, 10.0, 605.0)),
     ]
     poses = shots(shooting, board_pose)
-    advice = next_move(poses, CHESSBOARD, shooting.sizes)
+    advice = advise_pose(poses, CHESSBOARD, shooting.sizes)
     seeds = range(100, 106)
     without = np.sqrt((_errors_px(shooting, board_pose, seeds) ** 2).mean())
     lazy = held(CHESSBOARD, tilt=(15.0, -10.0), middle_mm=(-10.0, 15.0, 600.0))
@@ -279,8 +278,8 @@ def test_the_stated_uncertainty_is_that_of_repeated_solves() -> None:
     ]
     poses = shots(shooting, board_pose)
     poses = [pose for pose in poses if pose.views]
-    guess = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
-    stated = np.sqrt(2) * _cells(guess.information[None], _reach(guess)).max()
+    guess = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    stated = np.sqrt(2) * _cell_sigma_px(guess.information[None], _lens_sensitivity(guess)).max()
     found = np.sqrt(
         (
             _errors_px(shooting, [each for each in board_pose if shooting.shot("x", each).views], range(200, 210)) ** 2
@@ -306,7 +305,7 @@ def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Bo
     figures = {name: SHARP for name in only if name != PROJECTOR}
     random = np.random.default_rng(7)
     poses = _first(shooting)
-    advice = next_move(poses, board, shooting.sizes)
+    advice = advise_pose(poses, board, shooting.sizes)
     worst = [max(advice.worst_px.values())]
     while not advice.enough:
         assert len(poses) < 25
@@ -317,18 +316,18 @@ def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Bo
         middle = exact.rotation @ board.points_mm.mean(axis=0) + exact.translation_mm
         by_hand = BoardPose(loose, middle * 1.03 - loose @ board.points_mm.mean(axis=0))
         pose = shooting.shot(f"pose_{len(poses):02d}", by_hand)
-        answer = judge_pose(pose, figures, poses, board, shooting.sizes)
+        answer = check_pose(pose, figures, poses, board, shooting.sizes)
         assert answer.accepted, answer.refusals  # what is advised is never refused
         poses.append(pose)
         advice = answer.advice
         worst.append(max(advice.worst_px.values()))
-    assert GOALS.fewest <= len(poses) <= 25
+    assert GOALS.min_poses <= len(poses) <= 25
     found = coverage(poses, board, shooting.sizes)
     assert found.missing == ()
-    assert advice.words.startswith("enough")
+    assert advice.text.startswith("enough")
     for each in found.devices.values():
         assert each.share >= 0.8
-    assert worst[-1] <= GOALS.sigma_px < worst[0]
+    assert worst[-1] <= GOALS.max_sigma_px < worst[0]
 
 
 # ---- What a person reads after a pose: each bad one is refused or warned of, with its cause and the cure
@@ -342,19 +341,19 @@ NAN = float("nan")
 @pytest.fixture
 def without_advice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is said of the next pose, which takes longer than all checks."""
-    monkeypatch.setattr(checks, "next_move", lambda *_, **__: None)
+    monkeypatch.setattr(checks, "advise_pose", lambda *_, **__: None)
 
 
-def judged(
-    pose: PoseObservation, shooter: Shooting, earlier: list[PoseObservation], figures: ViewFigures = SHARP
-) -> PoseAnswer:
+def check(
+    pose: PoseObservation, shooter: Shooting, earlier: list[PoseObservation], figures: ViewQuality = SHARP
+) -> PoseAssessment:
     """The answer to a pose; figures : of the left camera."""
-    return judge_pose(pose, {"left": figures, "right": SHARP}, earlier, shooter.board, shooter.sizes)
+    return check_pose(pose, {"left": figures, "right": SHARP}, earlier, shooter.board, shooter.sizes)
 
 
 def test_a_good_pose_is_accepted_and_measured() -> None:
     shooter = rig_of("left", "right", PROJECTOR)
-    answer = judged(shooter.shot("pose_03", GOOD), shooter, _first(shooter))
+    answer = check(shooter.shot("pose_03", GOOD), shooter, _first(shooter))
     assert answer.accepted
     assert answer.refusals == answer.warnings == ()
     assert answer.corners_found == {"left": 88, "right": 88}
@@ -364,18 +363,18 @@ def test_a_good_pose_is_accepted_and_measured() -> None:
     assert answer.tilt_deg["left"] == pytest.approx(steep_deg, abs=1.0)
     assert answer.distance_mm["left"] == pytest.approx(570.0, rel=0.01)
     assert answer.coverage.poses == ("pose_00", "pose_01", "pose_02", "pose_03")
-    assert "move the board" in answer.advice.words
+    assert "move the board" in answer.advice.text
 
 
 @pytest.mark.usefixtures("without_advice")
 def test_a_first_pose_has_a_tilt_and_no_distance_while_the_focal_length_is_unknown() -> None:
     shooter = rig_of("left", "right", PROJECTOR)
-    facing = judged(shooter.shot("pose_00", held(CHESSBOARD)), shooter, [])
+    facing = check(shooter.shot("pose_00", held(CHESSBOARD)), shooter, [])
     assert facing.accepted
     assert np.isnan(facing.distance_mm["left"])
     assert facing.tilt_deg["left"] < 12
-    steep = judged(shooter.shot("pose_00", held(CHESSBOARD, tilt=(68.0, 0.0))), shooter, [])
-    assert any("too steeply" in words for words in steep.refusals)
+    steep = check(shooter.shot("pose_00", held(CHESSBOARD, tilt=(68.0, 0.0))), shooter, [])
+    assert any("too steeply" in text for text in steep.refusals)
 
 
 @pytest.mark.usefixtures("without_advice")
@@ -393,18 +392,18 @@ def test_a_first_pose_has_a_tilt_and_no_distance_while_the_focal_length_is_unkno
         (replace(SHARP, saturated=0.01), [], ["saturated"]),
         (replace(SHARP, contrast=0.15), [], ["too little light"]),
         (replace(SHARP, decoded=0.3), [], ["decoded light"]),
-        (ViewFigures(NAN, NAN, NAN, NAN, NAN), [], []),
+        (ViewQuality(NAN, NAN, NAN, NAN, NAN), [], []),
     ],
 )
-def test_how_a_pose_was_shot_refuses_or_warns_with_cause_and_cure(
-    figures: ViewFigures, refusals: list[str], warnings: list[str]
+def test_image_quality_refuses_or_warns_with_cause_and_remedy(
+    figures: ViewQuality, refusals: list[str], warnings: list[str]
 ) -> None:
     shooter = rig_of("left")
-    answer = judged(shooter.shot("pose_03", GOOD), shooter, _first(shooter), figures)
+    answer = check(shooter.shot("pose_03", GOOD), shooter, _first(shooter), figures)
     assert answer.accepted is not bool(refusals)
     for found, expected in ((answer.refusals, refusals), (answer.warnings, warnings)):
         assert len(found) == bool(expected)
-        assert all(words in found[0] for words in expected)
+        assert all(text in found[0] for text in expected)
         assert all(each.startswith("camera 'left'") for each in found)
     # What was refused is not counted as covered.
     assert len(answer.coverage.poses) == 3 + answer.accepted
@@ -412,7 +411,7 @@ def test_how_a_pose_was_shot_refuses_or_warns_with_cause_and_cure(
 
 @pytest.mark.usefixtures("without_advice")
 @pytest.mark.parametrize(
-    ("pose", "corners", "accepted", "words"),
+    ("pose", "corners", "accepted", "parts"),
     [
         (first_poses(CHESSBOARD)[1], 88, False, ["the same as pose_01"]),
         (held(CHESSBOARD, tilt=(20.0, 0.0), middle_mm=(15.0, 5.0, 590.0)), 88, True, ["nearly the same as pose_01"]),
@@ -428,31 +427,31 @@ def test_how_a_pose_was_shot_refuses_or_warns_with_cause_and_cure(
     ],
     ids=["same", "near", "steep", "small", "few corners", "a part"],
 )
-def test_how_a_board_is_held_refuses_or_warns(pose: BoardPose, corners: int, accepted: bool, words: list[str]) -> None:
+def test_the_board_s_attitude_refuses_or_warns(pose: BoardPose, corners: int, accepted: bool, parts: list[str]) -> None:
     shooter = rig_of("left", board=CHESSBOARD if corners == 88 else CHARUCO)
     shot = shooter.shot("pose_03", pose)
     whole = shot.views["left"]
     view = BoardView(whole.corner[:corners], whole.points_px[:corners], whole.sigma_px[:corners])
-    answer = judged(replace(shot, views={"left": view}), shooter, _first(shooter))
+    answer = check(replace(shot, views={"left": view}), shooter, _first(shooter))
     assert answer.accepted is accepted
-    told = answer.warnings if accepted else answer.refusals
-    assert any(all(part in each for part in words) for each in told), told
+    messages = answer.warnings if accepted else answer.refusals
+    assert any(all(part in each for part in parts) for each in messages), messages
 
 
 @pytest.mark.usefixtures("without_advice")
 def test_a_board_that_not_every_device_sees_is_warned_of_or_refused() -> None:
     shooter = rig_of("left", "right", PROJECTOR)
     pose, earlier = shooter.shot("pose_03", GOOD), _first(shooter)
-    missed = judged(replace(pose, views={"left": pose.views["left"]}), shooter, earlier)
+    missed = check(replace(pose, views={"left": pose.views["left"]}), shooter, earlier)
     assert missed.accepted
-    assert any("camera 'right' does not see the board" in words for words in missed.warnings)
-    nowhere = judged(replace(pose, views={}), shooter, earlier)
+    assert any("camera 'right' does not see the board" in text for text in missed.warnings)
+    nowhere = check(replace(pose, views={}), shooter, earlier)
     assert not nowhere.accepted
-    assert any("no camera sees the board" in words for words in nowhere.refusals)
+    assert any("no camera sees the board" in text for text in nowhere.refusals)
     dark = replace(pose, correspondences={})
-    assert any("no light of the projector" in words for words in judged(dark, shooter, earlier).refusals)
+    assert any("no light of the projector" in text for text in check(dark, shooter, earlier).refusals)
     # Where no projector is calibrated, none is needed.
-    assert judged(dark, rig_of("left", "right"), earlier).accepted
+    assert check(dark, rig_of("left", "right"), earlier).accepted
 
 
 @pytest.mark.usefixtures("without_advice")
@@ -460,11 +459,11 @@ def test_a_board_parallel_to_all_earlier_ones_is_warned_of_and_a_tilted_one_is_n
     shooter = rig_of("left")
     places = [(0.0, 0.0, 600.0), (50.0, 30.0, 560.0), (-50.0, -30.0, 640.0)]
     poses = shots(shooter, [held(CHESSBOARD, middle_mm=each) for each in places])
-    answer = judged(poses[2], shooter, poses[:2])
+    answer = check(poses[2], shooter, poses[:2])
     assert answer.accepted
-    assert any("parallel to all 2 earlier poses" in words and "tilt" in words for words in answer.warnings)
+    assert any("parallel to all 2 earlier poses" in text and "tilt" in text for text in answer.warnings)
     tilted = shooter.shot("pose_03", held(CHESSBOARD, tilt=(25.0, 0.0)))
-    assert not any("parallel" in words for words in judged(tilted, shooter, poses).warnings)
+    assert not any("parallel" in text for text in check(tilted, shooter, poses).warnings)
 
 
 def test_a_capture_from_another_rig_is_named_with_all_its_differences() -> None:
@@ -473,11 +472,11 @@ def test_a_capture_from_another_rig_is_named_with_all_its_differences() -> None:
     other = {"left": Size(1920, 1080), "middle": Size(1280, 1024), PROJECTOR: Size(1280, 800)}
     with pytest.raises(CalibrationError, match="pose_04 was captured with another rig") as caught:
         check_same_devices("pose_04", other, rig)
-    words = str(caught.value)
-    assert "camera 'left' has 1920 x 1080 pixels, expected 1280 x 1024" in words
-    assert "the projector has 1280 x 800 pixels" in words
-    assert "camera 'right' is missing" in words
-    assert "camera 'middle' is not one of the rig's" in words
+    text = str(caught.value)
+    assert "expected 1280 x 1024 pixels of camera 'left', found 1920 x 1080" in text
+    assert "of the projector, found 1280 x 800" in text
+    assert "camera 'right' is missing" in text
+    assert "camera 'middle' is not one of the rig's" in text
 
 
 # ---- Pictures of a calibration: what is drawn lies where it should
@@ -495,13 +494,13 @@ def _cell(picture: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], row: int, co
     return [int(each) for each in colours[counts.argmax()]]
 
 
-def test_a_coverage_picture_fills_covered_cells_and_shows_where_to_go() -> None:
+def test_a_coverage_picture_fills_covered_cells_and_draws_the_outline() -> None:
     shooting = rig_of()
     tilts = ((0.0, 0.0), (20.0, 0.0))
     poses = shots(shooting, [held(CHESSBOARD, tilt=tilt, middle_mm=(-60.0, -50.0, 700.0)) for tilt in tilts])
     found = coverage(poses, CHESSBOARD, shooting.sizes).devices["left"]
     points = [pose.views["left"].points_px for pose in poses]
-    plain = coverage_picture(found, points, SIZE)
+    plain = draw_coverage(found, points, SIZE)
     assert plain.shape == (512, 640, 3)
     assert plain.dtype == np.uint8
     for row in range(6):
@@ -509,7 +508,7 @@ def test_a_coverage_picture_fills_covered_cells_and_shows_where_to_go() -> None:
             red, green, _ = _cell(plain, row, column)
             assert (green - red > 10) == bool(found.cells[row, column]), (row, column)
     outline = np.array([[900.0, 700.0], [1200.0, 700.0], [1200.0, 900.0], [900.0, 900.0]])
-    guided = coverage_picture(found, points, SIZE, outline_px=outline)
+    guided = draw_coverage(found, points, SIZE, outline_px=outline)
     changed = np.argwhere((guided != plain).any(axis=2))
     # Half as large as the image: the frame and its marked corner lie at half the coordinates.
     assert changed[:, 1].min() == pytest.approx(450, abs=8)
@@ -524,10 +523,10 @@ def test_a_pose_picture_marks_the_corners_on_the_stretched_frame(colour: bool) -
     frame = np.full(SIZE.shape, 400, dtype=np.uint16)  # of a 12-bit camera, dark
     frame[500, 600] = 4000
     image = np.repeat(frame[:, :, None], 3, axis=2) if colour else frame
-    bare = pose_picture(image, None, CHESSBOARD)
+    bare = draw_pose(image, None, CHESSBOARD)
     assert bare.shape == (512, 640, 3)
     assert int(np.median(bare)) == 235
-    marked = pose_picture(image, view, CHESSBOARD)
+    marked = draw_pose(image, view, CHESSBOARD)
     changed = np.argwhere((marked != bare).any(axis=2))[:, ::-1]
     for point in view.points_px / 2:
         assert np.abs(changed - point).max(axis=1).min() < 5

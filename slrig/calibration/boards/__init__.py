@@ -1,1 +1,0 @@
-"""Boards: how they are printed, and how their corners are found in an image."""

@@ -1,0 +1,1 @@
+"""Tests of slrig.calibration.detection."""
