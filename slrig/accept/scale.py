@@ -10,7 +10,7 @@ import numpy as np
 from slrig.accept.evaluation import Reading, errors_by_step
 from slrig.accept.plan import Artefacts, Quantity
 from slrig.accept.uncertainty import error_uncertainty
-from slrig.calibration.judging.verdict import LEAST_OFF, SURE
+from slrig.calibration.judgement import LEAST_OFF, SURE
 from slrig.errors import setting
 
 _FEWEST_PLACES = 3

@@ -15,7 +15,7 @@ from slrig.calibrate.records import SessionRecord, plain
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import Judgement, Setting, Standing
-from slrig.calibration.judging.verdict import board_words
+from slrig.calibration.judgement import board_words
 from slrig.calibration.poses.checks import judge_pose
 from slrig.calibration.poses.coverage import Advice, Coverage, coverage, next_move
 from slrig.calibration.poses.rough import rig_guess
@@ -34,7 +34,7 @@ _ANSWER = (
 """Fields of `slrig.calibration.poses.checks.PoseAnswer` that belong to the pose alone."""
 
 _CHECK = ("poses", "difference_mm", "stated_mm", "ratio", "chance", "fits", "words")
-"""Fields of `slrig.calibration.judging.comparison.OddEven`, whose `motion` stands beside them."""
+"""Fields of `slrig.calibration.accuracy.OddEven`, whose `motion` stands beside them."""
 
 
 def judgement(pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> Judgement:

@@ -13,7 +13,7 @@ from slrig.calibrate.figures import PoseFigures, baselines, device_figures, name
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.words import rounded
 from slrig.calibration.board import Board
-from slrig.calibration.judging.verdict import board_words
+from slrig.calibration.judgement import board_words
 from slrig.calibration.poses.checks import pose_picture
 from slrig.calibration.poses.rough import lit_board
 from slrig.calibration.solution import PROJECTOR, device_title

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from uuid import uuid4
 
+from slrig.calibration.accuracy import OddEven, odd_even
 from slrig.calibration.board import Board, BoardShape
-from slrig.calibration.judging.comparison import OddEven, odd_even
-from slrig.calibration.judging.verdict import Verdict, check_scale, verdict
+from slrig.calibration.judgement import Verdict, check_scale, verdict
 from slrig.calibration.observations import Observations, PoseObservation, ViewFigures
 from slrig.calibration.poses.coverage import Coverage, coverage
 from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
@@ -69,7 +69,7 @@ def solve_poses(
         The poses determine no calibration, or do not span a volume to state an error for.
     """
     # Late: the service knows these values, and loads no compiled kernel before somebody solves.
-    from slrig.calibration.judging.comparison import expected_error
+    from slrig.calibration.accuracy import expected_error
     from slrig.calibration.solving.solve import solve
 
     observed = tuple(pose.observation for pose in poses)

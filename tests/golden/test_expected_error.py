@@ -29,11 +29,10 @@ from scipy.spatial.transform import Rotation
 
 from slrig.bundle import write_calibration
 from slrig.calibrate.pose_reading import read_pose
+from slrig.calibration.accuracy import expected_error
 from slrig.calibration.board import Board, BoardKind, BoardShape
-from slrig.calibration.displacement import modes_of, moved_points, rigid_free
-from slrig.calibration.judging.comparison import expected_error
 from slrig.calibration.observations import Observations
-from slrig.calibration.solution import ExpectedError
+from slrig.calibration.solution import ExpectedError, modes_of, moved_points, rigid_free
 from slrig.calibration.solving.solve import solve
 from slrig.config import read_rig
 from slrig.discovery import open_rig

@@ -27,9 +27,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slrig.calibration.board import Board
-from slrig.calibration.displacement import modes_of
 from slrig.calibration.observations import Observations, PoseObservation
-from slrig.calibration.solution import PARAMETERS, PROJECTOR, BoardPose, covariance_of, device_title, devices_of
+from slrig.calibration.solution import (
+    PARAMETERS,
+    PROJECTOR,
+    BoardPose,
+    covariance_of,
+    device_title,
+    devices_of,
+    modes_of,
+)
 from slrig.calibration.solving.adjustment import corner_terms, flat_geometry, match_terms
 from slrig.calibration.solving.projection import (
     DEVICE,

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slrig.calibration.board import Board
-from slrig.calibration.displacement import cell_centres, modes_of, moved_points, rigid_free
 from slrig.calibration.health.drift import (
     ALIKE,
     Change,
@@ -28,7 +27,19 @@ from slrig.calibration.health.drift import (
     rivals,
 )
 from slrig.calibration.observations import COLUMN, ROW, Correspondences, PoseObservation
-from slrig.calibration.solution import CELLS, PARAMETERS, PROJECTOR, BoardPose, covariance_of, device_title, devices_of
+from slrig.calibration.solution import (
+    CELLS,
+    PARAMETERS,
+    PROJECTOR,
+    BoardPose,
+    cell_centres,
+    covariance_of,
+    device_title,
+    devices_of,
+    modes_of,
+    moved_points,
+    rigid_free,
+)
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, IntArray, Pinhole, Size
 

@@ -29,7 +29,7 @@ from slrig.calibration.solving.adjustment import (
     solved,
     weights_of,
 )
-from slrig.calibration.solving.held_out import (
+from slrig.calibration.solving.covariance import (
     allowing_for,
     bend_of,
     chosen_shape,
@@ -350,7 +350,7 @@ def solve(
 
     The first camera's frame is the world. Every lens has all its terms, held near 0 as lenses are where the poses tell
     nothing of one; poses that contradict the others are left out, by name. board_shape : whether the board may be bent
-    and its corners off their printed places (`slrig.calibration.solving.held_out`).
+    and its corners off their printed places (`slrig.calibration.solving.covariance`).
 
     Raises
     ------

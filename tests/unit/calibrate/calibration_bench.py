@@ -18,8 +18,8 @@ from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import CalibrationTools, Judgement, Setting, Standing
+from slrig.calibration.accuracy import comparison
 from slrig.calibration.board import Board, BoardKind, BoardShape
-from slrig.calibration.judging.comparison import comparison
 from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
 from slrig.devices import Rig
 from slrig.errors import PoseRefusedError

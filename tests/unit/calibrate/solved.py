@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 
 from slrig.calibrate.solving import CalibrationResult, ReadPose
+from slrig.calibration.accuracy import OddEven
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.displacement import RigidMotion
-from slrig.calibration.judging.comparison import OddEven
-from slrig.calibration.judging.verdict import verdict
+from slrig.calibration.judgement import verdict
 from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.calibration.poses.coverage import coverage
 from slrig.calibration.solution import (
@@ -24,6 +23,7 @@ from slrig.calibration.solution import (
     Bow,
     DeviceResiduals,
     ExpectedError,
+    RigidMotion,
     Solution,
 )
 from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved

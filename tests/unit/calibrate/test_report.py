@@ -21,10 +21,10 @@ from slrig.calibrate.pose_judging import judgement, summary
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
 from slrig.calibrate.tools import Setting
+from slrig.calibration.accuracy import comparison
 from slrig.calibration.board import BoardShape
 from slrig.calibration.health.verification import verify_by_board
-from slrig.calibration.judging.comparison import comparison
-from slrig.calibration.judging.verdict import Grade
+from slrig.calibration.judgement import Grade
 from slrig.calibration.observations import ViewFigures
 from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import tell_result

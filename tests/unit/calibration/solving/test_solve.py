@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from slrig.calibration.accuracy import expected_error
 from slrig.calibration.board import BoardShape
-from slrig.calibration.judging.comparison import expected_error
-from slrig.calibration.judging.verdict import judged_size
+from slrig.calibration.judgement import judged_size
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import CELLS, LEAST_HALVED, PROJECTOR, DeviceResiduals, ExpectedError, Solution
 from slrig.calibration.solving.adjustment import LENS_SIGMA, Fit, Problem, fitted
-from slrig.calibration.solving.held_out import allowing_for, folds_of, halves_of
+from slrig.calibration.solving.covariance import allowing_for, folds_of, halves_of
 from slrig.calibration.solving.projection import difference
 from slrig.calibration.solving.solve import solve
 from slrig.errors import SolveRefusedError

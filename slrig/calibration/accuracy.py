@@ -1,7 +1,7 @@
 """Comparison of two calibrations: changes of each device in σ, the error that follows, and expected errors.
 
 Points move together, as one rigid body, and each by itself. Only the second changes what is measured of a shape, so
-that both are told apart (`slrig.calibration.displacement.without_rigid_motion`).
+that both are told apart (`slrig.calibration.solution.without_rigid_motion`).
 """
 
 from __future__ import annotations
@@ -14,25 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from slrig.calibration.displacement import (
-    Moved,
-    RigidMotion,
-    cell_centres,
-    modes_of,
-    moved_points,
-    rigid_free,
-    stated_deviation,
-    without_rigid_motion,
-)
 from slrig.calibration.observations import COLUMN, ROW, Observations
 from slrig.calibration.solution import (
     PROJECTOR,
     ExpectedError,
+    Moved,
+    RigidMotion,
     Solution,
+    cell_centres,
     covariance_of,
     device_title,
     devices_of,
+    modes_of,
+    moved_points,
+    rigid_free,
     scale_mode,
+    stated_deviation,
+    without_rigid_motion,
 )
 from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, Pinhole, triangulated_axis

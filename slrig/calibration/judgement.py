@@ -10,8 +10,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.calibration.accuracy import OddEven
 from slrig.calibration.board import PRINT_SIGMA, Board
-from slrig.calibration.judging.comparison import OddEven
 from slrig.calibration.poses.coverage import Coverage, place_words
 from slrig.calibration.solution import (
     CELLS,
@@ -67,7 +67,7 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """One thing that was judged. figure : its name in `slrig.calibration.judging.verdict.LIMITS`, "error", "poses",
+    """One thing that was judged. figure : its name in `slrig.calibration.judgement.LIMITS`, "error", "poses",
     "scale", "stretch" or "odd_even"; device : which one, None for all together. words : what was found, what is usual,
     and what to do. remarkable : worth a person's look, though the grade is good.
     """

@@ -11,16 +11,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slrig.calibration.accuracy import comparison, expected_error, odd_even, volume_of
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.displacement import modes_of, moved_points, rigid_free, without_rigid_motion
-from slrig.calibration.judging.comparison import comparison, expected_error, odd_even, volume_of
-from slrig.calibration.judging.verdict import Grade, verdict
+from slrig.calibration.judgement import Grade, verdict
 from slrig.calibration.observations import COLUMN, ROW, Correspondences, Observations, PoseObservation
-from slrig.calibration.solution import BoardPose, Half, Solution
+from slrig.calibration.solution import (
+    BoardPose,
+    Half,
+    Solution,
+    modes_of,
+    moved_points,
+    rigid_free,
+    without_rigid_motion,
+)
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
 from slrig.reconstruction.surface_fit import stencils
-from tests.unit.calibration.judging.test_verdict import EXPECTED
 from tests.unit.calibration.perturbed import (
     aligned,
     changed,
@@ -33,6 +39,7 @@ from tests.unit.calibration.perturbed import (
     ray_directions,
     right_camera,
 )
+from tests.unit.calibration.test_judgement import EXPECTED
 
 FITTED = float(np.sqrt((stencils()[0][0].astype(np.float64) ** 2).sum()))
 """What the fit of a scan makes of the noise of one pixel."""

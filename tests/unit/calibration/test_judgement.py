@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.calibration.judging.verdict import (
+from slrig.calibration.judgement import (
     LIMITS,
     Grade,
     ScaleCheck,
