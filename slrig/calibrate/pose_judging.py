@@ -15,7 +15,7 @@ from slrig.calibrate.records import SessionRecord, plain
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import Judgement, Setting, Standing
-from slrig.calibration.judgement import board_words
+from slrig.calibration.judgement import describe_board
 from slrig.calibration.poses.checks import judge_pose
 from slrig.calibration.poses.coverage import Advice, Coverage, coverage, next_move
 from slrig.calibration.poses.rough import rig_guess
@@ -75,7 +75,7 @@ def summary(result: CalibrationResult) -> Mapping[str, Any]:
         "board": {
             "bowed": solution.board_shape_mm is not None,
             "bow_mm": None if bow is None else [bow.height_mm, bow.sigma_mm],
-            "words": board_words(solution),
+            "words": describe_board(solution),
             "scale_sigma": solution.size.scale_sigma,
             "stretch": [solution.size.stretch, solution.size.stretch_sigma],
         },

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from uuid import uuid4
 
-from slrig.calibration.accuracy import OddEven, odd_even
+from slrig.calibration.accuracy import OddEven, compare_halves
 from slrig.calibration.board import Board, BoardShape
-from slrig.calibration.judgement import Verdict, check_scale, verdict
+from slrig.calibration.judgement import Verdict, check_scale, judge_calibration
 from slrig.calibration.observations import Observations, PoseObservation, ViewFigures
 from slrig.calibration.poses.coverage import Coverage, coverage
 from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
@@ -84,7 +84,7 @@ def solve_poses(
         expected = expected_error(solution, observations)
     except CalibrationError as error:
         raise SolveRefusedError(str(error)) from error
-    checked = odd_even(solution, expected.grid_mm)
+    checked = compare_halves(solution, expected.grid_mm)
     sizes = dict(cameras) if projector is None else {**cameras, PROJECTOR: projector}
     used = [pose for pose in observed if pose.name not in solution.outliers]
     covered = coverage(used, board, sizes)
@@ -102,7 +102,7 @@ def solve_poses(
         solution=solution,
         calibration=replace(solution.calibration, solved=solved),
         expected=expected,
-        verdict=verdict(solution, expected, covered, checked, board=board, scale=scale, wanted_mm=wanted_mm),
+        verdict=judge_calibration(solution, expected, covered, checked, board=board, scale=scale, wanted_mm=wanted_mm),
         coverage=covered,
         odd_even=checked,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from slrig.calibration.board import Board
-from slrig.calibration.health.drift import board_poses
+from slrig.calibration.health.drift import estimate_board_poses
 from slrig.calibration.observations import PoseObservation
 from slrig.model import Calibration
 from slrig.views import BoardAxis, board_axis
@@ -26,5 +26,5 @@ def axis_of_poses(
     StageRefusedError
         As `board_axis` does.
     """
-    known = board_poses(poses, board, calibration)
+    known = estimate_board_poses(poses, board, calibration)
     return board_axis(known.names, known.poses, known.covariance, board.points_mm, angles_deg)

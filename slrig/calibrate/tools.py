@@ -110,7 +110,7 @@ def calibration_tools(worker: Compute) -> CalibrationTools:
         solve=worker.task(f"{room}.solving:solve_poses", "solve"),
         report=worker.task(f"{room}.pose_judging:write_report", "report of the solve"),
         summary=worker.task(f"{room}.pose_judging:summary", "summary of the solve"),
-        compare=worker.task("slrig.calibration.accuracy:comparison", "comparison"),
+        compare=worker.task("slrig.calibration.accuracy:compare_calibrations", "comparison"),
         parse=worker.task("slrig.bundle.calibration:read_calibration", "reading of the calibration"),
         warm=worker.task(f"{room}.pose_judging:warm", "preparation"),
     )

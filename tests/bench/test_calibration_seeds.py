@@ -31,7 +31,7 @@ from slrig.calibrate.pose_reading import read_pose
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import Solution
-from slrig.calibration.solving.projection import difference
+from slrig.calibration.solving.projection import device_difference
 from slrig.calibration.solving.solve import solve
 from slrig.errors import PoseRefusedError, ScanEvidenceError
 from slrig.model import Calibration
@@ -170,7 +170,7 @@ WORLDS = {
 
 def chi_square(solution: Solution, truth: Calibration) -> tuple[float, int]:
     """χ² of all numbers that are free, and how many."""
-    off = difference(rows_of(solution.calibration), rows_of(truth)).ravel()
+    off = device_difference(rows_of(solution.calibration), rows_of(truth)).ravel()
     covariance = exact_covariance(solution)
     free = np.diagonal(covariance) > 0
     sigma = np.sqrt(np.diagonal(covariance)[free])

@@ -1,14 +1,12 @@
-"""Poses outside the solve: their residuals, the board's shape, halves of the poses, and the covariance.
+"""Covariance of a solve, shape of the board, halves of the poses, and residuals at held-out poses.
 
-The poses are dealt into folds. For each fold all others are adjusted; then the devices are held, the fold's board poses
-are fitted to the cameras' corners alone, and all residuals of the fold are taken. All poses are of one board, so that
-what its shape takes off the residuals of some poses it takes off those of others, too. A shape is kept when the loss
-over all folds falls by more than MARGIN per term, in units of a squared deviation: a useless term lowers it by nothing,
-and one that is known to n of its own deviations by about n².
+Cross-validation divides the poses into folds. For each fold all other poses are adjusted; then the devices are held,
+the fold's board poses are fitted to the cameras' corners alone, and all residuals of the fold are taken. A shape is
+accepted if the loss over all folds falls by more than MARGIN per term, in squared deviations: a useless term does not
+lower it, and a term that is known to n of its own deviations lowers it by about n².
 
-There are three shapes, each a special case of the next: flat and as printed; bent; bent with every corner off its
-printed place. Lens and shape can be confused where the board always stands at one place of the image; how far is in the
-covariance.
+There are three shapes, each a special case of the next: flat with nominal corners; bent; bent with an offset of each
+corner. Lens and shape can be confused if the board is always at one place of the image; the covariance includes that.
 """
 
 from __future__ import annotations
@@ -21,112 +19,137 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from slrig.calibration.board import Board, BoardShape
-from slrig.calibration.solution import LEAST_HALVED, Bow, DeviceResiduals, Half
+from slrig.calibration.solution import MIN_HALVED_POSES, Bow, DeviceResiduals, HalfSolution
 from slrig.calibration.solving.adjustment import (
+    AdjustmentProblem,
     Deviations,
     DeviceNoise,
     Fit,
-    Prior,
-    Problem,
     Residuals,
+    ShapePrior,
     Weights,
-    adjusted,
-    deviations_of,
-    fitted,
-    free_of,
-    in_shape,
-    kept_of,
-    losses_of,
+    adjust,
+    clear_unsolved_shape,
+    compute_residuals,
+    fit_geometry,
+    free_parameters,
+    inlier_weights,
     normal_equations,
-    residuals_of,
-    weights_of,
+    observation_deviations,
+    robust_losses,
+    robust_weights,
 )
-from slrig.calibration.solving.projection import BEND, DEVICE, Geometry, Measurements, difference
+from slrig.calibration.solving.projection import BEND, DEVICE, Geometry, Measurements, device_difference
 from slrig.errors import SolveRefusedError
 from slrig.model import FloatArray, IntArray
 
-LEAST_KNOWN = 0.05
-"""The greatest deviation of a focal length, over it, with which a calibration still is one."""
+MAX_FOCAL_DEVIATION = 0.05
+"""Maximum standard deviation of a focal length, relative to it."""
+
+FOLDS = 5
+MARGIN = 4.0
+"""Reduction of the loss at held-out poses that a term of a shape must bring, in squared deviations."""
+_TRIAL_STEPS = 15
+"""Maximum number of Levenberg-Marquardt steps for trying a shape."""
+
+MIN_FOLDED_POSES = 4
+"""With fewer poses none are held out."""
+
+_BEND_SIGMA = 0.01
+"""Prior standard deviation of each coefficient of the bend, relative to half the board's extent."""
+_OFFSET_SIGMA_MM = 0.2
+"""Prior standard deviation of a corner's offset along either axis, from the accuracy of printers and paper."""
+
+_TERM_COUNTS = (0, BEND, 2 * BEND)
+"""Number of terms that each shape counts as. Offsets are many, and their prior holds each near 0."""
+
+_MATCHES_PER_VIEW = 1000
+"""For halves: a third of those of the full solve. Neighbours err alike, so the covariance grows little."""
+_HALF_ROUNDS = 2
 
 
-def covariance_of(problem: Problem, fit: Fit, bend: Prior | None, /) -> tuple[FloatArray, Bow | None]:
+def estimate_covariance(
+    problem: AdjustmentProblem, fit: Fit, bend: ShapePrior | None, /
+) -> tuple[FloatArray, Bow | None]:
     """Covariance of all devices' parameters, (15 d, 15 d), 0 for the world's pose; and the bow of the board.
 
-    bend : what is known beforehand of the board's bend; None if it is known to be flat, and the bow is None too.
+    bend : prior of the board's bend; None for a board declared flat, whose bow is None.
 
-    Raises SolveRefusedError where the poses leave a number open, or a focal length all but open.
+    Raises SolveRefusedError if the poses leave a parameter undetermined, or determine a focal length too poorly.
     """
-    devices, bent = _inverse(problem, fit)
-    _refuse_open(problem, fit, devices)
+    devices, bend_covariance = _invert_normal_equations(problem, fit)
+    _refuse_undetermined(problem, fit, devices)
     if problem.prior is not None or bend is None:
-        return devices, None if bend is None else _bow_of(fit.geometry, bent, solved=True)
-    open_problem, sigma = replace(problem, prior=bend), problem.deviations(fit.noise)
-    wide = adjusted(
-        fit.geometry, problem.measurements, free_of(open_problem, fit.geometry), sigma, prior=bend,
-        kept=kept_of(fit.residuals, sigma),
+        return devices, None if bend is None else _estimate_bow(fit.geometry, bend_covariance, solved=True)
+    # The board was solved as flat: add the uncertainty of its bend, and the change of the devices with a bent board.
+    bent_problem, sigma = replace(problem, prior=bend), problem.deviations(fit.noise)
+    bent = adjust(
+        fit.geometry, problem.measurements, free_parameters(bent_problem, fit.geometry), sigma, prior=bend,
+        inliers=inlier_weights(fit.residuals, sigma),
     )  # fmt: skip
-    shift = difference(wide.geometry.devices, fit.geometry.devices).ravel()
-    devices, bent = _inverse(open_problem, replace(fit, geometry=wide.geometry, residuals=wide.residuals))
-    return devices + np.outer(shift, shift), _bow_of(wide.geometry, bent, solved=False)
+    shift = device_difference(bent.geometry.devices, fit.geometry.devices).ravel()
+    bent_fit = replace(fit, geometry=bent.geometry, residuals=bent.residuals)
+    devices, bend_covariance = _invert_normal_equations(bent_problem, bent_fit)
+    return devices + np.outer(shift, shift), _estimate_bow(bent.geometry, bend_covariance, solved=False)
 
 
-def allowing_for(covariance: FloatArray, residuals: Sequence[DeviceResiduals], /) -> FloatArray:
-    """The covariance, (15 d, 15 d) float64, with all deviations as many times as large as residuals are larger at
-    held-out poses than at those that were seen, of the device where that is most.
+def inflate_by_held_out(covariance: FloatArray, residuals: Sequence[DeviceResiduals], /) -> FloatArray:
+    """Scale the covariance (15 d, 15 d) by the largest ratio, squared, of held-out to own rms residuals of a device.
 
-    One factor for all: devices err together, and a point by a hundredth of what each of them does. A solve that holds
-    no poses out tells nothing of this, and its covariance stays.
+    One factor for all: errors of devices are correlated, and a point's error is about a hundredth of theirs. Without
+    held-out poses the covariance stays.
     """
-    ratios = [left.held_out_rms_px / left.rms_px for left in residuals]
+    ratios = [each.held_out_rms_px / each.rms_px for each in residuals]
     return covariance * max([1.0, *(ratio for ratio in ratios if np.isfinite(ratio))]) ** 2
 
 
-def _inverse(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:
-    """Covariance of the devices, (15 d, 15 d), and of the bend, (7, 7), which is 0 where it is held."""
+def _invert_normal_equations(problem: AdjustmentProblem, fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """Covariance of the devices, (15 d, 15 d), and of the bend, (7, 7), which is 0 if it is not solved for."""
     sigma = problem.deviations(fit.noise)
-    kept = kept_of(fit.residuals, sigma)
-    weights = weights_of(fit.residuals, sigma, kept)
+    inliers = inlier_weights(fit.residuals, sigma)
+    weights = robust_weights(fit.residuals, sigma, inliers)
     matrix = normal_equations(fit.geometry, problem.measurements, weights, prior=problem.prior)[0]
-    # A pose of which everything is outlying has no say, and nothing to say.
-    free = free_of(problem, fit.geometry) & (np.diagonal(matrix) > 0)
+    # The diagonal of a pose without inliers is 0.
+    free = free_parameters(problem, fit.geometry) & (np.diagonal(matrix) > 0)
     matrix = matrix[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.diagonal(matrix))
     try:
         factor = cho_factor(matrix * np.outer(scale, scale))
     except LinAlgError as error:
         message = (
-            f"the {int(problem.used.sum())} poses leave the calibration open: another one fits them as well; "
-            "shoot more, at several distances, tilted by 20° to 40° to all sides"
+            f"the {int(problem.used.sum())} poses leave the calibration open: other parameters fit them as well; "
+            "shoot more poses, at several distances, tilted by 20° to 40° to all sides"
         )
         raise SolveRefusedError(message) from error
     layout = fit.geometry.layout
-    place = np.flatnonzero(free)
-    mine = (place < layout.first_pose) | (place >= layout.first_bend)
-    unit = np.eye(len(place))[:, mine]
-    found = cho_solve(factor, unit)[mine] * np.outer(scale[mine], scale[mine])
-    # Devices first, then the bend: poses and offsets lie between them.
-    into = np.where(place < layout.first_pose, place, place - layout.first_bend + layout.first_pose)[mine]
+    index = np.flatnonzero(free)
+    # Devices first, then the bend: poses and offsets are between them in the parameter vector.
+    chosen = (index < layout.first_pose) | (index >= layout.first_bend)
+    unit = np.eye(len(index))[:, chosen]
+    inverse = cho_solve(factor, unit)[chosen] * np.outer(scale[chosen], scale[chosen])
+    target = np.where(index < layout.first_pose, index, index - layout.first_bend + layout.first_pose)[chosen]
     covariance = np.zeros((layout.first_pose + BEND,) * 2)
-    covariance[np.ix_(into, into)] = (found + found.T) / 2
+    covariance[np.ix_(target, target)] = (inverse + inverse.T) / 2
     return covariance[: layout.first_pose, : layout.first_pose], covariance[layout.first_pose :, layout.first_pose :]
 
 
-def _refuse_open(problem: Problem, fit: Fit, covariance: FloatArray) -> None:
+def _refuse_undetermined(problem: AdjustmentProblem, fit: Fit, covariance: FloatArray) -> None:
+    """Raise SolveRefusedError if the poses determine a focal length too poorly."""
     for device, name in enumerate(problem.devices):
         for axis in (0, 1):
             focal = fit.geometry.devices[device, axis]
             sigma = float(np.sqrt(covariance[DEVICE * device + axis, DEVICE * device + axis]))
-            if not sigma <= LEAST_KNOWN * focal:
+            if not sigma <= MAX_FOCAL_DEVIATION * focal:
                 message = (
                     f"'{name}': the {int(problem.used.sum())} poses determine its focal length to {sigma / focal:.0%} "
-                    f"only; {LEAST_KNOWN:.0%} is the most that is of use: shoot more poses, tilted by 20° to 40° to "
-                    "the left, to the right, up and down"
+                    f"only, and at most {MAX_FOCAL_DEVIATION:.0%} are allowed: shoot more poses, tilted by 20° to 40° "
+                    "to the left, to the right, up and down"
                 )
                 raise SolveRefusedError(message)
 
 
-def _bow_of(geometry: Geometry, covariance: FloatArray, /, *, solved: bool) -> Bow:
-    """How far the corners lie out of the plane that fits them best: from the lowest to the highest.
+def _estimate_bow(geometry: Geometry, covariance: FloatArray, /, *, solved: bool) -> Bow:
+    """Distance from the lowest to the highest corner, measured from the plane that fits all corners.
 
     covariance : (7, 7) float64, of the bend, mm².
     """
@@ -134,190 +157,174 @@ def _bow_of(geometry: Geometry, covariance: FloatArray, /, *, solved: bool) -> B
     plane = np.column_stack([np.ones(len(basis)), geometry.points - geometry.frame[:2]])
     basis = basis - plane @ np.linalg.lstsq(plane, basis, rcond=None)[0]
     height = basis @ geometry.bend
-    across = basis[int(np.argmax(height))] - basis[int(np.argmin(height))]
-    return Bow(float(np.ptp(height)), float(np.sqrt(max(across @ covariance @ across, 0.0))), solved)
+    extremes = basis[int(np.argmax(height))] - basis[int(np.argmin(height))]
+    return Bow(float(np.ptp(height)), float(np.sqrt(max(extremes @ covariance @ extremes, 0.0))), solved)
 
 
-_MATCHES_PER_VIEW = 1000
-"""A third of those of the whole solve, at a third of the time, make a half 3 % less sure: neighbours err alike."""
-_ROUNDS = 2
+def solve_halves(
+    problem: AdjustmentProblem, fit: Fit, bend: ShapePrior | None, residuals: Sequence[DeviceResiduals], /
+) -> tuple[HalfSolution, ...]:
+    """Solve the odd and the even used poses separately.
 
-
-def halves_of(
-    problem: Problem, fit: Fit, bend: Prior | None, residuals: Sequence[DeviceResiduals], /
-) -> tuple[Half, ...]:
-    """The odd poses and the even ones, counted in order among those that were used.
-
-    problem, fit, residuals : of the whole solve. bend : as `covariance_of` takes it. Empty where there are fewer
-    than `LEAST_HALVED` poses, or one half alone leaves a number open.
+    problem, fit, residuals : of the full solve. bend : see `estimate_covariance`. Empty if there are fewer than
+    `MIN_HALVED_POSES` poses, or one half leaves a parameter undetermined.
     """
     used = np.flatnonzero(problem.used)
-    if len(used) < LEAST_HALVED:
+    if len(used) < MIN_HALVED_POSES:
         return ()
-    thin = replace(problem, measurements=problem.measurements.thinned(_MATCHES_PER_VIEW))
-    found = []
+    thinned = replace(problem, measurements=problem.measurements.thin(_MATCHES_PER_VIEW))
+    halves = []
     for first in (0, 1):
         others = np.zeros(len(problem.pose_names), dtype=np.bool_)
         others[used[1 - first :: 2]] = True
-        half = thin.without(others)
+        half = thinned.exclude_poses(others)
         try:
-            part = fitted(half, fit.geometry, rounds=_ROUNDS, correlated=True, noise=fit.noise)
-            covariance, _ = covariance_of(half, part, bend)
+            half_fit = fit_geometry(half, fit.geometry, rounds=_HALF_ROUNDS, correlated=True, noise=fit.noise)
+            covariance, _ = estimate_covariance(half, half_fit, bend)
         except SolveRefusedError:
             return ()
         names = tuple(problem.pose_names[number] for number in used[first::2])
-        change = difference(part.geometry.devices, fit.geometry.devices).ravel()
-        found.append(Half(names, change, allowing_for(covariance, residuals)))
-    return tuple(found)
-
-
-FOLDS = 5
-MARGIN = 4.0
-"""What a term of a shape must take off the loss at held-out poses, in squared deviations."""
-_TRIAL_STEPS = 15
-"""Of Levenberg-Marquardt, where a model is only tried."""
-
-LEAST_POSES = 4
-"""With fewer poses none can be held out."""
-
-_BEND_SIGMA = 0.01
-"""Standard deviation of each number of a board's bend over half its extent: paper glued to a board bends less."""
-_OFFSET_SIGMA_MM = 0.2
-"""The same of a corner's offset along either axis: what printers and paper are off by within a page."""
-
-_WORTH = (0, BEND, 2 * BEND)
-"""How many terms each shape counts as. Offsets are many, and each is held near 0 by what is known of printers."""
+        change = device_difference(half_fit.geometry.devices, fit.geometry.devices).ravel()
+        halves.append(HalfSolution(names, change, inflate_by_held_out(covariance, residuals)))
+    return tuple(halves)
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOut:
-    """At poses that were not seen: rms_px by device (cameras: of the distance; the projector: per coordinate), and loss
-    by device, in squared deviations.
+class HeldOutResiduals:
+    """Residuals at held-out poses, by device. rms_px : cameras of the distance, the projector per coordinate; loss : in
+    squared deviations.
     """
 
     rms_px: Mapping[str, float]
     loss: Mapping[str, float]
 
 
-def folds_of(problem: Problem) -> list[NDArray[np.bool_]]:
-    """(m,) bool per fold: the poses of that fold, each in one; empty where there are too few to hold any out."""
+def make_folds(problem: AdjustmentProblem) -> list[NDArray[np.bool_]]:
+    """Divide the poses into folds, (m,) bool each; empty if there are too few to hold any out."""
     used = np.flatnonzero(problem.used)
-    if len(used) < LEAST_POSES:
+    if len(used) < MIN_FOLDED_POSES:
         return []
     folds = []
-    parts = min(FOLDS, len(used))
-    for part in range(parts):
+    count = min(FOLDS, len(used))
+    for number in range(count):
         fold = np.zeros(len(problem.pose_names), dtype=np.bool_)
-        fold[used[part::parts]] = True
+        fold[used[number::count]] = True
         folds.append(fold)
     return folds
 
 
-def held_out(
-    problem: Problem, geometry: Geometry, noise: Sequence[DeviceNoise],
-    folds: Sequence[NDArray[np.bool_]], kept: Weights, /, *, judged: tuple[Measurements, Weights] | None = None,
-) -> HeldOut:  # fmt: skip
-    """What is left at held-out poses, over all folds. geometry : the start, for all poses.
+def evaluate_held_out(
+    problem: AdjustmentProblem, geometry: Geometry, noise: Sequence[DeviceNoise], folds: Sequence[NDArray[np.bool_]],
+    inliers: Weights, /, *, evaluated: tuple[Measurements, Weights] | None = None,
+) -> HeldOutResiduals:  # fmt: skip
+    """Residuals at held-out poses over all folds. geometry : initial values for all poses.
 
-    kept : which observations count (`kept_of`). It is to be the same for all models that are compared: none is to gain
-    by what it fits worst. judged : observations of the same poses that are judged at, instead of the problem's own.
+    inliers : observations that count (`inlier_weights`), the same for all models that are compared, so that none gains
+    by excluding its worst residuals. evaluated : observations of the same poses at which residuals are taken; the
+    problem's own by default.
     """
-    trained_on = problem.measurements
-    m, judged_kept = judged or (trained_on, kept)
+    training = problem.measurements
+    m, evaluated_inliers = evaluated or (training, inliers)
     total = Residuals(np.full_like(m.corner_px, np.nan), np.full_like(m.match_px, np.nan))
     for fold in folds:
-        rest = problem.without(fold)
+        rest = problem.exclude_poses(fold)
         sigma = rest.deviations(noise)
-        corners, matches = fold[trained_on.corner_where[:, 1]], fold[trained_on.match_where[:, 1]]
-        trained = adjusted(
-            geometry, rest.measurements, free_of(rest, geometry), sigma, prior=problem.prior,
-            kept=(kept[0][~corners], kept[1][~matches]),
+        corners, matches = fold[training.corner_where[:, 1]], fold[training.match_where[:, 1]]
+        trained = adjust(
+            geometry, rest.measurements, free_parameters(rest, geometry), sigma, prior=problem.prior,
+            inliers=(inliers[0][~corners], inliers[1][~matches]),
         )  # fmt: skip
         corners, matches = fold[m.corner_where[:, 1]], fold[m.match_where[:, 1]]
-        own = m.of(corners, matches)
-        left = residuals_of(_placed(problem, trained.geometry, own, fold, noise, judged_kept[0][corners]), own)
-        total.corners[corners], total.matches[matches] = left.corners, left.matches
-    sigma = deviations_of(m, noise, problem.with_projector)
-    return _summed(problem, m.corner_where[:, 0], total, judged_kept, sigma)
+        own = m.select(corners, matches)
+        posed = _fit_fold_poses(problem, trained.geometry, own, fold, noise, evaluated_inliers[0][corners])
+        residuals = compute_residuals(posed, own)
+        total.corners[corners], total.matches[matches] = residuals.corners, residuals.matches
+    sigma = observation_deviations(m, noise, problem.with_projector)
+    return _summarise(problem, m.corner_where[:, 0], total, evaluated_inliers, sigma)
 
 
-def _placed(
-    problem: Problem, geometry: Geometry, own: Measurements, fold: NDArray[np.bool_], noise: Sequence[DeviceNoise],
-    kept: FloatArray,
+def _fit_fold_poses(
+    problem: AdjustmentProblem, geometry: Geometry, own: Measurements, fold: NDArray[np.bool_],
+    noise: Sequence[DeviceNoise], inliers: FloatArray,
 ) -> Geometry:  # fmt: skip
-    """The fold's board poses, fitted to its corners with the devices held."""
-    corners = own.of(np.ones(len(own.corner_px), dtype=np.bool_), np.zeros(len(own.match_px), dtype=np.bool_))
+    """Fit the fold's board poses to its corners, with the devices held."""
+    corners = own.select(np.ones(len(own.corner_px), dtype=np.bool_), np.zeros(len(own.match_px), dtype=np.bool_))
     free = np.zeros(geometry.layout.count, dtype=np.bool_)
     free[geometry.layout.first_pose : geometry.layout.first_offset] = np.repeat(fold, 6)
-    sigma = deviations_of(corners, noise, problem.with_projector)
-    return adjusted(geometry, corners, free, sigma, kept=(kept, np.zeros(0))).geometry
+    sigma = observation_deviations(corners, noise, problem.with_projector)
+    return adjust(geometry, corners, free, sigma, inliers=(inliers, np.zeros(0))).geometry
 
 
-def _summed(problem: Problem, camera: IntArray, left: Residuals, kept: Weights, sigma: Deviations) -> HeldOut:
-    corner_loss, match_loss = losses_of(left, sigma)
+def _summarise(
+    problem: AdjustmentProblem, camera: IntArray, residuals: Residuals, inliers: Weights, sigma: Deviations
+) -> HeldOutResiduals:
+    corner_loss, match_loss = robust_losses(residuals, sigma)
     rms, loss = {}, {}
     for device, name in enumerate(problem.devices):
-        if problem.beam(device):
-            mine = (kept[1] > 0) & np.isfinite(match_loss)
-            rms[name] = _rms(left.matches[mine])
-            loss[name] = float(np.sum(match_loss[mine]))
+        if problem.is_projector(device):
+            own = (inliers[1] > 0) & np.isfinite(match_loss)
+            rms[name] = _rms(residuals.matches[own])
+            loss[name] = float(np.sum(match_loss[own]))
         else:
-            mine = (camera == device) & (kept[0] > 0) & np.isfinite(corner_loss)
-            rms[name] = _rms(np.hypot(*left.corners[mine].T))
-            loss[name] = float(np.sum(corner_loss[mine]))
-    return HeldOut(rms, loss)
+            own = (camera == device) & (inliers[0] > 0) & np.isfinite(corner_loss)
+            rms[name] = _rms(np.hypot(*residuals.corners[own].T))
+            loss[name] = float(np.sum(corner_loss[own]))
+    return HeldOutResiduals(rms, loss)
 
 
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
 
 
-def loss_of(left: Residuals, sigma: Deviations, kept: Weights) -> float:
-    """The loss of all that counts, in squared deviations."""
-    return sum(float(np.nansum(loss[k > 0])) for loss, k in zip(losses_of(left, sigma), kept, strict=True))
+def total_loss(residuals: Residuals, sigma: Deviations, inliers: Weights) -> float:
+    """Loss of all inliers, in squared deviations."""
+    losses = robust_losses(residuals, sigma)
+    return sum(float(np.nansum(loss[own > 0])) for loss, own in zip(losses, inliers, strict=True))
 
 
-def shapes_of(board: Board, asked: BoardShape) -> tuple[Prior | None, ...]:
-    """The shapes that may be chosen, the simplest first; None is flat."""
-    bend = bend_of(board, asked)
+def candidate_shapes(board: Board, requested: BoardShape) -> tuple[ShapePrior | None, ...]:
+    """Shapes to choose from, the simplest first; None is flat."""
+    bend = bend_prior(board, requested)
     if bend is None:
         return (None,)
     bent = (bend, replace(bend, offset_sigma_mm=_OFFSET_SIGMA_MM))
-    return bent if asked is BoardShape.BOWED else (None, *bent)
+    return bent if requested is BoardShape.BOWED else (None, *bent)
 
 
-def bend_of(board: Board, asked: BoardShape) -> Prior | None:
-    """What is known beforehand of a board's bend; None where a person said that it is flat."""
-    if asked is BoardShape.FLAT:
+def bend_prior(board: Board, requested: BoardShape) -> ShapePrior | None:
+    """Prior of a board's bend; None if the board was declared flat."""
+    if requested is BoardShape.FLAT:
         return None
-    return Prior(_BEND_SIGMA * float(np.ptp(board.points_mm[:, :2], axis=0).max()) / 2)
+    return ShapePrior(_BEND_SIGMA * float(np.ptp(board.points_mm[:, :2], axis=0).max()) / 2)
 
 
-def chosen_shape(problem: Problem, fit: Fit, shapes: Sequence[Prior | None], /) -> Prior | None:
-    """The shape that poses are better with by more than MARGIN per term, in squared deviations: both those that it is
-    fitted to and those held out. The simplest where none can be held out.
+def choose_shape(problem: AdjustmentProblem, fit: Fit, shapes: Sequence[ShapePrior | None], /) -> ShapePrior | None:
+    """Choose the shape that lowers the loss by more than MARGIN per term at both fitted and held-out poses.
 
-    shapes : the simplest first.
+    shapes : the simplest first; it is the choice if no poses can be held out.
     """
-    dealt = folds_of(problem)
-    if len(shapes) == 1 or not dealt:
+    folds = make_folds(problem)
+    if len(shapes) == 1 or not folds:
         return shapes[0]
-    richest = fitted(replace(problem, prior=shapes[-1]), fit.geometry, rounds=2, correlated=True, noise=fit.noise)
+    richest = fit_geometry(replace(problem, prior=shapes[-1]), fit.geometry, rounds=2, correlated=True, noise=fit.noise)
     sigma = problem.deviations(richest.noise)
-    kept = kept_of(richest.residuals, sigma)
-    losses: list[float] = []
-    seen: list[float] = []
+    inliers = inlier_weights(richest.residuals, sigma)
+    held_out: list[float] = []
+    fitted: list[float] = []
     best = 0
-    for rung, shape in enumerate(shapes):
+    for number, shape in enumerate(shapes):
         trial = replace(problem, prior=shape)
-        start = in_shape(richest.geometry, trial)
-        free = free_of(trial, start)
-        tried = adjusted(start, problem.measurements, free, sigma, prior=shape, kept=kept, most_steps=_TRIAL_STEPS)
-        seen.append(loss_of(tried.residuals, sigma, kept))
-        losses.append(sum(held_out(trial, tried.geometry, richest.noise, dealt, kept).loss.values()))
-        # Of few poses, those held out lie far from what the others determine, and their loss is a matter of luck: a
-        # shape that is there is seen by the poses that it is fitted to as well.
-        enough = MARGIN * (_WORTH[rung] - _WORTH[best])
-        if min(losses[best] - losses[rung], seen[best] - seen[rung]) > enough:
-            best = rung
+        start = clear_unsolved_shape(richest.geometry, trial)
+        free = free_parameters(trial, start)
+        adjusted = adjust(
+            start, problem.measurements, free, sigma, prior=shape, inliers=inliers, max_steps=_TRIAL_STEPS
+        )
+        fitted.append(total_loss(adjusted.residuals, sigma, inliers))
+        result = evaluate_held_out(trial, adjusted.geometry, richest.noise, folds, inliers)
+        held_out.append(sum(result.loss.values()))
+        # With few poses, those held out are far from what the others determine, and their loss is a matter of chance. A
+        # real shape also lowers the loss at the poses that it is fitted to.
+        margin = MARGIN * (_TERM_COUNTS[number] - _TERM_COUNTS[best])
+        if min(held_out[best] - held_out[number], fitted[best] - fitted[number]) > margin:
+            best = number
     return shapes[best]

@@ -18,7 +18,7 @@ from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import CalibrationTools, Judgement, Setting, Standing
-from slrig.calibration.accuracy import comparison
+from slrig.calibration.accuracy import compare_calibrations
 from slrig.calibration.board import Board, BoardKind, BoardShape
 from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
 from slrig.devices import Rig
@@ -94,7 +94,7 @@ class TameCalibrating:
             picture=lambda *_: PNG,
             coverage_picture=lambda _, device, poses, __: f"{device} {len(poses)}".encode(),
             solve=self._solve,
-            compare=comparison,
+            compare=compare_calibrations,
             parse=read_calibration,
             report=lambda path, *_: cast("None", path.write_text("<html>report</html>")),
             summary=lambda _: {"verdict": {"grade": "good", "summary": "good", "reasons": []}},

@@ -12,7 +12,7 @@ import numpy as np
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibration.accuracy import OddEven
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.judgement import verdict
+from slrig.calibration.judgement import judge_calibration
 from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.calibration.poses.coverage import coverage
 from slrig.calibration.solution import (
@@ -181,5 +181,5 @@ def solved_result() -> CalibrationResult:
     sizes = {"left": rig["left"].size, PROJECTOR: rig[PROJECTOR].size}
     used = [pose.observation for name, pose in read_poses().items() if name != BUMPED]
     covered = coverage(used, BOARD, sizes)
-    judged = verdict(solution, expected, covered, HALVES, board=BOARD)
+    judged = judge_calibration(solution, expected, covered, HALVES, board=BOARD)
     return CalibrationResult(solution, calibration, expected, judged, covered, HALVES)
