@@ -10,7 +10,7 @@ import numpy as np
 from slrig.accept.evaluation import Reading, errors_by_step
 from slrig.accept.plan import Artefacts, Quantity
 from slrig.accept.uncertainty import error_uncertainty
-from slrig.calibration.judging.verdict import LEAST_OFF, SURE
+from slrig.calibration.judgement import MIN_SCALE_ERROR, SCALE_SIGMAS
 from slrig.errors import setting
 
 _FEWEST_PLACES = 3
@@ -44,7 +44,7 @@ def scale_by_bar(readings: Sequence[Reading], artefacts: Artefacts) -> Scale | N
     share = float(shares.mean())
     known = error_uncertainty(Quantity.SPACING, artefacts).expanded_mm / 2 / length_mm
     sigma = float(np.hypot(shares.std(ddof=1) / np.sqrt(len(shares)), known))
-    if abs(share) <= max(LEAST_OFF, SURE * sigma):
+    if abs(share) <= max(MIN_SCALE_ERROR, SCALE_SIGMAS * sigma):
         return Scale(share, sigma, len(shares), None)
     longer, smaller = ("longer", "smaller") if share > 0 else ("shorter", "larger")
     words = (

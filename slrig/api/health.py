@@ -16,7 +16,7 @@ from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
 from slrig.api.service import Service, Serving
 from slrig.bundle.validation import AwareMoment, Strict
 from slrig.calibration.board import Board
-from slrig.calibration.health.verification import THRESHOLDS, Drift, HealthState, PairFigures, Thresholds
+from slrig.calibration.health.verification import THRESHOLDS, DriftEstimate, HealthState, PairFigures, Thresholds
 from slrig.errors import CalibrationError
 from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.verify.plot import health_svg
@@ -41,7 +41,7 @@ class VerificationFigures(BaseModel):
     expected_mm: float | None
     stated_mm: float | None
     drift_mm: float | None
-    drifts: list[Drift]
+    drifts: list[DriftEstimate]
     open: str | None = Field(description="what the geometry leaves open")
     unseen: list[str] = Field(description="devices that took no part, of which nothing was learned")
 

@@ -16,8 +16,8 @@ from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.solves import SolveDesk
 from slrig.calibrate.store import CALIBRATION, READING, ActivePointer, CalibrationStore
 from slrig.calibrate.tools import CalibrationTools, setting_of
+from slrig.calibration.accuracy import Comparison
 from slrig.calibration.board import Board
-from slrig.calibration.judging.comparison import Comparison
 from slrig.errors import (
     ArtefactNotReadyError,
     CalibrationError,

@@ -15,7 +15,7 @@ from slrig.calibrate.records import SessionRecord, plain
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import Judgement, Setting, Standing
-from slrig.calibration.judging.verdict import board_words
+from slrig.calibration.judgement import describe_board
 from slrig.calibration.poses import Advice, Coverage, advise_pose, check_pose, coverage, estimate_rig
 
 _ANSWER = (
@@ -32,7 +32,7 @@ _ANSWER = (
 """Fields of `slrig.calibration.poses.checks.PoseAssessment` that belong to the pose alone."""
 
 _CHECK = ("poses", "difference_mm", "stated_mm", "ratio", "chance", "fits", "words")
-"""Fields of `slrig.calibration.judging.comparison.OddEven`, whose `motion` stands beside them."""
+"""Fields of `slrig.calibration.accuracy.OddEven`, whose `motion` stands beside them."""
 
 
 def judgement(pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> Judgement:
@@ -73,7 +73,7 @@ def summary(result: CalibrationResult) -> Mapping[str, Any]:
         "board": {
             "bowed": solution.board_shape_mm is not None,
             "bow_mm": None if bow is None else [bow.height_mm, bow.sigma_mm],
-            "words": board_words(solution),
+            "words": describe_board(solution),
             "scale_sigma": solution.size.scale_sigma,
             "stretch": [solution.size.stretch, solution.size.stretch_sigma],
         },

@@ -13,7 +13,7 @@ from slrig.calibrate.figures import PoseFigures, baselines, device_figures, name
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.words import rounded
 from slrig.calibration.board import Board
-from slrig.calibration.judging.verdict import board_words
+from slrig.calibration.judgement import describe_board
 from slrig.calibration.poses import draw_pose, projector_view
 from slrig.calibration.solution import PROJECTOR, device_title
 from slrig.model import Pixels
@@ -72,7 +72,7 @@ def report_html(
         sides_mm=tuple(sides_mm),
         diagonal_mm=float(np.linalg.norm(sides_mm)),
         pictures=list(_pictures(shown, poses, pictures or {}, board)),
-        board_words=board_words,
+        describe_board=describe_board,
         coverage=partial(_coverage, result, poses, board),
         charts=charts,
         device_title=device_title,

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from uuid import uuid4
 
+from slrig.calibration.accuracy import OddEven, compare_halves
 from slrig.calibration.board import Board, BoardShape, Observations, PoseObservation, ViewQuality
-from slrig.calibration.judging.comparison import OddEven, odd_even
-from slrig.calibration.judging.verdict import Verdict, check_scale, verdict
+from slrig.calibration.judgement import Verdict, check_scale, judge_calibration
 from slrig.calibration.poses import Coverage, coverage
 from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
 from slrig.errors import CalibrationError, SolveRefusedError
@@ -68,7 +68,7 @@ def solve_poses(
         The poses determine no calibration, or do not span a volume to state an error for.
     """
     # Late: the service knows these values, and loads no compiled kernel before somebody solves.
-    from slrig.calibration.judging.comparison import expected_error
+    from slrig.calibration.accuracy import expected_error
     from slrig.calibration.solving.solve import solve
 
     observed = tuple(pose.observation for pose in poses)
@@ -83,7 +83,7 @@ def solve_poses(
         expected = expected_error(solution, observations)
     except CalibrationError as error:
         raise SolveRefusedError(str(error)) from error
-    checked = odd_even(solution, expected.grid_mm)
+    checked = compare_halves(solution, expected.grid_mm)
     sizes = dict(cameras) if projector is None else {**cameras, PROJECTOR: projector}
     used = [pose for pose in observed if pose.name not in solution.outliers]
     covered = coverage(used, board, sizes)
@@ -101,7 +101,7 @@ def solve_poses(
         solution=solution,
         calibration=replace(solution.calibration, solved=solved),
         expected=expected,
-        verdict=verdict(solution, expected, covered, checked, board=board, scale=scale, wanted_mm=wanted_mm),
+        verdict=judge_calibration(solution, expected, covered, checked, board=board, scale=scale, wanted_mm=wanted_mm),
         coverage=covered,
         odd_even=checked,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from slrig.calibration.board import Board, PoseObservation
-from slrig.calibration.health.drift import board_poses
+from slrig.calibration.health.drift import estimate_board_poses
 from slrig.model import Calibration
 from slrig.multiview import BoardAxis, axis_from_board
 
@@ -25,5 +25,5 @@ def axis_of_poses(
     StageRefusedError
         As `board_axis` does.
     """
-    known = board_poses(poses, board, calibration)
+    known = estimate_board_poses(poses, board, calibration)
     return axis_from_board(known.names, known.poses, known.covariance, board.points_mm, angles_deg)

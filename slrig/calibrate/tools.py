@@ -13,8 +13,8 @@ from typing import Any, Protocol
 
 from slrig.calibrate.records import SessionRecord
 from slrig.calibrate.solving import CalibrationResult, ReadPose
+from slrig.calibration.accuracy import Comparison
 from slrig.calibration.board import Board
-from slrig.calibration.judging.comparison import Comparison
 from slrig.calibration.solution import PROJECTOR
 from slrig.devices import Rig
 from slrig.errors import CalibrationStateError
@@ -110,7 +110,7 @@ def calibration_tools(worker: Compute) -> CalibrationTools:
         solve=worker.task(f"{room}.solving:solve_poses", "solve"),
         report=worker.task(f"{room}.pose_judging:write_report", "report of the solve"),
         summary=worker.task(f"{room}.pose_judging:summary", "summary of the solve"),
-        compare=worker.task("slrig.calibration.judging.comparison:comparison", "comparison"),
+        compare=worker.task("slrig.calibration.accuracy:compare_calibrations", "comparison"),
         parse=worker.task("slrig.bundle.calibration:read_calibration", "reading of the calibration"),
         warm=worker.task(f"{room}.pose_judging:warm", "preparation"),
     )

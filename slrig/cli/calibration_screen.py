@@ -13,7 +13,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from slrig.calibrate.words import rounded
-from slrig.calibration.solution import CELLS, LEAST_HALVED
+from slrig.calibration.solution import CELLS, MIN_HALVED_POSES
 from slrig.cli.display import counted, plain_table
 from slrig.errors import ConfigError
 from slrig.printable import printable
@@ -90,7 +90,7 @@ def checked(document: Mapping[str, Any]) -> dict[str, Any]:
     """
     if document.get("odd_even") is None:
         message = (
-            f"odd and even poses were not solved apart: expected {LEAST_HALVED} poses or more, each half of which "
+            f"odd and even poses were not solved apart: expected {MIN_HALVED_POSES} poses or more, each half of which "
             f"determines a calibration, found {len(document['poses'])} that could be used. Add poses, and solve again; "
             "what was solved before solves were checked so is checked by that, too"
         )

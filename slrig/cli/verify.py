@@ -12,7 +12,7 @@ from rich.markup import escape
 from slrig.bundle import read_calibration
 from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
-from slrig.calibration.health.verification import Health, HealthState, Verification, judged
+from slrig.calibration.health.verification import Health, HealthState, Verification, judge_health
 from slrig.cli.display import print_json, progress_shown
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -44,7 +44,7 @@ def verify(source: Path, board: Board, calibration_file: Path | None, *, positio
             verification = verify_bundle(source, board, calibration)
         else:
             verification = _shot(source, board, calibration_file, position, display)
-    health = judged([verification])
+    health = judge_health([verification])
     if as_json:
         found = {"state": str(health.state), "reasons": list(health.reasons), "remedy": health.remedy}
         print_json({**found, **verification.document()})

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
-from slrig.calibration.health.verification import Health, HealthState, health_of_scan
+from slrig.calibration.health.verification import Health, HealthState, verification_from_scan
 from slrig.errors import CalibrationError, CalibrationStateError, UnsupportedByDeviceError
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.job import Holder, Job
@@ -143,7 +143,7 @@ class VerificationDesk:
     def note(self, report: Mapping[str, Any]) -> None:
         """See `slrig.scan.job.WatchesHealth`."""
         _, _, calibration = self.health()
-        found = health_of_scan(report["redundancy"].get("residual_px") or ())
+        found = verification_from_scan(report["redundancy"].get("residual_px") or ())
         if found is not None and calibration is not None:
             self.store.add(found, calibration=calibration.solve_id, at=self._clock())
 

@@ -11,7 +11,13 @@ from uuid import UUID, uuid4
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from slrig.calibration.health.verification import Health, HealthState, Verification, judged, verification_from_document
+from slrig.calibration.health.verification import (
+    Health,
+    HealthState,
+    Verification,
+    judge_health,
+    verification_from_document,
+)
 from slrig.jobs.database import Database
 from slrig.jobs.tables import VerificationRow
 
@@ -61,7 +67,7 @@ class HealthStore:
             first = list(session.scalars(query.order_by(VerificationRow.number).limit(3)))
             last = list(session.scalars(query.order_by(VerificationRow.number.desc()).limit(_TREND)))
             rows = {row.number: row for row in [*first, *reversed(last)]}
-            health = judged([*(verification_from_document(rows[number].found) for number in sorted(rows)), found])
+            health = judge_health([*(verification_from_document(rows[number].found) for number in sorted(rows)), found])
             row = VerificationRow(
                 id=str(uuid4()), at=_stamp(at), calibration=calibration, kind=found.kind, state=str(health.state),
                 reasons=list(health.reasons), remedy=health.remedy, found=found.document(),
@@ -102,7 +108,7 @@ class HealthStore:
     def health_of(self, calibration: str) -> Health:
         """What the last verification of a calibration came to; unknown where there was none."""
         found = self.since_calibration(calibration, limit=1)
-        return found[-1].health if found else judged([])
+        return found[-1].health if found else judge_health([])
 
 
 def _record(row: VerificationRow) -> VerificationRecord:

@@ -30,7 +30,7 @@ from simulated_rig.options import HeadOptions
 from slrig.calibrate.pose_reading import read_pose
 from slrig.calibration.board import Board, BoardKind, Observations
 from slrig.calibration.solution import Solution
-from slrig.calibration.solving.projection import difference
+from slrig.calibration.solving.projection import device_difference
 from slrig.calibration.solving.solve import solve
 from slrig.errors import PoseRefusedError, ScanEvidenceError
 from slrig.model import Calibration
@@ -169,7 +169,7 @@ WORLDS = {
 
 def chi_square(solution: Solution, truth: Calibration) -> tuple[float, int]:
     """χ² of all numbers that are free, and how many."""
-    off = difference(rows_of(solution.calibration), rows_of(truth)).ravel()
+    off = device_difference(rows_of(solution.calibration), rows_of(truth)).ravel()
     covariance = exact_covariance(solution)
     free = np.diagonal(covariance) > 0
     sigma = np.sqrt(np.diagonal(covariance)[free])

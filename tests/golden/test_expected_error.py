@@ -29,10 +29,9 @@ from scipy.spatial.transform import Rotation
 
 from slrig.bundle import write_calibration
 from slrig.calibrate.pose_reading import read_pose
+from slrig.calibration.accuracy import expected_error
 from slrig.calibration.board import Board, BoardKind, BoardShape, Observations
-from slrig.calibration.displacement import modes_of, moved_points, rigid_free
-from slrig.calibration.judging.comparison import expected_error
-from slrig.calibration.solution import ExpectedError
+from slrig.calibration.solution import ExpectedError, covariance_modes, point_sensitivity, project_out_rigid_motion
 from slrig.calibration.solving.solve import solve
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -255,8 +254,10 @@ def test_the_calibration_has_its_share_of_it(measured: Measured) -> None:
     # The square of one draw is a weighted sum of a few squares of normal numbers, about two that count: one draw may be
     # several times less than it is in the mean. It has to lie within all but 0.2 % of what the covariance allows.
     assert solved.solved is not None
-    fields = moved_points([solved.cameras["left"]], solved.projector, places).by_parameter
-    along = np.einsum("ni,nik->nk", rays, rigid_free(places, fields @ modes_of(solved.solved.covariance)))
+    fields = point_sensitivity([solved.cameras["left"]], solved.projector, places).by_parameter
+    along = np.einsum(
+        "ni,nik->nk", rays, project_out_rigid_motion(places, fields @ covariance_modes(solved.solved.covariance))
+    )
     weights = np.clip(np.linalg.eigvalsh(along.T @ along / len(places)), 0, None)
     assert np.sqrt(weights.sum()) == pytest.approx(measured.stated.point_mm, rel=1e-6)
     drawn_mm = np.sqrt(np.random.default_rng(0).normal(size=(100_000, len(weights))) ** 2 @ weights)

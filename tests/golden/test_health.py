@@ -17,7 +17,7 @@ from slrig.bundle import Bundle, read_bundle
 from slrig.calibrate.pose_reading import read_pose
 from slrig.calibrate.solving import solve_poses
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.health.verification import HealthState, judged
+from slrig.calibration.health.verification import HealthState, judge_health
 from slrig.calibration.solution import PROJECTOR
 from slrig.capture.verifier import check_capture
 from slrig.model import Axis, Calibration, Capture, LineShift, Size
@@ -74,7 +74,7 @@ def test_a_change_is_stale_and_its_device_named(
 ) -> None:
     (bundle,) = rendered_poses(tmp_path, changed(change), poses=[0])
     found = verify_bundle(bundle, BOARD, calibration)
-    assert judged([found]).state is HealthState.STALE
+    assert judge_health([found]).state is HealthState.STALE
     assert found.drifts[0].device == device
     if change.endswith("turned"):
         assert "turned by 0.0" in found.drifts[0].words
@@ -84,7 +84,7 @@ def test_a_rig_that_did_not_change_is_good_in_every_pose(tmp_path: Path, calibra
     options = board_options(cameras=2) | {"seed": 77}
     for bundle in rendered_poses(tmp_path, options, poses=[1, 11]):
         found = verify_bundle(bundle, BOARD, calibration)
-        assert judged([found]).state is HealthState.GOOD
+        assert judge_health([found]).state is HealthState.GOOD
         assert max(abs(pair.mean_px) for pair in found.pairs) < 0.02
         assert abs(found.scale_percent or 1) < 0.03
 

@@ -10,8 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.solving.adjustment import corner_terms, match_terms
-from slrig.calibration.solving.projection import spread
+from slrig.calibration.solving.projection import (
+    corner_residuals,
+    match_residuals,
+    select_evenly,
+)
 from slrig.calibration.solving.solve import solve
 from tests.unit.calibration.solving.test_adjustment import aside, true_geometry
 from tests.unit.calibration.synthetic import Recipe, made
@@ -27,24 +30,26 @@ def test_a_step_changes_residuals_by_its_derivative(seed: int, bend: list[float]
     geometry = replace(aside(geometry, seed), bend=np.array(bend))
     step = np.random.default_rng(seed).normal(0, 1e-6, geometry.layout.count)
     step[geometry.layout.first_offset :] = 0
-    ahead, behind = geometry.moved(step), geometry.moved(-step)
+    ahead, behind = geometry.apply_step(step), geometry.apply_step(-step)
     layout = geometry.layout
-    residual, rows = corner_terms(geometry, seen, jacobian=True)
+    residual, rows = corner_residuals(geometry, seen, jacobian=True)
     place = np.hstack([
         15 * seen.corner_where[:, :1] + np.arange(15), layout.first_pose + 6 * seen.corner_where[:, 1:2] + np.arange(6)
     ])  # fmt: skip
     change = np.einsum("nki,ni->nk", rows[:, :, :21], step[place])
-    by_number = (corner_terms(ahead, seen, jacobian=False)[0] - corner_terms(behind, seen, jacobian=False)[0]) / 2
+    by_number = (
+        corner_residuals(ahead, seen, jacobian=False)[0] - corner_residuals(behind, seen, jacobian=False)[0]
+    ) / 2
     good = np.isfinite(residual)
     np.testing.assert_allclose(change[good], by_number[good], atol=1e-7)
-    residual, rows = match_terms(geometry, seen, jacobian=True)
+    residual, rows = match_residuals(geometry, seen, jacobian=True)
     place = np.hstack([
         15 * seen.match_where[:, :1] + np.arange(15),
         np.tile(15 * (layout.devices - 1) + np.arange(15), (len(residual), 1)),
         layout.first_pose + 6 * seen.match_where[:, 1:2] + np.arange(6),
     ])  # fmt: skip
     change = np.einsum("ni,ni->n", rows[:, :36], step[place])
-    by_number = (match_terms(ahead, seen, jacobian=False)[0] - match_terms(behind, seen, jacobian=False)[0]) / 2
+    by_number = (match_residuals(ahead, seen, jacobian=False)[0] - match_residuals(behind, seen, jacobian=False)[0]) / 2
     good = np.isfinite(residual)
     assert good.any()
     np.testing.assert_allclose(change[good], by_number[good], atol=1e-6)
@@ -68,6 +73,6 @@ def test_the_board_s_unit_scales_lengths_and_nothing_else(share: float) -> None:
 )  # fmt: skip
 def test_a_spread_has_as_many_as_it_may_and_none_twice(count: int, limit: int, width: float, seed: int) -> None:
     points = np.random.default_rng(seed).uniform(0, 1, (count, 2)) * [width, 100]
-    kept = spread(points, limit)
+    kept = select_evenly(points, limit)
     assert len(kept) == min(count, limit)
     assert len(set(kept.tolist())) == len(kept)

@@ -120,7 +120,7 @@ def test_folder_of_poses_becomes_a_calibration(poses: Path, solving: Solving, tm
     assert written.cameras["left"].matrix[0, 0] == 1810.4
     for words in ("1810.40 ± 0.21", "842.40 ± 0.61", "19 used of 20", f"{BUMPED}  left moved by 1.9 px", str(output)):
         assert words in result.stdout, words
-    assert "flat as far as the poses tell: 0.031 ± 0.012 mm" in result.stdout
+    assert "flat as far as the poses determine: 0.031 ± 0.012 mm" in result.stdout
     # Off a terminal every stage is a line of its own.
     stages = [line.split("%  ")[1].split("   ")[0] for line in result.stderr.splitlines()]
     assert stages[:2] == ["loading", "reading pose_00"]
@@ -155,7 +155,7 @@ def test_solve_takes_all_its_options(poses: Path, solving: Solving, tmp_path: Pa
 def test_folder_of_poses_is_checked_without_writing_anything(poses: Path, solving: Solving, tmp_path: Path) -> None:
     printed = done("check", poses, *BOARD_OPTIONS, "--board-shape", "flat")
     assert (solving.asked["poses"], solving.asked["board_shape"]) == (list(GIVEN), BoardShape.FLAT)
-    assert "0.89 × what is stated for two halves" in " ".join(printed.split())
+    assert "0.89 × the stated deviation" in " ".join(printed.split())
     assert [path.name for path in tmp_path.iterdir()] == ["poses"]
 
 
@@ -449,7 +449,7 @@ def test_kept_calibrations_are_listed_shown_compared_and_used(kept: list[httpx2.
 
 def test_check_shows_the_halves_of_a_kept_solve(kept: list[httpx2.Request], monkeypatch: pytest.MonkeyPatch) -> None:
     words = " ".join(done("check", ID[:4]).split())
-    for part in ("differ by 0.017 mm at a point, 0.89 × what is stated", "10 odd, 9 even", "0.0193 mm (1 σ)"):
+    for part in ("differ by 0.017 mm at a point, 0.89 × the stated", "10 odd, 9 even", "0.0193 mm (1 σ)"):
         assert part in words
     assert kept[-1].method == "GET"
     found = json.loads(done("check", ID, "--json"))

@@ -27,17 +27,26 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slrig.calibration.board import Board, Observations, PoseObservation
-from slrig.calibration.displacement import modes_of
-from slrig.calibration.solution import PARAMETERS, PROJECTOR, BoardPose, covariance_of, device_title, devices_of
-from slrig.calibration.solving.adjustment import corner_terms, flat_geometry, match_terms
+from slrig.calibration.solution import (
+    PARAMETERS,
+    PROJECTOR,
+    BoardPose,
+    covariance_modes,
+    device_covariance,
+    device_title,
+    devices_by_name,
+)
+from slrig.calibration.solving.adjustment import flat_geometry
 from slrig.calibration.solving.projection import (
     DEVICE,
     POSE,
     Geometry,
     Measurements,
+    collect_measurements,
+    corner_residuals,
     device_row,
-    groups,
-    measured,
+    find_groups,
+    match_residuals,
     pose_row,
     to_board_pose,
 )
@@ -47,15 +56,15 @@ from slrig.model import Calibration, FloatArray, IntArray, Pinhole
 SHARED_PX = 0.01
 """Standard deviation of each coefficient of an error that all observations of one camera and axis share, px."""
 
-_LIGHT = 12_000  # correspondences taken of each camera, pose and axis
+_MAX_MATCHES = 12_000  # correspondences taken of each camera, pose and axis
 _CELLS = 14
-_FEWEST_IN_CELL = 3
-_OUTLYING = 6.0
-_PER_MEDIAN = 1.4826
+_MIN_IN_CELL = 3
+_OUTLIER_SIGMAS = 6.0
+_SIGMA_PER_MEDIAN = 1.4826
 _MAX_ITERATIONS = 4
-_SETTLED = 1e-5  # rad, mm
+_STEP_TOLERANCE = 1e-5  # rad, mm
 
-_Part = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+_EquationGroup = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 """n equations of one camera, pose and axis: what is left (n,), by_device, by_pose, the surface (n, 6), deviations."""
 
 
@@ -76,7 +85,7 @@ class Equations:
     standing: Mapping[str, BoardPose]
 
 
-def equations(poses: Sequence[PoseObservation], board: Board, calibration: Calibration, /) -> Equations:
+def linearise(poses: Sequence[PoseObservation], board: Board, calibration: Calibration, /) -> Equations:
     """Set up the equations of one or more poses.
 
     Raises CalibrationError where no camera of the calibration sees enough of the board.
@@ -84,7 +93,9 @@ def equations(poses: Sequence[PoseObservation], board: Board, calibration: Calib
     names = list(calibration.cameras)
     sizes = {name: camera.size for name, camera in calibration.cameras.items()}
     projector_size = None if calibration.projector is None else calibration.projector.size
-    everything = measured(Observations(board, sizes, projector_size, tuple(poses)), {}, matches_per_view=_LIGHT)
+    everything = collect_measurements(
+        Observations(board, sizes, projector_size, tuple(poses)), {}, matches_per_view=_MAX_MATCHES
+    )
     if not len(everything.corner_px):
         seen = sorted({name for pose in poses for name in pose.views})
         message = (
@@ -94,41 +105,43 @@ def equations(poses: Sequence[PoseObservation], board: Board, calibration: Calib
         raise CalibrationError(message)
     devices = np.stack([
         device_row(each.matrix, each.distortion, each.rotation, each.translation_mm)
-        for each in devices_of(calibration).values()
+        for each in devices_by_name(calibration).values()
     ])  # fmt: skip
-    geometry = flat_geometry(board, devices, np.stack([_standing(pose, board, calibration) for pose in poses]))
+    geometry = flat_geometry(
+        board, devices, np.stack([_initial_board_pose(pose, board, calibration) for pose in poses])
+    )
     # The board is taken for the one that the calibration was made with: its size has not changed since then.
-    modes = modes_of(covariance_of(calibration, board=False))
-    found = _linear(everything, geometry, modes)
+    modes = covariance_modes(device_covariance(calibration, board=False))
+    found = _build_equations(everything, geometry, modes)
     for _ in range(_MAX_ITERATIONS):
         # The most likely board poses, modes and shared errors, with no change of the devices.
-        solved = np.linalg.lstsq(design(found), padded(found, found.left), rcond=None)[0][: POSE * len(poses)]
+        solved = np.linalg.lstsq(design_matrix(found), pad(found, found.left), rcond=None)[0][: POSE * len(poses)]
         step = np.zeros(geometry.layout.count)
         step[geometry.layout.first_pose : geometry.layout.first_offset] = solved
-        geometry = geometry.moved(step)
-        found = _linear(everything, geometry, modes)
-        if np.abs(solved).max() < _SETTLED:
+        geometry = geometry.apply_step(step)
+        found = _build_equations(everything, geometry, modes)
+        if np.abs(solved).max() < _STEP_TOLERANCE:
             break
     standing = {pose.name: to_board_pose(row) for pose, row in zip(poses, geometry.poses, strict=True)}
     return replace(found, standing=standing)
 
 
-def design(found: Equations, /) -> FloatArray:
+def design_matrix(found: Equations, /) -> FloatArray:
     """(n + k + s, 6 m + k + s): all that is not a change, and below it that the modes and shared errors are about 0."""
     own = np.hstack([found.by_device @ found.modes, found.shared])
     below = np.hstack([np.zeros((own.shape[1], found.by_pose.shape[1])), np.eye(own.shape[1])])
     return np.vstack([np.hstack([found.by_pose, own]), below])
 
 
-def padded(found: Equations, values: FloatArray, /) -> FloatArray:
-    """Values (n, …) with zeros for the equations that `design` adds."""
+def pad(found: Equations, values: FloatArray, /) -> FloatArray:
+    """Values (n, …) with zeros for the equations that `design_matrix` adds."""
     below = found.modes.shape[1] + found.shared.shape[1]
     return np.concatenate([values, np.zeros((below, *values.shape[1:]))])
 
 
-def _linear(m: Measurements, geometry: Geometry, modes: FloatArray) -> Equations:
+def _build_equations(m: Measurements, geometry: Geometry, modes: FloatArray) -> Equations:
     """The equations about the poses of a geometry."""
-    parts = _corners(m, geometry) + _light(m, geometry)
+    parts = _corner_equations(m, geometry) + _light_equations(m, geometry)
     shared = np.zeros((sum(len(part[0]) for part in parts), 6 * len(parts)))
     start = 0
     for number, (left, _, _, surface, sigma) in enumerate(parts):
@@ -138,46 +151,46 @@ def _linear(m: Measurements, geometry: Geometry, modes: FloatArray) -> Equations
     return Equations(left / scale, by_device / scale[:, None], by_pose / scale[:, None], shared, modes, {})
 
 
-def _corners(m: Measurements, geometry: Geometry) -> list[_Part]:
-    residual, rows = corner_terms(geometry, m, jacobian=True)
-    parts: list[_Part] = []
-    for run in groups(m.corner_where, columns=2):
+def _corner_equations(m: Measurements, geometry: Geometry) -> list[_EquationGroup]:
+    residual, rows = corner_residuals(geometry, m, jacobian=True)
+    parts: list[_EquationGroup] = []
+    for run in find_groups(m.corner_where, columns=2):
         camera, pose = m.corner_where[run][0, :2]
-        surface = _surface(geometry, geometry.points[m.corner_where[run][:, 2]])
+        surface = _quadratic_terms(geometry, geometry.points[m.corner_where[run][:, 2]])
         for axis in (0, 1):
             left = -residual[run, axis]
-            sigma, kept = _sigma(left, m.corner_sigma[run], surface)
-            by_device = _spread(rows[run, axis, :DEVICE], camera, len(geometry.devices))
-            by_pose = _spread(rows[run, axis, DEVICE : DEVICE + POSE], pose, len(geometry.poses))
+            sigma, kept = _estimate_sigma(left, m.corner_sigma[run], surface)
+            by_device = _place_block(rows[run, axis, :DEVICE], camera, len(geometry.devices))
+            by_pose = _place_block(rows[run, axis, DEVICE : DEVICE + POSE], pose, len(geometry.poses))
             parts.append((left[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
     return parts
 
 
-def _light(m: Measurements, geometry: Geometry) -> list[_Part]:
-    left = -match_terms(geometry, m, jacobian=False)[0]
+def _light_equations(m: Measurements, geometry: Geometry) -> list[_EquationGroup]:
+    left = -match_residuals(geometry, m, jacobian=False)[0]
     devices = len(geometry.devices)
-    parts: list[_Part] = []
-    for run in groups(m.match_where):
+    parts: list[_EquationGroup] = []
+    for run in find_groups(m.match_where):
         good = np.flatnonzero(np.isfinite(left[run])) + run.start
         if len(good) < _CELLS:
             continue
-        pixels, value, sigma = _cells(m.match_pixel[good], left[good], m.match_sigma[good])
+        pixels, value, sigma = _average_cells(m.match_pixel[good], left[good], m.match_sigma[good])
         where = np.repeat(m.match_where[good[:1]], len(value), axis=0)
         camera, pose = where[0, :2]
         cells = replace(m, match_where=where, match_pixel=pixels, match_px=np.zeros(len(value)))
-        _, rows = match_terms(geometry, cells, jacobian=True)
+        _, rows = match_residuals(geometry, cells, jacobian=True)
         on_board = (pixels - pixels.mean(axis=0)) / np.ptp(pixels) * 2 * geometry.frame[2] + geometry.frame[:2]
-        surface = _surface(geometry, on_board)
-        sigma, kept = _sigma(value, sigma, surface)
+        surface = _quadratic_terms(geometry, on_board)
+        sigma, kept = _estimate_sigma(value, sigma, surface)
         kept = kept & np.isfinite(rows).all(axis=1)
-        by_device = _spread(rows[:, :DEVICE], camera, devices)
-        by_device += _spread(rows[:, DEVICE : 2 * DEVICE], devices - 1, devices)
-        by_pose = _spread(rows[:, 2 * DEVICE : 2 * DEVICE + POSE], pose, len(geometry.poses))
+        by_device = _place_block(rows[:, :DEVICE], camera, devices)
+        by_device += _place_block(rows[:, DEVICE : 2 * DEVICE], devices - 1, devices)
+        by_pose = _place_block(rows[:, 2 * DEVICE : 2 * DEVICE + POSE], pose, len(geometry.poses))
         parts.append((value[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
     return parts
 
 
-def _spread(rows: FloatArray, index: int, count: int) -> FloatArray:
+def _place_block(rows: FloatArray, index: int, count: int) -> FloatArray:
     """(n, k count): rows (n, k) in their place among `count` such blocks, zeros elsewhere."""
     width = rows.shape[1]
     columns = np.zeros((len(rows), width * count))
@@ -185,13 +198,13 @@ def _spread(rows: FloatArray, index: int, count: int) -> FloatArray:
     return columns
 
 
-def _surface(geometry: Geometry, points_mm: FloatArray) -> FloatArray:
+def _quadratic_terms(geometry: Geometry, points_mm: FloatArray) -> FloatArray:
     """(n, 6): the terms of a quadratic surface over the board."""
     x, y = ((points_mm - geometry.frame[:2]) / geometry.frame[2]).T
     return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-def _sigma(left: FloatArray, stated: FloatArray, surface: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _estimate_sigma(left: FloatArray, stated: FloatArray, surface: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Deviations (n,), the stated ones made larger where the scatter about a smooth surface says so; which to keep."""
     cubic = np.column_stack([surface, surface[:, 1:3] * surface[:, 3:4], surface[:, 1:3] * surface[:, 5:6]])
     kept = np.isfinite(left)
@@ -201,12 +214,14 @@ def _sigma(left: FloatArray, stated: FloatArray, surface: FloatArray) -> tuple[F
         solved = np.linalg.lstsq(cubic * weight[:, None], np.nan_to_num(left) * weight, rcond=None)[0]
         rest = np.abs(left - cubic @ solved) / stated
         spare = max(kept.sum() - cubic.shape[1], 1) / max(kept.sum(), 1)
-        factor = max(_PER_MEDIAN * float(np.nanmedian(rest[kept])) / np.sqrt(spare), 1.0)
-        kept = np.isfinite(left) & (rest <= _OUTLYING * factor)
+        factor = max(_SIGMA_PER_MEDIAN * float(np.nanmedian(rest[kept])) / np.sqrt(spare), 1.0)
+        kept = np.isfinite(left) & (rest <= _OUTLIER_SIGMAS * factor)
     return stated * factor, kept
 
 
-def _cells(pixels_px: FloatArray, left: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _average_cells(
+    pixels_px: FloatArray, left: FloatArray, sigma: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Means over cells of the light's extent: pixels (c, 2), what is left (c,), and deviations (c,); outliers out."""
     least = pixels_px.min(axis=0)
     cell = np.minimum(((pixels_px - least) / (np.ptp(pixels_px, axis=0) + 1e-9) * _CELLS).astype(int), _CELLS - 1)
@@ -215,9 +230,9 @@ def _cells(pixels_px: FloatArray, left: FloatArray, sigma: FloatArray) -> tuple[
     found = []
     for rows in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
         middle = np.median(left[rows])
-        spread = _PER_MEDIAN * float(np.median(np.abs(left[rows] - middle))) + 1e-9
-        good = rows[np.abs(left[rows] - middle) <= _OUTLYING * spread]
-        if len(good) < _FEWEST_IN_CELL:
+        spread = _SIGMA_PER_MEDIAN * float(np.median(np.abs(left[rows] - middle))) + 1e-9
+        good = rows[np.abs(left[rows] - middle) <= _OUTLIER_SIGMAS * spread]
+        if len(good) < _MIN_IN_CELL:
             continue
         weight = 1 / sigma[good] ** 2
         weight /= weight.sum()
@@ -228,7 +243,7 @@ def _cells(pixels_px: FloatArray, left: FloatArray, sigma: FloatArray) -> tuple[
     return np.ascontiguousarray(table[:, :2]), table[:, 2], table[:, 3]
 
 
-def _standing(pose: PoseObservation, board: Board, calibration: Calibration) -> FloatArray:
+def _initial_board_pose(pose: PoseObservation, board: Board, calibration: Calibration) -> FloatArray:
     """(12,): about where the board is, by the camera that sees most of it."""
     seen = [name for name in calibration.cameras if name in pose.views]
     if not seen:
@@ -258,7 +273,7 @@ class BoardPoses(NamedTuple):
     covariance: FloatArray
 
 
-def board_poses(poses: Sequence[PoseObservation], board: Board, calibration: Calibration, /) -> BoardPoses:
+def estimate_board_poses(poses: Sequence[PoseObservation], board: Board, calibration: Calibration, /) -> BoardPoses:
     """The board's poses by least squares, with the calibration's own error, which all of them share.
 
     A pose's own unknowns (errors its observations share) are solved for beside it and eliminated (Schur), so that the
@@ -266,7 +281,7 @@ def board_poses(poses: Sequence[PoseObservation], board: Board, calibration: Cal
 
     Raises CalibrationError where no camera of the calibration sees enough of the board.
     """
-    each = [equations([pose], board, calibration) for pose in poses]
+    each = [linearise([pose], board, calibration) for pose in poses]
     modes, size = each[0].modes.shape[1], 6 * len(each)
     information, pull = np.zeros((size + modes,) * 2), np.zeros(size + modes)
     information[size:, size:] = np.eye(modes)
@@ -291,18 +306,18 @@ def board_poses(poses: Sequence[PoseObservation], board: Board, calibration: Cal
     return BoardPoses(tuple(pose.name for pose in poses), placed, covariance[:size, :size])
 
 
-ALIKE = 9.0
+MIN_EVIDENCE_GAP = 9.0
 """Hypotheses whose evidence differs by less (2 ln) cannot be told apart: 3 σ."""
 
 _TURN = slice(PARAMETERS.index("turn_x"), PARAMETERS.index("turn_z") + 1)
 _SHIFT = slice(PARAMETERS.index("x_mm"), PARAMETERS.index("z_mm") + 1)
-_MOST_TURN_RAD = float(np.radians(0.1))
-_MOST_SHIFT_MM = 0.5
-_MOST_FOCAL = 0.001
-_MOST_GROWTH = 0.001
+_TURN_SIGMA_RAD = float(np.radians(0.1))
+_SHIFT_SIGMA_MM = 0.5
+_FOCAL_SIGMA = 0.001
+_GROWTH_SIGMA = 0.001
 _AXES = ("about its horizontal axis", "about its vertical axis", "about its viewing axis")
-_WAYS = ("to its side", "up or down", "along its viewing axis")
-_ALL_BUT = 0.9
+_DIRECTIONS = ("to its side", "up or down", "along its viewing axis")
+_MAIN_AXIS_FRACTION = 0.9
 
 
 class Change(StrEnum):
@@ -353,64 +368,66 @@ class Hypothesis:
         return self.kind in (Change.MOVED, Change.BUMPED)
 
 
-def hypotheses(found: Equations, calibration: Calibration, /) -> tuple[Hypothesis, ...]:
+def rank_hypotheses(found: Equations, calibration: Calibration, /) -> tuple[Hypothesis, ...]:
     """Every explanation, the most likely first; that nothing changed is among them."""
-    devices = devices_of(calibration)
-    tried = [_fitted(found, "", Change.NONE, np.zeros((DEVICE * len(devices), 0)))]
+    devices = devices_by_name(calibration)
+    tried = [_fit_hypothesis(found, "", Change.NONE, np.zeros((DEVICE * len(devices), 0)))]
     for index, (name, device) in enumerate(devices.items()):
         for kind in (Change.TURNED, Change.MOVED, Change.FOCAL, Change.BUMPED):
-            own = _columns(kind, device)
+            own = _change_columns(kind, device)
             columns = np.zeros((len(devices), *own.shape))
             columns[index] = own
-            tried.append(_fitted(found, name, kind, columns.reshape(-1, own.shape[1])))
+            tried.append(_fit_hypothesis(found, name, kind, columns.reshape(-1, own.shape[1])))
     tried.sort(key=lambda each: -each.evidence)
     odds = np.exp((np.array([each.evidence for each in tried]) - tried[0].evidence) / 2)
     return tuple(replace(each, weight=float(weight)) for each, weight in zip(tried, odds / odds.sum(), strict=True))
 
 
-def rivals(ranked: Sequence[Hypothesis], /) -> tuple[Hypothesis, ...]:
+def equally_likely(ranked: Sequence[Hypothesis], /) -> tuple[Hypothesis, ...]:
     """The other hypotheses that explain what is seen about as well as the first, with as few numbers or fewer."""
     best = ranked[0]
     if best.kind is Change.NONE:
         return ()
-    close = [each for each in ranked[1:] if best.evidence - each.evidence < ALIKE and each.kind is not Change.NONE]
+    close = [
+        each for each in ranked[1:] if best.evidence - each.evidence < MIN_EVIDENCE_GAP and each.kind is not Change.NONE
+    ]
     # A device that turned is also one that turned and moved a little: that adds nothing.
     return tuple(each for each in close if each.kind is not Change.BUMPED or best.kind is Change.BUMPED)
 
 
-def board_growth(found: Equations, calibration: Calibration, /) -> tuple[float, float]:
+def estimate_board_growth(found: Equations, calibration: Calibration, /) -> tuple[float, float]:
     """The share by which a larger board alone would explain what is seen, and its evidence.
 
     A board that grew looks like a rig that shrank: all devices drew nearer to one another.
     """
-    devices = list(devices_of(calibration).values())
+    devices = list(devices_by_name(calibration).values())
     columns = np.zeros((len(devices), DEVICE))
     for index, device in enumerate(devices):
         columns[index, _SHIFT] = device.rotation @ (device.centre_mm - devices[0].centre_mm)
-    columns = columns.reshape(-1, 1) * _MOST_GROWTH
-    fitted = _fitted(found, "", Change.NONE, columns)
+    columns = columns.reshape(-1, 1) * _GROWTH_SIGMA
+    fitted = _fit_hypothesis(found, "", Change.NONE, columns)
     first = int(np.argmax(np.abs(columns)))
-    return float(fitted.change[first] / columns[first, 0] * _MOST_GROWTH), fitted.evidence
+    return float(fitted.change[first] / columns[first, 0] * _GROWTH_SIGMA), fitted.evidence
 
 
-def _columns(kind: Change, device: Pinhole) -> FloatArray:
+def _change_columns(kind: Change, device: Pinhole) -> FloatArray:
     """(15, k): the change of one device per unit of its prior size."""
     turn, moved, focal = np.zeros((DEVICE, 3)), np.zeros((DEVICE, 3)), np.zeros((DEVICE, 1))
     turn[_TURN] = np.eye(3)
     # A turn about the device's own centre turns its translation along.
     turn[_SHIFT] = np.cross(np.eye(3), device.translation_mm).T
-    turn *= _MOST_TURN_RAD
-    moved[_SHIFT] = np.eye(3) * _MOST_SHIFT_MM
-    focal[:2, 0] = np.diagonal(device.matrix)[:2] * _MOST_FOCAL
+    turn *= _TURN_SIGMA_RAD
+    moved[_SHIFT] = np.eye(3) * _SHIFT_SIGMA_MM
+    focal[:2, 0] = np.diagonal(device.matrix)[:2] * _FOCAL_SIGMA
     both = np.hstack([turn, moved])
     return {Change.TURNED: turn, Change.MOVED: moved, Change.FOCAL: focal, Change.BUMPED: both}[kind]
 
 
-def _fitted(found: Equations, device: str, kind: Change, columns: FloatArray) -> Hypothesis:
+def _fit_hypothesis(found: Equations, device: str, kind: Change, columns: FloatArray) -> Hypothesis:
     count = columns.shape[1]
-    base, left = design(found), padded(found, found.left)
+    base, left = design_matrix(found), pad(found, found.left)
     basis, _ = np.linalg.qr(base)
-    by_change = padded(found, found.by_device @ columns)
+    by_change = pad(found, found.by_device @ columns)
     free = by_change - basis @ (basis.T @ by_change)
     normal = free.T @ free
     against = free.T @ (left - basis @ (basis.T @ left))
@@ -420,7 +437,7 @@ def _fitted(found: Equations, device: str, kind: Change, columns: FloatArray) ->
     deviation: FloatArray = np.sqrt(np.diagonal(np.linalg.inv(regular))).astype(np.float64)
     mean, modes = _posterior(found, base, left, columns, by_change)
     nothing: FloatArray = np.full(3, np.nan)
-    degrees = np.degrees(_MOST_TURN_RAD)
+    degrees = np.degrees(_TURN_SIGMA_RAD)
     made = Hypothesis(
         device=device, kind=kind, weight=0.0, significance=float(np.sqrt(max(drop, 0.0))),
         evidence=float(against @ size) - float(np.linalg.slogdet(regular)[1]) if count else 0.0,
@@ -430,9 +447,9 @@ def _fitted(found: Equations, device: str, kind: Change, columns: FloatArray) ->
     if made.turned:
         made = replace(made, turn_deg=degrees * size[:3], turn_sigma_deg=degrees * deviation[:3])
     if made.moved:
-        made = replace(made, shift_mm=_MOST_SHIFT_MM * size[-3:], shift_sigma_mm=_MOST_SHIFT_MM * deviation[-3:])
+        made = replace(made, shift_mm=_SHIFT_SIGMA_MM * size[-3:], shift_sigma_mm=_SHIFT_SIGMA_MM * deviation[-3:])
     if kind is Change.FOCAL:
-        share, sigma = _MOST_FOCAL * float(size[0]), _MOST_FOCAL * float(deviation[0])
+        share, sigma = _FOCAL_SIGMA * float(size[0]), _FOCAL_SIGMA * float(deviation[0])
         made = replace(made, focal_share=share, focal_sigma=sigma)
     return made
 
@@ -450,7 +467,7 @@ def _posterior(
     return carry @ solved[chosen], carry @ np.linalg.inv(upper)[chosen]
 
 
-def change_words(each: Hypothesis, /) -> str:
+def describe_change(each: Hypothesis, /) -> str:
     """One sentence without an end: which device changed, and by how much, with its standard deviation."""
     if each.kind is Change.NONE:
         return "no device changed"
@@ -460,12 +477,12 @@ def change_words(each: Hypothesis, /) -> str:
             f"{name}: its focal length changed by {100 * each.focal_share:+.3f} ± {100 * each.focal_sigma:.3f} % "
             "(its lens was turned, or it warmed up)"
         )
-    told = [f"turned by {_sized(each.turn_deg, each.turn_sigma_deg, '°', _AXES)}"] if each.turned else []
-    told += [f"moved by {_sized(each.shift_mm, each.shift_sigma_mm, ' mm', _WAYS)}"] if each.moved else []
+    told = [f"turned by {_format_change(each.turn_deg, each.turn_sigma_deg, '°', _AXES)}"] if each.turned else []
+    told += [f"moved by {_format_change(each.shift_mm, each.shift_sigma_mm, ' mm', _DIRECTIONS)}"] if each.moved else []
     return f"{name} {' and '.join(told)}"
 
 
-def rival_words(
+def describe_alternatives(
     best: Hypothesis, others: Sequence[Hypothesis], calibration: Calibration, growth: float, /
 ) -> str | None:
     """What else it may be, and why the geometry cannot tell; None where nothing is left open.
@@ -477,7 +494,7 @@ def rival_words(
     if others:
         names = sorted({f"{device_title(each.device)} {verbs.get(each.kind, each.kind)}" for each in others})
         parts.append(f"as well explained by: {', '.join(names)}")
-    if others and len(devices_of(calibration)) == 2:
+    if others and len(devices_by_name(calibration)) == 2:
         if best.moved:
             pair = "one camera and one projector" if calibration.projector is not None else "two cameras"
             parts.append(f"{pair} cannot tell a device that moved from the other one that moved the opposite way")
@@ -491,7 +508,7 @@ def rival_words(
     return "; ".join(parts) or None
 
 
-def remedy_words(best: Hypothesis, /) -> str:
+def describe_remedy(best: Hypothesis, /) -> str:
     """What to do about it."""
     if best.kind is Change.FOCAL:
         return "lock its lens, let the rig warm up, and calibrate again"
@@ -499,9 +516,9 @@ def remedy_words(best: Hypothesis, /) -> str:
     return f"check {mount}, and calibrate again"
 
 
-def _sized(value: FloatArray, sigma: FloatArray, unit: str, ways: Sequence[str]) -> str:
+def _format_change(value: FloatArray, sigma: FloatArray, unit: str, ways: Sequence[str]) -> str:
     size = float(np.linalg.norm(value))
     along = value / max(size, 1e-300)
     spread = float(np.sqrt(((along * sigma) ** 2).sum()))
     main = int(np.argmax(np.abs(along)))
-    return f"{size:.3f} ± {spread:.3f}{unit} {'' if abs(along[main]) > _ALL_BUT else 'mostly '}{ways[main]}"
+    return f"{size:.3f} ± {spread:.3f}{unit} {'' if abs(along[main]) > _MAIN_AXIS_FRACTION else 'mostly '}{ways[main]}"

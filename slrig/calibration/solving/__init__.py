@@ -1,1 +1,1 @@
-"""The solve: from observations of a board to devices and their covariance."""
+"""Solve a calibration from observations of a board."""

@@ -18,8 +18,8 @@ from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import CalibrationTools, Judgement, Setting, Standing
+from slrig.calibration.accuracy import compare_calibrations
 from slrig.calibration.board import Board, BoardKind, BoardShape, BoardView, PoseObservation, ViewQuality
-from slrig.calibration.judging.comparison import comparison
 from slrig.devices import Rig
 from slrig.errors import PoseRefusedError
 from slrig.jobs.records import JobKind
@@ -93,7 +93,7 @@ class TameCalibrating:
             picture=lambda *_: PNG,
             coverage_picture=lambda _, device, poses, __: f"{device} {len(poses)}".encode(),
             solve=self._solve,
-            compare=comparison,
+            compare=compare_calibrations,
             parse=read_calibration,
             report=lambda path, *_: cast("None", path.write_text("<html>report</html>")),
             summary=lambda _: {"verdict": {"grade": "good", "summary": "good", "reasons": []}},

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 
 from slrig.calibrate.solving import CalibrationResult, ReadPose
+from slrig.calibration.accuracy import OddEven
 from slrig.calibration.board import Board, BoardKind, BoardView, Correspondences, PoseObservation, ViewQuality
-from slrig.calibration.displacement import RigidMotion
-from slrig.calibration.judging.comparison import OddEven
-from slrig.calibration.judging.verdict import verdict
+from slrig.calibration.judgement import judge_calibration
 from slrig.calibration.poses.guidance import coverage
 from slrig.calibration.solution import (
     CELLS,
@@ -23,6 +22,7 @@ from slrig.calibration.solution import (
     Bow,
     DeviceResiduals,
     ExpectedError,
+    RigidMotion,
     Solution,
 )
 from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
@@ -180,5 +180,5 @@ def solved_result() -> CalibrationResult:
     sizes = {"left": rig["left"].size, PROJECTOR: rig[PROJECTOR].size}
     used = [pose.observation for name, pose in read_poses().items() if name != BUMPED]
     covered = coverage(used, BOARD, sizes)
-    judged = verdict(solution, expected, covered, HALVES, board=BOARD)
+    judged = judge_calibration(solution, expected, covered, HALVES, board=BOARD)
     return CalibrationResult(solution, calibration, expected, judged, covered, HALVES)

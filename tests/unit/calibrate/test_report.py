@@ -21,10 +21,10 @@ from slrig.calibrate.pose_judging import judgement, summary
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
 from slrig.calibrate.tools import Setting
+from slrig.calibration.accuracy import compare_calibrations
 from slrig.calibration.board import BoardShape, ViewQuality
 from slrig.calibration.health.verification import verify_by_board
-from slrig.calibration.judging.comparison import comparison
-from slrig.calibration.judging.verdict import Grade
+from slrig.calibration.judgement import Grade
 from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import tell_result
 from slrig.errors import CalibrationError
@@ -166,9 +166,9 @@ def test_names_and_titles_are_shown_as_text() -> None:
 
 def test_verdict_comes_first_and_in_words() -> None:
     verdict = result().verdict
-    assert page().figures["grade"] == verdict.grade.words.capitalize()
+    assert page().figures["grade"] == verdict.grade.label.capitalize()
     words = "".join(page().words)
-    assert words.index(verdict.grade.words.capitalize()) < words.index("Expected error of a point")
+    assert words.index(verdict.grade.label.capitalize()) < words.index("Expected error of a point")
     for reason in verdict.reasons:
         assert reason[1:] in words
     worse = replace(
@@ -190,7 +190,7 @@ def test_every_number_is_that_of_the_result_and_its_covariance() -> None:
     ):
         assert page().number(name) == pytest.approx(value, rel=5e-3)
     assert "0.89 times what is stated for two halves" in " ".join(" ".join(page().words).split())
-    flat = "The board is flat as far as the poses tell: 0.031 ± 0.012 mm from its lowest to its highest corner."
+    flat = "The board is flat as far as the poses determine: 0.031 ± 0.012 mm from its lowest to its highest corner."
     assert flat in page().words
     seen = 0
     for device in device_figures(result()):
@@ -340,9 +340,9 @@ def test_the_error_is_said_to_be_across_the_line_of_sight() -> None:
     assert "a point of known distance is expected within" in verdict.summary
     assert "mm across the line of sight (1 in" in verdict.summary
     assert verdict.summary.endswith("that takes a projector or a second camera, calibrated with it")
-    (error,) = (each for each in verdict.judged if each.figure == "error")
-    assert "off across the line of sight by the calibration; twice that" in error.words
-    assert "noise of the light" not in error.words
+    (error,) = (each for each in verdict.figures if each.figure == "error")
+    assert "off across the line of sight by the calibration; twice that" in error.message
+    assert "noise of the light" not in error.message
 
 
 def test_what_is_not_known_is_null_in_json_and_no_number_on_screen_and_page() -> None:
@@ -389,6 +389,6 @@ def test_it_is_no_calibration_for_scans_and_is_compared_by_its_lens() -> None:
     )
     with pytest.raises(CalibrationError, match="one of camera 'left' alone: calibrate it again"):
         verify_by_board([poses_of_one()[0][0].observation], CHESSBOARD, of_one().calibration)
-    found = comparison(of_one().calibration, of_one().calibration)
-    assert found.words[0].endswith("they have one device in common, and a point takes two.")
+    found = compare_calibrations(of_one().calibration, of_one().calibration)
+    assert found.words[0].endswith("the calibrations have only one device in common.")
     assert found.devices["left"].focal_percent.value == 0

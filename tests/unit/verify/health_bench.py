@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
 
-from slrig.calibration.health.verification import Drift, PairFigures, Verification
+from slrig.calibration.health.verification import DriftEstimate, PairFigures, Verification
 
 START = datetime(2026, 11, 20, 8, 0, tzinfo=UTC)
 
@@ -16,7 +16,7 @@ def a_verification(
     cells = [[0.01] * 6 for _ in range(6)]
     pair = PairFigures("left", "projector", 2000, mean_px, rms_px, 0.04, 0.002, cells, cells, [[9] * 6] * 6)
     words = "camera 'left' turned by 0.050 ± 0.004° about its vertical axis"
-    drifts = (Drift("left", "turned", evidence, evidence**0.5, 1.0, words),) if evidence else ()
+    drifts = (DriftEstimate("left", "turned", evidence, evidence**0.5, 1.0, words),) if evidence else ()
     remedy = "check the mount of camera 'left', and calibrate again" if evidence else None
     return Verification(
         "board", (pair,), 0.01, 0.006, 0.012, 0.01 * ratio, 0.01, 0.01 * (ratio - 1), evidence**0.5, evidence, drifts,

@@ -15,7 +15,7 @@ import pytest
 
 from slrig.calibrate.solving import ReadPose
 from slrig.calibration.board import Board, BoardKind, PoseObservation, ViewQuality
-from slrig.calibration.health.verification import Health, HealthState, Verification, judged
+from slrig.calibration.health.verification import Health, HealthState, Verification, judge_health
 from slrig.devices import Rig
 from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.data_folder import DataFolder
@@ -235,7 +235,7 @@ def warm_up() -> list[VerificationRecord]:
         verifications.append(found)
         name = "one" if number < 36 else "two"
         records.append(
-            VerificationRecord(number, UUID(int=number), hours(number / 4), name, found, judged(verifications))
+            VerificationRecord(number, UUID(int=number), hours(number / 4), name, found, judge_health(verifications))
         )
     return records
 
@@ -262,7 +262,7 @@ def test_thresholds_and_the_recalibration_are_named() -> None:
     assert texts.count("calibrated") == 1
     assert health_svg(warm_up()).count('stroke-dasharray="2 3"') == 1, "a line where it was calibrated again"
     assert "left - projector" in texts
-    odd = VerificationRecord(1, UUID(int=1), hours(0), "<b>", warm_up()[0].found, judged([]))
+    odd = VerificationRecord(1, UUID(int=1), hours(0), "<b>", warm_up()[0].found, judge_health([]))
     assert "<b>" not in health_svg([odd, warm_up()[0]])
     assert len(list(parsed(health_svg(warm_up()[:1])).iter(f"{_SVG}circle"))) >= 1
     assert "Nothing was verified yet" in health_svg([])

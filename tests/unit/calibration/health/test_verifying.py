@@ -16,9 +16,9 @@ from slrig.calibration.health.verification import (
     HealthState,
     PairFigures,
     Verification,
-    health_of_scan,
-    judged,
+    judge_health,
     verification_from_document,
+    verification_from_scan,
     verify_by_board,
 )
 from slrig.calibration.solution import PROJECTOR
@@ -76,7 +76,7 @@ def test_a_change_makes_stale_is_named_and_predicts_its_error(
     rig = bench()
     now = planted(rig.devices, change)
     found = looked(rig, now)
-    assert judged([found]).state is HealthState.STALE
+    assert judge_health([found]).state is HealthState.STALE
     first = found.drifts[0]
     assert (first.device, first.kind) == (device, kind)
     assert first.words.startswith(words)
@@ -92,7 +92,7 @@ def test_changes_that_the_geometry_cannot_distinguish_are_named_together(change:
     rig = bench()
     now = planted(rig.devices, change)
     found = looked(rig, now)
-    assert judged([found]).state is HealthState.STALE
+    assert judge_health([found]).state is HealthState.STALE
     true = PROJECTOR if change in ("projector turned up", "baseline") else "left"
     likely = {each.device for each in found.drifts if each.evidence > found.evidence - 9}
     assert likely == {"left", PROJECTOR}
@@ -113,7 +113,7 @@ def test_changes_that_the_geometry_cannot_distinguish_are_named_together(change:
 def test_a_second_camera_distinguishes_them(change: str, device: str) -> None:
     rig = bench(cameras=2)
     found = looked(rig, planted(rig.devices, change))
-    assert judged([found]).state is HealthState.STALE
+    assert judge_health([found]).state is HealthState.STALE
     assert found.drifts[0].device == device
     assert found.open is None
 
@@ -121,7 +121,7 @@ def test_a_second_camera_distinguishes_them(change: str, device: str) -> None:
 def test_a_rig_that_did_not_change_is_good() -> None:
     rig = bench(3)
     found = looked(rig, rig.devices)
-    assert judged([found]).state is HealthState.GOOD
+    assert judge_health([found]).state is HealthState.GOOD
     assert not found.drifts
     assert abs(found.scale_percent or 1) < 4 * (found.scale_sigma_percent or 0)
     (pair,) = found.pairs
@@ -144,7 +144,7 @@ def test_a_device_left_out_of_a_verification_raises_no_alarm_and_is_named() -> N
         # What is not seen is not as bad as anything that might have happened to it. By its noise one look makes some
         # small change of the others a little likelier than none: less than what a rig is watched for.
         assert (found.expected_mm or 0) < 1.4 * (found.stated_mm or 0)
-        health = judged([found])
+        health = judge_health([found])
         assert health.state is HealthState.GOOD
         assert f"camera '{absent}' did not take part in the last verification" in health.reasons[0]
         # A change of the others is found all the same.
@@ -153,7 +153,7 @@ def test_a_device_left_out_of_a_verification_raises_no_alarm_and_is_named() -> N
         other = replace(
             seen, views={others: seen.views[others]}, correspondences={others: seen.correspondences[others]}
         )
-        alarm = judged([verify_by_board([other], BOARD, rig.calibration)])
+        alarm = judge_health([verify_by_board([other], BOARD, rig.calibration)])
         assert alarm.state is HealthState.STALE
         assert alarm.reasons[-1].startswith(f"camera '{absent}' did not take part")
     dark = replace(look_of(rig.devices, 5), correspondences={})
@@ -196,9 +196,9 @@ def test_a_calibration_that_says_nothing_of_its_error_is_judged_by_the_residuals
     bare = Calibration({"left": rig.devices["left"]}, rig.devices[PROJECTOR])
     clean = verify_by_board([look_of(rig.devices, 0)], BOARD, bare)
     assert clean.stated_mm is None
-    assert judged([clean]).state is HealthState.GOOD
+    assert judge_health([clean]).state is HealthState.GOOD
     knocked = verify_by_board([look_of(planted(rig.devices, "camera turned up"), 0)], BOARD, bare)
-    assert judged([knocked]).state is HealthState.STALE
+    assert judge_health([knocked]).state is HealthState.STALE
 
 
 def test_a_look_survives_its_document() -> None:
@@ -213,14 +213,14 @@ def test_a_scan_with_two_cameras_is_a_look_too() -> None:
     # As `redundancy.residual_px` of a report lists it.
     pair = {"reference": "left", "camera": "right", "pairs": 4000, "outlying": 3, "mean": 0.42, "rms": 0.5,
             "median_absolute": 0.42, "stated_rms": 0.08, "map": {"mean": [], "rms": [], "pairs": []}}  # fmt: skip
-    found = health_of_scan([pair])
+    found = verification_from_scan([pair])
     assert found is not None
-    verdict = judged([found])
+    verdict = judge_health([found])
     assert verdict.state is HealthState.STALE
     assert "'left' and 'right' disagree by 0.42 px in the mean" in verdict.reasons[0]
     assert verdict.remedy is not None
     assert "shoot a verification" in verdict.remedy
-    assert health_of_scan([]) is None
+    assert verification_from_scan([]) is None
 
 
 # ---- Good, watch, stale over time: warm-up, clean captures, one bad look, a knock
@@ -239,7 +239,7 @@ def figures(
 
 
 def test_nothing_verified_is_unknown() -> None:
-    assert judged([]).state is HealthState.UNKNOWN
+    assert judge_health([]).state is HealthState.UNKNOWN
 
 
 @pytest.mark.parametrize(
@@ -259,30 +259,32 @@ def test_nothing_verified_is_unknown() -> None:
     ],
 )
 def test_thresholds(found: Verification, state: HealthState) -> None:
-    assert judged([found]).state is state
+    assert judge_health([found]).state is state
 
 
 def test_residuals_that_double_are_watched() -> None:
     clean = [figures() for _ in range(5)]
-    assert judged([*clean, *[figures(rms_px=0.11)] * 3]).state is HealthState.WATCH
-    assert judged([*clean, *[figures(rms_px=0.25)] * 3]).state is HealthState.STALE
+    assert judge_health([*clean, *[figures(rms_px=0.11)] * 3]).state is HealthState.WATCH
+    assert judge_health([*clean, *[figures(rms_px=0.25)] * 3]).state is HealthState.STALE
 
 
 def test_one_bad_verification_is_no_alarm_and_two_are() -> None:
     clean = [figures() for _ in range(5)]
     bad = figures(1.8, evidence=12)
-    assert judged([*clean, bad]).state is HealthState.GOOD
-    assert judged([*clean, bad, bad]).state is HealthState.WATCH
+    assert judge_health([*clean, bad]).state is HealthState.GOOD
+    assert judge_health([*clean, bad, bad]).state is HealthState.WATCH
 
 
 def test_a_knock_counts_at_once() -> None:
     clean = [figures() for _ in range(50)]
-    assert judged([*clean, figures(8, evidence=2000)]).state is HealthState.STALE
-    assert judged([*clean, figures(mean_px=0.9)]).state is HealthState.STALE
+    assert judge_health([*clean, figures(8, evidence=2000)]).state is HealthState.STALE
+    assert judge_health([*clean, figures(mean_px=0.9)]).state is HealthState.STALE
 
 
 def test_the_reasons_of_stale_come_first_with_a_remedy() -> None:
-    health = judged([replace(figures(1.5, mean_px=0.5), remedy="check the projector's mount, and calibrate again")])
+    health = judge_health(
+        [replace(figures(1.5, mean_px=0.5), remedy="check the projector's mount, and calibrate again")]
+    )
     assert health.state is HealthState.STALE
     assert health.reasons[0].startswith("'left' and 'projector' disagree by 0.50 px")
     assert health.remedy == "check the projector's mount, and calibrate again"
@@ -291,9 +293,9 @@ def test_the_reasons_of_stale_come_first_with_a_remedy() -> None:
 def test_a_creeping_size_is_watched_and_scatter_is_not() -> None:
     noise = np.random.default_rng(1).normal(0, 0.005, 60)
     still = [replace(figures(), scale_percent=value) for value in noise]
-    assert judged(still).state is HealthState.GOOD
+    assert judge_health(still).state is HealthState.GOOD
     creeping = [replace(figures(), scale_percent=value + 0.0006 * at) for at, value in enumerate(noise)]
-    health = judged(creeping)
+    health = judge_health(creeping)
     assert health.state is HealthState.WATCH
     assert "measured size has crept by +0.03" in health.reasons[0]
 
@@ -307,7 +309,7 @@ def test_no_alarm_on_many_clean_captures() -> None:
         verifications: list[Verification] = []
         for seed in range(count // 2):
             verifications.append(verify_by_board([look_of(rig.devices, 1000 * number + seed)], BOARD, rig.calibration))
-            assert judged(verifications).state is HealthState.GOOD
+            assert judge_health(verifications).state is HealthState.GOOD
 
 
 @pytest.mark.slow
@@ -322,7 +324,7 @@ def test_a_warm_up_is_watched_before_the_error_doubles(number: int) -> None:
         lamp = zoomed(turned(rig.devices[PROJECTOR], (0.001 * share, 0.006 * share, 0)), 1e-4 * share)
         now = {**rig.devices, PROJECTOR: lamp}
         verifications.append(verify_by_board([look_of(now, capture)], BOARD, rig.calibration))
-        states.append(judged(verifications).state)
+        states.append(judge_health(verifications).state)
         errors_mm.append(true_error_mm(now, rig.calibration))
     alarm = next(at for at, state in enumerate(states) if state is not HealthState.GOOD)
     stated = max(errors_mm[0], float(verifications[0].stated_mm or 0))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from slrig.calibration.solution import PARAMETERS, PROJECTOR, Solution, scale_mode
-from slrig.calibration.solving.projection import difference
+from slrig.calibration.solving.projection import device_difference
 from slrig.model import Calibration, FloatArray, Pinhole
 from tests.unit.calibration.solving.test_projection import row_of
 
@@ -44,7 +44,7 @@ def in_deviations(solution: Solution, truth: Calibration, *, exact_board: bool =
     stated = exact_covariance(solution) if exact_board else solution.covariance
     names = [*truth.cameras, *([PROJECTOR] if truth.projector else [])]
     rows = [rows_of(solution.calibration), rows_of(truth)]
-    off = difference(*rows)
+    off = device_difference(*rows)
     found = {}
     for device, name in enumerate(names):
         own = slice(15 * device, 15 * device + 15)

@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from slrig.calibration.accuracy import expected_error
 from slrig.calibration.board import BoardShape, Observations
-from slrig.calibration.judging.comparison import expected_error
-from slrig.calibration.judging.verdict import judged_size
-from slrig.calibration.solution import CELLS, LEAST_HALVED, PROJECTOR, DeviceResiduals, ExpectedError, Solution
-from slrig.calibration.solving.adjustment import LENS_SIGMA, Fit, Problem, fitted
-from slrig.calibration.solving.held_out import allowing_for, folds_of, halves_of
-from slrig.calibration.solving.projection import difference
+from slrig.calibration.judgement import grade_board_size
+from slrig.calibration.solution import CELLS, MIN_HALVED_POSES, PROJECTOR, DeviceResiduals, ExpectedError, Solution
+from slrig.calibration.solving.adjustment import LENS_SIGMA, AdjustmentProblem, Fit, fit_geometry
+from slrig.calibration.solving.covariance import inflate_by_held_out, make_folds, solve_halves
+from slrig.calibration.solving.projection import device_difference
 from slrig.calibration.solving.solve import solve
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, FloatArray
@@ -292,7 +292,7 @@ def test_a_stretched_print_is_found_and_its_error_stated(wide: float, high: floa
     assert actual_mm(solution, stated, truth) < 2.5 * stated.point_mm
     if abs(stretch) > 1e-3:
         assert 0.7 < stated.point_mm / actual_mm(solution, stated, truth) < 1.4
-        assert [each.figure for each in judged_size(solution, None)] == ["stretch"]
+        assert [each.figure for each in grade_board_size(solution, None)] == ["stretch"]
     found = in_deviations(solution, truth, exact_board=False)
     assert max(np.abs(list(found.values()))) < 3.5, found
 
@@ -324,21 +324,21 @@ def test_a_ruler_makes_a_wrong_print_right() -> None:
 # ---- Poses that are held out, and the odd and even half of a solve: what each says without the others
 
 
-def problem_of(recipe: Recipe) -> Problem:
+def problem_of(recipe: Recipe) -> AdjustmentProblem:
     _, seen = true_geometry(recipe)
     names = tuple(f"pose {number}" for number in range(recipe.poses))
-    return Problem(("left",), names, False, seen.of_poses(np.ones(recipe.poses, np.bool_), matches=False))
+    return AdjustmentProblem(("left",), names, False, seen.select_poses(np.ones(recipe.poses, np.bool_), matches=False))
 
 
 def test_each_pose_is_held_out_once() -> None:
     problem = problem_of(Recipe(poses=13, projector=False, side=4))
-    folds = folds_of(problem)
+    folds = make_folds(problem)
     assert len(folds) == 5
     np.testing.assert_array_equal(np.sum(folds, axis=0), 1)
 
 
 def test_three_poses_are_too_few_to_hold_any_out() -> None:
-    assert folds_of(problem_of(Recipe(poses=3, projector=False, side=4))) == []
+    assert make_folds(problem_of(Recipe(poses=3, projector=False, side=4))) == []
 
 
 @pytest.mark.parametrize(
@@ -354,28 +354,28 @@ def test_deviations_allow_for_the_residuals_of_held_out_poses(ratios: tuple[floa
         DeviceResiduals(0.2, 0.2, 0.2 * ratio, 100, 0, {}, no_map, np.zeros((CELLS, CELLS, 2)), no_map.astype(np.int32))
         for ratio in ratios
     ]
-    allowed = allowing_for(covariance, residuals)
+    allowed = inflate_by_held_out(covariance, residuals)
     np.testing.assert_allclose(np.sqrt(np.diagonal(allowed)), factor * np.sqrt(np.diagonal(covariance)))
     # Correlations stay: devices that err together are a small error between them.
     np.testing.assert_allclose(allowed / covariance, factor**2)
 
 
-def whole(poses: int) -> tuple[Problem, Fit]:
+def whole(poses: int) -> tuple[AdjustmentProblem, Fit]:
     geometry, seen = true_geometry(Recipe(poses=poses, side=12, seed=2))
-    problem = Problem(("left", "projector"), tuple(f"pose {number}" for number in range(poses)), True, seen)
-    return problem, fitted(problem, geometry, correlated=True)
+    problem = AdjustmentProblem(("left", "projector"), tuple(f"pose {number}" for number in range(poses)), True, seen)
+    return problem, fit_geometry(problem, geometry, correlated=True)
 
 
 def test_a_half_is_what_its_poses_give_from_wherever_it_starts() -> None:
     problem, fit = whole(9)
-    halves = halves_of(problem, fit, None, ())
+    halves = solve_halves(problem, fit, None, ())
     assert [half.poses for half in halves] == [tuple(f"pose {n}" for n in range(first, 9, 2)) for first in (0, 1)]
     for first, half in enumerate(halves):
         others = np.arange(9) % 2 != first
         moved = fit.geometry.devices.copy()
         moved[:, :4] *= 1.002
-        alone = fitted(problem.without(others), replace(fit.geometry, devices=moved), correlated=True)
-        change = difference(alone.geometry.devices, fit.geometry.devices).ravel()
+        alone = fit_geometry(problem.exclude_poses(others), replace(fit.geometry, devices=moved), correlated=True)
+        change = device_difference(alone.geometry.devices, fit.geometry.devices).ravel()
         sigma = np.sqrt(np.diagonal(half.covariance))
         known = sigma > 0
         # They settle on which observations are outlying by themselves.
@@ -387,14 +387,14 @@ def test_a_half_sees_nothing_of_the_other() -> None:
     m = problem.measurements
     even = m.corner_where[:, 1] % 2 == 1
     wrong = replace(problem, measurements=replace(m, corner_px=m.corner_px + 3.0 * even[:, None]))
-    before, after = (halves_of(each, fit, None, ()) for each in (problem, wrong))
+    before, after = (solve_halves(each, fit, None, ()) for each in (problem, wrong))
     np.testing.assert_array_equal(before[0].change, after[0].change)
     np.testing.assert_array_equal(before[0].covariance, after[0].covariance)
     assert np.abs(after[1].change - before[1].change).max() > 1
 
 
 def test_too_few_poses_are_not_halved() -> None:
-    problem, fit = whole(LEAST_HALVED)
-    assert len(halves_of(problem, fit, None, ())) == 2
-    left_out = np.arange(LEAST_HALVED) == 3
-    assert halves_of(problem.without(left_out), fit, None, ()) == ()
+    problem, fit = whole(MIN_HALVED_POSES)
+    assert len(solve_halves(problem, fit, None, ())) == 2
+    left_out = np.arange(MIN_HALVED_POSES) == 3
+    assert solve_halves(problem.exclude_poses(left_out), fit, None, ()) == ()

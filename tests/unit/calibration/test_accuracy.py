@@ -11,15 +11,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slrig.calibration.accuracy import compare_calibrations, compare_halves, expected_error, sample_volume
 from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, Correspondences, Observations, PoseObservation
-from slrig.calibration.displacement import modes_of, moved_points, rigid_free, without_rigid_motion
-from slrig.calibration.judging.comparison import comparison, expected_error, odd_even, volume_of
-from slrig.calibration.judging.verdict import Grade, verdict
-from slrig.calibration.solution import BoardPose, Half, Solution
+from slrig.calibration.judgement import Grade, judge_calibration
+from slrig.calibration.solution import (
+    BoardPose,
+    HalfSolution,
+    Solution,
+    covariance_modes,
+    point_sensitivity,
+    project_out_rigid_motion,
+    remove_rigid_motion,
+)
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
 from slrig.reconstruction.surface_fit import stencils
-from tests.unit.calibration.judging.test_verdict import EXPECTED
 from tests.unit.calibration.perturbed import (
     aligned,
     changed,
@@ -32,6 +38,7 @@ from tests.unit.calibration.perturbed import (
     ray_directions,
     right_camera,
 )
+from tests.unit.calibration.test_judgement import EXPECTED
 
 FITTED = float(np.sqrt((stencils()[0][0].astype(np.float64) ** 2).sum()))
 """What the fit of a scan makes of the noise of one pixel."""
@@ -198,9 +205,9 @@ def test_the_weighted_mean_of_two_cameras_is_what_a_scan_takes() -> None:
     left, right, projector = left_camera(), right_camera(), light_source()
     away = replace(right, translation_mm=right.translation_mm + np.array([0.0, 0, -5000.0]))
     places = np.array([[0.0, 0, 600], [10.0, -15, 620]])
-    alone = moved_points([left], projector, places)
-    both = moved_points([left, away], projector, places)
-    assert both.seen.all()
+    alone = point_sensitivity([left], projector, places)
+    both = point_sensitivity([left, away], projector, places)
+    assert both.visible.all()
     assert both.by_parameter[:, :, :15] == pytest.approx(alone.by_parameter[:, :, :15])
     assert both.by_parameter[:, :, 30:] == pytest.approx(alone.by_parameter[:, :, 15:])
     assert not both.by_parameter[:, :, 15:30].any()
@@ -212,17 +219,17 @@ def test_a_rigid_motion_is_no_error() -> None:
     motion = np.cross(np.array([1e-3, -2e-3, 5e-4]), places) + np.array([0.1, 0.2, 0.3])
     strain = (places - places.mean(axis=0)) * 1e-3
     fields = np.stack([motion, motion + strain], axis=2)
-    left = rigid_free(places, fields)
+    left = project_out_rigid_motion(places, fields)
     assert np.abs(left[:, :, 0]).max() < 1e-12
     assert left[:, :, 1] == pytest.approx(strain, abs=1e-12)
 
 
 def test_modes_give_the_covariance_again() -> None:
     covariance = covariance_by_known_points([left_camera(), light_source()], 1, 0.05, 0)
-    modes = modes_of(covariance)
+    modes = covariance_modes(covariance)
     scale = np.sqrt(np.maximum(np.diagonal(covariance), 1e-30))
     assert modes @ modes.T / np.outer(scale, scale) == pytest.approx(covariance / np.outer(scale, scale), abs=1e-9)
-    assert modes_of(np.zeros((30, 30))).shape == (30, 0)
+    assert covariance_modes(np.zeros((30, 30))).shape == (30, 0)
 
 
 def test_an_exact_calibration_has_no_error() -> None:
@@ -233,7 +240,7 @@ def test_an_exact_calibration_has_no_error() -> None:
 
 def test_the_volume_is_where_the_board_was_and_the_devices_see_it() -> None:
     solution, observations = solved({"left": left_camera()}, light_source())
-    box, places = volume_of(solution, observations)
+    box, places = sample_volume(solution, observations)
     corners = np.concatenate(
         [BOARD.points_mm @ pose.rotation.T + pose.translation_mm for pose in solution.poses.values()]
     )
@@ -275,7 +282,7 @@ def test_a_board_that_never_left_one_plane_is_refused_with_words() -> None:
 def whole() -> tuple[Solution, FloatArray]:
     """A solution of a camera and a projector, and some forty places in its volume."""
     solution, observations = solved({"left": left_camera()}, light_source())
-    _, places = volume_of(solution, observations)
+    _, places = sample_volume(solution, observations)
     return solution, places[:: len(places) // 40]
 
 
@@ -283,7 +290,7 @@ def halved(odd: FloatArray, even: FloatArray, covariance: FloatArray) -> tuple[S
     """The same with halves that are off by so much."""
     solution, places = whole()
     names = tuple(solution.poses)
-    halves = (Half(names[::2], odd, covariance), Half(names[1::2], even, covariance))
+    halves = (HalfSolution(names[::2], odd, covariance), HalfSolution(names[1::2], even, covariance))
     return replace(solution, halves=halves), places
 
 
@@ -296,7 +303,7 @@ def test_halves_that_are_off_as_they_state_differ_by_what_is_stated() -> None:
     off = draws(spread, 500, 5)
     found = []
     for odd, even in zip(off[::2], off[1::2], strict=True):
-        made = odd_even(*halved(odd, even, spread))
+        made = compare_halves(*halved(odd, even, spread))
         assert made is not None
         found.append(made)
     ratio = np.array([each.ratio for each in found])
@@ -321,7 +328,7 @@ def test_the_difference_is_how_far_apart_both_find_a_point() -> None:
         for each in (odd, even)
     ]
     apart = along_rays(aligned(there[0] - there[1] + places, places), places, camera)
-    found = odd_even(solution, places)
+    found = compare_halves(solution, places)
     assert found is not None
     assert found.difference_mm == pytest.approx(float(np.sqrt((apart**2).mean())), rel=0.005)
     assert found.poses == (4, 4)
@@ -337,7 +344,7 @@ def test_halves_that_are_moved_as_a_whole_do_not_differ() -> None:
         return np.concatenate([np.zeros(9), own, -(rotation @ shift)])
 
     moved = np.concatenate([change(left_camera()), change(light_source())])
-    found = odd_even(*halved(moved, np.zeros(30), covariance()))
+    found = compare_halves(*halved(moved, np.zeros(30), covariance()))
     assert found is not None
     assert found.difference_mm < 1e-6
     assert found.motion.turn_deg == pytest.approx(np.degrees(2e-5), rel=1e-3)
@@ -348,7 +355,7 @@ def test_halves_that_are_moved_as_a_whole_do_not_differ() -> None:
 def test_a_difference_beyond_chance_is_a_reason_against_good() -> None:
     spread = covariance()
     odd, even = draws(spread, 2, 3)
-    plain, large = (odd_even(*halved(times * odd, times * even, spread)) for times in (1, 6))
+    plain, large = (compare_halves(*halved(times * odd, times * even, spread)) for times in (1, 6))
     assert plain is not None
     assert large is not None
     assert large.stated_mm == pytest.approx(plain.stated_mm)
@@ -356,19 +363,19 @@ def test_a_difference_beyond_chance_is_a_reason_against_good() -> None:
     assert plain.fits
     assert not large.fits
     solution = halved(odd, even, spread)[0]
-    assert large.words in verdict(solution, EXPECTED, None, large, board=BOARD).reasons
-    assert plain.words not in verdict(solution, EXPECTED, None, plain, board=BOARD).reasons
-    judged = {each.figure: each for each in verdict(solution, EXPECTED, None, large, board=BOARD).judged}
+    assert large.words in judge_calibration(solution, EXPECTED, None, large, board=BOARD).reasons
+    assert plain.words not in judge_calibration(solution, EXPECTED, None, plain, board=BOARD).reasons
+    judged = {each.figure: each for each in judge_calibration(solution, EXPECTED, None, large, board=BOARD).figures}
     assert judged["odd_even"].grade is Grade.USABLE
     assert judged["odd_even"].value == large.ratio
-    assert f"reckon with {large.difference_mm / 2:.2g} mm for the error of a point" in large.words
+    assert f"expect an error of {large.difference_mm / 2:.2g} mm at a point" in large.words
     assert "more than chance" in large.words
 
 
 def test_without_halves_nothing_is_said() -> None:
     solution, places = halved(np.zeros(30), np.zeros(30), covariance())
-    assert odd_even(replace(solution, halves=()), places) is None
-    assert "odd_even" not in {each.figure for each in verdict(solution, EXPECTED, board=BOARD).judged}
+    assert compare_halves(replace(solution, halves=()), places) is None
+    assert "odd_even" not in {each.figure for each in judge_calibration(solution, EXPECTED, board=BOARD).figures}
 
 
 # ---- Two calibrations compared: a change that was made is found again, in its size and in its σ
@@ -393,10 +400,12 @@ def with_right(calibration: Calibration, **changes: Any) -> Calibration:
 
 
 def test_calibration_is_the_same_as_itself() -> None:
-    found = comparison(rig(), rig())
+    found = compare_calibrations(rig(), rig())
     assert found.missing == ()
     assert found.moved_rms_mm == found.moved_most_mm == found.turn_deg == found.shift_mm == 0
-    assert found.words[0].startswith("Points in the working volume move by 0 mm rms, by 0 mm at most, besides a turn")
+    assert found.words[0].startswith(
+        "Points in the working volume move by 0 mm rms and at most 0 mm, in addition to a turn"
+    )
     assert set(found.devices) == {"left", "right", "projector"}
     for each in found.devices.values():
         assert each.focal_percent.value == each.principal_px.value == 0
@@ -408,7 +417,7 @@ def test_a_longer_focal_length_is_reported_in_percent_and_sigmas() -> None:
     matrix = rig().cameras["right"].matrix.copy()
     matrix[0, 0] *= 1.002
     matrix[1, 1] *= 1.002
-    right = comparison(rig(), with_right(rig(), matrix=matrix)).devices["right"]
+    right = compare_calibrations(rig(), with_right(rig(), matrix=matrix)).devices["right"]
     assert right.focal_percent.value == pytest.approx(0.2)
     # The mean of fx and fy, each known to 0.5 px in both solves.
     assert right.focal_percent.sigma == pytest.approx(100 / 2202.2 * 0.5, rel=1e-3)
@@ -419,7 +428,7 @@ def test_a_longer_focal_length_is_reported_in_percent_and_sigmas() -> None:
 def test_turn_and_baseline_are_reported_with_their_deviations() -> None:
     before = rig().cameras["right"]
     turn = Rotation.from_rotvec([0.0, np.radians(0.05), 0.0]).as_matrix()
-    found = comparison(
+    found = compare_calibrations(
         rig(), with_right(rig(), rotation=turn @ before.rotation, translation_mm=turn @ before.translation_mm)
     )
     right = found.devices["right"]
@@ -428,7 +437,9 @@ def test_turn_and_baseline_are_reported_with_their_deviations() -> None:
     assert right.rotation_deg.value == pytest.approx(0.05)
     assert right.rotation_deg.sigma == pytest.approx(np.degrees(1e-4) * np.sqrt(2), rel=1e-6)
     assert right.baseline_mm.value == pytest.approx(0.0, abs=1e-9)
-    moved = comparison(rig(), with_right(rig(), translation_mm=before.translation_mm * 1.001)).devices["right"]
+    moved = compare_calibrations(rig(), with_right(rig(), translation_mm=before.translation_mm * 1.001)).devices[
+        "right"
+    ]
     assert moved.baseline_mm is not None
     assert moved.baseline_mm.value == pytest.approx(1e-3 * np.linalg.norm([210.0, 8.0, 5.0]))
     assert moved.baseline_mm.sigma == pytest.approx(0.02 * np.sqrt(2), rel=1e-6)
@@ -443,14 +454,14 @@ def test_points_move_by_what_a_longer_baseline_makes_of_them() -> None:
     second = Calibration(
         cameras, replace(first.projector, translation_mm=first.projector.translation_mm * share), first.solved
     )
-    found = comparison(first, second)
+    found = compare_calibrations(first, second)
     # The middle of the volume moves away, by 0.6 mm, and the rest about it: the farthest point is a corner.
     assert found.shift_mm == pytest.approx((share - 1) * 600, rel=1e-4)
     assert found.turn_deg < 1e-6
     assert found.moved_most_mm == pytest.approx((share - 1) * np.linalg.norm([80, 60, 50]), rel=1e-4)
     assert found.moved_rms_mm < found.moved_most_mm
-    assert f"by {found.moved_most_mm:.3g} mm at most, besides a turn of" in found.words[0]
-    assert "and a shift of 0.6 mm that all of them share" in found.words[0]
+    assert f"at most {found.moved_most_mm:.3g} mm, in addition to a turn of" in found.words[0]
+    assert "and a shift of 0.6 mm of all of them" in found.words[0]
 
 
 def test_a_motion_of_all_points_is_no_change_of_shape_however_large() -> None:
@@ -459,13 +470,13 @@ def test_a_motion_of_all_points_is_no_change_of_shape_however_large() -> None:
     turn = Rotation.from_rotvec([0.2, -0.7, 0.4])
     strain = np.array([0.01, 0.0, 0.0]) * ((places - places.mean(axis=0)) / 80) ** 2
     moved = places.mean(axis=0) + turn.apply(places - places.mean(axis=0)) + [30.0, -20.0, 7.0]
-    left, motion = without_rigid_motion(places, moved)
+    left, motion = remove_rigid_motion(places, moved)
     assert np.abs(left).max() < 1e-10
     assert motion.turn_deg == pytest.approx(np.degrees(turn.magnitude()))
     assert motion.shift_mm == pytest.approx(np.linalg.norm([30.0, -20.0, 7.0]))
     # What is left of a small strain is what the least squares of a small motion leaves of it.
-    small, _ = without_rigid_motion(places, places + strain)
-    assert small == pytest.approx(rigid_free(places, strain[:, :, None])[:, :, 0], abs=1e-6)
+    small, _ = remove_rigid_motion(places, places + strain)
+    assert small == pytest.approx(project_out_rigid_motion(places, strain[:, :, None])[:, :, 0], abs=1e-6)
 
 
 def test_world_frame_makes_no_difference() -> None:
@@ -480,35 +491,35 @@ def test_world_frame_makes_no_difference() -> None:
         return replace(each, rotation=rotation, translation_mm=each.translation_mm + rotation @ shift)
 
     second = Calibration({name: moved(each) for name, each in first.cameras.items()}, moved(first.projector))
-    found = comparison(rig(), second)
+    found = compare_calibrations(rig(), second)
     assert found.moved_most_mm < 1e-6
     right = found.devices["right"]
     assert right.rotation_deg is not None
     assert right.rotation_deg.value < 1e-5
     assert np.isnan(right.rotation_deg.sigma)
-    assert "how sure that is, is not known" in right.rotation_deg.words
-    nowhere = comparison(first, second)
+    assert "its standard deviation is not known" in right.rotation_deg.words
+    nowhere = compare_calibrations(first, second)
     assert np.isnan(nowhere.moved_rms_mm)
-    assert "neither calibration names a working volume" in nowhere.words[0]
+    assert "neither calibration states a working volume" in nowhere.words[0]
 
 
 def test_device_that_only_one_has_is_named() -> None:
     first = rig()
     second = Calibration({"left": first.cameras["left"]}, first.projector)
-    found = comparison(first, second)
+    found = compare_calibrations(first, second)
     assert found.missing == ("right",)
     assert set(found.devices) == {"left", "projector"}
-    assert any("Only one of them has right" in words for words in found.words)
+    assert any("Only one calibration has right" in words for words in found.words)
 
 
 def test_calibrations_of_two_rigs_are_refused() -> None:
     first = rig()
     other = Calibration({"top": first.cameras["left"]}, first.projector)
     with pytest.raises(CalibrationError, match=r"one has left, right, the other top"):
-        comparison(first, other)
+        compare_calibrations(first, other)
     smaller = with_right(first)
     smaller = replace(
         smaller, cameras={**smaller.cameras, "right": replace(smaller.cameras["right"], size=Size(640, 512))}
     )
     with pytest.raises(CalibrationError, match="right has 1200 x 1000 pixels in one and 640 x 512 in the other"):
-        comparison(first, smaller)
+        compare_calibrations(first, smaller)

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.calibration.judging.verdict import (
+from slrig.calibration.judgement import (
     LIMITS,
     Grade,
     ScaleCheck,
     Verdict,
     check_scale,
-    judged_size,
+    grade_board_size,
+    judge_calibration,
     unattended_faults,
-    verdict,
 )
 from slrig.calibration.poses.guidance import Coverage, coverage
 from slrig.calibration.solution import (
@@ -75,7 +75,7 @@ def _with(solution: Solution, name: str, residuals: DeviceResiduals) -> Solution
 def judged(
     solution: Solution, expected: ExpectedError | None = EXPECTED, covered: Coverage | None = None, **asked: Any
 ) -> Verdict:
-    return verdict(solution, expected, covered, board=CHESSBOARD, **asked)
+    return judge_calibration(solution, expected, covered, board=CHESSBOARD, **asked)
 
 
 def _says(found: Verdict, *words: str) -> bool:
@@ -91,12 +91,12 @@ def test_a_sound_calibration_is_good_and_says_what_was_judged() -> None:
     assert found.grade is Grade.GOOD
     assert found.reasons == found.remarks == ()
     assert found.summary.startswith("good: a scanned point is expected within 0.01 mm (1 in 32,4")
-    assert found.summary.endswith("twice that is no more than the 0.16 mm that are wanted")
-    assert {each.figure for each in found.judged} >= {
+    assert found.summary.endswith("twice that is within the wanted 0.16 mm")
+    assert {each.figure for each in found.figures} >= {
         "error", "poses", "camera_rms_px", "projector_rms_px", "held_out", "stated_ratio", "principal_sigma_px",
         "focal_sigma_share",
     }  # fmt: skip
-    assert all(each.words for each in found.judged)
+    assert all(each.message for each in found.figures)
 
 
 POSES = dict(list(_solution().poses.items())[:6])
@@ -124,11 +124,11 @@ def _left(rms_px: float = 0.08, **changes: Any) -> Solution:
         (replace(_solution(), poses=POSES), "6 poses used.*20 to 30 are usual"),
         (replace(_solution(), outliers={"pose_12": "it moved"}), r"1 of 13 poses left out \(pose_12: it moved\)"),
         (_known(2 * EACH + 3, 9.0), "projector: the principal row is 860.0 ± 9 px.*about the horizontal axis"),
-        (_known(0, 12.0), "'left': the focal length is 2100.0 ± 12 px.*±0.1% is well.*other distances"),
-        (_with(_solution(), PROJECTOR, FAR_OFF), "the projector is 5.0 × as far off as the noise.*gamma"),
-        (_left(0.15, stated_rms_px=0.05), "camera 'left' is 3.0 ×.*bent board"),
-        (BENT, "bowed, 0.412 ± 0.021 mm.*0.06 mm off their printed places.*up to 0.2 mm is well.*glass"),
-        (_left(outlying=100), "9.5% of 1056 observations are outlying"),
+        (_known(0, 12.0), "'left': the focal length is 2100.0 ± 12 px.*±0.1% is good.*other distances"),
+        (_with(_solution(), PROJECTOR, FAR_OFF), "the projector: residuals are 5.0 × as large as the noise.*gamma"),
+        (_left(0.15, stated_rms_px=0.05), "camera 'left': residuals are 3.0 ×.*bent board"),
+        (BENT, "bowed, 0.412 ± 0.021 mm.*0.06 mm off their nominal positions.*up to 0.2 mm is good.*glass"),
+        (_left(outlying=100), "9.5% of 1056 observations are outliers"),
         (_left(held_out_rms_px=0.16), "camera 'left'.*2.00 × its own.*at most 1.3 ×.*add poses"),
         # Poor beside the rest, and still no more than is usual.
         (_left(0.05, held_out_rms_px=0.19), "3.80 × its own"),
@@ -158,7 +158,7 @@ def test_what_is_far_from_usual_is_not_to_be_used(solution: Solution) -> None:
 def test_the_worst_reason_decides(rms_px: float, grade: Grade) -> None:
     found = judged(_with(_solution(), "right", _residuals(rms_px)))
     assert found.grade is grade
-    assert found.judged[0].grade is grade
+    assert found.figures[0].grade is grade
     assert any("its verdict is not to use it" in words for words in found.unattended) is (grade is Grade.DO_NOT_USE)
 
 
@@ -169,10 +169,10 @@ def test_a_projector_has_its_own_limit() -> None:
     assert _says(found, "the projector has 5 px rms", "usual is 0.1–0.3", "refresh period")
 
 
-def test_without_held_out_poses_nobody_knows_the_lens() -> None:
+def test_missing_held_out_poses_make_it_usable_only() -> None:
     found = judged(_left(held_out_rms_px=float("nan")))
     assert found.grade is Grade.USABLE
-    assert _says(found, "too few poses to keep some from the solve")
+    assert _says(found, "too few poses to hold some out from the solve")
 
 
 def test_the_grade_follows_the_millimetres_that_are_wanted() -> None:
@@ -183,15 +183,15 @@ def test_the_grade_follows_the_millimetres_that_are_wanted() -> None:
     assert judged(_solution(), wanted_mm=0.019).grade is Grade.USABLE
     assert judged(_solution(), wanted_mm=0.009).grade is Grade.DO_NOT_USE
     lengths = judged(_solution(), replace(EXPECTED, length_share=4e-4))
-    assert "a length of 162 mm 0.065 mm wrong" in lengths.judged[0].words
+    assert "a length of 162 mm 0.065 mm wrong" in lengths.figures[0].message
     unknown = judged(_solution(), None)
     assert unknown.grade is Grade.USABLE
-    assert _says(unknown, "could not be told")
+    assert _says(unknown, "the error of a scan is unknown")
 
 
 def test_a_board_that_limits_the_error_is_named_with_what_to_do() -> None:
     found = judged(_solution(), replace(EXPECTED, board_mm=0.009))
-    assert _remarks(found, "limited by the board, whose size makes 0.009 mm of it", "measure both rulers")
+    assert _remarks(found, "limited by the board, whose size contributes 0.009 mm", "measure both rulers")
     assert "by the size of the board most of all" in found.summary
     poor = judged(_solution(), replace(EXPECTED, board_mm=0.009), wanted_mm=0.015)
     assert poor.grade is Grade.USABLE
@@ -212,7 +212,7 @@ def test_leaning_residuals_are_named_with_their_place() -> None:
     mean, count = residuals.map_mean_px.copy(), residuals.map_count.copy()
     mean[5, 0] = (0.15, 0.0)
     found = judged(_left(map_mean_px=mean))
-    assert _remarks(found, "in the lower left corner the residuals lean by 0.15 px", "add poses there")
+    assert _remarks(found, "in the lower left corner the mean residual is 0.15 px", "add poses there")
     # Next to nothing was seen there: a mean of ten residuals tells nothing.
     count[5, 0] = 10
     assert judged(_left(map_mean_px=mean, map_count=count)).remarks == ()
@@ -234,16 +234,16 @@ def test_a_border_that_no_corner_reached_leaves_the_distortion_open_there() -> N
 def test_a_bow_within_chance_is_reported_and_lowers_no_grade() -> None:
     found = judged(replace(_solution(), bow=Bow(0.5, 0.4, solved=False)))
     assert found.remarks == ()
-    (bend,) = (each for each in found.judged if each.figure == "bend_mm")
-    assert "flat as far as the poses tell: 0.50 ± 0.40 mm" in bend.words
+    (bend,) = (each for each in found.figures if each.figure == "bend_mm")
+    assert "flat as far as the poses determine: 0.50 ± 0.40 mm" in bend.message
     # Where a person said that the board is flat, nobody looked.
-    assert not [each for each in judged(_solution()).judged if each.figure == "bend_mm"]
+    assert not [each for each in judged(_solution()).figures if each.figure == "bend_mm"]
 
 
 def test_every_limit_has_a_source_and_grades_in_order() -> None:
     for limit in LIMITS.values():
         assert limit.source
-        assert limit.good < limit.most
+        assert limit.good < limit.usable
         assert limit.grade(limit.good) is Grade.GOOD
         assert limit.grade(float("nan")) is Grade.USABLE
 
@@ -275,12 +275,12 @@ def test_a_wrong_square_size_is_named_with_the_size_that_the_squares_have(factor
     found = check_scale(
         replace(solution, calibration=_enlarged(solution.calibration, factor)), solution.calibration, CHESSBOARD
     )
-    assert found.share == pytest.approx(factor - 1, rel=1e-6)
-    (words,) = found.words
+    assert found.change == pytest.approx(factor - 1, rel=1e-6)
+    (words,) = found.messages
     assert f"everything is {abs(factor - 1):.2%} {'larger' if factor > 1 else 'smaller'}" in words
     assert f"squares measure {12 / factor:.5g} mm instead of 12 mm" in words
     assert "measure both rulers" in words
-    (judged,) = judged_size(solution, found)
+    (judged,) = grade_board_size(solution, found)
     assert (judged.grade, judged.figure) == (Grade.USABLE, "scale")
 
 
@@ -288,17 +288,17 @@ def test_a_tenth_of_a_per_cent_is_what_a_rig_may_do_by_itself() -> None:
     solution = _bare()
     slightly = replace(solution, calibration=_enlarged(solution.calibration, 1.0009))
     found = check_scale(slightly, solution.calibration, CHESSBOARD)
-    assert (found.checked, found.words) == (True, ())
-    assert found.share == pytest.approx(9e-4, rel=1e-6)
+    assert (found.checked, found.messages) == (True, ())
+    assert found.change == pytest.approx(9e-4, rel=1e-6)
     assert 0 < found.sigma < 3e-4
 
 
 def test_a_scale_that_the_solve_itself_does_not_know_is_not_blamed_on_the_board() -> None:
     solution = _bare()
     wrong = replace(solution, calibration=_enlarged(solution.calibration, 1.01))
-    assert check_scale(wrong, solution.calibration, CHESSBOARD).words
+    assert check_scale(wrong, solution.calibration, CHESSBOARD).messages
     unsure = replace(wrong, covariance=wrong.covariance * 60.0**2)
-    assert check_scale(unsure, solution.calibration, CHESSBOARD).words == ()
+    assert check_scale(unsure, solution.calibration, CHESSBOARD).messages == ()
 
 
 def test_how_sure_a_board_s_size_is_hides_no_change_of_it() -> None:
@@ -308,7 +308,7 @@ def test_how_sure_a_board_s_size_is_hides_no_change_of_it() -> None:
     mode = 0.01 * scale_mode(wrong.calibration)
     unsure = replace(wrong, covariance=wrong.covariance + np.outer(mode, mode))
     found = check_scale(unsure, solution.calibration, CHESSBOARD)
-    assert found.words
+    assert found.messages
     assert found.sigma == pytest.approx(check_scale(wrong, solution.calibration, CHESSBOARD).sigma, abs=2e-4)
 
 
@@ -338,7 +338,7 @@ def test_a_rebuilt_rig_is_not_taken_for_a_wrong_square_size() -> None:
     assert projector is not None
     moved = replace(projector, translation_mm=projector.translation_mm * 1.1)
     rebuilt = Calibration(solution.calibration.cameras, moved)
-    (words,) = check_scale(replace(solution, calibration=rebuilt), solution.calibration, CHESSBOARD).words
+    (words,) = check_scale(replace(solution, calibration=rebuilt), solution.calibration, CHESSBOARD).messages
     assert "the rig was rebuilt, or a device was bumped" in words
     assert "camera 'left' to the projector" in words
 
@@ -349,28 +349,28 @@ def test_without_a_common_distance_the_scale_is_not_checked() -> None:
     other = Calibration({"middle": solution.calibration.projector}, None)
     found = check_scale(solution, other, CHESSBOARD)
     assert not found.checked
-    assert "the scale is not checked: that takes two devices which the earlier calibration has too, found no" in str(
-        found.words
+    assert "the scale is not checked: expected two devices in common with the earlier calibration, found no" in str(
+        found.messages
     )
 
 
 @pytest.mark.parametrize(("stretch", "words"), [(0.002, "0.20% ± 0.01% wider than it is high"), (-0.002, "higher")])
 def test_a_stretched_print_is_named(stretch: float, words: str) -> None:
     solution = replace(_bare(), size=BoardSize(0.001, stretch, 1e-4))
-    (judged,) = judged_size(solution, None)
+    (judged,) = grade_board_size(solution, None)
     assert judged.grade is Grade.USABLE
-    assert words in judged.words
-    assert "measure both rulers" in judged.words
+    assert words in judged.message
+    assert "measure both rulers" in judged.message
     small = replace(solution, size=BoardSize(0.001, stretch / 2.1, 1e-4))
     unsure = replace(solution, size=BoardSize(0.001, stretch, 5e-4))
-    assert not [*judged_size(small, None), *judged_size(unsure, None)]
+    assert not [*grade_board_size(small, None), *grade_board_size(unsure, None)]
 
 
 def test_a_schedule_puts_a_calibration_in_use_only_if_its_scale_is_vouched_for() -> None:
     solution, agrees = _bare(), ScaleCheck(True, 1e-4, 1e-4, ())
     assert unattended_faults(solution, CHESSBOARD, agrees) == ()
     (words,) = unattended_faults(solution, CHESSBOARD, None)
-    assert "nothing vouches for the scale" in words
+    assert "the scale is not verified" in words
     certified = replace(CHESSBOARD, square_sigma=1e-4)
     assert unattended_faults(solution, certified, None) == ()
     assert unattended_faults(solution, CHESSBOARD.as_measured(*CHESSBOARD.rulers_mm), None) == ()
