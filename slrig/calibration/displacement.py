@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.calibration.solution import PARAMETERS
-from slrig.model import Axis, FloatArray, Pinhole, told_depth, triangulated_axis
-from slrig.model.lens import by_terms, distorted
+from slrig.model import Axis, FloatArray, Pinhole, depth_sensitive_cameras, triangulated_axis
+from slrig.model.lens import distort, distortion_by_terms
 
 _EACH = len(PARAMETERS)
 
@@ -82,7 +82,7 @@ def moved_points(cameras: Sequence[Pinhole], projector: Pinhole | None, points_m
     axis = triangulated_axis(cameras, projector)
     coordinate = 0 if axis is Axis.COLUMN else 1
     ray = _unit(points_mm - projector.centre_mm)
-    told = np.array(told_depth(axis, cameras, projector))
+    told = np.array(depth_sensitive_cameras(axis, cameras, projector))
     seen_to_move = [(np.einsum("nij,nj->ni", view.by_point, ray) ** 2).sum(axis=1) for view in views]
     weights = np.stack([np.where(view.inside, m, 0.0) for view, m in zip(views, seen_to_move, strict=True)])
     weights *= told[:, None]
@@ -195,7 +195,7 @@ def _projected(device: Pinhole, points_mm: FloatArray) -> _Projected:
     before = z > 0
     z = np.where(before, z, np.nan)
     x, y = x / z, y / z
-    xd, yd, xx, xy, yy = distorted(device.distortion, x, y)
+    xd, yd, xx, xy, yy = distort(device.distortion, x, y)
     matrix = device.matrix[:2, :2]
     pixel = np.stack([xd, yd], axis=1) @ matrix.T + device.matrix[:2, 2]
     by_normalised = matrix @ np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
@@ -207,7 +207,7 @@ def _projected(device: Pinhole, points_mm: FloatArray) -> _Projected:
     by[:, 0, 0], by[:, 1, 1] = xd, yd
     by[:, 0, 2] = by[:, 1, 3] = 1
     for row in range(2):
-        by[:, row, 4:9] = np.stack(by_terms(matrix[row, 0], matrix[row, 1], x, y), axis=1)
+        by[:, row, 4:9] = np.stack(distortion_by_terms(matrix[row, 0], matrix[row, 1], x, y), axis=1)
     # R' X = R X + turn x (R X).
     by[:, :, 9:12] = np.cross(turned[:, None, :], by_device)
     by[:, :, 12:15] = by_device

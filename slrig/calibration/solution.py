@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slrig.model import Calibration, FloatArray, IntArray, Pinhole
-from slrig.model.lens import LENS_TERMS
+from slrig.model import LENS_TERMS, Calibration, FloatArray, IntArray, Pinhole
 
 PARAMETERS = ("fx", "fy", "cx", "cy", *LENS_TERMS, "turn_x", "turn_y", "turn_z", "x_mm", "y_mm", "z_mm")
 CELLS = 6

@@ -18,21 +18,21 @@ from enum import StrEnum
 import numpy as np
 
 from slrig.bundle.sidecars import Refused
-from slrig.capture.frame_checks import NEARLY_FULL, NOISE_FLOOR_DN, Samples, named
+from slrig.capture.frame_checks import NEAR_SATURATION, NOISE_FLOOR_DN, Samples, describe_pattern
 from slrig.capture.verifier import EvidenceSummary, Sampler, check_capture
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
 
-_ROUNDED = 1e-6  # of a refresh period: a range that is stated as whole ones is
-_MOST_SATURATED = 0.9  # of what is lit, as `frame_checks.lighting` has it
-_LEAST_LIT = 40  # samples, as `checks` has it
-LEAST_CLEAR = 12.0  # noises that white lies above black
-LEAST_CLEAR_DN = 4.0  # rounding hides the shares of less
-_LEAST_COMPARED = 300  # samples, as many as a band needs to be judged
-_MOST_MOVED = 0.05  # of the pixels, as `frame_checks.drift_fault` has it
-_MOVED = 0.3  # of white, as `frame_checks.drift` has it
+_PERIOD_TOLERANCE = 1e-6  # of a refresh period: a range that is stated as whole ones is
+_MAX_SATURATED_FRACTION = 0.9  # of what is lit, as `frame_checks.measure_lighting` has it
+_MIN_LIT_SAMPLES = 40  # samples, as `checks` has it
+MIN_CONTRAST_TO_NOISE = 12.0  # noises that white lies above black
+MIN_CONTRAST_DN = 4.0  # rounding hides the shares of less
+_MIN_COMPARED_SAMPLES = 300  # samples, as many as a band needs to be judged
+_MAX_MOVED_FRACTION = 0.05  # of the pixels, as `frame_checks.drift_fault` has it
+_MOVED_THRESHOLD = 0.3  # of white, as `frame_checks.measure_drift` has it
 
 
-def whole_refreshes_s(exposure_s: float, refresh_s: float | None, ranges_s: Iterable[tuple[float, float]]) -> float:
+def round_to_refresh_s(exposure_s: float, refresh_s: float | None, ranges_s: Iterable[tuple[float, float]]) -> float:
     """The exposure of whole refresh periods, one at least, that is nearest to what was asked and that cameras of these
     ranges can do; the nearest of one period and more where they can do none.
 
@@ -48,12 +48,12 @@ def whole_refreshes_s(exposure_s: float, refresh_s: float | None, ranges_s: Iter
         return exposure_s
     least, most = 1, round(exposure_s / refresh_s)
     for low_s, high_s in ranges_s:
-        least = max(least, math.ceil(low_s / refresh_s - _ROUNDED))
-        most = min(most, math.floor(high_s / refresh_s + _ROUNDED))
+        least = max(least, math.ceil(low_s / refresh_s - _PERIOD_TOLERANCE))
+        most = min(most, math.floor(high_s / refresh_s + _PERIOD_TOLERANCE))
     return max(least, most) * refresh_s
 
 
-class Unfit(StrEnum):
+class ExposureFault(StrEnum):
     """Why an exposure is of no use to a camera."""
 
     TOO_DARK = "too dark"
@@ -61,20 +61,20 @@ class Unfit(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ExposureVerdict:
     """What white and black say of an exposure, in one word and in several."""
 
-    unfit: Unfit
+    fault: ExposureFault
     words: str
 
 
-def verdict(white: Pixels, black: Pixels, form: CameraFormat) -> Verdict | None:
+def judge_exposure(white: Pixels, black: Pixels, form: CameraFormat) -> ExposureVerdict | None:
     """Judge an exposure by its white and black frames; None where too much or too little light is not what is wrong.
 
     Too bright: all but a tenth of what the projector lights is saturated, or half of the image is under black. Too
     dark: nothing is lit, or noise hides a good part of what is.
     """
-    sampler, nearly_full = Sampler.of(form.size), NEARLY_FULL * form.full_scale
+    sampler, nearly_full = Sampler.of(form.size), NEAR_SATURATION * form.full_scale
     lit_frame, dark_frame = sampler.take(white), sampler.take(black)
     contrast = lit_frame - dark_frame
     high, low = float(np.percentile(contrast, 99.5)), -float(np.percentile(contrast, 0.5))
@@ -83,20 +83,20 @@ def verdict(white: Pixels, black: Pixels, form: CameraFormat) -> Verdict | None:
     lit = (contrast >= max(2.0, 0.1 * high, 4 * noise)) | full
     saturated = float(np.mean(full[lit])) if lit.any() else 0.0
     under_black = float(np.mean(dark_frame >= nearly_full))
-    if saturated > _MOST_SATURATED or under_black > 0.5:
+    if saturated > _MAX_SATURATED_FRACTION or under_black > 0.5:
         words = f"white is saturated on {saturated:.0%} of what the projector lights, black on {under_black:.0%} of all"
-        return Verdict(Unfit.TOO_BRIGHT, words)
+        return ExposureVerdict(ExposureFault.TOO_BRIGHT, words)
     if low > 3 * max(high, 1.0):
         return None
-    clear = float(np.median(contrast[lit])) if np.count_nonzero(lit) >= _LEAST_LIT else max(high, 0.0)
-    if np.count_nonzero(lit) < _LEAST_LIT or clear < LEAST_CLEAR * noise:
+    clear = float(np.median(contrast[lit])) if np.count_nonzero(lit) >= _MIN_LIT_SAMPLES else max(high, 0.0)
+    if np.count_nonzero(lit) < _MIN_LIT_SAMPLES or clear < MIN_CONTRAST_TO_NOISE * noise:
         words = f"white is {clear:.1f} DN above black, and noise is {noise:.1f} DN"
-        return Verdict(Unfit.TOO_DARK, words)
+        return ExposureVerdict(ExposureFault.TOO_DARK, words)
     return None
 
 
 @dataclass(frozen=True, slots=True)
-class ExposedSamples:
+class ExposureSamples:
     """One exposure of one camera at the pixels of `Sampler.of` its size: samples by index of their pattern."""
 
     exposure_s: float
@@ -104,8 +104,8 @@ class ExposedSamples:
     noise_dn: float
 
 
-def movement_between(
-    before: ExposedSamples, after: ExposedSamples, patterns: Sequence[Pattern], full_scale: int
+def detect_movement(
+    before: ExposureSamples, after: ExposureSamples, patterns: Sequence[Pattern], full_scale: int
 ) -> str | None:
     """Say whether something moved between two exposures: each pattern, as a share of white, must look the same.
 
@@ -114,30 +114,32 @@ def movement_between(
     relative, doubt = [], []
     usable: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] | None = None
     for each in (before, after):
-        ends = [_first(each, patterns, kind) for kind in (White(), Black())]
+        ends = [_first_samples(each, patterns, kind) for kind in (White(), Black())]
         if ends[0] is None or ends[1] is None:
             return None
         white, black = ends[0], ends[1]
         contrast = np.maximum(white - black, np.float32(1))
-        clear = (contrast >= max(LEAST_CLEAR_DN, LEAST_CLEAR * each.noise_dn)) & (white < NEARLY_FULL * full_scale)
+        clear = (contrast >= max(MIN_CONTRAST_DN, MIN_CONTRAST_TO_NOISE * each.noise_dn)) & (
+            white < NEAR_SATURATION * full_scale
+        )
         usable = clear if usable is None else usable & clear
         relative.append({i: (frame - black) / contrast for i, frame in each.frames.items()})
         doubt.append(2**0.5 * each.noise_dn / contrast)
-    if usable is None or np.count_nonzero(usable) < _LEAST_COMPARED:
+    if usable is None or np.count_nonzero(usable) < _MIN_COMPARED_SAMPLES:
         return None
-    limit = np.maximum(_MOVED, 5 * np.hypot(*doubt))[usable]
+    limit = np.maximum(_MOVED_THRESHOLD, 5 * np.hypot(*doubt))[usable]
     for index in sorted(relative[0].keys() & relative[1].keys()):
         moved = float(np.mean(np.abs(relative[0][index] - relative[1][index])[usable] > limit))
-        if moved > _MOST_MOVED:
+        if moved > _MAX_MOVED_FRACTION:
             return (
-                f"{named(index, patterns[index])} looks otherwise at {after.exposure_s:g} s than at "
+                f"{describe_pattern(index, patterns[index])} looks otherwise at {after.exposure_s:g} s than at "
                 f"{before.exposure_s:g} s on {moved:.0%} of the pixels: the object, the projector or a camera moved "
                 "between the two exposures; hold them still, or ask for fewer exposures, and scan again"
             )
     return None
 
 
-def _first(exposed: ExposedSamples, patterns: Sequence[Pattern], kind: Pattern) -> Samples | None:
+def _first_samples(exposed: ExposureSamples, patterns: Sequence[Pattern], kind: Pattern) -> Samples | None:
     return next((exposed.frames[i] for i in sorted(exposed.frames) if patterns[i] == kind), None)
 
 
@@ -168,7 +170,7 @@ def check_exposures(recorded: Capture, refused: Sequence[Refused] = ()) -> Evide
     if all(len(exposures) <= 1 for exposures in of_camera.values()) or None in alike:
         return check_capture(recorded, refused)
     patterns, parts, faults = recorded.patterns, [], []
-    compared: dict[str, ExposedSamples] = {}
+    compared: dict[str, ExposureSamples] = {}
     for exposure_s in sorted({each for each in alike.values() if each is not None}):
         shots = tuple(replace(s, exposure_s=exposure_s) for s in recorded.shots if alike[s.exposure_s] == exposure_s)
         cameras = {name: form for name, form in recorded.cameras.items() if exposure_s in of_camera[name]}
@@ -178,9 +180,9 @@ def check_exposures(recorded: Capture, refused: Sequence[Refused] = ()) -> Evide
             sampler = Sampler.of(form.size)
             # Of a pattern that was taken twice the first counts, as it does in the check of each exposure.
             samples = {s.pattern: sampler.take(s.image) for s in reversed(shots) if s.camera == name}
-            exposed = ExposedSamples(exposure_s, samples, summary.noise_dn.get(name, NOISE_FLOOR_DN))
+            exposed = ExposureSamples(exposure_s, samples, summary.noise_dn.get(name, NOISE_FLOOR_DN))
             before = compared.get(name)
-            fault = None if before is None else movement_between(before, exposed, patterns, form.full_scale)
+            fault = None if before is None else detect_movement(before, exposed, patterns, form.full_scale)
             if fault is not None:
                 faults.append(f"camera '{name}', {fault}")
             compared[name] = exposed

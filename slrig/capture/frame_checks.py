@@ -16,11 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import Black, Gray, LineShift, Pattern, Primary, White
-from slrig.model.patterns import Integers, from_gray, gray_index, to_gray
+from slrig.model import Black, Gray, Integers, LineShift, Pattern, Primary, White, from_gray, gray_index, to_gray
 
 Samples = NDArray[np.float32]
-Chosen = NDArray[np.bool_]
+SampleMask = NDArray[np.bool_]
 
 BANDS = 12
 """Frames are judged as a whole and in this many horizontal bands: a transfer that broke off spoils rows."""
@@ -31,11 +30,11 @@ NOISE_FLOOR_DN = 0.3
 BAND_SAMPLES = 300
 """A band of fewer samples is not judged by itself."""
 
-_LIT_SAMPLES = 40
+_MIN_LIT_SAMPLES = 40
 
-NEARLY_FULL = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
+NEAR_SATURATION = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
 
-_ALIKE = 0.02
+_REPEAT_TOLERANCE = 0.02
 """Of a frame's own variation: lines that are blurred to three times their width differ by more from step to step."""
 
 
@@ -58,7 +57,7 @@ class Contradiction:
         return f"{self.where}: {self.cause}"
 
 
-def named(index: int, pattern: Pattern) -> str:
+def describe_pattern(index: int, pattern: Pattern) -> str:
     """Words for a pattern of a sequence.
 
     >>> from slrig.model import Axis
@@ -70,7 +69,7 @@ def named(index: int, pattern: Pattern) -> str:
         case White() | Black():
             words = pattern.kind
         case Primary():
-            words = pattern.words
+            words = pattern.description
         case Gray():
             words = f"{pattern.axis} Gray bit {pattern.bit} of {pattern.bits}{', inverse' if pattern.inverted else ''}"
         case LineShift():
@@ -78,9 +77,9 @@ def named(index: int, pattern: Pattern) -> str:
     return f"pattern {index} ({words})"
 
 
-def place(camera: str, index: int, pattern: Pattern) -> str:
+def describe_frame(camera: str, index: int, pattern: Pattern) -> str:
     """Words for a camera's frame of a pattern."""
-    return f"camera '{camera}', {named(index, pattern)}"
+    return f"camera '{camera}', {describe_pattern(index, pattern)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +94,7 @@ class Lighting:
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
+class ReferenceFrames:
     """One camera's opening white and black frames at the sampled pixels.
 
     contrast : white − black, at least 1. lit, judged : which pixels the projector reaches, and which are asked.
@@ -105,8 +104,8 @@ class Reference:
     white: Samples
     black: Samples
     contrast: Samples
-    lit: Chosen
-    judged: Chosen
+    lit: SampleMask
+    judged: SampleMask
     row: NDArray[np.intp]
     band: NDArray[np.intp]
 
@@ -115,7 +114,7 @@ class Reference:
         return np.asarray((frame - self.black)[self.judged] / self.contrast[self.judged])
 
 
-def lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np.intp]) -> Lighting | str:
+def measure_lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np.intp]) -> Lighting | str:
     """Compare white with black: what the projector lights, or what is wrong and what to do about it."""
     contrast = white - black
     high, low = float(np.percentile(contrast, 99.5)), -float(np.percentile(contrast, 0.5))
@@ -133,7 +132,7 @@ def lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np
             f"white is darker than black ({levels}): the projector shows its patterns inverted, or later than it "
             "says; set its input to normal polarity, check its latency, and scan again"
         )
-    darker = _darker(contrast, high, row)
+    darker = _find_darker_band(contrast, high, row)
     if darker is not None:
         return (
             f"white is darker than black on {darker}: one of the two frames was damaged in transfer, or the room's "
@@ -141,7 +140,7 @@ def lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np
         )
     threshold = max(2.0, 0.1 * high, 4 * noise)
     lit = contrast >= threshold
-    if np.count_nonzero(lit) < _LIT_SAMPLES:
+    if np.count_nonzero(lit) < _MIN_LIT_SAMPLES:
         if white.max() <= max(3.0, 0.02 * full_scale):
             remedy = "both are dark: is the lamp off, the lens cap on, or the exposure far too short?"
         else:
@@ -159,62 +158,62 @@ def lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np
     return Lighting(float(np.mean(lit)), threshold)
 
 
-def reference(
+def build_reference(
     white: Samples, black: Samples, *, threshold_dn: float, full_scale: int, row: NDArray[np.intp]
-) -> Reference:
+) -> ReferenceFrames:
     """Choose which of the sampled pixels are asked. At least one must be lit and not saturated."""
     contrast = white - black
     lit = contrast >= threshold_dn
     usable = lit & (white < full_scale)
     # Noise makes of a clipped sample one that is nearly full, and of half of its light more than half of it is seen.
-    clear = usable & (white < NEARLY_FULL * full_scale)
+    clear = usable & (white < NEAR_SATURATION * full_scale)
     if np.count_nonzero(clear) >= BAND_SAMPLES * BANDS:
         usable = clear
     judged = usable & (contrast >= np.median(contrast[usable]))
-    return Reference(white, black, np.maximum(contrast, np.float32(1)), lit, judged, row, _bands(row))
+    return ReferenceFrames(white, black, np.maximum(contrast, np.float32(1)), lit, judged, row, _assign_bands(row))
 
 
-def _bands(row: NDArray[np.intp]) -> NDArray[np.intp]:
+def _assign_bands(row: NDArray[np.intp]) -> NDArray[np.intp]:
     """Bands of equally many samples."""
     return np.searchsorted(np.quantile(row, np.arange(1, BANDS) / BANDS), row, side="right")
 
 
-def _darker(contrast: Samples, high: float, row: NDArray[np.intp]) -> str | None:
+def _find_darker_band(contrast: Samples, high: float, row: NDArray[np.intp]) -> str | None:
     """Words for a band in which white − black is far below zero, which no light can do."""
-    band = _bands(row)
+    band = _assign_bands(row)
     # Noise by the middle band: damage is not everywhere.
     lower = [float(np.percentile(contrast[band == b], 2.0)) for b in range(BANDS) if (band == b).any()]
     noise = max(0.0, -float(np.median(lower)) / 2.05)
     wrong = contrast < -max(3.0, 0.25 * high, 6 * noise)
-    return _worst(wrong, band, row, whole=0.05, quarter=0.1, of="pixels")
+    return _describe_worst(wrong, band, row, whole=0.05, quarter=0.1, of="pixels")
 
 
-def noise_dn(bit: Samples, inverse: Samples, ref: Reference, *, sums: Sequence[Samples] = ()) -> float:
+def pair_noise_dn(bit: Samples, inverse: Samples, ref: ReferenceFrames, *, sums: Sequence[Samples] = ()) -> float:
     """Noise of one frame, DN: bit + inverse − white − black is the noise of four.
 
     sums : of other pairs. The least that a difference from one of them tells counts, too: if white or black was
     damaged, the difference from these is that damage, and noise so large would hide all else.
     """
     pair = bit + inverse
-    return min(_noise_of_four((pair - other)[ref.judged]) for other in (ref.white + ref.black, *sums))
+    return min(_noise_from_four_frames((pair - other)[ref.judged]) for other in (ref.white + ref.black, *sums))
 
 
-def noise_of_bit(bit: Samples, ref: Reference) -> float:
+def bit_noise_dn(bit: Samples, ref: ReferenceFrames) -> float:
     """Noise of one frame, DN, by a bit that lights few edges: where it is lit it shows what white does, else black."""
     above, below = bit - ref.white, bit - ref.black
     nearer = np.where(np.abs(above) < np.abs(below), above, below)[ref.judged]
     # Of two frames; the square root of two less than what four would tell.
-    return max(NOISE_FLOOR_DN, _noise_of_four(nearer) * math.sqrt(2))
+    return max(NOISE_FLOOR_DN, _noise_from_four_frames(nearer) * math.sqrt(2))
 
 
-def _noise_of_four(rest: Samples) -> float:
+def _noise_from_four_frames(rest: Samples) -> float:
     # Whole numbers have a coarse median; spread over the interval that each stands for, they have a fine one.
     rest = rest + np.linspace(-0.5, 0.5, len(rest), dtype=np.float32)
     spread = 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
     return max(NOISE_FLOOR_DN, math.sqrt(max(spread**2 - 1 / 12, 0.0)) / 2)
 
 
-def range_fault(frame: Samples, ref: Reference, *, noise: float | None) -> str | None:
+def range_fault(frame: Samples, ref: ReferenceFrames, *, noise: float | None) -> str | None:
     """No pattern is darker than black or brighter than white: a frame that is was damaged on its way.
 
     Without a known noise, more is let pass.
@@ -222,30 +221,32 @@ def range_fault(frame: Samples, ref: Reference, *, noise: float | None) -> str |
     u = ref.relative(frame)
     slack = np.maximum(0.3, 6 * noise / ref.contrast[ref.judged]) if noise is not None else np.float32(0.6)
     outside = (u < -slack) | (u > 1 + slack)
-    worst = worst_judged(outside, ref, whole=0.05)
+    worst = describe_worst_tested(outside, ref, whole=0.05)
     if worst is None:
         return None
     return (
         f"{worst} lie outside the range between the black and the white frame: the frame was damaged in transfer, the "
-        f"room's light changed, the projector's light comes later than it says, or {contrast_words(ref)}; check the "
+        f"room's light changed, the projector's light comes later than it says, or {describe_contrast(ref)}; check the "
         "cable, the light and the projector's latency, and scan again"
     )
 
 
-def dimmed(frame: Samples, ref: Reference) -> bool:
+def is_partly_lit(frame: Samples, ref: ReferenceFrames) -> bool:
     """Whether a frame is neither as dark as black nor as bright as white, all in all."""
     u = ref.relative(frame)
     return bool(0.005 < np.average(u, weights=ref.contrast[ref.judged]) < 0.985)
 
 
-def variation(frame: Samples, ref: Reference) -> float:
+def variation(frame: Samples, ref: ReferenceFrames) -> float:
     """Mean square, DN², of what is left of a frame after its best fit by black + share · (white − black)."""
     contrast, seen = ref.contrast[ref.judged], (frame - ref.black)[ref.judged]
     share = float(np.dot(contrast, seen) / np.dot(contrast, contrast))
     return float(np.mean((seen - share * contrast) ** 2))
 
 
-def repeated(frame: Samples, earlier: Sequence[Samples], ref: Reference, *, noise: float, factor: float) -> int | None:
+def find_repeated(
+    frame: Samples, earlier: Sequence[Samples], ref: ReferenceFrames, *, noise: float, factor: float
+) -> int | None:
     """Index of an earlier frame from which this one differs by noise only.
 
     A frame may rightly equal another where the visible part of the pattern is constant: only one whose own variation
@@ -257,12 +258,12 @@ def repeated(frame: Samples, earlier: Sequence[Samples], ref: Reference, *, nois
     distance = [float(np.mean((here - other[ref.judged]) ** 2)) for other in earlier]
     nearest = int(np.argmin(distance))
     # The noise is that of bright pixels. A camera whose values are made for displays has several times as much in dark.
-    alike = max(6 * noise**2, _ALIKE * variation(frame, ref))
+    alike = max(6 * noise**2, _REPEAT_TOLERANCE * variation(frame, ref))
     return nearest if distance[nearest] < alike else None
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class FrameDrift:
     """How a pattern's second frame differs from its first.
 
     light : median of the difference over the white contrast; light_limit : how large it may be.
@@ -274,7 +275,7 @@ class Drift:
     moved: float
 
 
-def drift(first: Samples, again: Samples, ref: Reference, *, noise: float | None) -> Drift:
+def measure_drift(first: Samples, again: Samples, ref: ReferenceFrames, *, noise: float | None) -> FrameDrift:
     """Compare two frames of one pattern. Without a known noise, that of their difference is taken."""
     contrast, change = ref.contrast[ref.judged], (again - first)[ref.judged]
     light = float(np.median(change / contrast))
@@ -283,10 +284,10 @@ def drift(first: Samples, again: Samples, ref: Reference, *, noise: float | None
         noise = max(NOISE_FLOOR_DN, 1.4826 * float(np.median(rest)) / 2**0.5)
     moved = float(np.mean(rest > np.maximum(0.3 * contrast, 8 * noise)))
     # In the dark, the brighter half of the pixels are those that noise made bright: they come back darker.
-    return Drift(light, 0.1 + 1.5 * noise / float(np.median(contrast)), moved)
+    return FrameDrift(light, 0.1 + 1.5 * noise / float(np.median(contrast)), moved)
 
 
-def drift_fault(seen: Drift) -> str | None:
+def drift_fault(seen: FrameDrift) -> str | None:
     """Refuse light that changed by more than 10 % of white, and more than 5 % of pixels that changed otherwise."""
     if seen.moved > 0.05:
         return (
@@ -301,7 +302,7 @@ def drift_fault(seen: Drift) -> str | None:
     return None
 
 
-def changed_fault(
+def reference_change_fault(
     first: Samples,
     again: Samples,
     brighter: tuple[Samples, Samples],
@@ -324,7 +325,7 @@ def changed_fault(
     if noise is None:
         noise = max(NOISE_FLOOR_DN, 1.4826 * float(np.median(change)) / 2**0.5)
     wrong = change > np.maximum(0.3 * contrast[lit], 8 * noise)
-    where = _worst(wrong, _bands(row[lit]), row[lit], whole=0.05, quarter=0.15)
+    where = _describe_worst(wrong, _assign_bands(row[lit]), row[lit], whole=0.05, quarter=0.15)
     if where is None:
         return None
     return (
@@ -333,18 +334,20 @@ def changed_fault(
     )
 
 
-def worst_judged(wrong: Chosen, ref: Reference, *, whole: float, quarter: float = 0.25) -> str | None:
+def describe_worst_tested(
+    wrong: SampleMask, ref: ReferenceFrames, *, whole: float, quarter: float = 0.25
+) -> str | None:
     """Words for the share of judged pixels that are wrong: None below `whole` of all and below `quarter` of a band."""
-    return _worst(wrong, ref.band[ref.judged], ref.row[ref.judged], whole=whole, quarter=quarter)
+    return _describe_worst(wrong, ref.band[ref.judged], ref.row[ref.judged], whole=whole, quarter=quarter)
 
 
-def worst_of(wrong: Chosen, row: NDArray[np.intp], *, whole: float, quarter: float = 0.25) -> str | None:
-    """As `worst_judged`, of any lit pixels in these rows."""
-    return _worst(wrong, _bands(row), row, whole=whole, quarter=quarter)
+def describe_worst_lit(wrong: SampleMask, row: NDArray[np.intp], *, whole: float, quarter: float = 0.25) -> str | None:
+    """As `describe_worst_tested`, of any lit pixels in these rows."""
+    return _describe_worst(wrong, _assign_bands(row), row, whole=whole, quarter=quarter)
 
 
-def _worst(
-    wrong: Chosen,
+def _describe_worst(
+    wrong: SampleMask,
     band: NDArray[np.intp],
     row: NDArray[np.intp],
     *,
@@ -361,10 +364,10 @@ def _worst(
     shares[counts < BAND_SAMPLES // 4] = 0.0
     top = int(np.argmax(shares))
     inside = row[band == top]
-    return f"{shares[top]:.0%} of the {of} in {_rows(inside)}" if shares[top] > quarter else None
+    return f"{shares[top]:.0%} of the {of} in {_describe_rows(inside)}" if shares[top] > quarter else None
 
 
-def contrast_words(ref: Reference) -> str:
+def describe_contrast(ref: ReferenceFrames) -> str:
     """Words for the case that it is noise after all."""
     return (
         f"noise hides the pattern (white − black is {float(np.median(ref.contrast[ref.judged])):.0f} DN: if that is "
@@ -372,22 +375,22 @@ def contrast_words(ref: Reference) -> str:
     )
 
 
-def rows_of(ref: Reference, band: int) -> str:
+def describe_band(ref: ReferenceFrames, band: int) -> str:
     """Words for where a band lies."""
-    return _rows(ref.row[ref.band == band])
+    return _describe_rows(ref.row[ref.band == band])
 
 
-def _rows(row: NDArray[np.intp]) -> str:
+def _describe_rows(row: NDArray[np.intp]) -> str:
     return f"rows {row.min()} to {row.max()}"
 
 
 _EDGE_PX = 8.0
 """Breadth of an edge that a scaler blurred, projector pixels: from end to end of a Gaussian of 2 px, ± 2 deviations."""
 
-_EVEN = 0.08
+_EVEN_SPREAD = 0.08
 """Spread of what an even change of light leaves, by noise: damage and other patterns leave light and dark."""
 
-_ROUGHER, _ROUGH = 1.25, 0.15
+_ROUGHNESS_RATIO, _ROUGHNESS_MARGIN = 1.25, 0.15
 """Bytes that are anything differ from pixel to pixel by a third of the full scale on average. A projector that was
 found to dither differed by 0.18 of white where all was lit."""
 
@@ -397,61 +400,64 @@ _NOISE_ROUGHNESS = 1.5
 _STEEPEST_GAMMA = 2.4
 """Of displays: ITU-R BT.1886."""
 
-_CROSSINGS = 12  # pairs across an edge, for a median of their steps
-_SPAN_PERIODS = 3  # between the 5th and the 95th percentile of the positions
-_BAND_LINES = 4  # of a band: where it is used says why
+_MIN_CROSSINGS = 12  # pairs across an edge, for a median of their steps
+_MIN_SPAN_PERIODS = 3  # between the 5th and the 95th percentile of the positions
+_MIN_BAND_LINES = 4  # of a band: where it is used says why
 
-_LEAST_SUM_OFF = 0.25
+_LINE_SUM_TOLERANCE = 0.25
 """Of white: sums of line frames that differ by less are those of sharp lines on pixels as wide as theirs."""
 
-_LEAST_SUM_OFF_HALF = 0.08
+_HALF_LINE_SUM_TOLERANCE = 0.08
 """Of white, for lines of half their period: of twelve rendered scenes the sums of all differ by less."""
 
-_AS_MUCH_TO_BLAME = 0.1  # of the wrong pixels: frames that explain as many, less this
+_BLAME_MARGIN = 0.1  # of the wrong pixels: frames that explain as many, less this
 
-_FEW = 0.25  # of the pairs that come closer when two bits are exchanged back: those that come apart
-_MANY = 0.5  # of the pixels in what is wrong: a bit that explains fewer is not to blame alone
-_FEWEST_FOR_SHAPE = 5  # line frames: three tell a wave's place, height and level, and no more
-_LEAST_HEIGHT = 0.15  # of white over black; sharp lines have 0.64
+_MAX_WORSENED_FRACTION = 0.25  # of the pairs that come closer when two bits are exchanged back: those that come apart
+_MIN_EXPLAINED_FRACTION = 0.5  # of the pixels in what is wrong: a bit that explains fewer is not to blame alone
+_MIN_SHAPE_FRAMES = 5  # line frames: three tell a wave's place, height and level, and no more
+_MIN_WAVE_HEIGHT = 0.15  # of white over black; sharp lines have 0.64
 _SHAPE_BINS = 32
-_SHAPE_SPREADS, _LEAST_ODD = 6.0, 0.15  # of the wave's height, which half of a wave rises by
-_ODD, _ODD_IN_BAND = 0.05, 0.15  # of the judged pixels
-_NEAR_EDGE, _NEARER = 0.8, 0.2  # of white over black, by which a bit swings beside its edge, and less than another
-_SURE_OF_WAVE = 5.0  # standard deviations
-_LEAST_WAVE = 0.03  # of white over black, for each line; sharp lines have 0.32
-_LIT_BY_LINES = 0.1
-_LEAST_ENDS_OFF, _LEAST_ABOVE = 0.3, 0.15  # of what lines light of a pixel, from dark to bright
+_SHAPE_SPREADS, _MIN_SHAPE_TOLERANCE = 6.0, 0.15  # of the wave's height, which half of a wave rises by
+_MAX_ODD_FRACTION, _MAX_ODD_FRACTION_IN_BAND = 0.05, 0.15  # of the judged pixels
+_EDGE_SWING, _MIN_SWING_DIFFERENCE = (
+    0.8,
+    0.2,
+)  # of white over black, by which a bit swings beside its edge, and less than another
+_MIN_WAVE_SIGMAS = 5.0  # standard deviations
+_MIN_WAVE = 0.03  # of white over black, for each line; sharp lines have 0.32
+_MIN_LINE_LIGHT = 0.1
+_REFERENCE_LEVEL_TOLERANCE, _MIN_REFERENCE_MARGIN = 0.3, 0.15  # of what lines light of a pixel, from dark to bright
 
 
-def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float, run_px: int) -> str | None:
+def pair_fault(bit: Samples, inverse: Samples, ref: ReferenceFrames, *, noise: float, run_px: int) -> str | None:
     """Light is additive: a bit and its inverse add up to white and black.
 
     Limits leave room for noise; for a camera that is not linear, whose blurred edges add up to more than white; and for
     a projector behind a scaler. That blurs the pattern's values before gamma makes light of them, and then both frames
-    are dark at an edge. There a pair may fall short by as much as its own swing explains (`_least_sum`). How much of
+    are dark at an edge. There a pair may fall short by as much as its own swing explains (`_min_pair_sum`). How much of
     the image lies at edges follows from run_px, the length of the bit's runs of equal pixels in the projector.
     """
     u, v = ref.relative(bit), ref.relative(inverse)
     excess = u + v - 1
-    slack = np.clip(8 * max(noise, noise_dn(bit, inverse, ref)) / ref.contrast[ref.judged], 0.2, 0.5)
+    slack = np.clip(8 * max(noise, pair_noise_dn(bit, inverse, ref)) / ref.contrast[ref.judged], 0.2, 0.5)
     above = excess > 0.8
     at_edges = min(1.0, _EDGE_PX / run_px)
-    dark = _in_dark_bands(u, v, ref)
+    dark = _dark_band_mask(u, v, ref)
     for one, other in ((bit, inverse), (inverse, bit)):
-        rough = rougher(one, [other], ref, noise=noise)
+        rough = roughness_fault(one, [other], ref, noise=noise)
         if rough is not None:
             return rough
-    worst = worst_judged(above | dark | (u + v < _least_sum(np.abs(u - v)) - slack), ref, whole=0.1)
+    worst = describe_worst_tested(above | dark | (u + v < _min_pair_sum(np.abs(u - v)) - slack), ref, whole=0.1)
     if worst is None and at_edges < 1.0:
         wrong = above | (excess < -slack)
-        worst = worst_judged(wrong, ref, whole=0.1 + at_edges, quarter=0.25 + at_edges)
+        worst = describe_worst_tested(wrong, ref, whole=0.1 + at_edges, quarter=0.25 + at_edges)
     if worst is None:
         return None
     apart = float(np.median(np.abs((bit - inverse)[ref.judged]) / ref.contrast[ref.judged]))
     if apart < 0.25:
         return f"the frame and its inverse show the same on {worst}: one of them is stale; scan again"
     together = float(np.median(u + v))
-    if float(np.median(np.abs(u + v - together))) < _EVEN * together:
+    if float(np.median(np.abs(u + v - together))) < _EVEN_SPREAD * together:
         return (
             f"the frame and its inverse have {together:.0%} of the light of white and black, evenly on all of the "
             "image: the exposure or the lamp changed since: switch off automatic exposure and gain, dynamic contrast "
@@ -459,11 +465,11 @@ def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float, 
         )
     return (
         f"the frame and its inverse do not add up to white and black on {worst}: one of them shows another pattern or "
-        f"was damaged, or something moved, or {contrast_words(ref)}; scan again"
+        f"was damaged, or something moved, or {describe_contrast(ref)}; scan again"
     )
 
 
-def _in_dark_bands(u: Samples, v: Samples, ref: Reference) -> Chosen:
+def _dark_band_mask(u: Samples, v: Samples, ref: ReferenceFrames) -> SampleMask:
     """Which pixels lie in bands where one frame of a pair has hardly any light and the other does not make up for it.
 
     What a scaler takes from the edges it takes from both.
@@ -480,7 +486,7 @@ _SWING = _SIGNAL**_STEEPEST_GAMMA - (1 - _SIGNAL) ** _STEEPEST_GAMMA
 _SUM = _SIGNAL**_STEEPEST_GAMMA + (1 - _SIGNAL) ** _STEEPEST_GAMMA
 
 
-def _least_sum(swing: Samples) -> Samples:
+def _min_pair_sum(swing: Samples) -> Samples:
     """What a bit and its inverse add up to, at least, where they differ by `swing`; all on the scale of `u`.
 
     A blurred bit has the value s where its inverse has 1 - s: they differ by s^g - (1 - s)^g and add up to
@@ -489,7 +495,7 @@ def _least_sum(swing: Samples) -> Samples:
     return np.asarray(np.interp(swing, _SWING, _SUM), dtype=np.float32)
 
 
-def rougher(frame: Samples, others: Sequence[Samples], ref: Reference, *, noise: float) -> str | None:
+def roughness_fault(frame: Samples, others: Sequence[Samples], ref: ReferenceFrames, *, noise: float) -> str | None:
     """Words for a band in which a frame is rougher than frames of patterns as fine as its own: it was damaged there.
 
     Roughness is the mean difference of pixels that lie beside each other. A bit and its inverse have the same, and so
@@ -499,18 +505,18 @@ def rougher(frame: Samples, others: Sequence[Samples], ref: Reference, *, noise:
     here, light = _roughness(frame, ref)
     usual = np.median([_roughness(each, ref)[0] for each in others], axis=0)
     hidden = _NOISE_ROUGHNESS * noise / float(np.median(ref.contrast[ref.judged]))
-    over = here - _ROUGHER * usual - _ROUGH * (1 + np.clip(light, 0, 1)) - hidden
+    over = here - _ROUGHNESS_RATIO * usual - _ROUGHNESS_MARGIN * (1 + np.clip(light, 0, 1)) - hidden
     worst = int(np.nanargmax(np.append(over, 0.0)))
     if worst == BANDS:
         return None
     return (
-        f"in {rows_of(ref, worst)} pixels beside each other differ by {here[worst]:.0%} of white, and by "
+        f"in {describe_band(ref, worst)} pixels beside each other differ by {here[worst]:.0%} of white, and by "
         f"{usual[worst]:.0%} in frames of patterns as fine: the frame was damaged in transfer; check the cable, and "
         "scan again"
     )
 
 
-def _roughness(frame: Samples, ref: Reference) -> tuple[Samples, Samples]:
+def _roughness(frame: Samples, ref: ReferenceFrames) -> tuple[Samples, Samples]:
     """(BANDS,) float32 each: the mean difference of pixels beside each other, and the mean light, NaN where few are
     judged.
     """
@@ -527,25 +533,25 @@ def _roughness(frame: Samples, ref: Reference) -> tuple[Samples, Samples]:
 
 
 @dataclass(frozen=True, slots=True)
-class Code:
+class DecodedCode:
     """Gray code read at the sampled pixels. index : (n,) int64, cell index; sure : every bit is beyond doubt;
     differences : (bits, n), of each bit from its inverse.
     """
 
     index: Integers
-    sure: Chosen
+    certain: SampleMask
     bits: int
     differences: Samples
 
 
-def read_code(differences: Sequence[Samples], ref: Reference) -> Code:
+def decode_samples(differences: Sequence[Samples], ref: ReferenceFrames) -> DecodedCode:
     """Decode: one vector bit − inverse (or 2·bit − white − black) per bit, most significant first."""
     stack = np.stack(differences)
     sure = ref.lit & (np.abs(stack) > 0.2 * ref.contrast).all(axis=0)
-    return Code(gray_index(stack > 0), sure, len(stack), stack)
+    return DecodedCode(gray_index(stack > 0), sure, len(stack), stack)
 
 
-def swapped_bit(code: Code) -> int | None:
+def find_inverted_bit(code: DecodedCode) -> int | None:
     """Which bit was exchanged with its inverse, told from where more significant bits change.
 
     The first half of the sampled pixels lie beside the second half. Two pixels beside each other have close indices,
@@ -555,7 +561,7 @@ def swapped_bit(code: Code) -> int | None:
     frames show these (`line_fault`).
     """
     here, beside = code.index.reshape(2, -1)
-    sure = code.sure.reshape(2, -1).all(axis=0)
+    sure = code.certain.reshape(2, -1).all(axis=0)
     if not sure.any():
         return None
     here, beside = here[sure], beside[sure]
@@ -564,7 +570,7 @@ def swapped_bit(code: Code) -> int | None:
     for coarse in range(code.bits - 1):
         # Pairs whose most significant difference is this bit.
         crossing = words >> (code.bits - 1 - coarse) == 1
-        if np.count_nonzero(crossing) < _CROSSINGS:
+        if np.count_nonzero(crossing) < _MIN_CROSSINGS:
             continue
         a, b = here[crossing], beside[crossing]
         if np.median(np.abs(a - b)) <= 4 * step:
@@ -587,27 +593,27 @@ class LineExpectation:
     position: Samples
     light: Samples
 
-    def tells(self, where: Chosen) -> bool:
+    def is_testable(self, where: SampleMask) -> bool:
         """Whether these pixels, all of them sure, are enough of them and see several lines."""
         if np.count_nonzero(where) < BAND_SAMPLES:
             return False
         near, far = np.percentile(self.position[where], (5, 95))
         # A line that straddles two cells of half a period lights all cells alike.
-        return bool(far - near >= _SPAN_PERIODS and np.ptp(self.light[where]) > 0)
+        return bool(far - near >= _MIN_SPAN_PERIODS and np.ptp(self.light[where]) > 0)
 
-    def lines(self, where: Chosen) -> int:
+    def lines(self, where: SampleMask) -> int:
         """How many periods these pixels, all of them sure, lie in."""
         return len(np.unique(np.floor(self.position[where])))
 
 
-def exchanged_bits(code: Code) -> tuple[int, int] | None:
+def find_exchanged_bits(code: DecodedCode) -> tuple[int, int] | None:
     """Which two bits stand in each other's place, told from pixels beside each other: these have close indices.
 
     Exchanged back, indices come closer at many pairs, and apart at few. What this cannot see: an exchange of bits of
     which neither changes over what is lit.
     """
     here, beside = code.index.reshape(2, -1)
-    sure = code.sure.reshape(2, -1).all(axis=0)
+    sure = code.certain.reshape(2, -1).all(axis=0)
     sure &= here != beside
     words = [to_gray(each[sure]) for each in (here, beside)]
     apart = np.abs(here - beside)[sure]
@@ -616,42 +622,42 @@ def exchanged_bits(code: Code) -> tuple[int, int] | None:
     for one in range(code.bits):
         for other in range(one + 1, code.bits):
             first, second = code.bits - 1 - one, code.bits - 1 - other
-            a, b = (index_of[_exchanged(word, first, second)] for word in words)
+            a, b = (index_of[_exchange_bits(word, first, second)] for word in words)
             change = np.abs(a - b) - apart
             nearer = np.count_nonzero(change < 0)
-            if nearer >= _CROSSINGS and np.count_nonzero(change > 0) < _FEW * nearer:
+            if nearer >= _MIN_CROSSINGS and np.count_nonzero(change > 0) < _MAX_WORSENED_FRACTION * nearer:
                 return one, other
     return None
 
 
-def _exchanged(word: Integers, first: int, second: int) -> Integers:
+def _exchange_bits(word: Integers, first: int, second: int) -> Integers:
     """Words with two of their bits, counted from the least significant one, in each other's place."""
     unlike = ((word >> first) ^ (word >> second)) & 1
     return np.asarray(word ^ (unlike << first) ^ (unlike << second))
 
 
 @dataclass(frozen=True, slots=True)
-class Agreement:
+class LineAgreement:
     """What lines say of the code at the sampled pixels.
 
     told : (n,) where they say anything; wrong : (n,) where they contradict the code. reversed : whether lines run
     through the cells against the code, as if they came in the opposite order.
     """
 
-    told: Chosen
-    wrong: Chosen
+    told: SampleMask
+    wrong: SampleMask
     reversed: bool
 
 
-def agreement(
-    code: Code,
+def compare_with_lines(
+    code: DecodedCode,
     lines: Sequence[tuple[LineShift, Samples]],
-    ref: Reference,
+    ref: ReferenceFrames,
     *,
     cell_px: int,
     offset_px: int,
     noise: float,
-) -> Agreement:
+) -> LineAgreement:
     """Compare the phase of the lines at each pixel with the cell that the code gives.
 
     A single wrong bit, whichever it is, moves the index by an odd number of cells, and half a period where a cell is as
@@ -662,27 +668,27 @@ def agreement(
     period_px, count = lines[0][0].period_px, len(lines)
     turn = 2j * np.pi / period_px
     waves = np.sum([frame * np.exp(turn * line.centre_px) for line, frame in lines], axis=0)
-    clear = np.abs(waves) > np.maximum(_SURE_OF_WAVE * noise * (count / 2) ** 0.5, _LEAST_WAVE * count * ref.contrast)
+    clear = np.abs(waves) > np.maximum(_MIN_WAVE_SIGMAS * noise * (count / 2) ** 0.5, _MIN_WAVE * count * ref.contrast)
     centre_px = cell_px * code.index - offset_px + (cell_px - 1) / 2
     off_px = (np.angle(waves) / abs(turn) - centre_px + period_px / 2) % period_px - period_px / 2
-    told = code.sure & clear
+    told = code.certain & clear
     wrong = told & (np.abs(off_px) > cell_px / 2 + period_px / 16)
     # The bit that changes at an edge of the cell swings least beside it: so it shows which edge a pixel is nearer to.
     swing = np.abs(code.differences) / ref.contrast
     before, after = (swing[_changing_bit(code, step), np.arange(len(code.index))] for step in (-1, 1))
-    beside = told & (np.minimum(before, after) < _NEAR_EDGE) & (np.abs(before - after) > _NEARER)
+    beside = told & (np.minimum(before, after) < _EDGE_SWING) & (np.abs(before - after) > _MIN_SWING_DIFFERENCE)
     against = (before < after) != (off_px < 0)
-    turned = np.count_nonzero(beside) >= BAND_SAMPLES and np.mean(against[beside]) > _MANY
-    return Agreement(told, wrong, bool(turned))
+    turned = np.count_nonzero(beside) >= BAND_SAMPLES and np.mean(against[beside]) > _MIN_EXPLAINED_FRACTION
+    return LineAgreement(told, wrong, bool(turned))
 
 
-def _changing_bit(code: Code, step: int) -> Integers:
+def _changing_bit(code: DecodedCode, step: int) -> Integers:
     """(n,) which bit, the most significant one first, differs between each cell and the one before or after it."""
     changed = to_gray(code.index) ^ to_gray(np.clip(code.index + step, 0, 2**code.bits - 1))
     return np.asarray(code.bits - 1 - np.log2(np.maximum(changed, 1)).astype(np.int64))
 
 
-def blamed_bits(code: Code, wrong: Chosen) -> tuple[int, ...]:
+def find_faulty_bits(code: DecodedCode, wrong: SampleMask) -> tuple[int, ...]:
     """Which bits are to blame where lines contradict the code: those that, turned over there, bring pixels beside each
     other as close as they are elsewhere; all of them where none does.
 
@@ -690,10 +696,10 @@ def blamed_bits(code: Code, wrong: Chosen) -> tuple[int, ...]:
     """
     here, beside = code.index.reshape(2, -1)
     wrong_here, wrong_beside = wrong.reshape(2, -1)
-    crossing = code.sure.reshape(2, -1).all(axis=0) & (here != beside)
+    crossing = code.certain.reshape(2, -1).all(axis=0) & (here != beside)
     doubted = crossing & (wrong_here | wrong_beside)
     every = tuple(range(code.bits))
-    if np.count_nonzero(doubted) < _CROSSINGS:
+    if np.count_nonzero(doubted) < _MIN_CROSSINGS:
         return every
     sound = np.abs(here - beside)[crossing & ~doubted]
     close = max(1.0, float(np.percentile(sound, 90))) if len(sound) else 1.0
@@ -703,10 +709,12 @@ def blamed_bits(code: Code, wrong: Chosen) -> tuple[int, ...]:
         a, b = here ^ (mirror * wrong_here), beside ^ (mirror * wrong_beside)
         closed.append(float(np.mean(np.abs(a - b)[doubted] <= close)))
     most = max(closed)
-    return tuple(bit for bit in every if closed[bit] >= most - _AS_MUCH_TO_BLAME) if most >= _MANY else every
+    return (
+        tuple(bit for bit in every if closed[bit] >= most - _BLAME_MARGIN) if most >= _MIN_EXPLAINED_FRACTION else every
+    )
 
 
-def ends_fault(
+def reference_level_fault(
     white: Samples, black: Samples, lines: Sequence[Samples], *, threshold_dn: float, full_scale: int,
     row: NDArray[np.intp],
 ) -> str | None:  # fmt: skip
@@ -725,19 +733,21 @@ def ends_fault(
         second = np.sort(stack, axis=0)[[1, -2]]
         reach = second[1] - second[0]
     # What is clipped adds up to less.
-    clear = stack.max(axis=0) < NEARLY_FULL * full_scale
-    clipped = white >= NEARLY_FULL * full_scale
-    lit = clear & (reach >= max(threshold_dn, _LIT_BY_LINES * float(np.percentile(reach, 99))))
+    clear = stack.max(axis=0) < NEAR_SATURATION * full_scale
+    clipped = white >= NEAR_SATURATION * full_scale
+    lit = clear & (reach >= max(threshold_dn, _MIN_LINE_LIGHT * float(np.percentile(reach, 99))))
     told = ~clipped[lit]
     if np.count_nonzero(told) < BAND_SAMPLES:
         return None
     off = ((white + black - 2 * average) / np.maximum(reach, 1))[lit]
     usual = float(np.median(off[told]))
-    slack = max(_LEAST_ENDS_OFF, 6 * 1.4826 * float(np.median(np.abs(off - usual)[told])))
+    slack = max(_REFERENCE_LEVEL_TOLERANCE, 6 * 1.4826 * float(np.median(np.abs(off - usual)[told])))
     # A white that is clipped is less than the lines foresee, never more.
     off[~told] = np.maximum(off[~told], usual)
-    wrong = (np.abs(off - usual) > slack) | (np.minimum(white - average, average - black) < _LEAST_ABOVE * reach)[lit]
-    where = worst_of(wrong, row[lit], whole=0.05, quarter=0.1)
+    wrong = (np.abs(off - usual) > slack) | (
+        np.minimum(white - average, average - black) < _MIN_REFERENCE_MARGIN * reach
+    )[lit]
+    where = describe_worst_lit(wrong, row[lit], whole=0.05, quarter=0.1)
     if where is None:
         return None
     return (
@@ -746,8 +756,8 @@ def ends_fault(
     )
 
 
-def expect_lines(
-    code: Code, ref: Reference, *, cell_px: int, offset_px: int, shift: int, period_px: int, width_px: int
+def predict_lines(
+    code: DecodedCode, ref: ReferenceFrames, *, cell_px: int, offset_px: int, shift: int, period_px: int, width_px: int
 ) -> LineExpectation:
     """Turn decoded cells into the light of one line frame."""
     first_px = cell_px * code.index - offset_px
@@ -755,12 +765,18 @@ def expect_lines(
     lit = (first_px + inside_px - shift) % period_px < width_px
     light = (np.count_nonzero(lit, axis=0) / cell_px).astype(np.float32)
     position = (first_px / period_px).astype(np.float32)
-    position[~(code.sure & ref.judged)] = np.nan
+    position[~(code.certain & ref.judged)] = np.nan
     return LineExpectation(position, light)
 
 
 def line_fault(
-    frame: Samples, others: Sequence[Samples], ref: Reference, expected: LineExpectation, *, noise: float, duty: float
+    frame: Samples,
+    others: Sequence[Samples],
+    ref: ReferenceFrames,
+    expected: LineExpectation,
+    *,
+    noise: float,
+    duty: float,
 ) -> tuple[bool, str | None]:
     """Compare a line frame with the Gray code and with the line frames before it.
 
@@ -770,21 +786,21 @@ def line_fault(
     duty : line width over period, the share of white that a line frame holds.
     """
     asked = ~np.isnan(expected.position)
-    if not expected.tells(asked):
+    if not expected.is_testable(asked):
         return False, None
-    share = _share(frame, ref, ref.judged)
+    share = _light_fraction(frame, ref, ref.judged)
     if share < 0.05 * duty:  # a soft scaler leaves a fifth of a narrow line, and less
         return (
             True,
             f"the frame holds {share:.1%} of white's light, lines should hold {duty:.1%}: it is dark; scan again",
         )
-    typical = float(np.median([_share(other, ref, ref.judged) for other in others])) if others else share
+    typical = float(np.median([_light_fraction(other, ref, ref.judged) for other in others])) if others else share
     if not 0.4 * typical < share < 2.5 * typical:
         return True, (
             f"the frame holds {share:.1%} of white's light, the other line frames {typical:.1%}: it shows another "
             "pattern or was damaged; scan again"
         )
-    rough = rougher(frame, others, ref, noise=noise) if others else None
+    rough = roughness_fault(frame, others, ref, noise=noise) if others else None
     if rough is not None:
         return True, rough
     # Lines that noise or blur hides cannot be judged. Sharp ones would vary by duty · (1 − duty).
@@ -802,21 +818,21 @@ def line_fault(
         inside = asked & (ref.band == band)
         # A line at the border of its cell lights the next one nearly as much. Which of the two gets more goes by where
         # pixels happen to lie, and only over several lines is it that of the whole frame.
-        if not expected.tells(inside) or expected.lines(inside) < _BAND_LINES:
+        if not expected.is_testable(inside) or expected.lines(inside) < _MIN_BAND_LINES:
             continue
         here = _correlation(frame, ref, expected.light, inside)
         # Half of the samples lie beside the others and say little more than these.
         chance = 5 * (2 / np.count_nonzero(inside)) ** 0.5
         if here < 0.35 * agreement and here < agreement - chance:
             return True, (
-                f"in {rows_of(ref, band)} its lines are not where the Gray code says: the frame was damaged in "
+                f"in {describe_band(ref, band)} its lines are not where the Gray code says: the frame was damaged in "
                 "transfer; check the cable, and scan again"
             )
     return True, None
 
 
-def line_sum(
-    frames: Sequence[Samples], ref: Reference, *, noise: float, half: bool = False
+def line_sum_fault(
+    frames: Sequence[Samples], ref: ReferenceFrames, *, noise: float, half: bool = False
 ) -> tuple[tuple[int, ...], str] | None:
     """Judge the sum of the n line frames of one axis, given by shift: those to blame and what is wrong, or None.
 
@@ -830,24 +846,24 @@ def line_sum(
     off = total - np.median(total)
     spread = 1.4826 * float(np.median(np.abs(off)))
     slack = np.maximum(
-        max(_LEAST_SUM_OFF_HALF if half else _LEAST_SUM_OFF, 6 * spread),
+        max(_HALF_LINE_SUM_TOLERANCE if half else _LINE_SUM_TOLERANCE, 6 * spread),
         8 * noise * len(frames) ** 0.5 / ref.contrast[ref.judged],
     )
     wrong = np.abs(off) > slack
-    where = worst_judged(wrong, ref, whole=0.1, quarter=0.15)
+    where = describe_worst_tested(wrong, ref, whole=0.1, quarter=0.15)
     if where is None:
         return None
     without = (light - off)[:, wrong]
     outside = np.mean((without < -slack[wrong]) | (without > 1 + slack[wrong]), axis=1)
-    blamed = tuple(int(each) for each in np.flatnonzero(outside <= outside.min() + _AS_MUCH_TO_BLAME))
+    blamed = tuple(int(each) for each in np.flatnonzero(outside <= outside.min() + _BLAME_MARGIN))
     return blamed, (
         f"on {where} the line frames do not add up to what they do elsewhere: one of them was damaged in transfer or "
         "shows another pattern, or something moved; check the cable, and scan again"
     )
 
 
-def line_shape(
-    lines: Sequence[LineShift], frames: Sequence[Samples], ref: Reference, *, noise: float
+def line_shape_fault(
+    lines: Sequence[LineShift], frames: Sequence[Samples], ref: ReferenceFrames, *, noise: float
 ) -> tuple[int, str] | None:
     """Judge each line frame by the others: (which one shows something else, what is wrong), or None.
 
@@ -857,30 +873,31 @@ def line_shape(
     lines, frames : by shift, of one axis; the shifts divide the period evenly.
     """
     count = len(frames)
-    if count < _FEWEST_FOR_SHAPE:
+    if count < _MIN_SHAPE_FRAMES:
         return None
     light = np.stack([ref.relative(frame) for frame in frames])
     shifts = np.exp(2j * np.pi / lines[0].period_px * np.array([line.centre_px for line in lines]))
     wave = shifts @ light * (2 / count)
     height = np.abs(wave)
-    clear = height > _LEAST_HEIGHT
+    clear = height > _MIN_WAVE_HEIGHT
     if np.count_nonzero(clear) < BAND_SAMPLES:
         return None
     around = np.angle(wave / shifts[:, np.newaxis]) / (2 * np.pi) % 1
     bins = np.minimum((around * _SHAPE_BINS).astype(np.intp), _SHAPE_BINS - 1)
-    swing = (light - light.mean(axis=0)) / np.maximum(height, _LEAST_HEIGHT)
+    swing = (light - light.mean(axis=0)) / np.maximum(height, _MIN_WAVE_HEIGHT)
     every = np.arange(_SHAPE_BINS)
-    shape = np.array([_median_of(swing[(bins == each) & clear]) for each in every])
+    shape = np.array([_median_or_zero(swing[(bins == each) & clear]) for each in every])
     off = swing - shape[bins]
     # Within its bin an edge rises, and edges that are sharp differ by how pixels lie on them.
     rise = np.abs(np.roll(shape, -1) - np.roll(shape, 1))[bins] / 2
-    spread = 1.4826 * np.array([_median_of(np.abs(off[(bins == each) & clear])) for each in every])[bins]
+    spread = 1.4826 * np.array([_median_or_zero(np.abs(off[(bins == each) & clear])) for each in every])[bins]
     slack = np.maximum(
-        np.maximum(_LEAST_ODD + rise, _SHAPE_SPREADS * spread), 5 * noise / (ref.contrast[ref.judged] * height + 1e-6)
+        np.maximum(_MIN_SHAPE_TOLERANCE + rise, _SHAPE_SPREADS * spread),
+        5 * noise / (ref.contrast[ref.judged] * height + 1e-6),
     )
     wrong = (np.abs(off) > slack) & clear
     worst = int(np.argmax(np.count_nonzero(wrong, axis=1)))
-    where = worst_judged(wrong[worst], ref, whole=_ODD, quarter=_ODD_IN_BAND)
+    where = describe_worst_tested(wrong[worst], ref, whole=_MAX_ODD_FRACTION, quarter=_MAX_ODD_FRACTION_IN_BAND)
     if where is None:
         return None
     return worst, (
@@ -889,11 +906,11 @@ def line_shape(
     )
 
 
-def _median_of(values: Samples) -> float:
+def _median_or_zero(values: Samples) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
-def line_order(frames: Sequence[Samples], ref: Reference, *, noise: float) -> tuple[bool, int | None]:
+def check_line_order(frames: Sequence[Samples], ref: ReferenceFrames, *, noise: float) -> tuple[bool, int | None]:
     """Judge the order of the n line frames of one axis, given by shift: (whether it shows, the first one out of place).
 
     Blurred lines overlap those of the next frame more than those of the one after it. Where lines are too sharp, or
@@ -915,11 +932,11 @@ def line_order(frames: Sequence[Samples], ref: Reference, *, noise: float) -> tu
     return bool(lead.min() > margin), None
 
 
-def _share(frame: Samples, ref: Reference, where: Chosen) -> float:
+def _light_fraction(frame: Samples, ref: ReferenceFrames, where: SampleMask) -> float:
     return float(np.sum((frame - ref.black)[where]) / np.sum(ref.contrast[where]))
 
 
-def _correlation(frame: Samples, ref: Reference, light: Samples, where: Chosen) -> float:
+def _correlation(frame: Samples, ref: ReferenceFrames, light: Samples, where: SampleMask) -> float:
     seen = (frame - ref.black)[where]
     rest = seen - np.sum(seen) / np.sum(ref.contrast[where]) * ref.contrast[where]
     wanted = light[where] - np.mean(light[where])

@@ -15,20 +15,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.devices import Camera, CameraSettings, Rig, Shown, Synchronisation, Trigger
+from slrig.devices import Camera, CameraSettings, DisplayedPattern, Rig, Synchronisation, Trigger
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import Black, FloatArray, Frame, PatternSequence, Pixels, Size, White
 
-FEWEST_FLASHES = 8
-STEADY = 0.02
+MIN_FLASHES = 8
+STEADY_TOLERANCE = 0.02
 """Light counts as steady when no more of the row's way from black to white is missing than this."""
 
-_FEWEST_PIXELS = 4  # usable ones of a row, for its mean
-_FEWEST_ROWS = 8  # of a camera, and of one flash
-_NOISIEST_SHARE = 0.05  # standard deviation of a row's share, 1 is white less black
+_MIN_ROW_PIXELS = 4  # usable ones of a row, for its mean
+_MIN_ROWS = 8  # of a camera, and of one flash
+_MAX_ROW_NOISE = 0.05  # standard deviation of a row's share, 1 is white less black
 _STAMP_NOISE_S = 2e-5  # standard deviation that time stamps are taken to have
-_LEAST_SKEW_S = 1e-4  # of a whole shutter that counts as rolling
-_ONE_SIDED = 0.999  # level of the t test for a line time
+_MIN_SKEW_S = 1e-4  # of a whole shutter that counts as rolling
+_T_TEST_LEVEL = 0.999  # level of the t test for a line time
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class RowLevels:
 
 
 @dataclass(frozen=True, slots=True)
-class Flash:
+class LightChange:
     """One change of light, to white or to black, and the n frames around it in the order of their exposure.
 
     since_s : (n,) float64, the start of each frame's first row, from the instant that the projector stated.
@@ -70,7 +70,9 @@ class Flash:
     passed: FloatArray
 
     @classmethod
-    def of(cls, to_white: bool, shown: Shown, frames: Sequence[tuple[int, float, FloatArray]]) -> Flash:
+    def of(
+        cls, to_white: bool, shown: DisplayedPattern, frames: Sequence[tuple[int, float, FloatArray]]
+    ) -> LightChange:
         """Of each frame: t_start_ns, exposure_s, and the `RowLevels.shares` of its rows."""
         since_s = np.array([(t_start_ns - shown.t_visible_ns) / 1e9 for t_start_ns, _, _ in frames])
         shares = np.array([shares for _, _, shares in frames])
@@ -78,7 +80,7 @@ class Flash:
 
 
 @dataclass(frozen=True, slots=True)
-class FlashRows:
+class TransitionRows:
     """The rows of one flash that were exposed while the light changed, one element each.
 
     row, passed, y_s : (n,) float64, the equation y = L - ℓ·row. weight : (n,) float64, 1/s².
@@ -159,19 +161,19 @@ def row_levels(camera: str, black: Sequence[Pixels], white: Sequence[Pixels], *,
     contrast = np.where(usable, span, 0).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         noise = np.sqrt(np.where(usable, variances, 0).sum(axis=2)) / contrast
-        known = (usable.sum(axis=1) >= _FEWEST_PIXELS) & (noise.max(axis=0) <= _NOISIEST_SHARE)
+        known = (usable.sum(axis=1) >= _MIN_ROW_PIXELS) & (noise.max(axis=0) <= _MAX_ROW_NOISE)
         weight = np.where(known[:, None], usable / contrast[:, None], np.nan)
-    if known.sum() < _FEWEST_ROWS:
+    if known.sum() < _MIN_ROWS:
         raise ScanEvidenceError(
             f"camera '{camera}': only {known.sum()} of {len(known)} rows tell white from black well enough to time a "
-            f"flash, {_FEWEST_ROWS} are needed; expose longer, or aim the camera at the projected picture"
+            f"flash, {_MIN_ROWS} are needed; expose longer, or aim the camera at the projected picture"
         )
     shares = np.array([((image - mean) * weight).sum(axis=1) for image in bright])[:, known]
     flicker = float(np.sqrt(max(np.mean(shares.var(axis=0, ddof=1) - noise[1, known] ** 2), 0.0)))
     return RowLevels(mean, weight, np.where(known, noise, np.nan), flicker)
 
 
-def rows_of(flash: Flash, levels: RowLevels) -> FlashRows | None:
+def find_transition_rows(flash: LightChange, levels: RowLevels) -> TransitionRows | None:
     """Return the rows that were exposed while the light changed, None where there are too few to go by.
 
     A row counts when it was neither black nor white, old light in the frame before, and new light in the frame after.
@@ -181,12 +183,12 @@ def rows_of(flash: Flash, levels: RowLevels) -> FlashRows | None:
     after = np.vstack([passed[1:], np.full_like(passed[:1], np.nan)])
     part = (passed > margin) & (passed < 1 - margin) & (before < margin) & (after > 1 - margin)
     frames, rows = np.nonzero(part)
-    if len(rows) < _FEWEST_ROWS:
+    if len(rows) < _MIN_ROWS:
         return None
     share, exposure_s = passed[frames, rows], flash.exposures_s[frames]
     white = share if flash.to_white else 1 - share
     variance = (1 - white) * levels.noise[0, rows] ** 2 + white * levels.noise[1, rows] ** 2
-    return FlashRows(
+    return TransitionRows(
         rows.astype(np.float64),
         share,
         flash.since_s[frames] + exposure_s * (1 - share),
@@ -194,21 +196,21 @@ def rows_of(flash: Flash, levels: RowLevels) -> FlashRows | None:
     )
 
 
-def fitted(camera: str, flashes: Sequence[Flash], levels: RowLevels) -> CameraLatency:
+def fit_latency(camera: str, flashes: Sequence[LightChange], levels: RowLevels) -> CameraLatency:
     """Return what the flashes tell: see the module.
     Raises ScanEvidenceError: too few flashes were seen while they happened.
     """
     # Here: it takes a tenth of a service's start to load, and few processes of those that capture measure a latency.
     from scipy.special import stdtrit
 
-    found = [(flash, rows) for flash in flashes if (rows := rows_of(flash, levels)) is not None]
-    if len(found) < FEWEST_FLASHES:
-        raise ScanEvidenceError(_missed(camera, flashes, len(found)))
+    found = [(flash, rows) for flash in flashes if (rows := find_transition_rows(flash, levels)) is not None]
+    if len(found) < MIN_FLASHES:
+        raise ScanEvidenceError(_too_few_flashes_message(camera, flashes, len(found)))
     used, rows_of_each = [flash for flash, _ in found], [rows for _, rows in found]
     line_time_s, error_s = _line_time(rows_of_each)
     last_row = len(levels.black_dn) - 1
-    threshold_s = float(stdtrit(len(found) - 1, _ONE_SIDED)) * error_s
-    significant = abs(line_time_s) > threshold_s and abs(line_time_s) * last_row > _LEAST_SKEW_S
+    threshold_s = float(stdtrit(len(found) - 1, _T_TEST_LEVEL)) * error_s
+    significant = abs(line_time_s) > threshold_s and abs(line_time_s) * last_row > _MIN_SKEW_S
     slope_s = line_time_s if significant else 0.0
     latencies = np.array([rows.latency_s(slope_s) for rows in rows_of_each])
     rising = np.array([flash.to_white for flash in used])
@@ -216,11 +218,11 @@ def fitted(camera: str, flashes: Sequence[Flash], levels: RowLevels) -> CameraLa
         [rows.y_s - lag + slope_s * rows.row for rows, lag in zip(rows_of_each, latencies, strict=True)]
     )
     kinds = [latencies[which] for which in (rising, ~rising) if which.any()]
-    end_s = max(_end(each) for each in kinds)
+    end_s = max(_upper_bound(each) for each in kinds)
     # A flash that was not seen as it happened has frames right after it all the same: at the latest, it came then.
     known = {id(flash): float(lag) for flash, lag in zip(used, latencies, strict=True)}
     changed_s = [known.get(id(flash), end_s) for flash in flashes]
-    settle_s = _settle_s(flashes, changed_s, slope_s, levels.flicker)
+    settle_s = _settling_time_s(flashes, changed_s, slope_s, levels.flicker)
     scanned_s = max(-slope_s, 0.0) * last_row
     jitter_s = float(latencies.std(ddof=1))
     return CameraLatency(
@@ -233,7 +235,7 @@ def fitted(camera: str, flashes: Sequence[Flash], levels: RowLevels) -> CameraLa
         settle_s=settle_s,
         latest_s=end_s + settle_s + scanned_s,
         # The instant of a change is the centroid of its light: it begins before it by no more than it goes on after it.
-        earliest_s=-max(_end(-each) for each in kinds) - settle_s - scanned_s,
+        earliest_s=-max(_upper_bound(-each) for each in kinds) - settle_s - scanned_s,
         line_time_s=line_time_s,
         line_time_error_s=error_s,
         rolling=significant and line_time_s > 0,
@@ -247,7 +249,7 @@ def fitted(camera: str, flashes: Sequence[Flash], levels: RowLevels) -> CameraLa
     )
 
 
-def _line_time(flashes: Sequence[FlashRows]) -> tuple[float, float]:
+def _line_time(flashes: Sequence[TransitionRows]) -> tuple[float, float]:
     """ℓ and its standard error, s."""
     products: list[tuple[FloatArray, FloatArray, FloatArray]] = []
     for rows in flashes:
@@ -260,7 +262,7 @@ def _line_time(flashes: Sequence[FlashRows]) -> tuple[float, float]:
     return line_time_s, (scatter * count / (count - 1)) ** 0.5 / total
 
 
-def _end(latencies_s: FloatArray) -> float:
+def _upper_bound(latencies_s: FloatArray) -> float:
     """The upper end of a uniform law, from n samples of it: with 95 % it is not beyond that.
 
     The largest of n lies below 1 - x of the whole with the probability (1 - x)ⁿ: 5 % for x = 3/n.
@@ -269,7 +271,9 @@ def _end(latencies_s: FloatArray) -> float:
     return highest + 3 * spread / (len(latencies_s) - 1) if len(latencies_s) > 1 else highest
 
 
-def _settle_s(flashes: Sequence[Flash], changed_s: Sequence[float], line_time_s: float, flicker: float) -> float:
+def _settling_time_s(
+    flashes: Sequence[LightChange], changed_s: Sequence[float], line_time_s: float, flicker: float
+) -> float:
     """How long after each change rows that begin then still miss light: the end of the last such slice of time."""
     width_s = max(float(flashes[0].exposures_s[0]) / 10, 5e-4)
     slices: dict[int, list[float]] = {}
@@ -285,18 +289,16 @@ def _settle_s(flashes: Sequence[Flash], changed_s: Sequence[float], line_time_s:
     for number, missing_of in sorted(slices.items()):
         values = np.array(missing_of)
         error = float(values.std(ddof=1)) / len(values) ** 0.5 if len(values) > 2 else float("inf")
-        if values.mean() <= max(STEADY, 4 * error, 2 * flicker):
+        if values.mean() <= max(STEADY_TOLERANCE, 4 * error, 2 * flicker):
             break
         end_s = (number + 1) * width_s
     return end_s
 
 
-def _missed(camera: str, flashes: Sequence[Flash], used: int) -> str:
+def _too_few_flashes_message(camera: str, flashes: Sequence[LightChange], used: int) -> str:
     """Why there are too few flashes to go by."""
-    bounds = [bound for flash in flashes if (bound := _between(flash)) is not None]
-    head = (
-        f"camera '{camera}': {used} of {len(flashes)} flashes were seen as they happened, {FEWEST_FLASHES} are needed"
-    )
+    bounds = [bound for flash in flashes if (bound := _change_interval_s(flash)) is not None]
+    head = f"camera '{camera}': {used} of {len(flashes)} flashes were seen as they happened, {MIN_FLASHES} are needed"
     if len(bounds) < len(flashes) / 2:
         return (
             f"{head}; in {len(flashes) - len(bounds)} the light did not change while it was watched: search "
@@ -312,7 +314,7 @@ def _missed(camera: str, flashes: Sequence[Flash], used: int) -> str:
     )
 
 
-def _between(flash: Flash) -> tuple[float, float] | None:
+def _change_interval_s(flash: LightChange) -> tuple[float, float] | None:
     """From the end of the last frame in the old light to the start of the first frame in the new, s; None if unseen."""
     gone: NDArray[np.bool_] = np.nanmedian(flash.passed, axis=1) > 0.5
     if not gone.any():
@@ -324,19 +326,19 @@ def _between(flash: Flash) -> tuple[float, float] | None:
     return float(flash.since_s[first - 1] + flash.exposures_s[first - 1]), start_s
 
 
-USUAL_TRIALS = 40
-USUAL_SEARCH_S = 0.5
+DEFAULT_TRIALS = 40
+DEFAULT_SEARCH_S = 0.5
 
 _WHITE, _BLACK = 0, 1
 _STEADY_FRAMES = 8  # of white and of black: mean, noise and period are taken from them
 _FRAMES_AFTER = 3  # in the new light, before a flash is over
-_GONE = 0.9  # of the way to the new light
+_CHANGED_FRACTION = 0.9  # of the way to the new light
 _FLASHES_PER_TRIAL = 8  # at most: a flash counts only if it comes during an exposure
-_RARELY = 0.25
+_MIN_USED_FRACTION = 0.25
 """Of the flashes. Where fewer are seen as they happen, the camera is started anew: a display and a camera whose rates
 are multiples of each other keep the phase in which they began, and with it what they miss.
 """
-_TRIES = 3  # for one frame that is lost
+_MAX_READS = 3  # for one frame that is lost
 _TIMEOUT_S = 2.0  # of one frame
 
 
@@ -370,7 +372,7 @@ class LatencyMeasurement:
         )
 
 
-def stable_from_ns(shown: Shown, synchronisation: Synchronisation | None) -> int:
+def stable_from_ns(shown: DisplayedPattern, synchronisation: Synchronisation | None) -> int:
     """Return the instant from which a pattern's light is the only one, the rig's clock, ns.
 
     Where latency was measured, that counts, later or earlier than what the projector states.
@@ -390,8 +392,8 @@ def shutter_skew_s(camera: Camera, name: str, synchronisation: Synchronisation |
 def measure_latency(
     rig: Rig,
     *,
-    trials: int = USUAL_TRIALS,
-    search_s: float = USUAL_SEARCH_S,
+    trials: int = DEFAULT_TRIALS,
+    search_s: float = DEFAULT_SEARCH_S,
     exposure_s: float | None = None,
     trigger: Trigger | None = None,
     told: Callable[[str, float, str], None] = lambda _stage, _fraction, _detail: None,
@@ -420,7 +422,7 @@ def measure_latency(
                 camera.configure(settings if exposure_s is None else replace(settings, exposure_s=exposure_s))
             elif exposure_s is not None:
                 camera.configure(CameraSettings(exposure_s))
-            test = _FlashTest(rig, name, camera, _trigger(name, camera, trigger), search_s)
+            test = _FlashTest(rig, name, camera, _choose_trigger(name, camera, trigger), search_s)
             rng = np.random.default_rng((0, index))
             try:
                 measured[name] = test.run(trials, rng, told)
@@ -440,7 +442,7 @@ def _white_and_black(size: Size) -> PatternSequence:
     return PatternSequence(size, (White(), Black()), tuple(np.full((1, 1), level, np.uint8) for level in levels))
 
 
-def _trigger(name: str, camera: Camera, asked: Trigger | None) -> Trigger:
+def _choose_trigger(name: str, camera: Camera, asked: Trigger | None) -> Trigger:
     offered = camera.info.triggers
     for trigger in (Trigger.FREE, Trigger.SOFTWARE):
         if trigger in offered and asked in (None, trigger):
@@ -474,19 +476,19 @@ class _FlashTest:
         black, white = self._steady(_BLACK), self._steady(_WHITE)
         full_scale = self.camera.info.format.full_scale
         levels = row_levels(self.name, black, white, full_scale=full_scale)
-        flashes: list[Flash] = []
+        flashes: list[LightChange] = []
         used = 0
         while used < trials and len(flashes) < most and not self._is_hopeless(flashes, used, trials):
             flash = self._flash(levels, rng, to_white=len(flashes) % 2 == 1)
             flashes.append(flash)
-            used += rows_of(flash, levels) is not None
-            if len(flashes) % trials == 0 and used < _RARELY * len(flashes):
+            used += find_transition_rows(flash, levels) is not None
+            if len(flashes) % trials == 0 and used < _MIN_USED_FRACTION * len(flashes):
                 self.camera.disarm()
                 self.camera.arm(frames, self.trigger)
             told(stage, used / trials, f"{used} of {trials} flashes")
-        return fitted(self.name, flashes, levels)
+        return fit_latency(self.name, flashes, levels)
 
-    def _is_hopeless(self, flashes: list[Flash], used: int, trials: int) -> bool:
+    def _is_hopeless(self, flashes: list[LightChange], used: int, trials: int) -> bool:
         """Whether going on would only take longer to say that it cannot be measured."""
         return used == 0 and len(flashes) >= max(2 * trials, 16)
 
@@ -499,7 +501,7 @@ class _FlashTest:
         self.period_ns = int(np.median(np.diff([frame.t_start_ns for frame in frames])))
         return [frame.image for frame in frames]
 
-    def _flash(self, levels: RowLevels, rng: np.random.Generator, *, to_white: bool) -> Flash:
+    def _flash(self, levels: RowLevels, rng: np.random.Generator, *, to_white: bool) -> LightChange:
         # The camera's last frame is taken just now, so the wait falls anywhere in its period.
         waiting_ns = round(float(rng.random()) * self.period_ns)
         pending = self.trigger is Trigger.SOFTWARE
@@ -528,10 +530,10 @@ class _FlashTest:
             shares = levels.shares(frame.image)
             frames.append((frame.t_start_ns, frame.exposure_s, shares))
             share = float(np.nanmedian(shares))
-            after += (share if to_white else 1 - share) > _GONE
-        return Flash.of(to_white, shown, frames)
+            after += (share if to_white else 1 - share) > _CHANGED_FRACTION
+        return LightChange.of(to_white, shown, frames)
 
-    def _show(self, index: int) -> Shown:
+    def _show(self, index: int) -> DisplayedPattern:
         shown = self.rig.projector.show(index)
         self.least_error_ns = min(self.least_error_ns, shown.t_err_ns)
         return shown
@@ -541,7 +543,7 @@ class _FlashTest:
 
     def _next(self, *, after_ns: int) -> Frame:
         """Return the next frame, taken now where a trigger is needed; one that is lost is asked for again."""
-        for _ in range(_TRIES - 1):
+        for _ in range(_MAX_READS - 1):
             if self.trigger is Trigger.SOFTWARE:
                 self.camera.trigger()
             with suppress(FrameTimeoutError):

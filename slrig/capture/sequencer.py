@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 
 from slrig.bundle.sidecars import Refused
-from slrig.capture.hardware_trigger import Session, differ, hardware_triggered, software_triggered
-from slrig.capture.streaming import FrameReader, earliest_change_s, streamed
+from slrig.capture.streaming import FrameReader, capture_streaming, earliest_change_s
+from slrig.capture.triggering import CaptureSession, capture_by_software, capture_by_wire, differs_from_request
 from slrig.capture.verifier import Evidence, RetryPolicy
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Rig, Trigger
 from slrig.errors import UnsupportedByDeviceError
@@ -53,21 +53,21 @@ def capture(
     triggers = choose_triggers(rig)
     with ExitStack() as leaving:
         for camera in rig.cameras.values():
-            leaving.callback(_whatever_happens, camera.disarm)
+            leaving.callback(_suppress_errors, camera.disarm)
         reader = FrameReader(rig.cameras)
         leaving.callback(reader.stop)
         with ExitStack() as lit:
             # The light goes off before anything else is tried.
-            lit.callback(_whatever_happens, rig.projector.blank)
-            session = Session(rig, sequence, _configure(rig), triggers, timeout_s, cancelled)
+            lit.callback(_suppress_errors, rig.projector.blank)
+            session = CaptureSession(rig, sequence, _configure_cameras(rig), triggers, timeout_s, cancelled)
             retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns, colour=colour)
             if Trigger.HARDWARE in triggers.values():
-                lit.callback(_whatever_happens, rig.projector.stop)
-                yield from hardware_triggered(session, retries)
+                lit.callback(_suppress_errors, rig.projector.stop)
+                yield from capture_by_wire(session, retries)
             elif (earliest_s := earliest_change_s(rig, triggers)) is not None:
-                yield from streamed(session, retries, reader, earliest_s)
+                yield from capture_streaming(session, retries, reader, earliest_s)
             else:
-                yield from software_triggered(session, retries)
+                yield from capture_by_software(session, retries)
             lit.pop_all()
         # Here a projector that will not go dark is an error of its own, not a footnote to another one.
         rig.projector.blank()
@@ -99,18 +99,18 @@ def choose_triggers(rig: Rig) -> dict[str, Trigger]:
     return chosen
 
 
-def _configure(rig: Rig) -> dict[str, AppliedSettings]:
+def _configure_cameras(rig: Rig) -> dict[str, AppliedSettings]:
     """Set every camera that has settings, and compare what it reads back."""
-    return {name: _apply(rig.cameras[name], name, settings) for name, settings in rig.settings.items()}
+    return {name: _configure_camera(rig.cameras[name], name, settings) for name, settings in rig.settings.items()}
 
 
-def _apply(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettings:
+def _configure_camera(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettings:
     applied = camera.configure(settings)
     for what, asked, got, unit in (
         ("exposure", settings.exposure_s, applied.exposure_s, " s"),
         ("gain", settings.gain, applied.gain, ""),
     ):
-        if differ(got, asked):
+        if differs_from_request(got, asked):
             raise UnsupportedByDeviceError(
                 f"camera '{name}': asked for {what} {asked:.6g}{unit}, it uses {got:.6g}{unit}; write a value that "
                 f"the camera can use into the rig file ({got:.6g}, for example)"
@@ -118,7 +118,7 @@ def _apply(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettin
     return applied
 
 
-def _whatever_happens(action: Callable[[], None]) -> None:
+def _suppress_errors(action: Callable[[], None]) -> None:
     """Do it as far as the device lets; the error that led here matters more than a device that is gone."""
     # Drivers raise what the operating system gives them, too, and no device may keep the next one from its turn.
     with suppress(Exception):

@@ -21,28 +21,28 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slrig.capture.hardware_trigger import Session, under_name
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
+from slrig.capture.triggering import CaptureSession, with_camera_name
 from slrig.capture.verifier import RetryPolicy
-from slrig.devices import Camera, Rig, Shown, Trigger
+from slrig.devices import Camera, DisplayedPattern, Rig, Trigger
 from slrig.errors import FrameTimeoutError
 from slrig.model import Frame, Shot
 
-_REMEMBERED = 24
+_MAX_REMEMBERED = 24
 """Frames that the period is taken from: at 30 a second, a little less than a second's."""
 
-_FEWEST = 3
+_MIN_FRAMES = 3
 """Frames that tell a period, and whether it can be relied on. With fewer, the camera's own word counts."""
 
-_UNPROVEN = 0.1
+_STATED_PERIOD_ERROR = 0.1
 """How much of the period that a camera states its next frame may come otherwise than foretold by that. Stamps of
 webcams scatter by about a millisecond; where the period is wrong, one pattern is shown again."""
 
-_SPARE = 2.0
+_SPARE_SIGMAS = 2.0
 """Standard deviations of the stamps that a frame may come otherwise than foretold. One in twenty comes otherwise still,
 and is shown again: to allow for it would cost every pattern more."""
 
-_WORST_JITTER = 0.25
+_MAX_JITTER = 0.25
 """Standard deviation of the stamps, in periods, from which on nothing is foretold."""
 
 
@@ -50,7 +50,7 @@ class Cadence:
     """Follows the frames of one camera, in order. stated_s : its period as it says itself; None where it does not."""
 
     def __init__(self, stated_s: float | None = None) -> None:
-        self._starts: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
+        self._starts: deque[tuple[int, int]] = deque(maxlen=_MAX_REMEMBERED)
         self._stated_ns = None if stated_s is None else stated_s * 1e9
 
     def note(self, frame: Frame) -> None:
@@ -69,22 +69,22 @@ class Cadence:
             return None
         numbers, starts_ns = np.array(self._starts, np.int64).T
         last, latest_ns = int(numbers[-1]), int(starts_ns[-1])
-        if len(self._starts) >= _FEWEST:
+        if len(self._starts) >= _MIN_FRAMES:
             x, y = (numbers - last).astype(np.float64), (starts_ns - latest_ns).astype(np.float64)
             slope, offset = np.polyfit(x, y, 1)
             jitter_ns = float(np.std(y - slope * x - offset))
-            if slope <= 0 or jitter_ns > _WORST_JITTER * slope:
+            if slope <= 0 or jitter_ns > _MAX_JITTER * slope:
                 return None
-            begun_ns, spare_ns = latest_ns + offset, _SPARE * jitter_ns
+            begun_ns, spare_ns = latest_ns + offset, _SPARE_SIGMAS * jitter_ns
         elif self._stated_ns is not None:
-            slope, begun_ns, spare_ns = self._stated_ns, latest_ns, _UNPROVEN * self._stated_ns
+            slope, begun_ns, spare_ns = self._stated_ns, latest_ns, _STATED_PERIOD_ERROR * self._stated_ns
         else:
             return None
         ahead = max(math.ceil((t_ns + spare_ns - begun_ns) / slope), 1)
         return round(begun_ns + ahead * slope), round(spare_ns)
 
 
-_WAIT_S = 0.25
+_READ_TIMEOUT_S = 0.25
 """How long one read may take: so soon a reader notices that it shall end, where its camera gives no frames."""
 
 Arrival = tuple[str, Frame | Exception]
@@ -130,7 +130,7 @@ class FrameReader:
     def _read(self, name: str, camera: Camera) -> None:
         while not self._stopped.is_set():
             try:
-                frame = camera.read(0, _WAIT_S)
+                frame = camera.read(0, _READ_TIMEOUT_S)
             except FrameTimeoutError:
                 continue
             except Exception as error:  # noqa: BLE001 - it is raised on the thread that captures
@@ -139,17 +139,17 @@ class FrameReader:
             self._arrived.put((name, frame))
 
 
-MOST_AHEAD = 12
+MAX_UNPAIRED = 12
 """Patterns that may have been shown without any frame of theirs: cameras and links hold back some frames, and one that
 gives none must not be played to for long."""
 
-_JUDGING_S = 0.012
+_CHECK_TIME_S = 0.012
 """Time to leave before a pattern is due: judging takes about 8 ms for a frame of 1280 x 1024."""
 
-_LOOK_S = 0.05
+_POLL_S = 0.05
 """How often to look whether the scan was cancelled, or a frame has been waited for in vain."""
 
-_MOST_WAITING = 8
+_MAX_PAIRED = 8
 """Frames that may wait to be judged; beyond that they come before the next pattern."""
 
 
@@ -163,14 +163,14 @@ def earliest_change_s(rig: Rig, triggers: dict[str, Trigger]) -> float | None:
 
 
 @dataclass(slots=True)
-class _Showing:
+class _Display:
     """A pattern that was shown, and the cameras that gave no frame of it yet.
 
     stable_ns : its light is whole from then on. end_ns : the light of the next one may begin then; None while it is
     shown. held : shown until its frames are there.
     """
 
-    shown: Shown
+    shown: DisplayedPattern
     stable_ns: int
     missing: list[str]
     held: bool
@@ -178,7 +178,7 @@ class _Showing:
 
 
 @dataclass(slots=True)
-class _Lead:
+class _DisplayLead:
     """How much earlier than its light a pattern may be asked for, so that the light does not begin before it is due.
 
     A display takes a picture at its next refresh and returns then; so the wait for that, of up to `refresh_ns`, is no
@@ -202,20 +202,22 @@ class _Lead:
 
 
 @dataclass(slots=True)
-class _Eye:
+class _CameraStreamState:
     """What is known of one camera. waiting : frames whose pattern is still shown, and what each says against itself."""
 
-    skew_ns: int
+    shutter_skew_ns: int
     cadence: Cadence
     last: Frame | None = None
     waiting: list[tuple[Frame, str | None]] = field(default_factory=list)
 
     def end_ns(self, frame: Frame) -> int:
         """When the last row's exposure has ended; a driver may not know that its shutter rolls."""
-        return frame.t_end_ns + max(self.skew_ns - round(frame.shutter_skew_s * 1e9), 0)
+        return frame.t_end_ns + max(self.shutter_skew_ns - round(frame.shutter_skew_s * 1e9), 0)
 
 
-def streamed(session: Session, retries: RetryPolicy, reader: FrameReader, earliest_s: float) -> Iterator[Shot]:
+def capture_streaming(
+    session: CaptureSession, retries: RetryPolicy, reader: FrameReader, earliest_s: float
+) -> Iterator[Shot]:
     """Show each pattern, and again where frames failed, until every frame counts. The reader is stopped by the caller.
 
     earliest_s : see `earliest_change_s`.
@@ -225,35 +227,35 @@ def streamed(session: Session, retries: RetryPolicy, reader: FrameReader, earlie
     rig = session.rig
     rig.projector.load(session.sequence)
     for camera in rig.cameras.values():
-        camera.arm(retries.most_shots, Trigger.FREE)
+        camera.arm(retries.max_exposures, Trigger.FREE)
     reader.start()
-    yield from _Stream(session, retries, reader, round(earliest_s * 1e9)).shots()
+    yield from _StreamingCapture(session, retries, reader, round(earliest_s * 1e9)).shots()
 
 
-class _Stream:
+class _StreamingCapture:
     """One streamed capture under way."""
 
-    def __init__(self, session: Session, retries: RetryPolicy, reader: FrameReader, earliest_ns: int) -> None:
+    def __init__(self, session: CaptureSession, retries: RetryPolicy, reader: FrameReader, earliest_ns: int) -> None:
         self._session = session
         self._earliest_ns = earliest_ns
         self._retries = retries
         self._reader = reader
         self._clock = session.rig.clock
         self._eyes = {
-            name: _Eye(
+            name: _CameraStreamState(
                 round(shutter_skew_s(camera, name, session.rig.synchronisation) * 1e9),
-                Cadence(applied.least_period_s if (applied := session.applied.get(name)) else None),
+                Cadence(applied.min_period_s if (applied := session.applied.get(name)) else None),
             )
             for name, camera in session.rig.cameras.items()
         }
-        self._showings: deque[_Showing] = deque()
+        self._showings: deque[_Display] = deque()
         self._paired: deque[tuple[int, Frame, str | None]] = deque()
-        self._lead = _Lead(round((session.rig.projector.info.refresh_s or 0.0) * 1e9))
+        self._lead = _DisplayLead(round((session.rig.projector.info.refresh_s or 0.0) * 1e9))
         self._index = 0
-        self._shown: _Showing | None = None
+        self._shown: _Display | None = None
 
     def shots(self) -> Iterator[Shot]:
-        """See `streamed`."""
+        """See `capture_streaming`."""
         retries = self._retries
         ahead = iter(range(len(self._session.sequence)))
         while True:
@@ -285,7 +287,7 @@ class _Stream:
         self._lead.note(asked_ns, returned_ns, begins_ns)
         for name in names:
             self._retries.begin(name, index)
-        self._shown = _Showing(shown, stable_ns, list(names), held)
+        self._shown = _Display(shown, stable_ns, list(names), held)
         self._showings.append(self._shown)
 
     def _until_due(self, *, last: bool) -> Iterator[Shot]:
@@ -297,13 +299,13 @@ class _Stream:
             self._session.stop_if_cancelled(self._index)
             self._settle()
             due_ns = self._due_ns(last=last)
-            left_s = _LOOK_S if due_ns is None else (due_ns - self._clock.now_ns()) / 1e9
-            if self._paired and (left_s > _JUDGING_S or len(self._paired) > _MOST_WAITING):
+            left_s = _POLL_S if due_ns is None else (due_ns - self._clock.now_ns()) / 1e9
+            if self._paired and (left_s > _CHECK_TIME_S or len(self._paired) > _MAX_PAIRED):
                 yield from self._judged()
             elif left_s <= 0:
                 return
             else:
-                arrival = self._reader.next(min(left_s, _LOOK_S))
+                arrival = self._reader.next(min(left_s, _POLL_S))
                 if arrival is not None:
                     self._take(*arrival)
 
@@ -312,7 +314,7 @@ class _Stream:
         if last:
             ended = not self._showings and not self._paired
             return 0 if ended or self._failed_at_rest() else None
-        if len(self._showings) > MOST_AHEAD:
+        if len(self._showings) > MAX_UNPAIRED:
             return None
         showing = self._shown
         if showing is None:
@@ -326,7 +328,7 @@ class _Stream:
         """Whether a frame failed, and the pattern that is shown is waited for no more."""
         return bool(self._retries.again) and (self._shown is None or not self._shown.missing) and not self._paired
 
-    def _foretold_ns(self, showing: _Showing) -> int | None:
+    def _foretold_ns(self, showing: _Display) -> int | None:
         """When to ask for the next pattern so that its light begins after a frame of each camera that has none."""
         due_ns = 0
         for name in showing.missing:
@@ -341,16 +343,16 @@ class _Stream:
 
     def _judged(self) -> Iterator[Shot]:
         index, frame, fault = self._paired.popleft()
-        shot = self._retries.took(index, frame, fault)
+        shot = self._retries.submit(index, frame, fault)
         if shot is not None:
             yield shot
 
     def _take(self, name: str, came: Frame | Exception) -> None:
         if isinstance(came, Exception):
             raise came
-        frame = under_name(name, came)
+        frame = with_camera_name(name, came)
         eye = self._eyes[name]
-        eye.waiting.append((frame, self._session.own_fault(frame, frame.t_start_ns, eye.last)))
+        eye.waiting.append((frame, self._session.frame_fault(frame, frame.t_start_ns, eye.last)))
         eye.cadence.note(frame)
         eye.last = frame
 
@@ -379,14 +381,14 @@ class _Stream:
             if not showing.missing:
                 self._showings.remove(showing)
 
-    def _showing_of(self, frame: Frame) -> _Showing | None:
+    def _showing_of(self, frame: Frame) -> _Display | None:
         """The last pattern whose light was whole when a frame began."""
         for showing in reversed(self._showings):
             if frame.t_start_ns >= showing.stable_ns:
                 return showing
         return None
 
-    def _give_up(self, showing: _Showing, now_ns: int) -> None:
+    def _give_up(self, showing: _Display, now_ns: int) -> None:
         """Have a pattern shown again to the cameras that are past it, or gave nothing for too long."""
         for name in list(showing.missing):
             last = self._eyes[name].last

@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 
 from slrig.bundle.sidecars import Refused
 from slrig.capture import frame_checks
-from slrig.capture.frame_checks import Chosen, Code, Contradiction, Lighting, Reference, Samples, named, place
+from slrig.capture.frame_checks import (
+    Contradiction,
+    DecodedCode,
+    Lighting,
+    ReferenceFrames,
+    SampleMask,
+    Samples,
+    describe_frame,
+    describe_pattern,
+)
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
 from slrig.model import (
     Axis,
@@ -30,12 +39,12 @@ from slrig.model import (
     Shot,
     Size,
     White,
-    coarse_bits,
-    divides_period,
+    coarse_bit_count,
+    has_even_shifts,
 )
 
 _SAMPLES = 12_000
-_BESIDE_PX = 3  # along rows and along columns
+_NEIGHBOUR_PX = 3  # along rows and along columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +66,8 @@ class Sampler:
         # Each pixel once: a small image has fewer than are drawn.
         drawn = np.unique(rng.integers(0, height * width if candidates is None else len(candidates), _SAMPLES))
         rows, columns = np.divmod(drawn if candidates is None else candidates[drawn], width)
-        all_rows = np.concatenate([rows, np.minimum(rows + _BESIDE_PX, height - 1)])
-        all_columns = np.concatenate([columns, np.minimum(columns + _BESIDE_PX, width - 1)])
+        all_rows = np.concatenate([rows, np.minimum(rows + _NEIGHBOUR_PX, height - 1)])
+        all_columns = np.concatenate([columns, np.minimum(columns + _NEIGHBOUR_PX, width - 1)])
         return cls(all_rows * width + all_columns, all_rows)
 
     def take(self, image: Pixels) -> Samples:
@@ -66,14 +75,17 @@ class Sampler:
         return np.asarray(image.reshape(-1)[self.flat], dtype=np.float32)
 
 
-_WRONG, _WRONG_IN_BAND = 0.01, 0.03  # of the judged pixels; of twelve sound scenes 0.4 % in the worst band
-_ALIKE = 0.7  # of the pixels that are wrong in one exposure or another: those that are in both
-_FEW_SUSPECTS = 3  # frames that a message names
-_OF_THE_SCENE = 0.25  # of the pixels that are told: a frame that shows another pattern is wrong at half of them
+_MAX_WRONG_FRACTION, _MAX_WRONG_FRACTION_IN_BAND = (
+    0.01,
+    0.03,
+)  # of the judged pixels; of twelve sound scenes 0.4 % in the worst band
+_SAME_PIXELS_FRACTION = 0.7  # of the pixels that are wrong in one exposure or another: those that are in both
+_MAX_NAMED_SUSPECTS = 3  # frames that a message names
+_MAX_SCENE_FRACTION = 0.25  # of the pixels that are told: a frame that shows another pattern is wrong at half of them
 
 
 @dataclass(slots=True)
-class Findings:
+class CameraFindings:
     """What the frames told so far: all of it follows from the frames, and is found again when one is taken back.
 
     verified : the patterns whose frames passed a test that another pattern would fail. light_drift : largest change of
@@ -82,15 +94,15 @@ class Findings:
     lined : axes of which a line frame lay where the Gray code says, which vouches for the code.
     """
 
-    firsts: dict[Pattern, int] = field(default_factory=dict)
+    first_seen_index: dict[Pattern, int] = field(default_factory=dict)
     verified: set[int] = field(default_factory=set)
     noises: list[float] = field(default_factory=list)
     sums: list[Samples] = field(default_factory=list)
-    codes: dict[Axis, tuple[Code, Gray]] = field(default_factory=dict)
-    waiting_lines: list[int] = field(default_factory=list)
+    codes: dict[Axis, tuple[DecodedCode, Gray]] = field(default_factory=dict)
+    pending_lines: list[int] = field(default_factory=list)
     light_drift: float | None = None
     sound: bool = False
-    lined: set[Axis] = field(default_factory=set)
+    verified_axes: set[Axis] = field(default_factory=set)
 
     @property
     def noise_dn(self) -> float | None:
@@ -112,16 +124,16 @@ class FrameVerifier:
         self._format = form
         self._patterns = patterns
         self._anywhere = Sampler.of(form.size)
-        self.found = Findings()
+        self.found = CameraFindings()
         self._waiting: dict[int, Pixels] = {}
         self._overview: dict[int, Samples] = {}
         self._frames: dict[int, Samples] = {}
         self._sampler: Sampler | None = None
-        self._reference: Reference | None = None
+        self._reference: ReferenceFrames | None = None
         self._referees: tuple[int, ...] = ()
         self._refused = False
         self._untold: list[Contradiction] = []
-        self._disputed: dict[Axis, Chosen] = {}
+        self._disputed: dict[Axis, SampleMask] = {}
 
     @property
     def _noise(self) -> float:
@@ -164,10 +176,10 @@ class FrameVerifier:
     def _again_from_start(self) -> list[Contradiction]:
         """Judge the frames that are left as if they came now, in the order in which they came."""
         waiting, frames = self._waiting, self._frames
-        self.found, self._waiting, self._frames = Findings(), {}, {}
+        self.found, self._waiting, self._frames = CameraFindings(), {}, {}
         found: list[Contradiction] = []
         for index in [*waiting, *frames]:
-            self.found.firsts.setdefault(self._patterns[index], index)
+            self.found.first_seen_index.setdefault(self._patterns[index], index)
             if index in waiting:
                 self._waiting[index] = waiting[index]
             else:
@@ -179,8 +191,8 @@ class FrameVerifier:
 
     def _admit(self, index: int, image: Pixels) -> list[Contradiction]:
         pattern = self._patterns[index]
-        self.found.firsts.setdefault(pattern, index)
-        if isinstance(pattern, White | Black) or (isinstance(pattern, LineShift) and pattern.lights_half):
+        self.found.first_seen_index.setdefault(pattern, index)
+        if isinstance(pattern, White | Black) or (isinstance(pattern, LineShift) and pattern.is_half_lit):
             self._overview[index] = self._anywhere.take(image)
         if self._sampler is None:
             self._waiting[index] = image
@@ -206,7 +218,7 @@ class FrameVerifier:
     def _says(self, index: int, fault: str, suspects: Iterable[int], beyond: Iterable[int] = ()) -> Contradiction:
         accused = tuple(sorted(set(suspects)))
         rest = tuple(sorted(set(beyond) - set(accused)))
-        return Contradiction(self.name, place(self.name, index, self._patterns[index]), fault, accused, rest)
+        return Contradiction(self.name, describe_frame(self.name, index, self._patterns[index]), fault, accused, rest)
 
     @property
     def _unproven_reference(self) -> tuple[int, ...]:
@@ -215,12 +227,12 @@ class FrameVerifier:
 
     def _refer(self) -> list[Contradiction]:
         """Once white and black are in: find what is lit, and judge the frames that waited."""
-        first_white, first_black = self.found.firsts.get(White()), self.found.firsts.get(Black())
+        first_white, first_black = self.found.first_seen_index.get(White()), self.found.first_seen_index.get(Black())
         if first_white is None or first_black is None:
             return []
         white, black = self._waiting[first_white], self._waiting[first_black]
         full_scale = self._format.full_scale
-        lighting = frame_checks.lighting(
+        lighting = frame_checks.measure_lighting(
             self._overview[first_white], self._overview[first_black], full_scale=full_scale, row=self._anywhere.row
         )
         if isinstance(lighting, str):
@@ -230,7 +242,7 @@ class FrameVerifier:
         lit = (white > black) & (white - black >= threshold) & (white < full_scale)
         sampler = Sampler.of(self._format.size, np.flatnonzero(lit))
         self.lighting, self._sampler, self._referees = lighting, sampler, (first_white, first_black)
-        self._reference = frame_checks.reference(
+        self._reference = frame_checks.build_reference(
             sampler.take(white), sampler.take(black), threshold_dn=threshold, full_scale=full_scale, row=sampler.row
         )
         self.found.verified |= {first_white, first_black}
@@ -242,7 +254,7 @@ class FrameVerifier:
         ref, pattern = self._reference, self._patterns[index]
         if ref is None:
             return []
-        first = self.found.firsts[pattern]
+        first = self.found.first_seen_index[pattern]
         if first != index:
             return self._again(index, first, ref)
         if isinstance(pattern, White | Black):
@@ -255,13 +267,13 @@ class FrameVerifier:
         if not found and isinstance(pattern, LineShift):
             found += self._line(index, pattern, ref) or self._line_family(pattern.axis, ref)
         # One light from another is told by times alone: an object may send back as much of both.
-        if not found and isinstance(pattern, Primary) and frame_checks.dimmed(self._frames[index], ref):
+        if not found and isinstance(pattern, Primary) and frame_checks.is_partly_lit(self._frames[index], ref):
             self.found.verified.add(index)
         return found
 
-    def _again(self, index: int, first: int, ref: Reference) -> list[Contradiction]:
+    def _again(self, index: int, first: int, ref: ReferenceFrames) -> list[Contradiction]:
         noise = self.found.noise_dn
-        seen = frame_checks.drift(self._frames[first], self._frames[index], ref, noise=noise)
+        seen = frame_checks.measure_drift(self._frames[first], self._frames[index], ref, noise=noise)
         if self.found.light_drift is None or abs(seen.light) > abs(self.found.light_drift):
             self.found.light_drift = seen.light
         fault = frame_checks.drift_fault(seen) or self._changed(index, first)
@@ -278,7 +290,7 @@ class FrameVerifier:
         white, black = (self._overview[referee] for referee in self._referees)
         again = self._overview[index]
         brighter = again - black if first == self._referees[0] else white - again
-        return frame_checks.changed_fault(
+        return frame_checks.reference_change_fault(
             self._overview[first],
             again,
             (white - black, brighter),
@@ -287,27 +299,27 @@ class FrameVerifier:
             row=self._anywhere.row,
         )
 
-    def _range(self, indices: Sequence[int], ref: Reference) -> list[Contradiction]:
+    def _range(self, indices: Sequence[int], ref: ReferenceFrames) -> list[Contradiction]:
         noise, beyond = self.found.noise_dn, self._unproven_reference
         judged = ((index, frame_checks.range_fault(self._frames[index], ref, noise=noise)) for index in indices)
         return [self._says(index, fault, [index], beyond) for index, fault in judged if fault is not None]
 
-    def _alone_or_paired(self, index: int, pattern: Pattern, ref: Reference) -> list[Contradiction]:
+    def _alone_or_paired(self, index: int, pattern: Pattern, ref: ReferenceFrames) -> list[Contradiction]:
         """Judge a frame beside that of the inverse of its pattern, or alone where there is none."""
         inverse = pattern.inverse if isinstance(pattern, Gray | LineShift) else None
         if isinstance(pattern, LineShift) and not self._single(pattern.axis):
             # Bits and their inverses vouch for white and black, and the sum of all lines names the one that is wrong.
             inverse = None
-        partner = None if inverse is None else self.found.firsts.get(inverse)
+        partner = None if inverse is None else self.found.first_seen_index.get(inverse)
         if partner is None or not isinstance(pattern, Gray | LineShift):
             # A pair tells the noise, which the other tests need: the first of a pair waits for the second.
             return [] if inverse in self._patterns else self._alone(index, pattern, ref)
         frame, other = self._frames[index], self._frames[partner]
         fault = frame_checks.pair_fault(frame, other, ref, noise=self._noise, run_px=_run_px(pattern))
         if fault is not None:
-            words = f"beside {named(partner, self._patterns[partner])}, {fault}"
+            words = f"beside {describe_pattern(partner, self._patterns[partner])}, {fault}"
             return [self._says(index, words, [index, partner], self._unproven_reference)]
-        self.found.noises.append(frame_checks.noise_dn(frame, other, ref, sums=self.found.sums))
+        self.found.noises.append(frame_checks.pair_noise_dn(frame, other, ref, sums=self.found.sums))
         self.found.sums = [frame + other]
         found = self._range([partner, index], ref)
         if not found:
@@ -316,26 +328,26 @@ class FrameVerifier:
             self.found.sound = True
         return found
 
-    def _alone(self, index: int, pattern: Pattern, ref: Reference) -> list[Contradiction]:
+    def _alone(self, index: int, pattern: Pattern, ref: ReferenceFrames) -> list[Contradiction]:
         """Judge a frame whose pattern has no inverse in the sequence."""
         found = self._range([index], ref)
         if found or not isinstance(pattern, Gray):
             return found
         lines = [
-            self._frames[i] for p, i in self.found.firsts.items()
-            if isinstance(p, LineShift) and p.axis is pattern.axis and p.lights_half
+            self._frames[i] for p, i in self.found.first_seen_index.items()
+            if isinstance(p, LineShift) and p.axis is pattern.axis and p.is_half_lit
         ]  # fmt: skip
         # Lines have edges everywhere, and bits have fewer. Those of narrow lines are less high.
-        rough = frame_checks.rougher(self._frames[index], lines, ref, noise=self._noise) if lines else None
+        rough = frame_checks.roughness_fault(self._frames[index], lines, ref, noise=self._noise) if lines else None
         if rough is not None:
             return [self._says(index, rough, [index], self._unproven_reference)]
-        if pattern.bit < coarse_bits(pattern.bits):
-            self.found.noises.append(frame_checks.noise_of_bit(self._frames[index], ref))
+        if pattern.bit < coarse_bit_count(pattern.bits):
+            self.found.noises.append(frame_checks.bit_noise_dn(self._frames[index], ref))
         return []
 
     def _family(self, pattern: Gray) -> list[Gray]:
         """Every bit of the code that a pattern belongs to, as far as it is shown."""
-        return [p for p in self._patterns if isinstance(p, Gray) and _code_of(p) == _code_of(pattern)]
+        return [p for p in self._patterns if isinstance(p, Gray) and _code_parameters(p) == _code_parameters(pattern)]
 
     def _single(self, axis: Axis) -> bool:
         """Whether the bits of an axis come without their inverses."""
@@ -346,7 +358,7 @@ class FrameVerifier:
         lines = {p for p in self._patterns if isinstance(p, LineShift) and p.axis is axis}
         return sorted(lines, key=lambda line: line.shift)
 
-    def _complete_code(self, pattern: Gray | LineShift, ref: Reference) -> list[Contradiction]:
+    def _complete_code(self, pattern: Gray | LineShift, ref: ReferenceFrames) -> list[Contradiction]:
         """Decode once the last frame of a code is in, and judge the line frames that waited for it.
 
         Bits without inverses are held against the lines, and wait for these where there are any.
@@ -355,30 +367,30 @@ class FrameVerifier:
         gray = next((p for p in self._patterns if isinstance(p, Gray) and p.axis is axis), None)
         if axis in self.found.codes or gray is None:
             return []
-        family, firsts, lines = self._family(gray), self.found.firsts, self._lines(axis)
+        family, firsts, lines = self._family(gray), self.found.first_seen_index, self._lines(axis)
         single = self._single(axis)
         if {p.bit for p in family} != set(range(gray.bits)) or any(p not in firsts for p in family):
             return []
-        proven_by = lines if single and divides_period(lines) else []
+        proven_by = lines if single and has_even_shifts(lines) else []
         if any(firsts.get(line) not in self._frames for line in proven_by):
             return []
         middle = np.asarray((ref.white + ref.black) / 2, dtype=np.float32)
         shown = [self._frames[firsts[line]] for line in proven_by]
-        if shown and lines[0].lights_half:
+        if shown and lines[0].is_half_lit:
             fault = self._ends_fault([firsts[line] for line in lines])
             if fault is not None:
                 return [self._says(self._referees[0], fault, self._referees)]
             middle = np.mean(np.stack(shown), axis=0).astype(np.float32)
         differences = [self._difference(bit, family, middle) for bit in range(gray.bits)]
-        code = frame_checks.read_code(differences, ref)
+        code = frame_checks.decode_samples(differences, ref)
         found = self._exchanged(code, family, single=single)
         if not found and shown:
             found, wrong = self._agreement(code, gray, family, list(zip(proven_by, shown, strict=True)), ref)
-            code = replace(code, sure=code.sure & ~wrong)
+            code = replace(code, certain=code.certain & ~wrong)
         if found:
             return found
         self.found.codes[axis] = (code, gray)
-        waited, self.found.waiting_lines = self.found.waiting_lines, []
+        waited, self.found.pending_lines = self.found.pending_lines, []
         for index in waited:
             line = self._patterns[index]
             if isinstance(line, LineShift):
@@ -391,23 +403,23 @@ class FrameVerifier:
         if self.lighting is None or any(index not in self._overview for index in (*self._referees, *lines)):
             return None
         white, black = (self._overview[index] for index in self._referees)
-        return frame_checks.ends_fault(
+        return frame_checks.reference_level_fault(
             white, black, [self._overview[index] for index in lines], threshold_dn=self.lighting.threshold_dn,
             full_scale=self._format.full_scale, row=self._anywhere.row,
         )  # fmt: skip
 
-    def _exchanged(self, code: Code, family: Sequence[Gray], *, single: bool) -> list[Contradiction]:
+    def _exchanged(self, code: DecodedCode, family: Sequence[Gray], *, single: bool) -> list[Contradiction]:
         """Judge whether bits stand where they should, by their order alone."""
-        firsts = self.found.firsts
+        firsts = self.found.first_seen_index
         order = "check that the projector shows the patterns in the order they were loaded"
         if single:
-            both = frame_checks.exchanged_bits(code)
+            both = frame_checks.find_exchanged_bits(code)
             if both is None:
                 return []
             blamed: tuple[int, ...] = both
             fault = f"bits {both[0]} and {both[1]} of the {family[0].axis} code are exchanged: codes jump; {order}"
         else:
-            exchanged = frame_checks.swapped_bit(code)
+            exchanged = frame_checks.find_inverted_bit(code)
             if exchanged is None:
                 return []
             blamed = (exchanged,)
@@ -419,11 +431,16 @@ class FrameVerifier:
         return [self._says(pair[0], fault, pair, [firsts[p] for p in family])]
 
     def _agreement(
-        self, code: Code, gray: Gray, family: Sequence[Gray], lines: list[tuple[LineShift, Samples]], ref: Reference
-    ) -> tuple[list[Contradiction], Chosen]:
+        self,
+        code: DecodedCode,
+        gray: Gray,
+        family: Sequence[Gray],
+        lines: list[tuple[LineShift, Samples]],
+        ref: ReferenceFrames,
+    ) -> tuple[list[Contradiction], SampleMask]:
         """Hold the code against the lines, which proves its bits; also where they contradict it."""
-        firsts, axis = self.found.firsts, gray.axis
-        told = frame_checks.agreement(
+        firsts, axis = self.found.first_seen_index, gray.axis
+        told = frame_checks.compare_with_lines(
             code, lines, ref, cell_px=gray.cell_px, offset_px=gray.offset_px, noise=self._noise
         )  # fmt: skip
         members = [firsts[line] for line, _ in lines]
@@ -433,7 +450,9 @@ class FrameVerifier:
                 "pixel; check that the projector shows the patterns in the order they were loaded"
             )
             return [self._says(members[0], fault, members)], told.wrong
-        where = frame_checks.worst_of(told.wrong, ref.row, whole=_WRONG, quarter=_WRONG_IN_BAND)
+        where = frame_checks.describe_worst_lit(
+            told.wrong, ref.row, whole=_MAX_WRONG_FRACTION, quarter=_MAX_WRONG_FRACTION_IN_BAND
+        )
         if where is None:
             if np.count_nonzero(told.told) >= frame_checks.BAND_SAMPLES:
                 self.found.verified |= {firsts[p] for p in family}
@@ -442,14 +461,18 @@ class FrameVerifier:
         self._disputed[axis] = told.wrong
         if before is not None and len(before) == len(told.wrong):
             alike = np.count_nonzero(before & told.wrong) / np.count_nonzero(before | told.wrong)
-            if alike > _ALIKE and np.mean(told.wrong[told.told]) < _OF_THE_SCENE:
+            if alike > _SAME_PIXELS_FRACTION and np.mean(told.wrong[told.told]) < _MAX_SCENE_FRACTION:
                 # Exposed again it is the same: what stands there does it, light that walls of a hollow send to each
                 # other, for one. No frame is to blame, and none is proven.
                 return [], told.wrong
-        bits = frame_checks.blamed_bits(code, told.wrong)
+        bits = frame_checks.find_faulty_bits(code, told.wrong)
         suspects = [firsts[p] for p in family if p.bit in bits]
-        few = len(suspects) <= _FEW_SUSPECTS
-        which = " or ".join(named(each, self._patterns[each]) for each in suspects) if few else "the frame of a bit"
+        few = len(suspects) <= _MAX_NAMED_SUSPECTS
+        which = (
+            " or ".join(describe_pattern(each, self._patterns[each]) for each in suspects)
+            if few
+            else "the frame of a bit"
+        )
         fault = (
             f"{where} have a code that their lines contradict: {which} was not shown or was damaged, or something "
             "moved; check the cable and the projector's latency, and scan again; if it stays, light comes from "
@@ -458,13 +481,13 @@ class FrameVerifier:
         return [self._says(suspects[0], fault, suspects, [*(firsts[p] for p in family), *members])], told.wrong
 
     def _difference(self, bit: int, family: Sequence[Gray], middle: Samples) -> Samples:
-        frames = {p.inverted: self._frames[self.found.firsts[p]] for p in family if p.bit == bit}
+        frames = {p.inverted: self._frames[self.found.first_seen_index[p]] for p in family if p.bit == bit}
         return np.asarray(frames.get(False, middle) - frames.get(True, middle)) * (1 if len(frames) == 2 else 2)
 
-    def _repetition(self, index: int, pattern: Pattern, ref: Reference) -> list[Contradiction]:
+    def _repetition(self, index: int, pattern: Pattern, ref: ReferenceFrames) -> list[Contradiction]:
         own = {pattern, White(), Black()}
         # A bit of narrow cells may light what lines do.
-        own |= {each for each in self._patterns if _light_of(each) == _light_of(pattern)}
+        own |= {each for each in self._patterns if _equivalent_pattern(each) == _equivalent_pattern(pattern)}
         kin = Primary if isinstance(pattern, Primary) else ()
         earlier = [
             i for i in self._frames
@@ -473,23 +496,23 @@ class FrameVerifier:
         # Wide lines move by a small part of their width: tell neighbours apart only where noise leaves room for it.
         factor = max(40.0, 4.0 * pattern.line_width_px) if isinstance(pattern, LineShift) else 40.0
         frames = [self._frames[i] for i in earlier]
-        found = frame_checks.repeated(self._frames[index], frames, ref, noise=self._noise, factor=factor)
+        found = frame_checks.find_repeated(self._frames[index], frames, ref, noise=self._noise, factor=factor)
         if found is None:
             return []
         twin = earlier[found]
         fault = (
-            f"the frame equals that of {named(twin, self._patterns[twin])}: it was not exposed while its own "
+            f"the frame equals that of {describe_pattern(twin, self._patterns[twin])}: it was not exposed while its own "
             "pattern was shown; check the trigger and the projector's latency, and scan again"
         )
         return [self._says(index, fault, [index], [twin, *self._unproven_reference])]
 
-    def _line(self, index: int, pattern: LineShift, ref: Reference) -> list[Contradiction]:
+    def _line(self, index: int, pattern: LineShift, ref: ReferenceFrames) -> list[Contradiction]:
         known = self.found.codes.get(pattern.axis)
         if known is None:
-            self.found.waiting_lines.append(index)
+            self.found.pending_lines.append(index)
             return []
         code, gray = known
-        expected = frame_checks.expect_lines(
+        expected = frame_checks.predict_lines(
             code,
             ref,
             cell_px=gray.cell_px,
@@ -500,7 +523,7 @@ class FrameVerifier:
         )
         others = [
             self._frames[i]
-            for p, i in self.found.firsts.items()
+            for p, i in self.found.first_seen_index.items()
             if isinstance(p, LineShift) and p.axis is pattern.axis and i != index
         ]
         duty = pattern.line_width_px / pattern.period_px
@@ -508,32 +531,36 @@ class FrameVerifier:
             self._frames[index], others, ref, expected, noise=self._noise, duty=duty
         )
         if fault is not None:
-            code_frames = [] if pattern.axis in self.found.lined else [self.found.firsts[p] for p in self._family(gray)]
+            code_frames = (
+                []
+                if pattern.axis in self.found.verified_axes
+                else [self.found.first_seen_index[p] for p in self._family(gray)]
+            )
             return [self._says(index, fault, [index], code_frames)]
         if compared:
             self.found.verified.add(index)
-            self.found.lined.add(pattern.axis)
+            self.found.verified_axes.add(pattern.axis)
         return []
 
-    def _line_family(self, axis: Axis, ref: Reference) -> list[Contradiction]:
+    def _line_family(self, axis: Axis, ref: ReferenceFrames) -> list[Contradiction]:
         """Judge the sum, the shape and the order of the line frames of an axis once all and the code are in."""
-        family, firsts = self._lines(axis), self.found.firsts
-        if axis not in self.found.codes or not divides_period(family):
+        family, firsts = self._lines(axis), self.found.first_seen_index
+        if axis not in self.found.codes or not has_even_shifts(family):
             return []
         if any(firsts.get(line) not in self._frames for line in family):
             return []
         frames = [self._frames[firsts[line]] for line in family]
         members = [firsts[line] for line in family]
-        index, half = max(members), family[0].lights_half
-        unequal = frame_checks.line_sum(frames, ref, noise=self._noise, half=half)
+        index, half = max(members), family[0].is_half_lit
+        unequal = frame_checks.line_sum_fault(frames, ref, noise=self._noise, half=half)
         if unequal is not None:
             blamed, fault = unequal
             return [self._says(index, fault, [members[each] for each in blamed], members)]
-        odd = frame_checks.line_shape(family, frames, ref, noise=self._noise) if half else None
+        odd = frame_checks.line_shape_fault(family, frames, ref, noise=self._noise) if half else None
         if odd is not None:
             at, fault = odd
             return [self._says(members[at], fault, [members[at]], members)]
-        shows, shift = frame_checks.line_order(frames, ref, noise=self._noise)
+        shows, shift = frame_checks.check_line_order(frames, ref, noise=self._noise)
         if shift is None:
             # One frame that lies where the code says, and the right order, place them all.
             if shows and set(members) & self.found.verified:
@@ -555,12 +582,12 @@ def _run_px(pattern: Gray | LineShift) -> int:
     return pattern.cell_px << (pattern.bits - pattern.bit if pattern.bit else pattern.bits - 1)
 
 
-def _light_of(pattern: Pattern) -> Pattern:
+def _equivalent_pattern(pattern: Pattern) -> Pattern:
     """The pattern, or the lines that light the same."""
     return (pattern.as_lines or pattern) if isinstance(pattern, Gray) else pattern
 
 
-def _code_of(pattern: Gray) -> tuple[Axis, int, int, int]:
+def _code_parameters(pattern: Gray) -> tuple[Axis, int, int, int]:
     return (pattern.axis, pattern.bits, pattern.cell_px, pattern.offset_px)
 
 
@@ -595,7 +622,9 @@ class EvidenceSummary:
         return replace(
             self,
             shot_again=len(shot),
-            causes=tuple(dict.fromkeys(f"{place(r.camera, r.pattern, patterns[r.pattern])}: {r.cause}" for r in shot)),
+            causes=tuple(
+                dict.fromkeys(f"{describe_frame(r.camera, r.pattern, patterns[r.pattern])}: {r.cause}" for r in shot)
+            ),
             left_out=tuple(dict.fromkeys(each.cause for each in refused if each.left_out)),
         )
 
@@ -659,12 +688,12 @@ def check_capture(capture: Capture, refused: Sequence[Refused] = ()) -> Evidence
     what was shot again while it was captured.
     """
     evidence = Evidence(capture.patterns, capture.cameras, refused)
-    for index in judged_frames(capture):
+    for index in checked_frames(capture):
         evidence.contradictions(capture.shots[index])
     return evidence.summary()
 
 
-def judged_frames(capture: Capture) -> list[int]:
+def checked_frames(capture: Capture) -> list[int]:
     """Of the frames of a capture those that `check_capture` judges, by their indices, in the order in which it does."""
     chosen: list[int] = []
     for camera in capture.cameras:
@@ -682,7 +711,7 @@ def judged_frames(capture: Capture) -> list[int]:
     return chosen
 
 
-MOST_FAILURES = 3
+MAX_FAILURES = 3
 """A pattern whose frame failed so often ends the scan."""
 
 _ORDINALS = ("first", "second", "third")
@@ -717,17 +746,17 @@ class RetryPolicy:
         self._last_cause = ""
 
     @property
-    def most_shots(self) -> int:
+    def max_exposures(self) -> int:
         """How many exposures one camera may need at most."""
-        return MOST_FAILURES * len(self._sequence)
+        return MAX_FAILURES * len(self._sequence)
 
     def begin(self, camera: str, index: int) -> None:
         """Count an exposure that is about to be made. Raises ScanEvidenceError when there were too many."""
         self._shots[camera, index] += 1
         self._made[camera] += 1
-        if self._made[camera] > self.most_shots:
+        if self._made[camera] > self.max_exposures:
             raise ScanEvidenceError(
-                f"camera '{camera}': {self.most_shots} exposures gave no {len(self._sequence)} frames that agree with "
+                f"camera '{camera}': {self.max_exposures} exposures gave no {len(self._sequence)} frames that agree with "
                 f"one another; the last cause: {self._last_cause}"
             )
 
@@ -740,7 +769,7 @@ class RetryPolicy:
         colour = frame.colour() if wanted and frame.colour is not None else None
         return Shot(index, frame.camera, frame.image, frame.exposure_s, time_s, colour)
 
-    def took(self, index: int, frame: Frame, fault: str | None) -> Shot | None:
+    def submit(self, index: int, frame: Frame, fault: str | None) -> Shot | None:
         """Judge a frame; return it if it counts. `fault` is what it says against itself.
         Raises ScanEvidenceError: it was the third failure of a pattern.
         """
@@ -760,7 +789,7 @@ class RetryPolicy:
         missing = self._missing[camera, index]
         missing.append(cause)
         self._shoot_again(Refused(index, camera, self._shots[camera, index], cause))
-        if len(missing) >= MOST_FAILURES:
+        if len(missing) >= MAX_FAILURES:
             raise FrameTimeoutError(self._failed(camera, index, missing))
 
     def _answer(self, shot: Shot, found: tuple[Contradiction, ...]) -> frozenset[int]:
@@ -802,19 +831,19 @@ class RetryPolicy:
     def _end_at_third(self, camera: str, patterns: Iterable[int]) -> None:
         for index in patterns:
             causes = self._causes[camera, index]
-            if len(causes) >= MOST_FAILURES:
+            if len(causes) >= MAX_FAILURES:
                 raise ScanEvidenceError(self._failed(camera, index, causes))
 
     def _failed(self, camera: str, index: int, causes: list[str]) -> str:
-        return f"{place(camera, index, self._sequence.patterns[index])}: {in_words(causes)}"
+        return f"{describe_frame(camera, index, self._sequence.patterns[index])}: {describe_causes(causes)}"
 
 
-def in_words(causes: list[str]) -> str:
+def describe_causes(causes: list[str]) -> str:
     """Words for several failures of one thing; those that differ in numbers only are told once.
 
-    >>> in_words(["frame 7 is dark", "frame 9 is dark"])
+    >>> describe_causes(["frame 7 is dark", "frame 9 is dark"])
     'it failed 2 times, each time alike: frame 9 is dark'
-    >>> in_words(["it is dark", "it came twice"])
+    >>> describe_causes(["it is dark", "it came twice"])
     'it failed 2 times. The first time: it is dark. The second time: it came twice'
     """
     if len({re.sub(r"\d+", "", cause) for cause in causes}) == 1:

@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.capture import STEADY, CameraLatency, measure_latency
+from slrig.capture import STEADY_TOLERANCE, CameraLatency, measure_latency
 from slrig.cli.display import print_json, progress_shown
 from slrig.cli.options import given
 from slrig.config import RigConfig, read_rig, read_settings
@@ -249,6 +249,6 @@ def _latency_words(found: CameraLatency) -> str:
         shutter,
         f"from {found.flashes_used} of {found.flashes} flashes, {found.rows_used} rows that fit to {ms['residual_s']}",
     ]
-    if found.flicker > STEADY:
+    if found.flicker > STEADY_TOLERANCE:
         said.append(f"steady white flickers by {found.flicker:.0%}: make the exposure a multiple of the refresh period")
     return "\n".join(f"  {line}" for line in said)

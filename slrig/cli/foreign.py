@@ -67,7 +67,7 @@ def import_images(
 
     Gray codes of OpenCV, scan3d-capture and SLStudio, or of named images. Then: slrig reconstruct.
     """
-    from slrig.importers.captures import Code, Naming, import_capture, parse_size
+    from slrig.importers import ImageNaming, ProjectorCode, import_capture, parse_size
 
     ways = {"--format": program, "--pattern": pattern, "--names": names, "--list": listed}
     asked = [way for way, value in ways.items() if value is not None]
@@ -79,8 +79,8 @@ def import_images(
             f"--format {program}: expected no --cell-px and --offset-px, which its order says itself; say --pattern"
         )
         raise ConfigError(message)
-    naming = Naming(program or (None if asked else "opencv"), pattern, names, white, black, listed)
-    code = Code(parse_size(projector), cell_px=cell_px, offset_px=offset_px)
+    naming = ImageNaming(program or (None if asked else "opencv"), pattern, names, white, black, listed)
+    code = ProjectorCode(parse_size(projector), cell_px=cell_px, offset_px=offset_px)
     found, used = import_capture(
         folder, output, code, naming, names=camera or (), bit_depth=bit_depth, calibration_file=calibration
     )

@@ -27,13 +27,13 @@ class CallLimits:
     computed: bool = False
 
 
-USUAL = CallLimits()
+DEFAULT_LIMITS = CallLimits()
 
-COMPUTED = CallLimits(call_s=600.0, read_slack_s=600.0, computed=True)
+COMPUTED_LIMITS = CallLimits(call_s=600.0, read_slack_s=600.0, computed=True)
 """Of what is rendered or replayed: as long as the machine takes beside its other work. A frame of 12 megapixels takes a
 few seconds on a quiet one."""
 
-_hearing = threading.local()
+_thread_local = threading.local()
 
 
 def progress_reporter() -> Callable[[str], None]:
@@ -42,22 +42,22 @@ def progress_reporter() -> Callable[[str], None]:
 
     Ask for it on the thread that was called; it may then be told on any. Where nobody listens it does nothing.
     """
-    listener: Callable[[str], None] = getattr(_hearing, "listener", _ignore)
+    listener: Callable[[str], None] = getattr(_thread_local, "listener", _ignore_progress)
     return listener
 
 
 @contextmanager
-def progress_heard(listener: Callable[[str], None]) -> Iterator[None]:
+def listen_for_progress(listener: Callable[[str], None]) -> Iterator[None]:
     """Have `listener` told, within the block, what a driver called on this thread is at."""
-    before = getattr(_hearing, "listener", _ignore)
-    _hearing.listener = listener
+    before = getattr(_thread_local, "listener", _ignore_progress)
+    _thread_local.listener = listener
     try:
         yield
     finally:
-        _hearing.listener = before
+        _thread_local.listener = before
 
 
-def _ignore(_doing: str) -> None:
+def _ignore_progress(_doing: str) -> None:
     pass
 
 
@@ -84,7 +84,7 @@ class CameraInfo:
     triggers: frozenset[Trigger]
     exposure_range_s: tuple[float, float]
     gain_range: tuple[float, float]
-    limits: CallLimits = USUAL
+    limits: CallLimits = DEFAULT_LIMITS
     notes: tuple[str, ...] = ()
     colour: bool = False
 
@@ -107,7 +107,7 @@ class AppliedSettings:
 
     exposure_s: float
     gain: float
-    least_period_s: float | None = None
+    min_period_s: float | None = None
 
 
 @runtime_checkable
@@ -181,10 +181,10 @@ class CameraState:
         """Raise DeviceStateError unless the camera is armed, for this trigger if one is given."""
         self.require_open()
         if self.armed is None:
-            raise DeviceStateError(f"camera '{self.name}' is not armed{_for(trigger)}; call arm first")
+            raise DeviceStateError(f"camera '{self.name}' is not armed{_for_trigger(trigger)}; call arm first")
         if trigger not in (None, self.armed):
-            found = "runs free" if self.armed is Trigger.FREE else f"is armed{_for(self.armed)}"
-            raise DeviceStateError(f"camera '{self.name}' {found}; read a frame, or arm it{_for(trigger)}")
+            found = "runs free" if self.armed is Trigger.FREE else f"is armed{_for_trigger(self.armed)}"
+            raise DeviceStateError(f"camera '{self.name}' {found}; read a frame, or arm it{_for_trigger(trigger)}")
 
     def require_settable(self) -> None:
         """Raise DeviceStateError of an armed camera, and after `close`."""
@@ -229,5 +229,5 @@ class CameraState:
             )
 
 
-def _for(trigger: Trigger | None) -> str:
+def _for_trigger(trigger: Trigger | None) -> str:
     return "" if trigger is None else f" for {trigger} triggers"

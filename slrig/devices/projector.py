@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass
 from typing import NoReturn, Protocol, runtime_checkable
 
-from slrig.devices.camera import USUAL, CallLimits
+from slrig.devices.camera import DEFAULT_LIMITS, CallLimits
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Pattern, PatternSequence, Size
 
@@ -30,7 +30,7 @@ class ProjectorInfo:
     plays: bool
     latency_s: float
     refresh_s: float | None = None
-    limits: CallLimits = USUAL
+    limits: CallLimits = DEFAULT_LIMITS
     recorded: tuple[Pattern, ...] = ()
     gap_s: float = 0.0005
     duty: float = 1.0
@@ -38,7 +38,7 @@ class ProjectorInfo:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class DisplayedPattern:
     """Pattern `index` lights the whole scene from `t_visible_ns` ± `t_err_ns` on (the rig's clock)."""
 
     index: int
@@ -61,7 +61,7 @@ class Projector(Protocol):
         """
         ...
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """Show one pattern of the loaded sequence and hold it; return once it is known when its light is on the scene.
 
         That may be a little later, by `info.latency_s` at most: a display is given its next picture while the one
@@ -91,7 +91,7 @@ class Projector(Protocol):
 
 
 @runtime_checkable
-class FlashedProjector(Projector, Protocol):
+class StoredPatternProjector(Projector, Protocol):
     """A projector that shows only the patterns that were put into its memory when a person asked for it."""
 
     def write_patterns(self, sequence: PatternSequence) -> str:
@@ -105,14 +105,14 @@ class FlashedProjector(Projector, Protocol):
 
 
 @runtime_checkable
-class UnprovenLight(Projector, Protocol):
+class UnknownPolarityProjector(Projector, Protocol):
     """A projector that may not know yet whether more current means a greater number or a smaller one.
 
     Until its rig file tells, it is dim whichever it is, with light that pulses. The doctor finds it out.
     """
 
     @property
-    def unproven(self) -> bool:
+    def is_polarity_unknown(self) -> bool:
         """Whether it is not known."""
         ...
 
@@ -121,13 +121,13 @@ class UnprovenLight(Projector, Protocol):
         """From one pulse of the dim light to the next: expose for whole ones."""
         ...
 
-    def try_current(self, share: float) -> None:
+    def set_trial_current(self, share: float) -> None:
         """Set the number that stands for the current, 0.4 to 0.6 of the greatest; dark until the next `show`.
         Raises UnsupportedByDeviceError: another number, or its sense is known.
         """
         ...
 
-    def option_for(self, *, rises: bool) -> str:
+    def polarity_option(self, *, rises: bool) -> str:
         """What to write into the [projector] table, if light rises with the number, or if it falls."""
         ...
 

@@ -30,7 +30,7 @@ class Clock(Protocol):
 
 
 @runtime_checkable
-class KeepsTime(Protocol):
+class HasClock(Protocol):
     """A head whose time stamps do not count in CLOCK_MONOTONIC, as that of a rendered rig on virtual time."""
 
     @property
@@ -105,7 +105,7 @@ class Turntable(Positioner, Protocol):
 
 
 @runtime_checkable
-class Positions(Protocol):
+class HasPositioner(Protocol):
     """A head that has a positioner."""
 
     @property
@@ -114,7 +114,7 @@ class Positions(Protocol):
         ...
 
 
-class AnyAngle(ABC):
+class TurntableBase(ABC):
     """A turntable that turns to any angle, and offers `count` of them as poses, evenly round the axis from 0° on. What
     it is made of turns.
     """
@@ -149,7 +149,7 @@ class AnyAngle(ABC):
 
 
 @runtime_checkable
-class Head(Protocol):
+class ScannerHead(Protocol):
     """One instrument that is cameras and projector in one: an integrated scanner, or the rendered rig."""
 
     @property
@@ -214,7 +214,7 @@ class Rig:
     projector: Projector
     settings: Mapping[str, CameraSettings]
     calibration: Calibration | None = None
-    head: Head | None = field(default=None)
+    head: ScannerHead | None = field(default=None)
     synchronisation: Synchronisation | None = None
     clock: Clock = field(default_factory=SystemClock)
     positioner: Positioner | None = None

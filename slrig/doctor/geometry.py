@@ -13,8 +13,7 @@ from slrig.doctor.findings import Finding, camera_named, fault, note, ok
 from slrig.doctor.light import Seen
 from slrig.doctor.measures.pictures import Orientation, apart_deg, expected_orientation, orientation
 from slrig.doctor.viewing import Viewer
-from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot
-from slrig.model.patterns import gray_index
+from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot, gray_index
 from slrig.patterns import cell_centre_px
 
 _COARSE_BITS = 6

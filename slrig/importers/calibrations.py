@@ -31,8 +31,8 @@ from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, Gray, Pinhole, Size
 from slrig.ros_messages import FRAME, MM_PER_M, PROJECTOR, WORLD, lens, pose
 
-MOST_BYTES = 2**18
-MOST_DEPTH = 12
+MAX_YAML_BYTES = 2**18
+MAX_YAML_DEPTH = 12
 
 
 _Loader: Any = type("_Loader", (yaml.SafeLoader,), {})
@@ -46,13 +46,13 @@ def read_yaml(path: Path) -> Any:
     """Return the data of a YAML file. Raises CalibrationError, with the line: it is cut, too large, too deep, or has
     anchors, which can make a short file an endless one.
     """
-    text = read_text(path, MOST_BYTES, CalibrationError)
+    text = read_text(path, MAX_YAML_BYTES, CalibrationError)
     depth = 0
     try:
         # Events are read one by one: nothing is built before the whole was looked at.
         for event in yaml.parse(text, _Loader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MOST_DEPTH or isinstance(event, yaml.AliasEvent):
+            if depth > MAX_YAML_DEPTH or isinstance(event, yaml.AliasEvent):
                 mark: Any = event.start_mark
                 message = f"{path}: expected YAML without anchors, and maps not deep in each other, found otherwise"
                 raise CalibrationError(f"{message} at line {mark.line + 1}; export it again")
@@ -88,7 +88,7 @@ TRANSFORMS = "transforms.yaml"
 Side = Annotated[int, Field(ge=1, le=MOST_SIDE_PX)]
 
 
-class Matrix(Strict):
+class RosMatrix(Strict):
     """Numbers row by row."""
 
     rows: Annotated[int, Field(ge=1, le=16)]
@@ -103,20 +103,20 @@ class Matrix(Strict):
         return np.array(self.data, dtype=np.float64).reshape(self.rows, self.cols)
 
 
-class CameraInfo(Strict):
+class RosCameraInfo(Strict):
     """What camera_calibration writes. What follows from the other numbers is passed over."""
 
     image_width: Side
     image_height: Side
     camera_name: str = ""
-    camera_matrix: Matrix
+    camera_matrix: RosMatrix
     distortion_model: str
-    distortion_coefficients: Matrix
+    distortion_coefficients: RosMatrix
     rectification_matrix: object = None
     projection_matrix: object = None
 
 
-class Vector(Strict):
+class RosVector(Strict):
     """Metres."""
 
     x: float
@@ -124,20 +124,20 @@ class Vector(Strict):
     z: float
 
 
-class Quaternion(Vector):
+class RosQuaternion(RosVector):
     """A rotation."""
 
     w: float
 
 
-class Pose(Strict):
+class RosTransform(Strict):
     """A child's pose in its parent."""
 
-    translation: Vector
-    rotation: Quaternion
+    translation: RosVector
+    rotation: RosQuaternion
 
 
-class Header(Strict):
+class RosHeader(Strict):
     """Whose frame the pose is told in."""
 
     frame_id: str
@@ -145,18 +145,18 @@ class Header(Strict):
     seq: object = None
 
 
-class Transform(Strict):
+class TransformStamped(Strict):
     """geometry_msgs/TransformStamped."""
 
-    header: Header
+    header: RosHeader
     child_frame_id: str
-    transform: Pose
+    transform: RosTransform
 
 
-class Transforms(Strict):
+class TfMessage(Strict):
     """tf2_msgs/TFMessage."""
 
-    transforms: Annotated[list[Transform], Field(min_length=1, max_length=64)]
+    transforms: Annotated[list[TransformStamped], Field(min_length=1, max_length=64)]
 
 
 def read_ros(folder: Path) -> Calibration:
@@ -170,16 +170,16 @@ def read_ros(folder: Path) -> Calibration:
             f"{folder}: expected NAME.yaml of each device, camera_info as camera_calibration writes it, and "
             f"{TRANSFORMS} with where they stand, found {found}"
         )
-    poses = _poses(folder / TRANSFORMS)
-    devices = {name: _device(path, poses, name) for name, path in files.items()}
+    poses = _read_ros_poses(folder / TRANSFORMS)
+    devices = {name: _read_ros_device(path, poses, name) for name, path in files.items()}
     projector = devices.pop(PROJECTOR, None)
     if not devices:
         raise CalibrationError(f"{folder}: expected a camera, found the projector alone; add its NAME.yaml")
     return Calibration(devices, projector)
 
 
-def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: str) -> Pinhole:
-    info = checked(CameraInfo, read_yaml(path), str(path), error=CalibrationError)
+def _read_ros_device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: str) -> Pinhole:
+    info = checked(RosCameraInfo, read_yaml(path), str(path), error=CalibrationError)
     terms = info.distortion_coefficients.array(f"{path}: distortion_coefficients").ravel()
     if info.distortion_model not in ("plumb_bob", "rational_polynomial") or terms[5:].any() or len(terms) < 4:
         raise CalibrationError(
@@ -202,9 +202,9 @@ def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: s
         raise CalibrationError(f"{path}: {cause}") from cause
 
 
-def _poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
+def _read_ros_poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
     """World to frame of each frame: rotation, and translation in mm. Raises CalibrationError."""
-    listed = checked(Transforms, read_yaml(path), str(path), error=CalibrationError).transforms
+    listed = checked(TfMessage, read_yaml(path), str(path), error=CalibrationError).transforms
     parents = {each.child_frame_id: each for each in listed}
     if len(parents) < len(listed):
         raise CalibrationError(f"{path}: expected one parent for each frame, found two; keep one of them")
@@ -247,7 +247,7 @@ def write_ros(folder: Path, calibration: Calibration) -> None:
     transforms: list[dict[str, Any]] = []
     texts: dict[str, bytes] = {}
     for name, device in devices.items():
-        texts[f"{name}.yaml"] = yaml_bytes(_info(name, device))
+        texts[f"{name}.yaml"] = yaml_bytes(_camera_info(name, device))
         place, turn = pose(device.rotation, device.translation_mm)
         stands = {
             "translation": dict(zip("xyz", place, strict=True)),
@@ -268,7 +268,7 @@ def write_ros(folder: Path, calibration: Calibration) -> None:
             shutil.rmtree(staging, ignore_errors=True)
 
 
-def _info(name: str, device: Pinhole) -> dict[str, Any]:
+def _camera_info(name: str, device: Pinhole) -> dict[str, Any]:
     def matrix(array: FloatArray) -> dict[str, Any]:
         return {"rows": array.shape[0], "cols": array.shape[1], "data": array.ravel().tolist()}
 
@@ -289,7 +289,7 @@ _MM_PER_M = 1000.0
 Four = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
-class ChainEntry(Strict):
+class KalibrCamera(Strict):
     """One camera of the chain."""
 
     camera_model: str
@@ -314,10 +314,10 @@ def read_kalibr(path: Path) -> Calibration:
         raise CalibrationError(
             f"{path}: expected Kalibr's cam0, cam1 … in this order, found {found}; of ROS name the folder"
         )
-    chain = [_entry(path, key, entry) for key, entry in data.items()]
+    chain = [_check_kalibr_camera(path, key, entry) for key, entry in data.items()]
     rotation, translation_mm = np.eye(3), np.zeros(3)
     devices = {}
-    for name, key, entry in zip(_names(chain), data, chain, strict=True):
+    for name, key, entry in zip(_kalibr_camera_names(chain), data, chain, strict=True):
         if (entry.T_cn_cnm1 is None) != (key == "cam0"):
             message = (
                 f"{path}: {key}.T_cn_cnm1: expected one for each but cam0, found otherwise; calibrate them together"
@@ -339,8 +339,8 @@ def read_kalibr(path: Path) -> Calibration:
     return Calibration(devices, projector)
 
 
-def _entry(path: Path, key: str, data: object) -> ChainEntry:
-    entry = checked(ChainEntry, data, f"{path}: {key}", error=CalibrationError)
+def _check_kalibr_camera(path: Path, key: str, data: object) -> KalibrCamera:
+    entry = checked(KalibrCamera, data, f"{path}: {key}", error=CalibrationError)
     models = (entry.camera_model, entry.distortion_model)
     if models != ("pinhole", "radtan") or (len(entry.intrinsics), len(entry.distortion_coeffs)) != (4, 4):
         raise CalibrationError(
@@ -351,7 +351,7 @@ def _entry(path: Path, key: str, data: object) -> ChainEntry:
     return entry
 
 
-def _names(chain: list[ChainEntry]) -> list[str]:
+def _kalibr_camera_names(chain: list[KalibrCamera]) -> list[str]:
     names = [entry.rostopic.strip("/").split("/")[0] for entry in chain]
     usable = len(set(names)) == len(names) and all(re.fullmatch(CAMERA_NAME, name) for name in names)
     return names if usable else [f"cam{number}" for number in range(len(chain))]
@@ -392,7 +392,7 @@ def write_kalibr(path: Path, calibration: Calibration) -> None:
     write_file(path, yaml_bytes(chain))
 
 
-PAIRS = {
+PROGRAM_KEYS = {
     "scan3d-capture": ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
     "SLStudio": ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),
     "procam-calibration": ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation"),
@@ -400,12 +400,12 @@ PAIRS = {
 }
 
 
-def program_of(root: Mapping[str, Value]) -> str | None:
+def detect_program(root: Mapping[str, Value]) -> str | None:
     """Whose file this is; None where it is nobody's of these."""
-    return next((program for program, keys in PAIRS.items() if set(keys) <= set(root)), None)
+    return next((program for program, keys in PROGRAM_KEYS.items() if set(keys) <= set(root)), None)
 
 
-def read_pair(
+def read_program_calibration(
     root: Mapping[str, Value],
     path: Path,
     *,
@@ -418,9 +418,9 @@ def read_pair(
     shown : a bit of the code of each axis: scan3d-capture counts the projector's pixels in cells of its finest bit.
     Raises CalibrationError: a matrix is missing or of another shape, or the extents are not known.
     """
-    program = str(program_of(root))
+    program = str(detect_program(root))
     found: list[FloatArray] = []
-    for key in PAIRS[program]:
+    for key in PROGRAM_KEYS[program]:
         value = root[key]
         if not isinstance(value, np.ndarray):
             raise CalibrationError(
@@ -437,10 +437,10 @@ def read_pair(
     both_cameras = program.startswith("OpenCV") and len(cameras) == 2
     other = sizes[1] if both_cameras else projector
     if program == "scan3d-capture":
-        second = _in_pixels(second, projector, shown)
+        second = _scale_cells_to_pixels(second, projector, shown)
     try:
-        here = Pinhole(sizes[0], first, five_terms(first_lens, path, PAIRS[program][1]), np.eye(3), np.zeros(3))
-        lens = five_terms(second_lens, path, PAIRS[program][3])
+        here = Pinhole(sizes[0], first, five_terms(first_lens, path, PROGRAM_KEYS[program][1]), np.eye(3), np.zeros(3))
+        lens = five_terms(second_lens, path, PROGRAM_KEYS[program][3])
         there = Pinhole(other, second, lens, rotation, translation.ravel())
     except CalibrationError as cause:
         raise CalibrationError(f"{path}: {cause}") from cause
@@ -449,7 +449,7 @@ def read_pair(
     return Calibration({names[0]: here}, there)
 
 
-def _in_pixels(matrix: FloatArray, projector: Size, shown: Mapping[Axis, Gray]) -> FloatArray:
+def _scale_cells_to_pixels(matrix: FloatArray, projector: Size, shown: Mapping[Axis, Gray]) -> FloatArray:
     """The matrix of a projector whose pixels are cells of the code, as one of its true pixels.
 
     With cells of c = 2^k px, cell x of n >> k begins at position c (x + offset of cells) - offset of pixels.
@@ -466,8 +466,8 @@ def _in_pixels(matrix: FloatArray, projector: Size, shown: Mapping[Axis, Gray]) 
     return found
 
 
-Form = Literal["slrig", "opencv", "ros", "kalibr"]
-ENDINGS: Mapping[str, Form] = {".json": "slrig", ".yml": "opencv", ".xml": "opencv"}
+CalibrationFormat = Literal["slrig", "opencv", "ros", "kalibr"]
+FORMAT_BY_SUFFIX: Mapping[str, CalibrationFormat] = {".json": "slrig", ".yml": "opencv", ".xml": "opencv"}
 
 
 def read_any_calibration(
@@ -479,7 +479,7 @@ def read_any_calibration(
 ) -> Calibration:
     """Return the calibration in a file, or in a folder as ROS has it.
 
-    cameras, projector, shown : what some programs' files do not say of the devices: see `read_pair`.
+    cameras, projector, shown : what some programs' files do not say of the devices: see `read_program_calibration`.
     Raises CalibrationError: it is of no kind that is known, or wrong.
     """
     if path.is_dir():
@@ -490,16 +490,16 @@ def read_any_calibration(
     if not text.removeprefix("\ufeff").startswith(("%YAML", "<")):
         return read_kalibr(path)
     root = read_file_storage(text, path)
-    if program_of(root) is None:
+    if detect_program(root) is None:
         return read_opencv_calibration(path)
-    return read_pair(root, path, cameras=cameras or {}, projector=projector, shown=shown or {})
+    return read_program_calibration(root, path, cameras=cameras or {}, projector=projector, shown=shown or {})
 
 
-def write_any_calibration(path: Path, calibration: Calibration, form: Form | None = None) -> None:
+def write_any_calibration(path: Path, calibration: Calibration, form: CalibrationFormat | None = None) -> None:
     """Write a calibration in one of the forms, by the ending of `path` where none is named; ROS's is a new folder.
     Raises CalibrationError: the ending says none, or the form cannot hold it; StorageError: the disk refused.
     """
-    form = form or ENDINGS.get(path.suffix.lower())
+    form = form or FORMAT_BY_SUFFIX.get(path.suffix.lower())
     if form is None:
         raise CalibrationError(
             f"{path}: expected a name that ends in .json, .yml or .xml, or --to; found '{path.suffix}'"

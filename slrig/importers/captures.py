@@ -44,15 +44,15 @@ _FIELDS = {
     "inverted": r"[A-Za-z0-9]*",
 }
 _FIELD = re.compile(r"\{(\w*)(?::0?(\d))?\}")
-_OTHERS = {
+_UNSUPPORTED = {
     "xor": "codes that are combined with a base pattern (XOR-02 and others) are not read: taken apart, their images "
     "are no pictures of light, and slrig measures edges in pictures to fractions of a pixel, and states how well",
     "phase": "phase shifts are not read: slrig measures edges of Gray codes and shifted lines",
 }
-_OTHERS |= dict.fromkeys(("phases", "sine", "sinus", "cos", "fringe", "fringes", "shift"), _OTHERS["phase"])
+_UNSUPPORTED |= dict.fromkeys(("phases", "sine", "sinus", "cos", "fringe", "fringes", "shift"), _UNSUPPORTED["phase"])
 
 
-class Code:
+class ProjectorCode:
     """The Gray codes of one projector, as the command line describes them."""
 
     def __init__(self, size: Size, *, cell_px: int = 1, offset_px: int = 0) -> None:
@@ -77,7 +77,7 @@ class Code:
         both = (False, True) if inverses else (False,)
         return [Gray(axis, bit, count, cell_px, offset, inverted) for bit in range(count) for inverted in both]
 
-    def of_words(self, words: str) -> Pattern:
+    def parse_pattern(self, words: str) -> Pattern:
         """What `white`, `black`, `column 3`, `row 0 inverted` or `column line 2 of 8 width 1` names; bit 0 is the most
         significant. Raises BundleError, PatternError.
         """
@@ -90,7 +90,7 @@ class Code:
         code = _CODE.fullmatch(plain)
         if code and code[1] in _AXES and (code[3] or "") in _INVERTED:
             return self.bit(_AXES[code[1]], int(code[2]), inverted=_INVERTED[code[3] or ""])
-        return _refuse_word(plain, "`white`, `black`, `column 3`, `row 0 inverted` or `column line 2 of 8`")
+        return _reject_word(plain, "`white`, `black`, `column 3`, `row 0 inverted` or `column line 2 of 8`")
 
     def bit(self, axis: Axis, bit: int, *, inverted: bool) -> Gray:
         """One bit of the whole code. Raises PatternError: it has no such bit."""
@@ -107,14 +107,14 @@ class Code:
                 axis = _AXES[name]
                 found += self.first(axis, self.bits(axis), inverses=not rest)
             else:
-                _refuse_word(word, "white, black, columns, rows, columns-plain and rows-plain")
+                _reject_word(word, "white, black, columns, rows, columns-plain and rows-plain")
         if not found:
             raise BundleError("--pattern: expected white, black, columns or rows, found nothing")
         encode(found, self.size)
         return found
 
 
-def opencv_sequence(code: Code, images: int, ends: Sequence[Pattern], *, ends_first: bool) -> list[Pattern]:
+def opencv_sequence(code: ProjectorCode, images: int, ends: Sequence[Pattern], *, ends_first: bool) -> list[Pattern]:
     """What OpenCV's `generate` showed: columns, then rows, each bit with its inverse. ends : white and black, as found.
     Raises BundleError: the images are as many for no such sequence.
     """
@@ -133,7 +133,7 @@ def opencv_sequence(code: Code, images: int, ends: Sequence[Pattern], *, ends_fi
     return [*ends, *middle] if ends_first else [*middle, *ends]
 
 
-def scan3d_sequence(code: Code, images: int) -> list[Pattern]:
+def scan3d_sequence(code: ProjectorCode, images: int) -> list[Pattern]:
     """White, black, then the first bits of columns and as many of rows, each with its inverse. Raises BundleError."""
     most = min(code.bits(axis) for axis in Axis)
     count, left = divmod(images - 2, 4)
@@ -146,20 +146,20 @@ def scan3d_sequence(code: Code, images: int) -> list[Pattern]:
     return [White(), Black(), *middle]
 
 
-def slstudio_sequence(code: Code, images: int) -> list[Pattern]:
+def slstudio_sequence(code: ProjectorCode, images: int) -> list[Pattern]:
     """White, black, then the first bits of columns, of rows, or of both, without inverses. Raises BundleError."""
     count = {axis: min(SLSTUDIO_BITS[axis], code.bits(axis)) for axis in Axis}
     known = {2 + sum(count[a] for a in shown): shown for shown in ([Axis.COLUMN], [Axis.ROW], list(Axis))}
     if images not in known:
         raise BundleError(
             f"expected {', '.join(map(str, known))} images of a Gray code, found {images}: SLStudio's other codes are "
-            f"phase shifts. {_OTHERS['phase']}; choose Gray Code in SLStudio's preferences and scan again"
+            f"phase shifts. {_UNSUPPORTED['phase']}; choose Gray Code in SLStudio's preferences and scan again"
         )
     middle = [each for axis in known[images] for each in code.first(axis, count[axis], inverses=False)]
     return [White(), Black(), *middle]
 
 
-def name_pattern(template: str) -> re.Pattern[str]:
+def compile_name_template(template: str) -> re.Pattern[str]:
     """What names a template as `{axis}_{bit:02}_{inverted}.png` fits. Raises BundleError: it has an unknown field."""
     parts: list[str] = []
     end = 0
@@ -174,16 +174,16 @@ def name_pattern(template: str) -> re.Pattern[str]:
     return re.compile("".join(parts) + re.escape(template[end:]))
 
 
-def pattern_of_name(code: Code, named: re.Match[str]) -> Pattern:
+def pattern_from_name(code: ProjectorCode, named: re.Match[str]) -> Pattern:
     """The bit that the fields of a name say: `bit` counts from the most significant, `power` is the one of 2.
     Raises BundleError: a field says nothing that is known; PatternError: the code has no such bit.
     """
     fields = named.groupdict()
     axis, inverted = (fields.get("axis") or "column").casefold(), (fields.get("inverted") or "").casefold()
     if axis not in _AXES:
-        _refuse_word(axis, f"{', '.join(_AXES)} as {{axis}} in {named[0]}")
+        _reject_word(axis, f"{', '.join(_AXES)} as {{axis}} in {named[0]}")
     if inverted not in _INVERTED:
-        _refuse_word(inverted, f"{', '.join(filter(None, _INVERTED))} or nothing as {{inverted}} in {named[0]}")
+        _reject_word(inverted, f"{', '.join(filter(None, _INVERTED))} or nothing as {{inverted}} in {named[0]}")
     bits = code.bits(_AXES[axis])
     if "bit" not in fields and "power" not in fields:
         raise BundleError("--names: expected a field {bit} or {power}, which tells the bits apart; add it")
@@ -196,23 +196,23 @@ def pattern_of_name(code: Code, named: re.Match[str]) -> Pattern:
     return code.bit(_AXES[axis], bit, inverted=_INVERTED[inverted])
 
 
-def _refuse_word(word: str, expected: str) -> NoReturn:
-    why = next((f" {text};" for name, text in _OTHERS.items() if word.startswith(name)), "")
+def _reject_word(word: str, expected: str) -> NoReturn:
+    why = next((f" {text};" for name, text in _UNSUPPORTED.items() if word.startswith(name)), "")
     raise BundleError(f"expected {expected}, found {word[:60]!r};{why} correct it")
 
 
 IMAGES = {".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"}
 CALIBRATIONS = ("calibration.yml", "calibration.yaml", "calibration.xml", "calibration.json")
-MOST_LIST_BYTES = 2**20
-_DIFFERS = 0.02
+MAX_LIST_BYTES = 2**20
+_MIN_DIFFERENCE = 0.02
 """Of full scale: by as much white and black differ where the projector's light falls."""
-_FEWEST, _CLEARLY = 0.002, 0.98
+_MIN_DIFFERING_FRACTION, _MIN_AGREEING_FRACTION = 0.002, 0.98
 """Share of pixels that have to differ at all, and of those that have to differ the same way."""
-_LEAST_OF_16_BITS = 2**14
+_MIN_BRIGHTEST_OF_16_BITS = 2**14
 
 
 @dataclass(frozen=True, slots=True)
-class Naming:
+class ImageNaming:
     """How images are told apart: a program's own order, an order in words, a template of names, or a list file."""
 
     program: str | None = None
@@ -224,7 +224,7 @@ class Naming:
 
 
 @dataclass(slots=True)
-class Imported:
+class ImageAssignment:
     """What was found. left_out : names of images that no pattern is known of."""
 
     cameras: dict[str, list[tuple[Path, Pattern]]] = field(default_factory=dict)
@@ -234,31 +234,31 @@ class Imported:
 def import_capture(
     folder: Path,
     output: Path,
-    code: Code,
-    naming: Naming,
+    code: ProjectorCode,
+    naming: ImageNaming,
     *,
     names: Sequence[str] = (),
     bit_depth: int | None = None,
     calibration_file: Path | None = None,
-) -> tuple[Imported, Path | None]:
+) -> tuple[ImageAssignment, Path | None]:
     """Write the images of `folder` as the bundle `output`; returns what was found, and the calibration that was used.
 
     names : of the cameras, in the natural order of what they are called in the folder. bit_depth : of samples in files
     of 16 bits. Raises BundleError, PatternError, CalibrationError: what was expected and found; StorageError.
     """
     with refusals_of(folder):
-        found = _found(folder, code, naming)
+        found = _assign_images(folder, code, naming)
     if names:
         if len(names) != len(found.cameras):
             have = ", ".join(found.cameras)
             raise BundleError(f"{folder}: expected {len(found.cameras)} names of cameras ({have}), found {len(names)}")
         found.cameras = dict(zip(names, found.cameras.values(), strict=True))
-    formats = {name: _one_format(files, bit_depth) for name, files in found.cameras.items()}
+    formats = {name: _common_format(files, bit_depth) for name, files in found.cameras.items()}
     sizes = {name: each.size for name, each in formats.items()}
     beside = next((folder / each for each in CALIBRATIONS if (folder / each).is_file()), None)
     path, calibration = calibration_file or beside, None
     if path is not None:
-        calibration = read_any_calibration(path, cameras=sizes, projector=code.size, shown=_shown_bits(found))
+        calibration = read_any_calibration(path, cameras=sizes, projector=code.size, shown=_bit_by_axis(found))
         check_calibration(calibration, code.size, sizes, str(path))
     patterns = list(dict.fromkeys(pattern for files in found.cameras.values() for _, pattern in files))
     with BundleWriter(output, code.size, patterns, formats, calibration) as writer:
@@ -267,17 +267,17 @@ def import_capture(
     return found, path
 
 
-def _found(folder: Path, code: Code, naming: Naming) -> Imported:
+def _assign_images(folder: Path, code: ProjectorCode, naming: ImageNaming) -> ImageAssignment:
     if not folder.is_dir():
         raise BundleError(f"{folder}: expected a folder of images, found none; check the path")
     if naming.listed is not None:
-        return _from_list(folder, code, naming.listed)
+        return _assign_from_list(folder, code, naming.listed)
     if naming.names is not None:
-        return _by_names(folder, code, naming)
-    found = Imported()
-    for name, files in _by_camera(folder).items():
+        return _assign_by_names(folder, code, naming)
+    found = ImageAssignment()
+    for name, files in _group_by_camera(folder).items():
         try:
-            patterns = _sequence(code, naming, files)
+            patterns = _pattern_sequence(code, naming, files)
         except BundleError as cause:
             raise BundleError(f"{folder}, {name}: {cause}") from cause
         if len(patterns) != len(files):
@@ -289,7 +289,7 @@ def _found(folder: Path, code: Code, naming: Naming) -> Imported:
     return found
 
 
-def _sequence(code: Code, naming: Naming, files: Sequence[Path]) -> list[Pattern]:
+def _pattern_sequence(code: ProjectorCode, naming: ImageNaming, files: Sequence[Path]) -> list[Pattern]:
     if naming.order is not None:
         return code.sequence(naming.order)
     count = len(files)
@@ -297,7 +297,7 @@ def _sequence(code: Code, naming: Naming, files: Sequence[Path]) -> list[Pattern
         form = frame_format(files[0])
         # Whoever saved the images chose where white and black stand, and which comes first.
         for ends_first, pair in ((False, files[-2:]), (True, files[:2])):
-            images = [_read(each, form) for each in pair]
+            images = [_read_image(each, form) for each in pair]
             brighter = _first_is_brighter(images[0], images[-1], form.full_scale)
             if brighter is not None:
                 ends: tuple[Pattern, ...] = (White(), Black()) if brighter else (Black(), White())
@@ -306,12 +306,12 @@ def _sequence(code: Code, naming: Naming, files: Sequence[Path]) -> list[Pattern
     return (scan3d_sequence if naming.program == "scan3d" else slstudio_sequence)(code, count)
 
 
-def _by_camera(folder: Path) -> dict[str, list[Path]]:
+def _group_by_camera(folder: Path) -> dict[str, list[Path]]:
     """Images in natural order, by subfolder, or by what their names have before the last number."""
-    images = _images(folder)
+    images = _list_images(folder)
     if not images:
         inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural)
-        found = {each.name: files for each in inside if (files := _images(each))}
+        found = {each.name: files for each in inside if (files := _list_images(each))}
         if not found:
             raise BundleError(f"{folder}: expected images ({', '.join(sorted(IMAGES))}), found none in it or below it")
         return found
@@ -323,21 +323,21 @@ def _by_camera(folder: Path) -> dict[str, list[Path]]:
     return {re.sub(r"[^A-Za-z0-9_-]+", "-", prefix).strip("_-") or "cam0": each for prefix, each in groups.items()}
 
 
-def _images(folder: Path) -> list[Path]:
+def _list_images(folder: Path) -> list[Path]:
     found = (each for each in folder.iterdir() if each.suffix.lower() in IMAGES and each.name[0] != ".")
     return sorted(found, key=natural)
 
 
-def _by_names(folder: Path, code: Code, naming: Naming) -> Imported:
-    bit_names = name_pattern(str(naming.names))
+def _assign_by_names(folder: Path, code: ProjectorCode, naming: ImageNaming) -> ImageAssignment:
+    bit_names = compile_name_template(str(naming.names))
     templates: tuple[tuple[str | None, Pattern], ...] = ((naming.white, White()), (naming.black, Black()))
-    ends = [(name_pattern(template), pattern) for template, pattern in templates if template is not None]
-    found = Imported()
+    ends = [(compile_name_template(template), pattern) for template, pattern in templates if template is not None]
+    found = ImageAssignment()
     for image in sorted((each for each in folder.rglob("*") if each.suffix.lower() in IMAGES), key=str):
         name = image.relative_to(folder).as_posix()
         known = [(match, pattern) for each, pattern in ends if (match := each.fullmatch(name))]
         if match := bit_names.fullmatch(name):
-            known.append((match, pattern_of_name(code, match)))
+            known.append((match, pattern_from_name(code, match)))
         if not known:
             found.left_out.append(name)
             continue
@@ -346,32 +346,32 @@ def _by_names(folder: Path, code: Code, naming: Naming) -> Imported:
     if not found.cameras:
         some = ", ".join(found.left_out[:5]) or "no image"
         raise BundleError(f"{folder}: expected images called as {naming.names}, found {some}; correct --names")
-    _require_whole(folder, found)
+    _require_complete_codes(folder, found)
     return found
 
 
-def _from_list(folder: Path, code: Code, path: Path) -> Imported:
+def _assign_from_list(folder: Path, code: ProjectorCode, path: Path) -> ImageAssignment:
     """Images of a CSV file with the columns file, pattern and, where there are several, camera."""
-    rows = csv.DictReader(read_text(path, MOST_LIST_BYTES, BundleError).splitlines(), skipinitialspace=True)
+    rows = csv.DictReader(read_text(path, MAX_LIST_BYTES, BundleError).splitlines(), skipinitialspace=True)
     columns = set(rows.fieldnames or ())
     if not {"file", "pattern"} <= columns <= {"file", "pattern", "camera"}:
         raise BundleError(f"{path}: expected the columns file, pattern and camera, found {', '.join(sorted(columns))}")
-    found = Imported()
+    found = ImageAssignment()
     for number, row in enumerate(rows, 2):
         if None in row or row["pattern"] is None:
             raise BundleError(f"{path}: expected {len(columns)} cells in line {number}, found others; correct it")
         try:
-            pattern = code.of_words(row["pattern"])
+            pattern = code.parse_pattern(row["pattern"])
         except BundleError as cause:
             raise BundleError(f"{path}, line {number}: {cause}") from cause
         found.cameras.setdefault(row.get("camera") or "cam0", []).append((folder / row["file"], pattern))
     if not found.cameras:
         raise BundleError(f"{path}: expected a line for each image, found none")
-    _require_whole(folder, found)
+    _require_complete_codes(folder, found)
     return found
 
 
-def _require_whole(folder: Path, found: Imported) -> None:
+def _require_complete_codes(folder: Path, found: ImageAssignment) -> None:
     """Refuse a bit that is missing before one that is there, and a pattern of which a camera has two images."""
     for name, files in found.cameras.items():
         patterns = [pattern for _, pattern in files]
@@ -389,7 +389,7 @@ def _require_whole(folder: Path, found: Imported) -> None:
                 )
 
 
-def _one_format(files: Sequence[tuple[Path, Pattern]], bit_depth: int | None) -> CameraFormat:
+def _common_format(files: Sequence[tuple[Path, Pattern]], bit_depth: int | None) -> CameraFormat:
     first = frame_format(files[0][0])
     if first.size.width_px * first.size.height_px > MOST_CAMERA_PX:
         raise BundleError(
@@ -408,7 +408,7 @@ def _one_format(files: Sequence[tuple[Path, Pattern]], bit_depth: int | None) ->
     return CameraFormat(first.size, bit_depth or first.bit_depth)
 
 
-def _read(path: Path, form: CameraFormat) -> Pixels:
+def _read_image(path: Path, form: CameraFormat) -> Pixels:
     return read_with_colour(path, (0,), form)[0][0]
 
 
@@ -430,7 +430,7 @@ def _write_camera(
         brightest = max(brightest, int(grey[0].max()))
         if isinstance(pattern, White | Black):
             ends[pattern.kind] = (path, grey[0])
-    if form.bit_depth > 8 and not told and brightest < _LEAST_OF_16_BITS:
+    if form.bit_depth > 8 and not told and brightest < _MIN_BRIGHTEST_OF_16_BITS:
         raise BundleError(
             f"{files[0][0].parent}, {name}: expected samples over all of 16 bits, found {brightest} at most: what "
             "is saturated cannot be told; say how many bits the camera has, as --bit-depth 12"
@@ -447,14 +447,14 @@ def _write_camera(
 def _first_is_brighter(first: Pixels, second: Pixels, full_scale: int) -> bool | None:
     """Whether one of two images is brighter wherever they differ; None where it is here the one, there the other."""
     difference = first.astype(np.int32) - second
-    differs = np.abs(difference) > _DIFFERS * full_scale
-    if differs.mean() < _FEWEST:
+    differs = np.abs(difference) > _MIN_DIFFERENCE * full_scale
+    if differs.mean() < _MIN_DIFFERING_FRACTION:
         return None
     share = float((difference[differs] > 0).mean())
-    return True if share >= _CLEARLY else False if share <= 1 - _CLEARLY else None
+    return True if share >= _MIN_AGREEING_FRACTION else False if share <= 1 - _MIN_AGREEING_FRACTION else None
 
 
-def _shown_bits(found: Imported) -> Mapping[Axis, Gray]:
+def _bit_by_axis(found: ImageAssignment) -> Mapping[Axis, Gray]:
     """A bit of the code of each axis that was shown."""
     return {p.axis: p for files in found.cameras.values() for _, p in files if isinstance(p, Gray)}
 

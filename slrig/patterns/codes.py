@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Size
-from slrig.model.patterns import from_gray, to_gray
+from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Size, from_gray, to_gray
 
 
 def gray_bits(extent_px: int, cell_px: int, offset_px: int) -> int:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import PatternError
 from slrig.model import (
+    MIN_LINE_STEPS,
     Axis,
     Black,
     Gray,
@@ -21,10 +22,9 @@ from slrig.model import (
     SequenceName,
     Size,
     White,
-    telling_bits,
-    telling_lines,
+    diagnostic_bits,
+    diagnostic_line_pairs,
 )
-from slrig.model.patterns import FEWEST_STEPS
 from slrig.patterns.codes import gray_bits, gray_profile, line_profile
 
 GRAY_ONLY_CELL_PX = 2
@@ -77,8 +77,8 @@ def scan_patterns(
     """List the patterns of one scan in the order of play.
 
     White, black; for columns, then for rows, as far as they are asked for, code and lines; white, black again, as far
-    as `closing` says. What tells how a camera sees comes first, `telling_bits` and without inverses `telling_lines`, so
-    that stripes are found while the bits come that only number them.
+    as `closing` says. What tells how a camera sees comes first, `diagnostic_bits` and without inverses
+    `diagnostic_line_pairs`, so that stripes are found while the bits come that only number them.
 
     size : the projector. line_shift : False leaves the line frames out: a Gray-only scan. period_px : n. steps : the
     number of line frames, which divide the period evenly; None stands for n. line_width_px : of a line; None stands for
@@ -104,10 +104,11 @@ def scan_patterns(
             f"slightly off moves a stripe by a whole period; use gray_cell_px ≤ {period_px // 2} or a longer period"
         )
     steps = period_px if steps is None else steps
-    if line_shift and (steps < FEWEST_STEPS or period_px % steps):
+    if line_shift and (steps < MIN_LINE_STEPS or period_px % steps):
         raise PatternError(
             f"lines {period_px} px apart cannot be shifted in {steps} equal steps of whole pixels; use a number from "
-            f"{FEWEST_STEPS} on that divides the period, or a period that is a multiple of {max(steps, FEWEST_STEPS)}"
+            f"{MIN_LINE_STEPS} on that divides the period, or a period that is a multiple of "
+            f"{max(steps, MIN_LINE_STEPS)}"
         )
     width_px = line_width_px if line_width_px is not None else period_px // 2
     ends: tuple[Pattern, ...] = (White(), Black())
@@ -115,9 +116,9 @@ def scan_patterns(
     for axis in [each for each, played in ((Axis.COLUMN, columns), (Axis.ROW, rows)) if played]:
         shifts = range(0, period_px, period_px // steps) if line_shift else ()
         lines = [LineShift(axis, shift, period_px, width_px) for shift in shifts]
-        first = list(chain.from_iterable(telling_lines(lines)))
+        first = list(chain.from_iterable(diagnostic_line_pairs(lines)))
         code = _gray_patterns(axis, size.along(axis), cell_px, gray_offset_px, inverses=inverses)
-        telling = telling_bits(code[0].bits)
+        telling = diagnostic_bits(code[0].bits)
         middle += [each for each in code if each.bit in telling]
         middle += [*first, *(line for line in lines if line not in first)] if not inverses else lines
         middle += [each for each in code if each.bit not in telling]

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import FloatArray, IntArray, Refusal, coarse_bits, telling_bits
+from slrig.model import FloatArray, IntArray, Refusal, coarse_bit_count, diagnostic_bits
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, lit_pixels
 from slrig.reconstruction.frames import AxisFrames, FrameStacks, Images, rows_of
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
@@ -104,7 +104,7 @@ def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_]
     `noise.estimate_noise`, and that away from their edges. Of single bits two that light the same window tell, or lines
     of half their period, whichever tell less, as there. Otherwise, and of few windows, nothing is told.
     """
-    count, lines = coarse_bits(len(frames.bits)), frames.telling_lines
+    count, lines = coarse_bit_count(len(frames.bits)), frames.telling_lines
     corner = _windows(where, len(summed.weights))
     if len(corner[0]) < _LEAST_WINDOWS or len(frames.bits) < _FEWEST_DEVIATING_BITS:
         return 1.0
@@ -283,7 +283,7 @@ def frames_loss(frames: AxisFrames, lit: NDArray[np.bool_], images: Images | Non
     """`compression_loss` of these images, of one camera and axis; by default of those that tell what the camera makes
     of light. lit : (H, W) bool.
     """
-    telling, lines = telling_bits(len(frames.bits)), frames.telling_lines
+    telling, lines = diagnostic_bits(len(frames.bits)), frames.telling_lines
     direct = [frames.bits[bit] for bit in telling] if lines is None else lines[0]
     told_by = direct + (lines[1] if lines is not None else [])
     if frames.inverses is not None:
@@ -368,7 +368,7 @@ def found_gamma(frames: AxisFrames) -> float:
     """How a camera bends light into values, by the edges of the code; 1 where that is not told, or next to nothing."""
     if frames.exposure_ratio != 1.0:
         return 1.0
-    full, telling, lines = frames.full_scale, telling_bits(len(frames.bits)), frames.telling_lines
+    full, telling, lines = frames.full_scale, diagnostic_bits(len(frames.bits)), frames.telling_lines
     # Rows enough: an edge of the code crosses most of them.
     step = max(1, frames.white.size // _MOST_PIXELS)
     if frames.inverses is not None:
@@ -409,7 +409,7 @@ def _sums(frames: AxisFrames, step: int) -> NDArray[np.float32]:
     them, and white and black as single bits show them.
     """
     lines, bits = ([image[::step] for image in images] for images in (frames.lines, frames.bits))
-    told = [bits[bit] for bit in telling_bits(len(bits))]
+    told = [bits[bit] for bit in diagnostic_bits(len(bits))]
     shown, seen = rows_of(lines), rows_of(told)
     white, black = seen.max(axis=0), seen.min(axis=0)
     clear = (white - black > _CLEAR_LEVELS / 255 * frames.full_scale) & (white < frames.clipped_at)

@@ -28,10 +28,10 @@ from slrig.model import (
     Pattern,
     Shot,
     White,
-    divides_period,
+    diagnostic_bits,
+    diagnostic_line_pairs,
     exposure_groups,
-    telling_bits,
-    telling_lines,
+    has_even_shifts,
 )
 
 Image = NDArray[np.float32]
@@ -111,7 +111,7 @@ class AxisFrames:
         """Of single bits, two line images and their inverses, which tell what the camera makes of light; None where
         there are none.
         """
-        pairs = () if self.inverses is not None else telling_lines(self.line_patterns)
+        pairs = () if self.inverses is not None else diagnostic_line_pairs(self.line_patterns)
         direct, inverted = ([self.lines[self.line_patterns.index(pair[i])] for pair in pairs] for i in (0, 1))
         return (direct, inverted) if pairs else None
 
@@ -178,8 +178,8 @@ class AxisPatterns:
         inverses `telling_lines`, or else lines of half their period and some bits; otherwise all of the code.
         """
         if len(self.ends) == 2:
-            told = telling_lines(self.lines)
-            bits = [replace(self.gray, bit=bit) for bit in telling_bits(self.gray.bits)]
+            told = diagnostic_line_pairs(self.lines)
+            bits = [replace(self.gray, bit=bit) for bit in diagnostic_bits(self.gray.bits)]
             if self.paired:
                 return frozenset((*self.ends, *bits, *(replace(bit, inverted=True) for bit in bits)))
             if self.halving and not self.inverted:
@@ -256,7 +256,7 @@ def halving(lines: Sequence[LineShift], /) -> bool:
     """Whether lines light half of their period, and their shifts divide it evenly: their mean is then the middle of
     white and black. lines : of one axis, period and width, by shift.
     """
-    return divides_period(lines) and lines[0].lights_half
+    return has_even_shifts(lines) and lines[0].is_half_lit
 
 
 def telling(shown: Sequence[Pattern], exposures_s: Sequence[float | None]) -> list[bool]:

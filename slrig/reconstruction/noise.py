@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import FloatArray, IntArray, coarse_bits
+from slrig.model import FloatArray, IntArray, coarse_bit_count
 from slrig.reconstruction.frames import AxisFrames, Images, at_rows, sampled
 
 _QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
@@ -109,7 +109,7 @@ def noise_samples(
 
     where : (H, W) bool, the pixels to take them from; all if it is None.
     """
-    coarse, lines = coarse_bits(len(frames.bits)), frames.telling_lines
+    coarse, lines = coarse_bit_count(len(frames.bits)), frames.telling_lines
     if frames.inverses is not None and len(frames.bits) >= _FEWEST_BITS:
         level, variance = _scatter_of_sums(frames.bits[:coarse], frames.inverses[:coarse], frames.clipped_at, where)
     elif frames.lines_halve and len(frames.bits) >= _FEWEST_BITS:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.model import FloatArray, LineShift, divides_period
+from slrig.model import FloatArray, LineShift, has_even_shifts
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames, band_rows, rows_of
 from slrig.reconstruction.noise import NoiseModel
@@ -38,7 +38,7 @@ def line_step_px(patterns: Sequence[LineShift], /) -> int | None:
     """The step of shifts that divide their period evenly into three or more, px, so that their light tells the phase at
     each pixel; None for others. patterns : of one period and width, by shift.
     """
-    return patterns[0].period_px // len(patterns) if divides_period(patterns) else None
+    return patterns[0].period_px // len(patterns) if has_even_shifts(patterns) else None
 
 
 def has_phase(frames: AxisFrames, /) -> bool:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Source
-from slrig.model.lens_kernels import STEPS, distorted, step_back, undistorted
+from slrig.model.lens_kernels import MAX_STEPS, distort, undistort, undistort_step
 from slrig.reconstruction.identification import StripeEnsemble
 
 _POINTS = 1024  # that are worth calling a kernel for
@@ -60,7 +60,7 @@ def distorted_from_pixel(d: Any, u: float, v: float) -> Any:
 def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
     """Undistorted normalised coordinates of a pixel, NaN for one that the lens cannot light."""
     xd, yd = distorted_from_pixel(d, u, v)
-    return undistorted(d[5:10], xd, yd, xd, yd, SETTLED)
+    return undistort(d[5:10], xd, yd, xd, yd, SETTLED)
 
 
 @kernel_part
@@ -92,7 +92,7 @@ def _project_kernel(first: int, last: int, d: Any, points: Any, out: Any) -> Non
     for i in range(first, last):
         px, py, pz = to_device(d, points[i, 0], points[i, 1], points[i, 2])
         if pz > 0:
-            xd, yd, _, _, _ = distorted(d[5:10], px / pz, py / pz)
+            xd, yd, _, _, _ = distort(d[5:10], px / pz, py / pz)
             out[i, 0] = d[0] * xd + d[1] * yd + d[2]
             out[i, 1] = d[3] * yd + d[4]
 
@@ -141,11 +141,11 @@ def on_light_sheets(
 @kernel_part
 def _settle_rays(w: Any, count: int, camera: Any) -> None:
     """Fill in x and y of a block's undistorted rays, NaN for those that the lens cannot light."""
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         unsettled = 0
         for i in range(count):
             x, y, goes_on = w[_X + i], w[_Y + i], w[_GOES_ON + i] > 0
-            dx, dy = step_back(camera[5:10], w[_XD + i], w[_YD + i], x, y)
+            dx, dy = undistort_step(camera[5:10], w[_XD + i], w[_YD + i], x, y)
             w[_X + i] = x + (dx if goes_on else 0.0)
             w[_Y + i] = y + (dy if goes_on else 0.0)
             goes_on = goes_on and dx * dx + dy * dy >= SETTLED * SETTLED  # not where that is NaN
@@ -164,7 +164,7 @@ def _settle_depths(w: Any, count: int, p: Any, coded: Any, position: float) -> N
             s, dx, dy, dz, goes_on = w[_S + i], w[_DX + i], w[_DY + i], w[_DZ + i], w[_GOES_ON + i] > 0
             scale = 1 / (p[21] + s * dz)
             x, y = (p[19] + s * dx) * scale, (p[20] + s * dy) * scale
-            xd, yd, a, b, c = distorted(p[5:10], x, y)
+            xd, yd, a, b, c = distort(p[5:10], x, y)
             gx, gy = coded[0] * a + coded[1] * b, coded[0] * b + coded[1] * c
             slope = (gx * (dx - x * dz) + gy * (dy - y * dz)) * scale
             missed = coded[0] * xd + coded[1] * yd + coded[2] - position
@@ -186,13 +186,13 @@ def _finish(w: Any, count: int, camera: Any, p: Any, coded: Any, other: Any) -> 
         depth = p[21] + s * dz
         scale = 1 / depth
         xn, yn = (p[19] + s * dx) * scale, (p[20] + s * dy) * scale
-        xd, yd, a, b, c = distorted(p[5:10], xn, yn)
+        xd, yd, a, b, c = distort(p[5:10], xn, yn)
         w[_S + i], w[_DEPTH + i], w[_ALONG + i] = s, depth, other[0] * xd + other[1] * yd + other[2]
         lit = a * c - b * b > 0  # where the projector's lens has not turned back
         gx, gy = coded[0] * a + coded[1] * b, coded[0] * b + coded[1] * c
         # On the same sheet, for a stripe found a little aside: position(o + s d) stays, so along with the ray's
         # direction its depth changes by ds = -s ∇position · dd / ∇position · d.
-        _, _, a, b, c = distorted(camera[5:10], x, y)
+        _, _, a, b, c = distort(camera[5:10], x, y)
         scale = s / (a * c - b * b) if lit else np.nan
         across, down = (w[_NX + i] - camera[1] / camera[3] * w[_NY + i]) / camera[0], w[_NY + i] / camera[3]
         mx, my = (c * across - b * down) * scale, (a * down - b * across) * scale

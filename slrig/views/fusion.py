@@ -25,9 +25,7 @@ from slrig.meshing import (
     used_vertices,
     vertex_normals,
 )
-from slrig.model import AlbedoMark, FloatArray, IntArray, Mesh
-from slrig.model.rig import require
-from slrig.model.surfaces import light_of, srgb_of
+from slrig.model import AlbedoMark, FloatArray, IntArray, Mesh, linear_to_srgb, require_array, srgb_to_linear
 from slrig.views.fusion_grid import (
     SEEN_BEYOND,
     Grid,
@@ -53,7 +51,7 @@ _ONE_SIGMA = 68.27  # per cent of a normal distribution
 _GAP, _VALUE, _WEIGHT, _NOISE, _NX, _NY, _NZ, _B0, _B1, _B2, _BEYOND, _FACE, _VIEW = range(13)
 _COLUMNS = 13
 _CLEAN, _UNKNOWN = int(AlbedoMark.NONE), int(AlbedoMark.UNKNOWN)
-_LIGHT = light_of(np.arange(256, dtype=np.uint8)) / light_of(np.array(255, np.uint8))
+_LIGHT = srgb_to_linear(np.arange(256, dtype=np.uint8)) / srgb_to_linear(np.array(255, np.uint8))
 
 
 class PoseErrors(NamedTuple):
@@ -349,7 +347,7 @@ def to_one_scale(sheets: Sheets, nearest: IntArray) -> FloatArray:
     """
     places = nearest[:, :: nearest.shape[1] // _SAMPLED_VERTICES + 1]
     vertex = sheets.faces[:, 0][places]
-    light = light_of(sheets.colour).max(axis=1)[vertex] / light_of(np.array([255], np.uint8))
+    light = srgb_to_linear(sheets.colour).max(axis=1)[vertex] / srgb_to_linear(np.array([255], np.uint8))
     sound = (places >= 0) & (sheets.mark[vertex] == AlbedoMark.NONE) & (light > _DARKEST)
     logs = np.log(np.where(sound, light, 1.0))
     count = len(places)
@@ -368,7 +366,7 @@ def to_one_scale(sheets: Sheets, nearest: IntArray) -> FloatArray:
     levels = np.arange(256, dtype=np.uint8)
     for view, gain in enumerate(gains):
         mine = sheets.colour[sheets.first_vertex[view] : sheets.first_vertex[view + 1]]
-        mine[:] = srgb_of(gain * light_of(levels) / light_of(levels[-1:]))[mine]
+        mine[:] = linear_to_srgb(gain * srgb_to_linear(levels) / srgb_to_linear(levels[-1:]))[mine]
     return np.asarray(gains)
 
 
@@ -423,7 +421,7 @@ class FusedModel:
     correlated_mm: float
 
     def __post_init__(self) -> None:
-        require(self.views, "FusedModel.views", (len(self.mesh.vertices_mm),), "i")
+        require_array(self.views, "FusedModel.views", (len(self.mesh.vertices_mm),), "i")
 
 
 def fused(
@@ -482,7 +480,7 @@ def fused(
     numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
     mesh = Mesh(
         points[used].astype(np.float32), numbers[faces], vertex_normals(points, faces)[used],
-        srgb_of(means.light[used]), means.mark[used],
+        linear_to_srgb(means.light[used]), means.mark[used],
         means.sigma_mm[used].astype(np.float32), np.full(int(used.sum()), NO_STRIPE, dtype=np.int32),
     )  # fmt: skip
     return FusedModel(mesh, means.views[used], voxel, rule.correlated_mm)

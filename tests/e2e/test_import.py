@@ -83,11 +83,11 @@ def test_the_patterns_of_a_program_light_what_slrig_says(program: str) -> None:
 def test_opencv_itself_shows_these_patterns(size: Size) -> None:
     if not hasattr(cv2, "structured_light"):
         pytest.skip("needs OpenCV's extra modules: pip install opencv-contrib-python-headless")
-    from slrig.importers.captures import Code, opencv_sequence
+    from slrig.importers.captures import ProjectorCode, opencv_sequence
 
     made, images = cv2.structured_light.GrayCodePattern.create(size.width_px, size.height_px).generate()
     assert made
-    ours = encode(opencv_sequence(Code(size), len(images), (), ends_first=False), size)
+    ours = encode(opencv_sequence(ProjectorCode(size), len(images), (), ends_first=False), size)
     for index, image in enumerate(images):
         assert (ours.image(index) == image).all(), index
 

@@ -14,14 +14,14 @@ import yaml
 
 from slrig.bundle import read_calibration, write_calibration
 from slrig.errors import BundleError, CalibrationError, PatternError, SlrigError
-from slrig.importers.calibrations import MOST_BYTES, read_any_calibration, read_yaml, write_any_calibration
+from slrig.importers.calibrations import MAX_YAML_BYTES, read_any_calibration, read_yaml, write_any_calibration
 from slrig.importers.captures import (
-    Code,
-    Naming,
+    ImageNaming,
+    ProjectorCode,
+    compile_name_template,
     import_capture,
-    name_pattern,
     parse_size,
-    pattern_of_name,
+    pattern_from_name,
     scan3d_sequence,
     slstudio_sequence,
 )
@@ -210,7 +210,7 @@ def test_yaml_that_would_grow_is_refused_before_it_is_built(tmp_path: Path) -> N
         ("[" * 10_000, "not deep in each other"),
         ("a: !!python/object/apply:os.getcwd []", "python/object"),
         ("a: [1", "at line 1"),
-        ("a: '" + "x" * MOST_BYTES + "'", f"at most {MOST_BYTES} bytes"),
+        ("a: '" + "x" * MAX_YAML_BYTES + "'", f"at most {MAX_YAML_BYTES} bytes"),
     ):
         with pytest.raises(CalibrationError, match=words):
             read_yaml(written(tmp_path / "rig.yaml", text))
@@ -258,7 +258,7 @@ def test_the_command_converts_files(tmp_path: Path) -> None:
 # ---- Which pattern an image shows by words and by names: what is known, and what is refused
 
 
-CODE = Code(Size(1824, 1140), cell_px=2)
+CODE = ProjectorCode(Size(1824, 1140), cell_px=2)
 
 
 @pytest.mark.parametrize(
@@ -274,7 +274,7 @@ CODE = Code(Size(1824, 1140), cell_px=2)
     ],
 )
 def test_words_name_a_pattern(words: str, wanted: Pattern) -> None:
-    assert CODE.of_words(words) == wanted
+    assert CODE.parse_pattern(words) == wanted
 
 
 @pytest.mark.parametrize(
@@ -291,7 +291,7 @@ def test_words_name_a_pattern(words: str, wanted: Pattern) -> None:
 )
 def test_other_words_are_refused(words: str, error: type[SlrigError], said: str) -> None:
     with pytest.raises(error, match=said):
-        CODE.of_words(words)
+        CODE.parse_pattern(words)
 
 
 @pytest.mark.parametrize(
@@ -305,9 +305,9 @@ def test_other_words_are_refused(words: str, error: type[SlrigError], said: str)
     ],
 )
 def test_a_name_says_its_bit(template: str, name: str, wanted: Pattern) -> None:
-    named = name_pattern(template).fullmatch(name)
+    named = compile_name_template(template).fullmatch(name)
     assert named is not None
-    assert pattern_of_name(CODE, named) == wanted
+    assert pattern_from_name(CODE, named) == wanted
 
 
 @pytest.mark.parametrize(
@@ -324,9 +324,9 @@ def test_a_name_says_its_bit(template: str, name: str, wanted: Pattern) -> None:
 )
 def test_a_name_that_says_none_is_refused(template: str, name: str, said: str) -> None:
     def read() -> Pattern:
-        named = name_pattern(template).fullmatch(name)
+        named = compile_name_template(template).fullmatch(name)
         assert named is not None
-        return pattern_of_name(CODE, named)
+        return pattern_from_name(CODE, named)
 
     with pytest.raises(SlrigError) as caught:
         read()
@@ -334,15 +334,17 @@ def test_a_name_that_says_none_is_refused(template: str, name: str, said: str) -
 
 
 def test_first_bits_are_a_code_of_wider_cells() -> None:
-    assert slstudio_sequence(Code(Size(1824, 1140)), 12)[2:] == [Gray(Axis.COLUMN, bit, 10, 2) for bit in range(10)]
-    assert slstudio_sequence(Code(Size(1824, 1140)), 8)[2:] == [Gray(Axis.ROW, bit, 6, 32) for bit in range(6)]
+    assert slstudio_sequence(ProjectorCode(Size(1824, 1140)), 12)[2:] == [
+        Gray(Axis.COLUMN, bit, 10, 2) for bit in range(10)
+    ]
+    assert slstudio_sequence(ProjectorCode(Size(1824, 1140)), 8)[2:] == [Gray(Axis.ROW, bit, 6, 32) for bit in range(6)]
     # 1280 columns are centred in 2048, in cells of 2; 800 rows in 1024.
-    shown = scan3d_sequence(Code(Size(1280, 800)), 42)
+    shown = scan3d_sequence(ProjectorCode(Size(1280, 800)), 42)
     assert shown[2:4] == [Gray(Axis.COLUMN, 0, 10, 2, 384), Gray(Axis.COLUMN, 0, 10, 2, 384, inverted=True)]
     assert shown[-1] == Gray(Axis.ROW, 9, 10, 1, 112, inverted=True)
     for images in (2, 41, 46):
         with pytest.raises(BundleError, match=f"found {images}"):
-            scan3d_sequence(Code(Size(1280, 800)), images)
+            scan3d_sequence(ProjectorCode(Size(1280, 800)), images)
 
 
 @pytest.mark.parametrize("words", ["", "1024", "0x768", "1024x", "-3x4", "1024x768x3", "123456x1"])
@@ -368,5 +370,5 @@ def test_an_extent_is_two_numbers(words: str) -> None:
 def test_a_list_that_is_wrong_is_refused(tmp_path: Path, lines: str, said: str) -> None:
     (tmp_path / "list.csv").write_text(lines)
     with pytest.raises(BundleError) as caught:
-        import_capture(tmp_path, tmp_path / "bundle", CODE, Naming(listed=tmp_path / "list.csv"))
+        import_capture(tmp_path, tmp_path / "bundle", CODE, ImageNaming(listed=tmp_path / "list.csv"))
     assert said in str(caught.value)

@@ -76,7 +76,7 @@ def expected_error(
     scale = solution.size.scale_sigma * scale_mode(calibration)
     board_mm = _rms(stated_deviation(moved.stated, rigid_free(places, moved.by_parameter @ scale[:, None])))
     diagonal_mm = float(np.linalg.norm(volume_mm[1] - volume_mm[0]))
-    length_share = _length_share(places, fields, diagonal_mm) if calibration.triangulates else float("nan")
+    length_share = _length_share(places, fields, diagonal_mm) if calibration.can_triangulate else float("nan")
     return ExpectedError(
         volume_mm=volume_mm,
         point_mm=calibration_mm,
@@ -85,7 +85,7 @@ def expected_error(
         length_share=length_share,
         grid_mm=places,
         grid_point_mm=point_mm,
-        across=not calibration.triangulates,
+        across=not calibration.can_triangulate,
         board_mm=board_mm,
     )
 
@@ -121,7 +121,7 @@ def volume_of(solution: Solution, observations: Observations, /) -> tuple[FloatA
         wanted *= 4
     if len(places) < _FEWEST_PLACES:
         other = "the projector" if solution.calibration.projector else "another camera"
-        whose = f" together with {other}" if solution.calibration.triangulates else ""
+        whose = f" together with {other}" if solution.calibration.can_triangulate else ""
         message = (
             f"expected places in the box of {_words(extent)} in which the board was held that the first camera sees"
             f"{whose}, found {len(places)} of {counts.prod()}; hold the board where all of it is in view"

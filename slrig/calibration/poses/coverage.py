@@ -25,7 +25,7 @@ from slrig.calibration.poses.rough import (
 )
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose, device_title
 from slrig.model import FloatArray, IntArray, Size
-from slrig.model.lens import distorted
+from slrig.model.lens import distort
 
 BoolArray = NDArray[np.bool_]
 
@@ -359,7 +359,7 @@ def projected(guess: DeviceGuess, space_mm: FloatArray) -> FloatArray:
     """
     depth = np.where(space_mm[..., 2] > 0, space_mm[..., 2], np.nan)
     x, y = space_mm[..., 0] / depth, space_mm[..., 1] / depth
-    across, down, _, _, _ = distorted(guess.distortion, x, y)
+    across, down, _, _, _ = distort(guess.distortion, x, y)
     matrix = guess.matrix
     return np.stack([matrix[0, 0] * across + matrix[0, 2], matrix[1, 1] * down + matrix[1, 2]], axis=-1)
 

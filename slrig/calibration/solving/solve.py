@@ -51,8 +51,7 @@ from slrig.calibration.solving.projection import (
     to_pinhole,
 )
 from slrig.errors import SolveRefusedError
-from slrig.model import Calibration, FloatArray, IntArray, Size
-from slrig.model.lens import LENS_TERMS
+from slrig.model import LENS_TERMS, Calibration, FloatArray, IntArray, Size
 
 _WITHIN_GROUP = 6.0
 _LEAST_AFTER = 2

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from slrig.bundle.sidecars import Refused
 from slrig.capture.frame_checks import (
     NOISE_FLOOR_DN,
-    Reference,
+    ReferenceFrames,
     Samples,
-    line_sum,
-    noise_dn,
-    reference,
-    repeated,
-    rougher,
+    build_reference,
+    find_repeated,
+    line_sum_fault,
+    pair_noise_dn,
+    roughness_fault,
 )
 from slrig.capture.verifier import Evidence, EvidenceSummary, Sampler, check_capture
 from slrig.errors import ScanEvidenceError
@@ -688,28 +688,28 @@ def noisy_band(
 
 
 @pytest.fixture(scope="module")
-def ref() -> Reference:
+def ref() -> ReferenceFrames:
     one = np.ones(SIZE.width_px)
     white, black = sampled(seen(one)), sampled(seen(0 * one))
-    return reference(white, black, threshold_dn=20, full_scale=255, row=SAMPLER.row)
+    return build_reference(white, black, threshold_dn=20, full_scale=255, row=SAMPLER.row)
 
 
 @pytest.mark.parametrize("period_px", [2, 4, 16, 64])
-def test_a_garbled_frame_is_rougher_than_its_inverse(ref: Reference, period_px: int) -> None:
+def test_a_garbled_frame_is_rougher_than_its_inverse(ref: ReferenceFrames, period_px: int) -> None:
     bit = seen(stripes(period_px // 2, period_px=period_px))
     inverse = sampled(seen(1 - stripes(period_px // 2, period_px=period_px)))
-    assert rougher(sampled(bit), [inverse], ref, noise=NOISE_DN) is None
-    assert rougher(inverse, [sampled(bit)], ref, noise=NOISE_DN) is None
-    told = rougher(sampled(noisy_band(bit)), [inverse], ref, noise=NOISE_DN)
+    assert roughness_fault(sampled(bit), [inverse], ref, noise=NOISE_DN) is None
+    assert roughness_fault(inverse, [sampled(bit)], ref, noise=NOISE_DN) is None
+    told = roughness_fault(sampled(noisy_band(bit)), [inverse], ref, noise=NOISE_DN)
     assert told is not None
     assert "damaged in transfer" in told
-    assert rougher(inverse, [sampled(noisy_band(bit))], ref, noise=NOISE_DN) is None
+    assert roughness_fault(inverse, [sampled(noisy_band(bit))], ref, noise=NOISE_DN) is None
 
 
-def test_light_that_flickers_from_pixel_to_pixel_is_no_damage(ref: Reference) -> None:
+def test_light_that_flickers_from_pixel_to_pixel_is_no_damage(ref: ReferenceFrames) -> None:
     """A projector that dithers: all is lit in one frame of a pair, and nothing in the other."""
     lit = seen(np.ones(SIZE.width_px)) * (1 + RANDOM.normal(0, 0.13, SIZE.shape))
-    assert rougher(sampled(lit), [sampled(seen(np.zeros(SIZE.width_px)))], ref, noise=NOISE_DN) is None
+    assert roughness_fault(sampled(lit), [sampled(seen(np.zeros(SIZE.width_px)))], ref, noise=NOISE_DN) is None
 
 
 def lines(width_px: int = 1) -> list[Samples]:
@@ -717,14 +717,14 @@ def lines(width_px: int = 1) -> list[Samples]:
 
 
 @pytest.mark.parametrize("width_px", [1, 3])
-def test_line_frames_add_up_alike_everywhere_whatever_the_response(ref: Reference, width_px: int) -> None:
-    assert line_sum(lines(width_px), ref, noise=NOISE_DN) is None
+def test_line_frames_add_up_alike_everywhere_whatever_the_response(ref: ReferenceFrames, width_px: int) -> None:
+    assert line_sum_fault(lines(width_px), ref, noise=NOISE_DN) is None
 
 
-def test_a_garbled_line_frame_is_blamed_by_the_sum(ref: Reference) -> None:
+def test_a_garbled_line_frame_is_blamed_by_the_sum(ref: ReferenceFrames) -> None:
     frames = lines()
     frames[3] = sampled(noisy_band(seen(stripes(1, 3))))
-    found = line_sum(frames, ref, noise=NOISE_DN)
+    found = line_sum_fault(frames, ref, noise=NOISE_DN)
     assert found is not None
     blamed, words = found
     assert 3 in blamed
@@ -732,15 +732,17 @@ def test_a_garbled_line_frame_is_blamed_by_the_sum(ref: Reference) -> None:
     assert "do not add up" in words
 
 
-def test_a_line_frame_that_shows_its_neighbours_lines_is_a_repetition_in_the_dark_too(ref: Reference) -> None:
+def test_a_line_frame_that_shows_its_neighbours_lines_is_a_repetition_in_the_dark_too(ref: ReferenceFrames) -> None:
     """Two exposures of one pattern: in dark such a camera has several times the noise that bright pixels tell."""
     again = sampled(seen(stripes(1, 2)) + RANDOM.normal(0, 3.0, SIZE.shape))
-    assert repeated(again, lines(), ref, noise=0.5, factor=40.0) == 2
-    assert repeated(sampled(seen(stripes(1, 2))), [sampled(seen(stripes(1, 3)))], ref, noise=0.5, factor=40.0) is None
+    assert find_repeated(again, lines(), ref, noise=0.5, factor=40.0) == 2
+    assert (
+        find_repeated(sampled(seen(stripes(1, 2))), [sampled(seen(stripes(1, 3)))], ref, noise=0.5, factor=40.0) is None
+    )
 
 
-def test_a_damaged_white_frame_does_not_pass_for_noise(ref: Reference) -> None:
-    damaged = Reference(
+def test_a_damaged_white_frame_does_not_pass_for_noise(ref: ReferenceFrames) -> None:
+    damaged = ReferenceFrames(
         RANDOM.uniform(120, 250, len(ref.white)).astype(np.float32), ref.black, ref.contrast, ref.lit, ref.judged,
         ref.row, ref.band,
     )  # fmt: skip
@@ -748,6 +750,6 @@ def test_a_damaged_white_frame_does_not_pass_for_noise(ref: Reference) -> None:
         [sampled(seen(stripes(16, period_px=32))), sampled(seen(1 - stripes(16, period_px=32)))],
         [sampled(seen(stripes(32, period_px=64))), sampled(seen(1 - stripes(32, period_px=64)))],
     )
-    assert noise_dn(first[0], first[1], damaged) > 10 * NOISE_DN
-    by_pairs = noise_dn(second[0], second[1], damaged, sums=[first[0] + first[1]])
+    assert pair_noise_dn(first[0], first[1], damaged) > 10 * NOISE_DN
+    by_pairs = pair_noise_dn(second[0], second[1], damaged, sums=[first[0] + first[1]])
     assert NOISE_FLOOR_DN < by_pairs < 3 * NOISE_DN

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from slrig.bundle.sidecars import Refused
-from slrig.capture.frame_checks import named, place
+from slrig.capture.frame_checks import describe_frame, describe_pattern
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
-from slrig.capture.verifier import RetryPolicy, in_words
-from slrig.devices import AppliedSettings, Rig, Shown, Trigger
+from slrig.capture.verifier import RetryPolicy, describe_causes
+from slrig.devices import AppliedSettings, DisplayedPattern, Rig, Trigger
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import Frame, Gray, PatternSequence, Primary, Shot
 
@@ -25,7 +25,7 @@ SETTINGS_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class CaptureSession:
     """One capture. `applied` has the cameras that were set; `timeout_s` is how long a frame may take beyond that."""
 
     rig: Rig
@@ -37,7 +37,7 @@ class Session:
 
     def pattern(self, index: int) -> str:
         """Words for a pattern."""
-        return named(index, self.sequence.patterns[index])
+        return describe_pattern(index, self.sequence.patterns[index])
 
     def patience_s(self, name: str) -> float:
         """How long to wait for a frame of this camera."""
@@ -48,7 +48,7 @@ class Session:
         if self.cancelled():
             raise ScanCancelledError(f"the scan was cancelled at {self.pattern(index)} of {len(self.sequence)}")
 
-    def settled_ns(self, shown: Shown) -> int:
+    def wait_until_stable(self, shown: DisplayedPattern) -> int:
         """Wait until a pattern's light is the only one, and return since when it is."""
         stable_ns = stable_from_ns(shown, self.rig.synchronisation)
         self.rig.clock.wait_until(stable_ns, threading.Event())
@@ -56,9 +56,9 @@ class Session:
 
     def read(self, name: str, after_ns: int, timeout_s: float) -> Frame:
         """Return the next frame under the name that the rig gives its camera. Raises as `Camera.read` does."""
-        return under_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
+        return with_camera_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
 
-    def own_fault(self, frame: Frame, after_ns: int, before: Frame | None) -> str | None:
+    def frame_fault(self, frame: Frame, after_ns: int, before: Frame | None) -> str | None:
         """Say why a frame was exposed too early, was delivered before, or was exposed otherwise than asked."""
         if frame.t_start_ns < after_ns or frame.t_end_ns < frame.t_start_ns:
             return (
@@ -72,7 +72,7 @@ class Session:
                 "delivered twice, or the camera restarted; scan again"
             )
         asked = self.applied.get(frame.camera)
-        if asked is not None and differ(frame.exposure_s, asked.exposure_s):
+        if asked is not None and differs_from_request(frame.exposure_s, asked.exposure_s):
             return (
                 f"exposed for {frame.exposure_s:.6g} s, set to {asked.exposure_s:.6g} s: switch off automatic "
                 "exposure, and scan again"
@@ -80,29 +80,29 @@ class Session:
         return None
 
 
-def under_name(name: str, frame: Frame) -> Frame:
+def with_camera_name(name: str, frame: Frame) -> Frame:
     """A frame under the name that the rig gives its camera."""
     return frame if frame.camera == name else replace(frame, camera=name)
 
 
-def differ(got: float, asked: float) -> bool:
+def differs_from_request(got: float, asked: float) -> bool:
     """Whether a setting is not what was asked."""
     return abs(got - asked) > SETTINGS_TOLERANCE * abs(asked)
 
 
-_Taken = tuple[int, str, Frame | str, str | None]
+_FrameResult = tuple[int, str, Frame | str, str | None]
 """Pattern and camera, what it gave or why nothing came in time, and what the frame says against itself."""
 
 
-def software_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]:
+def capture_by_software(session: CaptureSession, retries: RetryPolicy) -> Iterator[Shot]:
     """Show each pattern, and again where frames failed, until every frame counts. Raises as `RetryPolicy` does."""
     rig = session.rig
     rig.projector.load(session.sequence)
     for name, camera in rig.cameras.items():
-        camera.arm(retries.most_shots, session.triggers[name])
+        camera.arm(retries.max_exposures, session.triggers[name])
     ahead = iter(range(len(session.sequence)))
     last: dict[str, Frame] = {}
-    waiting: list[_Taken] = []
+    waiting: list[_FrameResult] = []
     while True:
         if retries.again:
             # First what failed, in order.
@@ -111,32 +111,34 @@ def software_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
         elif (index := next(ahead, -1)) >= 0:
             names = list(rig.cameras)
         elif waiting:
-            yield from _judged(retries, waiting)
+            yield from _submit_frames(retries, waiting)
             waiting = []
             continue
         else:
             return
         session.stop_if_cancelled(index)
         shown = rig.projector.show(index)
-        stable_ns = session.settled_ns(shown)
+        stable_ns = session.wait_until_stable(shown)
         for name in names:
             retries.begin(name, index)
             if session.triggers[name] is Trigger.SOFTWARE:
                 rig.cameras[name].trigger()
         # The sensors are at work now: there is time for the frames before.
-        yield from _judged(retries, waiting)
-        waiting = [_taken(session, name, shown, stable_ns, last) for name in names]
+        yield from _submit_frames(retries, waiting)
+        waiting = [_read_frame(session, name, shown, stable_ns, last) for name in names]
 
 
-def _judged(retries: RetryPolicy, taken: list[_Taken]) -> Iterator[Shot]:
+def _submit_frames(retries: RetryPolicy, taken: list[_FrameResult]) -> Iterator[Shot]:
     for index, name, frame, fault in taken:
         if isinstance(frame, str):
             retries.missed(name, index, frame)
-        elif (shot := retries.took(index, frame, fault)) is not None:
+        elif (shot := retries.submit(index, frame, fault)) is not None:
             yield shot
 
 
-def _taken(session: Session, name: str, shown: Shown, after_ns: int, last: dict[str, Frame]) -> _Taken:
+def _read_frame(
+    session: CaptureSession, name: str, shown: DisplayedPattern, after_ns: int, last: dict[str, Frame]
+) -> _FrameResult:
     session.stop_if_cancelled(shown.index)
     timeout_s = session.patience_s(name)
     try:
@@ -150,15 +152,15 @@ def _taken(session: Session, name: str, shown: Shown, after_ns: int, last: dict[
             + ("is the machine busy?" if computed else "check the camera's cable, bandwidth and trigger")
         )
         return shown.index, name, cause, None
-    fault = session.own_fault(frame, after_ns, last.get(name))
+    fault = session.frame_fault(frame, after_ns, last.get(name))
     last[name] = frame
     return shown.index, name, frame, fault
 
 
-MOST_PLAYS = 3
+MAX_PLAYS = 3
 
-_ALIKE = 0.9  # correlation of brightness that tells a shift: few cameras are linear
-_BETTER = 0.05  # than without a shift
+_MIN_CORRELATION = 0.9  # correlation of brightness that tells a shift: few cameras are linear
+_MIN_IMPROVEMENT = 0.05  # than without a shift
 
 
 @dataclass(slots=True)
@@ -180,7 +182,7 @@ class _Play:
         return len(apart_ns) > 1 and 1.5 < float(np.median(apart_ns)) / (self.period_s * 1e9) < 2.5
 
 
-def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]:
+def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[Shot]:
     """Play the sequence until every frame counts, three times at most.
 
     Frames are delivered as they come. Those of a play that failed are refused, and all come again.
@@ -199,18 +201,18 @@ def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
     last: dict[str, Frame] = {}
     causes: list[str] = []
     timed_out = 0
-    for number in range(1, MOST_PLAYS + 1):
+    for number in range(1, MAX_PLAYS + 1):
         for camera in rig.cameras.values():
             # Room for one more than there should be: it would tell.
             camera.arm(count + 1, Trigger.HARDWARE)
         play = _Play({name: [] for name in rig.cameras}, lit_s, period_s)
-        yield from _frames(session, retries, play, last)
+        yield from _read_play(session, retries, play, last)
         rig.projector.stop()
         if not play.faults:
             return
         for camera in rig.cameras.values():
             camera.disarm()
-        causes.append(_cause(play, session.sequence))
+        causes.append(_describe_faults(play, session.sequence))
         timed_out += play.missing == len(play.faults)
         # Slow enough is better than not at all: the cause says what to write into the rig file.
         period_s *= 2 if any(play.halved(name) for name in rig.cameras) else 1
@@ -219,11 +221,11 @@ def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
             retries.refuse(Refused(index, name, number, causes[-1], delivered=True))
         for shot in play.withheld:
             retries.refuse(Refused(shot.pattern, shot.camera, number, causes[-1], shot))
-    message = f"the sequence was played {MOST_PLAYS} times by wire: {in_words(causes)}"
+    message = f"the sequence was played {MAX_PLAYS} times by wire: {describe_causes(causes)}"
     raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
 
 
-def play_times_s(session: Session) -> tuple[float, float]:
+def play_times_s(session: CaptureSession) -> tuple[float, float]:
     """Return how long each pattern is lit, and the time from one trigger pulse to the next, s.
 
     The longest wins: what the projector needs between patterns, what each camera says that it needs from one exposure
@@ -238,12 +240,12 @@ def play_times_s(session: Session) -> tuple[float, float]:
     # The last row of a rolling shutter must have had the pattern's light as long as the first.
     lit_s = exposure_s + skew_s
     unknown_s = lit_s + exposure_s if asked_s is None else asked_s
-    needed_s = [unknown_s if each.least_period_s is None else each.least_period_s for each in applied.values()]
+    needed_s = [unknown_s if each.min_period_s is None else each.min_period_s for each in applied.values()]
     projector = rig.projector.info
     return lit_s, max((lit_s + projector.gap_s) / projector.duty, asked_s or 0.0, *needed_s)
 
 
-def _missed(session: Session, play: _Play, name: str, index: int, error: FrameTimeoutError) -> str:
+def _missing_frame_fault(session: CaptureSession, play: _Play, name: str, index: int, error: FrameTimeoutError) -> str:
     """Words for a frame that did not come."""
     count = len(session.sequence)
     if play.halved(name):
@@ -259,7 +261,7 @@ def _missed(session: Session, play: _Play, name: str, index: int, error: FrameTi
     )
 
 
-def _frames(session: Session, retries: RetryPolicy, play: _Play, last: dict[str, Frame]) -> Iterator[Shot]:
+def _read_play(session: CaptureSession, retries: RetryPolicy, play: _Play, last: dict[str, Frame]) -> Iterator[Shot]:
     rig, count = session.rig, len(session.sequence)
     lit_s, period_s = play.lit_s, play.period_s
     before: dict[str, Frame] = {}
@@ -273,14 +275,14 @@ def _frames(session: Session, retries: RetryPolicy, play: _Play, last: dict[str,
             try:
                 frame = session.read(name, after_ns, period_s + session.patience_s(name))
             except FrameTimeoutError as error:
-                play.faults.append(_missed(session, play, name, index, error))
+                play.faults.append(_missing_frame_fault(session, play, name, index, error))
                 play.missing += 1
                 waiting_for.remove(name)
                 continue
             play.levels[name].append(float(frame.image.mean()))
             play.starts_ns.setdefault(name, []).append(frame.t_start_ns)
-            where = place(name, index, session.sequence.patterns[index])
-            own = session.own_fault(frame, after_ns, before.get(name)) or _gap(frame, before.get(name))
+            where = describe_frame(name, index, session.sequence.patterns[index])
+            own = session.frame_fault(frame, after_ns, before.get(name)) or _numbering_fault(frame, before.get(name))
             last[name] = before[name] = frame
             shot = retries.shot(index, frame)
             if own is not None:
@@ -297,7 +299,7 @@ def _frames(session: Session, retries: RetryPolicy, play: _Play, last: dict[str,
                 play.delivered.append((index, name))
                 yield shot
     for name in waiting_for:
-        extra = _extra(session, name, last[name], period_s)
+        extra = _read_extra_frame(session, name, last[name], period_s)
         if extra is not None:
             play.levels[name].append(float(extra.image.mean()))
             play.faults.append(
@@ -306,7 +308,7 @@ def _frames(session: Session, retries: RetryPolicy, play: _Play, last: dict[str,
             )
 
 
-def _extra(session: Session, name: str, last: Frame, period_s: float) -> Frame | None:
+def _read_extra_frame(session: CaptureSession, name: str, last: Frame, period_s: float) -> Frame | None:
     """The frame beyond the last one. It would come within one period, as all of them did."""
     try:
         return session.read(name, last.t_end_ns, 1.5 * period_s)
@@ -314,7 +316,7 @@ def _extra(session: Session, name: str, last: Frame, period_s: float) -> Frame |
         return None
 
 
-def _gap(frame: Frame, before: Frame | None) -> str | None:
+def _numbering_fault(frame: Frame, before: Frame | None) -> str | None:
     skipped = before is not None and frame.sequence_number != before.sequence_number + 1
     if not skipped and not frame.dropped_count:
         return None
@@ -325,7 +327,7 @@ def _gap(frame: Frame, before: Frame | None) -> str | None:
     )
 
 
-def _cause(play: _Play, sequence: PatternSequence) -> str:
+def _describe_faults(play: _Play, sequence: PatternSequence) -> str:
     """What is wrong with a play: a shift of all frames, where their brightness shows one, explains everything else."""
     shifts = {name: frame_shift(levels, sequence) for name, levels in play.levels.items()}
     words = [
@@ -357,4 +359,4 @@ def frame_shift(levels: Sequence[float], sequence: PatternSequence) -> int:
         apart = len(frames) > 2 and np.ptp(frames) > 0 and np.ptp(shown) > 0
         agreement[shift] = float(np.corrcoef(frames, shown)[0, 1]) if apart else 0.0
     best = max(agreement, key=lambda shift: agreement[shift])
-    return best if agreement[best] > _ALIKE and agreement[best] > agreement[0] + _BETTER else 0
+    return best if agreement[best] > _MIN_CORRELATION and agreement[best] > agreement[0] + _MIN_IMPROVEMENT else 0
