@@ -86,9 +86,9 @@ def import_images(
     )
     for name, files in found.cameras.items():
         typer.echo(f"{'camera':<11}{name}: {len(files)} images, {files[0][0].name} to {files[-1][0].name}")
-    if found.left_out:
-        some = ", ".join(found.left_out[:5]) + (" …" if len(found.left_out) > 5 else "")
-        typer.echo(f"{'left out':<11}{len(found.left_out)} images that no pattern is known of: {some}")
+    if found.unassigned:
+        some = ", ".join(found.unassigned[:5]) + (" …" if len(found.unassigned) > 5 else "")
+        typer.echo(f"{'left out':<11}{len(found.unassigned)} images that no pattern is known of: {some}")
     typer.echo(f"{'bundle':<11}{output}")
     how = "" if used is not None else " --decode-only"
     typer.echo(f"{'calibrated':<11}{used or 'no: it can only be decoded'}")
