@@ -1,4 +1,4 @@
-"""Playing a pattern sequence on a rig and taking the frames that show it."""
+"""Capture of pattern sequences on a rig, with verification of the frames."""
 
 from slrig.capture.exposure import (
     MIN_CONTRAST_DN,

@@ -70,7 +70,7 @@ def doctor(
                 period_px=lines.period_px,
                 steps=lines.steps or lines.period_px,
                 search_s=search_s,
-                told=display,
+                on_progress=display,
             )
     if output is not None:
         write_rig_file(diagnosis, rig_file, output, force=force)
@@ -123,7 +123,7 @@ def tell_latency(
     kind = None if trigger is None else Trigger(trigger)
     with open_rig(read_rig(rig_file)) as rig, progress_shown() as display:
         measured = measure_latency(
-            rig, trials=trials, search_s=search_s, exposure_s=exposure_s, trigger=kind, told=display
+            rig, trials=trials, search_s=search_s, exposure_s=exposure_s, trigger=kind, on_progress=display
         )
     if as_json:
         # JSON knows no NaN.

@@ -84,7 +84,7 @@ def _played(viewer: Viewer, sequence: PatternSequence, seen: Seen) -> tuple[tupl
     with viewer.armed(sequence, seen.exposure_s, len(sequence)):
         for index, pattern in enumerate(patterns):
             image = viewer.frames(index)[0].image
-            causes += [str(each) for each in evidence.contradictions(Shot(index, viewer.name, image))]
+            causes += [str(each) for each in evidence.add_shot(Shot(index, viewer.name, image))]
             if not isinstance(pattern, Gray):
                 continue
             positive = Gray(pattern.axis, pattern.bit, pattern.bits, pattern.cell_px, pattern.offset_px)

@@ -182,7 +182,7 @@ def diagnostic_bits(bits: int) -> tuple[int, ...]:
 
 def diagnostic_line_pairs(lines: Sequence[LineShift]) -> tuple[tuple[LineShift, LineShift], ...]:
     """Return two pairs of lines and their inverses, about a quarter of a period apart, that characterise a camera:
-    where one pair has edges, the other has none. Empty if there are no such pairs.
+    where one pair has edges, the other has none. Empty without such pairs.
 
     lines : of one axis, period and width.
     """

@@ -75,7 +75,9 @@ class Exposing:
         self._tell = refused
         self._colour = colour
         self._formats = {name: camera.info.format for name, camera in rig.cameras.items()}
-        self._samplers = {name: Sampler.of(form.size) for name, form in self._formats.items()} if self._bracket else {}
+        self._samplers = (
+            {name: Sampler.from_size(form.size) for name, form in self._formats.items()} if self._bracket else {}
+        )
         self._runs: list[_Run] = []
         self._compared: dict[str, ExposureSamples] = {}
         self._refused: list[Refused] = []
@@ -233,7 +235,7 @@ class Exposing:
         again = f"at {run.exposure_s:g} s, the sequence was begun again without camera {', '.join(unfit)}"
         for name, told in unfit.items():
             longer = "; it was not exposed longer than that" if told.fault is ExposureFault.TOO_BRIGHT else ""
-            cause = f"{run.exposure_s:g} s is {told.fault} for camera '{name}': {told.words}{longer}"
+            cause = f"{run.exposure_s:g} s is {told.fault} for camera '{name}': {told.description}{longer}"
             self._causes[name] = cause
             white = self._sequence.patterns.index(White())
             self._note(Refused(white, name, run.refused[white, name] + 1, cause, left_out=True))

@@ -45,7 +45,7 @@ class Looking:
     def __init__(self, rig: Rig, *, cancelled: Callable[[], bool]) -> None:
         self._rig = rig
         self._cancelled = cancelled
-        self._samplers = {name: Sampler.of(camera.info.format.size) for name, camera in rig.cameras.items()}
+        self._samplers = {name: Sampler.from_size(camera.info.format.size) for name, camera in rig.cameras.items()}
         self._looks: dict[float, Mapping[str, Look]] = {}
         self._refused_shorter = False
         self.overheads_s: list[float] = []

@@ -262,7 +262,7 @@ def _streamed(
         stream.take(shot)
         if proven is None and one_exposure and index in judged:
             entered("check frames", shot.camera)
-            evidence.contradictions(shot)
+            evidence.add_shot(shot)
         entered("read bundle", shot.camera)
     if proven is None:
         proven = evidence.summary() if one_exposure else check_exposures(capture, refused)

@@ -435,7 +435,7 @@ class FakeRig:
 
 def add(evidence: Evidence, shot: Shot) -> None:
     """Feed a frame that must contradict nothing."""
-    found = evidence.contradictions(shot)
+    found = evidence.add_shot(shot)
     if found:
         raise ScanEvidenceError("; ".join(map(str, found)))
 

@@ -91,7 +91,7 @@ def shots_at(times: float, *, moved_px: float = 0.0, noise_dn: float = 0.8) -> l
 
 
 def samples_of(shots: Sequence[Shot]) -> ExposureSamples:
-    sampler = Sampler.of(Scene().camera)
+    sampler = Sampler.from_size(Scene().camera)
     exposure_s = shots[0].exposure_s
     assert exposure_s is not None
     return ExposureSamples(exposure_s, {shot.pattern: sampler.take(shot.image) for shot in shots}, 0.8)
@@ -108,7 +108,7 @@ def test_what_moved_between_two_exposures_is_told(moved_px: float) -> None:
     one, other = samples_of(shots_at(0.25)), samples_of(shots_at(1.0, moved_px=moved_px))
     told = detect_movement(one, other, PATTERNS, 255)
     assert told is not None
-    assert "looks otherwise at 0.01 s than at 0.0025 s" in told
+    assert "looks different at 0.01 s and at 0.0025 s" in told
     assert "moved between the two exposures" in told
 
 

@@ -77,7 +77,7 @@ def test_the_rig_is_dark_and_usable_after_the_test(tmp_path: Path, interrupted: 
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt) if interrupted else nullcontext():
-        measure_latency(usual, trials=8, told=told)
+        measure_latency(usual, trials=8, on_progress=told)
     usual.cameras["eye"].arm(1, Trigger.FREE)
     assert fractions[0] == 0
     assert interrupted or fractions[-1] == 1
@@ -260,7 +260,7 @@ class World:
                 image = self.image(self.shares(light, start_s), rng)
                 stamp_ns = STATED_NS + round((start_s + self.stamp_offset_s) * 1e9)
                 frames.append((stamp_ns, self.exposure_s, levels.shares(image)))
-            made.append(LightChange.of(to_white, DisplayedPattern(0, STATED_NS, 500_000), frames))
+            made.append(LightChange.from_frames(to_white, DisplayedPattern(0, STATED_NS, 500_000), frames))
         return made
 
     def measured(self, *, count: int = 60, seed: int = 0) -> CameraLatency:
@@ -392,7 +392,7 @@ def test_levels_leave_out_rows_that_tell_nothing() -> None:
     [
         ({"white_dn": 0.0}, r"sees no flash.*lamp is on"),
         ({"white_dn": 3000.0}, r"saturated.*expose shorter"),
-        ({"white_dn": 60.0, "noise_dn": 15.0}, "rows tell white from black"),
+        ({"white_dn": 60.0, "noise_dn": 15.0}, "rows distinguish white from black"),
         ({"exposure_s": 5e-4, "period_s": 0.1}, r"between two exposures .* raise its frame rate"),
         ({"light": both_ways(step(0.35))}, "did not change while it was watched"),
     ],

@@ -428,10 +428,10 @@ def test_a_camera_is_not_exposed_for_ever() -> None:
     policy = RetryPolicy(SHORT, Evidence(SHORT.patterns, {"left": Scene().format}), lambda _: None)
     assert policy.max_exposures == MAX_FAILURES * len(SHORT)
     for number in range(policy.max_exposures):
-        policy.begin("left", number % len(SHORT))
-    policy.begin("right", 0)
+        policy.start_exposure("left", number % len(SHORT))
+    policy.start_exposure("right", 0)
     with pytest.raises(ScanEvidenceError, match=f"{policy.max_exposures} exposures gave no {len(SHORT)} frames"):
-        policy.begin("left", 0)
+        policy.start_exposure("left", 0)
 
 
 def test_a_projector_that_swapped_two_patterns_once_is_overcome() -> None:

@@ -604,7 +604,7 @@ def test_what_moves_between_two_exposures_ends_the_scan(tmp_path: Path) -> None:
     rig.cameras["right"].pushed_at = 2
     told = ended(rig, tmp_path / "bundle")
     assert "camera 'right', pattern" in told
-    assert "looks otherwise at 0.01 s than at 0.005 s" in told
+    assert "looks different at 0.01 s and at 0.005 s" in told
 
 
 def test_a_cancel_at_the_second_exposure_leaves_nothing(tmp_path: Path) -> None:
