@@ -13,7 +13,7 @@ from simulated_rig.light import Float32Array, LightTable
 from simulated_rig.options import CameraOptions, Faults
 from simulated_rig.rendering import View
 from simulated_rig.world import Flicker, Lamp, nanoseconds
-from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings, CameraState, Clock, Trigger
+from slrig.devices import COMPUTED_LIMITS, AppliedSettings, CameraInfo, CameraSettings, CameraState, Clock, Trigger
 from slrig.errors import DeviceGoneError, FrameTimeoutError
 from slrig.model import CameraFormat, Frame, Pixels
 
@@ -79,7 +79,7 @@ class SimulatedCamera:
             triggers=frozenset({Trigger.FREE, Trigger.SOFTWARE}),
             exposure_range_s=(options.exposure_min_s, options.exposure_max_s),
             gain_range=(1.0, options.gain_max),
-            limits=COMPUTED,
+            limits=COMPUTED_LIMITS,
             colour=options.colour is not None,
         )
 

@@ -17,13 +17,13 @@ from simulated_rig.staging import Script, Staging
 from simulated_rig.turning import RenderedTurntable
 from simulated_rig.world import Flicker, VirtualClock
 from slrig.bundle.validation import checked
-from slrig.devices import Camera, Clock, Head, Positioner, SystemClock, progress_reporter
+from slrig.devices import Camera, Clock, Positioner, ScannerHead, SystemClock, progress_reporter
 from slrig.kernels import compilations_told
 from slrig.model import Calibration, Surface, Truth
 
 
 class SimulatedHead:
-    """Implements `slrig.devices.Head` on the rendered world.
+    """Implements `slrig.devices.ScannerHead` on the rendered world.
 
     The calibration it carries is exact. `clock` is the world's time; all time stamps count in it. `script` says what
     stands where.
@@ -80,17 +80,17 @@ class SimulatedHead:
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
-        """See `Head`."""
+        """See `ScannerHead`."""
         return self._cameras
 
     @property
     def projector(self) -> SimulatedProjector:
-        """See `Head`. Also says what it shows: `showing`, `lit`."""
+        """See `ScannerHead`. Also says what it shows: `showing`, `lit`."""
         return self._projector
 
     @property
     def calibration(self) -> Calibration | None:
-        """See `Head`. None if the options say so."""
+        """See `ScannerHead`. None if the options say so."""
         return self._calibration if self._carries_calibration else None
 
     @property
@@ -107,11 +107,11 @@ class SimulatedHead:
 
     @property
     def positioner(self) -> Positioner | None:
-        """See `slrig.devices.Positions`. None where the options have neither poses nor a turntable."""
+        """See `slrig.devices.HasPositioner`. None where the options have neither poses nor a turntable."""
         return self._positioner
 
     def truth(self) -> Truth:
-        """See `Head`. Of what stands there now. Works in every state, also after close."""
+        """See `ScannerHead`. Of what stands there now. Works in every state, also after close."""
         cameras = {name: view.truth() for name, view in self._views.items()}
         shape = self._stage.setting.surface
         known = self._truth
@@ -128,7 +128,7 @@ def _tell_traced(tell: Callable[[str], None], camera: str, share: float) -> None
     tell(f"tracing light for camera '{camera}', {share:.0%}")
 
 
-def open_head(options: Mapping[str, object], folder: Path) -> Head:
+def open_head(options: Mapping[str, object], folder: Path) -> ScannerHead:
     """Open the rendered rig described by a rig file's `[head]` table (without its `driver`).
 
     `folder` is the rig file's own: the scene's path counts from there.

@@ -10,7 +10,7 @@ from simulated_rig.light import LightTable, desktop_light, light_table, no_light
 from simulated_rig.options import Faults, ProjectorOptions
 from simulated_rig.staging import Staging
 from simulated_rig.world import NS_PER_S, Flicker, Lamp, nanoseconds
-from slrig.devices import COMPUTED, Clock, ProjectorInfo, ProjectorState, Shown
+from slrig.devices import COMPUTED_LIMITS, Clock, DisplayedPattern, ProjectorInfo, ProjectorState
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Primary
 
@@ -50,7 +50,7 @@ class SimulatedProjector:
             plays=False,
             latency_s=self._options.latency_s,
             refresh_s=None if self._options.refresh_hz is None else 1 / self._options.refresh_hz,
-            limits=COMPUTED,
+            limits=COMPUTED_LIMITS,
             lights=self._options.lights is not None,
         )
 
@@ -86,7 +86,7 @@ class SimulatedProjector:
         if self._staging is not None:
             self._staging.begun(len(sequence))
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`."""
         self._require_usable()
         sequence = self._state.require_pattern(index)
@@ -109,7 +109,7 @@ class SimulatedProjector:
         self.lamp.show(self._tables[index], at_ns=t_visible_ns + nanoseconds(off_s))
         self._showing = index
         self._clock.wait_until(t_visible_ns + nanoseconds(error_s), self._state.closed)
-        return Shown(index, t_visible_ns, nanoseconds(error_s))
+        return DisplayedPattern(index, t_visible_ns, nanoseconds(error_s))
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. This one does not play."""

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from simulated_rig.tables import Names, NotNegative, Triple
 from slrig.bundle.validation import Strict
-from slrig.devices import AnyAngle
+from slrig.devices import TurntableBase
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray, StageAxis
 
@@ -74,7 +74,7 @@ class TurntableOptions(Strict, use_attribute_docstrings=True):
         return motion
 
 
-class RenderedTurntable(AnyAngle):
+class RenderedTurntable(TurntableBase):
     """Implements `slrig.devices.Turntable` on the rendered world.
 
     turn_objects : has what stands on the table stand turned, by a motion (4, 4) from where the scene file has it.

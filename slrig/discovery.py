@@ -2,8 +2,8 @@
 
 A driver package declares factories in the groups below; slrig names no driver. A camera's factory is
 `open_camera(name, options, folder) -> Camera`, a projector's `open_projector(options, folder) -> Projector`, a head's
-`open_head(options, folder) -> Head`, a positioner's `open_positioner(options, folder) -> Positioner`; `options` are the
-driver's own keys of the rig file, `folder` is where that file lies. A finder is
+`open_head(options, folder) -> ScannerHead`, a positioner's `open_positioner(options, folder) -> Positioner`; `options`
+are the driver's own keys of the rig file, `folder` is where that file lies. A finder is
 `find_devices() -> tuple[FoundDevice, ...]`.
 """
 
@@ -27,12 +27,12 @@ from slrig.devices import (
     CameraSettings,
     Clock,
     FoundDevice,
-    Head,
-    KeepsTime,
+    HasClock,
+    HasPositioner,
     Positioner,
-    Positions,
     Projector,
     Rig,
+    ScannerHead,
     Synchronisation,
     SystemClock,
 )
@@ -177,7 +177,7 @@ def open_rig(config: RigConfig) -> Rig:
 
 def _open_each(
     config: RigConfig, opened: ExitStack
-) -> tuple[Head | None, Projector, Mapping[str, Camera], Positioner | None]:
+) -> tuple[ScannerHead | None, Projector, Mapping[str, Camera], Positioner | None]:
     """Every device of a rig, closed again by `opened`. Raises as `open_rig`."""
     faults: list[ConfigError] = []
 
@@ -196,7 +196,7 @@ def _open_each(
             opened.callback(_close_quietly, each)
         return device
 
-    head: Head | None = None if config.head is None else attempt("head", config.head, Head)
+    head: ScannerHead | None = None if config.head is None else attempt("head", config.head, ScannerHead)
     if config.head is None:
         if config.projector is None:
             message = f"rig '{config.name}' has neither a head nor a projector; add one of the tables to its file"
@@ -229,11 +229,11 @@ def _exposure_s(camera: CameraInfo, asked_s: float | None, config: RigConfig) ->
 
 
 def _clock(head: object) -> Clock:
-    return head.clock if isinstance(head, KeepsTime) else SystemClock()
+    return head.clock if isinstance(head, HasClock) else SystemClock()
 
 
 def _positioner(head: object) -> Positioner | None:
-    return head.positioner if isinstance(head, Positions) else None
+    return head.positioner if isinstance(head, HasPositioner) else None
 
 
 def _synchronisation(config: RigConfig, cameras: Mapping[str, Camera]) -> Synchronisation | None:
@@ -252,7 +252,7 @@ def _synchronisation(config: RigConfig, cameras: Mapping[str, Camera]) -> Synchr
 
 
 def _calibration(
-    config: RigConfig, head: Head | None, projector: Projector, cameras: Mapping[str, Camera]
+    config: RigConfig, head: ScannerHead | None, projector: Projector, cameras: Mapping[str, Camera]
 ) -> Calibration | None:
     if config.calibration is not None:
         calibration: Calibration | None = read_calibration(config.calibration)

@@ -18,7 +18,7 @@ import numpy as np
 import tifffile
 
 from slrig.bundle import write_bundle, write_calibration, write_opencv_calibration
-from slrig.model import Calibration, Solved
+from slrig.model import Calibration, SolveRecord
 from tests.samples import CAMERA, sample_calibration, sample_capture
 
 TOKENS = (
@@ -37,7 +37,7 @@ def solved_calibration(seed: int = 0) -> Calibration:
     count = 15 * (len(calibration.cameras) + (calibration.projector is not None))
     root = np.random.default_rng(seed).normal(size=(count, count)) * np.geomspace(1e-8, 1e2, count)[:, None]
     box = np.array([[-60.5, -40, 400], [60, 40.25, 520]])
-    return replace(calibration, solved=Solved("a1b2", "2026-11-22T06:12:49+00:00", root @ root.T, box, 0.00712))
+    return replace(calibration, solved=SolveRecord("a1b2", "2026-11-22T06:12:49+00:00", root @ root.T, box, 0.00712))
 
 
 def good_calibrations() -> list[tuple[str, bytes]]:

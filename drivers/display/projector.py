@@ -11,7 +11,7 @@ from drivers.display.options import UNMEASURED_S, DisplayOptions
 from drivers.display.stage import Stage
 from drivers.display.timing import Presented, whole_light
 from drivers.display.working import OwnThread
-from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.devices import DisplayedPattern, ProjectorInfo, ProjectorState, SystemClock
 from slrig.errors import DeviceError, DeviceStateError
 from slrig.model import PatternSequence, Primary
 
@@ -82,7 +82,7 @@ class DisplayProjector:
         self._state.loaded = sequence
         self._unchecked = self._options.check_pixels
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`. Dark, if it fails."""
         sequence = self._state.require_pattern(index)
         return self._or_dark(lambda: self._shown(sequence, index))
@@ -131,7 +131,7 @@ class DisplayProjector:
             self._thread.do(self._stage.close, timeout_s=_DARKENS_IN_S)
         self._thread.end(timeout_s=_DARKENS_IN_S)
 
-    def _shown(self, sequence: PatternSequence, index: int) -> Shown:
+    def _shown(self, sequence: PatternSequence, index: int) -> DisplayedPattern:
         self._darkened.clear()
         presented = self._thread.do(lambda: self._stage.show(index), timeout_s=_SHOWS_IN_S)
         t_visible_ns, t_err_ns = self._light(presented)
@@ -142,7 +142,7 @@ class DisplayProjector:
         if self._darkened.is_set():
             message = f"pattern {index} was darkened from outside before its light was there; show it again"
             raise DeviceStateError(message)
-        return Shown(index, t_visible_ns, t_err_ns)
+        return DisplayedPattern(index, t_visible_ns, t_err_ns)
 
     def _light(self, presented: Presented) -> tuple[int, int]:
         return whole_light(

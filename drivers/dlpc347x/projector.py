@@ -14,7 +14,7 @@ from drivers.dlpc347x.options import EngineOptions
 from drivers.pattern_engine.light import HeldLight
 from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing, check_duty, light_us
-from slrig.devices import Clock, ProjectorInfo, Shown
+from slrig.devices import Clock, DisplayedPattern, ProjectorInfo
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
@@ -36,7 +36,7 @@ MOST_REPEATS = 254
 
 
 class LightEngine(HeldLight[Engine]):
-    """Implements `slrig.devices.FlashedProjector` on a DLPC3470 or DLPC3478.
+    """Implements `slrig.devices.StoredPatternProjector` on a DLPC3470 or DLPC3478.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class LightEngine(HeldLight[Engine]):
         self._take_over()
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """See `FlashedProjector`. Into the engine itself, if it lacks any; what its flash had before is gone then."""
+        """See `StoredPatternProjector`. Into the engine itself, if it lacks any; this overwrites its flash."""
         self._state.require_size(sequence, self._lines.mirrors.size)
         block = block_of(sequence, self._lines)
         with self._lock:
@@ -93,7 +93,7 @@ class LightEngine(HeldLight[Engine]):
         self._colours = tuple(map(self._options.colour_of, sequence.patterns))
         self._state.loaded = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`. Light that pulses, 97 % of the time; dark again after `hold_s`, and `LEFT_ALONE_S` after the
         end of this program.
         """

@@ -13,7 +13,7 @@ from drivers.pattern_engine.link import Kind, Link
 from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
 from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
-from slrig.devices import Clock, ProjectorInfo, Shown
+from slrig.devices import Clock, DisplayedPattern, ProjectorInfo
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
@@ -58,7 +58,7 @@ class LightEngine(PatternEngine[Engine]):
         self._take_over()
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """See `FlashedProjector`. What is flashed already keeps its place."""
+        """See `StoredPatternProjector`. What is flashed already keeps its place."""
         self._state.require_size(sequence, MIRRORS)
         return self._flash.written(sequence)
 
@@ -78,7 +78,7 @@ class LightEngine(PatternEngine[Engine]):
         self._colours = tuple(map(self._options.colour_of, sequence.patterns))
         self._state.loaded = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`. Dark again after `hold_s`, and `LEFT_ALONE_S` after the end of this program.
 
         When light begins is not told by the engine: it is after the command to start was sent, and before its sequencer
@@ -89,7 +89,7 @@ class LightEngine(PatternEngine[Engine]):
         load_s = self._options.load_s(kept=self._picture == place.image)
         # The sequence ends by itself: until it began, a picture may have to be loaded.
         alone_us = round((LEFT_ALONE_S - self._options.image_load_s) * 1e6)
-        if self.unproven:
+        if self.is_polarity_unknown:
             timing, count = DIM, min(alone_us // DIM.period_us, MOST_PATTERNS)
         else:
             timing, count = Timing(alone_us - DARK_US, alone_us), 1
@@ -150,7 +150,7 @@ class LightEngine(PatternEngine[Engine]):
             model="DLPC350 light engine",
             serial=self._serial,
             size=MIRRORS,
-            plays=not self.unproven,
+            plays=not self.is_polarity_unknown,
             latency_s=options.load_s(kept=True) + COMMANDS_S,
             gap_s=options.light_margin_s,
             duty=options.duty_limit,

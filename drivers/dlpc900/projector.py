@@ -11,7 +11,7 @@ from drivers.pattern_engine.link import Kind, Link
 from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
 from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
-from slrig.devices import Clock, ProjectorInfo, Shown
+from slrig.devices import Clock, DisplayedPattern, ProjectorInfo
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
@@ -77,13 +77,13 @@ class LightEngine(PatternEngine[Engine]):
                 self._engine.upload(number, [packed(half) for half in halves])
         self._state.loaded = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`. Dark again after `hold_s`, and `LEFT_ALONE_S` after the end of this program.
 
         A pattern without any LED ends what is shown: it is dark, whatever the mirrors do after a sequence.
         """
         self._state.require_pattern(index)
-        if self.unproven:
+        if self.is_polarity_unknown:
             exposure_us, dark_us = DIM.exposure_us, DIM.period_us - DIM.exposure_us
             times = _ALONE_US // DIM.period_us
         else:
@@ -172,7 +172,7 @@ class LightEngine(PatternEngine[Engine]):
             model=f"DLPC900 light engine, {mirrors.name}",
             serial=self._serial,
             size=mirrors.size,
-            plays=not self.unproven,
+            plays=not self.is_polarity_unknown,
             latency_s=options.start_s + COMMANDS_S,
             gap_s=options.light_margin_s + mirrors.least_us / 1e6,
             duty=options.duty_limit,

@@ -102,7 +102,7 @@ class OpenCvCamera:
         if self._controls is not None:
             self._require_idle()
             self._applied = self._controls.apply(settings)
-        return replace(self._applied, least_period_s=self._least_period_s())
+        return replace(self._applied, min_period_s=self._least_period_s())
 
     def _least_period_s(self) -> float | None:
         """Of a camera as OpenCV says, of a live source as the person does. A film is made already."""

@@ -11,7 +11,7 @@ from typing import Generic, Protocol, TypeVar
 
 from drivers.pattern_engine.options import LightOptions
 from drivers.pattern_engine.timing import LEFT_ALONE_S
-from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.devices import Clock, DisplayedPattern, ProjectorInfo, ProjectorState, SystemClock
 from slrig.errors import SlrigError
 
 
@@ -105,11 +105,11 @@ class HeldLight(ABC, Generic[SourceT]):
         self._held_until_s = now_s + self._light.hold_s
         self._restart_at_s, self._restart_each_s = now_s + alone_s / 2, again_s
 
-    def _shown(self, index: int, earliest_ns: int, latest_ns: int) -> Shown:
+    def _shown(self, index: int, earliest_ns: int, latest_ns: int) -> DisplayedPattern:
         """Wait until the latest instant at which light can begin."""
         self._clock.wait_until(latest_ns, self._state.closed)
         self._state.require_open()
-        return Shown(index, (earliest_ns + latest_ns) // 2, (latest_ns - earliest_ns + 1) // 2)
+        return DisplayedPattern(index, (earliest_ns + latest_ns) // 2, (latest_ns - earliest_ns + 1) // 2)
 
     def _now_s(self) -> float:
         return self._clock.now_ns() / 1e9

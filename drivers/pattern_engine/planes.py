@@ -39,7 +39,7 @@ def words(pattern: Pattern) -> str:
         case White() | Black():
             return pattern.kind
         case Primary():
-            return pattern.words
+            return pattern.description
         case Gray():
             inverse = ", inverted" if pattern.inverted else ""
             return f"{pattern.axis} Gray bit {pattern.bit} of {pattern.bits}, cell {pattern.cell_px} px{inverse}"

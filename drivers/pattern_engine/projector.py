@@ -26,25 +26,25 @@ EngineT = TypeVar("EngineT", bound=Engine)
 
 
 class PatternEngine(HeldLight[EngineT], ABC):
-    """What implements `slrig.devices.Projector` and `UnprovenLight` on an engine with a USB port."""
+    """What implements `slrig.devices.Projector` and `UnknownPolarityProjector` on an engine with a USB port."""
 
     def __init__(self, engine: EngineT, options: UsbLightOptions, *, clock: Clock | None = None) -> None:
         super().__init__(engine, options, clock=clock)
         self._light: UsbLightOptions = options
 
     @property
-    def unproven(self) -> bool:
-        """See `UnprovenLight`."""
+    def is_polarity_unknown(self) -> bool:
+        """See `UnknownPolarityProjector`."""
         return self._light.led_current_inverted is None
 
     @property
     def light_period_s(self) -> float:
-        """See `UnprovenLight`."""
+        """See `UnknownPolarityProjector`."""
         return DIM.period_us / 1e6
 
-    def try_current(self, share: float) -> None:
-        """See `UnprovenLight`."""
-        if not self.unproven or not 0.4 <= share <= 0.6:
+    def set_trial_current(self, share: float) -> None:
+        """See `UnknownPolarityProjector`."""
+        if not self.is_polarity_unknown or not 0.4 <= share <= 0.6:
             message = f"asked to try a current register at {share:g}: only 0.4 to 0.6, while its sense is not known"
             raise UnsupportedByDeviceError(message)
         with self._lock:
@@ -52,8 +52,8 @@ class PatternEngine(HeldLight[EngineT], ABC):
             self.blank()
             self._engine.set_led_registers(bytes([round(share * 255)] * 3))
 
-    def option_for(self, *, rises: bool) -> str:
-        """See `UnprovenLight`."""
+    def polarity_option(self, *, rises: bool) -> str:
+        """See `UnknownPolarityProjector`."""
         inverted = rises == self._engine.led_polarity_turned
         return f"led_current_inverted = {str(inverted).lower()}"
 
@@ -79,7 +79,7 @@ class PatternEngine(HeldLight[EngineT], ABC):
             engine.set_led_current(light.colour, light.current_byte, inverted=light.led_current_inverted)
 
     def _require_proven(self) -> None:
-        if self.unproven:
+        if self.is_polarity_unknown:
             message = (
                 "asked to play, but it is not known which way the LEDs' current goes, and light is dim until it is: "
                 "slrig doctor finds it out, and says what to write into the rig file"

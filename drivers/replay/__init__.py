@@ -18,9 +18,9 @@ from drivers.replay.clock import ReplayClock
 from drivers.replay.projector import ReplayProjector
 from slrig.bundle import Bundle, read_bundle
 from slrig.bundle.validation import Strict, checked
-from slrig.devices import Camera, Head, Projector
+from slrig.devices import Camera, Projector, ScannerHead
 from slrig.errors import BundleError, ConfigError
-from slrig.model import Calibration, Truth, without_missing_bits
+from slrig.model import Calibration, Truth, trim_incomplete_codes
 
 __all__ = ["ReplayCamera", "ReplayClock", "ReplayHead", "ReplayOptions", "ReplayProjector", "open_head"]
 
@@ -49,7 +49,7 @@ class ReplayOptions(Strict, use_attribute_docstrings=True):
 
 
 class ReplayHead:
-    """Implements `slrig.devices.Head` on a recorded bundle.
+    """Implements `slrig.devices.ScannerHead` on a recorded bundle.
 
     `clock` says how fast, by default without a pace; all time stamps count in it.
     """
@@ -63,25 +63,25 @@ class ReplayHead:
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
-        """See `Head`."""
+        """See `ScannerHead`."""
         return self._cameras
 
     @property
     def projector(self) -> Projector:
-        """See `Head`."""
+        """See `ScannerHead`."""
         return self._projector
 
     @property
     def calibration(self) -> Calibration | None:
-        """See `Head`: the calibration that lies in the bundle."""
+        """See `ScannerHead`: the calibration that lies in the bundle."""
         return self._calibration
 
     def truth(self) -> Truth | None:
-        """See `Head`. A recording knows its frames only."""
+        """See `ScannerHead`. A recording knows its frames only."""
         return None
 
 
-def open_head(options: Mapping[str, object], folder: Path) -> Head:
+def open_head(options: Mapping[str, object], folder: Path) -> ScannerHead:
     """Open a recorded bundle as a rig, from a rig file's `[head]` table (without its `driver`).
 
     Parameters
@@ -109,7 +109,7 @@ def open_head(options: Mapping[str, object], folder: Path) -> Head:
     if not bundle.capture.shots:
         message = f"{path / 'bundle.json'}: the recording has no frames; there is nothing to replay"
         raise BundleError(message)
-    capture, told = without_missing_bits(bundle.capture)
+    capture, told = trim_incomplete_codes(bundle.capture)
     for words in told:
         _log.warning(words, recording=str(path))
     return ReplayHead(replace(bundle, capture=capture), ReplayClock(table.speed))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
-from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
+from slrig.devices import COMPUTED_LIMITS, AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Black, Frame, Pattern, Shot
 
@@ -42,7 +42,7 @@ class ReplayCamera:
             # A recording that does not tell its exposure agrees with every one.
             exposure_range_s=(exposures[0], exposures[-1]) if exposures else (1e-6, 3600.0),
             gain_range=(1.0, 1.0),
-            limits=COMPUTED,
+            limits=COMPUTED_LIMITS,
             colour=any(shot.colour is not None for shots in self._recorded.values() for shot in shots),
         )
         self._applied = AppliedSettings(exposures[0] if exposures else 0.01, 1.0)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from drivers.replay.camera import ReplayCamera, Stage
 from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
-from slrig.devices import COMPUTED, ProjectorInfo, ProjectorState, Shown
+from slrig.devices import COMPUTED_LIMITS, DisplayedPattern, ProjectorInfo, ProjectorState
 from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
 
@@ -23,7 +23,7 @@ class ReplayProjector:
             size=bundle.capture.projector,
             plays=False,
             latency_s=0.0,
-            limits=COMPUTED,
+            limits=COMPUTED_LIMITS,
             recorded=tuple(
                 pattern
                 for pattern in bundle.capture.patterns
@@ -61,7 +61,7 @@ class ReplayProjector:
         self._clock.rewind()
         self._state.loaded = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`."""
         patterns = self._state.require_pattern(index).patterns
         pattern = patterns[index]
@@ -72,7 +72,7 @@ class ReplayProjector:
             for shots in (camera.frames_of(pattern) for camera in self._cameras.values())
         ]
         first_s = min((time_s for time_s in times_s if time_s is not None), default=0.0)
-        return Shown(index, self._clock.change_light(first_s), 0)
+        return DisplayedPattern(index, self._clock.change_light(first_s), 0)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. A recording does not play."""
@@ -112,7 +112,7 @@ def _family(pattern: Pattern) -> str:
         case White() | Black():
             return pattern.kind
         case Primary():
-            return pattern.words
+            return pattern.description
         case Gray():
             inverse = ", inverted" if pattern.inverted else ""
             offset = f", offset {pattern.offset_px} px" if pattern.offset_px else ""

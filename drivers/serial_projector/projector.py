@@ -14,7 +14,7 @@ from drivers.serial_projector.keeping import KeepAlive
 from drivers.serial_projector.link import Link, RefusedError
 from drivers.serial_projector.options import SerialProjectorOptions
 from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each, export
-from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.devices import Clock, DisplayedPattern, ProjectorInfo, ProjectorState, SystemClock
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
@@ -101,9 +101,9 @@ class SerialProjector:
         return self._client
 
     @property
-    def played(self) -> tuple[Shown, ...]:
+    def played(self) -> tuple[DisplayedPattern, ...]:
         """When each pattern of the last `play` became visible, as far as the box's events came through."""
-        return tuple(Shown(*frame) for frame in self._client.frames())
+        return tuple(DisplayedPattern(*frame) for frame in self._client.frames())
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`. The box must hold these patterns: their checksums are compared.
@@ -134,7 +134,7 @@ class SerialProjector:
         self._state.loaded = sequence
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """See `FlashedProjector`. Into a folder of its own: no other set is written over."""
+        """See `StoredPatternProjector`. Into a folder of its own: no other set is written over."""
         self._state.require_size(sequence, self._size)
         crc32 = crc32_of_all(crc32_of_each(sequence))
         folder = self._export_folder / f"{crc32:08X}"
@@ -144,14 +144,14 @@ class SerialProjector:
             "in the order of their numbers, and patterns.json onto the box"
         )
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`. The instant is the box's own stamp; its error comes from the exchanges with its clock."""
         self._state.require_pattern(index)
         with self._dark_if_it_fails():
             t_visible_ns, t_err_ns = self._sent(lambda: self._client.show(index))
             self._lit = f"pattern {index} was lit"
             self._clock.wait_until(t_visible_ns + t_err_ns, self._state.closed)
-        return Shown(index, t_visible_ns, t_err_ns)
+        return DisplayedPattern(index, t_visible_ns, t_err_ns)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. Returns when the box has begun; a play that ends by itself ends dark."""

@@ -10,7 +10,7 @@ from typing import Protocol
 from drivers.serial_port import Port
 from drivers.serial_turntable.lines import Lines
 from drivers.serial_turntable.options import LineOptions
-from slrig.devices import AnyAngle, Clock
+from slrig.devices import Clock, TurntableBase
 from slrig.errors import DeviceError, DeviceStateError, SlrigError, UnsupportedByDeviceError
 from slrig.model import StageAxis
 
@@ -34,7 +34,7 @@ class Controller(Protocol):
         ...
 
 
-class SerialTurntable(AnyAngle):
+class SerialTurntable(TurntableBase):
     """Implements `slrig.devices.Turntable`.
 
     A controller that restarts begins to count anew. So before each turn it is asked where it stands, and after whatever

@@ -14,10 +14,10 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, ScanSeries, scan_body, scan_plan
 from slrig.api.service import Cursor, PageLength, Service, Serving, paged
 from slrig.jobs.records import JobRecord
-from slrig.model.region import MOST_MASK_CHARACTERS
+from slrig.model import MAX_MASK_CHARACTERS
 from slrig.verify.verification import require_healthy
 
-MOST_SCAN_BYTES = 4 * MOST_MASK_CHARACTERS
+MOST_SCAN_BYTES = 4 * MAX_MASK_CHARACTERS
 """Of a request: masks of four cameras as long as any may be, or of more as they are."""
 
 router = APIRouter(prefix="/scan", tags=["scan"])

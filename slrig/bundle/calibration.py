@@ -24,7 +24,7 @@ from slrig.bundle.description import CAMERA_NAME, MOST_SIDE_PX, PROJECTOR, Camer
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.bundle.validation import MOST_FAULTS, AwareMoment, Strict, read_description_of, read_text, shorten
 from slrig.errors import CalibrationError
-from slrig.model import DEVICE_PARAMETERS, Calibration, FloatArray, LightMap, Pinhole, Size, Solved
+from slrig.model import DEVICE_PARAMETERS, Calibration, FloatArray, LightMap, Pinhole, Size, SolveRecord
 
 MOST_DEPTH = 8
 MOST_NODES = 4096
@@ -395,7 +395,7 @@ def _is_side(value: Value) -> TypeGuard[int]:
     return isinstance(value, int) and 1 <= value <= MOST_SIDE_PX
 
 
-def _read_solved(found: Value, path: Path) -> Solved:
+def _read_solved(found: Value, path: Path) -> SolveRecord:
     entries = _require_keys(found, SOLVED_KEYS, path, SOLVED, "leave the whole map out")
     name, solved_at = entries["id"], entries["solved_at"]
     error_mm, scale_sigma = entries["expected_error_mm"], entries["scale_sigma"]
@@ -418,7 +418,7 @@ def _read_solved(found: Value, path: Path) -> Solved:
     if not np.isfinite(volume_mm).all():
         _refuse(path, f"finite numbers in {SOLVED}.volume_mm", "others", "export it again")
     try:
-        return Solved(name, solved_at, covariance, volume_mm, float(error_mm), float(scale_sigma))
+        return SolveRecord(name, solved_at, covariance, volume_mm, float(error_mm), float(scale_sigma))
     except (CalibrationError, ValueError) as cause:
         raise CalibrationError(f"{path}: {SOLVED}.{cause}") from cause
 
@@ -471,7 +471,7 @@ class DeviceEntry(Strict):
 
 
 class SolvedEntry(Strict):
-    """How the calibration was found: see `slrig.model.Solved`. Absent where it says nothing of its own error."""
+    """How the calibration was found: see `slrig.model.SolveRecord`. Absent where it says nothing of its own error."""
 
     id: Annotated[str, Field(min_length=1, max_length=64)]
     solved_at: Annotated[AwareMoment, Field(description="ISO 8601 with the offset from UTC")]
@@ -577,11 +577,11 @@ def check_rays(calibration: Calibration, cameras: Collection[str], source: str) 
         )
 
 
-def _solved(entry: SolvedEntry | None) -> Solved | None:
+def _solved(entry: SolvedEntry | None) -> SolveRecord | None:
     if entry is None:
         return None
     covariance, volume_mm = (np.array(each, dtype=np.float64) for each in (entry.covariance, entry.volume_mm))
-    return Solved(
+    return SolveRecord(
         entry.id, entry.solved_at.isoformat(), covariance, volume_mm, entry.expected_error_mm, entry.scale_sigma
     )
 

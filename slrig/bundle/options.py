@@ -19,18 +19,19 @@ from slrig.bundle.storage import json_bytes
 from slrig.bundle.validation import AwareMoment, FreeText, Strict, checked, read_description_of, read_toml
 from slrig.errors import ConfigError
 from slrig.model import (
-    FEWEST_EXPOSURES,
-    MOST_EXPOSURES,
+    MAX_EXPOSURES,
+    MAX_MASK_CHARACTERS,
+    MIN_EXPOSURES,
     Axis,
     FlipRule,
     FloatArray,
     MeasuredAxis,
     PlaneKind,
+    Region,
     SequenceName,
     StagePlane,
     bracket_fault,
 )
-from slrig.model.region import MOST_MASK_CHARACTERS, Region
 
 MOST_VIEWS = 1000
 _POSES_MAX_BYTES = 8 * 2**20
@@ -285,7 +286,7 @@ class RegionTable(Strict):
     polygons_px: dict[CameraName, _Polygon] = Field(
         default_factory=dict, description="by camera, corners [x, y] of the part of its image that counts"
     )
-    masks: dict[CameraName, Annotated[str, Field(max_length=MOST_MASK_CHARACTERS)]] = Field(
+    masks: dict[CameraName, Annotated[str, Field(max_length=MAX_MASK_CHARACTERS)]] = Field(
         default_factory=dict,
         description="by camera, the same as a PNG of the image's extent, in base64: what is not black counts",
     )
@@ -368,12 +369,12 @@ ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
 BracketSeconds = Annotated[
     tuple[ExposureSeconds, ...],
     # A list in TOML and in JSON. Its length is checked with the rest, or one wrong time would be told as two faults.
-    Field(strict=False, json_schema_extra={"minItems": FEWEST_EXPOSURES, "maxItems": MOST_EXPOSURES}),
+    Field(strict=False, json_schema_extra={"minItems": MIN_EXPOSURES, "maxItems": MAX_EXPOSURES}),
     AfterValidator(_a_bracket),
 ]
 ExposureFactors = Annotated[
     tuple[Annotated[float, Field(gt=0, le=1000)], ...],
-    Field(strict=False, json_schema_extra={"minItems": 1, "maxItems": MOST_EXPOSURES}),
+    Field(strict=False, json_schema_extra={"minItems": 1, "maxItems": MAX_EXPOSURES}),
     AfterValidator(_factors),
 ]
 PRESET_NAME = r"[a-z][a-z0-9_-]{0,39}"

@@ -15,8 +15,7 @@ from slrig.calibrate.solving import CalibrationResult
 from slrig.calibration.board import Board
 from slrig.calibration.poses import attitude
 from slrig.calibration.solution import PARAMETERS, PROJECTOR, BoardPose, DeviceResiduals
-from slrig.model import Calibration, FloatArray, Pinhole, Size
-from slrig.model.lens import LENS_TERMS
+from slrig.model import LENS_TERMS, Calibration, FloatArray, Pinhole, Size
 
 _INNER = PARAMETERS[:9]
 _TURN = slice(9, 12)

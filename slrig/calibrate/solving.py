@@ -13,7 +13,7 @@ from slrig.calibration.poses import Coverage, coverage
 from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
 from slrig.errors import CalibrationError, SolveRefusedError
 from slrig.jobs.records import utc_now
-from slrig.model import Calibration, Size, Solved
+from slrig.model import Calibration, Size, SolveRecord
 from slrig.scan.plan import Progress
 
 _SOLVE_SHARE = 0.95
@@ -87,7 +87,7 @@ def solve_poses(
     sizes = dict(cameras) if projector is None else {**cameras, PROJECTOR: projector}
     used = [pose for pose in observed if pose.name not in solution.outliers]
     covered = coverage(used, board, sizes)
-    solved = Solved(
+    solved = SolveRecord(
         id=uuid4().hex[:12],
         solved_at=utc_now().isoformat(timespec="seconds"),
         covariance=solution.covariance,

@@ -86,7 +86,7 @@ def expected_error(
     scale_field = project_out_rigid_motion(points, sensitivity.by_parameter @ scale[:, None])
     board_mm = _rms(projected_deviation(sensitivity.projection, scale_field))
     diagonal_mm = float(np.linalg.norm(volume_mm[1] - volume_mm[0]))
-    length_share = _relative_length_error(points, fields, diagonal_mm) if calibration.triangulates else float("nan")
+    length_share = _relative_length_error(points, fields, diagonal_mm) if calibration.can_triangulate else float("nan")
     return ExpectedError(
         volume_mm=volume_mm,
         point_mm=calibration_mm,
@@ -95,7 +95,7 @@ def expected_error(
         length_share=length_share,
         grid_mm=points,
         grid_point_mm=point_mm,
-        across=not calibration.triangulates,
+        across=not calibration.can_triangulate,
         board_mm=board_mm,
     )
 
@@ -131,7 +131,7 @@ def sample_volume(solution: Solution, observations: Observations, /) -> tuple[Fl
         wanted *= 4
     if len(points) < _MIN_POINTS:
         other = "the projector" if solution.calibration.projector else "another camera"
-        together = f" together with {other}" if solution.calibration.triangulates else ""
+        together = f" together with {other}" if solution.calibration.can_triangulate else ""
         message = (
             f"expected points in the box of {_format_box(extent)} in which the board was held that the first camera "
             f"sees{together}, found {len(points)} of {counts.prod()}; hold the board where all of it is in view"

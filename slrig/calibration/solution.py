@@ -27,8 +27,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import Axis, Calibration, FloatArray, IntArray, Pinhole, told_depth, triangulated_axis
-from slrig.model.lens import LENS_TERMS, by_terms, distorted
+from slrig.model import LENS_TERMS, Axis, Calibration, FloatArray, IntArray, Pinhole, depth_sensitive_cameras, triangulated_axis
+from slrig.model.lens import distortion_by_terms, distort
 
 PARAMETERS = ("fx", "fy", "cx", "cy", *LENS_TERMS, "turn_x", "turn_y", "turn_z", "x_mm", "y_mm", "z_mm")
 _PARAMETER_COUNT = len(PARAMETERS)
@@ -279,7 +279,7 @@ def point_sensitivity(
     axis = triangulated_axis(cameras, projector)
     coordinate = 0 if axis is Axis.COLUMN else 1
     light_ray = _normalise(points_mm - projector.centre_mm)
-    sensitive = np.array(told_depth(axis, cameras, projector))
+    sensitive = np.array(depth_sensitive_cameras(axis, cameras, projector))
     squared_motion = [(np.einsum("nij,nj->ni", view.by_point, light_ray) ** 2).sum(axis=1) for view in views]
     weights = np.stack([np.where(view.inside, m, 0.0) for view, m in zip(views, squared_motion, strict=True)])
     weights *= sensitive[:, None]
@@ -400,7 +400,7 @@ def _project(device: Pinhole, points_mm: FloatArray) -> _ProjectionDerivatives:
     in_front = z > 0
     z = np.where(in_front, z, np.nan)
     x, y = x / z, y / z
-    xd, yd, xx, xy, yy = distorted(device.distortion, x, y)
+    xd, yd, xx, xy, yy = distort(device.distortion, x, y)
     matrix = device.matrix[:2, :2]
     pixel = np.stack([xd, yd], axis=1) @ matrix.T + device.matrix[:2, 2]
     by_normalised = matrix @ np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
@@ -412,7 +412,7 @@ def _project(device: Pinhole, points_mm: FloatArray) -> _ProjectionDerivatives:
     by_parameter[:, 0, 0], by_parameter[:, 1, 1] = xd, yd
     by_parameter[:, 0, 2] = by_parameter[:, 1, 3] = 1
     for row in range(2):
-        by_parameter[:, row, 4:9] = np.stack(by_terms(matrix[row, 0], matrix[row, 1], x, y), axis=1)
+        by_parameter[:, row, 4:9] = np.stack(distortion_by_terms(matrix[row, 0], matrix[row, 1], x, y), axis=1)
     # R' X = R X + turn x (R X).
     by_parameter[:, :, 9:12] = np.cross(rotated[:, None, :], by_device)
     by_parameter[:, :, 12:15] = by_device

@@ -1,30 +1,26 @@
-"""Playing a pattern sequence on a rig and taking the frames that show it."""
+"""Capture of pattern sequences on a rig, with verification of the frames."""
 
 from slrig.capture.exposure import (
-    LEAST_CLEAR,
-    LEAST_CLEAR_DN,
-    ExposedSamples,
-    Unfit,
-    Verdict,
+    MIN_CONTRAST_DN,
+    MIN_CONTRAST_TO_NOISE,
+    ExposureFault,
+    ExposureSamples,
+    ExposureVerdict,
     bracket_summary,
     check_exposures,
-    movement_between,
-    verdict,
-    whole_refreshes_s,
+    detect_movement,
+    judge_exposure,
+    round_to_refresh_s,
 )
 from slrig.capture.frame_checks import (
-    NEARLY_FULL,
+    NEAR_SATURATION,
     NOISE_FLOOR_DN,
-    Chosen,
+    SampleMask,
     Samples,
 )
-from slrig.capture.hardware_trigger import (
-    SETTINGS_TOLERANCE,
-    differ,
-)
 from slrig.capture.latency import (
-    STEADY,
-    USUAL_SEARCH_S,
+    DEFAULT_SEARCH_S,
+    STEADY_TOLERANCE,
     CameraLatency,
     LatencyMeasurement,
     measure_latency,
@@ -37,41 +33,45 @@ from slrig.capture.sequencer import (
 from slrig.capture.streaming import (
     earliest_change_s,
 )
+from slrig.capture.triggering import (
+    SETTINGS_TOLERANCE,
+    differs_from_request,
+)
 from slrig.capture.verifier import (
     Evidence,
     EvidenceSummary,
     Sampler,
-    judged_frames,
+    checked_frames,
 )
 
 __all__ = [
-    "LEAST_CLEAR",
-    "LEAST_CLEAR_DN",
-    "NEARLY_FULL",
+    "DEFAULT_SEARCH_S",
+    "MIN_CONTRAST_DN",
+    "MIN_CONTRAST_TO_NOISE",
+    "NEAR_SATURATION",
     "NOISE_FLOOR_DN",
     "SETTINGS_TOLERANCE",
-    "STEADY",
-    "USUAL_SEARCH_S",
+    "STEADY_TOLERANCE",
     "CameraLatency",
-    "Chosen",
     "Evidence",
     "EvidenceSummary",
-    "ExposedSamples",
+    "ExposureFault",
+    "ExposureSamples",
+    "ExposureVerdict",
     "LatencyMeasurement",
+    "SampleMask",
     "Sampler",
     "Samples",
-    "Unfit",
-    "Verdict",
     "bracket_summary",
     "capture",
     "check_exposures",
+    "checked_frames",
     "choose_triggers",
-    "differ",
+    "detect_movement",
+    "differs_from_request",
     "earliest_change_s",
-    "judged_frames",
+    "judge_exposure",
     "measure_latency",
-    "movement_between",
+    "round_to_refresh_s",
     "stable_from_ns",
-    "verdict",
-    "whole_refreshes_s",
 ]

@@ -1,10 +1,10 @@
-"""Checks of sampled pixels of a frame: pure functions on vectors, each returns a contradiction or None.
+"""Checks of sampled pixels: pure functions of vectors that return a fault description or None.
 
-All vectors hold the same n sampled pixels of one camera: (n,) float32, in digital numbers (DN). `u` is a frame on the
-scale on which the black frame is 0 and the white frame is 1. Only `Reference.judged` pixels are asked: lit, not
-saturated, and of these the brighter half, so that noise does not speak.
+All vectors contain the same n sampled pixels of one camera: (n,) float32, in digital numbers (DN). `u` is a frame on
+the scale on which the black frame is 0 and the white frame is 1. Checks use `ReferenceFrames.tested` pixels only: lit,
+not saturated, and of these the half with the highest contrast, so that noise has little influence.
 
-What they name becomes a `Contradiction` between frames of one camera, with words for their patterns.
+`FrameVerifier` turns the faults into `Contradiction`s between frames of one camera.
 """
 
 from __future__ import annotations
@@ -16,78 +16,122 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import Black, Gray, LineShift, Pattern, Primary, White
-from slrig.model.patterns import Integers, from_gray, gray_index, to_gray
+from slrig.model import Black, Gray, Integers, LineShift, Pattern, Primary, White, from_gray, gray_index, to_gray
 
 Samples = NDArray[np.float32]
-Chosen = NDArray[np.bool_]
+SampleMask = NDArray[np.bool_]
 
 BANDS = 12
-"""Frames are judged as a whole and in this many horizontal bands: a transfer that broke off spoils rows."""
+"""Number of horizontal bands that are checked separately, because an interrupted transfer damages rows."""
 
 NOISE_FLOOR_DN = 0.3
-"""Standard deviation of rounding to whole numbers, 1/√12: no camera is less noisy."""
+"""Standard deviation of rounding to whole numbers, 1/√12, which is the minimum for any camera."""
 
 BAND_SAMPLES = 300
-"""A band of fewer samples is not judged by itself."""
+"""Minimum number of samples to check a band separately."""
 
-_LIT_SAMPLES = 40
+NEAR_SATURATION = 0.97
+"""Fraction of full scale above which a sample counts as saturated, because some sensors saturate below full scale."""
 
-NEARLY_FULL = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
+_MIN_LIT_SAMPLES = 40
 
-_ALIKE = 0.02
-"""Of a frame's own variation: lines that are blurred to three times their width differ by more from step to step."""
+_REPEAT_TOLERANCE = 0.02
+"""Fraction of a frame's own variation. Lines blurred to three times their width differ by more from step to step."""
+
+_EDGE_PX = 8.0
+"""Width of an edge blurred by a scaler, projector pixels: ± 2 standard deviations of a Gaussian of 2 px."""
+
+_EVEN_SPREAD = 0.08
+"""Relative spread of an even change of light; damage and other patterns have a larger one."""
+
+_ROUGHNESS_RATIO, _ROUGHNESS_MARGIN = 1.25, 0.15
+"""Tolerances of roughness, chosen above that of a projector with dithering. Random bytes have a third of full scale."""
+
+_NOISE_ROUGHNESS = 1.5
+"""Two samples of normal noise differ by 1.13 standard deviations on average."""
+
+_STEEPEST_GAMMA = 2.4
+"""Gamma of displays, ITU-R BT.1886."""
+
+_SIGNAL = np.linspace(0.5, 1.0, 257)
+_SWING = _SIGNAL**_STEEPEST_GAMMA - (1 - _SIGNAL) ** _STEEPEST_GAMMA
+_SUM = _SIGNAL**_STEEPEST_GAMMA + (1 - _SIGNAL) ** _STEEPEST_GAMMA
+
+_LINE_SUM_TOLERANCE = 0.25
+"""Relative to white; sums of sharp lines on pixels as wide as a line differ by less."""
+
+_HALF_LINE_SUM_TOLERANCE = 0.08
+"""The same for lines of half their period."""
+
+_MIN_CROSSINGS = 12  # pairs across an edge, for a median of their steps
+_MIN_SPAN_PERIODS = 3  # between the 5th and the 95th percentile of the positions
+_MIN_BAND_LINES = 4
+_BLAME_MARGIN = 0.1  # of the wrong pixels, between frames that count as equally suspect
+_MAX_WORSENED_FRACTION = 0.25  # ratio of worsened to improved pairs when two bits are exchanged back
+_MIN_EXPLAINED_FRACTION = 0.5  # of the wrong pixels, for a single bit to be the cause
+_MIN_SHAPE_FRAMES = 5  # three line frames determine a wave's position, height and level without redundancy
+_MIN_WAVE_HEIGHT = 0.15  # relative to white − black; sharp lines have 0.64
+_SHAPE_BINS = 32
+_SHAPE_SPREADS, _MIN_SHAPE_TOLERANCE = 6.0, 0.15  # the latter relative to the wave's height
+_MAX_ODD_FRACTION, _MAX_ODD_FRACTION_IN_BAND = 0.05, 0.15  # of the tested pixels
+_EDGE_SWING, _MIN_SWING_DIFFERENCE = 0.8, 0.2  # swing of a bit near its edge, relative to white − black
+_MIN_WAVE_SIGMAS = 5.0
+_MIN_WAVE = 0.03  # relative to white − black, for each line; sharp lines have 0.32
+_MIN_LINE_LIGHT = 0.1  # relative to the 99th percentile
+_REFERENCE_LEVEL_TOLERANCE, _MIN_REFERENCE_MARGIN = 0.3, 0.15  # relative to the swing of the lines at a pixel
 
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
     """Frames of one camera that cannot all show what they should.
 
-    where : camera and pattern, in words, whose frame brought it to light. cause : what is wrong and what to do.
-    suspects : the patterns whose frames it speaks against. beyond : those that are to blame if it stays when the
-    suspects were shot again: what the test rests on, as far as no other frame has vouched for it.
+    where : camera and pattern of the frame that revealed it. cause : the fault and the remedy. suspects : patterns
+    whose frames it concerns. further_suspects : patterns to blame if it remains after the suspects were captured again:
+    those that the check depends on and that no other frame has confirmed.
     """
 
     camera: str
     where: str
     cause: str
     suspects: tuple[int, ...]
-    beyond: tuple[int, ...] = ()
+    further_suspects: tuple[int, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.where}: {self.cause}"
 
 
-def named(index: int, pattern: Pattern) -> str:
-    """Words for a pattern of a sequence.
+def describe_pattern(index: int, pattern: Pattern) -> str:
+    """Return a description of a pattern of a sequence.
 
     >>> from slrig.model import Axis
-    >>> named(7, Gray(Axis.COLUMN, 2, 9, inverted=True))
+    >>> describe_pattern(7, Gray(Axis.COLUMN, 2, 9, inverted=True))
     'pattern 7 (column Gray bit 2 of 9, inverse)'
     """
-    words: str
+    description: str
     match pattern:
         case White() | Black():
-            words = pattern.kind
+            description = pattern.kind
         case Primary():
-            words = pattern.words
+            description = pattern.description
         case Gray():
-            words = f"{pattern.axis} Gray bit {pattern.bit} of {pattern.bits}{', inverse' if pattern.inverted else ''}"
+            description = (
+                f"{pattern.axis} Gray bit {pattern.bit} of {pattern.bits}{', inverse' if pattern.inverted else ''}"
+            )
         case LineShift():
-            words = f"{pattern.axis} lines, shift {pattern.shift} of {pattern.period_px}"
-    return f"pattern {index} ({words})"
+            description = f"{pattern.axis} lines, shift {pattern.shift} of {pattern.period_px}"
+    return f"pattern {index} ({description})"
 
 
-def place(camera: str, index: int, pattern: Pattern) -> str:
-    """Words for a camera's frame of a pattern."""
-    return f"camera '{camera}', {named(index, pattern)}"
+def describe_frame(camera: str, index: int, pattern: Pattern) -> str:
+    """Return a description of a camera's frame of a pattern."""
+    return f"camera '{camera}', {describe_pattern(index, pattern)}"
 
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """What white and black say at pixels drawn from the whole image.
+    """Lighting of the whole image, measured from white and black.
 
-    lit : share of the image that the projector lights. threshold_dn : white − black of a lit pixel, at least.
+    lit : fraction of the image that the projector lights. threshold_dn : minimum of white − black for a lit pixel.
     """
 
     lit: float
@@ -95,31 +139,31 @@ class Lighting:
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
-    """One camera's opening white and black frames at the sampled pixels.
+class ReferenceFrames:
+    """One camera's first white and black frames at the sampled pixels.
 
-    contrast : white − black, at least 1. lit, judged : which pixels the projector reaches, and which are asked.
-    row, band : (n,) where the pixel lies, and in which band of equally many samples.
+    contrast : white − black, at least 1. lit : pixels that the projector lights; tested : pixels that the checks use.
+    row : (n,) image row; band : (n,) index of one of `BANDS` bands with equal numbers of samples.
     """
 
     white: Samples
     black: Samples
     contrast: Samples
-    lit: Chosen
-    judged: Chosen
+    lit: SampleMask
+    tested: SampleMask
     row: NDArray[np.intp]
     band: NDArray[np.intp]
 
     def relative(self, frame: Samples) -> Samples:
-        """Return u = (frame − black)/(white − black) at the judged pixels."""
-        return np.asarray((frame - self.black)[self.judged] / self.contrast[self.judged])
+        """Return u = (frame − black)/(white − black) at the tested pixels."""
+        return np.asarray((frame - self.black)[self.tested] / self.contrast[self.tested])
 
 
-def lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np.intp]) -> Lighting | str:
-    """Compare white with black: what the projector lights, or what is wrong and what to do about it."""
+def measure_lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np.intp]) -> Lighting | str:
+    """Compare white with black. Return the lighting, or a description of the fault and its remedy."""
     contrast = white - black
     high, low = float(np.percentile(contrast, 99.5)), -float(np.percentile(contrast, 0.5))
-    # Where the projector does not reach, contrast is noise about zero: its lower tail tells how much.
+    # Outside the projector's light, contrast is noise around zero, which its lower tail measures.
     noise = max(0.0, -float(np.percentile(contrast, 2.0)) / 2.05)
     saturated_black = float(np.mean(black >= full_scale))
     levels = f"white mean {white.mean():.1f}, black mean {black.mean():.1f}, full scale {full_scale}"
@@ -131,9 +175,9 @@ def lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np
     if low > 3 * max(high, 1.0):
         return (
             f"white is darker than black ({levels}): the projector shows its patterns inverted, or later than it "
-            "says; set its input to normal polarity, check its latency, and scan again"
+            "reports; set its input to normal polarity, check its latency, and scan again"
         )
-    darker = _darker(contrast, high, row)
+    darker = _find_darker_band(contrast, high, row)
     if darker is not None:
         return (
             f"white is darker than black on {darker}: one of the two frames was damaged in transfer, or the room's "
@@ -141,7 +185,7 @@ def lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np
         )
     threshold = max(2.0, 0.1 * high, 4 * noise)
     lit = contrast >= threshold
-    if np.count_nonzero(lit) < _LIT_SAMPLES:
+    if np.count_nonzero(lit) < _MIN_LIT_SAMPLES:
         if white.max() <= max(3.0, 0.02 * full_scale):
             remedy = "both are dark: is the lamp off, the lens cap on, or the exposure far too short?"
         else:
@@ -159,172 +203,176 @@ def lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np
     return Lighting(float(np.mean(lit)), threshold)
 
 
-def reference(
+def build_reference(
     white: Samples, black: Samples, *, threshold_dn: float, full_scale: int, row: NDArray[np.intp]
-) -> Reference:
-    """Choose which of the sampled pixels are asked. At least one must be lit and not saturated."""
+) -> ReferenceFrames:
+    """Choose the pixels to test among the samples, at least one of which must be lit and not saturated."""
     contrast = white - black
     lit = contrast >= threshold_dn
     usable = lit & (white < full_scale)
-    # Noise makes of a clipped sample one that is nearly full, and of half of its light more than half of it is seen.
-    clear = usable & (white < NEARLY_FULL * full_scale)
+    # Noise can move a clipped sample below full scale, and half of its light then appears as more than half.
+    clear = usable & (white < NEAR_SATURATION * full_scale)
     if np.count_nonzero(clear) >= BAND_SAMPLES * BANDS:
         usable = clear
-    judged = usable & (contrast >= np.median(contrast[usable]))
-    return Reference(white, black, np.maximum(contrast, np.float32(1)), lit, judged, row, _bands(row))
+    tested = usable & (contrast >= np.median(contrast[usable]))
+    return ReferenceFrames(white, black, np.maximum(contrast, np.float32(1)), lit, tested, row, _assign_bands(row))
 
 
-def _bands(row: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Bands of equally many samples."""
+def _assign_bands(row: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Assign rows to bands of equal numbers of samples."""
     return np.searchsorted(np.quantile(row, np.arange(1, BANDS) / BANDS), row, side="right")
 
 
-def _darker(contrast: Samples, high: float, row: NDArray[np.intp]) -> str | None:
-    """Words for a band in which white − black is far below zero, which no light can do."""
-    band = _bands(row)
-    # Noise by the middle band: damage is not everywhere.
+def _find_darker_band(contrast: Samples, high: float, row: NDArray[np.intp]) -> str | None:
+    """Describe the band in which white − black is far below zero, which light cannot cause; None if there is none."""
+    band = _assign_bands(row)
+    # Noise of the median band, because damage does not affect all bands.
     lower = [float(np.percentile(contrast[band == b], 2.0)) for b in range(BANDS) if (band == b).any()]
     noise = max(0.0, -float(np.median(lower)) / 2.05)
     wrong = contrast < -max(3.0, 0.25 * high, 6 * noise)
-    return _worst(wrong, band, row, whole=0.05, quarter=0.1, of="pixels")
+    return _describe_worst(wrong, band, row, max_total=0.05, max_in_band=0.1, unit="pixels")
 
 
-def noise_dn(bit: Samples, inverse: Samples, ref: Reference, *, sums: Sequence[Samples] = ()) -> float:
-    """Noise of one frame, DN: bit + inverse − white − black is the noise of four.
+def pair_noise_dn(bit: Samples, inverse: Samples, ref: ReferenceFrames, *, sums: Sequence[Samples] = ()) -> float:
+    """Return the noise of one frame, DN: bit + inverse − white − black has the noise of four frames.
 
-    sums : of other pairs. The least that a difference from one of them tells counts, too: if white or black was
-    damaged, the difference from these is that damage, and noise so large would hide all else.
+    sums : bit + inverse of other pairs, which replace white + black if that gives less noise. Otherwise damage of white
+    or black would count as noise and hide all other faults.
     """
     pair = bit + inverse
-    return min(_noise_of_four((pair - other)[ref.judged]) for other in (ref.white + ref.black, *sums))
+    return min(_noise_from_four_frames((pair - other)[ref.tested]) for other in (ref.white + ref.black, *sums))
 
 
-def noise_of_bit(bit: Samples, ref: Reference) -> float:
-    """Noise of one frame, DN, by a bit that lights few edges: where it is lit it shows what white does, else black."""
+def bit_noise_dn(bit: Samples, ref: ReferenceFrames) -> float:
+    """Return the noise of one frame, DN, from a bit with few edges, which equals white where it is lit and black
+    elsewhere.
+    """
     above, below = bit - ref.white, bit - ref.black
-    nearer = np.where(np.abs(above) < np.abs(below), above, below)[ref.judged]
-    # Of two frames; the square root of two less than what four would tell.
-    return max(NOISE_FLOOR_DN, _noise_of_four(nearer) * math.sqrt(2))
+    nearer = np.where(np.abs(above) < np.abs(below), above, below)[ref.tested]
+    # The difference has the noise of two frames in place of four.
+    return max(NOISE_FLOOR_DN, _noise_from_four_frames(nearer) * math.sqrt(2))
 
 
-def _noise_of_four(rest: Samples) -> float:
-    # Whole numbers have a coarse median; spread over the interval that each stands for, they have a fine one.
+def _noise_from_four_frames(rest: Samples) -> float:
+    # Spread whole numbers over their rounding interval for a finer median.
     rest = rest + np.linspace(-0.5, 0.5, len(rest), dtype=np.float32)
     spread = 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
     return max(NOISE_FLOOR_DN, math.sqrt(max(spread**2 - 1 / 12, 0.0)) / 2)
 
 
-def range_fault(frame: Samples, ref: Reference, *, noise: float | None) -> str | None:
-    """No pattern is darker than black or brighter than white: a frame that is was damaged on its way.
+def range_fault(frame: Samples, ref: ReferenceFrames, *, noise: float | None) -> str | None:
+    """Check that a frame is not darker than black or brighter than white, which indicates damage.
 
-    Without a known noise, more is let pass.
+    noise : DN; None widens the tolerance.
     """
     u = ref.relative(frame)
-    slack = np.maximum(0.3, 6 * noise / ref.contrast[ref.judged]) if noise is not None else np.float32(0.6)
+    slack = np.maximum(0.3, 6 * noise / ref.contrast[ref.tested]) if noise is not None else np.float32(0.6)
     outside = (u < -slack) | (u > 1 + slack)
-    worst = worst_judged(outside, ref, whole=0.05)
+    worst = describe_worst_tested(outside, ref, max_total=0.05)
     if worst is None:
         return None
     return (
         f"{worst} lie outside the range between the black and the white frame: the frame was damaged in transfer, the "
-        f"room's light changed, the projector's light comes later than it says, or {contrast_words(ref)}; check the "
+        f"room's light changed, the projector's light is later than reported, or {describe_contrast(ref)}; check the "
         "cable, the light and the projector's latency, and scan again"
     )
 
 
-def dimmed(frame: Samples, ref: Reference) -> bool:
-    """Whether a frame is neither as dark as black nor as bright as white, all in all."""
+def is_partly_lit(frame: Samples, ref: ReferenceFrames) -> bool:
+    """True if the mean light of a frame is clearly between black and white."""
     u = ref.relative(frame)
-    return bool(0.005 < np.average(u, weights=ref.contrast[ref.judged]) < 0.985)
+    return bool(0.005 < np.average(u, weights=ref.contrast[ref.tested]) < 0.985)
 
 
-def variation(frame: Samples, ref: Reference) -> float:
-    """Mean square, DN², of what is left of a frame after its best fit by black + share · (white − black)."""
-    contrast, seen = ref.contrast[ref.judged], (frame - ref.black)[ref.judged]
-    share = float(np.dot(contrast, seen) / np.dot(contrast, contrast))
-    return float(np.mean((seen - share * contrast) ** 2))
+def variation(frame: Samples, ref: ReferenceFrames) -> float:
+    """Return the mean square residual, DN², of a frame after the best fit of black + a · (white − black)."""
+    contrast, light_dn = ref.contrast[ref.tested], (frame - ref.black)[ref.tested]
+    fraction = float(np.dot(contrast, light_dn) / np.dot(contrast, contrast))
+    return float(np.mean((light_dn - fraction * contrast) ** 2))
 
 
-def repeated(frame: Samples, earlier: Sequence[Samples], ref: Reference, *, noise: float, factor: float) -> int | None:
-    """Index of an earlier frame from which this one differs by noise only.
+def find_repeated(
+    frame: Samples, earlier: Sequence[Samples], ref: ReferenceFrames, *, noise: float, factor: float
+) -> int | None:
+    """Return the index of an earlier frame from which this one differs by noise only; None if there is none.
 
-    A frame may rightly equal another where the visible part of the pattern is constant: only one whose own variation
-    is `factor` times the noise can be a repetition.
+    Frames may rightly be equal if the visible part of the pattern is constant, so a frame counts as repeated only if
+    its own variation is `factor` times the noise variance.
     """
     if not earlier or variation(frame, ref) < factor * noise**2:
         return None
-    here = frame[ref.judged]
-    distance = [float(np.mean((here - other[ref.judged]) ** 2)) for other in earlier]
+    here = frame[ref.tested]
+    distance = [float(np.mean((here - other[ref.tested]) ** 2)) for other in earlier]
     nearest = int(np.argmin(distance))
-    # The noise is that of bright pixels. A camera whose values are made for displays has several times as much in dark.
-    alike = max(6 * noise**2, _ALIKE * variation(frame, ref))
+    # The noise is that of bright pixels; a camera with a display gamma has several times as much in dark ones.
+    alike = max(6 * noise**2, _REPEAT_TOLERANCE * variation(frame, ref))
     return nearest if distance[nearest] < alike else None
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
-    """How a pattern's second frame differs from its first.
+class FrameDrift:
+    """Difference between two frames of one pattern.
 
-    light : median of the difference over the white contrast; light_limit : how large it may be.
-    moved : share of pixels that changed by much more.
+    light_change : median difference relative to white − black; light_limit : its tolerance. changed_fraction : fraction
+    of pixels that changed by much more.
     """
 
-    light: float
+    light_change: float
     light_limit: float
-    moved: float
+    changed_fraction: float
 
 
-def drift(first: Samples, again: Samples, ref: Reference, *, noise: float | None) -> Drift:
-    """Compare two frames of one pattern. Without a known noise, that of their difference is taken."""
-    contrast, change = ref.contrast[ref.judged], (again - first)[ref.judged]
+def measure_drift(first: Samples, repeat: Samples, ref: ReferenceFrames, *, noise: float | None) -> FrameDrift:
+    """Compare two frames of one pattern. noise : DN; None estimates it from their difference."""
+    contrast, change = ref.contrast[ref.tested], (repeat - first)[ref.tested]
     light = float(np.median(change / contrast))
     rest = np.abs(change - light * contrast)
     if noise is None:
         noise = max(NOISE_FLOOR_DN, 1.4826 * float(np.median(rest)) / 2**0.5)
-    moved = float(np.mean(rest > np.maximum(0.3 * contrast, 8 * noise)))
-    # In the dark, the brighter half of the pixels are those that noise made bright: they come back darker.
-    return Drift(light, 0.1 + 1.5 * noise / float(np.median(contrast)), moved)
+    changed = float(np.mean(rest > np.maximum(0.3 * contrast, 8 * noise)))
+    # In weak light, the half of the pixels with the highest contrast is selected by noise and is darker when repeated.
+    return FrameDrift(light, 0.1 + 1.5 * noise / float(np.median(contrast)), changed)
 
 
-def drift_fault(seen: Drift) -> str | None:
-    """Refuse light that changed by more than 10 % of white, and more than 5 % of pixels that changed otherwise."""
-    if seen.moved > 0.05:
+def drift_fault(drift: FrameDrift) -> str | None:
+    """Check that the light changed by less than 10 % of white, and that at most 5 % of the pixels changed."""
+    if drift.changed_fraction > 0.05:
         return (
-            f"{seen.moved:.0%} of the pixels changed since this pattern was first shown: the object, the projector or "
-            "a camera moved; hold them still, and scan again"
+            f"{drift.changed_fraction:.0%} of the pixels changed since this pattern was first shown: the object, the "
+            "projector or a camera moved; hold them still, and scan again"
         )
-    if abs(seen.light) > seen.light_limit:
+    if abs(drift.light_change) > drift.light_limit:
         return (
-            f"the light changed by {seen.light:+.0%} of white since this pattern was first shown: let the lamp warm "
-            "up, switch off automatic exposure and dynamic contrast, keep the room's light steady, and scan again"
+            f"the light changed by {drift.light_change:+.0%} of white since this pattern was first shown: let the lamp "
+            "warm up, switch off automatic exposure and dynamic contrast, keep the room's light steady, and scan again"
         )
     return None
 
 
-def changed_fault(
+def reference_change_fault(
     first: Samples,
-    again: Samples,
-    brighter: tuple[Samples, Samples],
+    repeat: Samples,
+    contrasts: tuple[Samples, Samples],
     *,
     threshold_dn: float,
     noise: float | None,
     row: NDArray[np.intp],
 ) -> str | None:
-    """Compare two white or two black frames wherever either of them says that the projector lights.
+    """Compare two white or two black frames wherever one of them indicates light of the projector.
 
-    The pixels that all other tests ask were chosen by the first two frames, and damage may have chosen them.
+    All other checks use pixels that the first two frames selected, and damage may have affected that selection.
 
-    brighter : white − black, with the first and with the second of the two frames, at pixels of the whole image.
+    contrasts : white − black with the first and with the second of the two frames, at pixels of the whole image.
     """
-    contrast = np.maximum(*brighter)
+    contrast = np.maximum(*contrasts)
     lit = contrast >= threshold_dn
     if np.count_nonzero(lit) < BAND_SAMPLES:
         return None
-    change = np.abs(again - first)[lit]
+    change = np.abs(repeat - first)[lit]
     if noise is None:
         noise = max(NOISE_FLOOR_DN, 1.4826 * float(np.median(change)) / 2**0.5)
     wrong = change > np.maximum(0.3 * contrast[lit], 8 * noise)
-    where = _worst(wrong, _bands(row[lit]), row[lit], whole=0.05, quarter=0.15)
+    where = _describe_worst(wrong, _assign_bands(row[lit]), row[lit], max_total=0.05, max_in_band=0.15)
     if where is None:
         return None
     return (
@@ -333,240 +381,199 @@ def changed_fault(
     )
 
 
-def worst_judged(wrong: Chosen, ref: Reference, *, whole: float, quarter: float = 0.25) -> str | None:
-    """Words for the share of judged pixels that are wrong: None below `whole` of all and below `quarter` of a band."""
-    return _worst(wrong, ref.band[ref.judged], ref.row[ref.judged], whole=whole, quarter=quarter)
+def describe_worst_tested(
+    wrong: SampleMask, ref: ReferenceFrames, *, max_total: float, max_in_band: float = 0.25
+) -> str | None:
+    """Describe the wrong tested pixels; None below `max_total` of all and below `max_in_band` of each band."""
+    return _describe_worst(
+        wrong, ref.band[ref.tested], ref.row[ref.tested], max_total=max_total, max_in_band=max_in_band
+    )
 
 
-def worst_of(wrong: Chosen, row: NDArray[np.intp], *, whole: float, quarter: float = 0.25) -> str | None:
-    """As `worst_judged`, of any lit pixels in these rows."""
-    return _worst(wrong, _bands(row), row, whole=whole, quarter=quarter)
+def describe_worst_lit(
+    wrong: SampleMask, row: NDArray[np.intp], *, max_total: float, max_in_band: float = 0.25
+) -> str | None:
+    """Describe wrong lit pixels in these rows, as `describe_worst_tested`."""
+    return _describe_worst(wrong, _assign_bands(row), row, max_total=max_total, max_in_band=max_in_band)
 
 
-def _worst(
-    wrong: Chosen,
+def _describe_worst(
+    wrong: SampleMask,
     band: NDArray[np.intp],
     row: NDArray[np.intp],
     *,
-    whole: float,
-    quarter: float = 0.25,
-    of: str = "lit pixels",
+    max_total: float,
+    max_in_band: float = 0.25,
+    unit: str = "lit pixels",
 ) -> str | None:
-    """Words for the share of wrong pixels: None below `whole` of the image and below `quarter` of every band."""
+    """Describe the wrong pixels: None below `max_total` of all and below `max_in_band` of every band."""
     total = float(np.mean(wrong))
-    if total > whole:
-        return f"{total:.0%} of the {of}"
+    if total > max_total:
+        return f"{total:.0%} of the {unit}"
     counts = np.bincount(band, minlength=BANDS)
-    shares = np.bincount(band, weights=wrong, minlength=BANDS) / np.maximum(counts, 1)
-    shares[counts < BAND_SAMPLES // 4] = 0.0
-    top = int(np.argmax(shares))
+    fractions = np.bincount(band, weights=wrong, minlength=BANDS) / np.maximum(counts, 1)
+    fractions[counts < BAND_SAMPLES // 4] = 0.0
+    top = int(np.argmax(fractions))
     inside = row[band == top]
-    return f"{shares[top]:.0%} of the {of} in {_rows(inside)}" if shares[top] > quarter else None
+    return f"{fractions[top]:.0%} of the {unit} in {_describe_rows(inside)}" if fractions[top] > max_in_band else None
 
 
-def contrast_words(ref: Reference) -> str:
-    """Words for the case that it is noise after all."""
+def describe_contrast(ref: ReferenceFrames) -> str:
+    """Describe the case in which noise causes the fault."""
     return (
-        f"noise hides the pattern (white − black is {float(np.median(ref.contrast[ref.judged])):.0f} DN: if that is "
+        f"noise hides the pattern (white − black is {float(np.median(ref.contrast[ref.tested])):.0f} DN: if that is "
         "little, lengthen the exposure)"
     )
 
 
-def rows_of(ref: Reference, band: int) -> str:
-    """Words for where a band lies."""
-    return _rows(ref.row[ref.band == band])
+def describe_band(ref: ReferenceFrames, band: int) -> str:
+    """Describe the rows of a band."""
+    return _describe_rows(ref.row[ref.band == band])
 
 
-def _rows(row: NDArray[np.intp]) -> str:
+def _describe_rows(row: NDArray[np.intp]) -> str:
     return f"rows {row.min()} to {row.max()}"
 
 
-_EDGE_PX = 8.0
-"""Breadth of an edge that a scaler blurred, projector pixels: from end to end of a Gaussian of 2 px, ± 2 deviations."""
+def pair_fault(bit: Samples, inverse: Samples, ref: ReferenceFrames, *, noise: float, run_px: int) -> str | None:
+    """Check that a bit and its inverse add up to white and black, because light is additive.
 
-_EVEN = 0.08
-"""Spread of what an even change of light leaves, by noise: damage and other patterns leave light and dark."""
-
-_ROUGHER, _ROUGH = 1.25, 0.15
-"""Bytes that are anything differ from pixel to pixel by a third of the full scale on average. A projector that was
-found to dither differed by 0.18 of white where all was lit."""
-
-_NOISE_ROUGHNESS = 1.5
-"""Two samples of normal noise differ by 1.13 of its standard deviation on average."""
-
-_STEEPEST_GAMMA = 2.4
-"""Of displays: ITU-R BT.1886."""
-
-_CROSSINGS = 12  # pairs across an edge, for a median of their steps
-_SPAN_PERIODS = 3  # between the 5th and the 95th percentile of the positions
-_BAND_LINES = 4  # of a band: where it is used says why
-
-_LEAST_SUM_OFF = 0.25
-"""Of white: sums of line frames that differ by less are those of sharp lines on pixels as wide as theirs."""
-
-_LEAST_SUM_OFF_HALF = 0.08
-"""Of white, for lines of half their period: of twelve rendered scenes the sums of all differ by less."""
-
-_AS_MUCH_TO_BLAME = 0.1  # of the wrong pixels: frames that explain as many, less this
-
-_FEW = 0.25  # of the pairs that come closer when two bits are exchanged back: those that come apart
-_MANY = 0.5  # of the pixels in what is wrong: a bit that explains fewer is not to blame alone
-_FEWEST_FOR_SHAPE = 5  # line frames: three tell a wave's place, height and level, and no more
-_LEAST_HEIGHT = 0.15  # of white over black; sharp lines have 0.64
-_SHAPE_BINS = 32
-_SHAPE_SPREADS, _LEAST_ODD = 6.0, 0.15  # of the wave's height, which half of a wave rises by
-_ODD, _ODD_IN_BAND = 0.05, 0.15  # of the judged pixels
-_NEAR_EDGE, _NEARER = 0.8, 0.2  # of white over black, by which a bit swings beside its edge, and less than another
-_SURE_OF_WAVE = 5.0  # standard deviations
-_LEAST_WAVE = 0.03  # of white over black, for each line; sharp lines have 0.32
-_LIT_BY_LINES = 0.1
-_LEAST_ENDS_OFF, _LEAST_ABOVE = 0.3, 0.15  # of what lines light of a pixel, from dark to bright
-
-
-def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float, run_px: int) -> str | None:
-    """Light is additive: a bit and its inverse add up to white and black.
-
-    Limits leave room for noise; for a camera that is not linear, whose blurred edges add up to more than white; and for
-    a projector behind a scaler. That blurs the pattern's values before gamma makes light of them, and then both frames
-    are dark at an edge. There a pair may fall short by as much as its own swing explains (`_least_sum`). How much of
-    the image lies at edges follows from run_px, the length of the bit's runs of equal pixels in the projector.
+    The tolerances allow for noise, for a non-linear camera, whose blurred edges add up to more than white, and for a
+    projector with a scaler. A scaler blurs pixel values before gamma turns them into light, so that both frames are
+    dark at an edge; a pair may fall short by as much as its own difference explains (`_min_pair_sum`). run_px : length
+    of the bit's runs of equal projector pixels, which determines the fraction of the image at edges.
     """
     u, v = ref.relative(bit), ref.relative(inverse)
     excess = u + v - 1
-    slack = np.clip(8 * max(noise, noise_dn(bit, inverse, ref)) / ref.contrast[ref.judged], 0.2, 0.5)
+    slack = np.clip(8 * max(noise, pair_noise_dn(bit, inverse, ref)) / ref.contrast[ref.tested], 0.2, 0.5)
     above = excess > 0.8
     at_edges = min(1.0, _EDGE_PX / run_px)
-    dark = _in_dark_bands(u, v, ref)
+    dark = _dark_band_mask(u, v, ref)
     for one, other in ((bit, inverse), (inverse, bit)):
-        rough = rougher(one, [other], ref, noise=noise)
-        if rough is not None:
-            return rough
-    worst = worst_judged(above | dark | (u + v < _least_sum(np.abs(u - v)) - slack), ref, whole=0.1)
+        fault = roughness_fault(one, [other], ref, noise=noise)
+        if fault is not None:
+            return fault
+    worst = describe_worst_tested(above | dark | (u + v < _min_pair_sum(np.abs(u - v)) - slack), ref, max_total=0.1)
     if worst is None and at_edges < 1.0:
         wrong = above | (excess < -slack)
-        worst = worst_judged(wrong, ref, whole=0.1 + at_edges, quarter=0.25 + at_edges)
+        worst = describe_worst_tested(wrong, ref, max_total=0.1 + at_edges, max_in_band=0.25 + at_edges)
     if worst is None:
         return None
-    apart = float(np.median(np.abs((bit - inverse)[ref.judged]) / ref.contrast[ref.judged]))
-    if apart < 0.25:
+    difference = float(np.median(np.abs((bit - inverse)[ref.tested]) / ref.contrast[ref.tested]))
+    if difference < 0.25:
         return f"the frame and its inverse show the same on {worst}: one of them is stale; scan again"
-    together = float(np.median(u + v))
-    if float(np.median(np.abs(u + v - together))) < _EVEN * together:
+    total = float(np.median(u + v))
+    if float(np.median(np.abs(u + v - total))) < _EVEN_SPREAD * total:
         return (
-            f"the frame and its inverse have {together:.0%} of the light of white and black, evenly on all of the "
+            f"the frame and its inverse have {total:.0%} of the light of white and black, evenly on all of the "
             "image: the exposure or the lamp changed since: switch off automatic exposure and gain, dynamic contrast "
             "and power saving, and scan again"
         )
     return (
         f"the frame and its inverse do not add up to white and black on {worst}: one of them shows another pattern or "
-        f"was damaged, or something moved, or {contrast_words(ref)}; scan again"
+        f"was damaged, or something moved, or {describe_contrast(ref)}; scan again"
     )
 
 
-def _in_dark_bands(u: Samples, v: Samples, ref: Reference) -> Chosen:
-    """Which pixels lie in bands where one frame of a pair has hardly any light and the other does not make up for it.
+def _dark_band_mask(u: Samples, v: Samples, ref: ReferenceFrames) -> SampleMask:
+    """Mask of pixels in bands where one frame of a pair has almost no light and the other does not compensate for it.
 
-    What a scaler takes from the edges it takes from both.
+    The blur of a scaler, in contrast, affects both frames equally.
     """
-    band = ref.band[ref.judged]
+    band = ref.band[ref.tested]
     counts = np.bincount(band, minlength=BANDS)
     means = np.stack([np.bincount(band, weights=each, minlength=BANDS) for each in (u, v)]) / np.maximum(counts, 1)
     dark = (means.sum(axis=0) < 0.8) & (means.min(axis=0) < 0.3 * means.max(axis=0))
     return np.asarray(dark[band], dtype=np.bool_)
 
 
-_SIGNAL = np.linspace(0.5, 1.0, 257)
-_SWING = _SIGNAL**_STEEPEST_GAMMA - (1 - _SIGNAL) ** _STEEPEST_GAMMA
-_SUM = _SIGNAL**_STEEPEST_GAMMA + (1 - _SIGNAL) ** _STEEPEST_GAMMA
+def _min_pair_sum(swing: Samples) -> Samples:
+    """Return the smallest sum of a bit and its inverse whose difference is `swing`, all on the scale of `u`.
 
-
-def _least_sum(swing: Samples) -> Samples:
-    """What a bit and its inverse add up to, at least, where they differ by `swing`; all on the scale of `u`.
-
-    A blurred bit has the value s where its inverse has 1 - s: they differ by s^g - (1 - s)^g and add up to
-    s^g + (1 - s)^g, least for the steepest gamma g.
+    Where a blurred bit has the pixel value s, its inverse has 1 - s: they differ by s^g - (1 - s)^g and add up to s^g +
+    (1 - s)^g, which is smallest for the steepest gamma g.
     """
     return np.asarray(np.interp(swing, _SWING, _SUM), dtype=np.float32)
 
 
-def rougher(frame: Samples, others: Sequence[Samples], ref: Reference, *, noise: float) -> str | None:
-    """Words for a band in which a frame is rougher than frames of patterns as fine as its own: it was damaged there.
+def roughness_fault(frame: Samples, others: Sequence[Samples], ref: ReferenceFrames, *, noise: float) -> str | None:
+    """Describe a band in which a frame is rougher than frames of equally fine patterns: it was damaged there.
 
-    Roughness is the mean difference of pixels that lie beside each other. A bit and its inverse have the same, and so
-    have line frames among themselves, whatever camera and projector make of light. What is lit may be rougher than what
-    is dark: by its noise, and where white itself was not shown evenly.
+    Roughness is the mean difference of adjacent pixels. It is the same in a bit and its inverse, and in all line
+    frames, for any response of camera and projector. Lit areas may be rougher than dark ones, by their noise and by
+    unevenness of white itself.
     """
-    here, light = _roughness(frame, ref)
-    usual = np.median([_roughness(each, ref)[0] for each in others], axis=0)
-    hidden = _NOISE_ROUGHNESS * noise / float(np.median(ref.contrast[ref.judged]))
-    over = here - _ROUGHER * usual - _ROUGH * (1 + np.clip(light, 0, 1)) - hidden
-    worst = int(np.nanargmax(np.append(over, 0.0)))
+    roughness, light = _roughness(frame, ref)
+    typical = np.median([_roughness(each, ref)[0] for each in others], axis=0)
+    hidden = _NOISE_ROUGHNESS * noise / float(np.median(ref.contrast[ref.tested]))
+    excess = roughness - _ROUGHNESS_RATIO * typical - _ROUGHNESS_MARGIN * (1 + np.clip(light, 0, 1)) - hidden
+    worst = int(np.nanargmax(np.append(excess, 0.0)))
     if worst == BANDS:
         return None
     return (
-        f"in {rows_of(ref, worst)} pixels beside each other differ by {here[worst]:.0%} of white, and by "
-        f"{usual[worst]:.0%} in frames of patterns as fine: the frame was damaged in transfer; check the cable, and "
-        "scan again"
+        f"in {describe_band(ref, worst)} adjacent pixels differ by {roughness[worst]:.0%} of white, and by "
+        f"{typical[worst]:.0%} in frames of equally fine patterns: the frame was damaged in transfer; check the cable, "
+        "and scan again"
     )
 
 
-def _roughness(frame: Samples, ref: Reference) -> tuple[Samples, Samples]:
-    """(BANDS,) float32 each: the mean difference of pixels beside each other, and the mean light, NaN where few are
-    judged.
-    """
-    light, beside = ((frame - ref.black) / ref.contrast).reshape(2, -1)
-    both = ref.judged.reshape(2, -1).all(axis=0)
+def _roughness(frame: Samples, ref: ReferenceFrames) -> tuple[Samples, Samples]:
+    """(BANDS,) float32 each: mean difference of adjacent pixels, and mean light; NaN with few tested pixels."""
+    light, neighbour = ((frame - ref.black) / ref.contrast).reshape(2, -1)
+    both = ref.tested.reshape(2, -1).all(axis=0)
     band = ref.band.reshape(2, -1)[0][both]
     counts = np.bincount(band, minlength=BANDS).astype(np.float32)
     counts[counts < BAND_SAMPLES // 8] = np.nan
-    rough, mean = (
+    roughness, mean = (
         np.bincount(band, weights=each[both], minlength=BANDS) / counts
-        for each in (np.abs(light - beside), (light + beside) / 2)
+        for each in (np.abs(light - neighbour), (light + neighbour) / 2)
     )
-    return rough.astype(np.float32), mean.astype(np.float32)
+    return roughness.astype(np.float32), mean.astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
-class Code:
-    """Gray code read at the sampled pixels. index : (n,) int64, cell index; sure : every bit is beyond doubt;
-    differences : (bits, n), of each bit from its inverse.
+class DecodedCode:
+    """Gray code at the sampled pixels.
+
+    index : (n,) int64, cell index. certain : (n,) bool, True if all bits are unambiguous. differences : (bits, n)
+    float32, of each bit and its inverse.
     """
 
     index: Integers
-    sure: Chosen
+    certain: SampleMask
     bits: int
     differences: Samples
 
 
-def read_code(differences: Sequence[Samples], ref: Reference) -> Code:
-    """Decode: one vector bit − inverse (or 2·bit − white − black) per bit, most significant first."""
+def decode_samples(differences: Sequence[Samples], ref: ReferenceFrames) -> DecodedCode:
+    """Decode one vector bit − inverse (or 2·bit − white − black) for each bit, most significant first."""
     stack = np.stack(differences)
-    sure = ref.lit & (np.abs(stack) > 0.2 * ref.contrast).all(axis=0)
-    return Code(gray_index(stack > 0), sure, len(stack), stack)
+    certain = ref.lit & (np.abs(stack) > 0.2 * ref.contrast).all(axis=0)
+    return DecodedCode(gray_index(stack > 0), certain, len(stack), stack)
 
 
-def swapped_bit(code: Code) -> int | None:
-    """Which bit was exchanged with its inverse, told from where more significant bits change.
+def find_inverted_bit(code: DecodedCode) -> int | None:
+    """Return the bit that was exchanged with its inverse; None if there is none.
 
-    The first half of the sampled pixels lie beside the second half. Two pixels beside each other have close indices,
-    also where a coarse bit changes, unless a finer bit is inverted: that mirrors the indices within each of its
-    blocks, and mirroring them back closes the gap. What this cannot see: an exchange of the most significant bit, which
-    mirrors everything and leaves no gap, and of the last two or three, whose gap is as small as a common step. Line
-    frames show these (`line_fault`).
+    The second half of the sampled pixels are neighbours of the first half. Indices of neighbours are close, also where
+    a coarse bit changes, unless a finer bit is inverted: that mirrors the indices within each of its blocks, and
+    mirroring them back closes the gap. This cannot find an exchange of the most significant bit, which mirrors
+    everything without a gap, or of the last two or three, whose gap is as small as a normal step. Line frames reveal
+    these (`line_fault`).
     """
-    here, beside = code.index.reshape(2, -1)
-    sure = code.sure.reshape(2, -1).all(axis=0)
-    if not sure.any():
+    index, neighbour = code.index.reshape(2, -1)
+    certain = code.certain.reshape(2, -1).all(axis=0)
+    if not certain.any():
         return None
-    here, beside = here[sure], beside[sure]
-    step = max(1.0, float(np.percentile(np.abs(here - beside), 75)))
-    words = to_gray(here) ^ to_gray(beside)
+    index, neighbour = index[certain], neighbour[certain]
+    step = max(1.0, float(np.percentile(np.abs(index - neighbour), 75)))
+    words = to_gray(index) ^ to_gray(neighbour)
     for coarse in range(code.bits - 1):
         # Pairs whose most significant difference is this bit.
         crossing = words >> (code.bits - 1 - coarse) == 1
-        if np.count_nonzero(crossing) < _CROSSINGS:
+        if np.count_nonzero(crossing) < _MIN_CROSSINGS:
             continue
-        a, b = here[crossing], beside[crossing]
+        a, b = index[crossing], neighbour[crossing]
         if np.median(np.abs(a - b)) <= 4 * step:
             continue
         for fine in range(coarse + 1, code.bits):
@@ -578,329 +585,345 @@ def swapped_bit(code: Code) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class LineExpectation:
-    """Where the Gray code says that the lines of one frame are.
+    """Predicted light of one line frame.
 
-    position : (n,) float32, decoded position in periods, NaN where it is unsure or not asked.
-    light : (n,) float32, which part of the decoded cell the frame lights, 0 to 1.
+    position : (n,) float32, decoded position in periods, NaN where it is uncertain or not tested. light : (n,) float32,
+    fraction of the decoded cell that the frame lights, 0 to 1.
     """
 
     position: Samples
     light: Samples
 
-    def tells(self, where: Chosen) -> bool:
-        """Whether these pixels, all of them sure, are enough of them and see several lines."""
-        if np.count_nonzero(where) < BAND_SAMPLES:
+    def is_testable(self, mask: SampleMask) -> bool:
+        """True if the pixels of a mask, all of them certain, are enough and cover several lines."""
+        if np.count_nonzero(mask) < BAND_SAMPLES:
             return False
-        near, far = np.percentile(self.position[where], (5, 95))
-        # A line that straddles two cells of half a period lights all cells alike.
-        return bool(far - near >= _SPAN_PERIODS and np.ptp(self.light[where]) > 0)
+        low, high = np.percentile(self.position[mask], (5, 95))
+        # A line that straddles two cells of half a period lights all cells equally.
+        return bool(high - low >= _MIN_SPAN_PERIODS and np.ptp(self.light[mask]) > 0)
 
-    def lines(self, where: Chosen) -> int:
-        """How many periods these pixels, all of them sure, lie in."""
-        return len(np.unique(np.floor(self.position[where])))
+    def count_periods(self, mask: SampleMask) -> int:
+        """Return the number of periods with pixels of a mask, all of them certain."""
+        return len(np.unique(np.floor(self.position[mask])))
 
 
-def exchanged_bits(code: Code) -> tuple[int, int] | None:
-    """Which two bits stand in each other's place, told from pixels beside each other: these have close indices.
+def find_exchanged_bits(code: DecodedCode) -> tuple[int, int] | None:
+    """Return two bits that were exchanged with each other; None if there are none.
 
-    Exchanged back, indices come closer at many pairs, and apart at few. What this cannot see: an exchange of bits of
-    which neither changes over what is lit.
+    Exchanging them back brings the indices of many pairs of neighbours closer together, and of few further apart. This
+    cannot find an exchange of two bits that are both constant over the lit area.
     """
-    here, beside = code.index.reshape(2, -1)
-    sure = code.sure.reshape(2, -1).all(axis=0)
-    sure &= here != beside
-    words = [to_gray(each[sure]) for each in (here, beside)]
-    apart = np.abs(here - beside)[sure]
-    # A table is faster than the sums that it is made of, twice for each pair of bits.
+    index, neighbour = code.index.reshape(2, -1)
+    certain = code.certain.reshape(2, -1).all(axis=0)
+    certain &= index != neighbour
+    words = [to_gray(each[certain]) for each in (index, neighbour)]
+    distance = np.abs(index - neighbour)[certain]
+    # A table is faster than computing each index, twice for each pair of bits.
     index_of = from_gray(np.arange(2**code.bits))
     for one in range(code.bits):
         for other in range(one + 1, code.bits):
             first, second = code.bits - 1 - one, code.bits - 1 - other
-            a, b = (index_of[_exchanged(word, first, second)] for word in words)
-            change = np.abs(a - b) - apart
-            nearer = np.count_nonzero(change < 0)
-            if nearer >= _CROSSINGS and np.count_nonzero(change > 0) < _FEW * nearer:
+            a, b = (index_of[_exchange_bits(word, first, second)] for word in words)
+            change = np.abs(a - b) - distance
+            improved = np.count_nonzero(change < 0)
+            if improved >= _MIN_CROSSINGS and np.count_nonzero(change > 0) < _MAX_WORSENED_FRACTION * improved:
                 return one, other
     return None
 
 
-def _exchanged(word: Integers, first: int, second: int) -> Integers:
-    """Words with two of their bits, counted from the least significant one, in each other's place."""
+def _exchange_bits(word: Integers, first: int, second: int) -> Integers:
+    """Exchange two bits, counted from the least significant one, of each code word."""
     unlike = ((word >> first) ^ (word >> second)) & 1
     return np.asarray(word ^ (unlike << first) ^ (unlike << second))
 
 
 @dataclass(frozen=True, slots=True)
-class Agreement:
-    """What lines say of the code at the sampled pixels.
+class LineAgreement:
+    """Comparison of the code with the lines at the sampled pixels.
 
-    told : (n,) where they say anything; wrong : (n,) where they contradict the code. reversed : whether lines run
-    through the cells against the code, as if they came in the opposite order.
+    compared : (n,) bool, pixels with a clear phase; wrong : (n,) bool, pixels where phase and code contradict.
+    is_reversed : True if the line frames appear to come in the opposite order.
     """
 
-    told: Chosen
-    wrong: Chosen
-    reversed: bool
+    compared: SampleMask
+    wrong: SampleMask
+    is_reversed: bool
 
 
-def agreement(
-    code: Code,
+def compare_with_lines(
+    code: DecodedCode,
     lines: Sequence[tuple[LineShift, Samples]],
-    ref: Reference,
+    ref: ReferenceFrames,
     *,
     cell_px: int,
     offset_px: int,
     noise: float,
-) -> Agreement:
-    """Compare the phase of the lines at each pixel with the cell that the code gives.
+) -> LineAgreement:
+    """Compare the phase of the lines at each pixel with its decoded cell.
 
-    A single wrong bit, whichever it is, moves the index by an odd number of cells, and half a period where a cell is as
-    wide as that: an error of any one frame of the code shows at every pixel where it turned the bit over.
+    A single wrong bit moves the index by an odd number of cells, which is half a period for cells of that width. So a
+    wrong frame of the code is visible at every pixel whose bit it changed.
 
-    lines : the frames of one axis whose shifts divide their period evenly.
+    lines : frames of one axis with evenly spaced shifts.
     """
     period_px, count = lines[0][0].period_px, len(lines)
     turn = 2j * np.pi / period_px
     waves = np.sum([frame * np.exp(turn * line.centre_px) for line, frame in lines], axis=0)
-    clear = np.abs(waves) > np.maximum(_SURE_OF_WAVE * noise * (count / 2) ** 0.5, _LEAST_WAVE * count * ref.contrast)
+    clear = np.abs(waves) > np.maximum(_MIN_WAVE_SIGMAS * noise * (count / 2) ** 0.5, _MIN_WAVE * count * ref.contrast)
     centre_px = cell_px * code.index - offset_px + (cell_px - 1) / 2
     off_px = (np.angle(waves) / abs(turn) - centre_px + period_px / 2) % period_px - period_px / 2
-    told = code.sure & clear
-    wrong = told & (np.abs(off_px) > cell_px / 2 + period_px / 16)
-    # The bit that changes at an edge of the cell swings least beside it: so it shows which edge a pixel is nearer to.
+    compared = code.certain & clear
+    wrong = compared & (np.abs(off_px) > cell_px / 2 + period_px / 16)
+    # Near an edge of a cell, the bit that changes there has the smallest swing, which shows the edge that is closer.
     swing = np.abs(code.differences) / ref.contrast
     before, after = (swing[_changing_bit(code, step), np.arange(len(code.index))] for step in (-1, 1))
-    beside = told & (np.minimum(before, after) < _NEAR_EDGE) & (np.abs(before - after) > _NEARER)
+    near_edge = compared & (np.minimum(before, after) < _EDGE_SWING) & (np.abs(before - after) > _MIN_SWING_DIFFERENCE)
     against = (before < after) != (off_px < 0)
-    turned = np.count_nonzero(beside) >= BAND_SAMPLES and np.mean(against[beside]) > _MANY
-    return Agreement(told, wrong, bool(turned))
+    is_reversed = np.count_nonzero(near_edge) >= BAND_SAMPLES and np.mean(against[near_edge]) > _MIN_EXPLAINED_FRACTION
+    return LineAgreement(compared, wrong, bool(is_reversed))
 
 
-def _changing_bit(code: Code, step: int) -> Integers:
-    """(n,) which bit, the most significant one first, differs between each cell and the one before or after it."""
+def _changing_bit(code: DecodedCode, step: int) -> Integers:
+    """(n,): index of the bit, most significant first, that differs between each cell and the previous or next one."""
     changed = to_gray(code.index) ^ to_gray(np.clip(code.index + step, 0, 2**code.bits - 1))
     return np.asarray(code.bits - 1 - np.log2(np.maximum(changed, 1)).astype(np.int64))
 
 
-def blamed_bits(code: Code, wrong: Chosen) -> tuple[int, ...]:
-    """Which bits are to blame where lines contradict the code: those that, turned over there, bring pixels beside each
-    other as close as they are elsewhere; all of them where none does.
+def find_faulty_bits(code: DecodedCode, wrong: SampleMask) -> tuple[int, ...]:
+    """Return the bits whose inversion explains a contradiction of lines and code; all bits if none does.
 
-    A bit that is turned over mirrors the index: cells run backwards there.
+    Inverting a bit mirrors the index, so that cells run backwards. The faulty bit is the one whose inversion at the
+    wrong pixels brings neighbours as close together as they are elsewhere.
     """
-    here, beside = code.index.reshape(2, -1)
-    wrong_here, wrong_beside = wrong.reshape(2, -1)
-    crossing = code.sure.reshape(2, -1).all(axis=0) & (here != beside)
-    doubted = crossing & (wrong_here | wrong_beside)
-    every = tuple(range(code.bits))
-    if np.count_nonzero(doubted) < _CROSSINGS:
-        return every
-    sound = np.abs(here - beside)[crossing & ~doubted]
-    close = max(1.0, float(np.percentile(sound, 90))) if len(sound) else 1.0
-    closed = []
-    for bit in every:
+    index, neighbour = code.index.reshape(2, -1)
+    wrong_index, wrong_neighbour = wrong.reshape(2, -1)
+    crossing = code.certain.reshape(2, -1).all(axis=0) & (index != neighbour)
+    disputed = crossing & (wrong_index | wrong_neighbour)
+    all_bits = tuple(range(code.bits))
+    if np.count_nonzero(disputed) < _MIN_CROSSINGS:
+        return all_bits
+    undisputed = np.abs(index - neighbour)[crossing & ~disputed]
+    limit = max(1.0, float(np.percentile(undisputed, 90))) if len(undisputed) else 1.0
+    explained = []
+    for bit in all_bits:
         mirror = 2 ** (code.bits - bit) - 1
-        a, b = here ^ (mirror * wrong_here), beside ^ (mirror * wrong_beside)
-        closed.append(float(np.mean(np.abs(a - b)[doubted] <= close)))
-    most = max(closed)
-    return tuple(bit for bit in every if closed[bit] >= most - _AS_MUCH_TO_BLAME) if most >= _MANY else every
-
-
-def ends_fault(
-    white: Samples, black: Samples, lines: Sequence[Samples], *, threshold_dn: float, full_scale: int,
-    row: NDArray[np.intp],
-) -> str | None:  # fmt: skip
-    """Lines that light half of their period are on average the middle of white and black, at pixels of the whole image:
-    those that other tests ask were chosen by white and black, and damage may have chosen them.
-
-    lines : by shift. threshold_dn : of light that a pixel gets from lines.
-    """
-    stack = np.stack(lines)
-    if len(stack) % 2:
-        average, reach = stack.mean(axis=0), np.ptp(stack, axis=0)
-    else:
-        # Lines and their inverses: one of them that was damaged says nothing of white and black.
-        half = len(stack) // 2
-        average = np.median(stack[:half] + stack[half:], axis=0) / 2
-        second = np.sort(stack, axis=0)[[1, -2]]
-        reach = second[1] - second[0]
-    # What is clipped adds up to less.
-    clear = stack.max(axis=0) < NEARLY_FULL * full_scale
-    clipped = white >= NEARLY_FULL * full_scale
-    lit = clear & (reach >= max(threshold_dn, _LIT_BY_LINES * float(np.percentile(reach, 99))))
-    told = ~clipped[lit]
-    if np.count_nonzero(told) < BAND_SAMPLES:
-        return None
-    off = ((white + black - 2 * average) / np.maximum(reach, 1))[lit]
-    usual = float(np.median(off[told]))
-    slack = max(_LEAST_ENDS_OFF, 6 * 1.4826 * float(np.median(np.abs(off - usual)[told])))
-    # A white that is clipped is less than the lines foresee, never more.
-    off[~told] = np.maximum(off[~told], usual)
-    wrong = (np.abs(off - usual) > slack) | (np.minimum(white - average, average - black) < _LEAST_ABOVE * reach)[lit]
-    where = worst_of(wrong, row[lit], whole=0.05, quarter=0.1)
-    if where is None:
-        return None
+        a, b = index ^ (mirror * wrong_index), neighbour ^ (mirror * wrong_neighbour)
+        explained.append(float(np.mean(np.abs(a - b)[disputed] <= limit)))
+    best = max(explained)
     return (
-        f"{where} are not as far above the average of the line frames in white as below it in black: one of these two "
-        "was damaged in transfer or shows another pattern; check the cable, and scan again"
+        tuple(bit for bit in all_bits if explained[bit] >= best - _BLAME_MARGIN)
+        if best >= _MIN_EXPLAINED_FRACTION
+        else all_bits
     )
 
 
-def expect_lines(
-    code: Code, ref: Reference, *, cell_px: int, offset_px: int, shift: int, period_px: int, width_px: int
+def reference_level_fault(
+    white: Samples, black: Samples, lines: Sequence[Samples], *, threshold_dn: float, full_scale: int,
+    row: NDArray[np.intp],
+) -> str | None:  # fmt: skip
+    """Check white and black against line frames that light half of their period, whose mean is halfway between the two.
+
+    It uses pixels of the whole image, because white and black select the pixels of all other checks, and damage may
+    have affected that selection. lines : sorted by shift. threshold_dn : minimum light that a pixel gets from lines.
+    """
+    stack = np.stack(lines)
+    if len(stack) % 2:
+        average, swing = stack.mean(axis=0), np.ptp(stack, axis=0)
+    else:
+        # Use the median over lines and their inverses, to ignore a single damaged line frame.
+        half = len(stack) // 2
+        average = np.median(stack[:half] + stack[half:], axis=0) / 2
+        second = np.sort(stack, axis=0)[[1, -2]]
+        swing = second[1] - second[0]
+    # Clipped samples add up to less.
+    unclipped_lines = stack.max(axis=0) < NEAR_SATURATION * full_scale
+    clipped = white >= NEAR_SATURATION * full_scale
+    lit = unclipped_lines & (swing >= max(threshold_dn, _MIN_LINE_LIGHT * float(np.percentile(swing, 99))))
+    unclipped = ~clipped[lit]
+    if np.count_nonzero(unclipped) < BAND_SAMPLES:
+        return None
+    off = ((white + black - 2 * average) / np.maximum(swing, 1))[lit]
+    usual = float(np.median(off[unclipped]))
+    slack = max(_REFERENCE_LEVEL_TOLERANCE, 6 * 1.4826 * float(np.median(np.abs(off - usual)[unclipped])))
+    # A clipped white is darker than the lines predict, never brighter.
+    off[~unclipped] = np.maximum(off[~unclipped], usual)
+    wrong = (np.abs(off - usual) > slack) | (
+        np.minimum(white - average, average - black) < _MIN_REFERENCE_MARGIN * swing
+    )[lit]
+    where = describe_worst_lit(wrong, row[lit], max_total=0.05, max_in_band=0.1)
+    if where is None:
+        return None
+    return (
+        f"{where} are not as far above the mean of the line frames in white as below it in black: one of these two was "
+        "damaged in transfer or shows another pattern; check the cable, and scan again"
+    )
+
+
+def predict_lines(
+    code: DecodedCode, ref: ReferenceFrames, *, cell_px: int, offset_px: int, shift: int, period_px: int, width_px: int
 ) -> LineExpectation:
-    """Turn decoded cells into the light of one line frame."""
+    """Predict the light of one line frame from the decoded cells."""
     first_px = cell_px * code.index - offset_px
     inside_px = np.arange(cell_px)[:, np.newaxis]
     lit = (first_px + inside_px - shift) % period_px < width_px
     light = (np.count_nonzero(lit, axis=0) / cell_px).astype(np.float32)
     position = (first_px / period_px).astype(np.float32)
-    position[~(code.sure & ref.judged)] = np.nan
+    position[~(code.certain & ref.tested)] = np.nan
     return LineExpectation(position, light)
 
 
 def line_fault(
-    frame: Samples, others: Sequence[Samples], ref: Reference, expected: LineExpectation, *, noise: float, duty: float
+    frame: Samples,
+    others: Sequence[Samples],
+    ref: ReferenceFrames,
+    expected: LineExpectation,
+    *,
+    noise: float,
+    duty: float,
 ) -> tuple[bool, str | None]:
-    """Compare a line frame with the Gray code and with the line frames before it.
+    """Compare a line frame with the Gray code and with the earlier line frames.
 
-    The frame must be bright where the code says that its lines are, and as bright in all as the others: together, n
-    line frames of width w add up to w times white. Returns (whether the comparison could be made, what is wrong).
+    The frame must be bright where the code places its lines, and contain as much light as the others. Returns (True if
+    the comparison was possible, fault or None).
 
-    duty : line width over period, the share of white that a line frame holds.
+    duty : line width over period, the fraction of white in a line frame.
     """
-    asked = ~np.isnan(expected.position)
-    if not expected.tells(asked):
+    tested = ~np.isnan(expected.position)
+    if not expected.is_testable(tested):
         return False, None
-    share = _share(frame, ref, ref.judged)
-    if share < 0.05 * duty:  # a soft scaler leaves a fifth of a narrow line, and less
+    fraction = _light_fraction(frame, ref, ref.tested)
+    if fraction < 0.05 * duty:  # a soft scaler leaves a fifth of a narrow line, and less
         return (
             True,
-            f"the frame holds {share:.1%} of white's light, lines should hold {duty:.1%}: it is dark; scan again",
+            f"the frame holds {fraction:.1%} of white's light, lines should hold {duty:.1%}: it is dark; scan again",
         )
-    typical = float(np.median([_share(other, ref, ref.judged) for other in others])) if others else share
-    if not 0.4 * typical < share < 2.5 * typical:
+    typical = float(np.median([_light_fraction(other, ref, ref.tested) for other in others])) if others else fraction
+    if not 0.4 * typical < fraction < 2.5 * typical:
         return True, (
-            f"the frame holds {share:.1%} of white's light, the other line frames {typical:.1%}: it shows another "
+            f"the frame holds {fraction:.1%} of white's light, the other line frames {typical:.1%}: it shows another "
             "pattern or was damaged; scan again"
         )
-    rough = rougher(frame, others, ref, noise=noise) if others else None
-    if rough is not None:
-        return True, rough
-    # Lines that noise or blur hides cannot be judged. Sharp ones would vary by duty · (1 − duty).
-    hidden = 0.03 * duty * (1 - duty) * float(np.mean(ref.contrast[ref.judged] ** 2))
+    roughness = roughness_fault(frame, others, ref, noise=noise) if others else None
+    if roughness is not None:
+        return True, roughness
+    # Lines hidden by noise or blur cannot be checked. Sharp ones would vary by duty · (1 − duty).
+    hidden = 0.03 * duty * (1 - duty) * float(np.mean(ref.contrast[ref.tested] ** 2))
     if variation(frame, ref) < max(3 * noise**2, hidden):
         return False, None
     # A sharp line of one position correlates with its cell, half a period wide, by about √duty.
-    agreement, least = _correlation(frame, ref, expected.light, asked), 0.2 * duty**0.5
-    if agreement < least:
+    correlation, min_correlation = _correlation(frame, ref, expected.light, tested), 0.2 * duty**0.5
+    if correlation < min_correlation:
         return True, (
-            f"its lines are not where the Gray code says (correlation {agreement:.2f}, expected {least:.2f} or more): "
-            "a bit is exchanged with its inverse, or the frame shows another pattern; scan again"
+            f"its lines are not where the Gray code says (correlation {correlation:.2f}, expected "
+            f"{min_correlation:.2f} or more): a bit is exchanged with its inverse, or the frame shows another pattern; "
+            "scan again"
         )
     for band in range(BANDS):
-        inside = asked & (ref.band == band)
-        # A line at the border of its cell lights the next one nearly as much. Which of the two gets more goes by where
-        # pixels happen to lie, and only over several lines is it that of the whole frame.
-        if not expected.tells(inside) or expected.lines(inside) < _BAND_LINES:
+        inside = tested & (ref.band == band)
+        # A line at the border of its cell lights the next cell almost equally; only over several lines is the ratio
+        # independent of the positions of pixels.
+        if not expected.is_testable(inside) or expected.count_periods(inside) < _MIN_BAND_LINES:
             continue
-        here = _correlation(frame, ref, expected.light, inside)
-        # Half of the samples lie beside the others and say little more than these.
+        band_correlation = _correlation(frame, ref, expected.light, inside)
+        # Half of the samples are neighbours of the others and add little information.
         chance = 5 * (2 / np.count_nonzero(inside)) ** 0.5
-        if here < 0.35 * agreement and here < agreement - chance:
+        if band_correlation < 0.35 * correlation and band_correlation < correlation - chance:
             return True, (
-                f"in {rows_of(ref, band)} its lines are not where the Gray code says: the frame was damaged in "
+                f"in {describe_band(ref, band)} its lines are not where the Gray code says: the frame was damaged in "
                 "transfer; check the cable, and scan again"
             )
     return True, None
 
 
-def line_sum(
-    frames: Sequence[Samples], ref: Reference, *, noise: float, half: bool = False
+def line_sum_fault(
+    frames: Sequence[Samples], ref: ReferenceFrames, *, noise: float, half: bool = False
 ) -> tuple[tuple[int, ...], str] | None:
-    """Judge the sum of the n line frames of one axis, given by shift: those to blame and what is wrong, or None.
+    """Check the sum of the n line frames of one axis: (indices of suspect frames, fault), or None. frames : sorted by
+    shift.
 
-    Each place is lit by one frame as every other place is by another, so the sum is the same everywhere, also where a
-    camera is not linear or a scaler blurs. To blame is a frame that the sum's error can be taken from with light left
-    between black and white. half : lines light half of their period, and so much of it is in every sum that pixels
-    which are as wide as a line differ less.
+    Each pixel is lit by one frame as every other pixel is by another, so the sum is the same everywhere, also with a
+    non-linear camera or a scaler. A frame is suspect if subtracting the error of the sum from it leaves its light
+    between black and white. half : the lines light half of their period; then all sums contain so much light that
+    pixels as wide as a line differ less.
     """
     light = np.stack([ref.relative(frame) for frame in frames])
     total = light.sum(axis=0)
     off = total - np.median(total)
     spread = 1.4826 * float(np.median(np.abs(off)))
     slack = np.maximum(
-        max(_LEAST_SUM_OFF_HALF if half else _LEAST_SUM_OFF, 6 * spread),
-        8 * noise * len(frames) ** 0.5 / ref.contrast[ref.judged],
+        max(_HALF_LINE_SUM_TOLERANCE if half else _LINE_SUM_TOLERANCE, 6 * spread),
+        8 * noise * len(frames) ** 0.5 / ref.contrast[ref.tested],
     )
     wrong = np.abs(off) > slack
-    where = worst_judged(wrong, ref, whole=0.1, quarter=0.15)
+    where = describe_worst_tested(wrong, ref, max_total=0.1, max_in_band=0.15)
     if where is None:
         return None
     without = (light - off)[:, wrong]
     outside = np.mean((without < -slack[wrong]) | (without > 1 + slack[wrong]), axis=1)
-    blamed = tuple(int(each) for each in np.flatnonzero(outside <= outside.min() + _AS_MUCH_TO_BLAME))
+    blamed = tuple(int(each) for each in np.flatnonzero(outside <= outside.min() + _BLAME_MARGIN))
     return blamed, (
         f"on {where} the line frames do not add up to what they do elsewhere: one of them was damaged in transfer or "
         "shows another pattern, or something moved; check the cable, and scan again"
     )
 
 
-def line_shape(
-    lines: Sequence[LineShift], frames: Sequence[Samples], ref: Reference, *, noise: float
+def line_shape_fault(
+    lines: Sequence[LineShift], frames: Sequence[Samples], ref: ReferenceFrames, *, noise: float
 ) -> tuple[int, str] | None:
-    """Judge each line frame by the others: (which one shows something else, what is wrong), or None.
+    """Check each line frame against the others: (index of the deviating frame, fault), or None.
 
-    The wave that all frames draw at a pixel, light over shift, has the same shape everywhere, at a place, height and
-    level of its own. One frame off it is not where the others say; of three frames a wave tells nothing.
+    The light of a pixel as a function of shift has the same shape everywhere, up to position, height and level. With
+    three frames there is no redundancy.
 
-    lines, frames : by shift, of one axis; the shifts divide the period evenly.
+    lines, frames : of one axis, sorted by shift, evenly spaced.
     """
     count = len(frames)
-    if count < _FEWEST_FOR_SHAPE:
+    if count < _MIN_SHAPE_FRAMES:
         return None
     light = np.stack([ref.relative(frame) for frame in frames])
     shifts = np.exp(2j * np.pi / lines[0].period_px * np.array([line.centre_px for line in lines]))
     wave = shifts @ light * (2 / count)
     height = np.abs(wave)
-    clear = height > _LEAST_HEIGHT
+    clear = height > _MIN_WAVE_HEIGHT
     if np.count_nonzero(clear) < BAND_SAMPLES:
         return None
     around = np.angle(wave / shifts[:, np.newaxis]) / (2 * np.pi) % 1
     bins = np.minimum((around * _SHAPE_BINS).astype(np.intp), _SHAPE_BINS - 1)
-    swing = (light - light.mean(axis=0)) / np.maximum(height, _LEAST_HEIGHT)
+    swing = (light - light.mean(axis=0)) / np.maximum(height, _MIN_WAVE_HEIGHT)
     every = np.arange(_SHAPE_BINS)
-    shape = np.array([_median_of(swing[(bins == each) & clear]) for each in every])
+    shape = np.array([_median_or_zero(swing[(bins == each) & clear]) for each in every])
     off = swing - shape[bins]
-    # Within its bin an edge rises, and edges that are sharp differ by how pixels lie on them.
+    # An edge rises within its bin, and sharp edges differ with the position of pixels on them.
     rise = np.abs(np.roll(shape, -1) - np.roll(shape, 1))[bins] / 2
-    spread = 1.4826 * np.array([_median_of(np.abs(off[(bins == each) & clear])) for each in every])[bins]
+    spread = 1.4826 * np.array([_median_or_zero(np.abs(off[(bins == each) & clear])) for each in every])[bins]
     slack = np.maximum(
-        np.maximum(_LEAST_ODD + rise, _SHAPE_SPREADS * spread), 5 * noise / (ref.contrast[ref.judged] * height + 1e-6)
+        np.maximum(_MIN_SHAPE_TOLERANCE + rise, _SHAPE_SPREADS * spread),
+        5 * noise / (ref.contrast[ref.tested] * height + 1e-6),
     )
     wrong = (np.abs(off) > slack) & clear
     worst = int(np.argmax(np.count_nonzero(wrong, axis=1)))
-    where = worst_judged(wrong[worst], ref, whole=_ODD, quarter=_ODD_IN_BAND)
+    where = describe_worst_tested(wrong[worst], ref, max_total=_MAX_ODD_FRACTION, max_in_band=_MAX_ODD_FRACTION_IN_BAND)
     if where is None:
         return None
     return worst, (
-        f"on {where} its light is not what the other line frames draw: it was damaged in transfer or shows another "
+        f"on {where} its light does not fit the other line frames: it was damaged in transfer or shows another "
         "pattern, or something moved; check the cable, and scan again"
     )
 
 
-def _median_of(values: Samples) -> float:
+def _median_or_zero(values: Samples) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
-def line_order(frames: Sequence[Samples], ref: Reference, *, noise: float) -> tuple[bool, int | None]:
-    """Judge the order of the n line frames of one axis, given by shift: (whether it shows, the first one out of place).
+def check_line_order(frames: Sequence[Samples], ref: ReferenceFrames, *, noise: float) -> tuple[bool, int | None]:
+    """Check the order of the n line frames of one axis: (True if it is measurable, index of the first misplaced frame
+    or None).
 
-    Blurred lines overlap those of the next frame more than those of the one after it. Where lines are too sharp, or
-    noise is too strong, nothing shows.
+    Blurred lines overlap those of the next frame more than those of the one after. With sharp lines or strong noise the
+    order is not measurable. frames : sorted by shift.
     """
-    contrast = ref.contrast[ref.judged]
-    rest = np.stack([frame[ref.judged] - ref.black[ref.judged] for frame in frames])
+    contrast = ref.contrast[ref.tested]
+    rest = np.stack([frame[ref.tested] - ref.black[ref.tested] for frame in frames])
     rest -= rest @ contrast[:, np.newaxis] / np.dot(contrast, contrast) * contrast
     overlap = rest @ rest.T / rest.shape[1]
     count = len(frames)
@@ -915,13 +938,13 @@ def line_order(frames: Sequence[Samples], ref: Reference, *, noise: float) -> tu
     return bool(lead.min() > margin), None
 
 
-def _share(frame: Samples, ref: Reference, where: Chosen) -> float:
-    return float(np.sum((frame - ref.black)[where]) / np.sum(ref.contrast[where]))
+def _light_fraction(frame: Samples, ref: ReferenceFrames, mask: SampleMask) -> float:
+    return float(np.sum((frame - ref.black)[mask]) / np.sum(ref.contrast[mask]))
 
 
-def _correlation(frame: Samples, ref: Reference, light: Samples, where: Chosen) -> float:
-    seen = (frame - ref.black)[where]
-    rest = seen - np.sum(seen) / np.sum(ref.contrast[where]) * ref.contrast[where]
-    wanted = light[where] - np.mean(light[where])
-    power = float(np.dot(rest, rest)) * float(np.dot(wanted, wanted))
-    return float(np.dot(rest, wanted)) / power**0.5 if power > 0 else 0.0
+def _correlation(frame: Samples, ref: ReferenceFrames, light: Samples, mask: SampleMask) -> float:
+    light_dn = (frame - ref.black)[mask]
+    rest = light_dn - np.sum(light_dn) / np.sum(ref.contrast[mask]) * ref.contrast[mask]
+    expected = light[mask] - np.mean(light[mask])
+    power = float(np.dot(rest, rest)) * float(np.dot(expected, expected))
+    return float(np.dot(rest, expected)) / power**0.5 if power > 0 else 0.0

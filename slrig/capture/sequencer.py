@@ -1,4 +1,4 @@
-"""Playing a pattern sequence on a rig: every frame lies wholly within its pattern's light, and the rig ends dark."""
+"""Capture of a pattern sequence: each frame is exposed entirely within its pattern's light, and the rig ends dark."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 
 from slrig.bundle.sidecars import Refused
-from slrig.capture.hardware_trigger import Session, differ, hardware_triggered, software_triggered
-from slrig.capture.streaming import FrameReader, earliest_change_s, streamed
+from slrig.capture.streaming import FrameReader, capture_streaming, earliest_change_s
+from slrig.capture.triggering import CaptureSession, capture_by_software, capture_by_wire, differs_from_request
 from slrig.capture.verifier import Evidence, RetryPolicy
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Rig, Trigger
 from slrig.errors import UnsupportedByDeviceError
@@ -25,58 +25,56 @@ def capture(
     since_ns: int | None = None,
     colour: Collection[str] = (),
 ) -> Iterator[Shot]:
-    """Show every pattern, expose every camera to it, and yield the frames that are what they claim, as they come.
+    """Show every pattern, expose every camera to it, and yield the verified frames as they come.
 
-    A frame that is stale, swapped or damaged, or does not come, is shot again. Which frame is wrong may show only when
-    a later one contradicts it: then a frame that was yielded already is refused, and its pattern and camera are yielded
-    once more. The last one counts.
+    A frame that is stale, swapped, damaged or missing is captured again. If a later frame reveals that an earlier one,
+    already yielded, is wrong, that one is rejected, and its pattern and camera are yielded again; the last frame
+    counts.
 
-    A generator: nothing moves before the first frame is asked for. However it ends (the last frame, an error, a
-    cancel, a consumer that stops or is interrupted) the projector is dark and the cameras are disarmed afterwards.
-    Wire triggers are preferred to software triggers, these to free-running cameras, among what all devices declare.
-    Free-running cameras before a projector of measured latency are read beside it: see `slrig.capture.streaming`.
-    What the consumer does with a frame takes place while the next one is exposed.
+    This is a generator: nothing starts before the first frame is requested, and the next frame is exposed while the
+    consumer processes one. At the end, including errors, cancellation and an early stop of the consumer, the projector
+    is dark and the cameras are disarmed. All cameras use hardware triggers if possible, otherwise software triggers,
+    otherwise they run freely; with a measured latency these are read in parallel, see `slrig.capture.streaming`.
 
-    rig : open devices; cameras without settings are left as they are. cancelled : asked before every pattern and every
-    frame. timeout_s : how long a frame may take beyond its exposure. evidence : where the frames are judged; give one
-    to read its summary afterwards. refused : told of every exposure that does not count, before another one takes its
-    place. since_ns : when times count from, by the rig's clock, for one sequence of several; None is the start of the
-    first frame's exposure. colour : cameras whose white and black frames are yielded in colour, too.
+    rig : open devices; cameras without settings keep theirs. cancelled : called before each pattern and frame.
+    timeout_s : time that a frame may take beyond its exposure. evidence : verifies the frames; pass one to read its
+    summary afterwards. refused : called for each rejected exposure before it is repeated. since_ns : zero of
+    `Shot.time_s` in the rig's clock, for several sequences in a row; None is the start of the first frame. colour :
+    cameras whose white and black frames are also yielded in colour.
 
-    Raises UnsupportedByDeviceError: a device cannot do what is asked (settings, size, no trigger in common);
-    FrameTimeoutError: a frame did not come, three times (names pattern, camera, times); ScanEvidenceError: the frame of
-    a pattern failed three times (it was exposed too early, came twice, or contradicts the others; tells all three
-    causes); ScanCancelledError: `cancelled` said so; DeviceError: a device failed or is gone.
+    Raises UnsupportedByDeviceError: a device does not support the settings, the size or a common trigger;
+    FrameTimeoutError: a frame did not come three times; ScanEvidenceError: the frame of a pattern failed three times,
+    with all causes; ScanCancelledError: `cancelled` returned True; DeviceError: a device failed or is gone.
     """
     if evidence is None:
         evidence = Evidence(sequence.patterns, {name: camera.info.format for name, camera in rig.cameras.items()})
     triggers = choose_triggers(rig)
     with ExitStack() as leaving:
         for camera in rig.cameras.values():
-            leaving.callback(_whatever_happens, camera.disarm)
+            leaving.callback(_suppress_errors, camera.disarm)
         reader = FrameReader(rig.cameras)
         leaving.callback(reader.stop)
         with ExitStack() as lit:
-            # The light goes off before anything else is tried.
-            lit.callback(_whatever_happens, rig.projector.blank)
-            session = Session(rig, sequence, _configure(rig), triggers, timeout_s, cancelled)
+            # Switch the light off first.
+            lit.callback(_suppress_errors, rig.projector.blank)
+            session = CaptureSession(rig, sequence, _configure_cameras(rig), triggers, timeout_s, cancelled)
             retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns, colour=colour)
             if Trigger.HARDWARE in triggers.values():
-                lit.callback(_whatever_happens, rig.projector.stop)
-                yield from hardware_triggered(session, retries)
+                lit.callback(_suppress_errors, rig.projector.stop)
+                yield from capture_by_wire(session, retries)
             elif (earliest_s := earliest_change_s(rig, triggers)) is not None:
-                yield from streamed(session, retries, reader, earliest_s)
+                yield from capture_streaming(session, retries, reader, earliest_s)
             else:
-                yield from software_triggered(session, retries)
+                yield from capture_by_software(session, retries)
             lit.pop_all()
-        # Here a projector that will not go dark is an error of its own, not a footnote to another one.
+        # Outside the suppression, so that a projector that stays lit raises its error.
         rig.projector.blank()
 
 
 def choose_triggers(rig: Rig) -> dict[str, Trigger]:
-    """Choose what starts each camera's exposures: hardware for all of them, or else the best that each can do.
-    Raises UnsupportedByDeviceError: the rig has no camera, or a camera can be triggered by wire only and the others or
-    the projector cannot.
+    """Choose the trigger of each camera: hardware for all of them, or else the best one of each.
+    Raises UnsupportedByDeviceError: the rig has no camera, or a camera supports hardware triggers only and the other
+    cameras or the projector do not.
     """
     if not rig.cameras:
         raise UnsupportedByDeviceError(f"rig '{rig.name}' has no camera; add a [[camera]] table to its rig file")
@@ -94,32 +92,32 @@ def choose_triggers(rig: Rig) -> dict[str, Trigger]:
             raise UnsupportedByDeviceError(
                 f"camera '{name}' can be triggered by: {offered}; projector '{rig.projector.info.name}' "
                 f"{'plays' if rig.projector.info.plays else 'does not play'} sequences by wire, and every camera "
-                "must take part: use a camera with software trigger, or a projector and cameras with wire trigger"
+                "must use the same trigger: use a camera with software trigger, or a projector and cameras with wire "
+                "trigger"
             )
     return chosen
 
 
-def _configure(rig: Rig) -> dict[str, AppliedSettings]:
-    """Set every camera that has settings, and compare what it reads back."""
-    return {name: _apply(rig.cameras[name], name, settings) for name, settings in rig.settings.items()}
+def _configure_cameras(rig: Rig) -> dict[str, AppliedSettings]:
+    """Configure every camera that has settings, and compare the values read back."""
+    return {name: _configure_camera(rig.cameras[name], name, settings) for name, settings in rig.settings.items()}
 
 
-def _apply(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettings:
+def _configure_camera(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettings:
     applied = camera.configure(settings)
-    for what, asked, got, unit in (
+    for setting, requested, actual, unit in (
         ("exposure", settings.exposure_s, applied.exposure_s, " s"),
         ("gain", settings.gain, applied.gain, ""),
     ):
-        if differ(got, asked):
+        if differs_from_request(actual, requested):
             raise UnsupportedByDeviceError(
-                f"camera '{name}': asked for {what} {asked:.6g}{unit}, it uses {got:.6g}{unit}; write a value that "
-                f"the camera can use into the rig file ({got:.6g}, for example)"
+                f"camera '{name}': asked for {setting} {requested:.6g}{unit}, it uses {actual:.6g}{unit}; write a "
+                f"value that the camera can use into the rig file ({actual:.6g}, for example)"
             )
     return applied
 
 
-def _whatever_happens(action: Callable[[], None]) -> None:
-    """Do it as far as the device lets; the error that led here matters more than a device that is gone."""
-    # Drivers raise what the operating system gives them, too, and no device may keep the next one from its turn.
+def _suppress_errors(action: Callable[[], None]) -> None:
+    """Run an action and ignore its errors, so that the original error is raised and all devices are released."""
     with suppress(Exception):
         action()

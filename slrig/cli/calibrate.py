@@ -312,7 +312,7 @@ def export(
     if Path(calibration).exists() or to is not None:
         import tempfile
 
-        from slrig.importers.calibrations import read_any_calibration, write_any_calibration
+        from slrig.importers import read_any_calibration, write_any_calibration
 
         with tempfile.TemporaryDirectory() as folder:
             source = Path(calibration)
@@ -362,7 +362,7 @@ def submit(
     import tempfile
 
     from slrig.bundle import write_calibration
-    from slrig.importers.calibrations import read_any_calibration
+    from slrig.importers import read_any_calibration
 
     with service.client() as client:
         # Looked at here first, so that faults are told by the file's name; one form travels, whichever the file has.

@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.capture import STEADY, CameraLatency, measure_latency
+from slrig.capture import STEADY_TOLERANCE, CameraLatency, measure_latency
 from slrig.cli.display import print_json, progress_shown
 from slrig.cli.options import given
 from slrig.config import RigConfig, read_rig, read_settings
@@ -70,7 +70,7 @@ def doctor(
                 period_px=lines.period_px,
                 steps=lines.steps or lines.period_px,
                 search_s=search_s,
-                told=display,
+                on_progress=display,
             )
     if output is not None:
         write_rig_file(diagnosis, rig_file, output, force=force)
@@ -123,7 +123,7 @@ def tell_latency(
     kind = None if trigger is None else Trigger(trigger)
     with open_rig(read_rig(rig_file)) as rig, progress_shown() as display:
         measured = measure_latency(
-            rig, trials=trials, search_s=search_s, exposure_s=exposure_s, trigger=kind, told=display
+            rig, trials=trials, search_s=search_s, exposure_s=exposure_s, trigger=kind, on_progress=display
         )
     if as_json:
         # JSON knows no NaN.
@@ -249,6 +249,6 @@ def _latency_words(found: CameraLatency) -> str:
         shutter,
         f"from {found.flashes_used} of {found.flashes} flashes, {found.rows_used} rows that fit to {ms['residual_s']}",
     ]
-    if found.flicker > STEADY:
+    if found.flicker > STEADY_TOLERANCE:
         said.append(f"steady white flickers by {found.flicker:.0%}: make the exposure a multiple of the refresh period")
     return "\n".join(f"  {line}" for line in said)

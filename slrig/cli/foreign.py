@@ -67,7 +67,7 @@ def import_images(
 
     Gray codes of OpenCV, scan3d-capture and SLStudio, or of named images. Then: slrig reconstruct.
     """
-    from slrig.importers.captures import Code, Naming, import_capture, parse_size
+    from slrig.importers import ImageNaming, ProjectorCode, import_capture, parse_size
 
     ways = {"--format": program, "--pattern": pattern, "--names": names, "--list": listed}
     asked = [way for way, value in ways.items() if value is not None]
@@ -79,16 +79,16 @@ def import_images(
             f"--format {program}: expected no --cell-px and --offset-px, which its order says itself; say --pattern"
         )
         raise ConfigError(message)
-    naming = Naming(program or (None if asked else "opencv"), pattern, names, white, black, listed)
-    code = Code(parse_size(projector), cell_px=cell_px, offset_px=offset_px)
+    naming = ImageNaming(program or (None if asked else "opencv"), pattern, names, white, black, listed)
+    code = ProjectorCode(parse_size(projector), cell_px=cell_px, offset_px=offset_px)
     found, used = import_capture(
         folder, output, code, naming, names=camera or (), bit_depth=bit_depth, calibration_file=calibration
     )
     for name, files in found.cameras.items():
         typer.echo(f"{'camera':<11}{name}: {len(files)} images, {files[0][0].name} to {files[-1][0].name}")
-    if found.left_out:
-        some = ", ".join(found.left_out[:5]) + (" …" if len(found.left_out) > 5 else "")
-        typer.echo(f"{'left out':<11}{len(found.left_out)} images that no pattern is known of: {some}")
+    if found.unassigned:
+        some = ", ".join(found.unassigned[:5]) + (" …" if len(found.unassigned) > 5 else "")
+        typer.echo(f"{'left out':<11}{len(found.unassigned)} images that no pattern is known of: {some}")
     typer.echo(f"{'bundle':<11}{output}")
     how = "" if used is not None else " --decode-only"
     typer.echo(f"{'calibrated':<11}{used or 'no: it can only be decoded'}")

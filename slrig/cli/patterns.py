@@ -46,7 +46,7 @@ def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
     from slrig.api.schemas import PatternRequest, ScanRequest, scan_plan
     from slrig.calibrate.records import USUAL_PATTERNS
     from slrig.config import read_rig
-    from slrig.devices import FlashedProjector
+    from slrig.devices import StoredPatternProjector
     from slrig.discovery import open_rig
     from slrig.doctor.doctor import doctor_sequence
     from slrig.errors import UnsupportedByDeviceError
@@ -59,7 +59,7 @@ def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
     request = ScanRequest(patterns=PatternRequest.model_validate(asked))
     with open_rig(config) as rig:
         projector = rig.projector
-        if not isinstance(projector, FlashedProjector):
+        if not isinstance(projector, StoredPatternProjector):
             message = f"the projector of rig '{rig.name}' ({projector.info.model}) shows any pattern: nothing to flash"
             raise UnsupportedByDeviceError(message)
         size = projector.info.size

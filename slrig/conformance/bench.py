@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture import stable_from_ns
-from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Shown, Trigger
+from slrig.devices import AppliedSettings, Camera, CameraSettings, DisplayedPattern, Projector, Rig, Trigger
 from slrig.errors import SlrigError
 from slrig.model import Black, Frame, PatternSequence, Pixels, White
 
@@ -282,7 +282,7 @@ class View:
         """How long a frame may take."""
         return LONG_S + 2 * self.exposure_s
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """Show a pattern; the instant from which its light is certain is remembered."""
         shown = self.projector.show(index)
         stable_ns = self.stable_ns(shown)
@@ -290,7 +290,7 @@ class View:
         self.bench.noted(stable_ns)
         return shown
 
-    def stable_ns(self, shown: Shown) -> int:
+    def stable_ns(self, shown: DisplayedPattern) -> int:
         """The instant from which a pattern's light is the only one, as far as the rig's latency is known."""
         return stable_from_ns(shown, self.bench.rig.synchronisation)
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 
 from slrig.conformance.bench import RigBench, at, check, expect, refused
-from slrig.devices import Camera, Head, Projector, Trigger
+from slrig.devices import Camera, Projector, ScannerHead, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Size
 
@@ -27,7 +27,7 @@ def devices_implement_the_protocols(bench: RigBench) -> None:
     parts: list[tuple[str, object, type]] = [("projector", rig.projector, Projector)]
     parts += [(f"camera '{name}'", camera, Camera) for name, camera in rig.cameras.items()]
     if rig.head is not None:
-        parts.append(("head", rig.head, Head))
+        parts.append(("head", rig.head, ScannerHead))
         heads = sorted(rig.head.cameras)
         expect(
             heads == sorted(rig.cameras),

@@ -1,4 +1,4 @@
-"""What slrig asks of a camera, and which calls a driver's camera takes now, refused alike by all drivers."""
+"""Camera protocol, the values it exchanges, and the state checks that all camera drivers share."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from slrig.model import CameraFormat, Frame
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Declared by a device: after how long without progress a call of it counts as hung.
+    """Time without progress after which a call of a device counts as hung.
 
-    call_s : any call but `read`; a sequence is sent over a slow wire, a camera's streams are set up.
-    read_slack_s : how much longer than twice its time-out a `read` may take.
-    computed : the device is rendered or replayed. There is nothing to unplug, and no cable to check.
+    call_s : for any call except `read`; it includes sending a sequence over a slow wire and starting a camera's stream.
+    read_slack_s : time that `read` may take beyond twice its time-out.
+    computed : the device is rendered or replayed, so it has no cable to check.
     """
 
     call_s: float = 30.0
@@ -27,42 +27,41 @@ class CallLimits:
     computed: bool = False
 
 
-USUAL = CallLimits()
+DEFAULT_LIMITS = CallLimits()
 
-COMPUTED = CallLimits(call_s=600.0, read_slack_s=600.0, computed=True)
-"""Of what is rendered or replayed: as long as the machine takes beside its other work. A frame of 12 megapixels takes a
-few seconds on a quiet one."""
+COMPUTED_LIMITS = CallLimits(call_s=600.0, read_slack_s=600.0, computed=True)
+"""For rendered and replayed devices, whose calls take as long as the load of the machine requires."""
 
-_hearing = threading.local()
+_thread_local = threading.local()
 
 
 def progress_reporter() -> Callable[[str], None]:
-    """What to tell, in the call under way, what the driver is at: "tracing light, 30 %". A call that goes on telling is
-    not taken for hung, and people are shown what it tells.
+    """Return a function with which a driver reports progress of the current call, such as "tracing light, 30 %".
 
-    Ask for it on the thread that was called; it may then be told on any. Where nobody listens it does nothing.
+    Reports are displayed to the user, and a call that keeps reporting does not count as hung. Call this on the thread
+    of the driver call; the returned function works on any thread, and does nothing without a listener.
     """
-    listener: Callable[[str], None] = getattr(_hearing, "listener", _ignore)
+    listener: Callable[[str], None] = getattr(_thread_local, "listener", _ignore_progress)
     return listener
 
 
 @contextmanager
-def progress_heard(listener: Callable[[str], None]) -> Iterator[None]:
-    """Have `listener` told, within the block, what a driver called on this thread is at."""
-    before = getattr(_hearing, "listener", _ignore)
-    _hearing.listener = listener
+def listen_for_progress(listener: Callable[[str], None]) -> Iterator[None]:
+    """Pass to `listener` the progress that drivers called on this thread report within the block."""
+    previous = getattr(_thread_local, "listener", _ignore_progress)
+    _thread_local.listener = listener
     try:
         yield
     finally:
-        _hearing.listener = before
+        _thread_local.listener = previous
 
 
-def _ignore(_doing: str) -> None:
+def _ignore_progress(_text: str) -> None:
     pass
 
 
 class Trigger(StrEnum):
-    """What starts an exposure. `FREE`: the camera runs by itself; `SOFTWARE`: `Camera.trigger`; `HARDWARE`: a wire."""
+    """Source of an exposure. `FREE`: the camera runs freely; `SOFTWARE`: `Camera.trigger`; `HARDWARE`: a wire."""
 
     FREE = "free"
     SOFTWARE = "software"
@@ -71,10 +70,10 @@ class Trigger(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """Declared data about a camera. `triggers` are the ways in which an exposure can be started.
+    """Declared data of a camera.
 
-    `limits` say how long its calls may take. `notes` say what a person should know of how it runs, each in a sentence
-    with what to do about it. `colour` : its frames can be had in colour, see `Frame.colour`.
+    triggers : supported triggers. limits : time-outs of its calls. notes : remarks for the user about how the camera is
+    set up, each a sentence with the remedy. colour : True if its frames have `Frame.colour`.
     """
 
     name: str
@@ -84,14 +83,14 @@ class CameraInfo:
     triggers: frozenset[Trigger]
     exposure_range_s: tuple[float, float]
     gain_range: tuple[float, float]
-    limits: CallLimits = USUAL
+    limits: CallLimits = DEFAULT_LIMITS
     notes: tuple[str, ...] = ()
     colour: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """What a camera is asked for."""
+    """Requested settings of a camera."""
 
     exposure_s: float
     gain: float = 1.0
@@ -99,20 +98,20 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class AppliedSettings:
-    """What the camera says it uses, read back after it was set.
+    """Settings read back from a camera.
 
-    least_period_s : the least time from the start of one exposure to the start of the next with these settings, which
-    is the period of a camera that runs by itself; None where the device does not tell.
+    min_period_s : shortest time from the start of one exposure to the next, which is the period of a free-running
+    camera; None if the device does not report it.
     """
 
     exposure_s: float
     gain: float
-    least_period_s: float | None = None
+    min_period_s: float | None = None
 
 
 @runtime_checkable
 class Camera(Protocol):
-    """A camera. One thread owns it. Order: configure, arm, then trigger and read; disarm and close at any time."""
+    """A camera, used by one thread. Order: configure, arm, then trigger and read; disarm and close at any time."""
 
     @property
     def info(self) -> CameraInfo:
@@ -120,44 +119,41 @@ class Camera(Protocol):
         ...
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """Set exposure and gain, and return what the device reads back.
-        Raises UnsupportedByDeviceError: the value is outside what the device can do; DeviceStateError: the camera is
-        armed or closed.
+        """Set exposure and gain, and return the values read back.
+        Raises UnsupportedByDeviceError: a value is out of range; DeviceStateError: the camera is armed or closed.
         """
         ...
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """Get ready for `count` frames. Raises UnsupportedByDeviceError, DeviceStateError."""
+        """Prepare for `count` frames. Raises UnsupportedByDeviceError, DeviceStateError."""
         ...
 
     def trigger(self) -> None:
-        """Start one exposure (software trigger). Raises DeviceStateError unless armed for it."""
+        """Start one exposure. Raises DeviceStateError unless the camera is armed for software triggers."""
         ...
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """Return the next frame whose whole exposure lies after `after_ns` (the rig's clock).
+        """Return the next frame whose exposure starts after `after_ns` (the rig's clock), and discard earlier frames.
 
-        Frames that began earlier are stale and are passed over; they never come back.
-
-        Raises FrameTimeoutError: no such frame came in `timeout_s`; DeviceGoneError: the device was unplugged;
+        Raises FrameTimeoutError: no such frame came within `timeout_s`; DeviceGoneError: the device was unplugged;
         DeviceStateError: the camera is not armed.
         """
         ...
 
     def disarm(self) -> None:
-        """Stop waiting for frames. Idempotent."""
+        """Stop the exposures. Idempotent."""
         ...
 
     def close(self) -> None:
-        """Let the device go. Idempotent; works after an unplug and in every state."""
+        """Release the device. Idempotent; works after an unplug and in every state."""
         ...
 
 
 class CameraState:
-    """Open, armed or closed. A driver's camera asks it before it touches the device.
+    """State of a driver's camera: open, armed or closed. The driver checks it before each access to the device.
 
-    name : the camera's, as the rig file calls it. armed : what it is armed for, None if it is not; the driver sets it.
-    closed : set once the camera is, by any thread; whoever waits for a frame waits for this, too.
+    name : name of the camera in the rig file. armed : trigger that the camera is armed for, or None; set by the driver.
+    closed : event that any thread sets when the camera is closed; a thread that waits for a frame also waits for it.
     """
 
     def __init__(self, name: str) -> None:
@@ -166,7 +162,7 @@ class CameraState:
         self.closed = threading.Event()
 
     def close(self) -> bool:
-        """Not armed, and closed for good. Return whether it was open until now."""
+        """Mark the camera as closed. Return True if it was open."""
         self.armed = None
         was_open = not self.closed.is_set()
         self.closed.set()
@@ -181,13 +177,13 @@ class CameraState:
         """Raise DeviceStateError unless the camera is armed, for this trigger if one is given."""
         self.require_open()
         if self.armed is None:
-            raise DeviceStateError(f"camera '{self.name}' is not armed{_for(trigger)}; call arm first")
+            raise DeviceStateError(f"camera '{self.name}' is not armed{_for_trigger(trigger)}; call arm first")
         if trigger not in (None, self.armed):
-            found = "runs free" if self.armed is Trigger.FREE else f"is armed{_for(self.armed)}"
-            raise DeviceStateError(f"camera '{self.name}' {found}; read a frame, or arm it{_for(trigger)}")
+            found = "runs free" if self.armed is Trigger.FREE else f"is armed{_for_trigger(self.armed)}"
+            raise DeviceStateError(f"camera '{self.name}' {found}; read a frame, or arm it{_for_trigger(trigger)}")
 
     def require_settable(self) -> None:
-        """Raise DeviceStateError of an armed camera, and after `close`."""
+        """Raise DeviceStateError if the camera is armed or closed."""
         self.require_open()
         if self.armed is not None:
             raise DeviceStateError(f"camera '{self.name}' is armed; disarm it before changing its settings")
@@ -195,29 +191,27 @@ class CameraState:
     def check_settings(
         self, settings: CameraSettings, info: CameraInfo, *, within: float = 1e-9, hint: str = "choose such a value"
     ) -> None:
-        """Refuse to set an armed camera, or values out of its declared ranges.
+        """Check that the camera can be configured and that the values are in its declared ranges.
 
-        within : how far out of its range a value may be, as a share of it. hint : how a refusal ends.
+        within : relative tolerance of the ranges. hint : end of the error message.
 
         Raises DeviceStateError: the camera is armed or closed; UnsupportedByDeviceError: a value is out of range.
         """
         self.require_settable()
-        for what, asked, (least, most) in (
+        for name, requested, (low, high) in (
             ("exposure_s", settings.exposure_s, info.exposure_range_s),
             ("gain", settings.gain, info.gain_range),
         ):
-            if not least * (1 - within) <= asked <= most * (1 + within):
-                takes = f"{least:.6g} to {most:.6g}" if least < most else f"{least:.6g} only"
-                message = f"camera '{self.name}': asked for {what} {asked:.6g}, it takes {takes}; {hint}"
+            if not low * (1 - within) <= requested <= high * (1 + within):
+                range_text = f"{low:.6g} to {high:.6g}" if low < high else f"{low:.6g} only"
+                message = f"camera '{self.name}': asked for {name} {requested:.6g}, it takes {range_text}; {hint}"
                 raise UnsupportedByDeviceError(message)
 
     def check_arming(self, count: int, trigger: Trigger, info: CameraInfo, *, hint: str = "") -> None:
-        """Refuse to arm a camera that is armed, or for what it does not declare.
+        """Check that the camera can be armed. hint : end of the error message.
 
-        hint : how a refusal ends.
-
-        Raises DeviceStateError: the camera is armed already, or closed; UnsupportedByDeviceError: it has no such
-        trigger, or no frame was asked for.
+        Raises DeviceStateError: the camera is armed already, or closed; UnsupportedByDeviceError: the trigger is not
+        among the declared ones, or `count` is less than 1.
         """
         self.require_open()
         if self.armed is not None:
@@ -229,5 +223,5 @@ class CameraState:
             )
 
 
-def _for(trigger: Trigger | None) -> str:
+def _for_trigger(trigger: Trigger | None) -> str:
     return "" if trigger is None else f" for {trigger} triggers"

@@ -1,4 +1,4 @@
-"""What slrig asks of a projector, and which calls a driver's projector takes now, refused alike by all drivers."""
+"""Projector protocols, the values they exchange, and the state checks that all projector drivers share."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import threading
 from dataclasses import dataclass
 from typing import NoReturn, Protocol, runtime_checkable
 
-from slrig.devices.camera import USUAL, CallLimits
+from slrig.devices.camera import DEFAULT_LIMITS, CallLimits
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Pattern, PatternSequence, Size
 
 
 @dataclass(frozen=True, slots=True)
 class ProjectorInfo:
-    """Declared data about a projector.
+    """Declared data of a projector.
 
-    `plays` says whether it can step through a loaded sequence by itself, triggering the cameras by wire; `gap_s` is
-    then the least time from the end of a pattern's light to the next pulse, and `duty` how much of the time may be lit.
-    `latency_s` is the typical time from `show` to light. `refresh_s` is one refresh period of a projector whose light
-    is steady over whole ones only; None where exposures may have any length. `limits` say how long its calls may take.
-    `recorded` are the patterns of a recording, in its order: a scan that asks for none plays them. Empty where any
-    pattern can be shown. `lights` says whether it has lights of its own for red, green and blue, and shows `Primary`.
+    plays : True if it can step through a loaded sequence by itself and trigger the cameras by wire. gap_s : shortest
+    time from the end of a pattern's light to the next pulse; duty : largest fraction of time with light. latency_s :
+    typical time from `show` to light. refresh_s : refresh period of a projector whose light is constant only over whole
+    periods; None if exposures may have any length. limits : time-outs of its calls. recorded : patterns of a recording,
+    in its order, which a scan plays by default; empty if the projector shows any pattern. lights : True if it has
+    separate red, green and blue lights, and shows `Primary`.
     """
 
     name: str
@@ -30,7 +30,7 @@ class ProjectorInfo:
     plays: bool
     latency_s: float
     refresh_s: float | None = None
-    limits: CallLimits = USUAL
+    limits: CallLimits = DEFAULT_LIMITS
     recorded: tuple[Pattern, ...] = ()
     gap_s: float = 0.0005
     duty: float = 1.0
@@ -38,8 +38,8 @@ class ProjectorInfo:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
-    """Pattern `index` lights the whole scene from `t_visible_ns` ± `t_err_ns` on (the rig's clock)."""
+class DisplayedPattern:
+    """Pattern `index` lights the whole scene from `t_visible_ns` ± `t_err_ns` on, in the rig's clock."""
 
     index: int
     t_visible_ns: int
@@ -48,7 +48,7 @@ class Shown:
 
 @runtime_checkable
 class Projector(Protocol):
-    """A projector. One thread owns it. Dark after opening, after `stop`, `blank` and `close`."""
+    """A projector, used by one thread. It is dark after opening, `stop`, `blank` and `close`."""
 
     @property
     def info(self) -> ProjectorInfo:
@@ -56,23 +56,23 @@ class Projector(Protocol):
         ...
 
     def load(self, sequence: PatternSequence) -> None:
-        """Take a sequence. Shows nothing yet.
+        """Load a sequence without showing it.
         Raises UnsupportedByDeviceError: the sequence is for a projector of another size, or too long.
         """
         ...
 
-    def show(self, index: int) -> Shown:
-        """Show one pattern of the loaded sequence and hold it; return once it is known when its light is on the scene.
+    def show(self, index: int) -> DisplayedPattern:
+        """Show one pattern of the loaded sequence until the next call; return when the time of its light is known.
 
-        That may be a little later, by `info.latency_s` at most: a display is given its next picture while the one
-        before is still on its way. Whoever needs the light waits for it.
+        The light may come after the return, by `info.latency_s` at most, because a display accepts its next picture
+        before the previous one is on the screen. The caller waits for `t_visible_ns`.
 
         Raises DeviceStateError: nothing is loaded, or the projector is closed.
         """
         ...
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """Step once through the loaded sequence, one pattern per period, triggering the cameras by wire.
+        """Step once through the loaded sequence, one pattern per period, and trigger the cameras by wire.
         Raises UnsupportedByDeviceError: `info.plays` is False.
         """
         ...
@@ -82,22 +82,23 @@ class Projector(Protocol):
         ...
 
     def blank(self) -> None:
-        """Go dark now. Idempotent; a no-op after `close`."""
+        """Switch the light off. Idempotent; does nothing after `close`."""
         ...
 
     def close(self) -> None:
-        """Go dark and let the device go. Idempotent; works after an unplug and in every state."""
+        """Switch the light off and release the device. Idempotent; works after an unplug and in every state."""
         ...
 
 
 @runtime_checkable
-class FlashedProjector(Projector, Protocol):
-    """A projector that shows only the patterns that were put into its memory when a person asked for it."""
+class StoredPatternProjector(Projector, Protocol):
+    """A projector that shows only patterns in its memory, which the user writes by a separate command."""
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """Fill its memory with these patterns, or write files for that, and return what was done and what is to do.
+        """Write these patterns to the memory, or to files for it, and return a report with the next steps.
 
-        `load` never writes them: what is tried only to see whether the projector takes it must not replace them.
+        `load` never writes patterns, because a trial must not replace them.
+
         Raises UnsupportedByDeviceError: the patterns are for another size, or too many; DeviceError or StorageError:
         memory or files cannot be written.
         """
@@ -105,38 +106,38 @@ class FlashedProjector(Projector, Protocol):
 
 
 @runtime_checkable
-class UnprovenLight(Projector, Protocol):
-    """A projector that may not know yet whether more current means a greater number or a smaller one.
+class UnknownPolarityProjector(Projector, Protocol):
+    """A projector whose current register may be inverted, which the doctor measures.
 
-    Until its rig file tells, it is dim whichever it is, with light that pulses. The doctor finds it out.
+    Until the rig file states the polarity, the projector uses pulsed light that is dim for either polarity.
     """
 
     @property
-    def unproven(self) -> bool:
-        """Whether it is not known."""
+    def is_polarity_unknown(self) -> bool:
+        """True if the rig file does not state the polarity."""
         ...
 
     @property
     def light_period_s(self) -> float:
-        """From one pulse of the dim light to the next: expose for whole ones."""
+        """Period of the pulsed light; exposures must be multiples of it."""
         ...
 
-    def try_current(self, share: float) -> None:
-        """Set the number that stands for the current, 0.4 to 0.6 of the greatest; dark until the next `show`.
-        Raises UnsupportedByDeviceError: another number, or its sense is known.
+    def set_trial_current(self, share: float) -> None:
+        """Set the current register to a fraction of its maximum, 0.4 to 0.6, and go dark until the next `show`.
+        Raises UnsupportedByDeviceError: the fraction is out of range, or the polarity is known.
         """
         ...
 
-    def option_for(self, *, rises: bool) -> str:
-        """What to write into the [projector] table, if light rises with the number, or if it falls."""
+    def polarity_option(self, *, rises: bool) -> str:
+        """Return the line for the [projector] table. rises : True if light increases with the register value."""
         ...
 
 
 class ProjectorState:
-    """Open or closed, and what is loaded. A driver's projector asks it before it touches the device.
+    """State of a driver's projector. The driver checks it before each access to the device.
 
-    label : what messages call the projector. loaded : the sequence, None if there is none; the driver sets it. closed :
-    set once the projector is, by any thread; whoever waits for light waits for this, too.
+    label : name of the projector in messages. loaded : loaded sequence or None; set by the driver. closed : event that
+    any thread sets when the projector is closed; a thread that waits for light also waits for it.
     """
 
     def __init__(self, label: str = "the projector") -> None:
@@ -149,17 +150,17 @@ class ProjectorState:
         if self.closed.is_set():
             raise DeviceStateError(f"{self.label} is closed; open the rig again")
 
-    def require_loaded(self, doing: str) -> PatternSequence:
-        """Return the loaded sequence. Raises DeviceStateError, which says what was asked for."""
+    def require_loaded(self, action: str) -> PatternSequence:
+        """Return the loaded sequence. Raises DeviceStateError: nothing is loaded, with `action` in the message."""
         self.require_open()
         if self.loaded is None:
-            raise DeviceStateError(f"asked to {doing}, no sequence is loaded; call load first")
+            raise DeviceStateError(f"asked to {action}, no sequence is loaded; call load first")
         return self.loaded
 
     def require_pattern(self, index: int) -> PatternSequence:
-        """Return the loaded sequence, which has a pattern of this index.
-        Raises DeviceStateError: nothing is loaded, or the projector is closed; UnsupportedByDeviceError: the sequence
-        has no such pattern.
+        """Return the loaded sequence after checking that it has a pattern of this index.
+        Raises DeviceStateError: nothing is loaded, or the projector is closed; UnsupportedByDeviceError: the index is
+        out of range.
         """
         sequence = self.require_loaded(f"show pattern {index}")
         if not 0 <= index < len(sequence):
@@ -168,7 +169,7 @@ class ProjectorState:
         return sequence
 
     def require_size(self, sequence: PatternSequence, size: Size) -> None:
-        """Raise UnsupportedByDeviceError unless a sequence is for a projector of this size: it would be scaled."""
+        """Raise UnsupportedByDeviceError if a sequence has another size, because the projector would scale it."""
         if sequence.projector != size:
             message = f"{self.label} shows {size}, the sequence was made for {sequence.projector}; encode it for {size}"
             raise UnsupportedByDeviceError(message)

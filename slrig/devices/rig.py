@@ -1,4 +1,4 @@
-"""A rig: cameras and a projector that are opened, used and closed together, and what moves a board before them."""
+"""A rig: cameras, a projector and an optional positioner that are opened, used and closed together."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from slrig.model import Calibration, StageAxis, Truth
 
 @runtime_checkable
 class Clock(Protocol):
-    """A rig's time, ns: that of its time stamps."""
+    """Clock of a rig's time stamps."""
 
     def now_ns(self) -> int:
-        """The time now."""
+        """Return the current time, ns."""
         ...
 
     def wait_until(self, t_ns: int, stop: threading.Event) -> None:
-        """Return when it is `t_ns` or later, or as soon as `stop` is set."""
+        """Wait until `t_ns`, or until `stop` is set."""
         ...
 
 
 @runtime_checkable
-class KeepsTime(Protocol):
-    """A head whose time stamps do not count in CLOCK_MONOTONIC, as that of a rendered rig on virtual time."""
+class HasClock(Protocol):
+    """A head with its own clock in place of CLOCK_MONOTONIC, such as a rendered rig with virtual time."""
 
     @property
     def clock(self) -> Clock:
-        """The time of its devices."""
+        """Clock of the time stamps of all devices of the head."""
         ...
 
 
@@ -55,69 +55,64 @@ class SystemClock:
 
 @runtime_checkable
 class Positioner(Protocol):
-    """Moves an object, a calibration board among others, without a person.
-
-    It puts an object where it is told. One thread uses it, the one that owns the rig.
-    """
+    """A machine that moves the object or calibration board. It is used by the thread that owns the rig."""
 
     @property
     def poses(self) -> Sequence[str]:
-        """The poses that it can take, by name, in the order in which they are meant to be taken."""
+        """Names of its poses, in the order in which to use them."""
         ...
 
     def move(self, index: int) -> None:
-        """Take a pose and return when the object stands still.
-        Raises UnsupportedByDeviceError: there is no such pose. Name those there are; DeviceError: it did not get there.
+        """Move to a pose and return when the object is at rest.
+        Raises UnsupportedByDeviceError: no such pose; the message lists all poses. DeviceError: the move failed.
         """
         ...
 
     def close(self) -> None:
-        """Let it go. Idempotent."""
+        """Release the device. Idempotent."""
         ...
 
 
 @runtime_checkable
 class Turntable(Positioner, Protocol):
-    """A positioner that turns what stands on it about one axis, to any angle. Its poses are such angles."""
+    """A positioner that turns the object about one axis to any angle. Its poses are angles."""
 
     @property
     def axis(self) -> StageAxis | None:
-        """The axis, where the instrument knows it; None where it has to be found, as on metal."""
+        """The axis if the device knows it; None if it must be measured, as on real hardware."""
         ...
 
     @property
     def angles_deg(self) -> Sequence[float]:
-        """The angle of each of its poses."""
+        """Angle of each pose."""
         ...
 
     @property
     def opened_at_deg(self) -> float | None:
-        """Where its own count stood when it was opened, in degrees of the table: as it was left, unless it restarted or
-        was moved. None where each opening brings it to the same place.
+        """Angle in the device's own count when it was opened, which it keeps unless it was restarted or moved by hand.
+        None if opening brings it to a fixed position.
         """
         ...
 
     def turn(self, angle_deg: float) -> None:
-        """Stand at an angle, counted right-handed about the axis from where it stood when it was opened, and return
-        when the object stands still. Raises DeviceError: it did not get there.
+        """Turn to an angle, right-handed about the axis from the position at opening, and return when the object is at
+        rest. Raises DeviceError: the move failed.
         """
         ...
 
 
 @runtime_checkable
-class Positions(Protocol):
+class HasPositioner(Protocol):
     """A head that has a positioner."""
 
     @property
     def positioner(self) -> Positioner | None:
-        """What moves the object before it; None where a person does."""
+        """The positioner; None if the user moves the object."""
         ...
 
 
-class AnyAngle(ABC):
-    """A turntable that turns to any angle, and offers `count` of them as poses, evenly round the axis from 0° on. What
-    it is made of turns.
-    """
+class TurntableBase(ABC):
+    """Base of turntables: offers `count` evenly spaced angles from 0° as poses. Subclasses implement `turn`."""
 
     def __init__(self, count: int) -> None:
         self._angles_deg = tuple(360.0 * number / count for number in range(count))
@@ -125,7 +120,7 @@ class AnyAngle(ABC):
 
     @property
     def poses(self) -> Sequence[str]:
-        """See `Positioner`. The angles, as text."""
+        """See `Positioner`. The angles as text."""
         return self._names
 
     @property
@@ -149,12 +144,12 @@ class AnyAngle(ABC):
 
 
 @runtime_checkable
-class Head(Protocol):
-    """One instrument that is cameras and projector in one: an integrated scanner, or the rendered rig."""
+class ScannerHead(Protocol):
+    """An instrument with cameras and projector: an integrated scanner, or the rendered rig."""
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
-        """The cameras by name."""
+        """Cameras by name."""
         ...
 
     @property
@@ -164,17 +159,17 @@ class Head(Protocol):
 
     @property
     def calibration(self) -> Calibration | None:
-        """The calibration that the instrument carries, if it carries one."""
+        """Calibration stored in the instrument; None if there is none."""
         ...
 
     def truth(self) -> Truth | None:
-        """What the instrument knows of the scene before it; None on metal."""
+        """Return the ground truth of a rendered scene; None for real hardware."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """A device that is plugged in: the driver that can open it, the id to write into a rig file, and a label."""
+    """A connected device: its driver, its id for the rig file, and a label."""
 
     driver: str
     device: str
@@ -183,15 +178,15 @@ class FoundDevice:
 
 @dataclass(frozen=True, slots=True)
 class Synchronisation:
-    """What a flash test found of a rig's timing, as its rig file keeps it.
+    """Timing of a rig in its rig file, as `slrig latency` measures it.
 
-    latency_s : from the instant that the projector states to the change of light, on average, as the cameras' time
-    stamps see it; it holds what either of them states wrongly, and may be negative. latency_error_s : how much later
-    than that a change may end, beyond the error that the projector states itself; negative where it states more than
-    there is. earliest_s : from the stated instant to the earliest beginning of a change; None where nobody measured it,
-    and then the next pattern is shown only when the frames before it are there. line_time_s : of each camera with a
-    rolling shutter, from one row's exposure to the next row's; 0 or absent is a global shutter. trigger_period_s : what
-    a person wrote: the least time from one trigger pulse to the next, where cameras tell a lower one or none.
+    latency_s : mean time from the instant that the projector states to the change of light, by the cameras' time
+    stamps; it includes the clock errors of both and may be negative. latency_error_s : latest end of a change after
+    that, beyond the error that the projector states; negative if the projector overstates its error. earliest_s : time
+    from the stated instant to the earliest start of a change; None if not measured, and then each pattern waits for the
+    frames of the previous one. line_time_s : time between the exposures of adjacent rows of each camera with a rolling
+    shutter; 0 or absent for a global shutter. trigger_period_s : shortest time between trigger pulses, written by the
+    user if the cameras report none or a shorter one.
     """
 
     latency_s: float
@@ -203,10 +198,10 @@ class Synchronisation:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Open devices, with what is known about them. A context manager: leaving it darkens and closes everything.
+    """Open devices with settings, calibration and timing. A context manager that closes all devices on exit.
 
-    `synchronisation` is None where latency was not measured. All time stamps count in `clock`. `positioner` is None
-    where a person moves the calibration board.
+    `synchronisation` is None if latency was not measured. `clock` is the clock of all time stamps. `positioner` is None
+    if the user moves the calibration board.
     """
 
     name: str
@@ -214,17 +209,17 @@ class Rig:
     projector: Projector
     settings: Mapping[str, CameraSettings]
     calibration: Calibration | None = None
-    head: Head | None = field(default=None)
+    head: ScannerHead | None = field(default=None)
     synchronisation: Synchronisation | None = None
     clock: Clock = field(default_factory=SystemClock)
     positioner: Positioner | None = None
 
     def truth(self) -> Truth | None:
-        """What a rendered rig knows of its scene; None on metal."""
+        """Return the ground truth of a rendered scene; None for real hardware."""
         return self.head.truth() if self.head is not None else None
 
     def close(self) -> tuple[Exception, ...]:
-        """Darken the projector, then close every device, whatever state each is in. Return what they raised."""
+        """Switch the light off, then close every device in any state. Return the exceptions that they raised."""
         faults: list[Exception] = []
         steps: list[Callable[[], None]] = [self.projector.blank, self.projector.close]
         if self.positioner is not None:
@@ -232,7 +227,7 @@ class Rig:
         for step in (*steps, *(camera.close for camera in self.cameras.values())):
             try:
                 step()
-            except Exception as error:  # noqa: BLE001 - a driver may raise anything; the other devices are still closed
+            except Exception as error:  # noqa: BLE001 - a driver may raise anything; close the other devices too
                 faults.append(error)
         return tuple(faults)
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from slrig.devices import UnprovenLight
+from slrig.devices import UnknownPolarityProjector
 from slrig.doctor.findings import Finding, fault, note
 from slrig.doctor.light import Seen
 from slrig.doctor.viewing import Viewer
@@ -21,10 +21,10 @@ _CLEAR = 1.2
 def sense_of_current(viewer: Viewer, sequence: PatternSequence, seen: Seen) -> Finding:
     """Show white at two currents, a little above and below the half, and tell which one is brighter.
 
-    seen : the camera's look at white and black; `sequence` has white. The projector is an `UnprovenLight`.
+    seen : the camera's look at white and black; `sequence` has white. The projector is an `UnknownPolarityProjector`.
     """
     projector = viewer.projector
-    if not isinstance(projector, UnprovenLight):
+    if not isinstance(projector, UnknownPolarityProjector):
         message = f"expected a projector that does not know the sense of its current, found {projector.info.model}"
         raise TypeError(message)
     period_s = projector.light_period_s
@@ -36,18 +36,23 @@ def sense_of_current(viewer: Viewer, sequence: PatternSequence, seen: Seen) -> F
         remedy = "shade the room's light, see that nothing moves and nothing is saturated, and run the doctor again"
         return fault("light.current", "projector", f"{told}: which way its current goes is not told", remedy)
     remedy = (
-        f"write {projector.option_for(rises=ratio > 1)} into the [projector] table of the rig file, choose led_current "
-        "there, and run the doctor again: all else is measured then, for until now light is dim and pulses"
+        f"write {projector.polarity_option(rises=ratio > 1)} into the [projector] table of the rig file, choose "
+        "led_current there, and run the doctor again: all else is measured then, for until now light is dim and pulses"
     )
     return note("light.current", "projector", told, remedy)
 
 
 def _light(
-    viewer: Viewer, projector: UnprovenLight, sequence: PatternSequence, seen: Seen, exposure_s: float, share: float
+    viewer: Viewer,
+    projector: UnknownPolarityProjector,
+    sequence: PatternSequence,
+    seen: Seen,
+    exposure_s: float,
+    share: float,
 ) -> float:
     """What the projector adds to black where it lights the image, DN, at one current."""
     with viewer.armed(sequence, exposure_s, 2 * _FRAMES):
-        projector.try_current(share)
+        projector.set_trial_current(share)
         frames = viewer.frames(sequence.patterns.index(White()), _FRAMES)
         projector.blank()
         dark = [viewer.next(viewer.rig.clock.now_ns() + round(1e9 * exposure_s)) for _ in range(2)]

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from slrig.capture import USUAL_SEARCH_S, LatencyMeasurement, choose_triggers, earliest_change_s
-from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation, UnprovenLight
+from slrig.capture import DEFAULT_SEARCH_S, LatencyMeasurement, choose_triggers, earliest_change_s
+from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation, UnknownPolarityProjector
 from slrig.doctor import timing
 from slrig.doctor.advice import ExposureAdvice, LineAdvice, exposure_advice, is_whole, line_advice, unsnapped
 from slrig.doctor.current import sense_of_current
@@ -80,7 +80,7 @@ def examine(
     displays: Sequence[FoundDevice] = (),
     period_px: int = USUAL_PERIOD_PX,
     steps: int = USUAL_PERIOD_PX,
-    search_s: float = USUAL_SEARCH_S,
+    search_s: float = DEFAULT_SEARCH_S,
     told: Told = lambda _stage, _fraction, _detail: None,
 ) -> Diagnosis:
     """Examine an open rig. However it ends, the projector is dark and the cameras are disarmed afterwards.
@@ -121,7 +121,7 @@ class _Examination:
         self.refresh_hz: float | None = None
         self.curve: ResponseCurve | None = None
         self.flickers: tuple[Flicker, ...] = ()
-        self.unproven = False
+        self.is_polarity_unknown = False
         self._advice: dict[str, ExposureAdvice] = {}
         self._blurs_px: list[float] = []
 
@@ -145,7 +145,7 @@ class _Examination:
                 self.findings.append(_failed(stage, error))
                 if isinstance(error, DeviceGoneError):
                     return
-            if self.unproven:
+            if self.is_polarity_unknown:
                 # All else would be measured in a light that is not the one of scans.
                 return
 
@@ -208,8 +208,8 @@ class _Examination:
     def _prove(self) -> None:
         """Find out which way the current goes, where the projector does not know."""
         projector, best_lit = self.rig.projector, self._best_lit()
-        self.unproven = isinstance(projector, UnprovenLight) and projector.unproven
-        if self.unproven and best_lit is not None:
+        self.is_polarity_unknown = isinstance(projector, UnknownPolarityProjector) and projector.is_polarity_unknown
+        if self.is_polarity_unknown and best_lit is not None:
             self.findings.append(sense_of_current(self._viewer(best_lit.name), self.sequence, best_lit))
 
     def _time(self) -> None:

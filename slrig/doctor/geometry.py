@@ -13,8 +13,7 @@ from slrig.doctor.findings import Finding, camera_named, fault, note, ok
 from slrig.doctor.light import Seen
 from slrig.doctor.measures.pictures import Orientation, apart_deg, expected_orientation, orientation
 from slrig.doctor.viewing import Viewer
-from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot
-from slrig.model.patterns import gray_index
+from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot, gray_index
 from slrig.patterns import cell_centre_px
 
 _COARSE_BITS = 6
@@ -85,7 +84,7 @@ def _played(viewer: Viewer, sequence: PatternSequence, seen: Seen) -> tuple[tupl
     with viewer.armed(sequence, seen.exposure_s, len(sequence)):
         for index, pattern in enumerate(patterns):
             image = viewer.frames(index)[0].image
-            causes += [str(each) for each in evidence.contradictions(Shot(index, viewer.name, image))]
+            causes += [str(each) for each in evidence.add_shot(Shot(index, viewer.name, image))]
             if not isinstance(pattern, Gray):
                 continue
             positive = Gray(pattern.axis, pattern.bit, pattern.bits, pattern.cell_px, pattern.offset_px)

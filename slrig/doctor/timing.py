@@ -71,7 +71,7 @@ def latency(
     settings = {name: CameraSettings(each.exposure_s, rig.settings[name].gain) for name, each in seen.items()}
     watching = replace(rig, cameras={name: rig.cameras[name] for name in seen}, settings=settings)
     try:
-        measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, told=told)
+        measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, on_progress=told)
     except ScanEvidenceError as error:
         return None, [punctual(watching, each, error) for each in seen.values()]
     findings = [_late(measured, rig.synchronisation), *_jitter(measured, seen)]

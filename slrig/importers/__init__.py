@@ -1,4 +1,13 @@
-"""Captures and calibrations of other programs, converted from and to slrig's own.
+"""Conversion of captures and calibrations from and to the formats of other programs. Only the command line uses it."""
 
-Only the command line reads them: what is refused here is told on a terminal, by its flags.
-"""
+from slrig.importers.calibrations import read_any_calibration, write_any_calibration
+from slrig.importers.captures import ImageNaming, ProjectorCode, import_capture, parse_size
+
+__all__ = [
+    "ImageNaming",
+    "ProjectorCode",
+    "import_capture",
+    "parse_size",
+    "read_any_calibration",
+    "write_any_calibration",
+]

@@ -1,4 +1,4 @@
-"""A calibration in whatever form it comes: slrig's, OpenCV's, ROS's, Kalibr's, or that of a scanning program."""
+"""Calibration files of slrig, OpenCV, ROS, Kalibr and several scanning programs."""
 
 from __future__ import annotations
 
@@ -31,42 +31,56 @@ from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, Gray, Pinhole, Size
 from slrig.ros_messages import FRAME, MM_PER_M, PROJECTOR, WORLD, lens, pose
 
-MOST_BYTES = 2**18
-MOST_DEPTH = 12
+CalibrationFormat = Literal["slrig", "opencv", "ros", "kalibr"]
+FORMAT_BY_SUFFIX: Mapping[str, CalibrationFormat] = {".json": "slrig", ".yml": "opencv", ".xml": "opencv"}
 
+MAX_YAML_BYTES = 2**18
+MAX_YAML_DEPTH = 12
+
+TRANSFORMS = "transforms.yaml"
+
+PROGRAM_KEYS = {
+    "scan3d-capture": ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
+    "SLStudio": ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),
+    "procam-calibration": ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation"),
+    "OpenCV's sample of stereo calibration": ("M1", "D1", "M2", "D2", "R", "T"),
+}
+"""Keys by which a program's file is recognised: matrix and distortion of both devices, rotation and translation."""
 
 _Loader: Any = type("_Loader", (yaml.SafeLoader,), {})
-# YAML 1.1 asks for a point in a number with an exponent; other programs write 1e-05.
+# YAML 1.1 requires a point in a number with an exponent; other programs write 1e-05.
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
 )
 
 
 def read_yaml(path: Path) -> Any:
-    """Return the data of a YAML file. Raises CalibrationError, with the line: it is cut, too large, too deep, or has
-    anchors, which can make a short file an endless one.
+    """Return the data of a YAML file. Raises CalibrationError, with the line: the file is truncated, too large, nested
+    too deep, or has anchors, which can expand a short file without limit.
     """
-    text = read_text(path, MOST_BYTES, CalibrationError)
+    text = read_text(path, MAX_YAML_BYTES, CalibrationError)
     depth = 0
     try:
-        # Events are read one by one: nothing is built before the whole was looked at.
+        # Check all events before anything is built from them.
         for event in yaml.parse(text, _Loader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MOST_DEPTH or isinstance(event, yaml.AliasEvent):
+            if depth > MAX_YAML_DEPTH or isinstance(event, yaml.AliasEvent):
                 mark: Any = event.start_mark
-                message = f"{path}: expected YAML without anchors, and maps not deep in each other, found otherwise"
+                message = (
+                    f"{path}: expected YAML without anchors, nested at most {MAX_YAML_DEPTH} deep, found otherwise"
+                )
                 raise CalibrationError(f"{message} at line {mark.line + 1}; export it again")
         _require_single_keys(yaml.compose(text, _Loader), path)
         return yaml.load(text, _Loader)  # noqa: S506 - a safe loader
     except (yaml.YAMLError, ValueError) as cause:
         mark = getattr(cause, "problem_mark", None)
         where = "" if mark is None else f" at line {mark.line + 1}"
-        what = getattr(cause, "problem", None) or str(cause)
-        raise CalibrationError(f"{path}: expected YAML, found {what}{where}; correct it") from cause
+        problem = getattr(cause, "problem", None) or str(cause)
+        raise CalibrationError(f"{path}: expected YAML, found {problem}{where}; correct it") from cause
 
 
 def _require_single_keys(node: Any, path: Path) -> None:
-    """Refuse a key that is twice in one map: PyYAML would keep the last."""
+    """Reject duplicate keys in a map, of which PyYAML would keep the last."""
     if isinstance(node, yaml.MappingNode):
         keys = [str(key.value) for key, _ in node.value]
         if len(set(keys)) < len(keys):
@@ -78,113 +92,111 @@ def _require_single_keys(node: Any, path: Path) -> None:
 
 
 def yaml_bytes(data: object) -> bytes:
-    """A YAML text in the order of the data, lists of numbers in a line; numbers are written so that they read back."""
+    """Return data as YAML in its own order, with lists of numbers on one line."""
     text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=2**16, allow_unicode=True)
     return text.encode()
 
 
-TRANSFORMS = "transforms.yaml"
-
 Side = Annotated[int, Field(ge=1, le=MOST_SIDE_PX)]
 
 
-class Matrix(Strict):
-    """Numbers row by row."""
+class RosMatrix(Strict):
+    """A matrix, row by row."""
 
     rows: Annotated[int, Field(ge=1, le=16)]
     cols: Annotated[int, Field(ge=1, le=16)]
     data: Annotated[list[float], Field(max_length=256)]
 
-    def array(self, place: str) -> FloatArray:
+    def array(self, key: str) -> FloatArray:
         """(rows, cols) float64. Raises CalibrationError: there are more or fewer numbers."""
         if len(self.data) != self.rows * self.cols:
-            message = f"{place}: expected {self.rows * self.cols} numbers, found {len(self.data)}; export it again"
+            message = f"{key}: expected {self.rows * self.cols} numbers, found {len(self.data)}; export it again"
             raise CalibrationError(message)
         return np.array(self.data, dtype=np.float64).reshape(self.rows, self.cols)
 
 
-class CameraInfo(Strict):
-    """What camera_calibration writes. What follows from the other numbers is passed over."""
+class RosCameraInfo(Strict):
+    """A file of camera_calibration. Fields that follow from others are ignored."""
 
     image_width: Side
     image_height: Side
     camera_name: str = ""
-    camera_matrix: Matrix
+    camera_matrix: RosMatrix
     distortion_model: str
-    distortion_coefficients: Matrix
+    distortion_coefficients: RosMatrix
     rectification_matrix: object = None
     projection_matrix: object = None
 
 
-class Vector(Strict):
-    """Metres."""
+class RosVector(Strict):
+    """A vector in metres."""
 
     x: float
     y: float
     z: float
 
 
-class Quaternion(Vector):
-    """A rotation."""
+class RosQuaternion(RosVector):
+    """A rotation as a quaternion."""
 
     w: float
 
 
-class Pose(Strict):
-    """A child's pose in its parent."""
+class RosTransform(Strict):
+    """Pose of a child frame in its parent."""
 
-    translation: Vector
-    rotation: Quaternion
+    translation: RosVector
+    rotation: RosQuaternion
 
 
-class Header(Strict):
-    """Whose frame the pose is told in."""
+class RosHeader(Strict):
+    """Header with the parent frame."""
 
     frame_id: str
     stamp: object = None
     seq: object = None
 
 
-class Transform(Strict):
+class TransformStamped(Strict):
     """geometry_msgs/TransformStamped."""
 
-    header: Header
+    header: RosHeader
     child_frame_id: str
-    transform: Pose
+    transform: RosTransform
 
 
-class Transforms(Strict):
+class TfMessage(Strict):
     """tf2_msgs/TFMessage."""
 
-    transforms: Annotated[list[Transform], Field(min_length=1, max_length=64)]
+    transforms: Annotated[list[TransformStamped], Field(min_length=1, max_length=64)]
 
 
 def read_ros(folder: Path) -> Calibration:
     """Return the calibration in a folder of camera_info files.
-    Raises CalibrationError: a file is missing or wrong, a lens model is another one, a device has no transform.
+    Raises CalibrationError: a file is missing or invalid, a lens model is not supported, or a device has no transform.
     """
     files = {each.stem: each for each in sorted(folder.glob("*.yaml")) if each.name != TRANSFORMS}
     if not files or not (folder / TRANSFORMS).is_file():
         found = ", ".join(sorted(each.name for each in folder.iterdir())[:8]) or "nothing"
         raise CalibrationError(
             f"{folder}: expected NAME.yaml of each device, camera_info as camera_calibration writes it, and "
-            f"{TRANSFORMS} with where they stand, found {found}"
+            f"{TRANSFORMS} with their poses, found {found}; add the missing files"
         )
-    poses = _poses(folder / TRANSFORMS)
-    devices = {name: _device(path, poses, name) for name, path in files.items()}
+    poses = _read_ros_poses(folder / TRANSFORMS)
+    devices = {name: _read_ros_device(path, poses, name) for name, path in files.items()}
     projector = devices.pop(PROJECTOR, None)
     if not devices:
         raise CalibrationError(f"{folder}: expected a camera, found the projector alone; add its NAME.yaml")
     return Calibration(devices, projector)
 
 
-def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: str) -> Pinhole:
-    info = checked(CameraInfo, read_yaml(path), str(path), error=CalibrationError)
+def _read_ros_device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: str) -> Pinhole:
+    info = checked(RosCameraInfo, read_yaml(path), str(path), error=CalibrationError)
     terms = info.distortion_coefficients.array(f"{path}: distortion_coefficients").ravel()
     if info.distortion_model not in ("plumb_bob", "rational_polynomial") or terms[5:].any() or len(terms) < 4:
         raise CalibrationError(
             f"{path}: expected the distortion plumb_bob (k1, k2, p1, p2, k3), found {info.distortion_model} with "
-            f"{len(terms)} numbers; slrig has no other lens: calibrate with plumb_bob"
+            f"{len(terms)} numbers; slrig supports no other lens: calibrate with plumb_bob"
         )
     frame = next((each for each in (name, name + FRAME) if each in poses), None)
     if frame is None:
@@ -202,16 +214,16 @@ def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: s
         raise CalibrationError(f"{path}: {cause}") from cause
 
 
-def _poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """World to frame of each frame: rotation, and translation in mm. Raises CalibrationError."""
-    listed = checked(Transforms, read_yaml(path), str(path), error=CalibrationError).transforms
+def _read_ros_poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return rotation and translation, mm, from the world to each frame. Raises CalibrationError."""
+    listed = checked(TfMessage, read_yaml(path), str(path), error=CalibrationError).transforms
     parents = {each.child_frame_id: each for each in listed}
     if len(parents) < len(listed):
         raise CalibrationError(f"{path}: expected one parent for each frame, found two; keep one of them")
     roots = {each.header.frame_id for each in listed} - set(parents)
     if len(roots) != 1:
-        found = ", ".join(sorted(roots)) or "a circle"
-        raise CalibrationError(f"{path}: expected one frame that all others hang on, found {found}; join them")
+        found = ", ".join(sorted(roots)) or "a cycle"
+        raise CalibrationError(f"{path}: expected one root frame of all others, found {found}; connect them")
     (root,) = roots
     poses: dict[str, tuple[FloatArray, FloatArray]] = {root: (np.eye(3), np.zeros(3))}
     for frame in parents:
@@ -224,20 +236,20 @@ def _poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
             quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
             if not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
                 raise CalibrationError(f"{path}: {at}: expected a quaternion of length 1, found {quaternion.tolist()}")
-            # x_child = Rᵀ (x_parent - t), then on to what comes before.
-            back = Rotation.from_quat(quaternion).as_matrix().T
+            # x_child = Rᵀ (x_parent - t), then continue with the parent.
+            inverse = Rotation.from_quat(quaternion).as_matrix().T
             offset = np.array([step.translation.x, step.translation.y, step.translation.z])
-            translation = translation - rotation @ back @ offset
-            rotation, at = rotation @ back, parents[at].header.frame_id
+            translation = translation - rotation @ inverse @ offset
+            rotation, at = rotation @ inverse, parents[at].header.frame_id
         if at != root:
-            raise CalibrationError(f"{path}: expected a way from {frame} to {root}, found a circle; join them")
+            raise CalibrationError(f"{path}: expected a path from {frame} to {root}, found a cycle; connect them")
         poses[frame] = (rotation, translation * MM_PER_M)
     return poses
 
 
 def write_ros(folder: Path, calibration: Calibration) -> None:
-    """Write a calibration as camera_info of each device and their transforms, the whole folder or nothing.
-    Raises CalibrationError: a camera is called projector or transforms, or the folder is there already; StorageError.
+    """Write camera_info of each device and the transforms to a new folder, which appears only when it is complete.
+    Raises CalibrationError: a camera is named projector or transforms, or the folder exists; StorageError.
     """
     if folder.exists() or {PROJECTOR, "transforms"} & set(calibration.cameras):
         raise CalibrationError(f"{folder}: expected a new folder, and no camera of the name {PROJECTOR} or transforms")
@@ -247,13 +259,13 @@ def write_ros(folder: Path, calibration: Calibration) -> None:
     transforms: list[dict[str, Any]] = []
     texts: dict[str, bytes] = {}
     for name, device in devices.items():
-        texts[f"{name}.yaml"] = yaml_bytes(_info(name, device))
-        place, turn = pose(device.rotation, device.translation_mm)
-        stands = {
-            "translation": dict(zip("xyz", place, strict=True)),
-            "rotation": dict(zip("xyzw", turn, strict=True)),
+        texts[f"{name}.yaml"] = yaml_bytes(_camera_info(name, device))
+        translation, quaternion = pose(device.rotation, device.translation_mm)
+        transform = {
+            "translation": dict(zip("xyz", translation, strict=True)),
+            "rotation": dict(zip("xyzw", quaternion, strict=True)),
         }
-        transforms.append({"header": {"frame_id": WORLD}, "child_frame_id": name + FRAME, "transform": stands})
+        transforms.append({"header": {"frame_id": WORLD}, "child_frame_id": name + FRAME, "transform": transform})
     texts[TRANSFORMS] = yaml_bytes({"transforms": transforms})
     staging = staging_name(folder)
     with refusals_of(folder):
@@ -268,29 +280,28 @@ def write_ros(folder: Path, calibration: Calibration) -> None:
             shutil.rmtree(staging, ignore_errors=True)
 
 
-def _info(name: str, device: Pinhole) -> dict[str, Any]:
+def _camera_info(name: str, device: Pinhole) -> dict[str, Any]:
     def matrix(array: FloatArray) -> dict[str, Any]:
         return {"rows": array.shape[0], "cols": array.shape[1], "data": array.ravel().tolist()}
 
-    sees = lens(device.matrix, device.distortion)
+    info = lens(device.matrix, device.distortion)
     return {
         "image_width": device.size.width_px,
         "image_height": device.size.height_px,
         "camera_name": name,
-        "camera_matrix": matrix(sees["k"]),
-        "distortion_model": sees["distortion_model"],
-        "distortion_coefficients": matrix(sees["d"][None]),
-        "rectification_matrix": matrix(sees["r"]),
-        "projection_matrix": matrix(sees["p"]),
+        "camera_matrix": matrix(info["k"]),
+        "distortion_model": info["distortion_model"],
+        "distortion_coefficients": matrix(info["d"][None]),
+        "rectification_matrix": matrix(info["r"]),
+        "projection_matrix": matrix(info["p"]),
     }
 
 
-_MM_PER_M = 1000.0
 Four = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
-class ChainEntry(Strict):
-    """One camera of the chain."""
+class KalibrCamera(Strict):
+    """One camera of a camchain file."""
 
     camera_model: str
     intrinsics: Annotated[list[float], Field(max_length=8, description="fu, fv, pu, pv")]
@@ -306,27 +317,27 @@ class ChainEntry(Strict):
 
 def read_kalibr(path: Path) -> Calibration:
     """Return the calibration in a camchain file.
-    Raises CalibrationError: it is cut, a lens model is another one, or the chain has a gap.
+    Raises CalibrationError: the file is truncated, a lens model is not supported, or the chain has a gap.
     """
     data = read_yaml(path)
     if not isinstance(data, dict) or not data or list(data) != [f"cam{number}" for number in range(len(data))]:
         found = ", ".join(map(str, list(data)[:5])) if isinstance(data, dict) and data else "no map"
         raise CalibrationError(
-            f"{path}: expected Kalibr's cam0, cam1 … in this order, found {found}; of ROS name the folder"
+            f"{path}: expected Kalibr's cam0, cam1 … in this order, found {found}; for ROS, give the folder"
         )
-    chain = [_entry(path, key, entry) for key, entry in data.items()]
+    chain = [_check_kalibr_camera(path, key, entry) for key, entry in data.items()]
     rotation, translation_mm = np.eye(3), np.zeros(3)
     devices = {}
-    for name, key, entry in zip(_names(chain), data, chain, strict=True):
+    for name, key, entry in zip(_kalibr_camera_names(chain), data, chain, strict=True):
         if (entry.T_cn_cnm1 is None) != (key == "cam0"):
             message = (
-                f"{path}: {key}.T_cn_cnm1: expected one for each but cam0, found otherwise; calibrate them together"
+                f"{path}: {key}.T_cn_cnm1: expected one for each except cam0, found otherwise; calibrate them together"
             )
             raise CalibrationError(message)
         if entry.T_cn_cnm1 is not None:
             step = np.array(entry.T_cn_cnm1, dtype=np.float64)
             rotation = step[:3, :3] @ rotation
-            translation_mm = step[:3, :3] @ translation_mm + step[:3, 3] * _MM_PER_M
+            translation_mm = step[:3, :3] @ translation_mm + step[:3, 3] * MM_PER_M
         (fx, fy, cx, cy), size = entry.intrinsics, Size(*entry.resolution)
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         try:
@@ -339,19 +350,19 @@ def read_kalibr(path: Path) -> Calibration:
     return Calibration(devices, projector)
 
 
-def _entry(path: Path, key: str, data: object) -> ChainEntry:
-    entry = checked(ChainEntry, data, f"{path}: {key}", error=CalibrationError)
+def _check_kalibr_camera(path: Path, key: str, data: object) -> KalibrCamera:
+    entry = checked(KalibrCamera, data, f"{path}: {key}", error=CalibrationError)
     models = (entry.camera_model, entry.distortion_model)
     if models != ("pinhole", "radtan") or (len(entry.intrinsics), len(entry.distortion_coeffs)) != (4, 4):
         raise CalibrationError(
             f"{path}: {key}: expected pinhole-radtan with 4 intrinsics and 4 coefficients, found {'-'.join(models)} "
-            f"with {len(entry.intrinsics)} and {len(entry.distortion_coeffs)}; slrig has no other lens: calibrate with "
-            "--models pinhole-radtan"
+            f"with {len(entry.intrinsics)} and {len(entry.distortion_coeffs)}; slrig supports no other lens: calibrate "
+            "with --models pinhole-radtan"
         )
     return entry
 
 
-def _names(chain: list[ChainEntry]) -> list[str]:
+def _kalibr_camera_names(chain: list[KalibrCamera]) -> list[str]:
     names = [entry.rostopic.strip("/").split("/")[0] for entry in chain]
     usable = len(set(names)) == len(names) and all(re.fullmatch(CAMERA_NAME, name) for name in names)
     return names if usable else [f"cam{number}" for number in range(len(chain))]
@@ -359,7 +370,7 @@ def _names(chain: list[ChainEntry]) -> list[str]:
 
 def write_kalibr(path: Path, calibration: Calibration) -> None:
     """Write a calibration as a camchain, the projector last. The first camera's frame becomes the world.
-    Raises CalibrationError: a lens has k3 or skew, which the format has not; StorageError.
+    Raises CalibrationError: a lens has k3 or skew, which the format lacks; StorageError.
     """
     devices = dict(calibration.cameras)
     if calibration.projector is not None:
@@ -371,13 +382,13 @@ def write_kalibr(path: Path, calibration: Calibration) -> None:
             f"{', '.join(lossy)}; export to ros or opencv"
         )
     chain: dict[str, Any] = {}
-    before: Pinhole | None = None
+    previous: Pinhole | None = None
     for number, (name, device) in enumerate(devices.items()):
         entry: dict[str, Any] = {}
-        if before is not None:
+        if previous is not None:
             step = np.eye(4)
-            step[:3, :3] = device.rotation @ before.rotation.T
-            step[:3, 3] = (device.translation_mm - step[:3, :3] @ before.translation_mm) / _MM_PER_M
+            step[:3, :3] = device.rotation @ previous.rotation.T
+            step[:3, 3] = (device.translation_mm - step[:3, :3] @ previous.translation_mm) / MM_PER_M
             entry["T_cn_cnm1"] = step.tolist()
         matrix = device.matrix
         entry |= {
@@ -388,39 +399,31 @@ def write_kalibr(path: Path, calibration: Calibration) -> None:
             "resolution": [device.size.width_px, device.size.height_px],
             "rostopic": f"/{name}/image_raw",
         }
-        chain[f"cam{number}"], before = entry, device
+        chain[f"cam{number}"], previous = entry, device
     write_file(path, yaml_bytes(chain))
 
 
-PAIRS = {
-    "scan3d-capture": ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
-    "SLStudio": ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),
-    "procam-calibration": ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation"),
-    "OpenCV's sample of stereo calibration": ("M1", "D1", "M2", "D2", "R", "T"),
-}
+def detect_program(root: Mapping[str, Value]) -> str | None:
+    """Return the program of `PROGRAM_KEYS` that wrote a file; None if there is none."""
+    return next((program for program, keys in PROGRAM_KEYS.items() if set(keys) <= set(root)), None)
 
 
-def program_of(root: Mapping[str, Value]) -> str | None:
-    """Whose file this is; None where it is nobody's of these."""
-    return next((program for program, keys in PAIRS.items() if set(keys) <= set(root)), None)
-
-
-def read_pair(
+def read_program_calibration(
     root: Mapping[str, Value],
     path: Path,
     *,
     cameras: Mapping[str, Size],
     projector: Size | None,
-    shown: Mapping[Axis, Gray],
+    bits: Mapping[Axis, Gray],
 ) -> Calibration:
     """Return the calibration of the first of `cameras`, and of the projector or, with two cameras, of the second.
 
-    shown : a bit of the code of each axis: scan3d-capture counts the projector's pixels in cells of its finest bit.
-    Raises CalibrationError: a matrix is missing or of another shape, or the extents are not known.
+    bits : a bit of the code of each axis; scan3d-capture counts projector pixels in cells of its finest bit.
+    Raises CalibrationError: a matrix is missing or has another shape, or the extents are not known.
     """
-    program = str(program_of(root))
+    program = str(detect_program(root))
     found: list[FloatArray] = []
-    for key in PAIRS[program]:
+    for key in PROGRAM_KEYS[program]:
         value = root[key]
         if not isinstance(value, np.ndarray):
             raise CalibrationError(
@@ -430,44 +433,41 @@ def read_pair(
     first, first_lens, second, second_lens, rotation, translation = found
     if not cameras or projector is None:
         raise CalibrationError(
-            f"{path}: expected a calibration that says the extents of its images, found one of {program}, which does "
-            "not; import a capture with it: slrig import --calibration"
+            f"{path}: expected a calibration with the sizes of its images, found one of {program} without them; import "
+            "a capture with it: slrig import --calibration"
         )
     names, sizes = list(cameras), list(cameras.values())
     both_cameras = program.startswith("OpenCV") and len(cameras) == 2
-    other = sizes[1] if both_cameras else projector
     if program == "scan3d-capture":
-        second = _in_pixels(second, projector, shown)
+        second = _scale_cells_to_pixels(second, projector, bits)
     try:
-        here = Pinhole(sizes[0], first, five_terms(first_lens, path, PAIRS[program][1]), np.eye(3), np.zeros(3))
-        lens = five_terms(second_lens, path, PAIRS[program][3])
-        there = Pinhole(other, second, lens, rotation, translation.ravel())
+        terms = five_terms(first_lens, path, PROGRAM_KEYS[program][1])
+        first_device = Pinhole(sizes[0], first, terms, np.eye(3), np.zeros(3))
+        terms = five_terms(second_lens, path, PROGRAM_KEYS[program][3])
+        size = sizes[1] if both_cameras else projector
+        second_device = Pinhole(size, second, terms, rotation, translation.ravel())
     except CalibrationError as cause:
         raise CalibrationError(f"{path}: {cause}") from cause
     if both_cameras:
-        return Calibration({names[0]: here, names[1]: there}, None)
-    return Calibration({names[0]: here}, there)
+        return Calibration({names[0]: first_device, names[1]: second_device}, None)
+    return Calibration({names[0]: first_device}, second_device)
 
 
-def _in_pixels(matrix: FloatArray, projector: Size, shown: Mapping[Axis, Gray]) -> FloatArray:
-    """The matrix of a projector whose pixels are cells of the code, as one of its true pixels.
+def _scale_cells_to_pixels(matrix: FloatArray, projector: Size, bits: Mapping[Axis, Gray]) -> FloatArray:
+    """Convert a projector's matrix from cells of the code to pixels.
 
     With cells of c = 2^k px, cell x of n >> k begins at position c (x + offset of cells) - offset of pixels.
     """
-    found = np.array(matrix, dtype=np.float64)
+    scaled = np.array(matrix, dtype=np.float64)
     for row, axis in enumerate(Axis):
-        if axis not in shown or found.shape != (3, 3):
+        if axis not in bits or scaled.shape != (3, 3):
             continue
-        cell_px, offset_px, bits = shown[axis].cell_px, shown[axis].offset_px, shown[axis].bits
+        cell_px, offset_px = bits[axis].cell_px, bits[axis].offset_px
         cells = projector.along(axis) // cell_px
-        first_cell = (2**bits - cells) // 2
-        found[row] *= cell_px
-        found[row, 2] += cell_px * first_cell - offset_px + (cell_px - 1) / 2
-    return found
-
-
-Form = Literal["slrig", "opencv", "ros", "kalibr"]
-ENDINGS: Mapping[str, Form] = {".json": "slrig", ".yml": "opencv", ".xml": "opencv"}
+        first_cell = (2 ** bits[axis].bits - cells) // 2
+        scaled[row] *= cell_px
+        scaled[row, 2] += cell_px * first_cell - offset_px + (cell_px - 1) / 2
+    return scaled
 
 
 def read_any_calibration(
@@ -475,12 +475,12 @@ def read_any_calibration(
     *,
     cameras: Mapping[str, Size] | None = None,
     projector: Size | None = None,
-    shown: Mapping[Axis, Gray] | None = None,
+    bits: Mapping[Axis, Gray] | None = None,
 ) -> Calibration:
-    """Return the calibration in a file, or in a folder as ROS has it.
+    """Return the calibration in a file, or in a folder of ROS files.
 
-    cameras, projector, shown : what some programs' files do not say of the devices: see `read_pair`.
-    Raises CalibrationError: it is of no kind that is known, or wrong.
+    cameras, projector, bits : data that some programs' files lack; see `read_program_calibration`.
+    Raises CalibrationError: the format is unknown, or the file is invalid.
     """
     if path.is_dir():
         return read_ros(path)
@@ -490,19 +490,19 @@ def read_any_calibration(
     if not text.removeprefix("\ufeff").startswith(("%YAML", "<")):
         return read_kalibr(path)
     root = read_file_storage(text, path)
-    if program_of(root) is None:
+    if detect_program(root) is None:
         return read_opencv_calibration(path)
-    return read_pair(root, path, cameras=cameras or {}, projector=projector, shown=shown or {})
+    return read_program_calibration(root, path, cameras=cameras or {}, projector=projector, bits=bits or {})
 
 
-def write_any_calibration(path: Path, calibration: Calibration, form: Form | None = None) -> None:
-    """Write a calibration in one of the forms, by the ending of `path` where none is named; ROS's is a new folder.
-    Raises CalibrationError: the ending says none, or the form cannot hold it; StorageError: the disk refused.
+def write_any_calibration(path: Path, calibration: Calibration, form: CalibrationFormat | None = None) -> None:
+    """Write a calibration in a format, or in that of the suffix of `path`. The ROS format is a new folder.
+    Raises CalibrationError: the suffix is unknown, or the format cannot store the calibration; StorageError.
     """
-    form = form or ENDINGS.get(path.suffix.lower())
+    form = form or FORMAT_BY_SUFFIX.get(path.suffix.lower())
     if form is None:
         raise CalibrationError(
-            f"{path}: expected a name that ends in .json, .yml or .xml, or --to; found '{path.suffix}'"
+            f"{path}: expected a name that ends in .json, .yml or .xml, found '{path.suffix}'; rename it, or give --to"
         )
     writers = {"slrig": write_calibration, "opencv": write_opencv_calibration, "ros": write_ros, "kalibr": write_kalibr}
     writers[form](path, calibration)

@@ -17,8 +17,7 @@ from typing import Any, Protocol
 import structlog
 
 from slrig.capture import EvidenceSummary
-from slrig.model import Calibration, Region, Shot
-from slrig.model.header import CaptureHeader
+from slrig.model import Calibration, CaptureHeader, Region, Shot
 
 LEAST_WAITING_BYTES, MOST_WAITING_BYTES = 128 * 2**20, 512 * 2**20
 """How much of frames may wait for the reconstruction: a whole scan of a common camera where there is little memory, and

@@ -1,19 +1,19 @@
-"""The lens of a camera or projector: Brown's distortion and its derivatives (Brown 1966; the form and order of OpenCV).
+"""Brown's lens distortion and its derivatives (Brown 1966; parameters in OpenCV's form and order).
 
     x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
     y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2 y²) + 2 p2 x y
 
-with r² = x² + y². (x, y) are normalised coordinates, of the plane at depth 1 before the device; they have no unit.
+with r² = x² + y². (x, y) are normalised coordinates in the plane at depth 1; they have no unit.
 
 x and y are numbers, or float64 arrays of one shape. `slrig.model.lens_kernels` has the same functions compiled, and the
-way back. The rendered rig has a lens of its own, so that an error of sign in this one cannot cancel itself.
+inverse. The rendered rig implements its own lens, so that an error of sign here cannot cancel in tests.
 """
 
 from __future__ import annotations
 
 from typing import TypeVar
 
-from slrig.model.rig import FloatArray
+from slrig.model.geometry import FloatArray
 
 LENS_TERMS = ("k1", "k2", "p1", "p2", "k3")
 """The terms of the distortion, in the order of `Pinhole.distortion`."""
@@ -21,13 +21,13 @@ LENS_TERMS = ("k1", "k2", "p1", "p2", "k3")
 Coordinate = TypeVar("Coordinate", float, FloatArray)
 
 
-def distorted(
+def distort(
     lens: FloatArray, x: Coordinate, y: Coordinate
 ) -> tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]:
-    """Where the lens sends an undistorted point, and the slopes there: x', y', ∂x'/∂x, ∂x'/∂y = ∂y'/∂x, ∂y'/∂y.
+    """Return the distorted point and the derivatives: x', y', ∂x'/∂x, ∂x'/∂y = ∂y'/∂x, ∂y'/∂y.
 
-    lens : (5,) float64, `LENS_TERMS`. Where the determinant of the slopes is not positive the distortion has turned
-    back: whatever the polynomial says, the lens sends no light there.
+    lens : (5,) float64, `LENS_TERMS`. The polynomial is valid only where the determinant of the derivatives is
+    positive; beyond, it is no longer invertible and describes no light.
     """
     k1, k2, p1, p2, k3 = lens[0], lens[1], lens[2], lens[3], lens[4]
     r2 = x * x + y * y
@@ -42,10 +42,10 @@ def distorted(
     )
 
 
-def by_terms(
+def distortion_by_terms(
     a: float, b: float, x: Coordinate, y: Coordinate
 ) -> tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]:
-    """The derivatives of a x' + b y' by each of `LENS_TERMS`, whatever these are: x' and y' are linear in them."""
+    """Return the derivatives of a x' + b y' with respect to each of `LENS_TERMS`, in which x' and y' are linear."""
     r2 = x * x + y * y
     radial = (a * x + b * y) * r2
     return (

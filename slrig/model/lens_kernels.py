@@ -1,6 +1,6 @@
-"""The lens model for kernels: `slrig.model.lens` compiled, and the way back from distorted to undistorted points.
+"""The lens model for kernels: `slrig.model.lens` compiled, and the inverse, from distorted to undistorted points.
 
-A module of its own, which `slrig.model` does not import: numba takes a second to load.
+`slrig.model` does not import this module, because numba takes a second to load.
 """
 
 from __future__ import annotations
@@ -10,23 +10,23 @@ from typing import Any
 import numpy as np
 
 from slrig.kernels import kernel_part
-from slrig.model import lens as model
+from slrig.model import lens as lens_model
 
-STEPS = 30  # Newton's method doubles the digits with each: what needs more does not settle
+MAX_STEPS = 30  # Newton's method doubles the correct digits with each step: a point that needs more does not converge
 
-distorted = kernel_part(inline="always")(model.distorted)
-by_terms = kernel_part(inline="always")(model.by_terms)
+distort = kernel_part(inline="always")(lens_model.distort)
+distortion_by_terms = kernel_part(inline="always")(lens_model.distortion_by_terms)
 
 
 @kernel_part(inline="always")
-def undistorted(lens: Any, xd: float, yd: float, x: float, y: float, settled: float) -> Any:
-    """The point (x, y) that the lens sends to (xd, yd), by Newton's method from a start.
+def undistort(lens: Any, xd: float, yd: float, x: float, y: float, settled: float) -> Any:
+    """Return the point (x, y) that the lens distorts to (xd, yd), by Newton's method from a start value.
 
-    lens : (5,) float64; settled : a step shorter than this is the last, and leaves about the square of it.
-    NaN for a point that the lens cannot light: beyond the radius where its distortion turns back there is no direction.
+    lens : (5,) float64; settled : length of the last step; the remaining error is about its square.
+    NaN for a point beyond the radius where the distortion is invertible.
     """
-    for _ in range(STEPS):
-        dx, dy = step_back(lens, xd, yd, x, y)
+    for _ in range(MAX_STEPS):
+        dx, dy = undistort_step(lens, xd, yd, x, y)
         x += dx
         y += dy
         size = dx * dx + dy * dy
@@ -38,11 +38,11 @@ def undistorted(lens: Any, xd: float, yd: float, x: float, y: float, settled: fl
 
 
 @kernel_part(inline="always")
-def step_back(lens: Any, xd: float, yd: float, x: float, y: float) -> Any:
-    """A step of Newton's method from (x, y) towards the point that the lens sends to (xd, yd); NaN where the lens has
-    turned back.
+def undistort_step(lens: Any, xd: float, yd: float, x: float, y: float) -> Any:
+    """Return a step of Newton's method from (x, y) towards the point that the lens distorts to (xd, yd); NaN where the
+    distortion is not invertible.
     """
-    gx, gy, a, b, c = distorted(lens, x, y)
+    gx, gy, a, b, c = distort(lens, x, y)
     det = a * c - b * b
     scale = 1 / det if det > 0 else np.nan
     return (c * (xd - gx) - b * (yd - gy)) * scale, (a * (yd - gy) - b * (xd - gx)) * scale

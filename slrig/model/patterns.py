@@ -1,4 +1,4 @@
-"""Patterns that a projector shows, and the Gray code that they are made of."""
+"""Projector patterns, and the Gray code that they encode."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slrig.errors import PatternError
-from slrig.model.rig import Axis, Pixels, Size
+from slrig.model.geometry import Axis, Pixels, Size
 
 Integers = NDArray[np.integer[Any]]
 
+MIN_LINE_STEPS = 3
+"""Shifts of a line within a period: with two, the direction is ambiguous."""
+
 
 def to_gray(index: ArrayLike) -> Integers:
-    """Code word g = i ^ (i >> 1) of each cell index; integers of any shape.
+    """Return the code word g = i ^ (i >> 1) of each cell index; integers of any shape.
 
     >>> [format(word, "03b") for word in to_gray([0, 1, 2, 3, 4, 5])]
     ['000', '001', '011', '010', '110', '111']
@@ -27,13 +30,13 @@ def to_gray(index: ArrayLike) -> Integers:
 
 
 def from_gray(word: ArrayLike) -> Integers:
-    """Cell index of each code word, the inverse of `to_gray`: bit s of i is the parity of g's bits from s upwards.
+    """Return the cell index of each code word, inverting `to_gray`: bit s of i is the parity of g's bits from s on.
 
     >>> from_gray([0, 1, 3, 2, 6, 7])
     array([0, 1, 2, 3, 4, 5])
     """
     cells = np.array(word)
-    # Prefix exclusive-or by doubling: after shifts of 1, 2, 4 … every bit has met all bits above it.
+    # Prefix exclusive-or by doubling: after shifts of 1, 2, 4 … every bit is combined with all bits above it.
     shift = 1
     while shift < 8 * cells.itemsize:
         cells ^= cells >> shift
@@ -42,7 +45,7 @@ def from_gray(word: ArrayLike) -> Integers:
 
 
 def gray_index(lit: NDArray[np.bool_]) -> Integers:
-    """Cell index from the bits seen, the inverse of playing a code: lit (bits, …) bool, most significant bit first.
+    """Return the cell index of decoded bits: lit (bits, …) bool, most significant bit first.
 
     >>> gray_index(np.array([[False, True], [True, True], [False, True]]))
     array([3, 5])
@@ -51,12 +54,8 @@ def gray_index(lit: NDArray[np.bool_]) -> Integers:
     return from_gray(np.tensordot(weights, lit.astype(np.int64), axes=1))
 
 
-FEWEST_STEPS = 3
-"""Of a line's shifts within a period: two leave its direction open."""
-
-
 class SequenceName(StrEnum):
-    """Pattern sequences by what they are for; `slrig.patterns.sequence.SEQUENCES` has what they play."""
+    """Names of the predefined pattern sequences; `slrig.patterns.sequence.SEQUENCES` defines them."""
 
     FAST = "fast"
     STANDARD = "standard"
@@ -79,14 +78,14 @@ class Black:
 
 @dataclass(frozen=True, slots=True)
 class Primary:
-    """Every projector pixel lit, by one of the projector's own lights alone: its white in red, green or blue."""
+    """Every projector pixel lit by one of the projector's own lights: red, green or blue."""
 
     colour: Literal["red", "green", "blue"]
     kind: Literal["primary"] = "primary"
 
     @property
-    def words(self) -> str:
-        """What a person calls it."""
+    def description(self) -> str:
+        """Description for messages."""
         return f"white in {self.colour} light"
 
 
@@ -111,41 +110,17 @@ class Gray:
 
     @property
     def inverse(self) -> Gray:
-        """The bit that is lit where this one is dark."""
+        """The same bit with lit and dark exchanged."""
         return replace(self, inverted=not self.inverted)
 
     @property
     def as_lines(self) -> LineShift | None:
-        """The lines that light the same, half as wide as their period; None of the first bit, which lights one side."""
+        """The identical line pattern, half as wide as its period; None for the first bit, which lights one side."""
         if self.bit == 0:
             return None
         run_px = self.cell_px << (self.bits - self.bit)
         shift = (run_px // 2 - self.offset_px + run_px * self.inverted) % (2 * run_px)
         return LineShift(self.axis, shift, 2 * run_px, run_px)
-
-
-def divides_period(lines: Sequence[LineShift]) -> bool:
-    """Whether the shifts of lines divide their period evenly, into three or more. lines : by shift."""
-    count = len(lines)
-    if count < FEWEST_STEPS or lines[0].period_px % count:
-        return False
-    step_px = lines[0].period_px // count
-    return all(line.shift == k * step_px and line.period_px == lines[0].period_px for k, line in enumerate(lines))
-
-
-def coarse_bits(bits: int) -> int:
-    """How many bits of a code, the first of them, are coarse: few pixels lie at their edges, and the rest tell noise.
-
-    Half of them; three at least, as many as tell a variance.
-    """
-    return max(3, bits // 2)
-
-
-def telling_bits(bits: int) -> tuple[int, ...]:
-    """Which bits of a code tell what a camera makes of light, all bits together no more: the coarse ones, which are
-    even and tell noise, and the two finest, whose edges tell compression and a bent response.
-    """
-    return tuple(sorted({*range(min(coarse_bits(bits), bits)), *range(max(bits - 2, 0), bits)}))
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,26 +146,50 @@ class LineShift:
         return self.shift + (self.line_width_px - 1) / 2
 
     @property
-    def lights_half(self) -> bool:
-        """Whether its lines are half as wide as their period."""
+    def is_half_lit(self) -> bool:
+        """True if the lines are half as wide as their period."""
         return 2 * self.line_width_px == self.period_px
 
     @property
     def inverse(self) -> LineShift | None:
-        """The lines that are lit where these are dark; None unless they are half as wide as their period."""
-        return replace(self, shift=(self.shift + self.line_width_px) % self.period_px) if self.lights_half else None
+        """The lines with lit and dark exchanged; None unless they are half as wide as their period."""
+        return replace(self, shift=(self.shift + self.line_width_px) % self.period_px) if self.is_half_lit else None
 
 
-def telling_lines(lines: Sequence[LineShift]) -> tuple[tuple[LineShift, LineShift], ...]:
-    """Two pairs of lines and their inverses, about a quarter of a period apart, that tell what a camera makes of light:
-    where the one pair has its edges, the other has none. None where there are no such pairs.
+def has_even_shifts(lines: Sequence[LineShift]) -> bool:
+    """True if the shifts divide the period evenly into three or more steps. lines : sorted by shift."""
+    count = len(lines)
+    if count < MIN_LINE_STEPS or lines[0].period_px % count:
+        return False
+    step_px = lines[0].period_px // count
+    return all(line.shift == k * step_px and line.period_px == lines[0].period_px for k, line in enumerate(lines))
+
+
+def coarse_bit_count(bits: int) -> int:
+    """Return how many of the first bits are coarse: few pixels are at their edges, so that the others show the noise.
+
+    Half of the bits, at least three, which a variance needs.
+    """
+    return max(3, bits // 2)
+
+
+def diagnostic_bits(bits: int) -> tuple[int, ...]:
+    """Return the bits that characterise a camera as well as all bits do: the coarse ones, which show the noise, and the
+    two finest, whose edges show compression and a non-linear response.
+    """
+    return tuple(sorted({*range(min(coarse_bit_count(bits), bits)), *range(max(bits - 2, 0), bits)}))
+
+
+def diagnostic_line_pairs(lines: Sequence[LineShift]) -> tuple[tuple[LineShift, LineShift], ...]:
+    """Return two pairs of lines and their inverses, about a quarter of a period apart, that characterise a camera:
+    where one pair has edges, the other has none. Empty without such pairs.
 
     lines : of one axis, period and width.
     """
-    shown = set(lines)
-    pairs = [(line, line.inverse) for line in sorted(lines, key=lambda each: each.shift)[: len(lines) // 2]]
-    told = [(line, inverse) for line, inverse in pairs if inverse in shown and inverse is not None]
-    return (told[0], told[len(told) // 2]) if len(told) > 1 else ()
+    available = set(lines)
+    candidates = [(line, line.inverse) for line in sorted(lines, key=lambda each: each.shift)[: len(lines) // 2]]
+    pairs = [(line, inverse) for line, inverse in candidates if inverse in available and inverse is not None]
+    return (pairs[0], pairs[len(pairs) // 2]) if len(pairs) > 1 else ()
 
 
 Pattern = White | Black | Primary | Gray | LineShift
@@ -198,11 +197,10 @@ Pattern = White | Black | Primary | Gray | LineShift
 
 @dataclass(frozen=True, slots=True)
 class PatternSequence:
-    """What a projector shows: specifications, and the light each one asks for.
+    """Patterns in display order, with the image of each.
 
-    Patterns vary along one axis only, so each image is kept as one row or one column and spread when looked at.
-
-    profiles : one (1, Wp), (Hp, 1) or (1, 1) uint8 array per pattern.
+    profiles : one (1, Wp), (Hp, 1) or (1, 1) uint8 array for each pattern, which varies along one axis only; `image`
+    broadcasts it to the projector's size.
     """
 
     projector: Size
@@ -220,5 +218,5 @@ class PatternSequence:
         return len(self.patterns)
 
     def image(self, index: int) -> Pixels:
-        """(Hp, Wp) uint8, a read-only view: the full image of pattern `index`."""
+        """(Hp, Wp) uint8, a read-only view: the image of pattern `index`."""
         return np.broadcast_to(self.profiles[index], self.projector.shape)

@@ -25,9 +25,7 @@ from slrig.meshing import (
     used_vertices,
     vertex_normals,
 )
-from slrig.model import AlbedoMark, FloatArray, IntArray, Mesh
-from slrig.model.rig import require
-from slrig.model.surfaces import light_of, srgb_of
+from slrig.model import AlbedoMark, FloatArray, IntArray, Mesh, linear_to_srgb, require_array, srgb_to_linear
 from slrig.multiview.fusion_grid import (
     BORDER_REACH,
     CELLS,
@@ -74,7 +72,7 @@ _MIN_TRIANGLES = 20  # of a component: fewer are dust; of a false layer: fewer a
 _GAP, _VALUE, _WEIGHT, _NOISE, _NX, _NY, _NZ, _B0, _B1, _B2, _BEYOND, _FACE, _VIEW = range(13)
 _COLUMNS = 13
 _UNMARKED, _UNKNOWN = int(AlbedoMark.NONE), int(AlbedoMark.UNKNOWN)
-_LIGHT = light_of(np.arange(256, dtype=np.uint8)) / light_of(np.array(255, np.uint8))
+_LIGHT = srgb_to_linear(np.arange(256, dtype=np.uint8)) / srgb_to_linear(np.array(255, np.uint8))
 
 
 class PoseErrors(NamedTuple):
@@ -371,7 +369,7 @@ def equalise_colours(stack: StackedViews, nearest: IntArray) -> FloatArray:
     """
     faces = nearest[:, :: nearest.shape[1] // _COLOUR_SAMPLE + 1]
     vertex = stack.faces[:, 0][faces]
-    light = light_of(stack.colour).max(axis=1)[vertex] / light_of(np.array([255], np.uint8))
+    light = srgb_to_linear(stack.colour).max(axis=1)[vertex] / srgb_to_linear(np.array([255], np.uint8))
     usable = (faces >= 0) & (stack.mark[vertex] == AlbedoMark.NONE) & (light > _MIN_LIGHT)
     logs = np.log(np.where(usable, light, 1.0))
     count = len(faces)
@@ -390,7 +388,7 @@ def equalise_colours(stack: StackedViews, nearest: IntArray) -> FloatArray:
     levels = np.arange(256, dtype=np.uint8)
     for view, gain in enumerate(gains):
         colour = stack.colour[stack.first_vertex[view] : stack.first_vertex[view + 1]]
-        colour[:] = srgb_of(gain * light_of(levels) / light_of(levels[-1:]))[colour]
+        colour[:] = linear_to_srgb(gain * srgb_to_linear(levels) / srgb_to_linear(levels[-1:]))[colour]
     return np.asarray(gains)
 
 
@@ -425,7 +423,7 @@ class FusedModel:
     correlated_mm: float
 
     def __post_init__(self) -> None:
-        require(self.views, "FusedModel.views", (len(self.mesh.vertices_mm),), "i")
+        require_array(self.views, "FusedModel.views", (len(self.mesh.vertices_mm),), "i")
 
 
 def fuse_views(
@@ -487,7 +485,7 @@ def fuse_views(
     numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
     mesh = Mesh(
         points[used].astype(np.float32), numbers[faces], vertex_normals(points, faces)[used],
-        srgb_of(means.light[used]), means.mark[used],
+        linear_to_srgb(means.light[used]), means.mark[used],
         means.sigma_mm[used].astype(np.float32), np.full(int(used.sum()), NO_STRIPE, dtype=np.int32),
     )  # fmt: skip
     return FusedModel(mesh, means.views[used], voxel, settings.correlated_mm)

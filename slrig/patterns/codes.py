@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Size
-from slrig.model.patterns import from_gray, to_gray
+from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Size, from_gray, to_gray
 
 MIN_BORDER_DISTANCE_PX = 3.0
 """Least distance of a line's centre from the projector's first and last position, px: see `line_positions`."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import PatternError
 from slrig.model import (
+    MIN_LINE_STEPS,
     Axis,
     Black,
     Gray,
@@ -21,10 +22,9 @@ from slrig.model import (
     SequenceName,
     Size,
     White,
-    telling_bits,
-    telling_lines,
+    diagnostic_bits,
+    diagnostic_line_pairs,
 )
-from slrig.model.patterns import FEWEST_STEPS
 from slrig.patterns.codes import gray_bits, gray_profile, line_profile
 
 GRAY_ONLY_CELL_PX = 2
@@ -75,8 +75,8 @@ def scan_patterns(
     """List the patterns of one scan in the order of play.
 
     White, black; code and lines of the requested axes, columns first; white and black again, by `closing`. Patterns
-    that show the response of the camera come first, `telling_bits` and without inverses `telling_lines`, so that
-    stripes can be located while the remaining bits, which only number them, are played.
+    that show the response of the camera come first, `diagnostic_bits` and without inverses `diagnostic_line_pairs`, so
+    that stripes can be located while the remaining bits, which only number them, are played.
 
     size : of the projector. line_shift : False for a scan without line frames. period_px : n. steps : number of line
     frames, which divide the period evenly; None for n. line_width_px : of a line; None for ⌊n/2⌋, the width with the
@@ -101,10 +101,11 @@ def scan_patterns(
             f"slightly off moves a stripe by a whole period; use gray_cell_px ≤ {period_px // 2} or a longer period"
         )
     steps = period_px if steps is None else steps
-    if line_shift and (steps < FEWEST_STEPS or period_px % steps):
+    if line_shift and (steps < MIN_LINE_STEPS or period_px % steps):
         raise PatternError(
             f"lines {period_px} px apart cannot be shifted in {steps} equal steps of whole pixels; use a number from "
-            f"{FEWEST_STEPS} on that divides the period, or a period that is a multiple of {max(steps, FEWEST_STEPS)}"
+            f"{MIN_LINE_STEPS} on that divides the period, or a period that is a multiple of "
+            f"{max(steps, MIN_LINE_STEPS)}"
         )
     width_px = line_width_px if line_width_px is not None else period_px // 2
     reference: tuple[Pattern, ...] = (White(), Black())
@@ -112,9 +113,9 @@ def scan_patterns(
     for axis in [each for each, played in ((Axis.COLUMN, columns), (Axis.ROW, rows)) if played]:
         shifts = range(0, period_px, period_px // steps) if line_shift else ()
         lines = [LineShift(axis, shift, period_px, width_px) for shift in shifts]
-        first = list(chain.from_iterable(telling_lines(lines)))
+        first = list(chain.from_iterable(diagnostic_line_pairs(lines)))
         code = _gray_patterns(axis, size.along(axis), cell_px, gray_offset_px, inverses=inverses)
-        telling = telling_bits(code[0].bits)
+        telling = diagnostic_bits(code[0].bits)
         body += [each for each in code if each.bit in telling]
         body += [*first, *(line for line in lines if line not in first)] if not inverses else lines
         body += [each for each in code if each.bit not in telling]

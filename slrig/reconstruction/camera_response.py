@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import FloatArray, IntArray, coarse_bits, telling_bits
+from slrig.model import FloatArray, IntArray, coarse_bit_count, diagnostic_bits
 from slrig.reconstruction.frames import AxisFrames, Images, select_rows, stack_rows, subsample
 from slrig.reconstruction.surface_fit import stencils
 
@@ -161,7 +161,7 @@ def sample_noise(
 
     where : (H, W) bool, pixels to sample; None for all.
     """
-    coarse_count, lines = coarse_bits(len(frames.bits)), frames.line_pairs
+    coarse_count, lines = coarse_bit_count(len(frames.bits)), frames.line_pairs
     if frames.inverses is not None and len(frames.bits) >= _MIN_BITS:
         level, variance = _scatter_of_sums(
             frames.bits[:coarse_count], frames.inverses[:coarse_count], frames.clipped_at, where
@@ -418,7 +418,7 @@ def noise_correlation(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.b
     from their edges. Without inverses, two bits that light the same window count, or lines of half their period,
     whichever give less. Without either, or with few windows, the result is 1.
     """
-    count, lines = coarse_bits(len(frames.bits)), frames.line_pairs
+    count, lines = coarse_bit_count(len(frames.bits)), frames.line_pairs
     corner = _windows(where, len(pixel_sum.weights))
     if len(corner[0]) < _MIN_WINDOWS or len(frames.bits) < _MIN_BITS:
         return 1.0
@@ -582,7 +582,7 @@ def frame_compression_loss(frames: AxisFrames, lit: NDArray[np.bool_], images: I
 
     lit : (H, W) bool.
     """
-    bits, lines = telling_bits(len(frames.bits)), frames.line_pairs
+    bits, lines = diagnostic_bits(len(frames.bits)), frames.line_pairs
     direct = [frames.bits[bit] for bit in bits] if lines is None else lines[0]
     searched = direct + (lines[1] if lines is not None else [])
     if frames.inverses is not None:
@@ -660,7 +660,7 @@ def estimate_gamma(frames: AxisFrames) -> float:
     """Estimate gamma of a camera from the edges of the code; 1 if they do not determine it, or it is close to 1."""
     if frames.exposure_ratio != 1.0:
         return 1.0
-    full, bit_numbers, lines = frames.full_scale, telling_bits(len(frames.bits)), frames.line_pairs
+    full, bit_numbers, lines = frames.full_scale, diagnostic_bits(len(frames.bits)), frames.line_pairs
     # Some rows are enough: an edge of the code crosses most of them.
     step = max(1, frames.white.size // _MAX_PIXELS)
     if frames.inverses is not None:
@@ -701,7 +701,7 @@ def _line_edge_samples(frames: AxisFrames, step: int) -> NDArray[np.float32]:
     black as single bits show them.
     """
     lines, bits = ([image[::step] for image in images] for images in (frames.lines, frames.bits))
-    selected = [bits[bit] for bit in telling_bits(len(bits))]
+    selected = [bits[bit] for bit in diagnostic_bits(len(bits))]
     line_values, bit_values = stack_rows(lines), stack_rows(selected)
     white, black = bit_values.max(axis=0), bit_values.min(axis=0)
     clear = (white - black > _MIN_CONTRAST_LEVELS / 255 * frames.full_scale) & (white < frames.clipped_at)

@@ -28,10 +28,10 @@ from slrig.model import (
     Pattern,
     Shot,
     White,
-    divides_period,
+    diagnostic_bits,
+    diagnostic_line_pairs,
     exposure_groups,
-    telling_bits,
-    telling_lines,
+    has_even_shifts,
 )
 
 Image = NDArray[np.float32]
@@ -110,7 +110,7 @@ class AxisFrames:
         """Two line images and their inverses, to estimate the response of the camera from; None if bits have inverses,
         or there are no such lines.
         """
-        pairs = () if self.inverses is not None else telling_lines(self.line_patterns)
+        pairs = () if self.inverses is not None else diagnostic_line_pairs(self.line_patterns)
         direct, inverted = ([self.lines[self.line_patterns.index(pair[i])] for pair in pairs] for i in (0, 1))
         return (direct, inverted) if pairs else None
 
@@ -181,8 +181,8 @@ class AxisPatterns:
         their period and some bits; otherwise the whole code.
         """
         if len(self.reference) == 2:
-            pairs = telling_lines(self.lines)
-            bits = [replace(self.gray, bit=bit) for bit in telling_bits(self.gray.bits)]
+            pairs = diagnostic_line_pairs(self.lines)
+            bits = [replace(self.gray, bit=bit) for bit in diagnostic_bits(self.gray.bits)]
             if self.has_inverses:
                 return frozenset((*self.reference, *bits, *(replace(bit, inverted=True) for bit in bits)))
             if self.lines_light_half and not self.inverted:
@@ -260,7 +260,7 @@ def lights_half_period(lines: Sequence[LineShift], /) -> bool:
 
     Their mean is then the middle of white and black. lines : of one axis, period and width, by shift.
     """
-    return divides_period(lines) and lines[0].lights_half
+    return has_even_shifts(lines) and lines[0].is_half_lit
 
 
 def used_frames(patterns: Sequence[Pattern], exposures_s: Sequence[float | None]) -> list[bool]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.model import FloatArray, LineShift, divides_period
+from slrig.model import FloatArray, LineShift, has_even_shifts
 from slrig.reconstruction.camera_response import NoiseModel
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames, rows_per_band, stack_rows
@@ -65,7 +65,7 @@ def line_step_px(patterns: Sequence[LineShift], /) -> int | None:
 
     patterns : of one period and width, by shift.
     """
-    return patterns[0].period_px // len(patterns) if divides_period(patterns) else None
+    return patterns[0].period_px // len(patterns) if has_even_shifts(patterns) else None
 
 
 def has_phase(frames: AxisFrames, /) -> bool:

@@ -358,7 +358,7 @@ def _phase_finds_all_points(frames: AxisFrames) -> bool:
     Narrow lines light too little for that, and the filter contributes to each point.
     """
     patterns = frames.line_patterns
-    return line_step_px(patterns) is not None and patterns[0].lights_half
+    return line_step_px(patterns) is not None and patterns[0].is_half_lit
 
 
 def _sampled_rows(image: DecodedImage) -> _FilterRows:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Source
-from slrig.model.lens_kernels import STEPS, distorted, step_back, undistorted
+from slrig.model.lens_kernels import MAX_STEPS, distort, undistort, undistort_step
 from slrig.reconstruction.identification import StripeEnsemble
 
 _MIN_POINTS = 1024  # least number for one call of a kernel
@@ -79,7 +79,7 @@ def distorted_from_pixel(d: Any, u: float, v: float) -> Any:
 def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
     """Undistorted normalised coordinates of a pixel, NaN if the lens cannot image it."""
     xd, yd = distorted_from_pixel(d, u, v)
-    return undistorted(d[5:10], xd, yd, xd, yd, CONVERGED)
+    return undistort(d[5:10], xd, yd, xd, yd, CONVERGED)
 
 
 @kernel_part
@@ -111,7 +111,7 @@ def _project_kernel(first: int, last: int, d: Any, points: Any, out: Any) -> Non
     for i in range(first, last):
         px, py, pz = to_device(d, points[i, 0], points[i, 1], points[i, 2])
         if pz > 0:
-            xd, yd, _, _, _ = distorted(d[5:10], px / pz, py / pz)
+            xd, yd, _, _, _ = distort(d[5:10], px / pz, py / pz)
             out[i, 0] = d[0] * xd + d[1] * yd + d[2]
             out[i, 1] = d[3] * yd + d[4]
 
@@ -147,11 +147,11 @@ def intersect_light_sheets(
 @kernel_part
 def _undistort_rays(w: Any, count: int, camera: Any) -> None:
     """Fill in x and y of a block's undistorted rays, NaN where the lens cannot image them."""
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         unfinished = 0
         for i in range(count):
             x, y, goes_on = w[_X + i], w[_Y + i], w[_GOES_ON + i] > 0
-            dx, dy = step_back(camera[5:10], w[_XD + i], w[_YD + i], x, y)
+            dx, dy = undistort_step(camera[5:10], w[_XD + i], w[_YD + i], x, y)
             w[_X + i] = x + (dx if goes_on else 0.0)
             w[_Y + i] = y + (dy if goes_on else 0.0)
             goes_on = goes_on and dx * dx + dy * dy >= CONVERGED * CONVERGED  # False for NaN
@@ -170,7 +170,7 @@ def _solve_depths(w: Any, count: int, p: Any, coded: Any, position: float) -> No
             s, dx, dy, dz, goes_on = w[_S + i], w[_DX + i], w[_DY + i], w[_DZ + i], w[_GOES_ON + i] > 0
             scale = 1 / (p[21] + s * dz)
             x, y = (p[19] + s * dx) * scale, (p[20] + s * dy) * scale
-            xd, yd, a, b, c = distorted(p[5:10], x, y)
+            xd, yd, a, b, c = distort(p[5:10], x, y)
             gx, gy = coded[0] * a + coded[1] * b, coded[0] * b + coded[1] * c
             slope = (gx * (dx - x * dz) + gy * (dy - y * dz)) * scale
             error = coded[0] * xd + coded[1] * yd + coded[2] - position
@@ -192,13 +192,13 @@ def _complete_block(w: Any, count: int, camera: Any, p: Any, coded: Any, other: 
         depth = p[21] + s * dz
         scale = 1 / depth
         xn, yn = (p[19] + s * dx) * scale, (p[20] + s * dy) * scale
-        xd, yd, a, b, c = distorted(p[5:10], xn, yn)
+        xd, yd, a, b, c = distort(p[5:10], xn, yn)
         w[_S + i], w[_DEPTH + i], w[_ALONG + i] = s, depth, other[0] * xd + other[1] * yd + other[2]
         is_regular = a * c - b * b > 0  # where the distortion of the projector is monotonic
         gx, gy = coded[0] * a + coded[1] * b, coded[0] * b + coded[1] * c
         # For a displaced stripe on the same sheet: position(o + s d) stays, so with the direction of the ray its depth
         # changes by ds = -s ∇position · dd / ∇position · d.
-        _, _, a, b, c = distorted(camera[5:10], x, y)
+        _, _, a, b, c = distort(camera[5:10], x, y)
         scale = s / (a * c - b * b) if is_regular else np.nan
         across, down = (w[_NX + i] - camera[1] / camera[3] * w[_NY + i]) / camera[0], w[_NY + i] / camera[3]
         mx, my = (c * across - b * down) * scale, (a * down - b * across) * scale

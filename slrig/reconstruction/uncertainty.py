@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slrig.errors import CalibrationError
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import DEVICE_PARAMETERS, Axis, Calibration, FloatArray, IntArray, Pinhole, Source
-from slrig.model.lens_kernels import by_terms, distorted
+from slrig.model.lens_kernels import distort, distortion_by_terms
 from slrig.reconstruction.triangulation import optical_depths_mm, pack_device, to_device
 
 _EACH = DEVICE_PARAMETERS
@@ -28,7 +28,7 @@ def coordinate_gradient(d: Any, a: float, b: float, x: float, y: float, z: float
     """Fill out (3,) with ∂(a u + b v)/∂X, X in the world."""
     xc, yc, zc = to_device(d, x, y, z)
     xn, yn = xc / zc, yc / zc
-    _, _, xx, xy, yy = distorted(d[5:10], xn, yn)
+    _, _, xx, xy, yy = distort(d[5:10], xn, yn)
     by_x, by_y = a * d[0], a * d[1] + b * d[3]
     gx, gy = (by_x * xx + by_y * xy) / zc, (by_x * xy + by_y * yy) / zc
     gz = -(gx * xn + gy * yn)
@@ -41,13 +41,13 @@ def add_parameters(d: Any, a: float, b: float, x: float, y: float, z: float, out
     """Add the derivatives of a u + b v by the device's 15 parameters to out (15,)."""
     xc, yc, zc = to_device(d, x, y, z)
     xn, yn = xc / zc, yc / zc
-    xd, yd, xx, xy, yy = distorted(d[5:10], xn, yn)
+    xd, yd, xx, xy, yy = distort(d[5:10], xn, yn)
     by_x, by_y = a * d[0], a * d[1] + b * d[3]
     out[0] += a * xd
     out[1] += b * yd
     out[2] += a
     out[3] += b
-    k1, k2, p1, p2, k3 = by_terms(by_x, by_y, xn, yn)
+    k1, k2, p1, p2, k3 = distortion_by_terms(by_x, by_y, xn, yn)
     out[4] += k1
     out[5] += k2
     out[6] += p1
@@ -71,7 +71,7 @@ def squared_image_motion(d: Any, size: Any, x: float, y: float, z: float, direct
     xc, yc, zc = to_device(d, x, y, z)
     if zc <= 0:
         return 0.0
-    xd, yd, xx, xy, yy = distorted(d[5:10], xc / zc, yc / zc)
+    xd, yd, xx, xy, yy = distort(d[5:10], xc / zc, yc / zc)
     u, v = d[0] * xd + d[1] * yd + d[2], d[3] * yd + d[4]
     # Beyond the radius at which its distortion stops rising, a lens images nothing.
     if not (-0.5 < u < size[0] - 0.5 and -0.5 < v < size[1] - 0.5 and xx * yy - xy * xy > 0):

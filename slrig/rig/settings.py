@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from slrig.capture import differ
+from slrig.capture import differs_from_request
 from slrig.devices import AppliedSettings, CameraSettings
 
 
@@ -30,8 +30,8 @@ class SettingsInUse:
         if self.applied is None:
             return ()
         asked, uses, told = self.asked, self.applied, []
-        if differ(uses.exposure_s, asked.exposure_s):
+        if differs_from_request(uses.exposure_s, asked.exposure_s):
             told.append(f"an exposure of {1e3 * asked.exposure_s:.4g} ms, and uses {1e3 * uses.exposure_s:.4g} ms")
-        if differ(uses.gain, asked.gain):
+        if differs_from_request(uses.gain, asked.gain):
             told.append(f"a gain of {asked.gain:.4g}, and uses {uses.gain:.4g}")
         return tuple(f"It was asked for {each}: write a value that it can use into the rig file." for each in told)

@@ -19,19 +19,19 @@ from typing import Generic, TypeVar
 import structlog
 
 from slrig.devices import (
-    USUAL,
+    DEFAULT_LIMITS,
     AppliedSettings,
     Camera,
     CameraInfo,
     CameraSettings,
+    DisplayedPattern,
     Positioner,
     Projector,
     ProjectorInfo,
     Rig,
-    Shown,
     Trigger,
     Turntable,
-    progress_heard,
+    listen_for_progress,
 )
 from slrig.errors import (
     DeviceBusyError,
@@ -130,7 +130,7 @@ class Calls:
             call.doing, call.since_s, call.late = doing, self._now_s(), 0
 
         try:
-            with progress_heard(heard):
+            with listen_for_progress(heard):
                 value = function()
         except SlrigError as error:
             # Whoever opens a device names it; and capture tells of a frame that did not come in words of its own.
@@ -299,7 +299,7 @@ class _GuardedProjector(_Guarded[Projector]):
     def load(self, sequence: PatternSequence) -> None:
         self._made("load", lambda: self._device.load(sequence))
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         return self._made("show", lambda: self._device.show(index))
 
     def play(self, exposure_s: float, period_s: float) -> None:
@@ -330,7 +330,7 @@ class GuardedPositioner:
 
     def close(self) -> None:
         """See `Positioner`."""
-        self._made("close", USUAL.call_s, self._positioner.close)
+        self._made("close", DEFAULT_LIMITS.call_s, self._positioner.close)
 
 
 class GuardedTurntable(GuardedPositioner):

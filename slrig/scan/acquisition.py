@@ -22,12 +22,11 @@ import structlog
 
 from slrig.bundle import BundleWriter, write_truth
 from slrig.bundle.sidecars import FOLDER, Refused, StageAngle, write_notes, write_stage
-from slrig.capture import SETTINGS_TOLERANCE, choose_triggers, whole_refreshes_s
+from slrig.capture import SETTINGS_TOLERANCE, choose_triggers, round_to_refresh_s
 from slrig.devices import Camera, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
 from slrig.jobs.frame_feed import FrameSink
-from slrig.model import Shot, Truth
-from slrig.model.header import CaptureHeader
+from slrig.model import CaptureHeader, Shot, Truth
 from slrig.rig.turn_count import CountedTurntable
 from slrig.scan.bracketing import Exposing
 from slrig.scan.plan import Progress, ScanPlan
@@ -272,7 +271,7 @@ def exposed(rig: Rig, plan: ScanPlan) -> tuple[Rig, tuple[float, ...], list[str]
             return asked_s
         why = f"whole periods of the projector ({refresh_s:.6g} s)"
         ranges_s = [camera.info.exposure_range_s for camera in cameras]
-        return instead(whole_refreshes_s(asked_s, refresh_s, ranges_s), asked_s, whose, why)
+        return instead(round_to_refresh_s(asked_s, refresh_s, ranges_s), asked_s, whose, why)
 
     own_s = {name: each.exposure_s for name, each in rig.settings.items()}
     exposures_s, every, factors = plan.rising_exposures_s, "every camera", sorted(plan.exposure_factors or ())

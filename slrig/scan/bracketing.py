@@ -16,15 +16,15 @@ from slrig.capture import (
     NOISE_FLOOR_DN,
     Evidence,
     EvidenceSummary,
-    ExposedSamples,
+    ExposureFault,
+    ExposureSamples,
+    ExposureVerdict,
     Sampler,
     Samples,
-    Unfit,
-    Verdict,
     bracket_summary,
     capture,
-    movement_between,
-    verdict,
+    detect_movement,
+    judge_exposure,
 )
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import ScanEvidenceError
@@ -75,9 +75,11 @@ class Exposing:
         self._tell = refused
         self._colour = colour
         self._formats = {name: camera.info.format for name, camera in rig.cameras.items()}
-        self._samplers = {name: Sampler.of(form.size) for name, form in self._formats.items()} if self._bracket else {}
+        self._samplers = (
+            {name: Sampler.from_size(form.size) for name, form in self._formats.items()} if self._bracket else {}
+        )
         self._runs: list[_Run] = []
-        self._compared: dict[str, ExposedSamples] = {}
+        self._compared: dict[str, ExposureSamples] = {}
         self._refused: list[Refused] = []
         self._done: set[tuple[float | None, int, str]] = set()
         self._begun_s: float | None = None
@@ -143,7 +145,7 @@ class Exposing:
                     raise self._placed(error, run) from error
                 self._leave_out(run, unfit)
                 taking = [name for name in taking if name not in unfit]
-                cameras[:] = [n for n in cameras if n not in unfit or unfit[n].unfit is not Unfit.TOO_BRIGHT]
+                cameras[:] = [n for n in cameras if n not in unfit or unfit[n].fault is not ExposureFault.TOO_BRIGHT]
                 continue
             self._compare(run, taking)
             # Whole images: nobody asks for them again.
@@ -209,18 +211,18 @@ class Exposing:
         self._refused.append(refused)
         self._tell(refused)
 
-    def _unfit(self, run: _Run, taking: Sequence[str]) -> dict[str, Verdict]:
+    def _unfit(self, run: _Run, taking: Sequence[str]) -> dict[str, ExposureVerdict]:
         """The cameras to which this exposure is of no use, and why."""
         if not self._bracket:
             return {}
-        found: dict[str, Verdict] = {}
+        found: dict[str, ExposureVerdict] = {}
         for name in taking:
             white, black = (self._end(run, name, kind) for kind in (White(), Black()))
             if white is None or black is None:
                 continue
-            told = verdict(white, black, self._formats[name])
+            told = judge_exposure(white, black, self._formats[name])
             # Light that a shorter exposure has seen cannot be too little for a longer one: then it went off.
-            if told is not None and (told.unfit is Unfit.TOO_BRIGHT or name not in self._compared):
+            if told is not None and (told.fault is ExposureFault.TOO_BRIGHT or name not in self._compared):
                 found[name] = told
         return found
 
@@ -228,12 +230,12 @@ class Exposing:
         index = self._sequence.patterns.index(kind) if kind in self._sequence.patterns else -1
         return run.ends.get((index, name))
 
-    def _leave_out(self, run: _Run, unfit: dict[str, Verdict]) -> None:
+    def _leave_out(self, run: _Run, unfit: dict[str, ExposureVerdict]) -> None:
         """Take back what there is of a sequence, and say why."""
         again = f"at {run.exposure_s:g} s, the sequence was begun again without camera {', '.join(unfit)}"
         for name, told in unfit.items():
-            longer = "; it was not exposed longer than that" if told.unfit is Unfit.TOO_BRIGHT else ""
-            cause = f"{run.exposure_s:g} s is {told.unfit} for camera '{name}': {told.words}{longer}"
+            longer = "; it was not exposed longer than that" if told.fault is ExposureFault.TOO_BRIGHT else ""
+            cause = f"{run.exposure_s:g} s is {told.fault} for camera '{name}': {told.description}{longer}"
             self._causes[name] = cause
             white = self._sequence.patterns.index(White())
             self._note(Refused(white, name, run.refused[white, name] + 1, cause, left_out=True))
@@ -252,10 +254,10 @@ class Exposing:
             return
         noises = run.evidence.summary().noise_dn
         for name in taking:
-            exposed = ExposedSamples(run.exposure_s or 0.0, run.samples[name], noises.get(name, NOISE_FLOOR_DN))
+            exposed = ExposureSamples(run.exposure_s or 0.0, run.samples[name], noises.get(name, NOISE_FLOOR_DN))
             before = self._compared.get(name)
             if before is not None:
-                fault = movement_between(before, exposed, self._sequence.patterns, self._formats[name].full_scale)
+                fault = detect_movement(before, exposed, self._sequence.patterns, self._formats[name].full_scale)
                 if fault is not None:
                     message = f"camera '{name}', {fault}"
                     raise ScanEvidenceError(message)

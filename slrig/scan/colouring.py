@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import AlbedoMark, Axis, LightMap, Mesh, Pinhole, Refusal, Source
-from slrig.model.surfaces import srgb_of
+from slrig.model import AlbedoMark, Axis, LightMap, Mesh, Pinhole, Refusal, Source, linear_to_srgb
 from slrig.reconstruction import (
     BRIGHT_ALBEDO,
     BRIGHT_PERCENT,
@@ -59,7 +58,7 @@ def coloured(
         channels = max(view.contrast.shape[2] for view in views)
         shares = None if light is None else light.light(places_px(curves, axis), projector.size, channels)
         found = estimate_albedo(points, views, projector.centre_mm, light=shares)
-    colour = srgb_of(found.value)
+    colour = linear_to_srgb(found.value)
     colour[found.mark == AlbedoMark.UNKNOWN] = _NEUTRAL
     return Coloured(np.repeat(colour, 3, axis=1) if colour.shape[1] == 1 else colour, found.mark, found)
 

@@ -19,7 +19,7 @@ from slrig.bundle.reading import read_capture
 from slrig.bundle.storage import write_file
 from slrig.disk import refusals_of
 from slrig.errors import PatternError, setting
-from slrig.model import Axis, Capture, Gray, Refusal, without_missing_bits
+from slrig.model import Axis, Capture, Gray, Refusal, trim_incomplete_codes
 from slrig.patterns import cell_positions, index_of_word
 from slrig.reconstruction import (
     AxisFrames,
@@ -95,7 +95,7 @@ def decode_bundle(bundle: Path, output: Path) -> tuple[list[Decoded], tuple[str,
     InvalidInputError, StorageError
         `output` holds something else, or the disk refused.
     """
-    capture, cut_short = without_missing_bits(read_capture(bundle))
+    capture, cut_short = trim_incomplete_codes(read_capture(bundle))
     axes = [axis for axis in Axis if any(isinstance(p, Gray) and p.axis is axis for p in capture.patterns)]
     if not axes:
         message = f"{bundle}: no Gray-code frames: nothing can be decoded"

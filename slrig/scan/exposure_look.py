@@ -11,7 +11,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from slrig.capture import Evidence, Sampler, capture, whole_refreshes_s
+from slrig.capture import Evidence, Sampler, capture, round_to_refresh_s
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import RigBusyError, UnsupportedByDeviceError
 from slrig.jobs.job import Holder, Job
@@ -45,7 +45,7 @@ class Looking:
     def __init__(self, rig: Rig, *, cancelled: Callable[[], bool]) -> None:
         self._rig = rig
         self._cancelled = cancelled
-        self._samplers = {name: Sampler.of(camera.info.format.size) for name, camera in rig.cameras.items()}
+        self._samplers = {name: Sampler.from_size(camera.info.format.size) for name, camera in rig.cameras.items()}
         self._looks: dict[float, Mapping[str, Look]] = {}
         self._refused_shorter = False
         self.overheads_s: list[float] = []
@@ -92,7 +92,7 @@ class Looking:
         ranges_s = [camera.info.exposure_range_s for camera in self._rig.cameras.values()]
         least_s, most_s = max(low for low, _ in ranges_s), min(LONGEST_S, *(high for _, high in ranges_s))
         within_s = min(max(exposure_s, least_s), most_s)
-        return whole_refreshes_s(within_s, self._rig.projector.info.refresh_s, ranges_s)
+        return round_to_refresh_s(within_s, self._rig.projector.info.refresh_s, ranges_s)
 
     def _take(self, exposure_s: float) -> None:
         rig, size = self._rig, self._rig.projector.info.size

@@ -16,7 +16,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture import LEAST_CLEAR, LEAST_CLEAR_DN, NEARLY_FULL, Chosen, Samples
+from slrig.capture import MIN_CONTRAST_DN, MIN_CONTRAST_TO_NOISE, NEAR_SATURATION, SampleMask, Samples
 from slrig.errors import ConfigError
 from slrig.reconstruction import NoiseModel, fit_noise
 
@@ -24,7 +24,7 @@ DECODED_CLEAR = 7.0
 """Noises that white lies above black where a pixel is decoded. On dark and mixed rendered reliefs, at nine exposures,
 the share of pixels beyond it and that of the surface that the mesh covers to 0.3 mm differ by 0.08 at most.
 """
-WELL_CLEAR = 2 * LEAST_CLEAR
+WELL_CLEAR = 2 * MIN_CONTRAST_TO_NOISE
 """Noises where an exposure covers well: twice what one of a bracket has to show to count."""
 
 _MOST_EXPOSURES = 4  # six are allowed; of what is measured here more than four gained nothing
@@ -57,43 +57,43 @@ class SeenObject:
     full_scale: int
     noise: NoiseModel
     dark_dn: float
-    lit: Chosen
+    lit: SampleMask
 
-    def at(self, exposure_s: float) -> tuple[Samples, Samples, Chosen]:
+    def at(self, exposure_s: float) -> tuple[Samples, Samples, SampleMask]:
         """White and black (n,) as they would be at an exposure, and which pixels white saturates."""
         shape = self.lit.shape
         white, black, known = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
         # The nearest look that is not saturated knows best.
         for look in sorted(self.looks, key=lambda look: abs(math.log(exposure_s / look.exposure_s))):
-            use = ~known & (look.white.max(axis=0) < NEARLY_FULL * self.full_scale)
+            use = ~known & (look.white.max(axis=0) < NEAR_SATURATION * self.full_scale)
             gain = np.float32(exposure_s / look.exposure_s)
             for seen, frames in ((white, look.white), (black, look.black)):
                 seen[use] = self.dark_dn + gain * (frames.mean(axis=0)[use] - self.dark_dn)
             known |= use
-        return white, black, ~known | (white >= NEARLY_FULL * self.full_scale)
+        return white, black, ~known | (white >= NEAR_SATURATION * self.full_scale)
 
-    def clearness(self, exposure_s: float) -> tuple[NDArray[np.float32], Chosen]:
+    def clearness(self, exposure_s: float) -> tuple[NDArray[np.float32], SampleMask]:
         """(n,) how many of its own noises white lies above black at an exposure, 0 where it is saturated or rounding
         hides it; and which pixels are saturated.
         """
         white, black, saturated = self.at(exposure_s)
         contrast = white - black
         clear = contrast / np.sqrt(self.noise.variance(white) + self.noise.variance(black))
-        return np.where(saturated | (contrast < LEAST_CLEAR_DN), np.float32(0), clear), saturated
+        return np.where(saturated | (contrast < MIN_CONTRAST_DN), np.float32(0), clear), saturated
 
 
 def seen_object(looks: Sequence[Look], full_scale: int) -> SeenObject:
     """Sum up the looks of one camera, one at least, in any order."""
     rising = tuple(sorted(looks, key=lambda look: look.exposure_s))
     noise = fit_noise(_noise_samples(look, full_scale) for look in rising)
-    shape, full = rising[0].white.shape[1], NEARLY_FULL * full_scale
+    shape, full = rising[0].white.shape[1], NEAR_SATURATION * full_scale
     # DN per second; of what every look saturates so much is known.
     lit, rate = np.zeros(shape, np.bool_), np.full(shape, full / rising[0].exposure_s)
     for look in rising:
         white, black = look.white.mean(axis=0), look.black.mean(axis=0)
         # Two of each were taken.
         spread = np.sqrt((noise.variance(white) + noise.variance(black)) / 2)
-        lit |= (white - black > np.maximum(LEAST_CLEAR_DN, 6 * spread)) | ((white >= full) & (black < full))
+        lit |= (white - black > np.maximum(MIN_CONTRAST_DN, 6 * spread)) | ((white >= full) & (black < full))
         np.divide(white - black, look.exposure_s, out=rate, where=white < full)
     if lit.any():
         lit &= rate >= _FAINT * np.median(rate[lit])
@@ -108,7 +108,7 @@ def _noise_samples(look: Look, full_scale: int) -> tuple[NDArray[np.float32], ND
     for first, second in (look.white, look.black):
         level = (first + second) / 2
         beside = np.roll(level, len(level) // 2)
-        inside = (np.minimum(first, second) > 0) & (np.maximum(level, beside) < NEARLY_FULL * full_scale)
+        inside = (np.minimum(first, second) > 0) & (np.maximum(level, beside) < NEAR_SATURATION * full_scale)
         # Whole numbers have a coarse median; spread over the interval that each stands for, they have a fine one.
         change = (first - second)[inside]
         change += np.random.default_rng(0).uniform(-0.5, 0.5, len(change)).astype(np.float32)
@@ -122,7 +122,7 @@ def _dark_dn(rising: Sequence[Look], full_scale: int) -> float:
     if len(rising) < 2:
         return 0.0
     short, long = rising[0], rising[-1]
-    inside = long.black.max(axis=0) < NEARLY_FULL * full_scale
+    inside = long.black.max(axis=0) < NEAR_SATURATION * full_scale
     if not inside.any():
         return 0.0
     slope = (long.black - short.black).mean(axis=0)[inside] / (long.exposure_s - short.exposure_s)

@@ -6,7 +6,15 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from math import asin, degrees
 
 from slrig.errors import PatternError, setting
-from slrig.model import LEAST_SHARE, Axis, Calibration, Pinhole, share_across, told_depth, triangulated_axis
+from slrig.model import (
+    MIN_BASELINE_FRACTION,
+    Axis,
+    Calibration,
+    Pinhole,
+    baseline_fraction,
+    depth_sensitive_cameras,
+    triangulated_axis,
+)
 
 _NEXT_TO_NONE = 0.01
 FAIR_SHARE = 0.5
@@ -56,7 +64,7 @@ def chosen_axis(shown: Collection[Axis], cameras: Sequence[Pinhole], projector: 
     if len(shown) != 1:
         return triangulated_axis(cameras, projector)
     (axis,) = shown
-    if projector is not None and share_across(axis, cameras, projector) < LEAST_SHARE:
+    if projector is not None and baseline_fraction(axis, cameras, projector) < MIN_BASELINE_FRACTION:
         where = "above or below" if axis is Axis.COLUMN else "beside"
         message = (
             f"expected patterns across the baseline, found those of {axis}s alone: the camera stands {where} the "
@@ -82,7 +90,7 @@ def left_out_notes(axis: Axis, cameras: Mapping[str, Pinhole], projector: Pinhol
     """One sentence for each camera that the axis tells no depth, where it tells others."""
     if projector is None:
         return []
-    told = told_depth(axis, list(cameras.values()), projector)
+    told = depth_sensitive_cameras(axis, list(cameras.values()), projector)
     return [
         f"camera '{name}' is left out: its baseline to the projector lies along the {axis}s of light, which tell it no "
         "depth; the other cameras measure by them"

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from slrig.errors import CalibrationError
-from slrig.model import AlbedoMark, Calibration, LightMap
-from slrig.model.rig import light_axes
+from slrig.model import AlbedoMark, Calibration, LightMap, light_map_coordinates
 from slrig.scan.colouring import coloured, places_px
 from slrig.scan.measured import Entered, measured
 
@@ -43,7 +42,9 @@ def with_light_map(bundle: Path, entered: Entered) -> Calibration:
     places = places_px(curves, walked.axis)
     value, good = seen.found.value, (seen.mark == AlbedoMark.NONE) & (seen.found.value > 0).all(axis=1)
     # Of each cell of the image: the mean place, and the mean logarithm of what the board sends back.
-    column, row = (np.clip((light_axes(places[good], projector.size) + 1) / 2, 0, 0.9999) * _CELLS).astype(int)
+    column, row = (np.clip((light_map_coordinates(places[good], projector.size) + 1) / 2, 0, 0.9999) * _CELLS).astype(
+        int
+    )
     cell = row * _CELLS + column
     counts = np.bincount(cell, minlength=_CELLS**2)
     known = counts >= _LEAST_POINTS
@@ -52,7 +53,7 @@ def with_light_map(bundle: Path, entered: Entered) -> Calibration:
         for values in (places, np.log(np.maximum(value, 1e-9)))
     )
     powers = np.array([(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)])
-    terms = np.prod(light_axes(middles, projector.size).T[:, None] ** powers, axis=2)
+    terms = np.prod(light_map_coordinates(middles, projector.size).T[:, None] ** powers, axis=2)
     fitted = np.linalg.lstsq(terms, logs, rcond=None)[0]
     uneven = float(np.sqrt(((logs - terms @ fitted) ** 2).mean())) if known.any() else np.inf
     saturated = float((seen.mark == AlbedoMark.SATURATED).mean())

@@ -1,6 +1,6 @@
 """From the frames of a scan to triangulated points, by the axis of light that tells most of depth.
 
-Where both axes were played the calibration names one of them (`slrig.model.rig`). What the frames hold may speak
+Where both axes were played the calibration names one of them (`slrig.model.geometry`). What the frames hold may speak
 for the other: the projector stands otherwise than was assumed, or the camera resolves its patterns better. Where the
 first axis is weak both are tried, and the one that decodes more pixels to a smaller error is used.
 """
@@ -18,10 +18,9 @@ from slrig.bundle.calibration import check_rays
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION, BundleFiles, open_bundle
 from slrig.bundle.sidecars import read_refused
-from slrig.capture import Evidence, EvidenceSummary, check_exposures, judged_frames
+from slrig.capture import Evidence, EvidenceSummary, check_exposures, checked_frames
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
-from slrig.model import LEAST_SHARE, Axis, Calibration, Region, Shot, without_missing_bits
-from slrig.model.header import CaptureHeader
+from slrig.model import MIN_BASELINE_FRACTION, Axis, Calibration, CaptureHeader, Region, Shot, trim_incomplete_codes
 from slrig.reconstruction import exposure_count
 from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.coverage import require_surface
@@ -90,7 +89,7 @@ def measured(
     best.notes.extend(left_out_notes(best.axis, {seen.name: seen.device for seen in best.seen}, best.devices.projector))
     words = weakness(best.axis, best.shown, found.share_across)
     if words is not None:
-        if found.share_across < LEAST_SHARE:
+        if found.share_across < MIN_BASELINE_FRACTION:
             message = f"{folder}: {words}"
             raise NothingToReconstructError(message)
         best.notes.append(words)
@@ -213,7 +212,7 @@ def _walked(
             message = f"{folder}: {cause}"
             raise PatternError(message) from cause
     sections = capture_report(stream.header, stream.axis, evidence)
-    step, cell = (each(stream.header.shown, stream.axis) for each in (step_px, cell_px))
+    step, cell = (each(stream.header.displayed_patterns, stream.axis) for each in (step_px, cell_px))
     notes = [
         *cut_short,
         *capture_notes(stream.header, stream.axis, evidence),
@@ -237,28 +236,33 @@ def _streamed(
     missing bit gives other patterns, are read first. proven : what the frames proved as they were captured.
     """
     refused = read_refused(files.folder)
-    capture, cut_short = without_missing_bits(files.outline)
+    capture, cut_short = trim_incomplete_codes(files.outline)
     exposures = [{shot.exposure_s for shot in capture.shots if shot.camera == name} for name in capture.cameras]
     one_exposure = all(exposure_count(each) <= 1 for each in exposures)
-    judged = judged_frames(capture)
+    judged = checked_frames(capture)
     others = sorted(set(range(len(capture.shots))) - set(judged))
     order = [i for name in capture.cameras for i in (*judged, *others) if capture.shots[i].camera == name]
     if cut_short or not one_exposure:
         every = tuple(files.shots(range(len(files.outline.shots))))
-        capture, _ = without_missing_bits(replace(files.outline, shots=every))
+        capture, _ = trim_incomplete_codes(replace(files.outline, shots=every))
         shots: Iterable[Shot] = [capture.shots[index] for index in order]
         proven = None  # of other patterns, or of each exposure by itself
     else:
         shots = files.shots(order)
     stream = ScanStream(
-        CaptureHeader.of(capture), devices, entered=entered, axis=axis, one_exposure=one_exposure, region=region
-    )  # fmt: skip
+        CaptureHeader.from_capture(capture),
+        devices,
+        entered=entered,
+        axis=axis,
+        one_exposure=one_exposure,
+        region=region,
+    )
     evidence = Evidence(capture.patterns, capture.cameras, refused)
     for index, shot in zip(order, shots, strict=True):
         stream.take(shot)
         if proven is None and one_exposure and index in judged:
             entered("check frames", shot.camera)
-            evidence.contradictions(shot)
+            evidence.add_shot(shot)
         entered("read bundle", shot.camera)
     if proven is None:
         proven = evidence.summary() if one_exposure else check_exposures(capture, refused)

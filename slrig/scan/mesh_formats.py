@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import FloatArray, Mesh
-from slrig.model.surfaces import light_of
+from slrig.model import FloatArray, Mesh, srgb_to_linear
 from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, Part, encode_glb
 
 _MOST_ROWS = 2**15  # rows that are worked on together: they stay in the processor's cache
@@ -32,7 +31,7 @@ def encode_mesh_glb(mesh: Mesh) -> bytes:
     positions = np.ascontiguousarray(mesh.vertices_mm, dtype="<f4")
     # Three components of two bytes would not end on a multiple of four.
     opaque = np.full((len(mesh.colour), 4), 2**16 - 1, dtype="<u2")
-    opaque[:, :3] = light_of(mesh.colour)
+    opaque[:, :3] = srgb_to_linear(mesh.colour)
     parts = []
     if len(positions):
         ends = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing import merge_depth_buffers
 from slrig.model import IntArray, Mesh, Pinhole
-from slrig.model.lens_kernels import distorted, undistorted
+from slrig.model.lens_kernels import distort, undistort
 from slrig.reconstruction import CONVERGED, distorted_from_pixel, pack_device, project
 
 NO_SURFACE = "no_surface"
@@ -100,9 +100,9 @@ def _sighted(first: int, last: int, d: Any, sight: Any) -> None:
         for column in range(sight.shape[1]):
             xd, yd = distorted_from_pixel(d, column, row)
             # As far from the last pixel as that was from the one before: one step of Newton's method is then enough.
-            nextx, nexty = undistorted(d[5:10], xd, yd, x + dx, y + dy, CONVERGED)
+            nextx, nexty = undistort(d[5:10], xd, yd, x + dx, y + dy, CONVERGED)
             if np.isnan(nextx):
-                nextx, nexty = undistorted(d[5:10], xd, yd, xd, yd, CONVERGED)
+                nextx, nexty = undistort(d[5:10], xd, yd, xd, yd, CONVERGED)
             dx, dy = (nextx - x, nexty - y) if not np.isnan(x) else (0.0, 0.0)
             x, y = nextx, nexty
             sight[row, column, 0], sight[row, column, 1] = x, y
@@ -179,7 +179,7 @@ def _box(d: Any, a: Any, b: Any, c: Any, pa: Any, pb: Any, pc: Any, wide: int, h
 @kernel_part
 def _sagitta(d: Any, a: Any, b: Any, pa: Any, pb: Any) -> Any:
     """How far, in pixels, the picture of the edge from a to b runs beside the middle of its chord."""
-    xd, yd, _, _, _ = distorted(d[5:10], (a[0] / a[2] + b[0] / b[2]) / 2, (a[1] / a[2] + b[1] / b[2]) / 2)
+    xd, yd, _, _, _ = distort(d[5:10], (a[0] / a[2] + b[0] / b[2]) / 2, (a[1] / a[2] + b[1] / b[2]) / 2)
     across = abs(d[0] * xd + d[1] * yd + d[2] - (pa[0] + pb[0]) / 2)
     return max(across, abs(d[3] * yd + d[4] - (pa[1] + pb[1]) / 2))
 

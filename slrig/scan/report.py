@@ -18,6 +18,7 @@ from slrig.meshing import MeshStage, SurfaceMesh
 from slrig.model import (
     Axis,
     Calibration,
+    CaptureHeader,
     FloatArray,
     LineShift,
     Mesh,
@@ -25,10 +26,9 @@ from slrig.model import (
     PointCurves,
     Refusal,
     Size,
-    Solved,
+    SolveRecord,
     Source,
 )
-from slrig.model.header import CaptureHeader
 from slrig.reconstruction import CameraCurves, ExposureUse, MergedCurves, PairRedundancy, Redundancy
 from slrig.scan.artefacts import REPORT_FORMAT
 
@@ -203,7 +203,7 @@ def capture_report(capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary
 
 
 def _has_lines(capture: CaptureHeader, axis: Axis) -> bool:
-    return any(isinstance(pattern, LineShift) and pattern.axis is axis for pattern in capture.shown)
+    return any(isinstance(pattern, LineShift) and pattern.axis is axis for pattern in capture.displayed_patterns)
 
 
 def capture_notes(capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary) -> list[str]:
@@ -257,7 +257,7 @@ def calibration_report(
     return report if words is None else {**report, "age_absent": words}
 
 
-def _age(solved: Solved, bundle: Path) -> tuple[float | None, str | None]:
+def _age(solved: SolveRecord, bundle: Path) -> tuple[float | None, str | None]:
     """Days from the solve to the capture, or None with the reason."""
     captured_at = read_description(bundle).captured_at
     if captured_at is None:

@@ -20,6 +20,7 @@ from slrig.model import (
     Black,
     Calibration,
     Capture,
+    CaptureHeader,
     Gray,
     LineShift,
     Pattern,
@@ -33,7 +34,6 @@ from slrig.model import (
     White,
     exposure_groups,
 )
-from slrig.model.header import CaptureHeader
 from slrig.patterns import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction import (
     NEAR_SATURATION,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import setting
 from slrig.meshing import runs_of_curve_parts
-from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Region, share_across, told_depth
+from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Region, baseline_fraction, depth_sensitive_cameras
 from slrig.reconstruction import (
     CameraCurves,
     MergedCurves,
@@ -65,7 +65,9 @@ def triangulated(
     if projector is not None:
         met = [
             _on_sheets(seen, projector, axis, told=told)
-            for seen, told in zip(cameras, told_depth(axis, list(devices.values()), projector), strict=True)
+            for seen, told in zip(
+                cameras, depth_sensitive_cameras(axis, list(devices.values()), projector), strict=True
+            )
         ]
         told = [
             replace(seen, curves=replace(seen.curves, refusal=_with_left_out(seen.curves, part, cause)))
@@ -78,7 +80,9 @@ def triangulated(
         gap = widest_gap_px(projector, axis)
         spare = evaluate_redundancy(parts, devices, axis, widest_gap_px=gap)
         joined = merge_curves(parts, projector.centre_mm, widest_gap_px=gap)
-        return Triangulated(joined, spare, _without_points(told), share_across(axis, list(devices.values()), projector))
+        return Triangulated(
+            joined, spare, _without_points(told), baseline_fraction(axis, list(devices.values()), projector)
+        )
     first, *others = cameras
     mine = first.curves.ensemble
     crossing = [stripe_crossing(mine, first.device, seen.device) for seen in others]

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import FloatArray, Mesh
-from slrig.model.surfaces import light_of
+from slrig.model import FloatArray, Mesh, srgb_to_linear
 from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, Part, encode_glb
 
 SIGMA_STEP_MM = 1e-4
@@ -55,7 +54,7 @@ def encode_view_glb(mesh: Mesh) -> bytes:
         normals[:, :3] = np.rint(mesh.normals * np.float32(127))
         parts.append(Part("NORMAL", normals, "VEC3", {"normalized": True}))
     colours = np.full((count, 4), _MOST, dtype="<u2")
-    colours[:, :3] = light_of(mesh.colour)
+    colours[:, :3] = srgb_to_linear(mesh.colour)
     sigma, stripe = np.zeros((count, 2), dtype="<u2"), np.zeros((count, 2), dtype="<u2")
     sigma[:, 0] = np.fmin(np.rint(mesh.sigma_mm / np.float32(SIGMA_STEP_MM)), _MOST)
     # A negative number, read without its sign, is a great one.

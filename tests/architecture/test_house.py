@@ -233,8 +233,8 @@ def dangling(source: Source) -> Iterator[str]:
 
 def test_dotted_names_in_docstrings_exist() -> None:
     assert exists(["slrig", "model", "Pinhole"])
-    assert exists(["slrig", "model", "rig", "Pinhole", "centre_mm"])
-    assert not exists(["slrig", "model", "rig", "Pinhole", "center_mm"])
+    assert exists(["slrig", "model", "geometry", "Pinhole", "centre_mm"])
+    assert not exists(["slrig", "model", "geometry", "Pinhole", "center_mm"])
     assert not exists(["slrig", "no_room"])
     assert [each for source in SOURCES.values() for each in dangling(source)] == []
 

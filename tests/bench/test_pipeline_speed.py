@@ -26,7 +26,7 @@ from slrig.capture.verifier import check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, Mesh, Region
-from slrig.model.header import CaptureHeader
+from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.measured import Walked
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
@@ -90,7 +90,7 @@ class Run:
         capture, folder = recorded.capture, recorded.folder
         began = time.perf_counter()
         cpu = time.process_time()
-        header, region = CaptureHeader.of(capture), plan.region
+        header, region = CaptureHeader.from_capture(capture), plan.region
         stream = ScanStream(header, calibration, entered=lambda stage, _camera: watch.enter(stage), region=region)
         taken_s: list[float] = []
         for shot in capture.shots:
@@ -100,7 +100,7 @@ class Run:
         all_in = time.perf_counter()
         seen = stream.finish()
         watch.enter("triangulate")
-        step, cell = (each(stream.header.shown, stream.axis) for each in (step_px, cell_px))
+        step, cell = (each(stream.header.displayed_patterns, stream.axis) for each in (step_px, cell_px))
         found = triangulated(seen, calibration.projector, stream.axis, region)
         walked = Walked(calibration, stream.axis, stream.header.axes, seen, step, cell, {}, [])
         meshed = _meshed(folder, found, walked, plan, lambda stage, _fraction, _detail: watch.enter(stage))

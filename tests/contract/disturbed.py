@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from drivers.opencv import open_camera as open_opencv_camera
-from slrig.devices import Camera, CameraSettings, Head, Rig
+from slrig.devices import Camera, CameraSettings, Rig, ScannerHead
 from slrig.model import PatternSequence, Pixels, Size
 from tests.contract import (
     depthai_bench,
@@ -43,7 +43,7 @@ PROMISED = pytest.mark.realtime
 class Disturbed:
     """A device and its driver. `stage` is what the cameras see; of a gain of 1 if not told otherwise."""
 
-    open_head: Callable[[], Head]
+    open_head: Callable[[], ScannerHead]
     stage: Stage
     sequence: PatternSequence
     exposure_s: float

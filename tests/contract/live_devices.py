@@ -15,9 +15,9 @@ from slrig.devices import (
     CameraInfo,
     CameraSettings,
     CameraState,
+    DisplayedPattern,
     ProjectorInfo,
     Rig,
-    Shown,
     Trigger,
 )
 from slrig.errors import FrameTimeoutError
@@ -43,7 +43,7 @@ class LiveDisplay(StagedProjector):
         refresh_s = self.refresh_ns / 1e9
         return replace(super().info, latency_s=2 * UNMEASURED_S + 2 * refresh_s, refresh_s=refresh_s)
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`. Waits for the next refresh."""
         flip_ns = self._flip(self._state.require_pattern(index).profiles[index])
         t_visible_ns, t_err_ns = whole_light(
@@ -52,7 +52,7 @@ class LiveDisplay(StagedProjector):
             latency_s=UNMEASURED_S,
             latency_error_s=UNMEASURED_S,
         )
-        return Shown(index, t_visible_ns, t_err_ns)
+        return DisplayedPattern(index, t_visible_ns, t_err_ns)
 
     def blank(self) -> None:
         if not self._state.closed.is_set():

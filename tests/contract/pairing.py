@@ -15,7 +15,7 @@ from slrig.bundle.sidecars import Refused
 from slrig.capture.frame_checks import Contradiction
 from slrig.capture.sequencer import capture
 from slrig.capture.verifier import Evidence
-from slrig.devices import Head, Projector, ProjectorInfo, Rig, Shown
+from slrig.devices import DisplayedPattern, Projector, ProjectorInfo, Rig, ScannerHead
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
 from slrig.model import Pattern, PatternSequence, Pixels, Shot
 from tests.contract.suite import rig_of
@@ -75,7 +75,7 @@ class IdlingProjector:
     def info(self) -> ProjectorInfo:
         return self._projector.info
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         self._gaps.idle()
         return self._projector.show(index)
 
@@ -89,7 +89,7 @@ class Unproven(Evidence):
 
 
 def wrong_pairings(
-    open_rig: Callable[[], Rig | Head],
+    open_rig: Callable[[], Rig | ScannerHead],
     sequence: PatternSequence,
     expected: Expected,
     *,
@@ -174,7 +174,7 @@ class Truths:
         return None
 
 
-def seen_by(open_rig: Callable[[], Rig | Head], sequence: PatternSequence) -> Expected:
+def seen_by(open_rig: Callable[[], Rig | ScannerHead], sequence: PatternSequence) -> Expected:
     """What an undisturbed instrument of the same kind sees: the truth for those that make their own pictures."""
     opened = open_rig()
     rig = opened if isinstance(opened, Rig) else rig_of(opened)

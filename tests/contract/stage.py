@@ -7,7 +7,7 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.devices import Clock, DisplayedPattern, ProjectorInfo, ProjectorState, SystemClock
 from slrig.model import CameraFormat, PatternSequence, Pixels
 from tests.unit.capture.fake_rig import Scene
 
@@ -119,10 +119,10 @@ class StagedProjector:
         self.blank()
         self._state.loaded = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         at_ns = self._stage.show(self._state.require_pattern(index).profiles[index])
         self._stage.clock.wait_until(at_ns + self._err_ns, self._state.closed)
-        return Shown(index, at_ns, self._err_ns)
+        return DisplayedPattern(index, at_ns, self._err_ns)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         self._state.refuse_to_play(exposure_s, period_s)

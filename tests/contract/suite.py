@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from slrig.conformance import Examination
 from slrig.conformance.bench import usual_settings
-from slrig.devices import Camera, Clock, Head, KeepsTime, Projector, Rig, SystemClock
+from slrig.devices import Camera, Clock, HasClock, Projector, Rig, ScannerHead, SystemClock
 from slrig.model import Calibration, PatternSequence, Size, Truth
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract.stage import Stage
@@ -25,12 +25,12 @@ class Bench:
     lets go of what stands below the driver.
     """
 
-    open_head: Callable[[], Head]
+    open_head: Callable[[], ScannerHead]
     sequence: PatternSequence
     end: Callable[[], object] = lambda: None
 
     @contextmanager
-    def head(self) -> Iterator[Head]:
+    def head(self) -> Iterator[ScannerHead]:
         head = self.open_head()
         try:
             yield head
@@ -49,15 +49,15 @@ def sequence_for(projector: Size) -> PatternSequence:
     return encode(patterns_for(projector), projector)
 
 
-def close(head: Head) -> None:
+def close(head: ScannerHead) -> None:
     head.projector.close()
     for camera in head.cameras.values():
         camera.close()
 
 
-def rig_of(head: Head) -> Rig:
+def rig_of(head: ScannerHead) -> Rig:
     settings = {name: usual_settings(camera) for name, camera in head.cameras.items()}
-    clock = head.clock if isinstance(head, KeepsTime) else SystemClock()
+    clock = head.clock if isinstance(head, HasClock) else SystemClock()
     return Rig("bench", head.cameras, head.projector, settings, head.calibration, head, clock=clock)
 
 

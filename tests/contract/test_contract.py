@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from slrig.conformance import CHECKS, Check, Examination, Outcome
-from slrig.devices import Camera, Head, KeepsTime, Projector
+from slrig.devices import Camera, HasClock, Projector, ScannerHead
 from tests.contract.benches import BENCHES, picamera2
 from tests.contract.suite import Bench
 
@@ -50,7 +50,7 @@ def recording(target: object, protocol: type, asked: set[str], **instead: Callab
 
         return property(get)
 
-    kept = {"clock": target.clock} if isinstance(target, KeepsTime) else {}
+    kept = {"clock": target.clock} if isinstance(target, HasClock) else {}
     return type("Recording", (), {**kept, **{name: property_of(name) for name in members(protocol)}})()
 
 
@@ -58,17 +58,21 @@ def test_the_suite_uses_every_member_of_the_protocols(tmp_path: Path) -> None:
     plain = picamera2(tmp_path)
     asked: set[str] = set()
 
-    def open_head() -> Head:
+    def open_head() -> ScannerHead:
         def noted(cameras: Mapping[str, Camera]) -> Mapping[str, Camera]:
             return {name: recording(camera, Camera, asked) for name, camera in cameras.items()}
 
         head = recording(
-            plain.open_head(), Head, asked, cameras=noted, projector=lambda found: recording(found, Projector, asked)
+            plain.open_head(),
+            ScannerHead,
+            asked,
+            cameras=noted,
+            projector=lambda found: recording(found, Projector, asked),
         )
-        return cast("Head", head)
+        return cast("ScannerHead", head)
 
     with Bench(open_head, plain.sequence).examination() as examination:
         for check in CHECKS:
             assert examination.judge(check).outcome in {Outcome.PASSED, Outcome.NOT_APPLICABLE}, check.name
-    protocols = (Camera, Projector, Head)
+    protocols = (Camera, Projector, ScannerHead)
     assert asked == {f"{protocol.__name__}.{name}" for protocol in protocols for name in members(protocol)}

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from drivers import opencv, v4l2
-from slrig.devices import Camera, ProjectorInfo, Shown
+from slrig.devices import Camera, DisplayedPattern, ProjectorInfo
 from slrig.model import Pixels, Size
 from tests.contract.guest.vivid import Control, Node, Output, nodes
 from tests.contract.stage import Stage, StagedProjector
@@ -70,11 +70,11 @@ class LoopedProjector(StagedProjector):
         """See `Projector`. It changes at the next frame of its signal."""
         return replace(super().info, latency_s=1 / 60)
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         profile = self._state.require_pattern(index).profiles[index]
         with self._lock:
             at_ns = self._output.show(expected(profile).tobytes())
-        return Shown(index, at_ns, _CUT_NS)
+        return DisplayedPattern(index, at_ns, _CUT_NS)
 
     def blank(self) -> None:
         if not self._state.closed.is_set():

@@ -83,11 +83,11 @@ def test_the_patterns_of_a_program_light_what_slrig_says(program: str) -> None:
 def test_opencv_itself_shows_these_patterns(size: Size) -> None:
     if not hasattr(cv2, "structured_light"):
         pytest.skip("needs OpenCV's extra modules: pip install opencv-contrib-python-headless")
-    from slrig.importers.captures import Code, opencv_sequence
+    from slrig.importers.captures import ProjectorCode, opencv_sequence
 
     made, images = cv2.structured_light.GrayCodePattern.create(size.width_px, size.height_px).generate()
     assert made
-    ours = encode(opencv_sequence(Code(size), len(images), (), ends_first=False), size)
+    ours = encode(opencv_sequence(ProjectorCode(size), len(images), (), references_first=False), size)
     for index, image in enumerate(images):
         assert (ours.image(index) == image).all(), index
 
@@ -170,7 +170,7 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     refused(whole, projector="1280x800", says=[count, "found 34"])
     refused(whole, "--pattern", "white black columns", says=["expected 18 images", "found 34"])
     refused(whole, "--pattern", "white, black, columns, rows", says=["expected white, and 01.png black"])
-    refused(whole, "--format", "slstudio", says=["expected 10, 8, 16 images", "phase shifts are not read"])
+    refused(whole, "--format", "slstudio", says=["expected 10, 8, 16 images", "phase shifts are not supported"])
     refused(whole, "--format", "scan3d", "--names", "{bit}.png", says=["expected one of --format"])
     refused(whole, "--camera", "a", "--camera", "b", says=["expected 1 names of cameras (cam0), found 2"])
     refused(whole, "--format", "scan3d", "--cell-px", 2, says=["expected no --cell-px and --offset-px"])
@@ -182,7 +182,7 @@ def test_what_does_not_fit_is_refused_in_words(tmp_path: Path) -> None:
     # Three steps of a phase instead of a code.
     phases = [np.tile(np.uint8(127 + 100 * np.cos(np.arange(64) / 5 + k)), (48, 1)) for k in (0, 2, 4)]
     three = lay_out(tmp_path / "three", phases, "frameSeq_{:02}.bmp")
-    refused(three, "--format", "slstudio", says=["found 3", "phase shifts are not read"])
+    refused(three, "--format", "slstudio", says=["found 3", "phase shifts are not supported"])
     ten = lay_out(tmp_path / "ten", (phases * 4)[:10], "{:02}.bmp")
     refused(ten, "--format", "slstudio", says=["These may be phase shifts"])
     # Samples of 12 bits in files of 16.

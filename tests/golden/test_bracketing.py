@@ -10,7 +10,7 @@ from slrig.capture.verifier import EvidenceSummary
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, Shot
-from slrig.model.header import CaptureHeader
+from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from slrig.scan.stream import LiveScan

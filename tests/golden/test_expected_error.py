@@ -35,7 +35,7 @@ from slrig.calibration.solution import ExpectedError, covariance_modes, point_se
 from slrig.calibration.solving.solve import solve
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.model import Calibration, FloatArray, Pinhole, Solved
+from slrig.model import Calibration, FloatArray, Pinhole, SolveRecord
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.golden.test_bundles import reconstructed
@@ -204,7 +204,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Measured:
     stated = expected_error(solution, observations)
     solved = replace(
         solution.calibration,
-        solved=Solved(
+        solved=SolveRecord(
             "five-places", "2026-11-01T12:00:00+00:00", solution.covariance, stated.volume_mm, stated.point_mm
         ),
     )

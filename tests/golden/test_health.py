@@ -129,4 +129,4 @@ def test_rows_of_another_frame_are_damage(recorded: Bundle) -> None:
     damaged = Capture(capture.projector, capture.patterns, capture.cameras, shots)
     (found,) = check_capture(damaged).faults
     assert "shift 2 of 8): on " in found
-    assert "its light is not what the other line frames draw" in found
+    assert "its light does not fit the other line frames" in found

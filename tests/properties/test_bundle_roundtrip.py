@@ -31,7 +31,7 @@ from slrig.model import (
     Pinhole,
     Shot,
     Size,
-    Solved,
+    SolveRecord,
     White,
 )
 from tests.samples import noise
@@ -108,7 +108,7 @@ def _solved_calibrations(draw: st.DrawFn) -> Calibration:
     root *= np.geomspace(1e-12, draw(st.floats(1e-3, 1e12)), count)[:, None]
     box = np.array(draw(st.tuples(*[finite] * 6))).reshape(2, 3)
     moment = draw(st.datetimes(timezones=st.timezones())).isoformat()
-    solved = Solved(draw(texts), moment, root @ root.T, box, draw(st.floats(0, 1e300)))
+    solved = SolveRecord(draw(texts), moment, root @ root.T, box, draw(st.floats(0, 1e300)))
     return replace(calibration, solved=solved)
 
 

@@ -19,7 +19,7 @@ from slrig.bundle.reading import open_bundle
 from slrig.devices import ProjectorInfo
 from slrig.errors import BundleError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, CameraFormat, Capture, Gray, PatternSequence, Pixels, Primary, Shot, Size, White
-from slrig.model.header import CaptureHeader
+from slrig.model.capture import CaptureHeader
 from slrig.patterns.sequence import encode
 from slrig.reconstruction.camera_response import NoiseModel
 from slrig.reconstruction.fusion import FusedFrames, fuse_colour
@@ -227,7 +227,7 @@ def test_white_and_black_in_colour_reach_the_place_where_a_mesh_is_made(exposure
 
     def streamed(shots: Iterable[Shot]) -> CameraResult:
         stream = ScanStream(
-            CaptureHeader.of(capture), calibration, entered=lambda *_: None, axis=Axis.COLUMN,
+            CaptureHeader.from_capture(capture), calibration, entered=lambda *_: None, axis=Axis.COLUMN,
             one_exposure=len(exposures_s) == 1,
         )  # fmt: skip
         for shot in shots:

@@ -14,14 +14,14 @@ import yaml
 
 from slrig.bundle import read_calibration, write_calibration
 from slrig.errors import BundleError, CalibrationError, PatternError, SlrigError
-from slrig.importers.calibrations import MOST_BYTES, read_any_calibration, read_yaml, write_any_calibration
+from slrig.importers.calibrations import MAX_YAML_BYTES, read_any_calibration, read_yaml, write_any_calibration
 from slrig.importers.captures import (
-    Code,
-    Naming,
+    ImageNaming,
+    ProjectorCode,
+    compile_name_template,
     import_capture,
-    name_pattern,
     parse_size,
-    pattern_of_name,
+    pattern_from_name,
     scan3d_sequence,
     slstudio_sequence,
 )
@@ -157,7 +157,7 @@ def test_opencvs_stereo_sample_is_of_two_cameras_or_of_a_camera_and_the_projecto
     assert one.projector is not None
     assert one.projector.matrix[0, 0] == 60
     assert np.allclose(one.projector.rotation, turn)
-    with pytest.raises(CalibrationError, match="extents of its images, found one of OpenCV's sample"):
+    with pytest.raises(CalibrationError, match="sizes of its images, found one of OpenCV's sample"):
         read_any_calibration(path)
 
 
@@ -170,7 +170,7 @@ def test_opencvs_stereo_sample_is_of_two_cameras_or_of_a_camera_and_the_projecto
         ("cam1:", "cam2:", "expected Kalibr's cam0, cam1"),
         ("  rostopic: /cam0/image_raw\n", "  shutter: rolling\n", "cam0 is wrong:\n  shutter: unknown key"),
         ("[0.0, -1.0, 0.0, -0.11]", "[0.0, -2.0, 0.0, -0.11]", "cam1.rotation"),
-        ("cam1:\n  T_cn_cnm1:", "cam1:\n  T_cam_imu:", "expected one for each but cam0"),
+        ("cam1:\n  T_cn_cnm1:", "cam1:\n  T_cam_imu:", "expected one for each except cam0"),
         ("rostopic: /cam0/image_raw", "camera_model: pinhole", "expected each key once"),
         ("intrinsics: [458.6, 457.2", "intrinsics: [.nan, 457.2", "finite number"),
     ],
@@ -191,7 +191,7 @@ def test_a_camchain_that_is_wrong_is_refused(tmp_path: Path, before: str, after:
         ({"left": INFO.replace("rows: 3, cols: 3, data: [600.0, 0,", "rows: 3, cols: 3, data: [0,")}, "expected 9"),
         ({"left": INFO.replace("image_width: 640", "image_width: 640.5")}, "image_width"),
         ({"right": INFO}, "expected a transform to the frame right or right_optical_frame"),
-        ({"transforms": TRANSFORMS.replace("table", "left_optical_frame")}, "found a circle"),
+        ({"transforms": TRANSFORMS.replace("table", "left_optical_frame")}, "found a cycle"),
         ({"transforms": TRANSFORMS.replace("{frame_id: bar}", "{frame_id: wall}")}, "table, wall"),
         ({"transforms": TRANSFORMS.replace("w: 1}", "w: 2}")}, "quaternion of length 1"),
         ({"transforms": TRANSFORMS.replace("child_frame_id: bar", "child_frame_id: left_optical_frame")}, "found two"),
@@ -207,10 +207,10 @@ def test_yaml_that_would_grow_is_refused_before_it_is_built(tmp_path: Path) -> N
     bomb = "a0: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40))
     for text, words in (
         (bomb, "without anchors"),
-        ("[" * 10_000, "not deep in each other"),
+        ("[" * 10_000, "nested at most 12 deep"),
         ("a: !!python/object/apply:os.getcwd []", "python/object"),
         ("a: [1", "at line 1"),
-        ("a: '" + "x" * MOST_BYTES + "'", f"at most {MOST_BYTES} bytes"),
+        ("a: '" + "x" * MAX_YAML_BYTES + "'", f"at most {MAX_YAML_BYTES} bytes"),
     ):
         with pytest.raises(CalibrationError, match=words):
             read_yaml(written(tmp_path / "rig.yaml", text))
@@ -249,7 +249,7 @@ def test_the_command_converts_files(tmp_path: Path) -> None:
         read_calibration(tmp_path / "back.json").cameras["right"].rotation,
         sample_calibration().cameras["right"].rotation,
     )
-    assert "--to; found '.yaml'" in refused(run("export", tmp_path / "rig", tmp_path / "chain.yaml"))
+    assert "found '.yaml'; rename it, or give --to" in refused(run("export", tmp_path / "rig", tmp_path / "chain.yaml"))
     assert "create the folder first" in refused(run("export", tmp_path / "rig", tmp_path / "no" / "x", "--to", "ros"))
     assert sorted(each.name for each in tmp_path.iterdir()) == ["back.json", "rig", "rig.json"]
     assert "expected a new folder" in refused(run("export", tmp_path / "rig.json", tmp_path / "rig", "--to", "ros"))
@@ -258,7 +258,7 @@ def test_the_command_converts_files(tmp_path: Path) -> None:
 # ---- Which pattern an image shows by words and by names: what is known, and what is refused
 
 
-CODE = Code(Size(1824, 1140), cell_px=2)
+CODE = ProjectorCode(Size(1824, 1140), cell_px=2)
 
 
 @pytest.mark.parametrize(
@@ -274,7 +274,7 @@ CODE = Code(Size(1824, 1140), cell_px=2)
     ],
 )
 def test_words_name_a_pattern(words: str, wanted: Pattern) -> None:
-    assert CODE.of_words(words) == wanted
+    assert CODE.parse_pattern(words) == wanted
 
 
 @pytest.mark.parametrize(
@@ -284,14 +284,14 @@ def test_words_name_a_pattern(words: str, wanted: Pattern) -> None:
         ("diagonal 3", BundleError, "'diagonal 3'"),
         ("column 3 upside", BundleError, "expected `white`"),
         ("xor02 column 3", BundleError, "XOR-02 and others"),
-        ("sine 0", BundleError, "phase shifts are not read"),
+        ("sine 0", BundleError, "phase shifts are not supported"),
         ("column 10", PatternError, "bit 10 of 10"),
         ("column line 9 of 8", PatternError, "found shift 9"),
     ],
 )
 def test_other_words_are_refused(words: str, error: type[SlrigError], said: str) -> None:
     with pytest.raises(error, match=said):
-        CODE.of_words(words)
+        CODE.parse_pattern(words)
 
 
 @pytest.mark.parametrize(
@@ -305,9 +305,9 @@ def test_other_words_are_refused(words: str, error: type[SlrigError], said: str)
     ],
 )
 def test_a_name_says_its_bit(template: str, name: str, wanted: Pattern) -> None:
-    named = name_pattern(template).fullmatch(name)
+    named = compile_name_template(template).fullmatch(name)
     assert named is not None
-    assert pattern_of_name(CODE, named) == wanted
+    assert pattern_from_name(CODE, named) == wanted
 
 
 @pytest.mark.parametrize(
@@ -324,9 +324,9 @@ def test_a_name_says_its_bit(template: str, name: str, wanted: Pattern) -> None:
 )
 def test_a_name_that_says_none_is_refused(template: str, name: str, said: str) -> None:
     def read() -> Pattern:
-        named = name_pattern(template).fullmatch(name)
+        named = compile_name_template(template).fullmatch(name)
         assert named is not None
-        return pattern_of_name(CODE, named)
+        return pattern_from_name(CODE, named)
 
     with pytest.raises(SlrigError) as caught:
         read()
@@ -334,15 +334,17 @@ def test_a_name_that_says_none_is_refused(template: str, name: str, said: str) -
 
 
 def test_first_bits_are_a_code_of_wider_cells() -> None:
-    assert slstudio_sequence(Code(Size(1824, 1140)), 12)[2:] == [Gray(Axis.COLUMN, bit, 10, 2) for bit in range(10)]
-    assert slstudio_sequence(Code(Size(1824, 1140)), 8)[2:] == [Gray(Axis.ROW, bit, 6, 32) for bit in range(6)]
+    assert slstudio_sequence(ProjectorCode(Size(1824, 1140)), 12)[2:] == [
+        Gray(Axis.COLUMN, bit, 10, 2) for bit in range(10)
+    ]
+    assert slstudio_sequence(ProjectorCode(Size(1824, 1140)), 8)[2:] == [Gray(Axis.ROW, bit, 6, 32) for bit in range(6)]
     # 1280 columns are centred in 2048, in cells of 2; 800 rows in 1024.
-    shown = scan3d_sequence(Code(Size(1280, 800)), 42)
+    shown = scan3d_sequence(ProjectorCode(Size(1280, 800)), 42)
     assert shown[2:4] == [Gray(Axis.COLUMN, 0, 10, 2, 384), Gray(Axis.COLUMN, 0, 10, 2, 384, inverted=True)]
     assert shown[-1] == Gray(Axis.ROW, 9, 10, 1, 112, inverted=True)
     for images in (2, 41, 46):
         with pytest.raises(BundleError, match=f"found {images}"):
-            scan3d_sequence(Code(Size(1280, 800)), images)
+            scan3d_sequence(ProjectorCode(Size(1280, 800)), images)
 
 
 @pytest.mark.parametrize("words", ["", "1024", "0x768", "1024x", "-3x4", "1024x768x3", "123456x1"])
@@ -368,5 +370,5 @@ def test_an_extent_is_two_numbers(words: str) -> None:
 def test_a_list_that_is_wrong_is_refused(tmp_path: Path, lines: str, said: str) -> None:
     (tmp_path / "list.csv").write_text(lines)
     with pytest.raises(BundleError) as caught:
-        import_capture(tmp_path, tmp_path / "bundle", CODE, Naming(listed=tmp_path / "list.csv"))
+        import_capture(tmp_path, tmp_path / "bundle", CODE, ImageNaming(listed=tmp_path / "list.csv"))
     assert said in str(caught.value)

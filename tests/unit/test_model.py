@@ -30,7 +30,7 @@ from slrig.model import (
     lens,
     lens_kernels,
 )
-from slrig.model.surfaces import light_of, srgb_of
+from slrig.model.surface import linear_to_srgb, srgb_to_linear
 from tests.samples import pinhole
 
 FORMAT = CameraFormat(Size(4, 3), 8)
@@ -164,16 +164,16 @@ def sent(terms: FloatArray, points: FloatArray) -> FloatArray:
 
 @WAYS
 def test_the_lens_is_that_of_opencv(way: Any) -> None:
-    found = [way.distorted(STRONG, x, y)[:2] for x, y in POINTS]
+    found = [way.distort(STRONG, x, y)[:2] for x, y in POINTS]
     np.testing.assert_allclose(found, sent(STRONG, POINTS), rtol=0, atol=1e-15)
-    assert way.distorted(np.zeros(5), 0.31, -0.22) == (0.31, -0.22, 1.0, 0.0, 1.0)
+    assert way.distort(np.zeros(5), 0.31, -0.22) == (0.31, -0.22, 1.0, 0.0, 1.0)
 
 
 @WAYS
 def test_slopes_are_those_of_the_lens(way: Any) -> None:
     h = 1e-6
     for x, y in POINTS:
-        _, _, xx, xy, yy = way.distorted(STRONG, x, y)
+        _, _, xx, xy, yy = way.distort(STRONG, x, y)
         across, along = (
             (sent(STRONG, np.array([[x, y]]) + step) - sent(STRONG, np.array([[x, y]]) - step))[0] / (2 * h)
             for step in ((h, 0.0), (0.0, h))
@@ -188,24 +188,24 @@ def test_derivatives_by_the_terms_are_what_each_term_moves(way: Any, a: float, b
     # The lens is linear in its terms: without one of them it moves a point by as much less, whatever its size.
     for x, y in POINTS:
         moved = [(sent(term, np.array([[x, y]])) - [x, y])[0] @ [a, b] for term in np.eye(5)]
-        np.testing.assert_allclose(way.by_terms(a, b, x, y), moved, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(way.distortion_by_terms(a, b, x, y), moved, rtol=0, atol=1e-15)
 
 
 def test_arrays_are_sent_as_their_points_are_to_the_bit() -> None:
     x, y = POINTS.reshape(6, 10, 2).transpose(2, 0, 1)
-    one_by_one = np.array([lens_kernels.distorted(STRONG, *point) for point in POINTS])
-    np.testing.assert_array_equal(np.stack(lens.distorted(STRONG, x, y), axis=-1).reshape(-1, 5), one_by_one)
+    one_by_one = np.array([lens_kernels.distort(STRONG, *point) for point in POINTS])
+    np.testing.assert_array_equal(np.stack(lens.distort(STRONG, x, y), axis=-1).reshape(-1, 5), one_by_one)
 
 
 def test_the_way_back_ends_where_it_began_and_is_none_from_where_the_lens_sends_nothing() -> None:
     for x, y in POINTS:
-        xd, yd, *_ = lens.distorted(STRONG, float(x), float(y))
-        found = lens_kernels.undistorted(STRONG, xd, yd, xd, yd, 1e-7)
+        xd, yd, *_ = lens.distort(STRONG, float(x), float(y))
+        found = lens_kernels.undistort(STRONG, xd, yd, xd, yd, 1e-7)
         np.testing.assert_allclose(found, (x, y), rtol=0, atol=1e-13)
     # x (1 - 0.3 x²) never exceeds 0.7027.
     barrel = np.array([-0.3, 0.0, 0.0, 0.0, 0.0])
-    assert np.isfinite(lens_kernels.undistorted(barrel, 0.70, 0.0, 0.70, 0.0, 1e-7)).all()
-    assert np.isnan(lens_kernels.undistorted(barrel, 0.71, 0.0, 0.71, 0.0, 1e-7)).all()
+    assert np.isfinite(lens_kernels.undistort(barrel, 0.70, 0.0, 0.70, 0.0, 1e-7)).all()
+    assert np.isnan(lens_kernels.undistort(barrel, 0.71, 0.0, 0.71, 0.0, 1e-7)).all()
 
 
 # ---- The sRGB curve against the formula of IEC 61966-2-1, written out once more
@@ -218,18 +218,24 @@ def formula(share: float) -> float:
 def test_values_are_those_of_the_formula() -> None:
     light = np.random.default_rng(0).random(20_000) ** 3
     exact = np.array([255 * formula(share) for share in light.tolist()])
-    assert np.abs(srgb_of(light) - exact).max() < 0.53
-    assert srgb_of(np.array([[0.0, 1.0], [0.18, 0.5]])).tolist() == [[0, 255], [118, 188]]
+    assert np.abs(linear_to_srgb(light) - exact).max() < 0.53
+    assert linear_to_srgb(np.array([[0.0, 1.0], [0.18, 0.5]])).tolist() == [[0, 255], [118, 188]]
 
 
 def test_light_beyond_white_is_white_and_none_is_black() -> None:
-    assert srgb_of(np.array([-1.0, 7.0, np.inf, -np.inf, np.nan], dtype=np.float32)).tolist() == [0, 255, 255, 0, 0]
+    assert linear_to_srgb(np.array([-1.0, 7.0, np.inf, -np.inf, np.nan], dtype=np.float32)).tolist() == [
+        0,
+        255,
+        255,
+        0,
+        0,
+    ]
 
 
 def test_every_value_comes_back_and_dark_ones_stay_apart() -> None:
     values = np.arange(256, dtype=np.uint8)
-    light = light_of(values)
+    light = srgb_to_linear(values)
     assert light.dtype == np.uint16
     assert light[[0, 128, 255]].tolist() == [0, 14146, 65535]
     assert (np.diff(light.astype(int)) >= 19).all()
-    assert np.array_equal(srgb_of(light / 65535), values)
+    assert np.array_equal(linear_to_srgb(light / 65535), values)

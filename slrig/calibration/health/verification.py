@@ -150,7 +150,7 @@ def verify_by_board(poses: Sequence[PoseObservation], board: Board, calibration:
     CalibrationError
         None of the calibration's cameras sees the board, or it is of one camera alone.
     """
-    if not calibration.triangulates:
+    if not calibration.can_triangulate:
         message = (
             "expected a calibration of two devices, which a verification holds against each other, found one of camera "
             f"'{next(iter(calibration.cameras))}' alone: calibrate it again, and see what changed with slrig calibrate "

@@ -24,7 +24,7 @@ from slrig.calibration.poses.initial import (
 )
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose, device_title
 from slrig.model import FloatArray, IntArray, Size
-from slrig.model.lens import distorted
+from slrig.model.lens import distort
 
 BoolArray = NDArray[np.bool_]
 
@@ -357,7 +357,7 @@ def project_points(device: DeviceEstimate, points_mm: FloatArray) -> FloatArray:
     """
     depth = np.where(points_mm[..., 2] > 0, points_mm[..., 2], np.nan)
     x, y = points_mm[..., 0] / depth, points_mm[..., 1] / depth
-    across, down, _, _, _ = distorted(device.distortion, x, y)
+    across, down, _, _, _ = distort(device.distortion, x, y)
     matrix = device.matrix
     return np.stack([matrix[0, 0] * across + matrix[0, 2], matrix[1, 1] * down + matrix[1, 2]], axis=-1)
 

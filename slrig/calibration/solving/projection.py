@@ -30,7 +30,7 @@ from slrig.calibration.board import Correspondences, Observations
 from slrig.calibration.solution import PARAMETERS, BoardPose
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray, Pinhole, Size
-from slrig.model.lens_kernels import by_terms, distorted, undistorted
+from slrig.model.lens_kernels import distort, distortion_by_terms, undistort
 
 MIN_CORNERS = 6
 """Minimum number of corners of a view: fewer determine a pose too poorly."""
@@ -371,15 +371,15 @@ def _device_derivatives(d: Any, row: bool, x: float, y: float, z: float, w: Any,
     (x, y, z) : the point in the device; w : the point rotated into the device, before its translation.
     """
     xn, yn = x / z, y / z
-    xd, yd, a, b, c = distorted(d[4:9], xn, yn)
+    xd, yd, a, b, c = distort(d[4:9], xn, yn)
     if row:
         by_x, by_y = d[1] * b, d[1] * c
         out[0], out[1], out[2], out[3] = 0.0, yd, 0.0, 1.0
-        out[4], out[5], out[6], out[7], out[8] = by_terms(0.0, d[1], xn, yn)
+        out[4], out[5], out[6], out[7], out[8] = distortion_by_terms(0.0, d[1], xn, yn)
     else:
         by_x, by_y = d[0] * a, d[0] * b
         out[0], out[1], out[2], out[3] = xd, 0.0, 1.0, 0.0
-        out[4], out[5], out[6], out[7], out[8] = by_terms(d[0], 0.0, xn, yn)
+        out[4], out[5], out[6], out[7], out[8] = distortion_by_terms(d[0], 0.0, xn, yn)
     gx, gy = by_x / z, by_y / z
     gz = -(gx * xn + gy * yn)
     out[9], out[10], out[11] = w[1] * gz - w[2] * gy, w[2] * gx - w[0] * gz, w[0] * gy - w[1] * gx
@@ -402,7 +402,7 @@ def _corner_kernel(
         x, y, z = w[0] + d[18], w[1] + d[19], w[2] + d[20]
         if not z > 0:
             continue
-        xd, yd, _, _, _ = distorted(d[4:9], x / z, y / z)
+        xd, yd, _, _, _ = distort(d[4:9], x / z, y / z)
         residual[i, 0] = d[0] * xd + d[2] - measured[i, 0]
         residual[i, 1] = d[1] * yd + d[3] - measured[i, 1]
         if not jacobian:
@@ -444,7 +444,7 @@ def _light_kernel(
     for i in range(first, last):
         c, p, row = devices[where[i, 0]], poses[where[i, 1]], where[i, 2] == 1
         cxd, cyd = (pixels[i, 0] - c[2]) / c[0], (pixels[i, 1] - c[3]) / c[1]
-        xn, yn = undistorted(c[4:9], cxd, cyd, cxd, cyd, _UNDISTORTION_TOLERANCE)
+        xn, yn = undistort(c[4:9], cxd, cyd, cxd, cyd, _UNDISTORTION_TOLERANCE)
         d = _rotate_back(c, 9, xn, yn, 1.0)
         o = _rotate_back(c, 9, -c[18], -c[19], -c[20])
         in_board = _rotate_back(p, 0, o[0] - p[9], o[1] - p[10], o[2] - p[11])
@@ -456,7 +456,7 @@ def _light_kernel(
         x, y, z = w[0] + projector[18], w[1] + projector[19], w[2] + projector[20]
         if not z > 0:
             continue
-        xd, yd, _, _, _ = distorted(projector[4:9], x / z, y / z)
+        xd, yd, _, _, _ = distort(projector[4:9], x / z, y / z)
         projected = projector[1] * yd + projector[3] if row else projector[0] * xd + projector[2]
         residual[i] = projected - positions[i]
         if not jacobian:
@@ -480,13 +480,13 @@ def _light_kernel(
 @kernel_part
 def _ray_derivatives(c: Any, xd: float, yd: float, xn: float, yn: float, s: float, h: Any, out: Any) -> None:
     """Write derivatives by the 15 parameters of the ray's camera into out; h : gradient in the camera."""
-    _, _, a, b, e = distorted(c[4:9], xn, yn)
+    _, _, a, b, e = distort(c[4:9], xn, yn)
     det = a * e - b * b
     # d(x, y) = J⁻¹ (d(xd, yd) - ∂distorted/∂k dk), and the gradient by (x, y) is s h.
     gx, gy = s * (e * h[0] - b * h[1]) / det, s * (a * h[1] - b * h[0]) / det
     out[0], out[1] = -gx * xd / c[0], -gy * yd / c[1]
     out[2], out[3] = -gx / c[0], -gy / c[1]
-    out[4], out[5], out[6], out[7], out[8] = by_terms(-gx, -gy, xn, yn)
+    out[4], out[5], out[6], out[7], out[8] = distortion_by_terms(-gx, -gy, xn, yn)
     qx, qy, qz = s * xn - c[18], s * yn - c[19], s - c[20]
     out[9], out[10], out[11] = h[1] * qz - h[2] * qy, h[2] * qx - h[0] * qz, h[0] * qy - h[1] * qx
     out[12], out[13], out[14] = -h[0], -h[1], -h[2]

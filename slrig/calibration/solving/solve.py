@@ -50,8 +50,7 @@ from slrig.calibration.solving.projection import (
     to_pinhole,
 )
 from slrig.errors import SolveRefusedError
-from slrig.model import Calibration, FloatArray, IntArray, Size
-from slrig.model.lens import LENS_TERMS
+from slrig.model import LENS_TERMS, Calibration, FloatArray, IntArray, Size
 
 Progress = Callable[[str, float, str], None]
 """Called with the name of the stage, the completed fraction (0 to 1), and a description."""

@@ -22,7 +22,16 @@ from typing import Any
 import numpy as np
 
 from slrig.bundle.validation import Strict
-from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Projector, ProjectorInfo, Shown, Trigger
+from slrig.devices import (
+    AppliedSettings,
+    Camera,
+    CameraInfo,
+    CameraSettings,
+    DisplayedPattern,
+    Projector,
+    ProjectorInfo,
+    Trigger,
+)
 from slrig.errors import (
     DeviceBusyError,
     DeviceError,
@@ -269,14 +278,14 @@ class FaultyProjector:
         self._light(None, "load")
         self._sequence = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`. A fault comes when it has lit the pattern already: its answer is what is lost."""
         self._handle.require_open()
         if self._sequence is None:
             raise DeviceStateError(f"asked to show pattern {index}, nothing is loaded")
         self._light(self._sequence.profiles[index], f"show {index}")
         self._handle.step("show", index)
-        return Shown(index, time.monotonic_ns(), 0)
+        return DisplayedPattern(index, time.monotonic_ns(), 0)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         self._handle.require_open()

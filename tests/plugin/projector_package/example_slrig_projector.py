@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from slrig.devices import Projector, ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.devices import DisplayedPattern, Projector, ProjectorInfo, ProjectorState, SystemClock
 from slrig.model import PatternSequence, Pixels, Size
 
 LATENCY_S = 0.004
@@ -51,13 +51,13 @@ class LampProjector:
         self.blank()
         self._state.loaded = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`."""
         sequence = self._state.require_pattern(index)
         visible_ns = time.monotonic_ns() + round(LATENCY_S * 1e9)
         self._light(sequence.profiles[index], visible_ns)
         SystemClock().wait_until(visible_ns + _ERROR_NS, self._state.closed)
-        return Shown(index, visible_ns, _ERROR_NS)
+        return DisplayedPattern(index, visible_ns, _ERROR_NS)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`."""

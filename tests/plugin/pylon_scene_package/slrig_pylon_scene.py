@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slrig.devices import Projector, ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.devices import DisplayedPattern, Projector, ProjectorInfo, ProjectorState, SystemClock
 from slrig.model import PatternSequence, Pixels, Size
 
 FULL_SCALE_S = 1 / 40
@@ -47,13 +47,13 @@ class SceneProjector:
         self.blank()
         self._state.loaded = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         """See `Projector`."""
         rows = self._state.require_pattern(index).profiles[index]
         visible_ns = time.monotonic_ns() + round(LATENCY_S * 1e9)
         self._light(rows, visible_ns)
         SystemClock().wait_until(visible_ns + _ERROR_NS, self._state.closed)
-        return Shown(index, visible_ns, _ERROR_NS)
+        return DisplayedPattern(index, visible_ns, _ERROR_NS)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`."""

@@ -212,7 +212,7 @@ def test_plan_on_record_keeps_its_exposures_and_its_region() -> None:
         (Region, {"box_mm": ((1, 0, 0), (0, 1, 1))}, "box_mm: x: expected two rising numbers, found 1 and 0"),
         (Region, {"box_mm": ((0, 0, float("nan")), (1, 1, 1))}, "box_mm: z: expected two rising numbers"),
         (Region, {"depth_mm": (300, 300)}, "depth_mm: expected two rising numbers"),
-        (Region, {"depth_mm": (-2, -1)}, "expected depths before the camera"),
+        (Region, {"depth_mm": (-2, -1)}, "expected depths in front of the camera"),
         (Region, {"polygons_px": {"left": ((0, 0), (1, 1))}}, "polygons_px.left: expected three corners or more"),
         (Region, {"masks": {"left": "bm90IGEgUE5H"}}, "masks.left: expected a PNG"),
         (Region, {"masks": {"left": "not base64"}}, "masks.left: expected a PNG"),
@@ -274,7 +274,7 @@ def test_region_must_fit_the_cameras() -> None:
     assert check_plan(asked(masks={"left": mask_of(200, 100)}), facts()) > 0
     with pytest.raises(ConfigError, match=r"masks\.left: expected 200 x 100 pixels as the camera has, found 10 x 20"):
         check_plan(asked(masks={"left": mask_of(10, 20)}), facts())
-    with pytest.raises(ConfigError, match=r"names camera 'middle'; there are \['left', 'right'\]"):
+    with pytest.raises(ConfigError, match=r"expected one of the cameras \['left', 'right'\], found 'middle'"):
         check_plan(asked(polygons_px={"middle": ((0, 0), (1, 0), (1, 1))}), facts())
 
 

@@ -25,7 +25,7 @@ from slrig.errors import PoseRefusedError
 from slrig.jobs.records import JobKind
 from slrig.jobs.rig_jobs import Recorded
 from slrig.jobs.store import JobStore
-from slrig.model import Calibration, Pinhole, Size, Solved
+from slrig.model import Calibration, Pinhole, Size, SolveRecord
 from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import Progress, ScanPlan
 from tests.samples import put_database
@@ -48,7 +48,7 @@ def tame_calibration(
     eye, there = np.eye(3), np.array([-100.0, 0.0, 0.0])
     lens = np.array([[focal_px, 0.0, 31.5], [0.0, focal_px, 23.5], [0.0, 0.0, 1.0]])
     volume = np.array([[-40.0, -30.0, 450.0], [40.0, 30.0, 550.0]])
-    solved = Solved("tame", "2026-11-21T11:00:00+00:00", np.eye(30) * sigma**2, volume, 0.02)
+    solved = SolveRecord("tame", "2026-11-21T11:00:00+00:00", np.eye(30) * sigma**2, volume, 0.02)
     cameras = {"cam0": Pinhole(camera, lens, np.zeros(5), eye, np.zeros(3))}
     return Calibration(cameras, Pinhole(projector, lens, np.zeros(5), eye, there), solved)
 

@@ -25,7 +25,7 @@ from slrig.calibration.solution import (
     RigidMotion,
     Solution,
 )
-from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
+from slrig.model import Calibration, FloatArray, Pinhole, Size, SolveRecord
 
 BOARD = Board(BoardKind.CHESSBOARD, 11, 8, 12.0)
 BUMPED = "pose_07"
@@ -166,7 +166,7 @@ def solved_result() -> CalibrationResult:
     deviations = np.concatenate([_DEVIATIONS["left"], _DEVIATIONS[PROJECTOR]])
     assert len(deviations) == 2 * len(PARAMETERS)
     covariance = np.diag(deviations**2).astype(np.float64)
-    solved = Solved(CALIBRATION_ID, SOLVED_AT, covariance, expected.volume_mm, expected.point_mm)
+    solved = SolveRecord(CALIBRATION_ID, SOLVED_AT, covariance, expected.volume_mm, expected.point_mm)
     calibration = Calibration({"left": rig["left"]}, rig[PROJECTOR], solved)
     solution = Solution(
         calibration=Calibration({"left": rig["left"]}, rig[PROJECTOR]),

@@ -24,7 +24,7 @@ from slrig.calibration.solution import (
     remove_rigid_motion,
 )
 from slrig.errors import CalibrationError
-from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
+from slrig.model import Calibration, FloatArray, Pinhole, Size, SolveRecord
 from slrig.reconstruction.surface_fit import stencils
 from tests.unit.calibration.perturbed import (
     aligned,
@@ -389,7 +389,7 @@ def rig(*, solved: bool = True) -> Calibration:
     covariance = np.diag(np.concatenate([SIGMA, SIGMA, SIGMA]) ** 2)
     covariance[9:15] = covariance[:, 9:15] = 0.0
     volume = np.array([[-80.0, -60.0, 550.0], [80.0, 60.0, 650.0]])
-    found = Solved("a", "2026-11-22T10:00:00+00:00", covariance, volume, 0.01)
+    found = SolveRecord("a", "2026-11-22T10:00:00+00:00", covariance, volume, 0.01)
     cameras = {"left": left_camera(), "right": right_camera()}
     return Calibration(cameras, light_source(), found if solved else None)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture.verifier import Evidence
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, DisplayedPattern, ProjectorInfo, Rig, Trigger
 from slrig.errors import (
     DeviceGoneError,
     DeviceStateError,
@@ -196,7 +196,7 @@ class FakeProjector:
             raise UnsupportedByDeviceError(message)
         self.sequence = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         self.world.calls.append(f"show {index}")
         if self.sequence is None:
             message = "show before load"
@@ -211,7 +211,7 @@ class FakeProjector:
         self.shows += 1
         self._light(index)
         self.world.now_ns += LATENCY_NS
-        return Shown(index, self.world.now_ns, 1_000)
+        return DisplayedPattern(index, self.world.now_ns, 1_000)
 
     def _light(self, index: int) -> None:
         assert self.sequence is not None
@@ -295,7 +295,7 @@ class CameraFaults:
     over_exposed: frozenset[int] = frozenset()
     unplug_at: int | None = None
     readback: float = 1.0
-    least_period_s: float | None = None
+    min_period_s: float | None = None
 
 
 @dataclass
@@ -343,7 +343,7 @@ class FakeCamera:
         if len(self.exposures_s) == self.pushed_at:
             self.scene.column_px = self.scene.column_px + 2 * self.scene.columns_per_px
         faults = self.faults
-        return AppliedSettings(settings.exposure_s * faults.readback, settings.gain, faults.least_period_s)
+        return AppliedSettings(settings.exposure_s * faults.readback, settings.gain, faults.min_period_s)
 
     def arm(self, count: int, trigger: Trigger) -> None:
         self.world.calls.append(f"arm {self.name} {trigger}")
@@ -435,7 +435,7 @@ class FakeRig:
 
 def add(evidence: Evidence, shot: Shot) -> None:
     """Feed a frame that must contradict nothing."""
-    found = evidence.contradictions(shot)
+    found = evidence.add_shot(shot)
     if found:
         raise ScanEvidenceError("; ".join(map(str, found)))
 

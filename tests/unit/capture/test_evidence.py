@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from slrig.bundle.sidecars import Refused
 from slrig.capture.frame_checks import (
     NOISE_FLOOR_DN,
-    Reference,
+    ReferenceFrames,
     Samples,
-    line_sum,
-    noise_dn,
-    reference,
-    repeated,
-    rougher,
+    build_reference,
+    find_repeated,
+    line_sum_fault,
+    pair_noise_dn,
+    roughness_fault,
 )
 from slrig.capture.verifier import Evidence, EvidenceSummary, Sampler, check_capture
 from slrig.errors import ScanEvidenceError
@@ -226,11 +226,11 @@ def test_of_a_bit_that_lines_contradict_the_bit_is_blamed() -> None:
     image = shots[index].image.copy()
     image[60:110] = shots[1].image[60:110]
     evidence = Evidence(patterns, {"left": SCENE.format})
-    found = [each for shot in with_image(shots, index, image) for each in evidence.contradictions(shot)]
+    found = [each for shot in with_image(shots, index, image) for each in evidence.add_shot(shot)]
     assert [index in each.suspects and len(each.suspects) < 3 for each in found] == [True]
     assert "have a code that their lines contradict" in found[0].cause
     evidence.retract("left", found[0].suspects)
-    assert [each for suspect in found[0].suspects for each in evidence.contradictions(shots[suspect])] == []
+    assert [each for suspect in found[0].suspects for each in evidence.add_shot(shots[suspect])] == []
     assert evidence.summary().verified == len(patterns)
 
 
@@ -246,10 +246,10 @@ def test_what_the_scene_itself_does_is_no_fault_when_it_comes_again() -> None:
         return replace(shots[index], image=image)
 
     evidence = Evidence(patterns, {"left": SCENE.format})
-    found = [each for shot in with_image(shots, index, lit_by_a_wall().image) for each in evidence.contradictions(shot)]
+    found = [each for shot in with_image(shots, index, lit_by_a_wall().image) for each in evidence.add_shot(shot)]
     (first,) = found
     evidence.retract("left", first.suspects)
-    again = [each for i in sorted(first.suspects) for each in evidence.contradictions(
+    again = [each for i in sorted(first.suspects) for each in evidence.add_shot(
         lit_by_a_wall() if i == index else shots[i]
     )]  # fmt: skip
     assert again == []
@@ -459,8 +459,8 @@ def test_a_wrong_frame_that_is_retracted_and_replaced_leaves_no_trace(wrong: int
     blamed: list[int] = []
     while waiting:
         shot = waiting.pop(0)
-        found = evidence.contradictions(spoilt if shot.pattern == wrong and not blamed else shot)
-        suspects = {s for each in found for s in (*each.suspects, *each.beyond)}
+        found = evidence.add_shot(spoilt if shot.pattern == wrong and not blamed else shot)
+        suspects = {s for each in found for s in (*each.suspects, *each.further_suspects)}
         if suspects:
             blamed += sorted(suspects)
             gone = evidence.retract("left", suspects)
@@ -504,7 +504,7 @@ def test_what_was_never_there_can_be_retracted() -> None:
 def test_frames_that_come_while_white_and_black_are_refused_are_judged_later(clean: EvidenceSummary) -> None:
     evidence = evidence_of()
     add(evidence, replace(SHOTS[0], image=SHOTS[1].image))
-    (found,) = evidence.contradictions(SHOTS[1])
+    (found,) = evidence.add_shot(SHOTS[1])
     assert found.suspects == (0, 1)
     add(evidence, SHOTS[2])
     evidence.retract("left", found.suspects)
@@ -518,7 +518,7 @@ def test_one_of_two_suspects_may_be_enough() -> None:
     for shot in SHOTS[:4]:
         add(evidence, shot)
     add(evidence, replace(SHOTS[4], image=garbled(SHOTS, 4)))
-    found = evidence.contradictions(SHOTS[5])
+    found = evidence.add_shot(SHOTS[5])
     assert [each.suspects for each in found] == [(4, 5)]
     evidence.retract("left", [4])
     add(evidence, SHOTS[4])
@@ -532,12 +532,12 @@ def test_what_the_frames_left_contradict_is_told_with_the_next_one() -> None:
     shots = SCENE.shots(patterns)
     for shot in shots[:4]:
         add(evidence, shot)
-    (found,) = evidence.contradictions(replace(shots[4], image=garbled(shots, 4)))
+    (found,) = evidence.add_shot(replace(shots[4], image=garbled(shots, 4)))
     assert found.suspects == (4,)
     evidence.retract("left", [2])
-    (again,) = evidence.contradictions(shots[5])
+    (again,) = evidence.add_shot(shots[5])
     assert again.suspects == (3, 4)
-    assert evidence.contradictions(shots[6]) == ()
+    assert evidence.add_shot(shots[6]) == ()
     assert evidence.summary().faults == (str(again),)
 
 
@@ -545,14 +545,14 @@ def test_a_contradiction_names_what_it_rests_on_until_something_has_vouched_for_
     evidence = evidence_of()
     for shot in SHOTS[:3]:
         add(evidence, shot)
-    (early,) = evidence.contradictions(replace(SHOTS[3], image=garbled(SHOTS, 3)))
-    assert (early.suspects, early.beyond) == ((2, 3), (0, 1))
-    assert str(early).startswith("camera 'left', pattern 3 (column Gray bit 0 of 5, inverse): beside pattern 2 ")
+    (early,) = evidence.add_shot(replace(SHOTS[3], image=garbled(SHOTS, 3)))
+    assert (early.suspects, early.further_suspects) == ((2, 3), (0, 1))
+    assert str(early).startswith("camera 'left', pattern 3 (column Gray bit 0 of 5, inverse): compared with pattern 2 ")
     evidence.retract("left", [3])
     for shot in SHOTS[3:5]:
         add(evidence, shot)
-    (late,) = evidence.contradictions(replace(SHOTS[5], image=garbled(SHOTS, 5)))
-    assert (late.suspects, late.beyond) == ((4, 5), ())
+    (late,) = evidence.add_shot(replace(SHOTS[5], image=garbled(SHOTS, 5)))
+    assert (late.suspects, late.further_suspects) == ((4, 5), ())
 
 
 def test_lines_accuse_the_code_until_one_of_them_agrees_with_it() -> None:
@@ -562,20 +562,20 @@ def test_lines_accuse_the_code_until_one_of_them_agrees_with_it() -> None:
         add(evidence, shot)
     # The light is that of a line frame, and not where the code says.
     wrong = replace(SHOTS[first], image=SHOTS[first + 4].image)
-    (found,) = evidence.contradictions(wrong)
-    assert (found.suspects, found.beyond) == ((first,), tuple(range(2, first)))
+    (found,) = evidence.add_shot(wrong)
+    assert (found.suspects, found.further_suspects) == ((first,), tuple(range(2, first)))
     evidence.retract("left", [first])
     add(evidence, SHOTS[first])
-    (found,) = evidence.contradictions(replace(SHOTS[first + 1], image=SHOTS[first + 5].image))
-    assert (found.suspects, found.beyond) == ((first + 1,), ())
+    (found,) = evidence.add_shot(replace(SHOTS[first + 1], image=SHOTS[first + 5].image))
+    assert (found.suspects, found.further_suspects) == ((first + 1,), ())
 
 
 def test_what_was_refused_stays_on_record_when_all_frames_are_forgotten() -> None:
     evidence = evidence_of()
     add(evidence, SHOTS[0])
-    evidence.note(Refused(3, "left", 1, "stale", SHOTS[3]))
-    evidence.note(Refused(3, "left", 2, "stale", SHOTS[3]))
-    evidence.forget()
+    evidence.record_refused(Refused(3, "left", 1, "stale", SHOTS[3]))
+    evidence.record_refused(Refused(3, "left", 2, "stale", SHOTS[3]))
+    evidence.clear()
     summary = evidence.summary()
     assert (summary.patterns, summary.shot_again) == (0, 2)
     assert summary.causes == ("camera 'left', pattern 3 (column Gray bit 0 of 5, inverse): stale",)
@@ -639,7 +639,7 @@ def test_a_line_frame_with_rows_of_another_is_named_by_the_others() -> None:
     image[60:110] = shots[other].image[60:110]
     (fault,) = judged_summary(with_image(shots, index, image), patterns).faults
     assert f"pattern {index} " in fault
-    assert "its light is not what the other line frames draw" in fault
+    assert "its light does not fit the other line frames" in fault
 
 
 def test_an_opening_frame_that_shows_half_of_white_is_found_by_the_closing_one() -> None:
@@ -653,7 +653,7 @@ def test_an_opening_frame_that_shows_half_of_white_is_found_by_the_closing_one()
 
 Image = NDArray[np.float64]
 SIZE = Size(200, 240)
-SAMPLER = Sampler.of(SIZE)
+SAMPLER = Sampler.from_size(SIZE)
 NOISE_DN = 1.0
 PERIOD = 8
 RANDOM = np.random.default_rng(4)
@@ -688,28 +688,28 @@ def noisy_band(
 
 
 @pytest.fixture(scope="module")
-def ref() -> Reference:
+def ref() -> ReferenceFrames:
     one = np.ones(SIZE.width_px)
     white, black = sampled(seen(one)), sampled(seen(0 * one))
-    return reference(white, black, threshold_dn=20, full_scale=255, row=SAMPLER.row)
+    return build_reference(white, black, threshold_dn=20, full_scale=255, row=SAMPLER.row)
 
 
 @pytest.mark.parametrize("period_px", [2, 4, 16, 64])
-def test_a_garbled_frame_is_rougher_than_its_inverse(ref: Reference, period_px: int) -> None:
+def test_a_garbled_frame_is_rougher_than_its_inverse(ref: ReferenceFrames, period_px: int) -> None:
     bit = seen(stripes(period_px // 2, period_px=period_px))
     inverse = sampled(seen(1 - stripes(period_px // 2, period_px=period_px)))
-    assert rougher(sampled(bit), [inverse], ref, noise=NOISE_DN) is None
-    assert rougher(inverse, [sampled(bit)], ref, noise=NOISE_DN) is None
-    told = rougher(sampled(noisy_band(bit)), [inverse], ref, noise=NOISE_DN)
+    assert roughness_fault(sampled(bit), [inverse], ref, noise=NOISE_DN) is None
+    assert roughness_fault(inverse, [sampled(bit)], ref, noise=NOISE_DN) is None
+    told = roughness_fault(sampled(noisy_band(bit)), [inverse], ref, noise=NOISE_DN)
     assert told is not None
     assert "damaged in transfer" in told
-    assert rougher(inverse, [sampled(noisy_band(bit))], ref, noise=NOISE_DN) is None
+    assert roughness_fault(inverse, [sampled(noisy_band(bit))], ref, noise=NOISE_DN) is None
 
 
-def test_light_that_flickers_from_pixel_to_pixel_is_no_damage(ref: Reference) -> None:
+def test_light_that_flickers_from_pixel_to_pixel_is_no_damage(ref: ReferenceFrames) -> None:
     """A projector that dithers: all is lit in one frame of a pair, and nothing in the other."""
     lit = seen(np.ones(SIZE.width_px)) * (1 + RANDOM.normal(0, 0.13, SIZE.shape))
-    assert rougher(sampled(lit), [sampled(seen(np.zeros(SIZE.width_px)))], ref, noise=NOISE_DN) is None
+    assert roughness_fault(sampled(lit), [sampled(seen(np.zeros(SIZE.width_px)))], ref, noise=NOISE_DN) is None
 
 
 def lines(width_px: int = 1) -> list[Samples]:
@@ -717,14 +717,14 @@ def lines(width_px: int = 1) -> list[Samples]:
 
 
 @pytest.mark.parametrize("width_px", [1, 3])
-def test_line_frames_add_up_alike_everywhere_whatever_the_response(ref: Reference, width_px: int) -> None:
-    assert line_sum(lines(width_px), ref, noise=NOISE_DN) is None
+def test_line_frames_add_up_alike_everywhere_whatever_the_response(ref: ReferenceFrames, width_px: int) -> None:
+    assert line_sum_fault(lines(width_px), ref, noise=NOISE_DN) is None
 
 
-def test_a_garbled_line_frame_is_blamed_by_the_sum(ref: Reference) -> None:
+def test_a_garbled_line_frame_is_blamed_by_the_sum(ref: ReferenceFrames) -> None:
     frames = lines()
     frames[3] = sampled(noisy_band(seen(stripes(1, 3))))
-    found = line_sum(frames, ref, noise=NOISE_DN)
+    found = line_sum_fault(frames, ref, noise=NOISE_DN)
     assert found is not None
     blamed, words = found
     assert 3 in blamed
@@ -732,22 +732,24 @@ def test_a_garbled_line_frame_is_blamed_by_the_sum(ref: Reference) -> None:
     assert "do not add up" in words
 
 
-def test_a_line_frame_that_shows_its_neighbours_lines_is_a_repetition_in_the_dark_too(ref: Reference) -> None:
+def test_a_line_frame_that_shows_its_neighbours_lines_is_a_repetition_in_the_dark_too(ref: ReferenceFrames) -> None:
     """Two exposures of one pattern: in dark such a camera has several times the noise that bright pixels tell."""
     again = sampled(seen(stripes(1, 2)) + RANDOM.normal(0, 3.0, SIZE.shape))
-    assert repeated(again, lines(), ref, noise=0.5, factor=40.0) == 2
-    assert repeated(sampled(seen(stripes(1, 2))), [sampled(seen(stripes(1, 3)))], ref, noise=0.5, factor=40.0) is None
+    assert find_repeated(again, lines(), ref, noise=0.5, factor=40.0) == 2
+    assert (
+        find_repeated(sampled(seen(stripes(1, 2))), [sampled(seen(stripes(1, 3)))], ref, noise=0.5, factor=40.0) is None
+    )
 
 
-def test_a_damaged_white_frame_does_not_pass_for_noise(ref: Reference) -> None:
-    damaged = Reference(
-        RANDOM.uniform(120, 250, len(ref.white)).astype(np.float32), ref.black, ref.contrast, ref.lit, ref.judged,
+def test_a_damaged_white_frame_does_not_pass_for_noise(ref: ReferenceFrames) -> None:
+    damaged = ReferenceFrames(
+        RANDOM.uniform(120, 250, len(ref.white)).astype(np.float32), ref.black, ref.contrast, ref.lit, ref.tested,
         ref.row, ref.band,
     )  # fmt: skip
     first, second = (
         [sampled(seen(stripes(16, period_px=32))), sampled(seen(1 - stripes(16, period_px=32)))],
         [sampled(seen(stripes(32, period_px=64))), sampled(seen(1 - stripes(32, period_px=64)))],
     )
-    assert noise_dn(first[0], first[1], damaged) > 10 * NOISE_DN
-    by_pairs = noise_dn(second[0], second[1], damaged, sums=[first[0] + first[1]])
+    assert pair_noise_dn(first[0], first[1], damaged) > 10 * NOISE_DN
+    by_pairs = pair_noise_dn(second[0], second[1], damaged, sums=[first[0] + first[1]])
     assert NOISE_FLOOR_DN < by_pairs < 3 * NOISE_DN

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from slrig.bundle.sidecars import Refused
-from slrig.capture.exposure import ExposedSamples, Unfit, bracket_summary, check_exposures, movement_between, verdict
+from slrig.capture.exposure import (
+    ExposureFault,
+    ExposureSamples,
+    bracket_summary,
+    check_exposures,
+    detect_movement,
+    judge_exposure,
+)
 from slrig.capture.verifier import EvidenceSummary, Sampler, check_capture
 from slrig.model import Black, Capture, Gray, LineShift, Shot, White, bracket_fault, exposure_groups
 from slrig.patterns.sequence import encode
@@ -59,19 +66,21 @@ def at_exposure(times: float, **options: float) -> Scene:
 @pytest.mark.parametrize(
     ("scene", "expected"),
     [
-        *((at_exposure(times), Unfit.TOO_DARK) for times in (0.005, 0.02)),
+        *((at_exposure(times), ExposureFault.TOO_DARK) for times in (0.005, 0.02)),
         *((at_exposure(times), None) for times in (0.25, 1.0, 2.0)),
-        (at_exposure(6.0), Unfit.TOO_BRIGHT),
+        (at_exposure(6.0), ExposureFault.TOO_BRIGHT),
         # A room that outshines the projector.
-        (at_exposure(4.0, ambient=0.7), Unfit.TOO_BRIGHT),
+        (at_exposure(4.0, ambient=0.7), ExposureFault.TOO_BRIGHT),
     ],
 )
-def test_an_exposure_is_of_use_unless_it_shows_too_little_or_too_much(scene: Scene, expected: Unfit | None) -> None:
+def test_an_exposure_is_of_use_unless_it_shows_too_little_or_too_much(
+    scene: Scene, expected: ExposureFault | None
+) -> None:
     white, black = scene.image(WHITE), scene.image(BLACK)
-    told = verdict(white, black, scene.format)
-    assert (None if told is None else told.unfit) is expected
+    told = judge_exposure(white, black, scene.format)
+    assert (None if told is None else told.fault) is expected
     # White that is darker than black is no matter of exposure.
-    assert expected is not None or verdict(black, white, scene.format) is None
+    assert expected is not None or judge_exposure(black, white, scene.format) is None
 
 
 def shots_at(times: float, *, moved_px: float = 0.0, noise_dn: float = 0.8) -> list[Shot]:
@@ -81,41 +90,41 @@ def shots_at(times: float, *, moved_px: float = 0.0, noise_dn: float = 0.8) -> l
     return [replace(shot, exposure_s=0.01 * times) for shot in scene.shots(PATTERNS)]
 
 
-def samples_of(shots: Sequence[Shot]) -> ExposedSamples:
-    sampler = Sampler.of(Scene().camera)
+def samples_of(shots: Sequence[Shot]) -> ExposureSamples:
+    sampler = Sampler.from_size(Scene().camera)
     exposure_s = shots[0].exposure_s
     assert exposure_s is not None
-    return ExposedSamples(exposure_s, {shot.pattern: sampler.take(shot.image) for shot in shots}, 0.8)
+    return ExposureSamples(exposure_s, {shot.pattern: sampler.take(shot.image) for shot in shots}, 0.8)
 
 
 @pytest.mark.parametrize("times", [(0.25, 1.0), (0.1, 2.0), (1.0, 1.6)])
 def test_one_scene_looks_the_same_at_every_exposure(times: tuple[float, float]) -> None:
     one, other = (samples_of(shots_at(each)) for each in times)
-    assert movement_between(one, other, PATTERNS, 255) is None
+    assert detect_movement(one, other, PATTERNS, 255) is None
 
 
 @pytest.mark.parametrize("moved_px", [1.5, -3.0])
 def test_what_moved_between_two_exposures_is_told(moved_px: float) -> None:
     one, other = samples_of(shots_at(0.25)), samples_of(shots_at(1.0, moved_px=moved_px))
-    told = movement_between(one, other, PATTERNS, 255)
+    told = detect_movement(one, other, PATTERNS, 255)
     assert told is not None
-    assert "looks otherwise at 0.01 s than at 0.0025 s" in told
+    assert "looks different at 0.01 s and at 0.0025 s" in told
     assert "moved between the two exposures" in told
 
 
 def test_a_frame_of_another_pattern_is_told_by_the_other_exposure() -> None:
     line = next(i for i, pattern in enumerate(PATTERNS) if isinstance(pattern, LineShift))
     swapped = [replace(s, pattern={line: line + 1, line + 1: line}.get(s.pattern, s.pattern)) for s in shots_at(1.0)]
-    told = movement_between(samples_of(shots_at(0.25)), samples_of(swapped), PATTERNS, 255)
+    told = detect_movement(samples_of(shots_at(0.25)), samples_of(swapped), PATTERNS, 255)
     assert told is not None
     assert f"pattern {line} " in told
 
 
 def test_exposures_that_share_no_clear_pixel_say_nothing_of_one_another() -> None:
     bright = samples_of(shots_at(9.0, moved_px=5.0))
-    assert movement_between(samples_of(shots_at(0.25)), bright, PATTERNS, 255) is None
-    without = ExposedSamples(0.01, {i: s for i, s in bright.frames.items() if PATTERNS[i] != Black()}, 0.8)
-    assert movement_between(samples_of(shots_at(0.25)), without, PATTERNS, 255) is None
+    assert detect_movement(samples_of(shots_at(0.25)), bright, PATTERNS, 255) is None
+    without = ExposureSamples(0.01, {i: s for i, s in bright.frames.items() if PATTERNS[i] != Black()}, 0.8)
+    assert detect_movement(samples_of(shots_at(0.25)), without, PATTERNS, 255) is None
 
 
 def summary(verified: int, *, drift: float = 0.0, lit: float = 0.5, faults: tuple[str, ...] = ()) -> EvidenceSummary:

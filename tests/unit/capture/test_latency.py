@@ -14,19 +14,19 @@ import pytest
 
 from slrig.capture.latency import (
     CameraLatency,
-    Flash,
-    FlashRows,
     LatencyMeasurement,
+    LightChange,
     RowLevels,
-    fitted,
+    TransitionRows,
+    find_transition_rows,
+    fit_latency,
     measure_latency,
     row_levels,
-    rows_of,
     shutter_skew_s,
     stable_from_ns,
 )
 from slrig.config import read_rig
-from slrig.devices import CameraSettings, Rig, Shown, Synchronisation, SystemClock, Trigger
+from slrig.devices import CameraSettings, DisplayedPattern, Rig, Synchronisation, SystemClock, Trigger
 from slrig.discovery import open_rig
 from slrig.errors import ConfigError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Pixels
@@ -56,11 +56,11 @@ def test_a_camera_in_step_with_the_display_is_started_anew(tmp_path: Path, monke
         armed.append(0)
         arm(count, trigger)
 
-    def rows(flash: Flash, levels: RowLevels) -> FlashRows | None:
-        return rows_of(flash, levels) if len(armed) == 2 else None
+    def rows(flash: LightChange, levels: RowLevels) -> TransitionRows | None:
+        return find_transition_rows(flash, levels) if len(armed) == 2 else None
 
     monkeypatch.setattr(eye, "arm", counted)
-    monkeypatch.setattr("slrig.capture.latency.rows_of", rows)
+    monkeypatch.setattr("slrig.capture.latency.find_transition_rows", rows)
     found = measure_latency(usual, trials=12).cameras["eye"]
     assert len(armed) == 2
     assert found.latency_s == pytest.approx(0.012, abs=5e-4)
@@ -77,7 +77,7 @@ def test_the_rig_is_dark_and_usable_after_the_test(tmp_path: Path, interrupted: 
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt) if interrupted else nullcontext():
-        measure_latency(usual, trials=8, told=told)
+        measure_latency(usual, trials=8, on_progress=told)
     usual.cameras["eye"].arm(1, Trigger.FREE)
     assert fractions[0] == 0
     assert interrupted or fractions[-1] == 1
@@ -106,7 +106,7 @@ def test_light_before_the_first_trigger_is_explained(tmp_path: Path) -> None:
 
 
 def test_a_pattern_is_stable_when_the_projector_says_so_unless_measured() -> None:
-    shown = Shown(3, 1_000_000_000, 400_000)
+    shown = DisplayedPattern(3, 1_000_000_000, 400_000)
     assert stable_from_ns(shown, None) == 1_000_400_000
     assert stable_from_ns(shown, Synchronisation(0.047, 0.002)) == 1_049_400_000
     assert stable_from_ns(shown, Synchronisation(-0.01, 0.002)) == 992_400_000
@@ -123,7 +123,7 @@ def test_the_slowest_camera_is_waited_for() -> None:
     assert kept.earliest_s == quick.earliest_s
     assert set(kept.line_time_s) == {"slow"}
     for camera in (quick, slow):
-        shown = Shown(0, STATED_NS, 500_000)
+        shown = DisplayedPattern(0, STATED_NS, 500_000)
         assert stable_from_ns(shown, kept) >= STATED_NS + camera.latest_s * 1e9
 
 
@@ -249,7 +249,7 @@ class World:
         white = [self.image(self.shares(self.steady, float(rng.uniform(0, 0.1))), rng) for _ in range(8)]
         return row_levels("eye", black, white, full_scale=self.full_scale)
 
-    def flashes(self, count: int, levels: RowLevels, rng: np.random.Generator) -> list[Flash]:
+    def flashes(self, count: int, levels: RowLevels, rng: np.random.Generator) -> list[LightChange]:
         made = []
         for number in range(count):
             to_white = number % 2 == 1
@@ -260,13 +260,13 @@ class World:
                 image = self.image(self.shares(light, start_s), rng)
                 stamp_ns = STATED_NS + round((start_s + self.stamp_offset_s) * 1e9)
                 frames.append((stamp_ns, self.exposure_s, levels.shares(image)))
-            made.append(Flash.of(to_white, Shown(0, STATED_NS, 500_000), frames))
+            made.append(LightChange.from_frames(to_white, DisplayedPattern(0, STATED_NS, 500_000), frames))
         return made
 
     def measured(self, *, count: int = 60, seed: int = 0) -> CameraLatency:
         rng = np.random.default_rng(seed)
         levels = self.levels(rng)
-        return fitted("eye", self.flashes(count, levels, rng), levels)
+        return fit_latency("eye", self.flashes(count, levels, rng), levels)
 
 
 def both_ways(light: Light) -> Callable[[bool, np.random.Generator], Light]:
@@ -392,7 +392,7 @@ def test_levels_leave_out_rows_that_tell_nothing() -> None:
     [
         ({"white_dn": 0.0}, r"sees no flash.*lamp is on"),
         ({"white_dn": 3000.0}, r"saturated.*expose shorter"),
-        ({"white_dn": 60.0, "noise_dn": 15.0}, "rows tell white from black"),
+        ({"white_dn": 60.0, "noise_dn": 15.0}, "rows distinguish white from black"),
         ({"exposure_s": 5e-4, "period_s": 0.1}, r"between two exposures .* raise its frame rate"),
         ({"light": both_ways(step(0.35))}, "did not change while it was watched"),
     ],

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from slrig.bundle.sidecars import Refused
-from slrig.capture.hardware_trigger import frame_shift
 from slrig.capture.sequencer import capture
-from slrig.capture.verifier import MOST_FAILURES, Evidence, EvidenceSummary, RetryPolicy
+from slrig.capture.triggering import frame_shift
+from slrig.capture.verifier import MAX_FAILURES, Evidence, EvidenceSummary, RetryPolicy
 from slrig.devices import CameraSettings, Synchronisation, Trigger
 from slrig.errors import (
     DeviceGoneError,
@@ -177,7 +177,7 @@ def test_a_projector_that_shows_something_else_is_refused(projector: dict[str, o
     assert_refused(fake, ScanEvidenceError, words)
     if "swaps" not in projector:
         # White and black three times, and each time the pattern that was shown while they were judged.
-        assert sum(call.startswith("show") for call in fake.world.calls) == 3 * MOST_FAILURES
+        assert sum(call.startswith("show") for call in fake.world.calls) == 3 * MAX_FAILURES
 
 
 def test_a_projector_that_is_gone_when_it_should_go_dark_is_no_success() -> None:
@@ -400,7 +400,7 @@ def test_three_failures_end_the_scan_and_tell_why(faults: dict[str, object], wor
     with pytest.raises(ScanEvidenceError, match=words):
         taken.run()
     worst = max(r.attempt for r in taken.refused)
-    assert worst == MOST_FAILURES
+    assert worst == MAX_FAILURES
     # Every frame that was made counts or was refused.
     delivered = [r for r in taken.refused if r.delivered]
     assert len(taken.yielded) == len(taken.latest) + len(delivered)
@@ -426,12 +426,12 @@ def test_frames_that_are_lost_now_and_then_say_nothing_against_those_that_come()
 
 def test_a_camera_is_not_exposed_for_ever() -> None:
     policy = RetryPolicy(SHORT, Evidence(SHORT.patterns, {"left": Scene().format}), lambda _: None)
-    assert policy.most_shots == MOST_FAILURES * len(SHORT)
-    for number in range(policy.most_shots):
-        policy.begin("left", number % len(SHORT))
-    policy.begin("right", 0)
-    with pytest.raises(ScanEvidenceError, match=f"{policy.most_shots} exposures gave no {len(SHORT)} frames"):
-        policy.begin("left", 0)
+    assert policy.max_exposures == MAX_FAILURES * len(SHORT)
+    for number in range(policy.max_exposures):
+        policy.start_exposure("left", number % len(SHORT))
+    policy.start_exposure("right", 0)
+    with pytest.raises(ScanEvidenceError, match=f"{policy.max_exposures} exposures gave no {len(SHORT)} frames"):
+        policy.start_exposure("left", 0)
 
 
 def test_a_projector_that_swapped_two_patterns_once_is_overcome() -> None:
@@ -602,7 +602,7 @@ def test_pulses_come_as_often_as_cameras_projector_and_rig_file_let(
 ) -> None:
     fake = wired("left")
     for camera, least_s in zip(fake.cameras.values(), told_s, strict=True):
-        camera.faults = CameraFaults(least_period_s=least_s)
+        camera.faults = CameraFaults(min_period_s=least_s)
     assert times_s(fake, trigger_period_s=trigger_period_s) == pytest.approx((0.01, period_s))
 
 
@@ -611,4 +611,4 @@ def test_a_pattern_is_lit_until_the_last_row_of_a_rolling_shutter_has_seen_it() 
     lit_s = 0.01 + (rows - 1) * 1e-5
     assert times_s(wired(), line_s=1e-5) == pytest.approx((lit_s, lit_s + 0.01))
     # The projector has its gap after that.
-    assert times_s(wired(least_period_s=0.01), line_s=1e-5) == pytest.approx((lit_s, lit_s + 0.0005))
+    assert times_s(wired(min_period_s=0.01), line_s=1e-5) == pytest.approx((lit_s, lit_s + 0.0005))

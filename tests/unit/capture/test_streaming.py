@@ -10,7 +10,7 @@ import pytest
 
 from slrig.bundle.sidecars import Refused
 from slrig.capture.sequencer import capture
-from slrig.capture.streaming import Cadence, FrameReader, _Lead
+from slrig.capture.streaming import Cadence, FrameReader, _DisplayLead
 from slrig.devices import Camera, Synchronisation, Trigger
 from slrig.errors import DeviceGoneError, FrameTimeoutError
 from slrig.model import Frame
@@ -29,7 +29,7 @@ def after(numbers: list[int], t_ns: int, *, jitter_ns: float = 0.0) -> tuple[int
     rng = np.random.default_rng(4)
     cadence = Cadence()
     for number in numbers:
-        cadence.note(frame(number, 10**12 + number * PERIOD_NS + round(jitter_ns * float(rng.standard_normal()))))
+        cadence.add(frame(number, 10**12 + number * PERIOD_NS + round(jitter_ns * float(rng.standard_normal()))))
     return cadence.start_after(10**12 + t_ns)
 
 
@@ -69,15 +69,15 @@ def test_nothing_is_foretold_of_too_few_or_too_uneven_frames() -> None:
 def test_a_camera_that_counts_anew_is_learnt_anew() -> None:
     cadence = Cadence()
     for number in range(5):
-        cadence.note(frame(number, number * PERIOD_NS))
-    cadence.note(frame(0, 10**12))
+        cadence.add(frame(number, number * PERIOD_NS))
+    cadence.add(frame(0, 10**12))
     assert cadence.start_after(0) is None
 
 
 def test_one_frame_is_enough_where_a_camera_states_its_period() -> None:
     cadence = Cadence(PERIOD_NS / 1e9)
     assert cadence.start_after(0) is None
-    cadence.note(frame(0, 10**12))
+    cadence.add(frame(0, 10**12))
     foretold = cadence.start_after(10**12 + 2 * PERIOD_NS)
     assert foretold is not None
     start_ns, spare_ns = foretold
@@ -88,7 +88,7 @@ def test_one_frame_is_enough_where_a_camera_states_its_period() -> None:
 def test_a_period_that_is_stated_wrongly_is_corrected_by_the_frames() -> None:
     cadence = Cadence(PERIOD_NS / 2e9)
     for number in range(3):
-        cadence.note(frame(number, 10**12 + number * PERIOD_NS))
+        cadence.add(frame(number, 10**12 + number * PERIOD_NS))
     foretold = cadence.start_after(10**12 + 20 * PERIOD_NS - 1_000)
     assert foretold is not None
     assert abs(foretold[0] - (10**12 + 20 * PERIOD_NS)) < 100
@@ -164,28 +164,28 @@ DELAY_NS = 46_800_000
 
 def test_one_pattern_tells_a_displays_lead_wherever_in_its_refresh_it_was_asked_for() -> None:
     for asked_ns in np.linspace(0, REFRESH_NS, 7).astype(int).tolist():
-        lead = _Lead(REFRESH_NS)
+        lead = _DisplayLead(REFRESH_NS)
         assert lead.ns == 0
-        lead.note(asked_ns, REFRESH_NS, REFRESH_NS + DELAY_NS)
+        lead.add(asked_ns, REFRESH_NS, REFRESH_NS + DELAY_NS)
         assert lead.ns == DELAY_NS
 
 
 def test_a_thread_that_wakes_late_makes_the_lead_shorter_until_one_wakes_in_time() -> None:
-    lead = _Lead(REFRESH_NS)
-    lead.note(10_000_000, REFRESH_NS + 4_000_000, REFRESH_NS + DELAY_NS)
+    lead = _DisplayLead(REFRESH_NS)
+    lead.add(10_000_000, REFRESH_NS + 4_000_000, REFRESH_NS + DELAY_NS)
     assert lead.ns == DELAY_NS - 4_000_000
-    lead.note(12_000_000, REFRESH_NS + 100_000, REFRESH_NS + DELAY_NS)
+    lead.add(12_000_000, REFRESH_NS + 100_000, REFRESH_NS + DELAY_NS)
     assert lead.ns == DELAY_NS - 100_000
     # As late as several refreshes: no more than one of them was waited for.
-    late = _Lead(REFRESH_NS)
-    late.note(0, 5 * REFRESH_NS, REFRESH_NS + DELAY_NS)
+    late = _DisplayLead(REFRESH_NS)
+    late.add(0, 5 * REFRESH_NS, REFRESH_NS + DELAY_NS)
     assert late.ns == DELAY_NS
 
 
 def test_a_projector_without_refreshes_is_asked_by_the_shortest_lead_it_had() -> None:
-    lead = _Lead(0)
+    lead = _DisplayLead(0)
     for asked_ns, begins_ns in ((0, 9_000_000), (0, 5_000_000), (0, 7_000_000)):
-        lead.note(asked_ns, begins_ns - 1, begins_ns)
+        lead.add(asked_ns, begins_ns - 1, begins_ns)
     assert lead.ns == 5_000_000
-    lead.note(3_000_000, 3_500_000, 2_000_000)  # its light may be there before it returns
+    lead.add(3_000_000, 3_500_000, 2_000_000)  # its light may be there before it returns
     assert lead.ns == 0

@@ -21,7 +21,7 @@ from slrig.client.errors import ScanFailedError
 from slrig.client.events import Captured, Event, FileReady, Progress, StateChange
 from slrig.client.notebook import shown
 from slrig.errors import ScanCancelledError, ServiceError
-from slrig.model.surfaces import light_of
+from slrig.model.surface import srgb_to_linear
 from slrig.scan.artefacts import encode_mesh_ply
 from tests.unit.client.service import HERE, SCAN, Walk, client_of
 from tests.unit.scan.test_mesh_formats import half_ball
@@ -109,7 +109,7 @@ def test_arrays_are_those_of_the_first_camera_of_the_rig() -> None:
     assert result.causes[result.cause[0, 0]] == "not lit"
     assert result.albedo.dtype == np.float32
     assert np.isnan(result.albedo[0, 0]).all()
-    assert result.albedo[1, 1, 0] == pytest.approx(light_of(np.array([188], np.uint8))[0] / 65535, abs=1e-5)
+    assert result.albedo[1, 1, 0] == pytest.approx(srgb_to_linear(np.array([188], np.uint8))[0] / 65535, abs=1e-5)
     left = result.cloud("left")
     assert isinstance(left, Cloud)
     assert (left.camera, left.albedo[1, 1, 0]) == ("left", 1.0)

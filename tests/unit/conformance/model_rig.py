@@ -15,10 +15,10 @@ from slrig.devices import (
     CameraInfo,
     CameraSettings,
     CameraState,
+    DisplayedPattern,
     ProjectorInfo,
     ProjectorState,
     Rig,
-    Shown,
     Trigger,
 )
 from slrig.errors import DeviceStateError, FrameTimeoutError
@@ -200,12 +200,12 @@ class ModelProjector(ProjectorState):
         self.blank()
         self.loaded = sequence
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         profile = self.profile(index)
         at_ns = self.world.at_ns + LATENCY_NS
         self.world.change(at_ns, profile)
         self.world.at_ns = at_ns + ERROR_NS
-        return Shown(index, at_ns, ERROR_NS)
+        return DisplayedPattern(index, at_ns, ERROR_NS)
 
     def profile(self, index: int) -> Pixels:
         return self.require_pattern(index).profiles[index]
@@ -577,33 +577,33 @@ class _ShinesFromTheStart(ModelProjector):
 class LightsLate(ModelProjector):
     """A display that is slower than its driver believes."""
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         profile = self.profile(index)
         at_ns = self.world.at_ns + LATENCY_NS
         self.world.change(at_ns + 40_000_000, profile)
         self.world.at_ns = at_ns + ERROR_NS
-        return Shown(index, at_ns, ERROR_NS)
+        return DisplayedPattern(index, at_ns, ERROR_NS)
 
 
 @breaks("show_tells_which_pattern_is_lit_since_when", "ms after the return")
 class _ReturnsEarly(ModelProjector):
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         shown = super().show(index)
         return replace(shown, t_visible_ns=shown.t_visible_ns + 10**9)
 
 
 @breaks("show_tells_which_pattern_is_lit_since_when", "index=1")
 class _TellsTheNextPattern(ModelProjector):
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         shown = super().show(index)
-        return Shown(index + 1, shown.t_visible_ns, shown.t_err_ns)
+        return DisplayedPattern(index + 1, shown.t_visible_ns, shown.t_err_ns)
 
 
 @breaks("show_needs_a_loaded_sequence")
 class _ShowsWithoutSequence(ModelProjector):
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         if self.loaded is None and not self.closed.is_set():
-            return Shown(index, self.world.at_ns, 0)
+            return DisplayedPattern(index, self.world.at_ns, 0)
         return super().show(index)
 
 

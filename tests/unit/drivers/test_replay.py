@@ -12,7 +12,7 @@ import pytest
 from drivers.replay import ReplayClock, ReplayHead, open_head
 from slrig.bundle import read_bundle, write_bundle
 from slrig.capture.sequencer import capture
-from slrig.devices import CameraSettings, Head, Rig, Shown, Trigger
+from slrig.devices import CameraSettings, DisplayedPattern, Rig, ScannerHead, Trigger
 from slrig.errors import ConfigError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, CameraFormat, Capture, Frame, Gray, LineShift, Pattern, Shot, Size, White
 from slrig.patterns.sequence import encode
@@ -35,7 +35,7 @@ def head_of(
     shots: Sequence[Shot],
     patterns: Sequence[Pattern] = (White(), Black(), BIT),
     cameras: Sequence[str] = ("eye",),
-) -> Head:
+) -> ScannerHead:
     formats = {name: CameraFormat(CAMERA, 8) for name in cameras}
     write_bundle(folder / "rec", Capture(PROJECTOR, tuple(patterns), formats, tuple(shots)))
     return open_head({"bundle": "rec"}, folder)
@@ -55,12 +55,14 @@ class RealTime:
         self.now_ns += round(seconds * 1e9)
 
 
-def paced_head(folder: Path, shots: Sequence[Shot], speed: float, real: RealTime) -> Head:
+def paced_head(folder: Path, shots: Sequence[Shot], speed: float, real: RealTime) -> ScannerHead:
     head_of(folder, shots)
     return ReplayHead(read_bundle(folder / "rec"), ReplayClock(speed, real_ns=real.read_ns, wait=real.wait))
 
 
-def frames(head: Head, patterns: Sequence[Pattern], *, exposure_s: float = 0.02) -> Iterator[tuple[Shown, Frame]]:
+def frames(
+    head: ScannerHead, patterns: Sequence[Pattern], *, exposure_s: float = 0.02
+) -> Iterator[tuple[DisplayedPattern, Frame]]:
     """Play a sequence; give each pattern's light and frame."""
     camera = head.cameras["eye"]
     camera.configure(CameraSettings(exposure_s))
@@ -73,7 +75,7 @@ def frames(head: Head, patterns: Sequence[Pattern], *, exposure_s: float = 0.02)
     camera.disarm()
 
 
-def values(head: Head, patterns: Sequence[Pattern], *, exposure_s: float = 0.02) -> list[int]:
+def values(head: ScannerHead, patterns: Sequence[Pattern], *, exposure_s: float = 0.02) -> list[int]:
     return [int(frame.image[0, 0]) for _, frame in frames(head, patterns, exposure_s=exposure_s)]
 
 
@@ -190,7 +192,7 @@ def test_options_are_checked(tmp_path: Path, options: dict[str, object], words: 
         open_head(options, tmp_path)
 
 
-def scanned(head: Head, patterns: Sequence[Pattern], *, exposure_s: float = 0.02) -> list[Shot]:
+def scanned(head: ScannerHead, patterns: Sequence[Pattern], *, exposure_s: float = 0.02) -> list[Shot]:
     settings = {name: CameraSettings(exposure_s) for name in head.cameras}
     rig = Rig("recording", head.cameras, head.projector, settings)
     return list(capture(rig, encode(patterns, PROJECTOR)))

@@ -11,7 +11,7 @@ from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.meshing.quality import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import AlbedoMark, FloatArray, Mesh
-from slrig.model.surfaces import light_of, srgb_of
+from slrig.model.surface import linear_to_srgb, srgb_to_linear
 from slrig.multiview.fusion import (
     _FOLDED,
     _OUTWARD,
@@ -90,7 +90,7 @@ def test_the_two_sides_of_a_wall_do_not_cancel() -> None:
 
 def test_colours_are_mixed_as_light_and_marked_ones_only_where_there_is_no_other() -> None:
     pose = np.eye(4)
-    light = light_of(np.array([50, 200], np.uint8)).astype(float)
+    light = srgb_to_linear(np.array([50, 200], np.uint8)).astype(float)
     views = [sheet(0, colour=50), sheet(0, colour=200, sigma_mm=0.02)]
     for view in views:  # most of the surface looks alike to both: they have one scale
         view.colour[np.abs(view.vertices_mm[:, 0]) > 1.9] = 100
@@ -98,7 +98,7 @@ def test_colours_are_mixed_as_light_and_marked_ones_only_where_there_is_no_other
     inner = np.abs(mixed.mesh.vertices_mm[:, :2]).max(axis=1) < 1.2
     assert inner.sum() > 10
     weights = 1 / (np.array([0.01, 0.02]) ** 2 + mixed.correlated_mm**2)
-    got = light_of(mixed.mesh.colour[inner]).mean()
+    got = srgb_to_linear(mixed.mesh.colour[inner]).mean()
     assert got == pytest.approx((weights * light).sum() / weights.sum(), rel=0.03)
     marked = fuse_views([sheet(0, colour=50), sheet(0, colour=255, mark=1, sigma_mm=0.002)], [pose] * 2, voxel_mm=0.5)
     inner = np.abs(marked.mesh.vertices_mm[:, :2]).max(axis=1) < 3
@@ -123,7 +123,7 @@ def test_a_painted_ball_has_one_scale_its_own_colours_and_no_seams() -> None:
     scales = random.uniform(0.5, 1.0, 8)  # each scan has its own
     for view, scale in zip(views_of(star(), around(8), 0.2), scales, strict=True):
         placed = view.mesh.vertices_mm @ view.pose[:3, :3].T + view.pose[:3, 3]
-        colour, mark = srgb_of(scale * paint(placed)), np.zeros(len(placed), np.uint8)
+        colour, mark = linear_to_srgb(scale * paint(placed)), np.zeros(len(placed), np.uint8)
         # A lobe that every camera sees clipped somewhere else, and a band that all see clipped.
         lobe = random.uniform(size=3) - 0.5
         clipped = placed @ (lobe / np.linalg.norm(lobe)) > 7
@@ -137,7 +137,7 @@ def test_a_painted_ball_has_one_scale_its_own_colours_and_no_seams() -> None:
     assert (mesh.mark[band < 0.5] == AlbedoMark.SATURATED).mean() > 0.95
     assert clean[band > 1.2].mean() > 0.97  # the rest one view alone has seen, and clipped
     true = paint(mesh.vertices_mm.astype(float))[clean]
-    off = light_of(mesh.colour[clean]) / 65535 / true
+    off = srgb_to_linear(mesh.colour[clean]) / 65535 / true
     assert np.median(off) == pytest.approx(scales.min(), rel=0.02)
     # Where views end there is no step: all vertices have the colour, not most of them.
     assert np.quantile(np.abs(off / np.median(off) - 1), (0.5, 0.99)) == pytest.approx((0, 0), abs=0.03)

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.errors import CalibrationError
-from slrig.model import Axis, Calibration, FloatArray, Pinhole, Solved, Source
+from slrig.model import Axis, Calibration, FloatArray, Pinhole, SolveRecord, Source
 from slrig.reconstruction.uncertainty import calibration_modes, calibration_sigma, stripe_tangents
 from tests.unit.calibration.perturbed import (
     changed,
@@ -33,7 +33,7 @@ NAMES = ("left", "right")
 def calibrated(cameras: dict[str, Pinhole], projector: Pinhole | None, seed: int = 0) -> Calibration:
     devices = [*cameras.values(), *([projector] if projector else [])]
     covariance = covariance_by_known_points(devices, 1, 0.05, seed)
-    solved = Solved("a solve", "2026-11-22T06:00:00+00:00", covariance, BOX, 0.01)
+    solved = SolveRecord("a solve", "2026-11-22T06:00:00+00:00", covariance, BOX, 0.01)
     return Calibration(cameras, projector, solved)
 
 
@@ -263,7 +263,7 @@ def test_without_a_normal_the_viewing_ray_stands() -> None:
 def test_a_calibration_without_covariance_has_no_modes_and_an_exact_one_no_share() -> None:
     plain = Calibration({"left": left_camera()}, light_source())
     assert calibration_modes(plain, ["left"], Axis.COLUMN) is None
-    exact = Calibration(plain.cameras, plain.projector, Solved("id", "now", np.zeros((30, 30)), BOX, 0.0))
+    exact = Calibration(plain.cameras, plain.projector, SolveRecord("id", "now", np.zeros((30, 30)), BOX, 0.0))
     assert (share(exact, *surface(5, 9)) == 0).all()
 
 

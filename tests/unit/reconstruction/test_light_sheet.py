@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Size, lens
-from slrig.model.lens_kernels import undistorted
+from slrig.model.lens_kernels import undistort
 from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.triangulation import intersect_light_sheets, normalised_from_pixel, pack_device
 from tests.unit.reconstruction.builders import ensemble_of, looking
@@ -28,11 +28,11 @@ def one_by_one(
     for curve, position in enumerate(ensemble.position_px):
         for i in range(*ensemble.offsets[curve : curve + 2]):
             xd, yd, _ = np.linalg.solve(camera.matrix, [*ensemble.points_px[i], 1.0])
-            ray = np.array([*undistorted(camera.distortion, xd, yd, xd, yd, 1e-7), 1.0]) @ camera.rotation
+            ray = np.array([*undistort(camera.distortion, xd, yd, xd, yd, 1e-7), 1.0]) @ camera.rotation
             s, steps[i] = depth_on_sheet(camera.centre_mm, ray, projector, position, axis)
             points[i] = camera.centre_mm + s * ray
             x, y, depth = projector.rotation @ points[i] + projector.translation_mm
-            _, _, xx, xy, yy = lens.distorted(projector.distortion, x / depth, y / depth)
+            _, _, xx, xy, yy = lens.distort(projector.distortion, x / depth, y / depth)
             if s <= 0 or depth <= 0:
                 cause[i] = Refusal.BEHIND_DEVICE
             elif xx * yy > xy * xy:
@@ -55,7 +55,7 @@ def depth_on_sheet(
     for step in range(1, 26):
         place = projector.rotation @ (origin_mm + s * ray) + projector.translation_mm
         x, y = place[:2] / place[2]
-        xd, yd, xx, xy, yy = lens.distorted(projector.distortion, x, y)
+        xd, yd, xx, xy, yy = lens.distort(projector.distortion, x, y)
         missed = (projector.matrix @ [xd, yd, 1.0])[across] - position
         moved = np.array([[xx, xy], [xy, yy]]) @ (ahead[:2] - np.array([x, y]) * ahead[2]) / place[2]
         s -= missed / (projector.matrix[:2, :2] @ moved)[across]

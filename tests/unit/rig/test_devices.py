@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from slrig.devices import AnyAngle, AppliedSettings, CallLimits, CameraSettings, Rig, Trigger, progress_reporter
+from slrig.devices import AppliedSettings, CallLimits, CameraSettings, Rig, Trigger, TurntableBase, progress_reporter
 from slrig.errors import (
     CameraNotFoundError,
     ConfigError,
@@ -519,7 +519,7 @@ class Motor:
         self.fails = False
 
 
-class Table(AnyAngle):
+class Table(TurntableBase):
     """One opening of it."""
 
     def __init__(self, motor: Motor, *, homed: bool = False) -> None:

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from slrig.capture.verifier import EvidenceSummary
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, DisplayedPattern, ProjectorInfo, Rig, Trigger
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FrameSink
 from slrig.jobs.rig_jobs import Recorded
 from slrig.model import Black, Calibration, CameraFormat, Frame, Shot, Size, White
-from slrig.model.header import CaptureHeader
+from slrig.model.capture import CaptureHeader
 from slrig.scan.plan import ScanPlan
 
 WAIT_S = 20.0
@@ -91,9 +91,9 @@ class TameProjector:
         self.blank_error: Exception | None = None
         self.info = ProjectorInfo("projector", "tame", "2", Size(64, 40), plays=False, latency_s=0.0)
 
-    def show(self, index: int) -> Shown:
+    def show(self, index: int) -> DisplayedPattern:
         self.dark = False
-        return Shown(index, 0, 0)
+        return DisplayedPattern(index, 0, 0)
 
     def stop(self) -> None:
         self.dark = True

@@ -32,7 +32,7 @@ from slrig.errors import (
 )
 from slrig.jobs.frame_feed import Abandon, FrameFeed
 from slrig.model import Axis, Black, Calibration, CameraFormat, Shot, Size, White
-from slrig.model.header import CaptureHeader
+from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import Recorder, capture_frames, exposed
 from slrig.scan.plan import PatternPlan, PresetUse, ScanPlan
 from slrig.scan.report import capture_notes, capture_report
@@ -105,7 +105,7 @@ def test_a_sound_capture_is_a_bundle_and_each_frame_is_shown_to_the_reconstructi
     (tmp_path / "bundle" / "calibration.json").unlink()  # of other devices
     capture = read_bundle(tmp_path / "bundle").capture
     assert len(capture.shots) == len(sink.shots) == 32
-    assert (sink.header, sink.calibration) == (CaptureHeader.of(capture), fake.rig.calibration)
+    assert (sink.header, sink.calibration) == (CaptureHeader.from_capture(capture), fake.rig.calibration)
     for shot, again in zip(sink.shots, capture.shots, strict=True):
         assert (shot.pattern, shot.camera, shot.exposure_s) == (again.pattern, again.camera, again.exposure_s)
         np.testing.assert_array_equal(shot.image, again.image)
@@ -183,7 +183,7 @@ def test_a_frame_that_was_shot_again_is_right_in_the_bundle_and_the_report_says_
     assert sink.evidence.causes == summary.causes
     assert str(sink.evidence) == str(summary) == "16/16 patterns verified, 3 frames shot again"
     assert told[-1] == (1.0, "frame 16 of 16, 3 shot again")
-    report = capture_report(CaptureHeader.of(capture), Axis.COLUMN, summary)
+    report = capture_report(CaptureHeader.from_capture(capture), Axis.COLUMN, summary)
     assert report["identity"] == str(summary)
     evidence = report["evidence"]
     assert isinstance(evidence, dict)
@@ -498,7 +498,11 @@ def test_the_sequence_is_played_once_for_each_exposure_from_short_to_long(tmp_pa
     times_s = [shot.time_s for shot in capture.shots if shot.camera == "right"]
     assert times_s[0] == 0.0
     assert all(a is not None and b is not None and a < b for a, b in pairwise(times_s))
-    assert CaptureHeader.of(capture) == sink.header == CaptureHeader.of(replace(capture, shots=tuple(sink.shots)))
+    assert (
+        CaptureHeader.from_capture(capture)
+        == sink.header
+        == CaptureHeader.from_capture(replace(capture, shots=tuple(sink.shots)))
+    )
     assert sink.evidence == check_exposures(capture)
     assert str(sink.evidence) == f"{COUNT}/{COUNT} patterns verified"
     assert told[-1] == (1.0, f"frame {2 * COUNT} of {2 * COUNT}")
@@ -529,8 +533,8 @@ def test_an_exposure_that_is_too_long_or_too_short_is_left_out_and_the_report_sa
     capture, refused = read_bundle(tmp_path / "bundle").capture, read_refused(tmp_path / "bundle")
     summary = check_exposures(capture, refused)
     assert summary == sink.evidence
-    report = capture_report(CaptureHeader.of(capture), Axis.COLUMN, summary)
-    notes = capture_notes(CaptureHeader.of(capture), Axis.COLUMN, summary)
+    report = capture_report(CaptureHeader.from_capture(capture), Axis.COLUMN, summary)
+    notes = capture_notes(CaptureHeader.from_capture(capture), Axis.COLUMN, summary)
     assert len(notes) == 2
     for note, words in zip(sorted(notes), ("0.0001 s is too dark", "0.08 s is too bright"), strict=True):
         assert note.startswith(f"an exposure was left out: {words} for camera 'right': ")
@@ -600,7 +604,7 @@ def test_what_moves_between_two_exposures_ends_the_scan(tmp_path: Path) -> None:
     rig.cameras["right"].pushed_at = 2
     told = ended(rig, tmp_path / "bundle")
     assert "camera 'right', pattern" in told
-    assert "looks otherwise at 0.01 s than at 0.005 s" in told
+    assert "looks different at 0.01 s and at 0.005 s" in told
 
 
 def test_a_cancel_at_the_second_exposure_leaves_nothing(tmp_path: Path) -> None:

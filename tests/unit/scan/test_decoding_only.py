@@ -20,7 +20,7 @@ from slrig.bundle import write_bundle
 from slrig.cli.commands import app
 from slrig.errors import PatternError
 from slrig.model import Axis, Black, CameraFormat, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White
-from slrig.model.missing_bits import MOST_BITS, without_missing_bits
+from slrig.model.capture import MAX_MISSING_BITS, trim_incomplete_codes
 from slrig.patterns.codes import gray_bits, gray_profile
 from slrig.patterns.sequence import scan_patterns
 from slrig.scan.decoding_only import decode_bundle
@@ -165,7 +165,7 @@ def test_what_is_left_shows_the_same_light(extent_px: int, cell_px: int, offset_
 def test_finer_bits_go_with_the_missing_one_in_every_camera(lacking: tuple[tuple[str, int], ...]) -> None:
     whole, capture = scan_without(), scan_without(*lacking)
     kept = lacking[0][1]
-    cut, (told,) = without_missing_bits(capture)
+    cut, (told,) = trim_incomplete_codes(capture)
     assert f"bit {kept + 1} of the 6 of the column code" in told
     assert f"cells of {2 << 6 - kept} px instead of 2" in told
     expected = {}
@@ -179,7 +179,7 @@ def test_finer_bits_go_with_the_missing_one_in_every_camera(lacking: tuple[tuple
     assert {p.bit for p in cut.patterns if isinstance(p, Gray)} == set(range(kept))
     other = scan_without(("left", 5), rows=True)
     rows = [p for p in other.patterns if isinstance(p, Gray) and p.axis is Axis.ROW]
-    cut_of_both, (_,) = without_missing_bits(other)
+    cut_of_both, (_,) = trim_incomplete_codes(other)
     assert [p for p in cut_of_both.patterns if isinstance(p, Gray) and p.axis is Axis.ROW] == rows
     assert [s.time_s for s in cut.shots] == sorted(s.time_s or 0.0 for s in cut.shots)
 
@@ -191,11 +191,11 @@ def test_finer_bits_go_with_the_missing_one_in_every_camera(lacking: tuple[tuple
         scan_without(lines=True, rows=True),
         # Cells of four pixels number lines that are eight apart, and wider ones do not.
         scan_without(("left", 4), lines=True),
-        scan_without(("left", 5 - MOST_BITS)),
+        scan_without(("left", 5 - MAX_MISSING_BITS)),
         scan_without(("left", 0)),
         Capture(PROJECTOR, (White(), Black(), LineShift(Axis.COLUMN, 0, 8, 1)), {}, ()),
     ],
     ids=["whole", "both axes", "lines", "too coarse", "nothing left", "no code"],
 )
 def test_all_else_is_left_as_it_is(capture: Capture) -> None:
-    assert without_missing_bits(capture) == (capture, ())
+    assert trim_incomplete_codes(capture) == (capture, ())

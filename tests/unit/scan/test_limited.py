@@ -18,7 +18,7 @@ from slrig.bundle import read_bundle, write_bundle
 from slrig.capture.verifier import check_capture
 from slrig.errors import ConfigError, NothingToReconstructError
 from slrig.model import Mesh, Pinhole, Refusal, Region
-from slrig.model.header import CaptureHeader
+from slrig.model.capture import CaptureHeader
 from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.reconstruct import reconstruct_bundle
@@ -190,7 +190,7 @@ def test_frames_that_came_live_give_the_same_bytes(scanned: Scanned, announced: 
     _, _, recorded = scanned(region)
     bundle = read_bundle(scanned.bundle)
     assert bundle.calibration is not None
-    live = LiveScan(CaptureHeader.of(bundle.capture), bundle.calibration, announced)
+    live = LiveScan(CaptureHeader.from_capture(bundle.capture), bundle.calibration, announced)
     for shot in bundle.capture.shots:
         live.take(shot)
     live.end(check_capture(bundle.capture, ()))
@@ -200,7 +200,7 @@ def test_frames_that_came_live_give_the_same_bytes(scanned: Scanned, announced: 
 
 
 def test_a_camera_that_is_not_there_is_no_region(scanned: Scanned) -> None:
-    with pytest.raises(ConfigError, match=r"names camera 'middle'; there are \['left'\]"):
+    with pytest.raises(ConfigError, match=r"expected one of the cameras \['left'\], found 'middle'"):
         scanned(Region(polygons_px={"middle": ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0))}))
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from slrig.errors import ConfigError, PatternError
 from slrig.model import (
-    LEAST_SHARE,
+    MIN_BASELINE_FRACTION,
     Axis,
     Calibration,
     CameraFormat,
@@ -24,8 +24,8 @@ from slrig.model import (
     Pinhole,
     SequenceName,
     Size,
-    share_across,
-    told_depth,
+    baseline_fraction,
+    depth_sensitive_cameras,
     triangulated_axis,
 )
 from slrig.rig.session import RigFacts
@@ -108,7 +108,7 @@ def test_a_weak_crossing_is_told_in_degrees_with_its_price_and_its_cure() -> Non
     assert "at 14° only" in told
     assert "4.0 times" in told
     assert "Scan with both axes: rows (--rows)" in told
-    assert "45°" in (weakness(Axis.ROW, BOTH, LEAST_SHARE) or "")
+    assert "45°" in (weakness(Axis.ROW, BOTH, MIN_BASELINE_FRACTION) or "")
     assert "more than 100 times" in (weakness(Axis.ROW, BOTH, 0.0) or "")
 
 
@@ -250,13 +250,13 @@ def test_the_axis_is_the_one_along_which_depth_shows(
     across, down = moved_px(one, two)
     assert triangulated_axis(cameras, projector) is (Axis.COLUMN if across > down else Axis.ROW)
     for axis, moved in ((Axis.COLUMN, across), (Axis.ROW, down)):
-        assert share_across(axis, cameras, projector) == pytest.approx(moved / math.hypot(across, down), abs=1e-9)
+        assert baseline_fraction(axis, cameras, projector) == pytest.approx(moved / math.hypot(across, down), abs=1e-9)
 
 
 def test_finer_rows_do_not_make_a_sheet_of_them_steeper() -> None:
     diamond = looking_from(0.0, 0.0, focal_px=(900.0, 1800.0))
     assert triangulated_axis([looking_from(100.0, 60.0)], diamond) is Axis.COLUMN
-    assert share_across(Axis.ROW, [looking_from(100.0, 60.0)], diamond) == pytest.approx(60 / math.hypot(100, 60))
+    assert baseline_fraction(Axis.ROW, [looking_from(100.0, 60.0)], diamond) == pytest.approx(60 / math.hypot(100, 60))
 
 
 def test_with_a_projector_all_cameras_decide_by_what_they_resolve() -> None:
@@ -266,7 +266,7 @@ def test_with_a_projector_all_cameras_decide_by_what_they_resolve() -> None:
     sharp = looking_from(0.0, 50.0, focal_px=(6300.0, 6300.0))
     assert triangulated_axis([sharp, looking_from(300.0, 0.0)], projector) is Axis.ROW
     two = [looking_from(0.0, 60.0), looking_from(80.0, 0.0)]
-    assert share_across(Axis.ROW, two, projector) == pytest.approx(0.6)
+    assert baseline_fraction(Axis.ROW, two, projector) == pytest.approx(0.6)
 
 
 def test_axis_gives_depth_to_cameras_with_a_baseline_across_it() -> None:
@@ -274,15 +274,15 @@ def test_axis_gives_depth_to_cameras_with_a_baseline_across_it() -> None:
         [looking_from(10.0, 90.0), looking_from(80.0, 80.0), looking_from(120.0, 0.0)],
         looking_from(0.0, 0.0),
     )
-    assert told_depth(Axis.COLUMN, cameras, projector) == [False, True, True]
-    assert told_depth(Axis.ROW, cameras, projector) == [True, True, False]
-    assert told_depth(Axis.ROW, cameras[2:], projector) == [True]
+    assert depth_sensitive_cameras(Axis.COLUMN, cameras, projector) == [False, True, True]
+    assert depth_sensitive_cameras(Axis.ROW, cameras, projector) == [True, True, False]
+    assert depth_sensitive_cameras(Axis.ROW, cameras[2:], projector) == [True]
 
 
 def test_of_several_cameras_the_longest_baseline_of_the_first_decides() -> None:
     cameras = [looking_from(0.0, 0.0), looking_from(80.0, 0.0), looking_from(0.0, 120.0)]
     assert triangulated_axis(cameras, None) is Axis.ROW
     assert triangulated_axis(cameras[:2], None) is Axis.COLUMN
-    assert share_across(Axis.ROW, cameras, None) == 1.0
+    assert baseline_fraction(Axis.ROW, cameras, None) == 1.0
     # Without a baseline columns are as good as rows.
     assert triangulated_axis(cameras[:1], None) is triangulated_axis(cameras[:1] * 2, None) is Axis.COLUMN

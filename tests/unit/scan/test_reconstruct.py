@@ -37,8 +37,21 @@ from slrig.errors import (
     SlrigError,
 )
 from slrig.jobs.versions import versions
-from slrig.model import Axis, Black, Calibration, Capture, Gray, LineShift, Pixels, Refusal, Shot, Size, Solved, White
-from slrig.model.header import CaptureHeader
+from slrig.model import (
+    Axis,
+    Black,
+    Calibration,
+    Capture,
+    Gray,
+    LineShift,
+    Pixels,
+    Refusal,
+    Shot,
+    Size,
+    SolveRecord,
+    White,
+)
+from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import write_converted
 from slrig.scan.measured import measured
@@ -275,7 +288,7 @@ def seen_live(bundle: Path, *, upside_down: bool = False, last_exposure_s: float
     """What a reconstruction holds that was fed while this bundle was captured."""
     recorded = read_bundle(bundle)
     assert recorded.calibration is not None
-    live = LiveScan(CaptureHeader.of(recorded.capture), recorded.calibration)
+    live = LiveScan(CaptureHeader.from_capture(recorded.capture), recorded.calibration)
     *others, last = recorded.capture.shots
     for shot in (*others, replace(last, exposure_s=last_exposure_s or last.exposure_s)):
         live.take(replace(shot, image=shot.image[::-1]) if upside_down else shot)
@@ -402,7 +415,7 @@ def test_what_frames_prove_is_what_they_prove_together(both_axes: Path, tmp_path
 def test_frames_are_let_go_when_they_are_not_needed(both_axes: Path) -> None:
     bundle = read_bundle(both_axes)
     assert bundle.calibration is not None
-    header = CaptureHeader.of(bundle.capture)
+    header = CaptureHeader.from_capture(bundle.capture)
     stream = ScanStream(header, bundle.calibration, entered=lambda *_: None, axis=Axis.COLUMN)
     held: list[tuple[Axis | None, weakref.ref[Pixels]]] = []
     most = 0
@@ -457,7 +470,7 @@ def test_frames_are_read_a_few_ahead(both_axes: Path, monkeypatch: pytest.Monkey
 
 def test_the_outline_has_everything_but_pixels(both_axes: Path) -> None:
     outline, whole = open_bundle(both_axes).outline, read_bundle(both_axes).capture
-    assert CaptureHeader.of(outline) == CaptureHeader.of(whole)
+    assert CaptureHeader.from_capture(outline) == CaptureHeader.from_capture(whole)
     assert not any(shot.image.any() for shot in outline.shots)
     assert sum(shot.image.base.nbytes for shot in outline.shots if shot.image.base is not None) < 1000
     assert isinstance(outline, Capture)
@@ -544,7 +557,7 @@ def stating(calibration: Calibration, scale: float = 1.0, solved_at: str = "2026
     """The calibration with an error of its own: the projector's principal point and place, in px and mm."""
     deviations = np.zeros(30)
     deviations[[15 + 2, 15 + 12, 15 + 14]] = 0.05 * scale, 0.02 * scale, 0.03 * scale
-    return replace(calibration, solved=Solved("solve-7", solved_at, np.diag(deviations**2), BOX, 0.0123))
+    return replace(calibration, solved=SolveRecord("solve-7", solved_at, np.diag(deviations**2), BOX, 0.0123))
 
 
 def vertices(path: Path) -> dict[str, NDArray[Any]]:

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from slrig.calibration.board import COLUMN, ROW, Board, BoardKind, BoardView, Correspondences, PoseObservation
 from slrig.calibration.solution import PROJECTOR
-from slrig.model import Calibration, FloatArray, Pinhole, Solved
+from slrig.model import Calibration, FloatArray, Pinhole, SolveRecord
 from tests.unit.calibration.perturbed import (
     aligned,
     changed,
@@ -49,7 +49,7 @@ def bench(seed: int = 0, *, cameras: int = 1, known_px: float = 0.02) -> Bench:
     covariance = covariance_by_known_points(list(devices.values()), 1, known_px, 5)
     error = draws(covariance, 1, seed + 100)[0].reshape(-1, 15)
     stated = {name: changed(device, error[index]) for index, (name, device) in enumerate(devices.items())}
-    solved = Solved("0123456789ab", "2026-11-20T08:00:00+00:00", covariance, VOLUME_MM, 0.01)
+    solved = SolveRecord("0123456789ab", "2026-11-20T08:00:00+00:00", covariance, VOLUME_MM, 0.01)
     light = stated.pop(PROJECTOR)
     return Bench(devices, Calibration(stated, light, solved))
 

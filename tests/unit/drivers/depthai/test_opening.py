@@ -324,7 +324,7 @@ def test_settings_that_come_late_are_waited_for(head: Opens) -> None:
     left = pair.cameras["left"]
     for exposure_s, gain in ((0.002, 1.0), (0.008, 2.0)):
         applied = left.configure(CameraSettings(exposure_s, gain))
-        assert (applied.exposure_s, applied.gain, applied.least_period_s) == (exposure_s, gain, 0.01)
+        assert (applied.exposure_s, applied.gain, applied.min_period_s) == (exposure_s, gain, 0.01)
     left.arm(1, Trigger.FREE)
     frame = left.read(0, PATIENCE_S)
     assert (frame.exposure_s, frame.gain) == (0.008, 2.0)

@@ -22,7 +22,7 @@ from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.planes import plane_of
 from drivers.pattern_engine.timing import Timing
 from slrig.bundle.validation import checked
-from slrig.devices import FlashedProjector
+from slrig.devices import StoredPatternProjector
 from slrig.errors import (
     ConfigError,
     DeviceError,
@@ -119,7 +119,7 @@ def test_a_flash_without_a_list_asks_for_pictures(bench: Bench, tmp_path: Path) 
     with pytest.raises(UnsupportedByDeviceError, match=r"lacks 3 of 3 patterns.*slrig patterns"):
         projector.load(SEQUENCE)
     assert list(tmp_path.iterdir()) == [], "what is only tried is not written"
-    assert isinstance(projector, FlashedProjector)
+    assert isinstance(projector, StoredPatternProjector)
     assert str(tmp_path / "to_flash") in projector.write_patterns(SEQUENCE)
     assert (tmp_path / "to_flash" / "images.json").is_file()
     with pytest.raises(DeviceStateError):

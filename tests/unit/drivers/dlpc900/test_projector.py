@@ -10,7 +10,7 @@ import pytest
 
 from drivers.dlpc900.pictures import MOST_PICTURES, memory_of, packed
 from drivers.pattern_engine.planes import plane_of
-from slrig.devices import FlashedProjector
+from slrig.devices import StoredPatternProjector
 from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, PatternSequence, Size, White
 from slrig.patterns.sequence import encode
@@ -32,7 +32,7 @@ def bench() -> Bench:
 def test_dark_between_is_declared_and_nothing_is_flashed(bench: Bench) -> None:
     projector = bench.open()
     assert projector.info.gap_s == pytest.approx(0.0005 + 105e-6)
-    assert not isinstance(projector, FlashedProjector)
+    assert not isinstance(projector, StoredPatternProjector)
 
 
 def test_the_table_comes_before_the_pictures_and_these_last_one_first(bench: Bench) -> None:

@@ -190,9 +190,7 @@ def test_settings_that_the_camera_changes_silently_are_refused(
 def test_the_least_period_is_what_the_camera_says(device: Device, overhead_s: float) -> None:
     camera = device.open()
     for exposure_s in (0.004, 0.013):
-        assert camera.configure(CameraSettings(exposure_s, 1.0)).least_period_s == pytest.approx(
-            exposure_s + overhead_s
-        )
+        assert camera.configure(CameraSettings(exposure_s, 1.0)).min_period_s == pytest.approx(exposure_s + overhead_s)
 
 
 @GENICAM
@@ -260,7 +258,7 @@ def test_a_camera_with_other_names_of_features_is_read_and_triggered(kind: str) 
         assert applied.exposure_s == pytest.approx(0.002)
         if kind == "stock":
             # It has no name for the rate that its settings result in, and whole gains.
-            assert applied.least_period_s is None
+            assert applied.min_period_s is None
             with pytest.raises(UnsupportedByDeviceError, match=r"asked for gain 1.5, it gives [12]"):
                 camera.configure(CameraSettings(0.002, 1.5))
         else:

@@ -53,7 +53,7 @@ def test_a_source_declares_what_its_table_says() -> None:
         assert (info.exposure_range_s, info.gain_range) == ((0.01, 0.01), (1.0, 1.0))
         assert info.triggers == {Trigger.FREE}
         assert str(info.format.size) == "80 x 60"
-        assert camera.configure(CameraSettings(0.01005)) == AppliedSettings(0.01, 1.0, least_period_s=0.02)
+        assert camera.configure(CameraSettings(0.01005)) == AppliedSettings(0.01, 1.0, min_period_s=0.02)
         with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s 0.02, it takes 0.01 only"):
             camera.configure(CameraSettings(0.02))
         with pytest.raises(UnsupportedByDeviceError, match="asked for gain 2, it takes 1 only; OpenCV has no control"):

@@ -153,7 +153,7 @@ def test_a_series_of_deep_images_keeps_its_depth(tmp_path: Path) -> None:
 def test_a_film_takes_the_exposure_it_was_made_with_and_a_rate_that_is_given(tmp_path: Path) -> None:
     write_film(tmp_path / "film.avi", ramp(20))
     camera = opened(tmp_path, frame_rate_hz=40.0)
-    assert camera.configure(CameraSettings(EXPOSURE_S)) == AppliedSettings(EXPOSURE_S, 1.0, least_period_s=None)
+    assert camera.configure(CameraSettings(EXPOSURE_S)) == AppliedSettings(EXPOSURE_S, 1.0, min_period_s=None)
     with pytest.raises(UnsupportedByDeviceError, match="no control"):
         camera.configure(CameraSettings(1 / 60))
     camera.arm(1, Trigger.FREE)

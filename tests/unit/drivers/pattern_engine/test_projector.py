@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from slrig.devices import UnprovenLight
+from slrig.devices import UnknownPolarityProjector
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Size
 from tests.contract.dlpc350_device import WHITE
@@ -218,7 +218,9 @@ def test_the_led_current_is_set_in_the_sense_of_the_board(
     assert list(usb_bench.engine.registers[0x0B01]) == sent
     # What it says to write into the rig file, once the doctor knows which way light goes.
     projector = usb_bench.open(led_current_inverted=None)
-    assert projector.option_for(rises=inverted is bool(polarity)) == f"led_current_inverted = {str(inverted).lower()}"
+    assert (
+        projector.polarity_option(rises=inverted is bool(polarity)) == f"led_current_inverted = {str(inverted).lower()}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -283,15 +285,15 @@ def test_until_the_sense_of_the_current_is_known_light_is_a_twentieth(made: Make
     bench = made(led_inverted=inverted)
     assert isinstance(bench, UsbBench)
     projector = bench.open(led_current_inverted=None, led_current=0.5)
-    assert isinstance(projector, UnprovenLight)
-    assert (projector.unproven, projector.info.plays) == (True, False)
+    assert isinstance(projector, UnknownPolarityProjector)
+    assert (projector.is_polarity_unknown, projector.info.plays) == (True, False)
     projector.load(bench.sequence)
     with pytest.raises(UnsupportedByDeviceError, match="slrig doctor finds it out"):
         projector.play(0.01, 0.02)
     most = {}
     for share in (None, 0.5, 0.4, 0.6):
         if share is not None:
-            projector.try_current(share)
+            projector.set_trial_current(share)
         bench.engine.shown.clear()
         projector.show(0)
         exposure_us, period_us, periods = bench.held_us()
@@ -303,14 +305,14 @@ def test_until_the_sense_of_the_current_is_known_light_is_a_twentieth(made: Make
     assert (most[0.6] > most[0.4]) is not inverted
     for share in (0.39, 0.61):
         with pytest.raises(UnsupportedByDeviceError, match=r"only 0\.4 to 0\.6"):
-            projector.try_current(share)
-    told = projector.option_for(rises=most[0.6] > most[0.4])
+            projector.set_trial_current(share)
+    told = projector.polarity_option(rises=most[0.6] > most[0.4])
     assert told == f"led_current_inverted = {str(inverted).lower()}"
 
 
 @USB
 def test_a_current_whose_sense_is_known_is_not_tried(usb_bench: UsbBench) -> None:
     projector = usb_bench.open()
-    assert not projector.unproven
+    assert not projector.is_polarity_unknown
     with pytest.raises(UnsupportedByDeviceError, match="asked to try"):
-        projector.try_current(0.5)
+        projector.set_trial_current(0.5)

@@ -69,8 +69,8 @@ def test_settings_become_controls_and_tell_the_least_period() -> None:
         with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s 0\.00015 and gain 1, it gives 0\.00016 and 1"):
             camera.configure(CameraSettings(0.00015))
         slow = camera.configure(CameraSettings(0.02))
-    assert (fast.exposure_s, fast.gain, fast.least_period_s) == pytest.approx((0.005, 2.0, 0.008333))
-    assert slow.least_period_s == pytest.approx(0.02 + BLANK_US / 1e6)
+    assert (fast.exposure_s, fast.gain, fast.min_period_s) == pytest.approx((0.005, 2.0, 0.008333))
+    assert slow.min_period_s == pytest.approx(0.02 + BLANK_US / 1e6)
     # Nothing automatic, and no sharpening: what its controls are, and not those that it lacks.
     off = {"AeEnable": False, "AwbEnable": False, "NoiseReductionMode": 0, "Sharpness": 0.0, "Contrast": 1.0}
     assert where.asked == {**off, "ExposureTime": 20_000, "AnalogueGain": 1.0, "FrameDurationLimits": (8_333, 25_000)}

@@ -21,7 +21,7 @@ from drivers.serial_projector.frames import Mode
 from drivers.serial_projector.link import Link
 from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each
 from drivers.serial_projector.projector import SerialProjector
-from slrig.devices import FlashedProjector
+from slrig.devices import StoredPatternProjector
 from slrig.errors import (
     ConfigError,
     DeviceBusyError,
@@ -166,7 +166,7 @@ def test_patterns_that_are_not_flashed_are_refused_dark_and_nothing_is_written(b
 
 def test_each_set_of_patterns_is_written_into_a_folder_of_its_own(bench: Bench, tmp_path: Path) -> None:
     projector = bench.open(tmp_path)
-    assert isinstance(projector, FlashedProjector)
+    assert isinstance(projector, StoredPatternProjector)
     told = [projector.write_patterns(each) for each in (SEQUENCE, BACKWARDS, SEQUENCE)]
     first, second = (crc32_of_all(crc32_of_each(each)) for each in (SEQUENCE, BACKWARDS))
     assert {folder.name for folder in (tmp_path / "patterns").iterdir()} == {f"{first:08X}", f"{second:08X}"}

@@ -122,11 +122,11 @@ def test_without_options_the_best_format_that_is_fast_is_taken(
 
 def test_the_least_period_is_that_of_the_frames_or_of_the_exposure(plugged: Plug) -> None:
     camera = plugged(Faked(stretches=True)).open_camera(**FAST)
-    assert camera.configure(CameraSettings(0.002)).least_period_s == pytest.approx(0.005)
-    assert camera.configure(CameraSettings(0.04)).least_period_s == pytest.approx(0.04)
+    assert camera.configure(CameraSettings(0.002)).min_period_s == pytest.approx(0.005)
+    assert camera.configure(CameraSettings(0.04)).min_period_s == pytest.approx(0.04)
     # The usual rate is slow: the next fast one takes its place.
     camera = plugged(Faked(rates=((1, 5), (1, 60), (1, 20), (1, 10)))).open_camera()
-    assert camera.configure(CameraSettings(0.01)).least_period_s == pytest.approx(1 / 20)
+    assert camera.configure(CameraSettings(0.01)).min_period_s == pytest.approx(1 / 20)
     assert camera.info.notes == ()
 
 
