@@ -22,9 +22,7 @@ from slrig.config import RigConfig, read_rig, read_settings
 from slrig.conformance import Outcome, Report, run
 from slrig.devices import Rig, Synchronisation, Trigger
 from slrig.discovery import found_devices, installed_drivers, open_rig
-from slrig.doctor.doctor import Diagnosis, examine
-from slrig.doctor.findings import Severity
-from slrig.doctor.rig_file import refuse_existing, write_rig_file
+from slrig.doctor import Diagnosis, Severity, examine, refuse_existing, write_rig_file
 from slrig.errors import StorageError
 from slrig.jobs.examinations import keep
 from slrig.logs import set_up_logs_for_a_person
@@ -70,7 +68,7 @@ def doctor(
                 period_px=lines.period_px,
                 steps=lines.steps or lines.period_px,
                 search_s=search_s,
-                told=display,
+                progress=display,
             )
     if output is not None:
         write_rig_file(diagnosis, rig_file, output, force=force)
@@ -171,7 +169,7 @@ def _tell_diagnosis(diagnosis: Diagnosis, console: Console, *, rig_file: Path, o
             told += f"\n[bold]do[/bold] {escape(finding.remedy)}"
         table.add_row(_coloured(finding.severity), f"{told}  [dim]({finding.name})[/dim]")
     console.print(table)
-    faults, notes = len(diagnosis.of(Severity.FAULT)), len(diagnosis.of(Severity.NOTE))
+    faults, notes = len(diagnosis.with_severity(Severity.FAULT)), len(diagnosis.with_severity(Severity.NOTE))
     console.print(f"\n[bold]{_counted(faults, 'fault')}, {_counted(notes, 'note')}[/bold]")
     if output is not None:
         console.print(f"A rig file with these values: {escape(str(output))}")

@@ -23,7 +23,7 @@ from slrig.cli.driver_options import explained, option
 from slrig.config import rig_of
 from slrig.devices import FoundDevice
 from slrig.discovery import Findings, found_devices
-from slrig.doctor.rig_file import refuse_existing, toml_value
+from slrig.doctor import refuse_existing, toml_value
 from slrig.errors import ConfigError, DeviceGoneError
 from slrig.option_models import kinds_of, option_model
 

@@ -48,7 +48,7 @@ def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
     from slrig.config import read_rig
     from slrig.devices import FlashedProjector
     from slrig.discovery import open_rig
-    from slrig.doctor.doctor import doctor_sequence
+    from slrig.doctor import doctor_sequence
     from slrig.errors import UnsupportedByDeviceError
     from slrig.logs import set_up_logs_for_a_person
     from slrig.patterns import united

@@ -21,7 +21,7 @@ from slrig.conformance import Outcome, Report
 from slrig.conformance.bench import Failure
 from slrig.conformance.running import Result
 from slrig.doctor.doctor import Diagnosis
-from slrig.doctor.findings import fault, ok
+from slrig.doctor.light import fault, ok
 from slrig.jobs.examinations import keep
 from slrig.jobs.records import utc_now
 from tests.e2e.conftest import KEY, SLOW, Start, write_rig
