@@ -19,7 +19,7 @@ from slrig.capture import STEADY, CameraLatency, measure_latency
 from slrig.cli.display import print_json, progress_shown
 from slrig.cli.options import given
 from slrig.config import RigConfig, read_rig, read_settings
-from slrig.conformance import Outcome, Report, run
+from slrig.conformance import CheckOutcome, ConformanceReport, run_checks
 from slrig.devices import Rig, Synchronisation, Trigger
 from slrig.discovery import found_devices, installed_drivers, open_rig
 from slrig.doctor import Diagnosis, Severity, examine, refuse_existing, write_rig_file
@@ -34,10 +34,10 @@ _COLOURS = {
     Severity.OK: "green",
     Severity.NOTE: "yellow",
     Severity.FAULT: "bold red",
-    Outcome.PASSED: "green",
-    Outcome.FAILED: "bold red",
-    Outcome.NOT_APPLICABLE: "dim",
-    Outcome.NOT_RUN: "yellow",
+    CheckOutcome.PASSED: "green",
+    CheckOutcome.FAILED: "bold red",
+    CheckOutcome.NOT_APPLICABLE: "dim",
+    CheckOutcome.NOT_RUN: "yellow",
 }
 
 
@@ -92,7 +92,7 @@ def conform(rig: Path, *, data: Path | None, as_json: bool) -> bool:
         display("opening the rig", 0.0, "")
         with open_rig(config) as opened:
             sequence = _own_sequence(opened, config)
-        report = run(lambda: open_rig(config), sequence, progress=display)
+        report = run_checks(lambda: open_rig(config), sequence, progress=display)
     _keep(data, "conform", report.document())
     if as_json:
         print_json(report.document())
@@ -177,31 +177,32 @@ def _tell_diagnosis(diagnosis: Diagnosis, console: Console, *, rig_file: Path, o
         console.print(f"For a rig file with these values: slrig doctor {escape(str(rig_file))} --output FILE.toml")
 
 
-def _tell_report(report: Report, console: Console) -> None:
+def _tell_report(report: ConformanceReport, console: Console) -> None:
     """Print a report for people: a row per check, then what is wrong, then the score."""
     heads = (Column("result", no_wrap=True), Column("s", justify="right", no_wrap=True), Column("check"))
     table = Table(*heads, box=None, title=f"Conformance of rig '{escape(report.rig)}'", title_justify="left")
     for result in report.results:
         told = escape(result.title)
-        if result.outcome is Outcome.NOT_APPLICABLE:
+        if result.outcome is CheckOutcome.NOT_APPLICABLE:
             told += f"\n[dim]{escape(result.reason or '')}[/dim]"
         table.add_row(_coloured(result.outcome), f"{result.seconds:.1f}", told)
     console.print(table)
     for result in report.results:
         if (failure := result.failure) is not None:
             console.print(f"\n[bold red]{escape(result.title)}[/bold red]  ({result.name})")
-            for what in ("where", "asked", "found", "do"):
-                if words := getattr(failure, what):
-                    console.print(f"  {what:<5}  {escape(words)}")
+            for label in ("where", "expected", "found", "remedy"):
+                if text := getattr(failure, label):
+                    console.print(f"  {label:<8}  {escape(text)}")
     if report.stopped is not None:
         console.print(f"\n[bold red]stopped[/bold red]  {escape(report.stopped)}")
+    passed, not_applicable = report.count(CheckOutcome.PASSED), report.count(CheckOutcome.NOT_APPLICABLE)
     console.print(
-        f"\n[bold]{report.percent} %[/bold]: {report.count(Outcome.PASSED)} of {report.applicable} checks that apply "
-        f"passed, {report.count(Outcome.NOT_APPLICABLE)} do not apply; {report.seconds:.0f} s"
+        f"\n[bold]{report.percent} %[/bold]: {passed} of {report.applicable} checks that apply passed, "
+        f"{not_applicable} do not apply; {report.seconds:.0f} s"
     )
 
 
-def _coloured(kind: Severity | Outcome) -> str:
+def _coloured(kind: Severity | CheckOutcome) -> str:
     return f"[{_COLOURS[kind]}]{kind}[/{_COLOURS[kind]}]"
 
 
