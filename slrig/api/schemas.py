@@ -27,7 +27,7 @@ from slrig.bundle.options import (
     PresetName,
     RegionTable,
     ScanDefaults,
-    alone,
+    refuse_alternatives,
 )
 from slrig.bundle.sidecars import TurnedBy
 from slrig.bundle.validation import FreeText, Strict
@@ -147,7 +147,7 @@ class ShotRequest(Strict):
         "false",
     )
 
-    _one_exposure = field_validator("exposures_s", "exposure_factors")(alone)
+    _one_exposure = field_validator("exposures_s", "exposure_factors")(refuse_alternatives)
 
 
 class ScanRequest(ShotRequest):

@@ -20,15 +20,15 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from slrig.bundle.description import CAMERA_NAME, MOST_SIDE_PX, PROJECTOR, CameraName, Extent
+from slrig.bundle.description import CAMERA_NAME, MAX_SIDE_PX, PROJECTOR, CameraName, Extent
 from slrig.bundle.storage import json_bytes, write_file
-from slrig.bundle.validation import MOST_FAULTS, AwareMoment, Strict, read_description_of, read_text, shorten
+from slrig.bundle.validation import MAX_FAULTS, AwareMoment, Strict, read_json_model, read_text, shorten
 from slrig.errors import CalibrationError
 from slrig.model import DEVICE_PARAMETERS, Calibration, FloatArray, LightMap, Pinhole, Size, Solved
 
-MOST_DEPTH = 8
-MOST_NODES = 4096
-MOST_NUMBERS = 2**16
+MAX_DEPTH = 8
+MAX_NODES = 4096
+MAX_NUMBERS = 2**16
 """Of one matrix: the covariance of 16 devices has 57 600."""
 
 Value: TypeAlias = "dict[str, Value] | FloatArray | list[str | int | float] | str | int | float"
@@ -55,7 +55,7 @@ def read_file_storage(text: str, path: Path) -> dict[str, Value]:
     """Return the maps, numbers, texts and matrices (float64) of a FileStorage text; `path` is for messages.
     Raises CalibrationError, with the line: the text is cut, of another layout, or beyond a limit.
     """
-    tree = _Tree(path)
+    tree = _TreeBuilder(path)
     text = text.removeprefix("\ufeff")
     control = _CONTROL.search(text)
     if control:
@@ -70,7 +70,7 @@ def read_file_storage(text: str, path: Path) -> dict[str, Value]:
     return tree.root
 
 
-class _Tree:
+class _TreeBuilder:
     """What was read so far, by map, with the limits. `line` is where the reader stands."""
 
     def __init__(self, path: Path) -> None:
@@ -90,8 +90,8 @@ class _Tree:
 
     def open(self, key: str, kind: str) -> None:
         """Begin a map; `kind` is empty, or that of a matrix."""
-        if self.depth >= MOST_DEPTH:
-            self.refuse(f"at most {MOST_DEPTH} maps in each other", "another one")
+        if self.depth >= MAX_DEPTH:
+            self.refuse(f"at most {MAX_DEPTH} maps in each other", "another one")
         if kind and kind not in _MATRIX_KEYS:
             self.refuse("an opencv-matrix", shorten(kind), "export matrices of numbers only")
         self._check(key)
@@ -112,8 +112,8 @@ class _Tree:
 
     def _check(self, key: str) -> None:
         self._nodes += 1
-        if self._nodes > MOST_NODES:
-            self.refuse(f"at most {MOST_NODES} entries", "more", "leave out all but the calibration")
+        if self._nodes > MAX_NODES:
+            self.refuse(f"at most {MAX_NODES} entries", "more", "leave out all but the calibration")
         if not _KEY.fullmatch(key):
             self.refuse("a key of at most 64 letters, digits, - and _", shorten(key), "rename it")
         if key in self._open[-1][2]:
@@ -124,7 +124,7 @@ class _Tree:
             self.refuse(f"{', '.join(sorted(_MATRIX_KEYS[kind]))} in '{key}'", f"{', '.join(sorted(found)[:8])}")
         shape = [found[name] for name in ("rows", "cols", "sizes") if name in found]
         shape = [part[0] if isinstance(part, list) and len(part) == 1 else part for part in shape]
-        sides = [part for part in shape if isinstance(part, int) and 1 <= part <= MOST_NUMBERS]
+        sides = [part for part in shape if isinstance(part, int) and 1 <= part <= MAX_NUMBERS]
         if len(sides) != len(shape):
             self.refuse(f"whole numbers from 1 as extent of '{key}', two of them at most", shorten(shape))
         dt = str(found["dt"]).removeprefix("1") if isinstance(found["dt"], str) else ""
@@ -155,12 +155,12 @@ class _Tree:
 
     def scalars(self, words: list[str]) -> list[str | int | float]:
         """What the words of a sequence stand for."""
-        if len(words) > MOST_NUMBERS:
-            self.refuse(f"at most {MOST_NUMBERS} numbers in a matrix", f"{len(words)}")
+        if len(words) > MAX_NUMBERS:
+            self.refuse(f"at most {MAX_NUMBERS} numbers in a matrix", f"{len(words)}")
         return [self.scalar(word.strip()) for word in words]
 
 
-def _read_yaml(lines: list[str], tree: _Tree) -> None:
+def _read_yaml(lines: list[str], tree: _TreeBuilder) -> None:
     if not _YAML_HEAD.fullmatch(lines[0].rstrip()):
         tree.refuse("%YAML:1.0 or %YAML 1.2", shorten(lines[0]))
     columns = [-1]
@@ -210,7 +210,7 @@ def _read_yaml(lines: list[str], tree: _Tree) -> None:
         tree.close()
 
 
-def _yaml_scalar(rest: str, tree: _Tree) -> str | int | float:
+def _yaml_scalar(rest: str, tree: _TreeBuilder) -> str | int | float:
     quoted = _QUOTED.match(rest)
     if quoted and _COMMENT.fullmatch(rest, quoted.end()):
         if quoted[1] is None:
@@ -221,7 +221,7 @@ def _yaml_scalar(rest: str, tree: _Tree) -> str | int | float:
     return tree.scalar(re.split(r"[ \t]#", rest, maxsplit=1)[0].strip())
 
 
-def _read_xml(text: str, tree: _Tree) -> None:
+def _read_xml(text: str, tree: _TreeBuilder) -> None:
     parser = expat.ParserCreate("utf-8")
     parser.buffer_text = True
     # One for each open element: its key, its type, what text it holds, and whether it holds elements.
@@ -234,8 +234,8 @@ def _read_xml(text: str, tree: _Tree) -> None:
         if not elements:
             if name != "opencv_storage":
                 tree.refuse("<opencv_storage>", shorten(name))
-        elif len(elements) > MOST_DEPTH + 1:
-            tree.refuse(f"at most {MOST_DEPTH} maps in each other", "another one")
+        elif len(elements) > MAX_DEPTH + 1:
+            tree.refuse(f"at most {MAX_DEPTH} maps in each other", "another one")
         else:
             parent = elements[-1]
             if "".join(parent[2]).strip():
@@ -278,9 +278,9 @@ def _read_xml(text: str, tree: _Tree) -> None:
         tree.refuse("sound XML", expat.ErrorString(cause.code) or "a fault", "the file may be cut: copy it again")
 
 
-MOST_FILE_BYTES = 4 * 2**20
+MAX_STORAGE_BYTES = 4 * 2**20
 SOLVED = "solved"
-MOST_ID_LENGTH = 64
+MAX_ID_LENGTH = 64
 NODE_NAME = re.compile(r"^[A-Za-z_][A-Za-z0-9_-]*$")
 DEVICE_KEYS = (
     "image_width",
@@ -300,7 +300,7 @@ def read_opencv_calibration(path: Path) -> Calibration:
     Raises CalibrationError: the file is missing, cut, has an unknown key, a number that is not finite, or distortion
     terms beyond k3.
     """
-    root = read_file_storage(read_text(path, MOST_FILE_BYTES, CalibrationError), path)
+    root = read_file_storage(read_text(path, MAX_STORAGE_BYTES, CalibrationError), path)
     devices = {name: _read_device(found, path, name) for name, found in root.items() if name != SOLVED}
     solved = _read_solved(root[SOLVED], path) if SOLVED in root else None
     cameras = {name: device for name, device in devices.items() if name != PROJECTOR}
@@ -351,7 +351,7 @@ def _require_keys(found: Value, wanted: tuple[str, ...], path: Path, name: str, 
     if set(entries) != set(wanted):
         wrong = [f"no {key}" for key in wanted if key not in entries]
         wrong += [f"the unknown key {key}" for key in sorted(set(entries) - set(wanted))]
-        _refuse(path, f"{', '.join(wanted)} in '{name}'", ", ".join(wrong[:MOST_FAULTS]), remedy)
+        _refuse(path, f"{', '.join(wanted)} in '{name}'", ", ".join(wrong[:MAX_FAULTS]), remedy)
     return entries
 
 
@@ -359,9 +359,9 @@ def _read_device(found: Value, path: Path, name: str) -> Pinhole:
     entries = _require_keys(found, DEVICE_KEYS, path, name, "write one map per device")
     width_px, height_px = entries["image_width"], entries["image_height"]
     if not _is_side(width_px) or not _is_side(height_px):
-        _refuse(path, f"whole numbers as extent of '{name}', from 1 to {MOST_SIDE_PX}", "something else",
+        _refuse(path, f"whole numbers as extent of '{name}', from 1 to {MAX_SIDE_PX}", "something else",
                 "correct image_width and image_height")  # fmt: skip
-    five = five_terms(_matrix(entries, "distortion_coefficients", path, name), path, name)
+    five = five_distortion_terms(_matrix(entries, "distortion_coefficients", path, name), path, name)
     try:
         return Pinhole(
             Size(width_px, height_px),
@@ -374,7 +374,7 @@ def _read_device(found: Value, path: Path, name: str) -> Pinhole:
         raise CalibrationError(f"{path}: {name}.{cause}") from cause
 
 
-def five_terms(distortion: FloatArray, path: Path, name: str) -> FloatArray:
+def five_distortion_terms(distortion: FloatArray, path: Path, name: str) -> FloatArray:
     """(5,) float64: k1, k2, p1, p2 and k3 of OpenCV's coefficients, 4 or more.
     Raises CalibrationError: there are fewer, or one beyond k3 is not 0.
     """
@@ -392,7 +392,7 @@ def five_terms(distortion: FloatArray, path: Path, name: str) -> FloatArray:
 
 
 def _is_side(value: Value) -> TypeGuard[int]:
-    return isinstance(value, int) and 1 <= value <= MOST_SIDE_PX
+    return isinstance(value, int) and 1 <= value <= MAX_SIDE_PX
 
 
 def _read_solved(found: Value, path: Path) -> Solved:
@@ -405,9 +405,9 @@ def _read_solved(found: Value, path: Path) -> Solved:
     if not isinstance(error_mm, int | float) or not isinstance(scale_sigma, int | float):
         _refuse(path, f"numbers as expected_error_mm and scale_sigma of '{SOLVED}'", "something else",
                 "export it again, or leave the whole map out")  # fmt: skip
-    if not 1 <= len(name) <= MOST_ID_LENGTH:
-        _refuse(path, f"a text of 1 to {MOST_ID_LENGTH} characters as {SOLVED}.id", shorten(name), "export it again")
-    if not _is_moment(solved_at):
+    if not 1 <= len(name) <= MAX_ID_LENGTH:
+        _refuse(path, f"a text of 1 to {MAX_ID_LENGTH} characters as {SOLVED}.id", shorten(name), "export it again")
+    if not _is_aware_time(solved_at):
         _refuse(path, f"ISO 8601 with the offset from UTC as {SOLVED}.solved_at", shorten(solved_at), "correct it")
     if not 0 <= error_mm < np.inf:
         _refuse(path, f"{SOLVED}.expected_error_mm of 0 or more", f"{error_mm}", "export it again")
@@ -423,7 +423,7 @@ def _read_solved(found: Value, path: Path) -> Solved:
         raise CalibrationError(f"{path}: {SOLVED}.{cause}") from cause
 
 
-def _is_moment(text: str) -> bool:
+def _is_aware_time(text: str) -> bool:
     try:
         return datetime.fromisoformat(text).tzinfo is not None
     except ValueError:
@@ -451,8 +451,8 @@ def _write_map(storage: Any, name: str, values: Mapping[str, Any]) -> None:
     storage.endWriteStruct()
 
 
-MOST_CALIBRATION_BYTES = 4 * 2**20
-MOST_DEVICES = 16
+MAX_CALIBRATION_BYTES = 4 * 2**20
+MAX_DEVICES = 16
 
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3)]
@@ -478,7 +478,7 @@ class SolvedEntry(Strict):
     covariance: Annotated[
         list[list[float]],
         Field(
-            max_length=MOST_DEVICES * DEVICE_PARAMETERS,
+            max_length=MAX_DEVICES * DEVICE_PARAMETERS,
             description="of fx, fy, cx, cy, k1, k2, p1, p2, k3, a small turn (rad) and the translation (mm) of each "
             "device: cameras in order, then the projector",
         ),
@@ -518,13 +518,13 @@ def read_calibration(path: Path) -> Calibration:
     """
     if path.suffix.lower() in {".yml", ".yaml", ".xml"}:
         return read_opencv_calibration(path)
-    entry = read_description_of(
-        path, CalibrationEntry, "calibration", most_bytes=MOST_CALIBRATION_BYTES, error=CalibrationError
+    entry = read_json_model(
+        path, CalibrationEntry, "calibration", most_bytes=MAX_CALIBRATION_BYTES, error=CalibrationError
     )
-    cameras = {name: _pinhole(device, path, f"cameras.{name}") for name, device in entry.cameras.items()}
-    projector = None if entry.projector is None else _pinhole(entry.projector, path, "projector")
+    cameras = {name: _build_pinhole(device, path, f"cameras.{name}") for name, device in entry.cameras.items()}
+    projector = None if entry.projector is None else _build_pinhole(entry.projector, path, "projector")
     try:
-        return Calibration(cameras, projector, _solved(entry.solved), _light(entry.light))
+        return Calibration(cameras, projector, _build_solved(entry.solved), _build_light_map(entry.light))
     except (CalibrationError, ValueError) as cause:
         raise CalibrationError(f"{path}: solved.{cause}") from cause
 
@@ -534,10 +534,10 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     data: dict[str, Any] = {
         "format": "slrig-calibration",
         "version": 1,
-        "cameras": {name: _device(pinhole) for name, pinhole in calibration.cameras.items()},
+        "cameras": {name: _device_document(pinhole) for name, pinhole in calibration.cameras.items()},
     }
     if calibration.projector is not None:
-        data["projector"] = _device(calibration.projector)
+        data["projector"] = _device_document(calibration.projector)
     for name, known in (("solved", calibration.solved), ("light", calibration.light)):
         if known is not None:
             data[name] = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(known).items()}
@@ -563,7 +563,7 @@ def check_calibration(calibration: Calibration, projector: Size, cameras: Mappin
         raise CalibrationError(message)
 
 
-def check_rays(calibration: Calibration, cameras: Collection[str], source: str) -> None:
+def require_two_rays(calibration: Calibration, cameras: Collection[str], source: str) -> None:
     """See that with these cameras the calibration has two rays for each point. `source` says where it came from.
     Raises CalibrationError: it has no projector, and one of the cameras.
     """
@@ -577,7 +577,7 @@ def check_rays(calibration: Calibration, cameras: Collection[str], source: str) 
         )
 
 
-def _solved(entry: SolvedEntry | None) -> Solved | None:
+def _build_solved(entry: SolvedEntry | None) -> Solved | None:
     if entry is None:
         return None
     covariance, volume_mm = (np.array(each, dtype=np.float64) for each in (entry.covariance, entry.volume_mm))
@@ -586,13 +586,13 @@ def _solved(entry: SolvedEntry | None) -> Solved | None:
     )
 
 
-def _light(entry: LightEntry | None) -> LightMap | None:
+def _build_light_map(entry: LightEntry | None) -> LightMap | None:
     if entry is None:
         return None
     return LightMap(*(np.array(each, dtype=np.float64) for each in (entry.coefficients, entry.covered_px)))
 
 
-def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:
+def _build_pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:
     numbers = (device.matrix, device.distortion, device.rotation, device.translation_mm)
     try:
         return Pinhole(Size(*device.size_px), *(np.array(each, dtype=np.float64) for each in numbers))
@@ -600,6 +600,6 @@ def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:
         raise CalibrationError(f"{path}: {place}.{cause}") from cause
 
 
-def _device(pinhole: Pinhole) -> dict[str, Any]:
+def _device_document(pinhole: Pinhole) -> dict[str, Any]:
     numbers = {key: getattr(pinhole, key).tolist() for key in ("matrix", "distortion", "rotation", "translation_mm")}
     return {"size_px": [pinhole.size.width_px, pinhole.size.height_px], **numbers}

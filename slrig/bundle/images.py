@@ -41,12 +41,12 @@ _NEXT_SCAN, _MOST_SCANS = b"\xff\xda", 64
 """Each scan of a progressive file costs a pass over all pixels; usual are ten."""
 
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-MOST_TIFF_PAGES = 65536
+MAX_TIFF_PAGES = 65536
 """As many as a page's number in bundle.json can name."""
-MOST_TIFF_TAGS = 256
+MAX_TIFF_TAGS = 256
 
 
-def tiff_page_count(data: bytes) -> int:
+def count_tiff_pages(data: bytes) -> int:
     """How many pages the chain of a TIFF's directories has, walked before anybody reads one.
     Raises ValueError with words for a chain that leads out of the file, comes back to itself or does not end.
     """
@@ -57,11 +57,11 @@ def tiff_page_count(data: bytes) -> int:
     try:
         (place,) = struct.unpack_from(order + next_of, data, first)
         while place:
-            if place in seen or len(seen) == MOST_TIFF_PAGES:
+            if place in seen or len(seen) == MAX_TIFF_PAGES:
                 raise ValueError(f"a chain of pages that does not end after {len(seen)}")
             seen.add(place)
             (tags,) = struct.unpack_from(order + count_of, data, place)
-            if tags > MOST_TIFF_TAGS:
+            if tags > MAX_TIFF_TAGS:
                 raise ValueError(f"{tags} tags on page {len(seen) - 1}")
             (place,) = struct.unpack_from(
                 order + next_of, data, place + struct.calcsize(order + count_of) + tags * tag_bytes
@@ -72,7 +72,7 @@ def tiff_page_count(data: bytes) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Bitmap:
+class BmpHeader:
     """A BMP's header. first_byte : of the rows, each of `stride` bytes; upside_down : the last row comes first, as is
     usual. palette_entries : of 4 bytes each, behind the header.
     """
@@ -87,7 +87,7 @@ class Bitmap:
     palette_entries: int
 
     @classmethod
-    def of(cls, data: bytes) -> Bitmap:
+    def of(cls, data: bytes) -> BmpHeader:
         """Read the header. Raises ValueError with words for what it is instead of a BMP that can be read."""
         if len(data) < _FILE_HEADER + _INFO_HEADER:
             raise ValueError(f"{len(data)} bytes without a header")
@@ -121,7 +121,7 @@ class Bitmap:
 
 
 @dataclass(frozen=True, slots=True)
-class Jpeg:
+class JpegHeader:
     """A JPEG's header. components : 1 or 3; remarks : first byte and end of each segment that has no part in the
     picture, as Exif.
     """
@@ -137,7 +137,7 @@ class Jpeg:
         return b"".join(data[a:b] for a, b in zip(ends, (*(a for a, _ in self.remarks), len(data)), strict=True))
 
     @classmethod
-    def of(cls, data: bytes) -> Jpeg:
+    def of(cls, data: bytes) -> JpegHeader:
         """Read the header. Raises ValueError with words for what it is instead of a JPEG that can be read."""
         tables: set[int] = set()
         frame: tuple[int, int, int, int] | None = None
@@ -218,10 +218,10 @@ def encode_frame(image: Pixels, name: str) -> bytes:
     rows[0, 1:] = samples[0]
     np.subtract(samples[1:], samples[:-1], out=rows[1:, 1:])
     header = HEADER.pack(width, height, 8 * image.itemsize, kind, 0, 0, 0)
-    return png_file(header, isal_zlib.compress(rows, _LEVEL))
+    return assemble_png(header, isal_zlib.compress(rows, _LEVEL))
 
 
-def png_file(header: bytes, packed: bytes) -> bytes:
+def assemble_png(header: bytes, packed: bytes) -> bytes:
     """A PNG of these contents of its IHDR and IDAT chunks."""
     parts = [SIGNATURE]
     for kind, data in ((b"IHDR", header), (b"IDAT", packed), (b"IEND", b"")):
@@ -230,7 +230,7 @@ def png_file(header: bytes, packed: bytes) -> bytes:
     return b"".join(parts)
 
 
-def rows_above_added(rows: bytes, height: int, bits: int) -> Pixels | None:
+def undo_up_filter(rows: bytes, height: int, bits: int) -> Pixels | None:
     """The (H, W) image whose rows were all filtered by differences to the row above; None where they were not.
 
     rows : the unpacked rows of a grey image, each with the number of its filter first.
@@ -248,7 +248,7 @@ def rows_above_added(rows: bytes, height: int, bits: int) -> Pixels | None:
 
 TIFF_ZLIB = (8, 32946)  # compression: Adobe's deflate and the older one
 TIFF_COMPRESSIONS = (1, 5, *TIFF_ZLIB)  # none, LZW
-MOST_FILE_BYTES = 2**31
+MAX_FILE_BYTES = 2**31
 TIFF_FAULTS = (
     tifffile.TiffFileError,
     struct.error,
@@ -308,7 +308,7 @@ def read_with_colour(
     return grey, {page: image for page, image in kept.items() if int(image.max()) <= camera.full_scale}
 
 
-def frame_format(path: Path) -> CameraFormat:
+def read_frame_format(path: Path) -> CameraFormat:
     """Extent and bits of the samples, 8 or 16, of the first page of a frame file, by its header alone.
     Raises BundleError: the file is missing or cut, or is none that `read_pages` reads.
     """
@@ -317,13 +317,13 @@ def frame_format(path: Path) -> CameraFormat:
         if data.startswith(SIGNATURE) and data[12:16] == b"IHDR" and len(data) >= 33:
             width, height, bits = HEADER.unpack(data[16:29])[:3]
         elif data.startswith(BMP_SIGNATURE):
-            bitmap = Bitmap.of(data)
+            bitmap = BmpHeader.of(data)
             width, height, bits = bitmap.width, bitmap.height, 8
         elif data.startswith(JPEG_SIGNATURE):
-            jpeg = Jpeg.of(data)
+            jpeg = JpegHeader.of(data)
             width, height, bits = jpeg.width, jpeg.height, 8
         elif data.startswith(TIFF_SIGNATURES):
-            tiff_page_count(data)
+            count_tiff_pages(data)
             with tifffile.TiffFile(io.BytesIO(data)) as tiff:
                 page = tiff.pages[0]
                 width, height, bits = page.imagewidth, page.imagelength, page.bitspersample
@@ -344,8 +344,8 @@ def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
 def _read_bytes(path: Path) -> bytes:
     try:
         size_bytes = path.stat().st_size
-        if size_bytes > MOST_FILE_BYTES:
-            _refuse(path, f"at most {MOST_FILE_BYTES} bytes", f"{size_bytes}", "split the frames over several files")
+        if size_bytes > MAX_FILE_BYTES:
+            _refuse(path, f"at most {MAX_FILE_BYTES} bytes", f"{size_bytes}", "split the frames over several files")
         return path.read_bytes()
     except OSError as cause:
         raise BundleError(
@@ -400,17 +400,17 @@ def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
             break
         place = end
     row_bytes = 1 + width * bits // 8 * (3 if colour == COLOUR else 1)
-    rows = _inflated(packed, row_bytes * height)
+    rows = _inflate(packed, row_bytes * height)
     if rows is None or len(rows) != row_bytes * height or max(rows[::row_bytes]) > FILTERS:
         return None
-    image = rows_above_added(rows, height, bits) if colour == GREY else None
+    image = undo_up_filter(rows, height, bits) if colour == GREY else None
     if image is not None:
         return image
     # The decoder gets a file of these rows alone: nothing that a stranger packed, and no chunk that the walk passed.
-    return _decoded(png_file(data[16:29], zlib.compress(rows, 0)))
+    return _decode(assemble_png(data[16:29], zlib.compress(rows, 0)))
 
 
-def _inflated(packed: bytearray | memoryview, most_bytes: int) -> bytes | None:
+def _inflate(packed: bytearray | memoryview, most_bytes: int) -> bytes | None:
     """What a zlib stream unpacks to, if it is whole, sound, and no longer than this."""
     unpacker = zlib.decompressobj()
     try:
@@ -422,7 +422,7 @@ def _inflated(packed: bytearray | memoryview, most_bytes: int) -> bytes | None:
 
 def _bitmap(path: Path, data: bytes, camera: CameraFormat) -> Pixels:
     try:
-        found = Bitmap.of(data)
+        found = BmpHeader.of(data)
         _check_header(path, found.width, found.height, 8, camera)
         return found.decoded(data)
     except ValueError as cause:
@@ -431,16 +431,16 @@ def _bitmap(path: Path, data: bytes, camera: CameraFormat) -> Pixels:
 
 def _jpeg(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     try:
-        found = Jpeg.of(data)
+        found = JpegHeader.of(data)
     except ValueError as cause:
         _refuse(path, "a whole JPEG of 8 bits, grey or in colour", str(cause), "copy the frame again")
     _check_header(path, found.width, found.height, 8, camera)
-    return _decoded(found.plain(data))
+    return _decode(found.plain(data))
 
 
 def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFormat) -> None:
     try:
-        count = tiff_page_count(data)
+        count = count_tiff_pages(data)
         with tifffile.TiffFile(io.BytesIO(data)) as tiff:
             if max(pages) >= count:
                 _refuse(path, f"a page {max(pages)}", f"{count} pages", "correct `page`, which counts from 0")
@@ -478,13 +478,13 @@ def _check_zlib(path: Path, index: int, data: bytes, page: Any) -> None:
     # Tiles at an edge are padded, and strips may all name the same bytes: four times the page is enough for all.
     left = 2**16 + page.imagewidth * page.imagelength * page.samplesperpixel * page.bitspersample // 2
     for offset, size in zip(page.dataoffsets, page.databytecounts, strict=True):
-        unpacked = _inflated(memoryview(data)[offset : offset + size], left)
+        unpacked = _inflate(memoryview(data)[offset : offset + size], left)
         if unpacked is None:
             _refuse(path, f"sound data on page {index}", "data that cannot be unpacked", "copy the frame again")
         left -= len(unpacked)
 
 
-def _decoded(data: bytes) -> Pixels | None:
+def _decode(data: bytes) -> Pixels | None:
     """The one image of a file whose header was checked; None where OpenCV cannot decode it."""
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)

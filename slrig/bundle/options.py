@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, fie
 from slrig.bundle.calibration import Vector3
 from slrig.bundle.description import CameraName
 from slrig.bundle.storage import json_bytes
-from slrig.bundle.validation import AwareMoment, FreeText, Strict, checked, read_description_of, read_toml
+from slrig.bundle.validation import AwareMoment, FreeText, Strict, read_json_model, read_toml, validate
 from slrig.errors import ConfigError
 from slrig.model import (
     FEWEST_EXPOSURES,
@@ -32,9 +32,9 @@ from slrig.model import (
 )
 from slrig.model.region import MOST_MASK_CHARACTERS, Region
 
-MOST_VIEWS = 1000
+MAX_VIEWS = 1000
 _POSES_MAX_BYTES = 8 * 2**20
-_ROUNDED = 3e-5
+_ROTATION_TOLERANCE = 3e-5
 """How far R Rᵀ of numbers with five digits may be from 1: at most 2e-5 was found of 20 000 rotations."""
 
 PoseRow = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -53,16 +53,16 @@ class AxisEntry(Strict):
         return self
 
 
-def _rigid(rows: list[PoseRow]) -> list[PoseRow]:
+def _check_rigid(rows: list[PoseRow]) -> list[PoseRow]:
     pose = np.array(rows)
     turn = pose[:3, :3]
-    rigid = np.abs(turn @ turn.T - np.eye(3)).max() < _ROUNDED and np.linalg.det(turn) > 0
+    rigid = np.abs(turn @ turn.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(turn) > 0
     if not rigid or (pose[3] != [0, 0, 0, 1]).any():
         raise ValueError(f"expected a rotation and a shift, and 0 0 0 1 below, found {rows}")
     return rows
 
 
-PoseEntry = Annotated[list[PoseRow], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
+PoseEntry = Annotated[list[PoseRow], Field(min_length=4, max_length=4), AfterValidator(_check_rigid)]
 """A rigid motion, 4 x 4, to the digits that it is written with."""
 
 
@@ -78,7 +78,7 @@ class PosesEntry(Strict):
 
     format: Literal["slrig-poses"]
     version: Literal[1]
-    views: list[ViewEntry] = Field(default_factory=list, max_length=MOST_VIEWS)
+    views: list[ViewEntry] = Field(default_factory=list, max_length=MAX_VIEWS)
     axis: AxisEntry | None = None
 
 
@@ -92,16 +92,16 @@ class Poses:
 
 def read_poses(path: Path) -> Poses:
     """The poses and the axis in a file. Raises ConfigError: it cannot be read or is no such file, with every fault."""
-    entry = read_description_of(path, PosesEntry, "file of poses", most_bytes=_POSES_MAX_BYTES, error=ConfigError)
+    entry = read_json_model(path, PosesEntry, "file of poses", most_bytes=_POSES_MAX_BYTES, error=ConfigError)
     names = [view.name for view in entry.views]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ConfigError(f"{path}: expected each view once, found two poses of '{twice}'; leave one out")
     axis = None if entry.axis is None else (np.array(entry.axis.point_mm), np.array(entry.axis.direction))
-    return Poses({view.name: rotating(view.pose) for view in entry.views}, axis)
+    return Poses({view.name: orthonormalise_pose(view.pose) for view in entry.views}, axis)
 
 
-def rotating(entry: Sequence[Sequence[float]]) -> FloatArray:
+def orthonormalise_pose(entry: Sequence[Sequence[float]]) -> FloatArray:
     """(4, 4): the pose with the nearest rotation to what was written of it: the two agree to the digits that were."""
     pose = np.array(entry)
     left, _, right = np.linalg.svd(pose[:3, :3])
@@ -121,10 +121,10 @@ def encode_poses(poses: Poses) -> bytes:
     return json_bytes(data)
 
 
-MOST_HISTORY = 500
+MAX_HISTORY = 500
 """Changes of the axis that are kept, the newest: a model an hour for three weeks."""
 _TURNTABLE_MAX_BYTES = 2 * 2**20
-_MOST_PLANES = 16
+_MAX_PLANES = 16
 
 TurntableRow = Annotated[list[float], Field(min_length=6, max_length=6)]
 Length = Annotated[float, Field(ge=0, le=1e6)]
@@ -191,8 +191,8 @@ class StageEntry(Strict):
     format: Literal["slrig-stage"]
     version: Literal[1]
     axis: MeasuredEntry | None = None
-    planes: list[PlaneEntry] = Field(default_factory=list, max_length=_MOST_PLANES)
-    history: list[ChangeEntry] = Field(default_factory=list, max_length=MOST_HISTORY)
+    planes: list[PlaneEntry] = Field(default_factory=list, max_length=_MAX_PLANES)
+    history: list[ChangeEntry] = Field(default_factory=list, max_length=MAX_HISTORY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,9 +206,7 @@ class StageRecord:
 
 def read_stage(path: Path) -> StageRecord:
     """What a file says of a stage. Raises ConfigError: it cannot be read or is no such file, with every fault."""
-    return stage_record(
-        read_description_of(path, StageEntry, "stage", most_bytes=_TURNTABLE_MAX_BYTES, error=ConfigError)
-    )
+    return stage_record(read_json_model(path, StageEntry, "stage", most_bytes=_TURNTABLE_MAX_BYTES, error=ConfigError))
 
 
 def stage_record(entry: StageEntry) -> StageRecord:
@@ -217,10 +215,15 @@ def stage_record(entry: StageEntry) -> StageRecord:
     return StageRecord(
         None
         if axis is None
-        else MeasuredAxis(np.array(axis.point_mm), _unit(axis.direction), np.array(axis.covariance)),
+        else MeasuredAxis(np.array(axis.point_mm), _normalise(axis.direction), np.array(axis.covariance)),
         tuple(
             StagePlane(
-                each.kind, np.array(each.point_mm), _unit(each.normal), each.sigma_mm, each.radius_mm, each.margin_mm
+                each.kind,
+                np.array(each.point_mm),
+                _normalise(each.normal),
+                each.sigma_mm,
+                each.radius_mm,
+                each.margin_mm,
             )
             for each in entry.planes
         ),
@@ -246,7 +249,7 @@ def stage_entry(record: StageRecord) -> StageEntry:
         for each in record.planes
     ]
     return StageEntry(
-        format="slrig-stage", version=1, axis=measured, planes=planes, history=list(record.history[-MOST_HISTORY:])
+        format="slrig-stage", version=1, axis=measured, planes=planes, history=list(record.history[-MAX_HISTORY:])
     )
 
 
@@ -255,14 +258,14 @@ def encode_stage(record: StageRecord) -> bytes:
     return json_bytes(stage_entry(record).model_dump(mode="json"))
 
 
-def _unit(vector: list[float]) -> FloatArray:
+def _normalise(vector: list[float]) -> FloatArray:
     """The vector at length 1; one that was written so keeps its digits."""
     found = np.array(vector, dtype=np.float64)
     length = float(np.linalg.norm(found))
     return found if abs(length - 1) < 1e-12 else np.asarray(found / length)
 
 
-MOST_REGION_BYTES = 2**20
+MAX_REGION_BYTES = 2**20
 
 # A list in TOML and in JSON.
 _Corner = Annotated[tuple[float, float, float], Field(strict=False)]
@@ -317,10 +320,10 @@ def read_region(path: Path) -> RegionTable:
     ConfigError
         The file cannot be read, or is no region, with every fault in one message.
     """
-    return checked(RegionTable, with_masks(read_toml(path, MOST_REGION_BYTES), path.parent), str(path))
+    return validate(RegionTable, embed_masks(read_toml(path, MAX_REGION_BYTES), path.parent), str(path))
 
 
-def with_masks(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def embed_masks(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """What a file says of a region, with the masks that it names by their paths, from its own folder on, in it.
     Raises ConfigError: one of them cannot be read.
     """
@@ -328,7 +331,7 @@ def with_masks(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     if not isinstance(masks, Mapping):
         return dict(table)
     read = {
-        camera: base64.b64encode(_bytes_of(folder / named)).decode()
+        camera: base64.b64encode(_read_mask(folder / named)).decode()
         if isinstance(named, str) and named.lower().endswith(".png")
         else named
         for camera, named in masks.items()
@@ -336,7 +339,7 @@ def with_masks(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return {**table, "masks": read}
 
 
-def _bytes_of(path: Path) -> bytes:
+def _read_mask(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
@@ -353,15 +356,15 @@ EXPOSURE_KEYS = ("exposure_s", "exposures_s", "exposure_factors")
 T = TypeVar("T")
 
 
-def _a_bracket(exposures_s: tuple[float, ...]) -> tuple[float, ...]:
+def _check_bracket(exposures_s: tuple[float, ...]) -> tuple[float, ...]:
     fault = bracket_fault(exposures_s)
     if fault is not None:
         raise ValueError(fault)
     return exposures_s
 
 
-def _factors(factors: tuple[float, ...]) -> tuple[float, ...]:
-    return factors if len(factors) == 1 else _a_bracket(factors)
+def _check_factors(factors: tuple[float, ...]) -> tuple[float, ...]:
+    return factors if len(factors) == 1 else _check_bracket(factors)
 
 
 ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
@@ -369,18 +372,18 @@ BracketSeconds = Annotated[
     tuple[ExposureSeconds, ...],
     # A list in TOML and in JSON. Its length is checked with the rest, or one wrong time would be told as two faults.
     Field(strict=False, json_schema_extra={"minItems": FEWEST_EXPOSURES, "maxItems": MOST_EXPOSURES}),
-    AfterValidator(_a_bracket),
+    AfterValidator(_check_bracket),
 ]
 ExposureFactors = Annotated[
     tuple[Annotated[float, Field(gt=0, le=1000)], ...],
     Field(strict=False, json_schema_extra={"minItems": 1, "maxItems": MOST_EXPOSURES}),
-    AfterValidator(_factors),
+    AfterValidator(_check_factors),
 ]
 PRESET_NAME = r"[a-z][a-z0-9_-]{0,39}"
 PresetName = Annotated[str, Field(pattern=f"^{PRESET_NAME}$")]
 
 
-def alone(asked: T, info: ValidationInfo, keys: Sequence[str] = EXPOSURE_KEYS) -> T:
+def refuse_alternatives(asked: T, info: ValidationInfo, keys: Sequence[str] = EXPOSURE_KEYS) -> T:
     """A validator of one of the keys. Raises ValueError: another one was given before it."""
     before = [key for key in keys if info.data.get(key) is not None]
     if asked is not None and before:
@@ -433,7 +436,7 @@ class ScanDefaults(Strict):
     @classmethod
     def _one_bracket(cls, factors: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
         # Beside exposure_s, which in a rig file is what the cameras have by themselves.
-        return alone(factors, info, EXPOSURE_KEYS[1:])
+        return refuse_alternatives(factors, info, EXPOSURE_KEYS[1:])
 
 
 class Preset(ScanDefaults):
@@ -441,7 +444,7 @@ class Preset(ScanDefaults):
 
     description: FreeText | None = Field(default=None, description="what it is for")
 
-    _one_exposure = field_validator("exposures_s", "exposure_factors")(alone)
+    _one_exposure = field_validator("exposures_s", "exposure_factors")(refuse_alternatives)
 
     def over(self, usual: ScanDefaults) -> ScanDefaults:
         """The usual options, but for what this one says; who says how long to expose says all of it."""
@@ -450,7 +453,7 @@ class Preset(ScanDefaults):
         return usual.model_copy(update={**other, **own})
 
 
-def _a_known_version(version: object) -> object:
+def _check_version(version: object) -> object:
     if version != PRESET_VERSION:
         message = (
             f"this slrig reads version {PRESET_VERSION} of presets, found {version!r}; bring slrig up to date, or have "
@@ -464,7 +467,7 @@ class PresetDocument(Strict):
     """A preset as a file that rigs may share. Its name is not in it."""
 
     format: Literal["slrig-preset"] = "slrig-preset"
-    version: Annotated[Literal[1], BeforeValidator(_a_known_version)] = PRESET_VERSION
+    version: Annotated[Literal[1], BeforeValidator(_check_version)] = PRESET_VERSION
     scan: Preset
 
     @property

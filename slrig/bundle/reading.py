@@ -18,7 +18,7 @@ from slrig.errors import BundleError
 from slrig.model import Black, Calibration, Capture, Pixels, Shot, White
 
 CALIBRATION = "calibration.json"
-MOST_READERS = 4  # threads, for files that are decoded at the same time
+MAX_READERS = 4  # threads, for files that are decoded at the same time
 
 _Pages = tuple[dict[int, Pixels], dict[int | str, Pixels]]
 """Grey by page; colour by page, or by the name of a file of its own."""
@@ -54,8 +54,8 @@ class BundleFiles:
         files: defaultdict[tuple[str, str], list[FrameEntry]] = defaultdict(list)
         for frame in frames:
             files[frame.camera, frame.file].append(frame)
-        paths = {file: _inside(self.folder, file) for _, file in files}
-        paths |= {each: _inside(self.folder, each) for frame in frames if (each := frame.colour_file) is not None}
+        paths = {file: _path_inside(self.folder, file) for _, file in files}
+        paths |= {each: _path_inside(self.folder, each) for frame in frames if (each := frame.colour_file) is not None}
 
         def read(key: tuple[str, str]) -> _Pages:
             form, entries = self.outline.cameras[key[0]], files[key]
@@ -66,7 +66,7 @@ class BundleFiles:
             colours.update((file, read_colour(paths[file], form)) for each in ends if (file := each.colour_file))
             return grey, colours
 
-        readers = min(MOST_READERS, os.cpu_count() or 1)
+        readers = min(MAX_READERS, os.cpu_count() or 1)
         keys, under_way = iter(files), dict[tuple[str, str], Future[_Pages]]()
         left = {key: len(each) for key, each in files.items()}
         # OpenCV and zlib let other threads run while they decode.
@@ -95,7 +95,7 @@ def read_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle
     CalibrationError: the calibration is malformed, not finite, or made for devices of another size.
     """
     files = open_bundle(folder, calibration_file=calibration_file)
-    return Bundle(_whole(files, colour=True), files.calibration, folder)
+    return Bundle(_read_all(files, colour=True), files.calibration, folder)
 
 
 def open_bundle(folder: Path, *, calibration_file: Path | None = None) -> BundleFiles:
@@ -116,7 +116,7 @@ def read_capture(folder: Path) -> Capture:
     Raises BundleError: bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key.
     """
     description = read_description(folder)
-    return _whole(BundleFiles(_outline(description), None, folder, description), colour=False)
+    return _read_all(BundleFiles(_outline(description), None, folder, description), colour=False)
 
 
 def _outline(description: Description) -> Capture:
@@ -129,11 +129,11 @@ def _outline(description: Description) -> Capture:
     return Capture(description.projector_size(), description.pattern_list(), cameras, shots)
 
 
-def _whole(files: BundleFiles, *, colour: bool) -> Capture:
+def _read_all(files: BundleFiles, *, colour: bool) -> Capture:
     return replace(files.outline, shots=tuple(files.shots(range(len(files.outline.shots)), colour=colour)))
 
 
-def _inside(folder: Path, file: str) -> Path:
+def _path_inside(folder: Path, file: str) -> Path:
     path = folder / file
     if not path.resolve().is_relative_to(folder.resolve()):
         raise BundleError(

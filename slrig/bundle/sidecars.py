@@ -19,7 +19,7 @@ from pydantic import Field
 
 from slrig.bundle.description import CameraName
 from slrig.bundle.storage import json_bytes, write_file
-from slrig.bundle.validation import Strict, read_description_of, read_json, read_text
+from slrig.bundle.validation import Strict, read_json, read_json_model, read_text
 from slrig.errors import BundleError
 from slrig.model import CameraTruth, FloatArray, Shot, Surface, Truth
 
@@ -68,13 +68,13 @@ def read_notes(folder: Path) -> tuple[str, ...]:
     return tuple(found)
 
 
-FOLDER = "refused"
-LIST = "refused.json"
+REFUSED_FOLDER = "refused"
+REFUSED_LIST = "refused.json"
 _REFUSED_MAX_BYTES = 16 * 2**20
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class RefusedFrame:
     """One exposure that did not count: which pattern and camera, which attempt at that pattern, and why.
 
     shot : its frame; None where no frame came, and where it had been accepted and `delivered` before. left_out : the
@@ -112,18 +112,18 @@ class RefusedList(Strict):
     frames: list[RefusedEntry]
 
 
-def read_refused(folder: Path) -> tuple[Refused, ...]:
+def read_refused(folder: Path) -> tuple[RefusedFrame, ...]:
     """What was refused while the bundle in `folder` was captured, without the frames themselves; often nothing.
     Raises BundleError: the list is there and is not as slrig wrote it.
     """
-    path = folder / FOLDER / LIST
+    path = folder / REFUSED_FOLDER / REFUSED_LIST
     if not path.is_file():
         return ()
-    listed = read_description_of(
+    listed = read_json_model(
         path, RefusedList, "list of refused frames", most_bytes=_REFUSED_MAX_BYTES, error=BundleError
     )
     return tuple(
-        Refused(entry.pattern, entry.camera, entry.attempt, entry.cause, left_out=bool(entry.left_out))
+        RefusedFrame(entry.pattern, entry.camera, entry.attempt, entry.cause, left_out=bool(entry.left_out))
         for entry in listed.frames
     )
 
@@ -160,12 +160,12 @@ def read_stage(folder: Path) -> StageAngle | None:
     path = folder / TURNTABLE_FILE
     if not path.exists():
         return None
-    return read_description_of(path, StageAngle, "angle of a stage", most_bytes=TURNTABLE_MAX_BYTES, error=BundleError)
+    return read_json_model(path, StageAngle, "angle of a stage", most_bytes=TURNTABLE_MAX_BYTES, error=BundleError)
 
 
-SURFACE = "truth.ply"
-VISIBLE = "visible_points.npy"
-MAPS = "truth-{camera}.npz"
+SURFACE_FILE = "truth.ply"
+VISIBLE_POINTS_FILE = "visible_points.npy"
+TRUTH_MAPS_FILE = "truth-{camera}.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,11 +185,11 @@ def write_truth(folder: Path, truth: Truth) -> None:
     import trimesh
 
     mesh = trimesh.Trimesh(truth.surface.vertices_mm, truth.surface.faces, process=False)
-    write_file(folder / SURFACE, mesh.export(file_type="ply", vertex_normal=False))
+    write_file(folder / SURFACE_FILE, mesh.export(file_type="ply", vertex_normal=False))
     first = next(iter(truth.cameras.values()))
     data = io.BytesIO()
     np.save(data, first.visible_points_mm, allow_pickle=False)
-    write_file(folder / VISIBLE, data.getvalue())
+    write_file(folder / VISIBLE_POINTS_FILE, data.getvalue())
     for name, camera in truth.cameras.items():
         data = io.BytesIO()
         np.savez(
@@ -198,26 +198,26 @@ def write_truth(folder: Path, truth: Truth) -> None:
             projector_px=camera.projector_px.astype(np.float32),
             visible_points_mm=camera.visible_points_mm,
         )
-        write_file(folder / MAPS.format(camera=name), data.getvalue())
+        write_file(folder / TRUTH_MAPS_FILE.format(camera=name), data.getvalue())
 
 
 def read_truth(folder: Path) -> BundleTruth | None:
     """Return the truth beside a bundle, or None where there is none.
     Raises BundleError: one of its files is missing, cut, or of another shape.
     """
-    if not (folder / SURFACE).exists() and not (folder / VISIBLE).exists():
+    if not (folder / SURFACE_FILE).exists() and not (folder / VISIBLE_POINTS_FILE).exists():
         return None
     # A second, for what no live scan has.
     import trimesh
 
-    path = folder / SURFACE
+    path = folder / SURFACE_FILE
     try:
         mesh = trimesh.load_mesh(path, process=False)
         surface = Surface(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32))
-        path = folder / VISIBLE
+        path = folder / VISIBLE_POINTS_FILE
         visible = _points(np.load(path, allow_pickle=False))
         cameras = {}
-        for path in sorted(folder.glob(MAPS.format(camera="*"))):
+        for path in sorted(folder.glob(TRUTH_MAPS_FILE.format(camera="*"))):
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as maps:
                 cameras[path.stem.removeprefix("truth-")] = CameraTruth(
                     np.asarray(maps["depth_mm"], dtype=np.float64),

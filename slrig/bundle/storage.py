@@ -8,13 +8,13 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
-from slrig.disk import refusals_of, staging_name
+from slrig.disk import staging_name, storage_errors
 
 
-def natural(path: Path) -> tuple[list[str | int], str]:
+def natural_sort_key(path: Path) -> tuple[list[str | int], str]:
     """A key to sort by. Capitals count only where nothing else tells two paths apart.
 
-    >>> [path.name for path in sorted(map(Path, ("Scan-2", "scan-10", "scan-1", "scan-2")), key=natural)]
+    >>> [path.name for path in sorted(map(Path, ("Scan-2", "scan-10", "scan-1", "scan-2")), key=natural_sort_key)]
     ['scan-1', 'Scan-2', 'scan-2', 'scan-10']
     """
     parts = re.split(r"([0-9]+)", str(path))
@@ -76,7 +76,7 @@ def write_file(path: Path, data: bytes | bytearray, *, durable: bool = True) -> 
     durable : False in a folder that `sync_tree` brings to disk before anybody relies on it.
     """
     staging = staging_name(path)
-    with refusals_of(path):
+    with storage_errors(path):
         try:
             if durable:
                 write_durably(staging, data)

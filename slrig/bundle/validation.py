@@ -61,8 +61,8 @@ AwareMoment = Annotated[AwareDatetime, Field(strict=False), BeforeValidator(_ref
 """The same, with its offset from UTC."""
 
 
-MOST_FAULTS = 20
-LONGEST_VALUE = 60
+MAX_FAULTS = 20
+MAX_VALUE_LENGTH = 60
 
 
 class Strict(BaseModel):
@@ -109,7 +109,7 @@ def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
             keys = [key for key, _ in pairs]
             twice = sorted({key for key in keys if keys.count(key) > 1})
             raise ValueError(
-                f"found the key {', '.join(map(shorten, twice[:MOST_FAULTS]))} twice in one object; keep one of them"
+                f"found the key {', '.join(map(shorten, twice[:MAX_FAULTS]))} twice in one object; keep one of them"
             )
         return data
 
@@ -139,7 +139,7 @@ def read_toml(path: Path, most_bytes: int) -> dict[str, Any]:
         raise ConfigError(f"{path}: expected TOML, found a fault: {cause}; correct that line") from cause
 
 
-def checked(
+def validate(
     model: type[Described], data: object, what: str, *, hint: str = "", error: type[InvalidInputError] = ConfigError
 ) -> Described:
     """Return `data` as a `model`.
@@ -148,10 +148,10 @@ def checked(
     try:
         return model.model_validate(dict(data) if isinstance(data, Mapping) else data)
     except ValidationError as cause:
-        raise error(f"{what} is wrong:\n{explain(cause, data, keys_of(model))}{hint}") from cause
+        raise error(f"{what} is wrong:\n{describe_errors(cause, data, model_keys(model))}{hint}") from cause
 
 
-def read_description_of(
+def read_json_model(
     path: Path, model: type[Described], what: str, *, most_bytes: int, error: type[InvalidInputError]
 ) -> Described:
     """Return what a file of JSON describes, as a `model`.
@@ -163,18 +163,18 @@ def read_description_of(
     try:
         return model.model_validate_json(text)
     except ValidationError as cause:
-        raise error(f"{path} is not a valid {what}:\n{explain(cause, data, keys_of(model))}") from cause
+        raise error(f"{path} is not a valid {what}:\n{describe_errors(cause, data, model_keys(model))}") from cause
 
 
-def explain(cause: ValidationError, data: object, known: Sequence[str]) -> str:
+def describe_errors(cause: ValidationError, data: object, known: Sequence[str]) -> str:
     """Return one line per fault; `known` are the keys to propose when one is misspelt."""
     lines = [f"  {_line(fault, data, known)}" for fault in cause.errors(include_url=False)]
-    if len(lines) > MOST_FAULTS:
-        lines[MOST_FAULTS:] = [f"  … and {len(lines) - MOST_FAULTS} more"]
+    if len(lines) > MAX_FAULTS:
+        lines[MAX_FAULTS:] = [f"  … and {len(lines) - MAX_FAULTS} more"]
     return "\n".join(lines)
 
 
-def keys_of(model: type[BaseModel]) -> tuple[str, ...]:
+def model_keys(model: type[BaseModel]) -> tuple[str, ...]:
     """Every key that a model and the models inside it know, for proposals."""
     schema = model.model_json_schema()
     return tuple(dict.fromkeys(_properties(schema)))
@@ -208,7 +208,7 @@ def _line(fault: ErrorDetails, data: object, known: Sequence[str]) -> str:
 def shorten(value: object) -> str:
     """What was found, short enough for a line."""
     text = repr(value)
-    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
+    return text if len(text) <= MAX_VALUE_LENGTH else f"{text[: MAX_VALUE_LENGTH - 1]}…"
 
 
 def _path(loc: Sequence[int | str], data: object, *, keep_last: bool) -> str:

@@ -18,15 +18,15 @@ from slrig.bundle.calibration import write_calibration
 from slrig.bundle.description import CAMERA_NAME, DESCRIPTION, PROJECTOR
 from slrig.bundle.images import encode_frame
 from slrig.bundle.reading import CALIBRATION
-from slrig.bundle.sidecars import FOLDER, LIST, Refused, RefusedEntry, RefusedList
+from slrig.bundle.sidecars import REFUSED_FOLDER, REFUSED_LIST, RefusedEntry, RefusedFrame, RefusedList
 from slrig.bundle.storage import json_bytes, sync_folder, write_durably
-from slrig.disk import refusals_of, staging_name
+from slrig.disk import staging_name, storage_errors
 from slrig.errors import BundleError, CalibrationError, StorageError
 from slrig.model import Calibration, CameraFormat, Capture, Pattern, Shot, Size
 
 
 @dataclass(slots=True)
-class _Place:
+class _FrameSlot:
     """Where a frame is listed; `vacant` from its refusal until another frame takes its place."""
 
     frame: dict[str, Any]
@@ -67,7 +67,7 @@ class BundleWriter:
         self._cameras = dict(cameras)
         self._calibration = calibration
         self._captured_at = captured_at
-        self._places: list[_Place] = []
+        self._places: list[_FrameSlot] = []
         self._refused: list[RefusedEntry] = []
         self._count: Counter[str] = Counter()
         self._ended: str | None = None
@@ -78,7 +78,7 @@ class BundleWriter:
                 f"{self.folder}: expected a new folder, found one that exists; "
                 "a bundle is never overwritten: remove it or choose another name"
             )
-        with refusals_of(self.folder):
+        with storage_errors(self.folder):
             try:
                 for name in self._cameras:
                     (self._staging / "frames" / name).mkdir(parents=True)
@@ -94,28 +94,28 @@ class BundleWriter:
         """
         self._check(shot)
         file = f"frames/{shot.camera}/{self._count[shot.camera]:03d}.png"
-        with refusals_of(self._staging / file):
+        with storage_errors(self._staging / file):
             write_durably(self._staging / file, encode_frame(shot.image, file))
         self._count[shot.camera] += 1
         frame: dict[str, Any] = {"pattern": shot.pattern, "camera": shot.camera, "file": file, **_times(shot)}
         if shot.colour is not None:
             frame["colour_file"] = file.replace(".png", "-colour.png")
-            with refusals_of(self._staging / frame["colour_file"]):
+            with storage_errors(self._staging / frame["colour_file"]):
                 write_durably(self._staging / frame["colour_file"], encode_frame(shot.colour, frame["colour_file"]))
         place = self._latest(shot.pattern, shot.camera, vacant=True)
         if place is None:
-            self._places.append(_Place(frame))
+            self._places.append(_FrameSlot(frame))
         else:
             place.frame, place.vacant = frame, False
 
-    def refuse(self, refused: Refused) -> None:
+    def refuse(self, refused: RefusedFrame) -> None:
         """Keep a refused frame apart: the one given, or the one that was added before, taken back.
         Raises StorageError: the disk refused.
         """
-        file = f"{FOLDER}/{len(self._refused):03d}.png"
+        file = f"{REFUSED_FOLDER}/{len(self._refused):03d}.png"
         entry: dict[str, Any] = {"pattern": refused.pattern, "camera": refused.camera, "attempt": refused.attempt}
-        with refusals_of(self._staging / FOLDER):
-            (self._staging / FOLDER).mkdir(exist_ok=True)
+        with storage_errors(self._staging / REFUSED_FOLDER):
+            (self._staging / REFUSED_FOLDER).mkdir(exist_ok=True)
             place = self._latest(refused.pattern, refused.camera, vacant=not refused.delivered)
             if refused.shot is not None:
                 write_durably(self._staging / file, encode_frame(refused.shot.image, file))
@@ -128,7 +128,7 @@ class BundleWriter:
                 entry |= {**place.frame, "file": file}
         if place is None:
             # Frames stay in the order of their patterns, however often one is shot.
-            place = _Place({"pattern": refused.pattern, "camera": refused.camera})
+            place = _FrameSlot({"pattern": refused.pattern, "camera": refused.camera})
             self._places.append(place)
         place.vacant = True
         entry |= {"cause": refused.cause, "left_out": refused.left_out or None}
@@ -163,14 +163,14 @@ class BundleWriter:
                 name: {"size_px": _extent(camera.size), "bit_depth": camera.bit_depth}
                 for name, camera in self._cameras.items()
             },
-            "patterns": [_pattern(pattern) for pattern in self._patterns],
+            "patterns": [_pattern_document(pattern) for pattern in self._patterns],
             "frames": frames,
         }
         if self._captured_at is not None:
             data["captured_at"] = self._captured_at.isoformat(timespec="seconds")
         if self._calibration is not None:
             write_calibration(self._staging / CALIBRATION, self._calibration)
-        with refusals_of(self.folder):
+        with storage_errors(self.folder):
             if frames:
                 # Without a frame it would be no bundle; what was refused is kept all the same.
                 write_durably(self._staging / DESCRIPTION, json_bytes(data))
@@ -182,7 +182,7 @@ class BundleWriter:
             self._staging.rename(self.folder)
             sync_folder(self.folder.parent)
 
-    def _latest(self, pattern: int, camera: str, *, vacant: bool) -> _Place | None:
+    def _latest(self, pattern: int, camera: str, *, vacant: bool) -> _FrameSlot | None:
         """The last place of one pattern and camera that is vacant, or that is not."""
         wanted = (pattern, camera, vacant)
         mine = (p for p in reversed(self._places) if (p.frame["pattern"], p.frame["camera"], p.vacant) == wanted)
@@ -190,10 +190,10 @@ class BundleWriter:
 
     def _write_refused(self) -> None:
         if self._refused or self._ended is not None:
-            folder = self._staging / FOLDER
+            folder = self._staging / REFUSED_FOLDER
             folder.mkdir(exist_ok=True)
             listed = RefusedList(ended=self._ended, frames=self._refused)
-            write_durably(folder / LIST, json_bytes(listed.model_dump(exclude_none=True)))
+            write_durably(folder / REFUSED_LIST, json_bytes(listed.model_dump(exclude_none=True)))
             sync_folder(folder)
 
     def _discard(self) -> None:
@@ -244,6 +244,6 @@ def _extent(size: Size) -> list[int]:
     return [size.width_px, size.height_px]
 
 
-def _pattern(pattern: Pattern) -> dict[str, Any]:
+def _pattern_document(pattern: Pattern) -> dict[str, Any]:
     values = asdict(pattern)
     return {"kind": values.pop("kind"), **values}

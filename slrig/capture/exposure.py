@@ -17,7 +17,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture.frame_checks import NEARLY_FULL, NOISE_FLOOR_DN, Samples, named
 from slrig.capture.verifier import EvidenceSummary, Sampler, check_capture
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
@@ -143,7 +143,7 @@ def _first(exposed: ExposedSamples, patterns: Sequence[Pattern], kind: Pattern) 
 
 def bracket_summary(
     parts: Sequence[tuple[float, EvidenceSummary]],
-    refused: Sequence[Refused],
+    refused: Sequence[RefusedFrame],
     faults: Sequence[str],
     patterns: Sequence[Pattern],
 ) -> EvidenceSummary:
@@ -161,7 +161,7 @@ def bracket_summary(
     return replace(best, light_drift=drift, faults=(*told, *faults)).with_refused(refused, patterns)
 
 
-def check_exposures(recorded: Capture, refused: Sequence[Refused] = ()) -> EvidenceSummary:
+def check_exposures(recorded: Capture, refused: Sequence[RefusedFrame] = ()) -> EvidenceSummary:
     """Judge a recorded capture as `slrig.capture.verifier.check_capture` does, a bracket exposure by exposure."""
     alike = exposure_groups(shot.exposure_s for shot in recorded.shots)
     of_camera = {name: {alike[s.exposure_s] for s in recorded.shots if s.camera == name} for name in recorded.cameras}

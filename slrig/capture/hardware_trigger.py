@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture.frame_checks import named, place
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
 from slrig.capture.verifier import RetryPolicy, in_words
@@ -216,9 +216,9 @@ def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
         period_s *= 2 if any(play.halved(name) for name in rig.cameras) else 1
         retries.evidence.forget()
         for index, name in play.delivered:
-            retries.refuse(Refused(index, name, number, causes[-1], delivered=True))
+            retries.refuse(RefusedFrame(index, name, number, causes[-1], delivered=True))
         for shot in play.withheld:
-            retries.refuse(Refused(shot.pattern, shot.camera, number, causes[-1], shot))
+            retries.refuse(RefusedFrame(shot.pattern, shot.camera, number, causes[-1], shot))
     message = f"the sequence was played {MOST_PLAYS} times by wire: {in_words(causes)}"
     raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
 

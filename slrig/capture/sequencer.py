@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture.hardware_trigger import Session, differ, hardware_triggered, software_triggered
 from slrig.capture.streaming import FrameReader, earliest_change_s, streamed
 from slrig.capture.verifier import Evidence, RetryPolicy
@@ -21,7 +21,7 @@ def capture(
     cancelled: Callable[[], bool] = lambda: False,
     timeout_s: float = 2.0,
     evidence: Evidence | None = None,
-    refused: Callable[[Refused], None] = lambda _: None,
+    refused: Callable[[RefusedFrame], None] = lambda _: None,
     since_ns: int | None = None,
     colour: Collection[str] = (),
 ) -> Iterator[Shot]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture import frame_checks
 from slrig.capture.frame_checks import Chosen, Code, Contradiction, Lighting, Reference, Samples, named, place
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
@@ -589,7 +589,7 @@ class EvidenceSummary:
         again = f", {self.shot_again} frame{'s' * (self.shot_again != 1)} shot again" if self.shot_again else ""
         return f"{self.verified}/{self.patterns} patterns verified{again}"
 
-    def with_refused(self, refused: Sequence[Refused], patterns: Sequence[Pattern]) -> EvidenceSummary:
+    def with_refused(self, refused: Sequence[RefusedFrame], patterns: Sequence[Pattern]) -> EvidenceSummary:
         """The summary with what refused exposures come to."""
         shot = [each for each in refused if not each.left_out]
         return replace(
@@ -607,7 +607,7 @@ class Evidence:
     """
 
     def __init__(
-        self, patterns: Sequence[Pattern], cameras: Mapping[str, CameraFormat], refused: Sequence[Refused] = ()
+        self, patterns: Sequence[Pattern], cameras: Mapping[str, CameraFormat], refused: Sequence[RefusedFrame] = ()
     ) -> None:
         self._patterns = tuple(patterns)
         self._cameras = dict(cameras)
@@ -631,7 +631,7 @@ class Evidence:
         """Forget every frame. What was refused stays on record."""
         self._verifiers = {name: FrameVerifier(name, form, self._patterns) for name, form in self._cameras.items()}
 
-    def note(self, refused: Refused) -> None:
+    def note(self, refused: RefusedFrame) -> None:
         """Put on record that an exposure was refused."""
         self._refused.append(replace(refused, shot=None))
 
@@ -652,7 +652,7 @@ class Evidence:
         return summary.with_refused(self._refused, self._patterns)
 
 
-def check_capture(capture: Capture, refused: Sequence[Refused] = ()) -> EvidenceSummary:
+def check_capture(capture: Capture, refused: Sequence[RefusedFrame] = ()) -> EvidenceSummary:
     """Judge a recorded capture. Contradictions are listed in the summary, not raised: somebody kept these frames.
 
     Of a pattern that was exposed for different times, the exposure that most patterns share is judged. `refused` is
@@ -699,7 +699,7 @@ class RetryPolicy:
         self,
         sequence: PatternSequence,
         evidence: Evidence,
-        refused: Callable[[Refused], None],
+        refused: Callable[[RefusedFrame], None],
         *,
         since_ns: int | None = None,
         colour: Collection[str] = (),
@@ -749,7 +749,7 @@ class RetryPolicy:
         self._missing[shot.camera, index].clear()
         if fault is not None:
             self._causes[shot.camera, index].append(fault)
-            self._shoot_again(Refused(index, shot.camera, self._shots[shot.camera, index], fault, shot))
+            self._shoot_again(RefusedFrame(index, shot.camera, self._shots[shot.camera, index], fault, shot))
             self._end_at_third(shot.camera, [index])
             return None
         found = self.evidence.contradictions(shot)
@@ -759,7 +759,7 @@ class RetryPolicy:
         """Take note that no frame came. Raises FrameTimeoutError when none came three times running."""
         missing = self._missing[camera, index]
         missing.append(cause)
-        self._shoot_again(Refused(index, camera, self._shots[camera, index], cause))
+        self._shoot_again(RefusedFrame(index, camera, self._shots[camera, index], cause))
         if len(missing) >= MOST_FAILURES:
             raise FrameTimeoutError(self._failed(camera, index, missing))
 
@@ -783,16 +783,16 @@ class RetryPolicy:
             cause = accused.get(pattern) or beyond.get(pattern) or found[0].cause
             own = pattern == shot.pattern
             attempt = self._shots[camera, pattern]
-            self._shoot_again(Refused(pattern, camera, attempt, cause, shot if own else None, delivered=not own))
+            self._shoot_again(RefusedFrame(pattern, camera, attempt, cause, shot if own else None, delivered=not own))
         self._end_at_third(camera, accused)
         return frozenset(gone)
 
-    def refuse(self, refused: Refused) -> None:
+    def refuse(self, refused: RefusedFrame) -> None:
         """Put an exposure on record as one that does not count, and tell of it."""
         self.evidence.note(refused)
         self._tell(refused)
 
-    def _shoot_again(self, refused: Refused) -> None:
+    def _shoot_again(self, refused: RefusedFrame) -> None:
         cameras = self.again.setdefault(refused.pattern, [])
         if refused.camera not in cameras:
             cameras.append(refused.camera)

@@ -21,11 +21,11 @@ from slrig.cli.options import given
 from slrig.config import RigConfig, read_rig, read_settings
 from slrig.conformance import CheckOutcome, ConformanceReport, run_checks
 from slrig.devices import Rig, Synchronisation, Trigger
-from slrig.discovery import found_devices, installed_drivers, open_rig
+from slrig.discovery import discover_devices, installed_drivers, open_rig
 from slrig.doctor import Diagnosis, Severity, examine, refuse_existing, write_rig_file
 from slrig.errors import StorageError
 from slrig.jobs.examinations import keep
-from slrig.logs import set_up_logs_for_a_person
+from slrig.logs import set_up_console_logs
 from slrig.model import PatternSequence
 from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence
@@ -49,7 +49,7 @@ def doctor(
 
     Raises SlrigError where a rig file is wrong or cannot be written, or the rig cannot be opened.
     """
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     config = read_rig(rig_file)
     lines = _own_plan(config).named
     if output is not None:
@@ -58,7 +58,7 @@ def doctor(
         display("looking for displays", 0.0, "")
         # Light engines, trigger boxes, and outputs with a display.
         projectors = {driver.name for driver in installed_drivers() if driver.kind == "projector"}
-        displays = tuple(device for device in found_devices().devices if device.driver in projectors)
+        displays = tuple(device for device in discover_devices().devices if device.driver in projectors)
         display("opening the rig", 0.0, "")
         with open_rig(config) as rig:
             diagnosis = examine(
@@ -86,7 +86,7 @@ def conform(rig: Path, *, data: Path | None, as_json: bool) -> bool:
 
     Raises SlrigError where the rig file is wrong, or the rig cannot be opened.
     """
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     config = read_rig(rig)
     with progress_shown() as display:
         display("opening the rig", 0.0, "")
@@ -117,7 +117,7 @@ def tell_latency(
     rig_file: Path, *, trials: int, search_s: float, exposure_s: float | None, trigger: str | None, as_json: bool
 ) -> None:
     """Measure a rig's latency, and print it in words with the table for its rig file, or as JSON."""
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     kind = None if trigger is None else Trigger(trigger)
     with open_rig(read_rig(rig_file)) as rig, progress_shown() as display:
         measured = measure_latency(

@@ -146,9 +146,6 @@ def _out_of_range_settings(camera: Camera, default: CameraSettings) -> list[Came
     return settings + [CameraSettings(default.exposure_s, gain) for gain in gains]
 
 
-
-
-
 @camera_check()
 def frames_are_as_declared(armed: ArmedCamera) -> None:
     """Frames have the name, extent, type and range that the camera declares."""
@@ -330,8 +327,6 @@ def expect_applied_settings(frame: Frame, applied: AppliedSettings) -> None:
         found=f"{duration_s:.6g} s, with what t_err_ns allows",
         remedy="t_start_ns is when the first row begins, t_end_ns when the last row ends",
     )
-
-
 
 
 @camera_check(Need.WHITE_AND_BLACK, every=True)

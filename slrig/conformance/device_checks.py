@@ -204,10 +204,6 @@ def _list_sizes(sizes: Mapping[str, Size]) -> str:
     return ", ".join(f"'{name}' {size}" for name, size in sorted(sizes.items())) or "no camera"
 
 
-
-
-
-
 @camera_check()
 def an_armed_camera_refuses_to_be_set_or_armed(armed: ArmedCamera) -> None:
     """An armed camera refuses to be set or armed, and goes on."""

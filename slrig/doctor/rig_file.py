@@ -15,8 +15,8 @@ from typing import Any
 
 from slrig.bundle.storage import write_durably
 from slrig.bundle.validation import read_text
-from slrig.config import MOST_CONFIG_BYTES, read_rig
-from slrig.disk import refusals_of, staging_name
+from slrig.config import MAX_CONFIG_BYTES, read_rig
+from slrig.disk import staging_name, storage_errors
 from slrig.doctor.advice import ExposureAdvice
 from slrig.doctor.doctor import Diagnosis
 from slrig.doctor.light import Severity, format_ms
@@ -37,9 +37,9 @@ def write_rig_file(diagnosis: Diagnosis, source: Path, target: Path, *, force: b
     ConfigError if the target exists and `force` is False; StorageError.
     """
     refuse_existing(target, force=force)
-    data = tomllib.loads(read_text(source, MOST_CONFIG_BYTES, ConfigError))
+    data = tomllib.loads(read_text(source, MAX_CONFIG_BYTES, ConfigError))
     text = rig_file_text(data, diagnosis, source=source.resolve(), target=target.resolve())
-    with refusals_of(target):
+    with storage_errors(target):
         staged = staging_name(target)
         try:
             write_durably(staged, text.encode())

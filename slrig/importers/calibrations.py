@@ -14,19 +14,19 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from slrig.bundle.calibration import (
-    MOST_FILE_BYTES,
+    MAX_STORAGE_BYTES,
     Value,
-    five_terms,
+    five_distortion_terms,
     read_calibration,
     read_file_storage,
     read_opencv_calibration,
     write_calibration,
     write_opencv_calibration,
 )
-from slrig.bundle.description import CAMERA_NAME, MOST_SIDE_PX
+from slrig.bundle.description import CAMERA_NAME, MAX_SIDE_PX
 from slrig.bundle.storage import sync_folder, write_durably, write_file
-from slrig.bundle.validation import Strict, checked, read_text
-from slrig.disk import refusals_of, staging_name
+from slrig.bundle.validation import Strict, read_text, validate
+from slrig.disk import staging_name, storage_errors
 from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, Gray, Pinhole, Size
 from slrig.ros_messages import FRAME, MM_PER_M, PROJECTOR, WORLD, lens, pose
@@ -85,7 +85,7 @@ def yaml_bytes(data: object) -> bytes:
 
 TRANSFORMS = "transforms.yaml"
 
-Side = Annotated[int, Field(ge=1, le=MOST_SIDE_PX)]
+Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]
 
 
 class Matrix(Strict):
@@ -179,7 +179,7 @@ def read_ros(folder: Path) -> Calibration:
 
 
 def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: str) -> Pinhole:
-    info = checked(CameraInfo, read_yaml(path), str(path), error=CalibrationError)
+    info = validate(CameraInfo, read_yaml(path), str(path), error=CalibrationError)
     terms = info.distortion_coefficients.array(f"{path}: distortion_coefficients").ravel()
     if info.distortion_model not in ("plumb_bob", "rational_polynomial") or terms[5:].any() or len(terms) < 4:
         raise CalibrationError(
@@ -204,7 +204,7 @@ def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: s
 
 def _poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
     """World to frame of each frame: rotation, and translation in mm. Raises CalibrationError."""
-    listed = checked(Transforms, read_yaml(path), str(path), error=CalibrationError).transforms
+    listed = validate(Transforms, read_yaml(path), str(path), error=CalibrationError).transforms
     parents = {each.child_frame_id: each for each in listed}
     if len(parents) < len(listed):
         raise CalibrationError(f"{path}: expected one parent for each frame, found two; keep one of them")
@@ -256,7 +256,7 @@ def write_ros(folder: Path, calibration: Calibration) -> None:
         transforms.append({"header": {"frame_id": WORLD}, "child_frame_id": name + FRAME, "transform": stands})
     texts[TRANSFORMS] = yaml_bytes({"transforms": transforms})
     staging = staging_name(folder)
-    with refusals_of(folder):
+    with storage_errors(folder):
         try:
             staging.mkdir()
             for file, text in texts.items():
@@ -340,7 +340,7 @@ def read_kalibr(path: Path) -> Calibration:
 
 
 def _entry(path: Path, key: str, data: object) -> ChainEntry:
-    entry = checked(ChainEntry, data, f"{path}: {key}", error=CalibrationError)
+    entry = validate(ChainEntry, data, f"{path}: {key}", error=CalibrationError)
     models = (entry.camera_model, entry.distortion_model)
     if models != ("pinhole", "radtan") or (len(entry.intrinsics), len(entry.distortion_coeffs)) != (4, 4):
         raise CalibrationError(
@@ -439,8 +439,10 @@ def read_pair(
     if program == "scan3d-capture":
         second = _in_pixels(second, projector, shown)
     try:
-        here = Pinhole(sizes[0], first, five_terms(first_lens, path, PAIRS[program][1]), np.eye(3), np.zeros(3))
-        lens = five_terms(second_lens, path, PAIRS[program][3])
+        here = Pinhole(
+            sizes[0], first, five_distortion_terms(first_lens, path, PAIRS[program][1]), np.eye(3), np.zeros(3)
+        )
+        lens = five_distortion_terms(second_lens, path, PAIRS[program][3])
         there = Pinhole(other, second, lens, rotation, translation.ravel())
     except CalibrationError as cause:
         raise CalibrationError(f"{path}: {cause}") from cause
@@ -486,7 +488,7 @@ def read_any_calibration(
         return read_ros(path)
     if path.suffix.lower() not in {".yml", ".yaml", ".xml"}:
         return read_calibration(path)
-    text = read_text(path, MOST_FILE_BYTES, CalibrationError)
+    text = read_text(path, MAX_STORAGE_BYTES, CalibrationError)
     if not text.removeprefix("\ufeff").startswith(("%YAML", "<")):
         return read_kalibr(path)
     root = read_file_storage(text, path)

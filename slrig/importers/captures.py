@@ -12,12 +12,12 @@ from typing import NoReturn
 import numpy as np
 
 from slrig.bundle.calibration import check_calibration
-from slrig.bundle.description import MOST_CAMERA_PX
-from slrig.bundle.images import frame_format, read_with_colour
-from slrig.bundle.storage import natural
+from slrig.bundle.description import MAX_CAMERA_PX
+from slrig.bundle.images import read_frame_format, read_with_colour
+from slrig.bundle.storage import natural_sort_key
 from slrig.bundle.validation import read_text
 from slrig.bundle.writing import BundleWriter
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
 from slrig.importers.calibrations import read_any_calibration
 from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Shot, Size, White
@@ -246,7 +246,7 @@ def import_capture(
     names : of the cameras, in the natural order of what they are called in the folder. bit_depth : of samples in files
     of 16 bits. Raises BundleError, PatternError, CalibrationError: what was expected and found; StorageError.
     """
-    with refusals_of(folder):
+    with storage_errors(folder):
         found = _found(folder, code, naming)
     if names:
         if len(names) != len(found.cameras):
@@ -294,7 +294,7 @@ def _sequence(code: Code, naming: Naming, files: Sequence[Path]) -> list[Pattern
         return code.sequence(naming.order)
     count = len(files)
     if naming.program == "opencv":
-        form = frame_format(files[0])
+        form = read_frame_format(files[0])
         # Whoever saved the images chose where white and black stand, and which comes first.
         for ends_first, pair in ((False, files[-2:]), (True, files[:2])):
             images = [_read(each, form) for each in pair]
@@ -310,7 +310,9 @@ def _by_camera(folder: Path) -> dict[str, list[Path]]:
     """Images in natural order, by subfolder, or by what their names have before the last number."""
     images = _images(folder)
     if not images:
-        inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural)
+        inside = sorted(
+            (each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural_sort_key
+        )
         found = {each.name: files for each in inside if (files := _images(each))}
         if not found:
             raise BundleError(f"{folder}: expected images ({', '.join(sorted(IMAGES))}), found none in it or below it")
@@ -325,7 +327,7 @@ def _by_camera(folder: Path) -> dict[str, list[Path]]:
 
 def _images(folder: Path) -> list[Path]:
     found = (each for each in folder.iterdir() if each.suffix.lower() in IMAGES and each.name[0] != ".")
-    return sorted(found, key=natural)
+    return sorted(found, key=natural_sort_key)
 
 
 def _by_names(folder: Path, code: Code, naming: Naming) -> Imported:
@@ -390,13 +392,13 @@ def _require_whole(folder: Path, found: Imported) -> None:
 
 
 def _one_format(files: Sequence[tuple[Path, Pattern]], bit_depth: int | None) -> CameraFormat:
-    first = frame_format(files[0][0])
-    if first.size.width_px * first.size.height_px > MOST_CAMERA_PX:
+    first = read_frame_format(files[0][0])
+    if first.size.width_px * first.size.height_px > MAX_CAMERA_PX:
         raise BundleError(
-            f"{files[0][0]}: expected at most {MOST_CAMERA_PX} pixels, found {first.size}; crop the images"
+            f"{files[0][0]}: expected at most {MAX_CAMERA_PX} pixels, found {first.size}; crop the images"
         )
     for path, _ in files:
-        each = frame_format(path)
+        each = read_frame_format(path)
         if each != first:
             raise BundleError(
                 f"{path}: expected {first.size} of {first.bit_depth} bits as {files[0][0].name}, found {each.size} of "

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from slrig.bundle.reading import BundleFiles
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ExtraMissingError
 from slrig.model import Calibration, Pinhole, Pixels, White
 from slrig.ros_messages import PROJECTOR, TF_STATIC, Device, Messages, topic
@@ -69,7 +69,7 @@ def encode_bag(
     with TemporaryDirectory(prefix="slrig-") as parent:
         # Writes FOLDER/FOLDER.mcap.
         folder = Path(parent, Path(BAG).stem)
-        with refusals_of(folder):
+        with storage_errors(folder):
             # From version 9 on QoS is stated in words, which Humble does not read; later releases read both.
             writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
             # As chunks of the MCAP, which any reader of the format unpacks.

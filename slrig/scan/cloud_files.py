@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from slrig.bundle.calibration import read_calibration
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION, open_bundle
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.jobs.data_folder import BUNDLE
 from slrig.model import Mesh, Pinhole
@@ -100,7 +100,7 @@ def _organised(folder: Path, mesh: Mesh, camera: str, device: Pinhole) -> Organi
 
 
 def _read(path: Path) -> bytes:
-    with refusals_of(path):
+    with storage_errors(path):
         return path.read_bytes()
 
 

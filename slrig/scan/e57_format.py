@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ExtraMissingError, NothingToReconstructError, StorageError
 from slrig.scan.offered import extra_of
 from slrig.scan.organised import OrganisedCloud
@@ -52,5 +52,5 @@ def encode_e57(cloud: OrganisedCloud) -> bytes:
         except E57Exception as cause:
             message = f"{path}: the disk refused: {cause}; free some space there"
             raise StorageError(message) from cause
-        with refusals_of(path):
+        with storage_errors(path):
             return path.read_bytes()

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slrig.bundle import read_calibration
-from slrig.bundle.calibration import check_rays
+from slrig.bundle.calibration import require_two_rays
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION, BundleFiles, open_bundle
 from slrig.bundle.sidecars import read_refused
@@ -161,7 +161,7 @@ def _require_calibration(folder: Path, names: list[str], found: Calibration | No
             f"calibrate {missing}, or use the names of the calibration"
         )
         raise CalibrationError(message)
-    check_rays(found, names, str(folder))
+    require_two_rays(found, names, str(folder))
     return found
 
 

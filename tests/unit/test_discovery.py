@@ -23,7 +23,7 @@ from slrig.devices import (
     Rig,
     Trigger,
 )
-from slrig.discovery import found_devices, installed_drivers, open_rig
+from slrig.discovery import discover_devices, installed_drivers, open_rig
 from slrig.errors import (
     CalibrationError,
     ConfigError,
@@ -339,6 +339,6 @@ def test_a_broken_driver_does_not_hide_the_others_and_one_of_two_packages_is_ref
 
 
 def test_a_failing_finder_does_not_hide_what_others_found() -> None:
-    findings = found_devices()
+    findings = discover_devices()
     assert FoundDevice("fake", "usb-1", "a fake camera") in findings.devices
     assert ["finder driver 'lost' failed: OSError: no bus" in str(fault) for fault in findings.faults] == [True]

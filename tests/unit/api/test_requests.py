@@ -15,7 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.bundle.description import MOST_CAPTURE_BYTES
+from slrig.bundle.description import MAX_CAPTURE_BYTES
 from slrig.bundle.options import Preset, PresetDocument, ScanDefaults
 from slrig.config import read_rig
 from slrig.devices import CameraInfo, ProjectorInfo, Trigger
@@ -247,7 +247,7 @@ def test_plan_takes_as_many_bytes_as_it_plays_frames() -> None:
     assert check_plan(ScanPlan(exposures_s=(0.01, 0.02, 0.04)), facts(bit_depth=12)) == 6 * one
     lit = replace(plain, projector=replace(plain.projector, lights=True))
     assert check_plan(ScanPlan(coloured_light=True), lit) == one + 2 * 3 * 200 * 100
-    assert check_plan(ScanPlan(), facts(Size(8192, 5000))) < MOST_CAPTURE_BYTES
+    assert check_plan(ScanPlan(), facts(Size(8192, 5000))) < MAX_CAPTURE_BYTES
 
 
 BRACKET_S = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032)
