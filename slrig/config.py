@@ -29,6 +29,11 @@ NoticeKind = Literal[
     "run.missed", "run.skipped", "run.failed", "run.interrupted", "health.changed", "job.ended"
 ]  # fmt: skip
 
+_PATHS = (
+    "data_dir", "rig", "webhook_secret_file", "mqtt_login_file", "compute_certificates", "compute_login_file",
+    "catalogue_login_file", "catalogue_authority",
+)  # fmt: skip
+
 
 class DriverTable(Strict, use_attribute_docstrings=True):
     """A device: the driver that opens it; every other key is an option of that driver, validated by the driver."""
@@ -216,12 +221,6 @@ def default_data_dir() -> Path:
     """Default folder for scans: in the data folder of the XDG base directories."""
     base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
     return Path(base) / "slrig"
-
-
-_PATHS = (
-    "data_dir", "rig", "webhook_secret_file", "mqtt_login_file", "compute_certificates", "compute_login_file",
-    "catalogue_login_file", "catalogue_authority",
-)  # fmt: skip
 
 
 class ServiceSettings(BaseSettings):

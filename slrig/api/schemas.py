@@ -203,7 +203,7 @@ def scan_plan(request: ShotRequest, defaults: ScanDefaults, preset: PresetDocume
     """
     usual, use = defaults.model_copy(update={"exposure_s": None}), None
     if preset is not None and request.preset is not None:
-        usual, use = preset.scan.over(usual), PresetUse(request.preset, preset.version, preset.digest)
+        usual, use = preset.scan.apply_to(usual), PresetUse(request.preset, preset.version, preset.digest)
     exposing: BaseModel = request if any(getattr(request, key) is not None for key in EXPOSURE_KEYS) else usual
     return ScanPlan(
         patterns=pattern_plan(request.patterns, usual),

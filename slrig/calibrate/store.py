@@ -212,7 +212,7 @@ class CalibrationStore:
 
     def _commit(self, staged: Path, place: Path) -> None:
         with disk_errors(staged):
-            sync_tree(staged, but=BUNDLE)
+            sync_tree(staged, except_folder=BUNDLE)
             staged.rename(place)
             sync_folder(place.parent)
 

@@ -427,7 +427,7 @@ def _write_camera(
     brightest = 0
     for path, pattern in files:
         coloured = (0,) if isinstance(pattern, White | Black) else ()
-        grey, colour = read_with_colour(path, (0,), form, coloured=coloured)
+        grey, colour = read_with_colour(path, (0,), form, colour_pages=coloured)
         writer.add(Shot(patterns.index(pattern), name, grey[0], colour=colour.get(0)))
         brightest = max(brightest, int(grey[0].max()))
         if isinstance(pattern, White | Black):

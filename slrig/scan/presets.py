@@ -104,7 +104,7 @@ class Presets:
         """
         path = self._path(name)
         if path.is_file():
-            return read_json_model(path, PresetDocument, "preset", most_bytes=MOST_PRESET_BYTES, error=ConfigError)
+            return read_json_model(path, PresetDocument, "preset", max_bytes=MOST_PRESET_BYTES, error=ConfigError)
         if name not in self._given:
             names = ", ".join(sorted(self._kept() | set(self._given)))
             message = f"There is no preset '{name}' here. There are: {names}."

@@ -281,7 +281,7 @@ def test_faults_of_several_tables_are_reported_together_and_all_is_closed(tmp_pa
     order = [
         "projector driver 'skreen'",
         "camera driver 'fkae'",
-        "camera driver 'strict' does not take",
+        "camera driver 'strict' refuses",
         "  speed: unknown key; remove it",
         "positioner driver 'tabel'",
     ]
@@ -298,7 +298,7 @@ def test_faults_of_several_tables_are_reported_together_and_all_is_closed(tmp_pa
         ("crashing", DriverBrokenError, "'crashing' failed: ZeroDivisionError: right; report it"),
         ("broken", DriverBrokenError, r"of fake_drivers 1\.2 cannot be loaded \(no_such_module:open_camera\)"),
         ("constant", DriverBrokenError, "cannot be called"),
-        ("nothing", DriverBrokenError, "returned tuple, which is no Camera"),
+        ("nothing", DriverBrokenError, "returned tuple, which is not a Camera"),
     ],
 )
 def test_devices_already_open_are_closed_when_one_fails(

@@ -347,7 +347,7 @@ def test_preset_replaces_a_shipped_one_until_it_is_deleted(client: TestClient, s
 @pytest.mark.parametrize(
     ("name", "sent", "words"),
     [
-        ("dark", {**document(), "version": 2}, "reads version 1 of presets, found 2; bring slrig up to date"),
+        ("dark", {**document(), "version": 2}, "reads version 1 of presets, found 2; update slrig"),
         ("dark", {**document(), "format": "slrig-bundle"}, "slrig-preset"),
         ("dark", document(exposure_factor=[2.0]), "no such field"),
         ("dark", document(exposure_factors=[]), "2 to 6 exposure times, found 0"),
@@ -365,7 +365,7 @@ def test_document_that_is_no_preset_is_refused(client: TestClient, name: str, se
 def test_preset_file_of_another_version_hides_no_other(tmp_path: Path) -> None:
     (tmp_path / "dark.json").write_text(json.dumps({**document(), "version": 3}))
     presets = Presets(tmp_path, {})
-    with pytest.raises(ConfigError, match=r"dark\.json is not a valid preset[^$]*found 3; bring slrig up to date"):
+    with pytest.raises(ConfigError, match=r"dark\.json is not a valid preset[^$]*found 3; update slrig"):
         presets.get("dark")
     assert presets.get("matt").scan == SHIPPED["matt"]
     (tmp_path / "By hand.json").write_text(json.dumps(document()))
