@@ -20,7 +20,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from slrig.bundle.calibration import check_calibration, read_calibration, require_two_rays
+from slrig.bundle import check_calibration, read_calibration, require_two_rays
 from slrig.bundle.validation import describe_errors
 from slrig.config import DriverTable, RigConfig
 from slrig.devices import (

@@ -32,8 +32,7 @@ from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import filled, pattern_plan
 from slrig.api.service import Service, Serving
-from slrig.bundle.calibration import MAX_CALIBRATION_BYTES
-from slrig.bundle.description import CAMERA_NAME
+from slrig.bundle import CAMERA_NAME, MAX_CALIBRATION_BYTES
 from slrig.bundle.validation import FreeText, SafeText
 from slrig.calibrate.calibrating import EXPORTS
 from slrig.calibrate.pose_shooting import PoseRequest

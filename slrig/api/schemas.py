@@ -19,6 +19,7 @@ from pydantic import (
 )
 
 from slrig.api.problems import fault_problem
+from slrig.bundle import TurnedBy
 from slrig.bundle.options import (
     EXPOSURE_KEYS,
     BracketSeconds,
@@ -29,7 +30,6 @@ from slrig.bundle.options import (
     ScanDefaults,
     refuse_alternatives,
 )
-from slrig.bundle.sidecars import TurnedBy
 from slrig.bundle.validation import FreeText, Strict
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState

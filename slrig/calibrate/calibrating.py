@@ -8,7 +8,7 @@ from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.bundle.calibration import write_calibration, write_opencv_calibration
+from slrig.bundle import write_calibration, write_opencv_calibration
 from slrig.bundle.storage import write_durably
 from slrig.calibrate.pose_shooting import PoseDesk, outcome_of
 from slrig.calibrate.records import USUAL_PATTERNS, SessionRecord, SessionState

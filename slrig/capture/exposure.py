@@ -17,7 +17,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from slrig.bundle.sidecars import RefusedFrame
+from slrig.bundle import RefusedFrame
 from slrig.capture.frame_checks import NEARLY_FULL, NOISE_FLOOR_DN, Samples, named
 from slrig.capture.verifier import EvidenceSummary, Sampler, check_capture
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slrig.bundle.sidecars import RefusedFrame
+from slrig.bundle import RefusedFrame
 from slrig.capture.frame_checks import named, place
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
 from slrig.capture.verifier import RetryPolicy, in_words

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 
-from slrig.bundle.sidecars import RefusedFrame
+from slrig.bundle import RefusedFrame
 from slrig.capture.hardware_trigger import Session, differ, hardware_triggered, software_triggered
 from slrig.capture.streaming import FrameReader, earliest_change_s, streamed
 from slrig.capture.verifier import Evidence, RetryPolicy

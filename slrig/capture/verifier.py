@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.sidecars import RefusedFrame
+from slrig.bundle import RefusedFrame
 from slrig.capture import frame_checks
 from slrig.capture.frame_checks import Chosen, Code, Contradiction, Lighting, Reference, Samples, named, place
 from slrig.errors import FrameTimeoutError, ScanEvidenceError

@@ -13,7 +13,9 @@ import yaml
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from slrig.bundle.calibration import (
+from slrig.bundle import (
+    CAMERA_NAME,
+    MAX_SIDE_PX,
     MAX_STORAGE_BYTES,
     Value,
     five_distortion_terms,
@@ -23,7 +25,6 @@ from slrig.bundle.calibration import (
     write_calibration,
     write_opencv_calibration,
 )
-from slrig.bundle.description import CAMERA_NAME, MAX_SIDE_PX
 from slrig.bundle.storage import sync_folder, write_durably, write_file
 from slrig.bundle.validation import Strict, read_text, validate
 from slrig.disk import staging_name, storage_errors

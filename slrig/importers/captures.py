@@ -11,12 +11,9 @@ from typing import NoReturn
 
 import numpy as np
 
-from slrig.bundle.calibration import check_calibration
-from slrig.bundle.description import MAX_CAMERA_PX
-from slrig.bundle.images import read_frame_format, read_with_colour
+from slrig.bundle import MAX_CAMERA_PX, BundleWriter, check_calibration, read_frame_format, read_with_colour
 from slrig.bundle.storage import natural_sort_key
 from slrig.bundle.validation import read_text
-from slrig.bundle.writing import BundleWriter
 from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
 from slrig.importers.calibrations import read_any_calibration

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import structlog
 
-from slrig.bundle.calibration import check_calibration, require_two_rays
+from slrig.bundle import check_calibration, require_two_rays
 from slrig.devices import CameraInfo, ProjectorInfo, Rig, Turntable
 from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
 from slrig.failure import UNEXPECTED, JobFailure, job_failure

@@ -20,8 +20,7 @@ from typing import Self
 
 import structlog
 
-from slrig.bundle import BundleWriter, write_truth
-from slrig.bundle.sidecars import REFUSED_FOLDER, RefusedFrame, StageAngle, write_notes, write_stage
+from slrig.bundle import REFUSED_FOLDER, BundleWriter, RefusedFrame, StageAngle, write_notes, write_stage, write_truth
 from slrig.capture import SETTINGS_TOLERANCE, choose_triggers, whole_refreshes_s
 from slrig.devices import Camera, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError

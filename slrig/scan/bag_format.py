@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from slrig.bundle.reading import BundleFiles
+from slrig.bundle import BundleFiles
 from slrig.disk import storage_errors
 from slrig.errors import ExtraMissingError
 from slrig.model import Calibration, Pinhole, Pixels, White

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from slrig.bundle.sidecars import RefusedFrame
+from slrig.bundle import RefusedFrame
 from slrig.capture import (
     NOISE_FLOOR_DN,
     Evidence,

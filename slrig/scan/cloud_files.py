@@ -13,9 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.calibration import read_calibration
-from slrig.bundle.description import read_description
-from slrig.bundle.reading import CALIBRATION, open_bundle
+from slrig.bundle import CALIBRATION, open_bundle, read_calibration, read_description
 from slrig.disk import storage_errors
 from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.jobs.data_folder import BUNDLE

@@ -13,11 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from slrig.bundle import read_calibration
-from slrig.bundle.calibration import require_two_rays
-from slrig.bundle.description import read_description
-from slrig.bundle.reading import CALIBRATION, BundleFiles, open_bundle
-from slrig.bundle.sidecars import read_refused
+from slrig.bundle import (
+    CALIBRATION,
+    BundleFiles,
+    open_bundle,
+    read_calibration,
+    read_description,
+    read_refused,
+    require_two_rays,
+)
 from slrig.capture import Evidence, EvidenceSummary, check_exposures, judged_frames
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
 from slrig.model import LEAST_SHARE, Axis, Calibration, Region, Shot, without_missing_bits

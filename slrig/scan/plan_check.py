@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from slrig.bundle.description import MAX_CAPTURE_BYTES
+from slrig.bundle import MAX_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo
 from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import Axis, Black, Calibration, Pattern, PatternSequence, Size, White

@@ -19,7 +19,7 @@ import numpy as np
 import structlog
 from numba import config
 
-from slrig.bundle.writing import write_bundle
+from slrig.bundle import write_bundle
 from slrig.errors import StorageError
 from slrig.kernels import KernelCount, count_prepared, report_compilations
 from slrig.meshing import FIRST_STAGE

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import read_truth
-from slrig.bundle.sidecars import read_health, read_notes, read_stage
+from slrig.bundle import read_health, read_notes, read_stage, read_truth
 from slrig.bundle.storage import write_file
 from slrig.capture import EvidenceSummary
 from slrig.errors import ScanCancelledError

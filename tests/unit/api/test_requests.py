@@ -372,7 +372,7 @@ def test_preset_file_of_another_version_hides_no_other(tmp_path: Path) -> None:
     listed = {each.name: each for each in presets.listed()}
     assert set(listed) == set(SHIPPED)
     assert (listed["dark"].digest, listed["matt"].fault) == (None, None)
-    assert "bring slrig up to date" in (listed["dark"].fault or "")
+    assert "update slrig" in (listed["dark"].fault or "")
     presets.delete("dark")
     assert presets.get("dark").scan == SHIPPED["dark"]
 
