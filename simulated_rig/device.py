@@ -16,9 +16,9 @@ from simulated_rig.scene import read_scene
 from simulated_rig.staging import Script, Staging
 from simulated_rig.turning import RenderedTurntable
 from simulated_rig.world import Flicker, VirtualClock
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import Camera, Clock, Positioner, ScannerHead, SystemClock, progress_reporter
-from slrig.kernels import compilations_told
+from slrig.kernels import report_compilations
 from slrig.model import Calibration, Surface, Truth
 
 
@@ -101,7 +101,7 @@ class SimulatedHead:
     def prepare(self) -> None:
         """Do what takes long the first time, telling of it: compile kernels, trace the light of what stands there."""
         tell = progress_reporter()
-        with compilations_told(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")):
+        with report_compilations(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")):
             for name, view in self._views.items():
                 view.prepare(told=partial(_tell_traced, tell, name))
 
@@ -145,6 +145,6 @@ def open_head(options: Mapping[str, object], folder: Path) -> ScannerHead:
 
 def simulated_head(options: Mapping[str, object], folder: Path) -> SimulatedHead:
     """Return `open_head`'s instrument under its own type."""
-    table = checked(HeadOptions, options, "the [head] table of the rendered rig")
+    table = validate(HeadOptions, options, "the [head] table of the rendered rig")
     path = folder / table.scene
     return SimulatedHead(table, Script(table, read_scene(path), path.parent))

@@ -21,7 +21,7 @@ from simulated_rig.boards import Board, Print
 from simulated_rig.placed import Colour, Placed, turned_by
 from simulated_rig.shapes import Part
 from simulated_rig.tables import NotNegative, Pair, Positive, at_least_one
-from slrig.bundle.validation import Strict, checked, read_toml
+from slrig.bundle.validation import Strict, read_toml, validate
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, IntArray
 
@@ -226,7 +226,7 @@ class SceneSurface:
 
 def read_scene(path: Path) -> Scene:
     """Return the scene of a TOML file. Raises ConfigError that lists all faults."""
-    return checked(Scene, read_toml(path, _MOST_BYTES), f"the scene file {path}")
+    return validate(Scene, read_toml(path, _MOST_BYTES), f"the scene file {path}")
 
 
 def surface_of(scene: Scene, folder: Path) -> SceneSurface:

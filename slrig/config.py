@@ -1,4 +1,4 @@
-"""Rig files and service settings: TOML in, checked values out, every fault in one message."""
+"""Rig files and service settings: TOML in, validated values out, all faults in one message."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from urllib.parse import urlsplit
 from pydantic import ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
 
-from slrig.bundle.description import CameraName
-from slrig.bundle.options import ExposureSeconds, Preset, PresetName, ScanDefaults, with_masks
-from slrig.bundle.validation import Strict, checked, explain, read_toml
+from slrig.bundle import CameraName
+from slrig.bundle.options import ExposureSeconds, Preset, PresetName, ScanDefaults, embed_masks
+from slrig.bundle.validation import Strict, describe_errors, read_toml, validate
 from slrig.errors import ConfigError
 
-MOST_CONFIG_BYTES = 2**20
+MAX_CONFIG_BYTES = 2**20
 
 
 LineSeconds = Annotated[float, Field(ge=0, le=0.1)]
@@ -29,14 +29,19 @@ NoticeKind = Literal[
     "run.missed", "run.skipped", "run.failed", "run.interrupted", "health.changed", "job.ended"
 ]  # fmt: skip
 
+_PATHS = (
+    "data_dir", "rig", "webhook_secret_file", "mqtt_login_file", "compute_certificates", "compute_login_file",
+    "catalogue_login_file", "catalogue_authority",
+)  # fmt: skip
+
 
 class DriverTable(Strict, use_attribute_docstrings=True):
-    """A device: the driver that opens it; every other key is an option of that driver, checked by the driver."""
+    """A device: the driver that opens it; every other key is an option of that driver, validated by the driver."""
 
     model_config = ConfigDict(extra="allow")
 
     driver: DriverName
-    """Which driver opens the device. `slrig devices` lists those that are installed."""
+    """Driver that opens the device. `slrig devices` lists the installed ones."""
 
     @property
     def options(self) -> Mapping[str, object]:
@@ -48,10 +53,11 @@ class HeadTable(DriverTable):
     """One instrument that is projector and cameras. Exposure and gain hold for each of its cameras."""
 
     exposure_s: ExposureSeconds | None = None
-    """Of each frame; else 1/60 s, if the camera can. On a video projector, whole refresh periods."""
+    """Exposure of each frame. Default: 1/60 s or the nearest that the camera can. On a video projector, whole refresh
+    periods."""
 
     gain: Gain = 1.0
-    """A factor; 1 is the least that the sensor does."""
+    """A factor; 1 is the minimum of the sensor."""
 
 
 class CameraTable(DriverTable):
@@ -61,28 +67,29 @@ class CameraTable(DriverTable):
     """The rig's name for it."""
 
     exposure_s: ExposureSeconds | None = None
-    """Of each frame; else 1/60 s, if the camera can. On a video projector, whole refresh periods."""
+    """Exposure of each frame. Default: 1/60 s or the nearest that the camera can. On a video projector, whole refresh
+    periods."""
 
     gain: Gain = 1.0
-    """A factor; 1 is the least that the sensor does."""
+    """A factor; 1 is the minimum of the sensor."""
 
 
 class SynchronisationTable(Strict):
-    """What `slrig latency` measured: how much later than stated light comes, and the line time of rolling shutters."""
+    """Results of `slrig latency`: delay of the light after the stated instant, and line time of rolling shutters."""
 
     latency_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
     latency_error_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
     earliest_s: Annotated[float, Field(ge=-10, le=10)] | None = None
-    """How much later than stated light begins to change at the earliest. With it, scans by free-running cameras wait
-    for no frame before the next pattern."""
+    """Shortest time from the stated instant to a change of the light. With it, scans by free-running cameras show the
+    next pattern without waiting for the frame."""
 
     line_time_s: Annotated[dict[CameraName, LineSeconds], Field(default_factory=dict)]
 
     trigger_period_s: Annotated[float, Field(gt=0, le=10)] | None = None
-    """By wire: the least time from one trigger pulse to the next, if the cameras need more than they tell."""
+    """By wire: the shortest time from one trigger pulse to the next, if the cameras need more than they declare."""
 
     @model_validator(mode="after")
-    def _measured_whole(self) -> Self:
+    def _check_latency_keys(self) -> Self:
         given = {"latency_s", "latency_error_s"} & self.model_fields_set
         if len(given) == 1 or (not given and self.trigger_period_s is None):
             message = "expected latency_s and latency_error_s, as slrig latency prints them, or trigger_period_s alone"
@@ -91,7 +98,7 @@ class SynchronisationTable(Strict):
 
 
 class VerificationTable(Strict):
-    """What follows from the health of the calibration."""
+    """Effect of the health of the calibration on scans."""
 
     refuse_when_stale: Annotated[
         bool, Field(description="refuse scans while the calibration is stale; they are stamped with it in any case")
@@ -99,11 +106,11 @@ class VerificationTable(Strict):
 
 
 class AccuracyTable(Strict, use_attribute_docstrings=True):
-    """What the rig is for."""
+    """Required accuracy."""
 
     wanted_mm: Annotated[float, Field(gt=0, le=1000)] | None = None
-    """What a point of a scan may be wrong by, in 95 of 100 places. Calibrations are graded by it, and the limits of an
-    acceptance test follow it."""
+    """Largest error of 95 % of the points of a scan. Calibrations are graded by it, and the limits of an acceptance
+    test follow it."""
 
 
 class RigTable(Strict):
@@ -125,13 +132,13 @@ class RigTable(Strict):
     ]
 
     @model_validator(mode="after")
-    def _one_kind_of_rig(self) -> Self:
+    def _check_kind_of_rig(self) -> Self:
         if self.head is not None and (self.projector is not None or self.camera):
-            message = "expected [head] alone, found [projector] or [[camera]] beside it; keep one kind"
+            message = "expected [head] alone, found [projector] or [[camera]] as well; keep one kind"
             raise ValueError(message)
         if self.head is None and (self.projector is None or not self.camera):
-            lacking = "[projector]" if self.projector is None else "[[camera]]"
-            message = f"expected [head], or [projector] and one [[camera]] or more, found no {lacking}; add it"
+            missing = "[projector]" if self.projector is None else "[[camera]]"
+            message = f"expected [head], or [projector] and one [[camera]] or more, found no {missing}; add it"
             raise ValueError(message)
         names = [camera.name for camera in self.camera]
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -151,9 +158,10 @@ class RigTable(Strict):
 
 @dataclass(frozen=True, slots=True)
 class RigConfig:
-    """A checked rig file. `folder` is where it lies: paths in it are relative to that folder.
+    """A validated rig file. `folder` is its folder: paths in it are relative to that folder.
 
-    Either `head` is given, or `projector` and `cameras`. positioner : what moves the object, but for a head's own.
+    Either `head` is given, or `projector` and `cameras`. positioner : moves the object; None if the head has one or
+    there is none.
     """
 
     name: str
@@ -173,30 +181,25 @@ class RigConfig:
 def read_rig(path: Path) -> RigConfig:
     """Return the rig that a TOML file describes.
 
-    Raises
-    ------
-    ConfigError
-        The file is missing or not TOML, or any of its keys is unknown or wrong; all faults in one message.
+    Raises ConfigError: the file is missing or not TOML, or any of its keys is unknown or wrong; all faults in one
+    message.
     """
-    data = read_toml(path, MOST_CONFIG_BYTES)
+    data = read_toml(path, MAX_CONFIG_BYTES)
     presets = data.get("presets")
-    named = [(presets, name) for name in presets] if isinstance(presets, dict) else []
-    for tables, name in [(data, "scan"), *named]:
+    preset_names = [(presets, name) for name in presets] if isinstance(presets, dict) else []
+    for tables, name in [(data, "scan"), *preset_names]:
         options = tables.get(name)
         if isinstance(options, Mapping) and isinstance(options.get("region"), Mapping):
-            tables[name] = {**options, "region": with_masks(options["region"], path.parent)}
-    return rig_of(data, path)
+            tables[name] = {**options, "region": embed_masks(options["region"], path.parent)}
+    return parse_rig(data, path)
 
 
-def rig_of(data: Mapping[str, Any], path: Path) -> RigConfig:
-    """Return the rig that the data of a TOML file describe; `path` is where the file lies, or is going to lie.
+def parse_rig(data: Mapping[str, Any], path: Path) -> RigConfig:
+    """Return the rig that the data of a TOML file describe. path : of the file, which need not exist.
 
-    Raises
-    ------
-    ConfigError
-        Any key is unknown or wrong; all faults in one message.
+    Raises ConfigError: any key is unknown or wrong; all faults in one message.
     """
-    table = checked(RigTable, data, f"the rig file {path}")
+    table = validate(RigTable, data, f"the rig file {path}")
     folder = path.resolve().parent
     return RigConfig(
         name=table.name,
@@ -215,36 +218,30 @@ def rig_of(data: Mapping[str, Any], path: Path) -> RigConfig:
 
 
 def default_data_dir() -> Path:
-    """Where scans are kept unless a setting says otherwise: the folder for data of the XDG base directories."""
+    """Default folder for scans: in the data folder of the XDG base directories."""
     base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
     return Path(base) / "slrig"
 
 
-_PATHS = (
-    "data_dir", "rig", "webhook_secret_file", "mqtt_login_file", "compute_certificates", "compute_login_file",
-    "catalogue_login_file", "catalogue_authority",
-)  # fmt: skip
-
-
 class ServiceSettings(BaseSettings):
-    """What the service needs to know, from `SLRIG_…` in the environment, then a TOML file, then these defaults.
+    """Settings of the service, from `SLRIG_…` in the environment, then a TOML file, then these defaults.
 
-    `require_key` False opens the service to everyone who reaches it, so it is refused beyond this machine.
-    `allowed_hosts` are names, beside `host` and those of this machine, that a request may carry as its Host; in the
-    environment they are separated by commas. `webhook_url` is sent notices of `webhook_kinds`, all by default, signed
-    with `webhook_secret` or what `webhook_secret_file` holds. `mqtt_url` is a broker that all notices are published at,
+    `require_key` False opens the service to everyone who reaches it, so it is allowed on this machine only.
+    `allowed_hosts` are names, in addition to `host` and those of this machine, that a request may have as its Host; in
+    the environment they are separated by commas. `webhook_url` receives notices of `webhook_kinds`, all by default,
+    signed with `webhook_secret` or the text in `webhook_secret_file`. `mqtt_url` is a broker that receives all notices,
     with the user and password of `mqtt_login` or `mqtt_login_file`. Without an address nothing is sent. Beyond the
-    newest `keep_calibrations`, calibrations are removed with their poses, but for the one in use and those that a scan
-    or an acceptance test names. Scans are kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes`
-    sets a limit: beyond it the oldest are removed, but for pinned ones and those whose files were asked for in the last
-    quarter of an hour. The newest `keep_models` are kept. `backlog_length` is how many scans may be reconstructed, or
-    wait for that, while the rig shoots the next one; what else computes counts, too. `drain_s` is how long, after
-    SIGTERM, the job that has the rig and those that compute may take to come to their end before they are interrupted;
-    what waits, and what has its frames, goes on at the next start. `compute` is the scheduler of a pool that
-    reconstructs for this rig, `compute_store` where bundles and results lie meanwhile, `compute_certificates` and
-    `compute_login_file` what opens the two: see slrig/compute/README.md. `catalogue` is a database that rigs share,
-    `catalogue_authority` who signed its certificate: see slrig/catalogue/README.md. Nobody but the service's own user
-    may read the data, and the users of `data_group`, if it is set. `log_format` auto is text on a terminal, JSON lines
+    newest `keep_calibrations`, calibrations are removed with their poses, except the one in use and those that a scan
+    or an acceptance test names. Scans are kept unless `keep_scans` (their number), `keep_scans_days` or
+    `keep_scans_bytes` sets a limit: beyond it the oldest are removed, except pinned ones and those whose files were
+    requested in the last quarter of an hour. The newest `keep_models` are kept. `backlog_length` is the number of scans
+    that may be reconstructed, or wait for that, while the rig captures the next one; other computations count too.
+    `drain_s` is the time after SIGTERM in which the job that has the rig and those that compute may end before they are
+    interrupted; jobs that wait, or have all their frames, continue at the next start. `compute` is the scheduler of a
+    pool that reconstructs for this rig, `compute_store` holds bundles and results meanwhile, `compute_certificates` and
+    `compute_login_file` open the two: see slrig/compute/README.md. `catalogue` is a database that rigs share,
+    `catalogue_authority` the signer of its certificate: see slrig/catalogue/README.md. Only the service's own user may
+    read the data, and the users of `data_group`, if it is set. `log_format` auto is text on a terminal, JSON lines
     elsewhere.
     """
 
@@ -263,7 +260,7 @@ class ServiceSettings(BaseSettings):
     backlog_length: Annotated[int, Field(ge=1, le=1000)] = 16
     max_body_bytes: Annotated[int, Field(ge=1024)] = 2**16
     min_free_bytes: Annotated[int, Field(ge=0)] = 2**30
-    # Twenty people who look at the page have two each: a picture, and what happens.
+    # For twenty viewers of the page, who have two each: pictures, and events.
     max_event_streams: Annotated[int, Field(ge=1)] = 48
     requests_per_s: Annotated[float, Field(gt=0)] = 50.0
     max_connections: Annotated[int, Field(ge=16, le=1536)] = 512
@@ -274,7 +271,7 @@ class ServiceSettings(BaseSettings):
     idempotency_keep_s: Annotated[float, Field(gt=0)] = 86400.0
     page_limit: Annotated[int, Field(ge=1, le=1000)] = 200
     keep_calibrations: Annotated[int, Field(ge=1, le=100_000)] = 100
-    # Some dozen MB each, of scans that may be gone.
+    # Some dozen MB each, of scans that may be removed already.
     keep_models: Annotated[int, Field(ge=1, le=100_000)] = 100
     keep_scans: Annotated[int, Field(ge=1)] | None = None
     keep_scans_days: Annotated[float, Field(gt=0)] | None = None
@@ -304,7 +301,7 @@ class ServiceSettings(BaseSettings):
 
     @field_validator(*_PATHS)
     @classmethod
-    def _at_home(cls, path: Path | None) -> Path | None:
+    def _expand_user(cls, path: Path | None) -> Path | None:
         return None if path is None else path.expanduser()
 
     @field_validator("allowed_hosts", "webhook_kinds", mode="before")
@@ -314,10 +311,10 @@ class ServiceSettings(BaseSettings):
 
     @field_validator("webhook_secret", "mqtt_login", "catalogue_login", mode="before")
     @classmethod
-    def _a_text(cls, secret: object) -> object:
+    def _require_text(cls, secret: object) -> object:
         if not isinstance(secret, str | SecretStr | None):
             message = "expected a text; put it in quotes"
-            raise ValueError(message)  # noqa: TRY004 - what pydantic collects
+            raise ValueError(message)  # noqa: TRY004 - pydantic collects ValueErrors only
         return secret or None
 
     @field_validator("mqtt_url", "catalogue")
@@ -327,18 +324,18 @@ class ServiceSettings(BaseSettings):
 
     @field_validator("webhook_url")
     @classmethod
-    def _a_web_address(cls, url: str | None) -> str | None:
+    def _check_web_address(cls, url: str | None) -> str | None:
         if not url:
             return None
         parts = urlsplit(url)
         if parts.scheme not in {"http", "https"} or not parts.hostname:
-            # What was found is not repeated: such an address often holds a secret.
+            # The message does not repeat the address, which often holds a secret.
             message = "expected an address that begins with http:// or https:// and a host; correct it or leave it out"
             raise ValueError(message)
         return url
 
     @model_validator(mode="after")
-    def _closed_beyond_this_machine(self) -> Self:
+    def _require_key_beyond_loopback(self) -> Self:
         if not self.require_key and not is_loopback(self.host):
             message = (
                 f"expected require_key on a service that others can reach, found host {self.host} without it; "
@@ -349,16 +346,12 @@ class ServiceSettings(BaseSettings):
 
 
 def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
-    """Return the settings of the service; `given` values come before the environment, and that before the file.
+    """Return the settings of the service; `given` values take precedence over the environment, and that over the file.
 
-    Paths in the file are relative to it.
-
-    Raises
-    ------
-    ConfigError
-        The file is missing or not TOML, or a value is wrong; all faults in one message.
+    Paths in the file are relative to it. Raises ConfigError: the file is missing or not TOML, or a value is wrong; all
+    faults in one message.
     """
-    data: dict[str, Any] = {} if path is None else read_toml(path, MOST_CONFIG_BYTES)
+    data: dict[str, Any] = {} if path is None else read_toml(path, MAX_CONFIG_BYTES)
     for key in _PATHS:
         if path is not None and isinstance(data.get(key), str):
             data[key] = str(path.resolve().parent / Path(data[key]).expanduser())
@@ -369,25 +362,25 @@ def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
         return ServiceSettings(**data)
     except ValidationError as cause:
         known = tuple(ServiceSettings.model_fields)
-        message = f"{source}: not valid settings of the service:\n{explain(cause, data, known)}"
+        message = f"{source}: not valid settings of the service:\n{describe_errors(cause, data, known)}"
         raise ConfigError(message) from cause
 
 
-def private_text(path: Path, source: str) -> str:
-    """What a file holds that nobody but its owner may read. source : which it is. Raises ConfigError."""
+def read_private_text(path: Path, source: str) -> str:
+    """Return the text of a file that only its owner may read. source : its name in messages. Raises ConfigError."""
     try:
         mode, text = path.stat().st_mode, path.read_text("utf-8")
     except (OSError, ValueError) as cause:
-        message = f"{source} cannot be read: {getattr(cause, 'strerror', None) or 'it is no text'}"
+        message = f"{source} cannot be read: {getattr(cause, 'strerror', None) or 'it is not text'}"
         raise ConfigError(message) from cause
     if os.name == "posix" and mode & 0o077:
-        message = f"{source} may be read by others. Take that from them: chmod 600 {path}"
+        message = f"{source} may be read by others; protect it: chmod 600 {path}"
         raise ConfigError(message)
     return text
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a service that listens on `host`."""
+    """True if only this machine can reach a service that listens on `host`."""
     if host == "localhost":
         return True
     with suppress(ValueError):

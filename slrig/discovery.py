@@ -1,10 +1,13 @@
-"""Drivers found by entry points, and the rig that a rig file describes, opened.
+"""Drivers of installed packages, found by entry points; and the opening of the rig that a rig file describes.
 
-A driver package declares factories in the groups below; slrig names no driver. A camera's factory is
-`open_camera(name, options, folder) -> Camera`, a projector's `open_projector(options, folder) -> Projector`, a head's
-`open_head(options, folder) -> ScannerHead`, a positioner's `open_positioner(options, folder) -> Positioner`; `options`
-are the driver's own keys of the rig file, `folder` is where that file lies. A finder is
-`find_devices() -> tuple[FoundDevice, ...]`.
+A driver package declares factories in the groups below; slrig names no driver. A camera's factory is `open_camera(name,
+options, folder) -> Camera`, a projector's `open_projector(options, folder) -> Projector`, a head's `open_head(options,
+folder) -> ScannerHead`, a positioner's `open_positioner(options, folder) -> Positioner`; `options`
+are the driver's own keys
+of the rig file, `folder` is the folder of that file. A finder is `find_devices() -> tuple[FoundDevice, ...]`.
+
+In the group slrig.options, a package may declare a pydantic model of a driver's options. It serves only to write rig
+files, and loads neither the driver nor its vendor's library.
 """
 
 from __future__ import annotations
@@ -16,10 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from slrig.bundle.calibration import check_calibration, check_rays, read_calibration
-from slrig.bundle.validation import explain
+from slrig.bundle import check_calibration, read_calibration, require_two_rays
+from slrig.bundle.validation import describe_errors
 from slrig.config import DriverTable, RigConfig
 from slrig.devices import (
     Camera,
@@ -54,13 +57,14 @@ GROUPS: Mapping[str, str] = {
     "positioner": "slrig.positioners",
     "finder": "slrig.finders",
 }
-USUAL_EXPOSURE_S = 1 / 60
-"""One period of a usual projector: the exposure of a camera whose rig file gives none, within what the camera can."""
+OPTIONS_GROUP = "slrig.options"
+DEFAULT_EXPOSURE_S = 1 / 60
+"""Exposure of a camera without one in the rig file, or the nearest it can do: one period of most projectors."""
 
 
 @dataclass(frozen=True, slots=True)
 class InstalledDriver:
-    """A driver that an installed package declares. `fault` says why it cannot be loaded; None if it can."""
+    """Driver that an installed package declares. fault : the reason why it cannot be loaded; None if it can."""
 
     kind: str
     name: str
@@ -72,7 +76,7 @@ class InstalledDriver:
 
 @dataclass(frozen=True, slots=True)
 class MissingLibrary:
-    """A driver that cannot look for its devices until the command `install` has been run."""
+    """Driver that cannot look for its devices until the command `install` has been run."""
 
     driver: str
     install: str
@@ -81,17 +85,17 @@ class MissingLibrary:
 
 @dataclass(frozen=True, slots=True)
 class OtherSystem:
-    """A driver that works on another operating system only."""
+    """Driver that works on another operating system only."""
 
     driver: str
     message: str
 
 
 @dataclass(frozen=True, slots=True)
-class Findings:
-    """What the finders found, the libraries that some of them lack, and the finders that failed otherwise.
+class DiscoveredDevices:
+    """Devices of all finders, libraries that finders lack, and other failures of finders.
 
-    elsewhere : the drivers that are for other operating systems.
+    elsewhere : drivers for other operating systems.
     """
 
     devices: tuple[FoundDevice, ...]
@@ -101,7 +105,7 @@ class Findings:
 
 
 def installed_drivers() -> tuple[InstalledDriver, ...]:
-    """Every driver that an installed package declares, loaded once to see whether it can be; sorted by kind, name."""
+    """Drivers of all installed packages, sorted by kind and name; each is loaded to find out whether it can be."""
     drivers = []
     for kind, group in GROUPS.items():
         for entry in importlib.metadata.entry_points(group=group):
@@ -110,13 +114,13 @@ def installed_drivers() -> tuple[InstalledDriver, ...]:
                 _load(kind, entry)
             except DriverBrokenError as error:
                 fault = str(error)
-            package, version = _package(entry)
+            package, version = _package_version(entry)
             drivers.append(InstalledDriver(kind, entry.name, package, version, entry.value, fault))
     return tuple(sorted(drivers, key=lambda driver: (driver.kind, driver.name, driver.package)))
 
 
-def found_devices() -> Findings:
-    """Ask every installed finder for the devices that are plugged in; one that fails does not hide the others."""
+def discover_devices() -> DiscoveredDevices:
+    """Ask every installed finder for the connected devices; a finder that fails does not affect others."""
     devices: list[FoundDevice] = []
     missing: list[MissingLibrary] = []
     faults: list[DriverBrokenError] = []
@@ -124,8 +128,8 @@ def found_devices() -> Findings:
     for entry in sorted(importlib.metadata.entry_points(group=GROUPS["finder"]), key=lambda entry: entry.name):
         try:
             finder = _load("finder", entry)
-            with _told("finder", entry.name, {}):
-                devices.extend(_devices(entry.name, finder()))
+            with _convert_driver_errors("finder", entry.name, {}):
+                devices.extend(_check_devices(entry.name, finder()))
         except LibraryMissingError as error:
             missing.append(MissingLibrary(entry.name, error.install, str(error)))
         except WrongSystemError as error:
@@ -135,28 +139,28 @@ def found_devices() -> Findings:
         except SlrigError as error:
             message = f"finder '{entry.name}' failed: {error}"
             faults.append(DriverBrokenError(message))
-    return Findings(tuple(devices), tuple(missing), tuple(faults), tuple(elsewhere))
+    return DiscoveredDevices(tuple(devices), tuple(missing), tuple(faults), tuple(elsewhere))
 
 
 def open_rig(config: RigConfig) -> Rig:
-    """Open every device of a rig; if one fails, those that are open already are closed again.
+    """Open every device of a rig. If one fails, those that are open are closed again.
 
-    What is wrong with the rig file is told of all devices together. The calibration is that of the rig file, else that
-    which the head carries.
+    Faults of the rig file are reported for all devices together. The calibration is that of the rig file or, without
+    one, that of the head.
 
     Raises DriverNotFoundError: no installed package provides a driver of that name; DriverBrokenError: a driver cannot
-    be loaded, or fails with an error of no known kind; ConfigError: a driver does not take the options of the rig file
+    be loaded, or fails with an error that is not of slrig; ConfigError: a driver refuses the options of the rig file
     (several faults, unknown drivers among them, are one message); CalibrationError: the calibration is malformed, or
     made for devices of another size; DeviceError: a device cannot be opened.
     """
     with ExitStack() as opened:
         head, projector, cameras, positioner = _open_each(config, opened)
         if config.head is not None:
-            asked = dict.fromkeys(cameras, (config.head.exposure_s, config.head.gain))
+            table_settings = dict.fromkeys(cameras, (config.head.exposure_s, config.head.gain))
         else:
-            asked = {table.name: (table.exposure_s, table.gain) for table in config.cameras}
+            table_settings = {table.name: (table.exposure_s, table.gain) for table in config.cameras}
         settings = {
-            name: CameraSettings(_exposure_s(camera.info, asked[name][0], config), asked[name][1])
+            name: CameraSettings(_exposure_s(camera.info, table_settings[name][0], config), table_settings[name][1])
             for name, camera in cameras.items()
         }
         calibration = _calibration(config, head, projector, cameras)
@@ -178,7 +182,7 @@ def open_rig(config: RigConfig) -> Rig:
 def _open_each(
     config: RigConfig, opened: ExitStack
 ) -> tuple[ScannerHead | None, Projector, Mapping[str, Camera], Positioner | None]:
-    """Every device of a rig, closed again by `opened`. Raises as `open_rig`."""
+    """Open every device of a rig; `opened` closes them again. Raises as `open_rig`."""
     faults: list[ConfigError] = []
 
     def attempt(kind: str, table: DriverTable, protocol: type[Any], *name: str) -> Any:
@@ -188,7 +192,7 @@ def _open_each(
             faults.append(error)
             return None
         except SlrigError:
-            # After a fault of the file the others are opened only to hear what their drivers say of theirs.
+            # After a fault of the file, the other devices are opened only to collect their faults of the file.
             if faults:
                 return None
             raise
@@ -203,7 +207,7 @@ def _open_each(
             raise ConfigError(message)
         projector = attempt("projector", config.projector, Projector)
         cameras = {table.name: attempt("camera", table, Camera, table.name) for table in config.cameras}
-    positioner = _positioner(head)
+    positioner = _head_positioner(head)
     if config.positioner is not None:
         if positioner is not None:
             message = f"rig '{config.name}': its head has a positioner, and its file names another; leave one out"
@@ -212,27 +216,27 @@ def _open_each(
     if len(faults) == 1:
         raise faults[0]
     if faults:
-        told = "\n".join(str(fault) for fault in faults)
-        message = f"rig '{config.name}': {len(faults)} of its tables are wrong; correct each and try again:\n{told}"
+        listed = "\n".join(str(fault) for fault in faults)
+        message = f"rig '{config.name}': {len(faults)} of its tables are wrong; correct each and try again:\n{listed}"
         raise ConfigError(message)
     if head is not None:
         return head, head.projector, dict(head.cameras), positioner
     return None, projector, cameras, positioner
 
 
-def _exposure_s(camera: CameraInfo, asked_s: float | None, config: RigConfig) -> float:
-    for exposure_s in (asked_s, config.scan.exposure_s):
+def _exposure_s(camera: CameraInfo, table_s: float | None, config: RigConfig) -> float:
+    for exposure_s in (table_s, config.scan.exposure_s):
         if exposure_s is not None:
             return exposure_s
-    least_s, most_s = camera.exposure_range_s
-    return min(max(USUAL_EXPOSURE_S, least_s), most_s)
+    min_s, max_s = camera.exposure_range_s
+    return min(max(DEFAULT_EXPOSURE_S, min_s), max_s)
 
 
 def _clock(head: object) -> Clock:
     return head.clock if isinstance(head, HasClock) else SystemClock()
 
 
-def _positioner(head: object) -> Positioner | None:
+def _head_positioner(head: object) -> Positioner | None:
     return head.positioner if isinstance(head, HasPositioner) else None
 
 
@@ -263,12 +267,12 @@ def _calibration(
     if calibration is not None:
         sizes = {name: camera.info.format.size for name, camera in cameras.items()}
         check_calibration(calibration, projector.info.size, sizes, source)
-        check_rays(calibration, sizes, source)
+        require_two_rays(calibration, sizes, source)
     return calibration
 
 
 def _close_quietly(device: Camera | Projector | Positioner) -> None:
-    # The error that made us close is the one to tell, whatever a driver raises on the way out.
+    # The error that caused the closing matters, not those of closing.
     with suppress(Exception):
         device.close()
 
@@ -283,24 +287,24 @@ def _open(kind: str, table: DriverTable, protocol: type[Any], folder: Path, *nam
             f"{installed}; correct the name or install the driver's package"
         )
     if len(entries) > 1:
-        packages = ", ".join(sorted(_package(entry)[0] for entry in entries))
+        packages = ", ".join(sorted(_package_version(entry)[0] for entry in entries))
         message = f"{kind} driver '{table.driver}' is provided by several packages: {packages}; uninstall all but one"
         raise DriverBrokenError(message)
     factory = _load(kind, entries[0])
-    with _told(kind, table.driver, table.options), _refusals(kind, table.driver):
+    with _convert_driver_errors(kind, table.driver, table.options), _convert_os_errors(kind, table.driver):
         device = factory(*name, table.options, folder)
         if not isinstance(device, protocol):
             raise DriverBrokenError(
-                f"{kind} driver '{table.driver}' returned {type(device).__name__}, which is no {protocol.__name__}"
+                f"{kind} driver '{table.driver}' returned {type(device).__name__}, which is not a {protocol.__name__}"
             )
         return device
 
 
 def _load(kind: str, entry: importlib.metadata.EntryPoint) -> Callable[..., Any]:
-    package, version = _package(entry)
+    package, version = _package_version(entry)
     try:
         factory = entry.load()
-    except (Exception, SystemExit) as cause:  # a package must not end the service, whatever it does at import
+    except (Exception, SystemExit) as cause:  # importing a package must not end the service
         raise DriverBrokenError(
             f"{kind} driver '{entry.name}' of {package} {version} cannot be loaded ({entry.value}): "
             f"{type(cause).__name__}: {cause}; install what it needs or uninstall it"
@@ -314,8 +318,8 @@ def _load(kind: str, entry: importlib.metadata.EntryPoint) -> Callable[..., Any]
 
 
 @contextmanager
-def _refusals(kind: str, name: str) -> Iterator[None]:
-    """Tell what the operating system refuses while a device is opened as a fault of the device, not of its driver."""
+def _convert_os_errors(kind: str, name: str) -> Iterator[None]:
+    """Convert an error of the operating system while a device is opened to a fault of the device, not of its driver."""
     try:
         yield
     except OSError as cause:
@@ -326,30 +330,83 @@ def _refusals(kind: str, name: str) -> Iterator[None]:
 
 
 @contextmanager
-def _told(kind: str, name: str, options: Mapping[str, object]) -> Iterator[None]:
-    """Give what a driver's factory raises a name and a kind."""
+def _convert_driver_errors(kind: str, name: str, options: Mapping[str, object]) -> Iterator[None]:
+    """Convert the errors of a driver's factory to errors of slrig with the driver's name and kind."""
     try:
         yield
     except SlrigError:
         raise
     except ValidationError as cause:
-        message = f"{kind} driver '{name}' does not take these options:\n{explain(cause, options, ())}"
+        message = f"{kind} driver '{name}' refuses these options:\n{describe_errors(cause, options, ())}"
         raise ConfigError(message) from cause
     except (Exception, SystemExit) as cause:
         message = f"{kind} driver '{name}' failed: {type(cause).__name__}: {cause}; report it to the driver's package"
         raise DriverBrokenError(message) from cause
 
 
-def _devices(name: str, found: Any) -> tuple[FoundDevice, ...]:
+def _check_devices(name: str, found: Any) -> tuple[FoundDevice, ...]:
     devices = tuple(found)
     strange = sorted({type(each).__name__ for each in devices if not isinstance(each, FoundDevice)})
     if strange:
         raise DriverBrokenError(
-            f"finder '{name}' returned {', '.join(strange)}, which is no FoundDevice; report it to the driver's package"
+            f"finder '{name}' returned {', '.join(strange)} instead of FoundDevice; report it to the driver's package"
         )
     return devices
 
 
-def _package(entry: importlib.metadata.EntryPoint) -> tuple[str, str]:
+def _package_version(entry: importlib.metadata.EntryPoint) -> tuple[str, str]:
     found = entry.dist
     return ("an unknown package", "") if found is None else (found.name, found.version)
+
+
+def driver_kinds(driver: str) -> tuple[str, ...]:
+    """Return the kinds of device that a driver of that name opens: "camera", "projector", "head", "positioner".
+
+    Raises DriverNotFoundError: no installed package provides a driver of that name.
+    """
+    names = {
+        kind: {entry.name for entry in importlib.metadata.entry_points(group=group)}
+        for kind, group in GROUPS.items()
+        if kind != "finder"
+    }
+    kinds = tuple(kind for kind, known in names.items() if driver in known)
+    if not kinds:
+        installed = ", ".join(sorted(set().union(*names.values()))) or "none"
+        message = (
+            f"no installed package provides a driver '{driver}'; installed: {installed}; correct the name or install "
+            "the driver's package"
+        )
+        raise DriverNotFoundError(message)
+    return kinds
+
+
+def option_model(driver: str) -> type[BaseModel] | None:
+    """Return the model of a driver's options; None if its package declares none.
+
+    Raises DriverBrokenError: it cannot be loaded, is not a pydantic model, or several packages declare one.
+    """
+    entries = list(importlib.metadata.entry_points(group=OPTIONS_GROUP, name=driver))
+    if not entries:
+        return None
+    packages = ", ".join(sorted(_package_version(each)[0] for each in entries))
+    if len(entries) > 1:
+        message = f"the options of driver '{driver}' come from several packages: {packages}; uninstall all but one"
+        raise DriverBrokenError(message)
+    try:
+        model: object = entries[0].load()
+    except (Exception, SystemExit) as cause:  # importing a package must not end the command
+        message = (
+            f"the options of driver '{driver}' of {packages} cannot be loaded ({entries[0].value}): "
+            f"{type(cause).__name__}: {cause}; report it there"
+        )
+        raise DriverBrokenError(message) from cause
+    if not (isinstance(model, type) and issubclass(model, BaseModel)):
+        message = f"the options of driver '{driver}' of {packages} are not a pydantic model; report it there"
+        raise DriverBrokenError(message)
+    return model
+
+
+def drivers_with_options(package: str) -> tuple[str, ...]:
+    """Names of the drivers for which a package declares an option model, sorted."""
+    entries = importlib.metadata.entry_points(group=OPTIONS_GROUP)
+    return tuple(sorted({entry.name for entry in entries if _package_version(entry)[0] == package}))

@@ -1,4 +1,4 @@
-"""Errors of a disk in words, and names of files that are not yet whole."""
+"""Errors of a disk as messages, and names of files that are being written."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _REMEDIES = {
 
 
 @contextmanager
-def refusals_of(path: Path) -> Iterator[None]:
-    """Turn what the disk says about `path` into a StorageError."""
+def storage_errors(path: Path) -> Iterator[None]:
+    """Convert an error of the disk about `path` to a StorageError."""
     try:
         yield
     except OSError as cause:
@@ -33,5 +33,5 @@ def refusals_of(path: Path) -> Iterator[None]:
 
 
 def staging_name(path: Path) -> Path:
-    """A hidden sibling of `path` that nobody else uses."""
+    """Return a unique hidden name in the folder of `path`."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")

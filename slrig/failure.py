@@ -1,4 +1,4 @@
-"""The cause of a failed job, as a value that crosses processes and is stored."""
+"""Cause of a failed job, as a value that crosses processes and is stored."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ _DISK_REFUSALS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.E
 
 @dataclass(frozen=True, slots=True)
 class JobFailure:
-    """`code` is that of a class of the error tree, or `UNEXPECTED`; `message` is its text."""
+    """code : that of a class of the error tree, or `UNEXPECTED`. message : text for people."""
 
     code: str
     message: str
 
 
 def errors_by_code() -> dict[str, type[SlrigError]]:
-    """Every class of the error tree that has a code of its own, the base included."""
-    found: dict[str, type[SlrigError]] = {}
+    """Every class of the error tree that has a code of its own, the base included, by its code."""
+    classes: dict[str, type[SlrigError]] = {}
     waiting: list[type[SlrigError]] = [SlrigError]
     while waiting:
         error = waiting.pop()
         if "code" in vars(error):
-            found[error.code] = error
+            classes[error.code] = error
         waiting.extend(error.__subclasses__())
-    return found
+    return classes
 
 
-def failure_of(error: BaseException) -> JobFailure:
-    """The fault that stands for an exception.
+def job_failure(error: BaseException) -> JobFailure:
+    """Return the failure that stands for an exception.
 
-    >>> failure_of(StorageError("The disk is full.")).code
+    >>> job_failure(StorageError("The disk is full.")).code
     'storage'
     """
     if isinstance(error, SlrigError):
@@ -51,7 +51,7 @@ def failure_of(error: BaseException) -> JobFailure:
         message = f"The machine has too little memory for this: {error}. Free some, or use a camera of fewer pixels."
         return JobFailure(OutOfMemoryError.code, message)
     if isinstance(error, OSError) and error.errno in _DISK_REFUSALS:
-        return JobFailure(StorageError.code, disk_refusal(error, None))
+        return JobFailure(StorageError.code, disk_error_message(error, None))
     message = (
         f"slrig met an error it did not expect ({type(error).__name__}). The service's log has the details under "
         "this job's id; please report them."
@@ -59,13 +59,13 @@ def failure_of(error: BaseException) -> JobFailure:
     return JobFailure(UNEXPECTED, message)
 
 
-def interruption() -> ScanInterruptedError:
-    """The error that stands for a job cut off by the end of the service."""
+def interruption_error() -> ScanInterruptedError:
+    """Return the error that stands for a job that ended with the service."""
     return ScanInterruptedError("The service ended while this was under way. Start it again.")
 
 
-def disk_refusal(error: OSError, path: Path | None) -> str:
-    """What to tell a person whose disk refused a write."""
+def disk_error_message(error: OSError, path: Path | None) -> str:
+    """Return the message for a person whose disk refused a write."""
     where = error.filename or path or "the data folder"
     reason = error.strerror or str(error)
     remedy = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "check the disk and its permissions"
@@ -74,10 +74,10 @@ def disk_refusal(error: OSError, path: Path | None) -> str:
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Turn a refusal of the disk within the block into a StorageError."""
+    """Convert a refusal of the disk within the block to a StorageError."""
     try:
         yield
     except OSError as error:
         if error.errno not in _DISK_REFUSALS:
             raise
-        raise StorageError(disk_refusal(error, path)) from error
+        raise StorageError(disk_error_message(error, path)) from error

@@ -1,7 +1,7 @@
 """Logs: text for people, JSON for programs.
 
-Every line has one form, whoever wrote it: our own loggers, those of libraries, Python's warnings, and the errors that
-end a thread or the process. They all go through the root logger of the standard library.
+All lines have one form: those of our own loggers, those of libraries, Python's warnings, and the errors that end a
+thread or the process. They all go through the root logger of the standard library.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _SECRET = re.compile(
     r"(?:(?:bearer|basic)\s+)?)(?P<secret>[^\s\\'\",;]+)",
     re.IGNORECASE,
 )
-"""A key, a cookie or what else opens the service, where a library quotes what it was sent."""
+"""Keys, cookies and other credentials of the service in requests that a library quotes."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogSettings:
-    """How this process logs. A process that it starts is told, and does the same."""
+    """Log settings of this process and of those that it starts."""
 
     level: str
     form: LogFormat
@@ -40,20 +40,20 @@ class LogSettings:
 _chosen: LogSettings | None = None
 
 
-def chosen() -> LogSettings | None:
-    """How this process logs; None where nobody said."""
+def log_settings() -> LogSettings | None:
+    """Return the log settings of this process; None if they were not set."""
     return _chosen
 
 
-class _Lines(logging.StreamHandler[TextIO]):
-    """A log that never fails whoever writes it: a full disk, a reader that is gone. The line is lost, not the work."""
+class _TolerantHandler(logging.StreamHandler[TextIO]):
+    """A handler that never fails its caller: if the disk is full or the reader is gone, it loses the line."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the standard library's own name
-        """Let it go."""
+        """Ignore the error."""
 
 
-class _OursOrSerious(logging.Filter):
-    """Lets pass what slrig says, and what is at least a warning of a library: alembic tells each of its steps."""
+class _OwnOrWarningFilter(logging.Filter):
+    """Passes lines of slrig, and warnings and errors of libraries, which log their steps at lower levels."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """See `logging.Filter`."""
@@ -61,7 +61,7 @@ class _OursOrSerious(logging.Filter):
 
 
 class _Formatter(structlog.stdlib.ProcessorFormatter):
-    """The form of a line, without what must not be in any."""
+    """Formats a line, with secrets masked."""
 
     def format(self, record: logging.LogRecord) -> str:
         """See `logging.Formatter`."""
@@ -69,29 +69,29 @@ class _Formatter(structlog.stdlib.ProcessorFormatter):
 
 
 def set_up_logs(level: str, form: LogFormat = "auto") -> None:
-    """Send log lines of `level` and above to stderr, those of libraries from warnings on, with whatever would else be
-    printed there as Python does: warnings, and the error that ends a thread or the process.
+    """Send log lines of `level` and above to stderr, and those of libraries from warnings on.
 
-    form auto : text on a terminal, JSON elsewhere.
+    Python's warnings, and errors that end a thread or the process, are logged too. form auto : text on a terminal, JSON
+    elsewhere.
     """
     global _chosen
     _chosen = LogSettings(level, form)
-    _set_up(level, form)
+    _configure(level, form)
     logging.captureWarnings(capture=True)
-    threading.excepthook = _thread_failed
-    sys.excepthook = _process_failed
-    sys.unraisablehook = _error_lost
+    threading.excepthook = _log_thread_error
+    sys.excepthook = _log_process_error
+    sys.unraisablehook = _log_unraisable_error
 
 
-def set_up_logs_for_a_person() -> None:
-    """For a command that does its work itself: warnings only, for it tells its progress and its errors by itself.
+def set_up_console_logs() -> None:
+    """Set up logs for a command that reports its own progress and errors: warnings only, as text on stderr.
 
-    Without it structlog writes on stdout, among what `--json` prints.
+    Without this call structlog writes to stdout, into the output of `--json`.
     """
-    _set_up("warning", "text")
+    _configure("warning", "text")
 
 
-def _set_up(level: str, form: LogFormat) -> None:
+def _configure(level: str, form: LogFormat) -> None:
     on_terminal = sys.stderr.isatty()
     text = on_terminal if form == "auto" else form == "text"
     common: list[Processor] = [
@@ -101,9 +101,9 @@ def _set_up(level: str, form: LogFormat) -> None:
     ]
     last: list[Processor] = (
         [
-            # A person compares the time with their own clock, and reads the event, not columns.
+            # Local time, and no columns: a person reads this.
             structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),
-            _printable_values,
+            _escape_values,
             structlog.dev.ConsoleRenderer(
                 colors=on_terminal,
                 pad_level=False,
@@ -119,8 +119,8 @@ def _set_up(level: str, form: LogFormat) -> None:
             structlog.processors.JSONRenderer(),
         ]
     )
-    lines = _Lines(sys.stderr)
-    lines.addFilter(_OursOrSerious())
+    lines = _TolerantHandler(sys.stderr)
+    lines.addFilter(_OwnOrWarningFilter())
     lines.setFormatter(
         _Formatter(
             foreign_pre_chain=common,
@@ -128,7 +128,7 @@ def _set_up(level: str, form: LogFormat) -> None:
         )
     )
     root = logging.getLogger()
-    root.handlers = [*(handler for handler in root.handlers if not isinstance(handler, _Lines)), lines]
+    root.handlers = [*(handler for handler in root.handlers if not isinstance(handler, _TolerantHandler)), lines]
     root.setLevel(level.upper())
     structlog.configure(
         processors=[*common, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
@@ -138,8 +138,8 @@ def _set_up(level: str, form: LogFormat) -> None:
     )
 
 
-def _printable_values(_logger: WrappedLogger, _method: str, event: EventDict) -> EventDict:
-    """What strangers sent moves no cursor. The name of the logger is for programs."""
+def _escape_values(_logger: WrappedLogger, _method: str, event: EventDict) -> EventDict:
+    """Escape control characters in values from outside, and omit the name of the logger."""
     event.pop("logger", None)
     return {
         name: printable(value.rstrip("\n")) if isinstance(value, str) and name != "exception" else value
@@ -147,21 +147,21 @@ def _printable_values(_logger: WrappedLogger, _method: str, event: EventDict) ->
     }
 
 
-def _thread_failed(failed: threading.ExceptHookArgs) -> None:
+def _log_thread_error(failed: threading.ExceptHookArgs) -> None:
     if failed.exc_type is not SystemExit:
         error = failed.exc_value or failed.exc_type()
         name = None if failed.thread is None else failed.thread.name
         structlog.get_logger(__name__).error("a thread ended by an error", thread=name, exc_info=error)
 
 
-def _process_failed(kind: type[BaseException], error: BaseException, _trace: TracebackType | None) -> None:
+def _log_process_error(kind: type[BaseException], error: BaseException, _trace: TracebackType | None) -> None:
     if issubclass(kind, KeyboardInterrupt):
         structlog.get_logger(__name__).warning("the process was interrupted")
     else:
         structlog.get_logger(__name__).critical("the process ended by an error", exc_info=error)
 
 
-def _error_lost(lost: sys.UnraisableHookArgs) -> None:
-    words = lost.err_msg or "an error could not be told to anybody"
+def _log_unraisable_error(lost: sys.UnraisableHookArgs) -> None:
+    message = lost.err_msg or "an error could not be raised"
     error = lost.exc_value
-    structlog.get_logger(__name__).error(words, object=repr(lost.object), exc_info=error or lost.exc_type())
+    structlog.get_logger(__name__).error(message, object=repr(lost.object), exc_info=error or lost.exc_type())

@@ -1,8 +1,8 @@
-r"""Text as it may be printed.
+"""Text that is safe to print.
 
 Control characters move a terminal's cursor, change its colours and its title, or end a line of a log. Unicode's
-overrides and isolates of direction (U+202A to U+202E, U+2066 to U+2069) have a text read as what it is not: see
-CVE-2021-42574. Marks of direction and joiners, which Arabic, Hebrew and Hindi need, are text.
+overrides and isolates of direction (U+202A to U+202E, U+2066 to U+2069) make text look like other text: see
+CVE-2021-42574. Direction marks and joiners, which Arabic, Hebrew and Hindi need, are allowed.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from __future__ import annotations
 import re
 
 UNSAFE = r"\u0000-\u001f\u007f-\u009f\u2028-\u202e\u2066-\u2069"
-"""What does something to a terminal, as a class of a regular expression."""
+"""Characters that affect a terminal, as a class of a regular expression."""
 
 unsafe = re.compile(rf"[{UNSAFE}\ud800-\udfff]")
-"""The same, and what UTF-8 cannot hold: half a surrogate pair, which JSON can."""
+"""The same, and half surrogate pairs, which JSON can hold and UTF-8 cannot."""
 
 
 def printable(text: str) -> str:
-    r"""The text with an escape for each character that does something to a terminal or that UTF-8 cannot hold.
+    r"""Return the text with an escape for each character that affects a terminal or that UTF-8 cannot hold.
 
     >>> printable("a\x1b[2Jb\u202e"), printable("\ud800")
     ('a\\u001b[2Jb\\u202e', '\\ud800')
     """
-    return unsafe.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return unsafe.sub(lambda match: f"\\u{ord(match[0]):04x}", text)

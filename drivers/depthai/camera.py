@@ -20,7 +20,7 @@ from drivers.depthai.library import library
 from drivers.depthai.messages import Delivery, brightness, coloured
 from drivers.depthai.options import OakOptions, Stream
 from drivers.depthai.sensors import Sensor
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import CalibrationError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Size
@@ -304,4 +304,4 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     LibraryMissingError, DeviceBusyError, DeviceGoneError, UnsupportedByDeviceError, DeviceError
         See `OakCamera`.
     """
-    return OakCamera(name, checked(OakOptions, options, f"the [[camera]] table '{name}'"))
+    return OakCamera(name, validate(OakOptions, options, f"the [[camera]] table '{name}'"))

@@ -40,7 +40,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import Projector
 
 
@@ -75,7 +75,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     from drivers.linux import require_linux
 
     require_linux("dlpc347x", through="the kernel's /dev/i2c-*", instead="run slrig on Linux for it")
-    table = checked(EngineOptions, options, "the [projector] table of a light engine")
+    table = validate(EngineOptions, options, "the [projector] table of a light engine")
     return LightEngine(open_bus(Path(table.device), table.address), table)
 
 

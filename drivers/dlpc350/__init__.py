@@ -40,7 +40,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import FoundDevice, Projector
 
 
@@ -76,7 +76,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     from drivers.pattern_engine.link import open_link
 
     require_hidraw(DLPC350)
-    table = checked(EngineOptions, options, "the [projector] table of a light engine")
+    table = validate(EngineOptions, options, "the [projector] table of a light engine")
     flash = read_flash(folder / table.patterns)
     node = resolved(table.device, engines(DLPC350))
     return LightEngine(open_link(node.path, DLPC350), table, flash, serial=node.name)

@@ -28,7 +28,7 @@ from pydantic import Field
 from drivers.dlpc350.planes import PLANES, picture_of, planes_in
 from drivers.dlpc350.timing import MOST_IMAGES
 from drivers.pattern_engine.planes import Plane, keys_of_plane, plane_of, words
-from slrig.bundle.validation import Strict, checked, read_json, read_text
+from slrig.bundle.validation import Strict, read_json, read_text, validate
 from slrig.errors import ConfigError, StorageError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
@@ -149,7 +149,7 @@ def read_flash(folder: Path) -> Flash:
     if not path.exists():
         return Flash(folder)
     data = read_json(read_text(path, _MOST_BYTES, ConfigError), path, ConfigError)
-    listed = checked(_List, data, f"{path}: the list of the flashed pictures")
+    listed = validate(_List, data, f"{path}: the list of the flashed pictures")
     indices = [image.flash_index for image in listed.images]
     if len(set(indices)) != len(indices):
         message = f"{path}: expected each flash_index once, found {indices}; correct the list"

@@ -34,7 +34,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import FoundDevice, Projector
 
 
@@ -69,7 +69,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     from drivers.pattern_engine.link import open_link
 
     require_hidraw(DLPC900)
-    table = checked(EngineOptions, options, "the [projector] table of a light engine")
+    table = validate(EngineOptions, options, "the [projector] table of a light engine")
     node = resolved(table.device, engines(DLPC900))
     return LightEngine(open_link(node.path, DLPC900), table, serial=node.name)
 

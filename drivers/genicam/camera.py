@@ -25,7 +25,7 @@ from drivers.genicam.options import CameraOptions, GenicamOptions, GentlOptions
 from drivers.genicam.pixels import FORMATS
 from drivers.genicam.session import Session
 from drivers.genicam.setup import line_of, prepare, set_trigger
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame
@@ -213,7 +213,7 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
         The camera does not take an option, or takes it otherwise.
     """
     del folder
-    table = checked(GenicamOptions, options, f"the [[camera]] table of '{name}' (driver genicam)")
+    table = validate(GenicamOptions, options, f"the [[camera]] table of '{name}' (driver genicam)")
     return GenicamCamera(AravisConnection(name, table), table)
 
 
@@ -242,5 +242,5 @@ def open_gentl_camera(name: str, options: Mapping[str, object], folder: Path) ->
     UnsupportedByDeviceError
         The camera does not take an option, or takes it otherwise.
     """
-    table = checked(GentlOptions, options, f"the [[camera]] table of '{name}' (driver gentl)")
+    table = validate(GentlOptions, options, f"the [[camera]] table of '{name}' (driver gentl)")
     return GenicamCamera(GentlConnection(name, table, folder), table)

@@ -55,10 +55,10 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     """
     from drivers.kms.options import KmsOptions
     from drivers.linux import require_linux
-    from slrig.bundle.validation import checked
+    from slrig.bundle.validation import validate
 
     del folder
-    told = checked(KmsOptions, options, "the [projector] table of driver 'kms'")
+    told = validate(KmsOptions, options, "the [projector] table of driver 'kms'")
     require_linux(DRIVER, through="the kernel's display interface (DRM/KMS)", instead="use driver 'screen'")
     from drivers.display.projector import DisplayProjector
     from drivers.kms.output import KmsStage

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit, urlunsplit
 import cv2
 from pydantic import Field, field_validator
 
-from slrig.bundle.validation import Strict, checked
+from slrig.bundle.validation import Strict, validate
 from slrig.errors import ConfigError
 from slrig.model import Size
 
@@ -151,7 +151,7 @@ def source_of(name: str, options: Mapping[str, object], folder: Path) -> Source:
             model = _UnstampedOptions
     elif device is not None:
         model = _LiveOptions
-    plain = checked(model, options, f"the table of camera '{name}'", hint=_NEEDED[model])
+    plain = validate(model, options, f"the table of camera '{name}'", hint=_NEEDED[model])
     backend = {**_backends(), "auto": usual}[plain.backend]
     return Source(
         kind, target if isinstance(target, int) else str(target), backend, _label(plain.device, target), plain

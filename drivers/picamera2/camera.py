@@ -16,7 +16,7 @@ from typing import Any
 from drivers.picamera2.library import cameras, library, told
 from drivers.picamera2.options import PiCameraOptions
 from drivers.picamera2.stream import Stream, configured
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import (
     AppliedSettings,
     Camera,
@@ -323,4 +323,4 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
         See `PiCamera`.
     """
     del folder
-    return PiCamera(name, checked(PiCameraOptions, options, f"the [[camera]] table '{name}'"))
+    return PiCamera(name, validate(PiCameraOptions, options, f"the [[camera]] table '{name}'"))

@@ -17,7 +17,7 @@ from drivers.replay.camera import ReplayCamera, Stage
 from drivers.replay.clock import ReplayClock
 from drivers.replay.projector import ReplayProjector
 from slrig.bundle import Bundle, read_bundle
-from slrig.bundle.validation import Strict, checked
+from slrig.bundle.validation import Strict, validate
 from slrig.devices import Camera, Projector, ScannerHead
 from slrig.errors import BundleError, ConfigError
 from slrig.model import Calibration, Truth, trim_incomplete_codes
@@ -100,7 +100,7 @@ def open_head(options: Mapping[str, object], folder: Path) -> ScannerHead:
     CalibrationError
         Its calibration is.
     """
-    table = checked(ReplayOptions, options, "the [head] table of a replayed rig")
+    table = validate(ReplayOptions, options, "the [head] table of a replayed rig")
     path = folder / table.bundle
     if not (path / "bundle.json").is_file():
         message = f'[head] bundle = "{table.bundle}": {path} is no scan bundle (it has no bundle.json); name its folder'

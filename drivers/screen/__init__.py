@@ -25,7 +25,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import FoundDevice, Projector
 from slrig.errors import DeviceError, LibraryMissingError
 
@@ -62,7 +62,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     from drivers.screen.stage import opened
 
     del folder
-    told = checked(ScreenOptions, options, "the [projector] table of driver 'screen'")
+    told = validate(ScreenOptions, options, "the [projector] table of driver 'screen'")
     return DisplayProjector(told, lambda: opened(told))
 
 

@@ -164,7 +164,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import FoundDevice, Projector
 
 
@@ -197,7 +197,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     from drivers.serial_projector.options import SerialProjectorOptions
     from drivers.serial_projector.projector import SerialProjector
 
-    table = checked(SerialProjectorOptions, options, "the [projector] table of a serial projector")
+    table = validate(SerialProjectorOptions, options, "the [projector] table of a serial projector")
 
     def open_port() -> SerialPort:
         return SerialPort(table.port, baud=table.baud, device="trigger box", driver="serial_projector")

@@ -38,7 +38,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import Clock, SystemClock, Turntable
 
 
@@ -63,7 +63,7 @@ def open_turntable(options: Mapping[str, object], folder: Path, *, clock: Clock 
     from drivers.serial_turntable.turntable import SerialTurntable
 
     del folder
-    table = checked(LineOptions, options, "the [positioner] table of a serial turntable")
+    table = validate(LineOptions, options, "the [positioner] table of a serial turntable")
     port = SerialPort(table.port, baud=table.baud, device="turntable", driver="serial_turntable")
     return SerialTurntable(port, table, lambda lines: SimpleController(lines, table), clock or SystemClock())
 
@@ -79,7 +79,7 @@ def open_grbl(options: Mapping[str, object], folder: Path, *, clock: Clock | Non
     from drivers.serial_turntable.turntable import SerialTurntable
 
     del folder
-    table = checked(GrblOptions, options, "the [positioner] table of a turntable behind GRBL")
+    table = validate(GrblOptions, options, "the [positioner] table of a turntable behind GRBL")
     port = SerialPort(table.port, baud=table.baud, device="turntable", driver="grbl_turntable")
     return SerialTurntable(port, table, lambda lines: Grbl(lines, table), clock or SystemClock())
 

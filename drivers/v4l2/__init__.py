@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from drivers.linux import require_linux
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import Camera, FoundDevice
 
 
@@ -45,7 +45,7 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     from drivers.v4l2.options import V4L2Options
 
     del folder
-    return V4L2Camera(name, checked(V4L2Options, options, f"the table of camera '{name}'"))
+    return V4L2Camera(name, validate(V4L2Options, options, f"the table of camera '{name}'"))
 
 
 def find_devices() -> tuple[FoundDevice, ...]:

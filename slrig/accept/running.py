@@ -15,7 +15,7 @@ from slrig.accept.plan import AcceptancePlan, Step
 from slrig.accept.store import keep_points
 from slrig.accept.verdicts import AcceptanceResult, verdicts
 from slrig.devices import Rig
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import (
     CalibrationError,
     InvalidInputError,
@@ -58,7 +58,7 @@ def evaluated(
     from slrig.scan.reconstruct import reconstruct_bundle
 
     reconstruct_bundle(work / _BUNDLE, work / _MESH, plan=ReconstructionPlan(), progress=progress, cancelled=cancelled)
-    with refusals_of(work):
+    with storage_errors(work):
         mesh = decode_mesh_ply((work / _MESH / "mesh.ply").read_bytes())
     found, evidence = reading(mesh, step, take, plan)
     keep_points(evidence, folder, step.name, take)
@@ -159,7 +159,7 @@ def _captured(
     work = folder / f".{step.name}-{take + 1}"
     shutil.rmtree(work, ignore_errors=True)
     try:
-        with refusals_of(work):
+        with storage_errors(work):
             work.mkdir(parents=True)
         scan = ScanPlan(exposure_s=plan.exposure_s)
         # The test must not use what a rendered rig knows of its scene; and the noise of a point, which is told beside

@@ -11,7 +11,7 @@ import numpy as np
 from slrig.accept.plan import AcceptancePlan, Artefact, Step
 from slrig.bundle.storage import write_file
 from slrig.config import HeadTable, RigConfig
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import FloatArray
 
@@ -33,7 +33,7 @@ def scripted_config(config: RigConfig, plan: AcceptancePlan, folder: Path) -> Ri
         )
         raise UnsupportedByDeviceError(message)
     path = (folder / SCENE).resolve()
-    with refusals_of(path):
+    with storage_errors(path):
         folder.mkdir(parents=True, exist_ok=True)
     write_file(path, scene_text(plan).encode())
     # A series of poses of a board that is not there any more would be refused.

@@ -23,7 +23,7 @@ from slrig.accept.evaluation import Evidence
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
 from slrig.bundle.storage import write_file
 from slrig.calibration.artefacts import Decision
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder, remove
@@ -113,7 +113,7 @@ def keep_points(evidence: Evidence, folder: Path, step: str, take: int) -> None:
         sigma_mm=evidence.sigma_mm.astype(np.float32),
     )
     path = folder / points_file(step, take)
-    with refusals_of(path):
+    with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, packed.getvalue())
 
@@ -121,7 +121,7 @@ def keep_points(evidence: Evidence, folder: Path, step: str, take: int) -> None:
 def kept_points(folder: Path, step: str, take: int) -> Evidence:
     """The points of a capture, coordinates and deviations to single precision. Raises StorageError."""
     path = folder / points_file(step, take)
-    with refusals_of(path), np.load(path) as kept:
+    with storage_errors(path), np.load(path) as kept:
         return Evidence(
             kept["points_mm"].astype(np.float64),
             kept["artefact"],

@@ -18,8 +18,7 @@ from fastapi.responses import FileResponse, StreamingResponse
 from slrig.api.clouds import clouds_of, has_sources, make_cloud
 from slrig.api.openapi import BYTES, file_of
 from slrig.api.service import Service, Serving
-from slrig.bundle.description import CAMERA_NAME
-from slrig.bundle.reading import CALIBRATION
+from slrig.bundle import CALIBRATION, CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.records import JobKind, JobRecord, JobState

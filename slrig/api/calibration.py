@@ -32,8 +32,7 @@ from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import filled, pattern_plan
 from slrig.api.service import Service, Serving
-from slrig.bundle.calibration import MOST_CALIBRATION_BYTES
-from slrig.bundle.description import CAMERA_NAME
+from slrig.bundle import CAMERA_NAME, MAX_CALIBRATION_BYTES
 from slrig.bundle.validation import FreeText, SafeText
 from slrig.calibrate.calibrating import EXPORTS
 from slrig.calibrate.pose_shooting import PoseRequest
@@ -43,7 +42,7 @@ from slrig.calibration.board import DEFAULT_BOARD, Board, BoardKind
 from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
 
 IMPORT_PATH = "/calibration/import"
-MOST_IMPORT_BYTES = MOST_CALIBRATION_BYTES
+MOST_IMPORT_BYTES = MAX_CALIBRATION_BYTES
 """How long the body of an import may be: a covariance is longer than any other request."""
 
 _ENDINGS = {

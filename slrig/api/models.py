@@ -14,7 +14,7 @@ from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import problems
 from slrig.api.schemas import JobBody, JobLinks, filled
 from slrig.api.service import Cursor, PageLength, Service, Serving, paged
-from slrig.bundle.options import MOST_VIEWS, AxisEntry, PoseEntry, rotating
+from slrig.bundle.options import MAX_VIEWS, AxisEntry, PoseEntry, orthonormalise_pose
 from slrig.bundle.validation import FreeText, SafeText, Strict
 from slrig.combine.offered import MEDIA_TYPES
 from slrig.combine.plan import (
@@ -37,14 +37,12 @@ router = APIRouter(prefix="/model", tags=["model"])
 class MadeRequest(Strict):
     """How a model is made of its scans, whether those are on record or still to be shot."""
 
-    poses: Literal["turntable", "markers", "unknown"] | Annotated[list[PoseEntry], Field(max_length=MOST_VIEWS)] = (
-        Field(
-            default="turntable",
-            description='about where the scans belong. "turntable": a stage turned the object. "markers": '
-            'printed ones turn with it. "unknown": found from what they see, or refused, as of an object that is '
-            "symmetric. Or of each scan a motion, 4 × 4, that takes its mm "
-            "to a common frame",
-        )
+    poses: Literal["turntable", "markers", "unknown"] | Annotated[list[PoseEntry], Field(max_length=MAX_VIEWS)] = Field(
+        default="turntable",
+        description='about where the scans belong. "turntable": a stage turned the object. "markers": '
+        'printed ones turn with it. "unknown": found from what they see, or refused, as of an object that is '
+        "symmetric. Or of each scan a motion, 4 × 4, that takes its mm "
+        "to a common frame",
     )
     dictionary: Annotated[SafeText, Field(min_length=1, max_length=64)] | None = Field(
         default=None, description=f"OpenCV's name for that of the markers. Default: {MARKER_DICTIONARY}"
@@ -84,7 +82,7 @@ class MadeRequest(Strict):
         elif self.poses == "markers":
             poses = MarkerPoses(self.dictionary or MARKER_DICTIONARY)
         elif self.poses != "turntable":
-            poses = GivenPoses.of(map(rotating, self.poses))
+            poses = GivenPoses.of(map(orthonormalise_pose, self.poses))
         else:
             axis = None if self.axis is None else StatedAxis.of(self.axis.point_mm, self.axis.direction)
             poses = TurntablePoses(axis, None if angles_deg is None else tuple(angles_deg))
@@ -96,10 +94,10 @@ class MadeRequest(Strict):
 class ModelRequest(MadeRequest):
     """A model of scans on record."""
 
-    scans: Annotated[list[Annotated[UUID, Field(strict=False)]], Field(min_length=2, max_length=MOST_VIEWS)] = Field(
+    scans: Annotated[list[Annotated[UUID, Field(strict=False)]], Field(min_length=2, max_length=MAX_VIEWS)] = Field(
         description="ids of scans that succeeded; the model is in the frame of the first"
     )
-    angles_deg: Annotated[list[float], Field(max_length=MOST_VIEWS)] | None = Field(
+    angles_deg: Annotated[list[float], Field(max_length=MAX_VIEWS)] | None = Field(
         default=None,
         description="of a turntable: where the stage stood at each scan, right-handed about its axis. Default: as the "
         "scans' reports say",

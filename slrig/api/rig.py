@@ -21,7 +21,7 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import CalibrationInUse, CameraBody, ProjectorBody, RigBody, filled
 from slrig.api.service import Serving
 from slrig.devices import CameraInfo, FoundDevice
-from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, found_devices, installed_drivers
+from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, discover_devices, installed_drivers
 from slrig.errors import SlrigError
 from slrig.jobs.examinations import Examination, last_examination
 from slrig.jobs.records import utc_now
@@ -86,7 +86,7 @@ class DeviceList(BaseModel):
 @router.get("/device")
 def list_devices() -> DeviceList:
     """Return the drivers that are installed, the devices that are plugged in, and the libraries that are missing."""
-    found = found_devices()
+    found = discover_devices()
     return filled(DeviceList, found, drivers=installed_drivers(), faults=[str(fault) for fault in found.faults])
 
 

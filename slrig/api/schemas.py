@@ -19,6 +19,7 @@ from pydantic import (
 )
 
 from slrig.api.problems import fault_problem
+from slrig.bundle import TurnedBy
 from slrig.bundle.options import (
     EXPOSURE_KEYS,
     BracketSeconds,
@@ -27,9 +28,8 @@ from slrig.bundle.options import (
     PresetName,
     RegionTable,
     ScanDefaults,
-    alone,
+    refuse_alternatives,
 )
-from slrig.bundle.sidecars import TurnedBy
 from slrig.bundle.validation import FreeText, Strict
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
@@ -147,7 +147,7 @@ class ShotRequest(Strict):
         "false",
     )
 
-    _one_exposure = field_validator("exposures_s", "exposure_factors")(alone)
+    _one_exposure = field_validator("exposures_s", "exposure_factors")(refuse_alternatives)
 
 
 class ScanRequest(ShotRequest):
@@ -203,7 +203,7 @@ def scan_plan(request: ShotRequest, defaults: ScanDefaults, preset: PresetDocume
     """
     usual, use = defaults.model_copy(update={"exposure_s": None}), None
     if preset is not None and request.preset is not None:
-        usual, use = preset.scan.over(usual), PresetUse(request.preset, preset.version, preset.digest)
+        usual, use = preset.scan.apply_to(usual), PresetUse(request.preset, preset.version, preset.digest)
     exposing: BaseModel = request if any(getattr(request, key) is not None for key in EXPOSURE_KEYS) else usual
     return ScanPlan(
         patterns=pattern_plan(request.patterns, usual),

@@ -1,28 +1,106 @@
-"""The scan bundle: a folder with a description, frames, and a calibration, written by us or by someone else."""
+"""Scan bundles: folders with a description, frames, and a calibration, from slrig or from other programs.
+
+Options, validation and storage have their own modules, which other rooms import directly.
+"""
 
 from slrig.bundle.calibration import (
+    MAX_CALIBRATION_BYTES,
+    MAX_STORAGE_BYTES,
+    Value,
     check_calibration,
+    five_distortion_terms,
     read_calibration,
+    read_file_storage,
     read_opencv_calibration,
+    require_two_rays,
     write_calibration,
     write_opencv_calibration,
 )
-from slrig.bundle.reading import Bundle, read_bundle, read_capture
-from slrig.bundle.sidecars import BundleTruth, read_truth, write_truth
-from slrig.bundle.writing import BundleWriter, write_bundle
+from slrig.bundle.description import (
+    CAMERA_NAME,
+    DESCRIPTION,
+    MAX_CAMERA_PX,
+    MAX_CAPTURE_BYTES,
+    MAX_SIDE_PX,
+    CameraName,
+    read_description,
+)
+from slrig.bundle.images import (
+    read_frame_format,
+    read_pages,
+    read_with_colour,
+)
+from slrig.bundle.reading import (
+    CALIBRATION,
+    Bundle,
+    BundleFiles,
+    open_bundle,
+    read_bundle,
+    read_capture,
+)
+from slrig.bundle.sidecars import (
+    REFUSED_FOLDER,
+    BundleTruth,
+    RefusedFrame,
+    StageAngle,
+    TurnedBy,
+    read_health,
+    read_notes,
+    read_refused,
+    read_stage,
+    read_truth,
+    write_health,
+    write_notes,
+    write_stage,
+    write_truth,
+)
+from slrig.bundle.writing import (
+    BundleWriter,
+    write_bundle,
+)
 
 __all__ = [
+    "CALIBRATION",
+    "CAMERA_NAME",
+    "DESCRIPTION",
+    "MAX_CALIBRATION_BYTES",
+    "MAX_CAMERA_PX",
+    "MAX_CAPTURE_BYTES",
+    "MAX_SIDE_PX",
+    "MAX_STORAGE_BYTES",
+    "REFUSED_FOLDER",
     "Bundle",
+    "BundleFiles",
     "BundleTruth",
     "BundleWriter",
+    "CameraName",
+    "RefusedFrame",
+    "StageAngle",
+    "TurnedBy",
+    "Value",
     "check_calibration",
+    "five_distortion_terms",
+    "open_bundle",
     "read_bundle",
     "read_calibration",
     "read_capture",
+    "read_description",
+    "read_file_storage",
+    "read_frame_format",
+    "read_health",
+    "read_notes",
     "read_opencv_calibration",
+    "read_pages",
+    "read_refused",
+    "read_stage",
     "read_truth",
+    "read_with_colour",
+    "require_two_rays",
     "write_bundle",
     "write_calibration",
+    "write_health",
+    "write_notes",
     "write_opencv_calibration",
+    "write_stage",
     "write_truth",
 ]

@@ -1,9 +1,10 @@
-"""Calibration files: our calibration.json, and OpenCV's FileStorage (YAML, XML, JSON) with its own small reader.
+"""Calibration files: slrig's calibration.json, and OpenCV's FileStorage (YAML, XML) with its own small reader.
 
-OpenCV's own reader is not for files of strangers: a short file can make it write outside its memory. This one knows
-maps, text, numbers and dense matrices of `d`, `f` or `i` with one channel. It keeps to its limits before it builds
-anything, and calls itself nowhere, so that no file is too deep for it. Everything else is refused with its line.
-OpenCV 5 writes an array of one dimension as an `opencv-nd-matrix` of one size; that is read, more sizes are not.
+OpenCV's reader is unsafe for files from others: a short file can make it write outside its memory. PyYAML's pure Python
+parser takes seconds for a large covariance, and does not end in useful time for deeply nested sequences. This reader
+knows maps, text, numbers and dense matrices of `d`, `f` or `i` with one channel. It checks its limits before it builds
+anything, and does not recurse, so that no file is too deep for it. It refuses everything else with the line number.
+OpenCV 5 writes an array of one dimension as an `opencv-nd-matrix` with one size, which is read; more sizes are refused.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from slrig.bundle.description import CAMERA_NAME, MOST_SIDE_PX, PROJECTOR, CameraName, Extent
+from slrig.bundle.description import CAMERA_NAME, MAX_SIDE_PX, PROJECTOR, CameraName, Extent
 from slrig.bundle.storage import json_bytes, write_file
-from slrig.bundle.validation import MOST_FAULTS, AwareMoment, Strict, read_description_of, read_text, shorten
+from slrig.bundle.validation import MAX_FAULTS, AwareMoment, Strict, read_json_model, read_text, shorten
 from slrig.errors import CalibrationError
 from slrig.model import DEVICE_PARAMETERS, Calibration, FloatArray, LightMap, Pinhole, Size, SolveRecord
 
-MOST_DEPTH = 8
-MOST_NODES = 4096
-MOST_NUMBERS = 2**16
-"""Of one matrix: the covariance of 16 devices has 57 600."""
+MAX_DEPTH = 8
+MAX_NODES = 4096
+MAX_NUMBERS = 2**16
+"""Numbers of one matrix: the covariance of 16 devices has 57 600."""
 
 Value: TypeAlias = "dict[str, Value] | FloatArray | list[str | int | float] | str | int | float"
 
@@ -50,237 +51,9 @@ _COMMENT = re.compile(r"[ \t]*(?:#.*)?")
 _ESCAPE = re.compile(r"\\(x[0-9A-Fa-f]{2}|.)")
 _ESCAPED = {"n": "\n", "r": "\r", "t": "\t", "0": "\0"}
 
-
-def read_file_storage(text: str, path: Path) -> dict[str, Value]:
-    """Return the maps, numbers, texts and matrices (float64) of a FileStorage text; `path` is for messages.
-    Raises CalibrationError, with the line: the text is cut, of another layout, or beyond a limit.
-    """
-    tree = _Tree(path)
-    text = text.removeprefix("\ufeff")
-    control = _CONTROL.search(text)
-    if control:
-        tree.line = text.count("\n", 0, control.start()) + 1
-        tree.refuse("text", f"the control character {control[0]!r}")
-    if text.startswith("<"):
-        _read_xml(text, tree)
-    elif text.startswith("%YAML"):
-        _read_yaml(text.split("\n"), tree)
-    else:
-        tree.refuse("OpenCV FileStorage, which begins with %YAML or <", shorten(text[:40]))
-    return tree.root
-
-
-class _Tree:
-    """What was read so far, by map, with the limits. `line` is where the reader stands."""
-
-    def __init__(self, path: Path) -> None:
-        self.root: dict[str, Value] = {}
-        self.line = 1
-        self._path = path
-        self._open: list[tuple[str, str, dict[str, Value], int]] = [("", "", self.root, 1)]
-        self._nodes = 0
-
-    @property
-    def depth(self) -> int:
-        """How many maps are open, beside the root."""
-        return len(self._open) - 1
-
-    def refuse(self, expected: str, found: str, remedy: str = "export it again") -> NoReturn:
-        raise CalibrationError(f"{self._path}: expected {expected}, found {found} at line {self.line}; {remedy}")
-
-    def open(self, key: str, kind: str) -> None:
-        """Begin a map; `kind` is empty, or that of a matrix."""
-        if self.depth >= MOST_DEPTH:
-            self.refuse(f"at most {MOST_DEPTH} maps in each other", "another one")
-        if kind and kind not in _MATRIX_KEYS:
-            self.refuse("an opencv-matrix", shorten(kind), "export matrices of numbers only")
-        self._check(key)
-        self._open.append((key, kind, {}, self.line))
-
-    def add(self, key: str, value: Value) -> None:
-        """Put a value into the map that was begun last."""
-        self._check(key)
-        self._open[-1][2][key] = value
-
-    def close(self) -> None:
-        """End the map that was begun last."""
-        key, kind, found, opened = self._open.pop()
-        # What is wrong with a matrix shows at its end, which may be the line of another key.
-        line, self.line = self.line, opened
-        self._open[-1][2][key] = self._matrix(key, kind, found) if kind else found
-        self.line = line
-
-    def _check(self, key: str) -> None:
-        self._nodes += 1
-        if self._nodes > MOST_NODES:
-            self.refuse(f"at most {MOST_NODES} entries", "more", "leave out all but the calibration")
-        if not _KEY.fullmatch(key):
-            self.refuse("a key of at most 64 letters, digits, - and _", shorten(key), "rename it")
-        if key in self._open[-1][2]:
-            self.refuse("each key once in a map", f"'{key}' twice", "keep one of them")
-
-    def _matrix(self, key: str, kind: str, found: dict[str, Value]) -> FloatArray:
-        if set(found) != _MATRIX_KEYS[kind]:
-            self.refuse(f"{', '.join(sorted(_MATRIX_KEYS[kind]))} in '{key}'", f"{', '.join(sorted(found)[:8])}")
-        shape = [found[name] for name in ("rows", "cols", "sizes") if name in found]
-        shape = [part[0] if isinstance(part, list) and len(part) == 1 else part for part in shape]
-        sides = [part for part in shape if isinstance(part, int) and 1 <= part <= MOST_NUMBERS]
-        if len(sides) != len(shape):
-            self.refuse(f"whole numbers from 1 as extent of '{key}', two of them at most", shorten(shape))
-        dt = str(found["dt"]).removeprefix("1") if isinstance(found["dt"], str) else ""
-        if dt not in _KINDS:
-            self.refuse(f"d, f or i as dt of '{key}'", shorten(found["dt"]), "export it with one channel of numbers")
-        data = found["data"] if isinstance(found["data"], list) else [found["data"]]
-        count = int(np.prod(sides, dtype=np.int64))
-        if len(data) != count:
-            self.refuse(f"{count} numbers as data of '{key}'", f"{len(data)}")
-        most = 2**31
-        wrong = [
-            each
-            for each in data
-            if not isinstance(each, int if dt == "i" else int | float) or (dt == "i" and not -most <= each < most)
-        ]
-        if wrong:
-            self.refuse(f"numbers of the kind '{dt}' as data of '{key}'", shorten(wrong[0]))
-        with np.errstate(over="ignore"):
-            return np.array(data, dtype=_KINDS[dt]).astype(np.float64).reshape(sides)
-
-    def scalar(self, word: str) -> str | int | float:
-        """What an unquoted word stands for."""
-        if _INT.fullmatch(word):
-            return int(word)
-        if _REAL.fullmatch(word):
-            return float(word)
-        return _SPECIAL.get(word.lower(), word)
-
-    def scalars(self, words: list[str]) -> list[str | int | float]:
-        """What the words of a sequence stand for."""
-        if len(words) > MOST_NUMBERS:
-            self.refuse(f"at most {MOST_NUMBERS} numbers in a matrix", f"{len(words)}")
-        return [self.scalar(word.strip()) for word in words]
-
-
-def _read_yaml(lines: list[str], tree: _Tree) -> None:
-    if not _YAML_HEAD.fullmatch(lines[0].rstrip()):
-        tree.refuse("%YAML:1.0 or %YAML 1.2", shorten(lines[0]))
-    columns = [-1]
-    """Where the keys of each open map begin; that of one just opened is that of its opener until its first key."""
-    opener: int | None = None
-    place = 1
-    while place < len(lines):
-        line, tree.line, place = lines[place].rstrip("\r"), place + 1, place + 1
-        if _COMMENT.fullmatch(line) or (line.rstrip() == "---" and not tree.root and not tree.depth):
-            continue
-        if line.rstrip() == "..." and not any(map(str.strip, lines[place:])):
-            break
-        entry = _YAML_ENTRY.fullmatch(line)
-        if entry is None:
-            tree.refuse("`key: value`, indented with spaces", shorten(line), "write maps and opencv-matrices only")
-        column, key, rest = len(entry[1]), entry[2], entry[3] or ""
-        if opener is not None and column > opener:
-            columns.append(column)
-        elif opener is not None:
-            tree.close()
-        elif columns == [-1]:
-            columns = [column]
-        opener = None
-        while column < columns[-1] and len(columns) > 1:
-            columns.pop()
-            tree.close()
-        if column != columns[-1]:
-            tree.refuse(
-                "a key below that of its map", f"'{key[:64]}' in column {column + 1}", "indent it as the others"
-            )
-        if _COMMENT.fullmatch(rest) or rest.startswith("!!"):
-            tree.open(key, rest[2:].partition("#")[0].strip() or "!!" if rest.startswith("!!") else "")
-            opener = column
-        elif rest.startswith("["):
-            first = place
-            while "]" not in lines[place - 1] and place < len(lines):
-                place += 1
-            parts = [rest, *lines[first:place]]
-            body, end, after = " ".join(part.rstrip("\r").split(" #")[0] for part in parts).partition("]")
-            tree.line = place
-            if not end or not _COMMENT.fullmatch(after):
-                tree.refuse("a sequence that ends in ]", "none that does", "the file may be cut: copy it again")
-            tree.add(key, tree.scalars(body[1:].split(",") if body[1:].strip() else []))
-        else:
-            tree.add(key, _yaml_scalar(rest, tree))
-    for _ in range(tree.depth):
-        tree.close()
-
-
-def _yaml_scalar(rest: str, tree: _Tree) -> str | int | float:
-    quoted = _QUOTED.match(rest)
-    if quoted and _COMMENT.fullmatch(rest, quoted.end()):
-        if quoted[1] is None:
-            return quoted[2].replace("''", "'")
-        return _ESCAPE.sub(lambda e: chr(int(e[1][1:], 16)) if len(e[1]) > 1 else _ESCAPED.get(e[1], e[1]), quoted[1])
-    if rest[0] in "\"'{}[]&*!|>%@`?,":
-        tree.refuse("a number, text or an opencv-matrix", shorten(rest), "write nothing else")
-    return tree.scalar(re.split(r"[ \t]#", rest, maxsplit=1)[0].strip())
-
-
-def _read_xml(text: str, tree: _Tree) -> None:
-    parser = expat.ParserCreate("utf-8")
-    parser.buffer_text = True
-    # One for each open element: its key, its type, what text it holds, and whether it holds elements.
-    elements: list[list[Any]] = []
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        tree.line = parser.CurrentLineNumber
-        if set(attributes) - {"type_id"}:
-            tree.refuse("no attribute but type_id", shorten(sorted(attributes)[0]), "leave it out")
-        if not elements:
-            if name != "opencv_storage":
-                tree.refuse("<opencv_storage>", shorten(name))
-        elif len(elements) > MOST_DEPTH + 1:
-            tree.refuse(f"at most {MOST_DEPTH} maps in each other", "another one")
-        else:
-            parent = elements[-1]
-            if "".join(parent[2]).strip():
-                tree.refuse("a map or text", "both in one element")
-            if len(elements) > 1 and not parent[3]:
-                tree.open(parent[0], parent[1])
-            parent[3] = True
-        elements.append([name, attributes.get("type_id", ""), [], False])
-
-    def end(_: str) -> None:
-        tree.line = parser.CurrentLineNumber
-        key, kind, parts, holds_elements = elements.pop()
-        text = "".join(parts).strip(" \t\r\n")
-        if holds_elements or not elements:
-            if text:
-                tree.refuse("a map or text", "both in one element")
-            if elements:
-                tree.close()
-        elif kind:
-            tree.refuse("an opencv-matrix with rows, cols, dt and data", shorten(kind))
-        elif text.startswith('"'):
-            if len(text) < 2 or not text.endswith('"'):
-                tree.refuse("one quoted text", shorten(text))
-            tree.add(key, text[1:-1])
-        else:
-            words = text.split()
-            tree.add(key, tree.scalar(words[0]) if len(words) == 1 else tree.scalars(words))
-
-    def refuse_kind(*_: object) -> None:
-        tree.line = parser.CurrentLineNumber
-        tree.refuse("elements, text and comments", "a document type, an entity or an instruction", "leave it out")
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler = lambda data: elements[-1][2].append(data)
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = parser.ProcessingInstructionHandler = refuse_kind
-    try:
-        parser.Parse(text.encode(), True)
-    except expat.ExpatError as cause:
-        tree.line = cause.lineno
-        tree.refuse("sound XML", expat.ErrorString(cause.code) or "a fault", "the file may be cut: copy it again")
-
-
-MOST_FILE_BYTES = 4 * 2**20
+MAX_STORAGE_BYTES = 4 * 2**20
 SOLVED = "solved"
-MOST_ID_LENGTH = 64
+MAX_ID_LENGTH = 64
 NODE_NAME = re.compile(r"^[A-Za-z_][A-Za-z0-9_-]*$")
 DEVICE_KEYS = (
     "image_width",
@@ -292,15 +65,246 @@ DEVICE_KEYS = (
 )
 SOLVED_KEYS = ("id", "solved_at", "covariance", "volume_mm", "expected_error_mm", "scale_sigma")
 
+MAX_CALIBRATION_BYTES = 4 * 2**20
+MAX_DEVICES = 16
+
+
+def read_file_storage(text: str, path: Path) -> dict[str, Value]:
+    """Return the maps, numbers, texts and matrices (float64) of a FileStorage text; `path` is for messages.
+
+    Raises CalibrationError, with the line: the text is cut, of another layout, or beyond a limit.
+    """
+    builder = _TreeBuilder(path)
+    text = text.removeprefix("\ufeff")
+    control = _CONTROL.search(text)
+    if control:
+        builder.line = text.count("\n", 0, control.start()) + 1
+        builder.refuse("text", f"the control character {control[0]!r}")
+    if text.startswith("<"):
+        _read_xml(text, builder)
+    elif text.startswith("%YAML"):
+        _read_yaml(text.split("\n"), builder)
+    else:
+        builder.refuse("OpenCV FileStorage, which begins with %YAML or <", shorten(text[:40]))
+    return builder.root
+
+
+class _TreeBuilder:
+    """Builds the tree of a file within the limits. `line` is the reader's present line."""
+
+    def __init__(self, path: Path) -> None:
+        self.root: dict[str, Value] = {}
+        self.line = 1
+        self._path = path
+        self._open: list[tuple[str, str, dict[str, Value], int]] = [("", "", self.root, 1)]
+        self._nodes = 0
+
+    @property
+    def depth(self) -> int:
+        """Number of open maps, without the root."""
+        return len(self._open) - 1
+
+    def refuse(self, expected: str, found: str, remedy: str = "export it again") -> NoReturn:
+        raise CalibrationError(f"{self._path}: expected {expected}, found {found} at line {self.line}; {remedy}")
+
+    def open(self, key: str, kind: str) -> None:
+        """Begin a map; `kind` is empty, or the type of a matrix."""
+        if self.depth >= MAX_DEPTH:
+            self.refuse(f"at most {MAX_DEPTH} maps in each other", "another one")
+        if kind and kind not in _MATRIX_KEYS:
+            self.refuse("an opencv-matrix", shorten(kind), "export matrices of numbers only")
+        self._check(key)
+        self._open.append((key, kind, {}, self.line))
+
+    def add(self, key: str, value: Value) -> None:
+        """Put a value into the innermost open map."""
+        self._check(key)
+        self._open[-1][2][key] = value
+
+    def close(self) -> None:
+        """End the innermost open map."""
+        key, kind, entries, opening_line = self._open.pop()
+        # Faults of a matrix show at its end, which may be the line of another key: report its beginning.
+        line, self.line = self.line, opening_line
+        self._open[-1][2][key] = self._matrix(key, kind, entries) if kind else entries
+        self.line = line
+
+    def _check(self, key: str) -> None:
+        self._nodes += 1
+        if self._nodes > MAX_NODES:
+            self.refuse(f"at most {MAX_NODES} entries", "more", "leave out all but the calibration")
+        if not _KEY.fullmatch(key):
+            self.refuse("a key of at most 64 letters, digits, - and _", shorten(key), "rename it")
+        if key in self._open[-1][2]:
+            self.refuse("each key once in a map", f"'{key}' twice", "keep one of them")
+
+    def _matrix(self, key: str, kind: str, entries: dict[str, Value]) -> FloatArray:
+        if set(entries) != _MATRIX_KEYS[kind]:
+            self.refuse(f"{', '.join(sorted(_MATRIX_KEYS[kind]))} in '{key}'", f"{', '.join(sorted(entries)[:8])}")
+        shape = [entries[name] for name in ("rows", "cols", "sizes") if name in entries]
+        shape = [part[0] if isinstance(part, list) and len(part) == 1 else part for part in shape]
+        sides = [part for part in shape if isinstance(part, int) and 1 <= part <= MAX_NUMBERS]
+        if len(sides) != len(shape):
+            self.refuse(f"whole numbers from 1 as extent of '{key}', two of them at most", shorten(shape))
+        dt = str(entries["dt"]).removeprefix("1") if isinstance(entries["dt"], str) else ""
+        if dt not in _KINDS:
+            self.refuse(f"d, f or i as dt of '{key}'", shorten(entries["dt"]), "export it with one channel of numbers")
+        data = entries["data"] if isinstance(entries["data"], list) else [entries["data"]]
+        count = int(np.prod(sides, dtype=np.int64))
+        if len(data) != count:
+            self.refuse(f"{count} numbers as data of '{key}'", f"{len(data)}")
+        limit = 2**31
+        wrong = [
+            each
+            for each in data
+            if not isinstance(each, int if dt == "i" else int | float) or (dt == "i" and not -limit <= each < limit)
+        ]
+        if wrong:
+            self.refuse(f"numbers of the kind '{dt}' as data of '{key}'", shorten(wrong[0]))
+        with np.errstate(over="ignore"):
+            return np.array(data, dtype=_KINDS[dt]).astype(np.float64).reshape(sides)
+
+    def scalar(self, word: str) -> str | int | float:
+        """Return the value of an unquoted word."""
+        if _INT.fullmatch(word):
+            return int(word)
+        if _REAL.fullmatch(word):
+            return float(word)
+        return _SPECIAL.get(word.lower(), word)
+
+    def scalars(self, words: list[str]) -> list[str | int | float]:
+        """Return the values of the words of a sequence."""
+        if len(words) > MAX_NUMBERS:
+            self.refuse(f"at most {MAX_NUMBERS} numbers in a matrix", f"{len(words)}")
+        return [self.scalar(word.strip()) for word in words]
+
+
+def _read_yaml(lines: list[str], builder: _TreeBuilder) -> None:
+    if not _YAML_HEAD.fullmatch(lines[0].rstrip()):
+        builder.refuse("%YAML:1.0 or %YAML 1.2", shorten(lines[0]))
+    columns = [-1]
+    """Column of the keys of each open map; a map without keys yet has the column of its opener."""
+    opener: int | None = None
+    next_line = 1
+    while next_line < len(lines):
+        line, builder.line, next_line = lines[next_line].rstrip("\r"), next_line + 1, next_line + 1
+        if _COMMENT.fullmatch(line) or (line.rstrip() == "---" and not builder.root and not builder.depth):
+            continue
+        if line.rstrip() == "..." and not any(map(str.strip, lines[next_line:])):
+            break
+        entry = _YAML_ENTRY.fullmatch(line)
+        if entry is None:
+            builder.refuse("`key: value`, indented with spaces", shorten(line), "write maps and opencv-matrices only")
+        column, key, rest = len(entry[1]), entry[2], entry[3] or ""
+        if opener is not None and column > opener:
+            columns.append(column)
+        elif opener is not None:
+            builder.close()
+        elif columns == [-1]:
+            columns = [column]
+        opener = None
+        while column < columns[-1] and len(columns) > 1:
+            columns.pop()
+            builder.close()
+        if column != columns[-1]:
+            builder.refuse(
+                "a key below that of its map", f"'{key[:64]}' in column {column + 1}", "indent it as the others"
+            )
+        if _COMMENT.fullmatch(rest) or rest.startswith("!!"):
+            builder.open(key, rest[2:].partition("#")[0].strip() or "!!" if rest.startswith("!!") else "")
+            opener = column
+        elif rest.startswith("["):
+            first = next_line
+            while "]" not in lines[next_line - 1] and next_line < len(lines):
+                next_line += 1
+            parts = [rest, *lines[first:next_line]]
+            body, end, after = " ".join(part.rstrip("\r").split(" #")[0] for part in parts).partition("]")
+            builder.line = next_line
+            if not end or not _COMMENT.fullmatch(after):
+                builder.refuse("a sequence that ends in ]", "none that does", "the file may be cut: copy it again")
+            builder.add(key, builder.scalars(body[1:].split(",") if body[1:].strip() else []))
+        else:
+            builder.add(key, _yaml_scalar(rest, builder))
+    for _ in range(builder.depth):
+        builder.close()
+
+
+def _yaml_scalar(text: str, builder: _TreeBuilder) -> str | int | float:
+    quoted = _QUOTED.match(text)
+    if quoted and _COMMENT.fullmatch(text, quoted.end()):
+        if quoted[1] is None:
+            return quoted[2].replace("''", "'")
+        return _ESCAPE.sub(lambda e: chr(int(e[1][1:], 16)) if len(e[1]) > 1 else _ESCAPED.get(e[1], e[1]), quoted[1])
+    if text[0] in "\"'{}[]&*!|>%@`?,":
+        builder.refuse("a number, text or an opencv-matrix", shorten(text), "write nothing else")
+    return builder.scalar(re.split(r"[ \t]#", text, maxsplit=1)[0].strip())
+
+
+def _read_xml(text: str, builder: _TreeBuilder) -> None:
+    parser = expat.ParserCreate("utf-8")
+    parser.buffer_text = True
+    # One for each open element: its key, its type, its text, and whether it contains elements.
+    elements: list[list[Any]] = []
+
+    def start(name: str, attributes: dict[str, str]) -> None:
+        builder.line = parser.CurrentLineNumber
+        if set(attributes) - {"type_id"}:
+            builder.refuse("no attribute but type_id", shorten(sorted(attributes)[0]), "leave it out")
+        if not elements:
+            if name != "opencv_storage":
+                builder.refuse("<opencv_storage>", shorten(name))
+        elif len(elements) > MAX_DEPTH + 1:
+            builder.refuse(f"at most {MAX_DEPTH} maps in each other", "another one")
+        else:
+            parent = elements[-1]
+            if "".join(parent[2]).strip():
+                builder.refuse("a map or text", "both in one element")
+            if len(elements) > 1 and not parent[3]:
+                builder.open(parent[0], parent[1])
+            parent[3] = True
+        elements.append([name, attributes.get("type_id", ""), [], False])
+
+    def end(_: str) -> None:
+        builder.line = parser.CurrentLineNumber
+        key, kind, parts, holds_elements = elements.pop()
+        text = "".join(parts).strip(" \t\r\n")
+        if holds_elements or not elements:
+            if text:
+                builder.refuse("a map or text", "both in one element")
+            if elements:
+                builder.close()
+        elif kind:
+            builder.refuse("an opencv-matrix with rows, cols, dt and data", shorten(kind))
+        elif text.startswith('"'):
+            if len(text) < 2 or not text.endswith('"'):
+                builder.refuse("one quoted text", shorten(text))
+            builder.add(key, text[1:-1])
+        else:
+            words = text.split()
+            builder.add(key, builder.scalar(words[0]) if len(words) == 1 else builder.scalars(words))
+
+    def refuse_kind(*_: object) -> None:
+        builder.line = parser.CurrentLineNumber
+        builder.refuse("elements, text and comments", "a document type, an entity or an instruction", "leave it out")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler = lambda data: elements[-1][2].append(data)
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = parser.ProcessingInstructionHandler = refuse_kind
+    try:
+        parser.Parse(text.encode(), True)
+    except expat.ExpatError as cause:
+        builder.line = cause.lineno
+        builder.refuse("sound XML", expat.ErrorString(cause.code) or "a fault", "the file may be cut: copy it again")
+
 
 def read_opencv_calibration(path: Path) -> Calibration:
     """Return the calibration in an OpenCV FileStorage file.
 
-    The map `projector` is the projector, `solved` what the calibration says of its own error, others are cameras.
+    The map `projector` is the projector, `solved` the calibration's statement of its error, all others are cameras.
     Raises CalibrationError: the file is missing, cut, has an unknown key, a number that is not finite, or distortion
     terms beyond k3.
     """
-    root = read_file_storage(read_text(path, MOST_FILE_BYTES, CalibrationError), path)
+    root = read_file_storage(read_text(path, MAX_STORAGE_BYTES, CalibrationError), path)
     devices = {name: _read_device(found, path, name) for name, found in root.items() if name != SOLVED}
     solved = _read_solved(root[SOLVED], path) if SOLVED in root else None
     cameras = {name: device for name, device in devices.items() if name != PROJECTOR}
@@ -316,9 +320,10 @@ def read_opencv_calibration(path: Path) -> Calibration:
 
 
 def write_opencv_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration as OpenCV FileStorage, whole or not at all; the name ends in yml, yaml or xml.
-    Raises CalibrationError: the ending is another one, or a camera has a name that FileStorage or this layout cannot
-    hold; StorageError: the disk refused.
+    """Write a calibration as OpenCV FileStorage, completely or not at all; the name ends in yml, yaml or xml.
+
+    Raises CalibrationError: the ending is another one, or FileStorage or this layout cannot hold the name of a camera;
+    StorageError: the disk refused.
     """
     ending = path.suffix.lower()
     if ending not in {".yml", ".yaml", ".xml"}:
@@ -346,22 +351,22 @@ def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
     raise CalibrationError(f"{path}: expected {expected}, found {found}; {remedy}")
 
 
-def _require_keys(found: Value, wanted: tuple[str, ...], path: Path, name: str, remedy: str) -> dict[str, Value]:
-    entries = found if isinstance(found, dict) else {}
-    if set(entries) != set(wanted):
-        wrong = [f"no {key}" for key in wanted if key not in entries]
-        wrong += [f"the unknown key {key}" for key in sorted(set(entries) - set(wanted))]
-        _refuse(path, f"{', '.join(wanted)} in '{name}'", ", ".join(wrong[:MOST_FAULTS]), remedy)
+def _require_keys(value: Value, keys: tuple[str, ...], path: Path, name: str, remedy: str) -> dict[str, Value]:
+    entries = value if isinstance(value, dict) else {}
+    if set(entries) != set(keys):
+        wrong = [f"no {key}" for key in keys if key not in entries]
+        wrong += [f"the unknown key {key}" for key in sorted(set(entries) - set(keys))]
+        _refuse(path, f"{', '.join(keys)} in '{name}'", ", ".join(wrong[:MAX_FAULTS]), remedy)
     return entries
 
 
-def _read_device(found: Value, path: Path, name: str) -> Pinhole:
-    entries = _require_keys(found, DEVICE_KEYS, path, name, "write one map per device")
+def _read_device(value: Value, path: Path, name: str) -> Pinhole:
+    entries = _require_keys(value, DEVICE_KEYS, path, name, "write one map per device")
     width_px, height_px = entries["image_width"], entries["image_height"]
     if not _is_side(width_px) or not _is_side(height_px):
-        _refuse(path, f"whole numbers as extent of '{name}', from 1 to {MOST_SIDE_PX}", "something else",
+        _refuse(path, f"whole numbers as extent of '{name}', from 1 to {MAX_SIDE_PX}", "something else",
                 "correct image_width and image_height")  # fmt: skip
-    five = five_terms(_matrix(entries, "distortion_coefficients", path, name), path, name)
+    five = five_distortion_terms(_matrix(entries, "distortion_coefficients", path, name), path, name)
     try:
         return Pinhole(
             Size(width_px, height_px),
@@ -374,29 +379,30 @@ def _read_device(found: Value, path: Path, name: str) -> Pinhole:
         raise CalibrationError(f"{path}: {name}.{cause}") from cause
 
 
-def five_terms(distortion: FloatArray, path: Path, name: str) -> FloatArray:
+def five_distortion_terms(distortion: FloatArray, path: Path, name: str) -> FloatArray:
     """(5,) float64: k1, k2, p1, p2 and k3 of OpenCV's coefficients, 4 or more.
+
     Raises CalibrationError: there are fewer, or one beyond k3 is not 0.
     """
-    found = distortion.ravel()
-    if found.size < 4 or found[5:].any():
+    terms = distortion.ravel()
+    if terms.size < 4 or terms[5:].any():
         _refuse(
             path,
             f"k1, k2, p1, p2 and at most k3 as distortion of '{name}'",
-            shorten(found[:14].tolist()),
+            shorten(terms[:14].tolist()),
             "calibrate without the rational, thin prism and tilt models",
         )
     five = np.zeros(5)
-    five[: min(found.size, 5)] = found[:5]
+    five[: min(terms.size, 5)] = terms[:5]
     return five
 
 
 def _is_side(value: Value) -> TypeGuard[int]:
-    return isinstance(value, int) and 1 <= value <= MOST_SIDE_PX
+    return isinstance(value, int) and 1 <= value <= MAX_SIDE_PX
 
 
-def _read_solved(found: Value, path: Path) -> SolveRecord:
-    entries = _require_keys(found, SOLVED_KEYS, path, SOLVED, "leave the whole map out")
+def _read_solved(value: Value, path: Path) -> SolveRecord:
+    entries = _require_keys(value, SOLVED_KEYS, path, SOLVED, "leave the whole map out")
     name, solved_at = entries["id"], entries["solved_at"]
     error_mm, scale_sigma = entries["expected_error_mm"], entries["scale_sigma"]
     if not isinstance(name, str) or not isinstance(solved_at, str):
@@ -405,9 +411,9 @@ def _read_solved(found: Value, path: Path) -> SolveRecord:
     if not isinstance(error_mm, int | float) or not isinstance(scale_sigma, int | float):
         _refuse(path, f"numbers as expected_error_mm and scale_sigma of '{SOLVED}'", "something else",
                 "export it again, or leave the whole map out")  # fmt: skip
-    if not 1 <= len(name) <= MOST_ID_LENGTH:
-        _refuse(path, f"a text of 1 to {MOST_ID_LENGTH} characters as {SOLVED}.id", shorten(name), "export it again")
-    if not _is_moment(solved_at):
+    if not 1 <= len(name) <= MAX_ID_LENGTH:
+        _refuse(path, f"a text of 1 to {MAX_ID_LENGTH} characters as {SOLVED}.id", shorten(name), "export it again")
+    if not _is_aware_time(solved_at):
         _refuse(path, f"ISO 8601 with the offset from UTC as {SOLVED}.solved_at", shorten(solved_at), "correct it")
     if not 0 <= error_mm < np.inf:
         _refuse(path, f"{SOLVED}.expected_error_mm of 0 or more", f"{error_mm}", "export it again")
@@ -423,7 +429,7 @@ def _read_solved(found: Value, path: Path) -> SolveRecord:
         raise CalibrationError(f"{path}: {SOLVED}.{cause}") from cause
 
 
-def _is_moment(text: str) -> bool:
+def _is_aware_time(text: str) -> bool:
     try:
         return datetime.fromisoformat(text).tzinfo is not None
     except ValueError:
@@ -431,10 +437,10 @@ def _is_moment(text: str) -> bool:
 
 
 def _matrix(entries: dict[str, Value], key: str, path: Path, name: str) -> FloatArray:
-    found = entries[key]
-    if not isinstance(found, np.ndarray):
+    value = entries[key]
+    if not isinstance(value, np.ndarray):
         _refuse(path, f"an !!opencv-matrix at {name}.{key}", "something else", "export it again")
-    return found
+    return value
 
 
 def _write_device(storage: Any, name: str, device: Pinhole) -> None:
@@ -450,9 +456,6 @@ def _write_map(storage: Any, name: str, values: Mapping[str, Any]) -> None:
         storage.write(key, value[:, None] if isinstance(value, np.ndarray) and value.ndim == 1 else value)
     storage.endWriteStruct()
 
-
-MOST_CALIBRATION_BYTES = 4 * 2**20
-MOST_DEVICES = 16
 
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3)]
@@ -471,14 +474,14 @@ class DeviceEntry(Strict):
 
 
 class SolvedEntry(Strict):
-    """How the calibration was found: see `slrig.model.SolveRecord`. Absent where it says nothing of its own error."""
+    """Origin and error of the calibration: see `slrig.model.SolveRecord`. Absent if the error is unknown."""
 
     id: Annotated[str, Field(min_length=1, max_length=64)]
     solved_at: Annotated[AwareMoment, Field(description="ISO 8601 with the offset from UTC")]
     covariance: Annotated[
         list[list[float]],
         Field(
-            max_length=MOST_DEVICES * DEVICE_PARAMETERS,
+            max_length=MAX_DEVICES * DEVICE_PARAMETERS,
             description="of fx, fy, cx, cy, k1, k2, p1, p2, k3, a small turn (rad) and the translation (mm) of each "
             "device: cameras in order, then the projector",
         ),
@@ -501,7 +504,7 @@ class LightEntry(Strict):
 
 
 class CalibrationEntry(Strict):
-    """The whole of calibration.json. Without a projector only cameras can be triangulated with each other."""
+    """The whole of calibration.json. Without a projector only pairs of cameras can be triangulated."""
 
     format: Literal["slrig-calibration"]
     version: Literal[1]
@@ -512,32 +515,33 @@ class CalibrationEntry(Strict):
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Return the calibration in a file: slrig's JSON, or OpenCV FileStorage where the name ends in yml, yaml or xml.
+    """Return the calibration in a file: slrig's JSON, or OpenCV FileStorage if the name ends in yml, yaml or xml.
+
     Raises CalibrationError: the file is missing, cut, has an unknown key or a number that is not finite; all faults in
     one message.
     """
     if path.suffix.lower() in {".yml", ".yaml", ".xml"}:
         return read_opencv_calibration(path)
-    entry = read_description_of(
-        path, CalibrationEntry, "calibration", most_bytes=MOST_CALIBRATION_BYTES, error=CalibrationError
+    entry = read_json_model(
+        path, CalibrationEntry, "calibration", max_bytes=MAX_CALIBRATION_BYTES, error=CalibrationError
     )
-    cameras = {name: _pinhole(device, path, f"cameras.{name}") for name, device in entry.cameras.items()}
-    projector = None if entry.projector is None else _pinhole(entry.projector, path, "projector")
+    cameras = {name: _build_pinhole(device, path, f"cameras.{name}") for name, device in entry.cameras.items()}
+    projector = None if entry.projector is None else _build_pinhole(entry.projector, path, "projector")
     try:
-        return Calibration(cameras, projector, _solved(entry.solved), _light(entry.light))
+        return Calibration(cameras, projector, _build_solved(entry.solved), _build_light_map(entry.light))
     except (CalibrationError, ValueError) as cause:
         raise CalibrationError(f"{path}: solved.{cause}") from cause
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration as slrig's JSON, whole or not at all. Raises StorageError: the disk refused."""
+    """Write a calibration as slrig's JSON, completely or not at all. Raises StorageError: the disk refused."""
     data: dict[str, Any] = {
         "format": "slrig-calibration",
         "version": 1,
-        "cameras": {name: _device(pinhole) for name, pinhole in calibration.cameras.items()},
+        "cameras": {name: _device_document(pinhole) for name, pinhole in calibration.cameras.items()},
     }
     if calibration.projector is not None:
-        data["projector"] = _device(calibration.projector)
+        data["projector"] = _device_document(calibration.projector)
     for name, known in (("solved", calibration.solved), ("light", calibration.light)):
         if known is not None:
             data[name] = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(known).items()}
@@ -545,8 +549,9 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def check_calibration(calibration: Calibration, projector: Size, cameras: Mapping[str, Size], source: str) -> None:
-    """Hold a calibration against the devices that it will be used for. `source` says where it came from.
-    Raises CalibrationError: it was made for devices of another size, or knows none of the cameras.
+    """Compare a calibration with the devices that it will be used for. source : its origin, for messages.
+
+    Raises CalibrationError: it was made for devices of another size, or has none of the cameras.
     """
     faults = [
         f"cameras.{name}: expected {size} as the camera's frames are, found {calibration.cameras[name].size}"
@@ -563,21 +568,22 @@ def check_calibration(calibration: Calibration, projector: Size, cameras: Mappin
         raise CalibrationError(message)
 
 
-def check_rays(calibration: Calibration, cameras: Collection[str], source: str) -> None:
-    """See that with these cameras the calibration has two rays for each point. `source` says where it came from.
-    Raises CalibrationError: it has no projector, and one of the cameras.
+def require_two_rays(calibration: Calibration, cameras: Collection[str], source: str) -> None:
+    """Check that with these cameras the calibration has two rays for each point. source : its origin, for messages.
+
+    Raises CalibrationError: it has no projector, and only one of the cameras.
     """
     known = [name for name in cameras if name in calibration.cameras]
     if calibration.projector is None and len(known) < 2:
-        whose = f"camera '{known[0]}'" if known else "none of these cameras"
+        owner = f"camera '{known[0]}'" if known else "none of these cameras"
         raise CalibrationError(
-            f"{source}: expected a calibration with two rays for each point, found that of {whose} alone, without a "
-            "projector: it tells no depth, and cannot scan; calibrate the camera together with the projector or with a "
+            f"{source}: expected a calibration with two rays for each point, found that of {owner} alone, without a "
+            "projector: it has no depth, and cannot scan; calibrate the camera together with the projector or with a "
             "second camera"
         )
 
 
-def _solved(entry: SolvedEntry | None) -> SolveRecord | None:
+def _build_solved(entry: SolvedEntry | None) -> SolveRecord | None:
     if entry is None:
         return None
     covariance, volume_mm = (np.array(each, dtype=np.float64) for each in (entry.covariance, entry.volume_mm))
@@ -586,13 +592,13 @@ def _solved(entry: SolvedEntry | None) -> SolveRecord | None:
     )
 
 
-def _light(entry: LightEntry | None) -> LightMap | None:
+def _build_light_map(entry: LightEntry | None) -> LightMap | None:
     if entry is None:
         return None
     return LightMap(*(np.array(each, dtype=np.float64) for each in (entry.coefficients, entry.covered_px)))
 
 
-def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:
+def _build_pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:
     numbers = (device.matrix, device.distortion, device.rotation, device.translation_mm)
     try:
         return Pinhole(Size(*device.size_px), *(np.array(each, dtype=np.float64) for each in numbers))
@@ -600,6 +606,6 @@ def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:
         raise CalibrationError(f"{path}: {place}.{cause}") from cause
 
 
-def _device(pinhole: Pinhole) -> dict[str, Any]:
+def _device_document(pinhole: Pinhole) -> dict[str, Any]:
     numbers = {key: getattr(pinhole, key).tolist() for key in ("matrix", "distortion", "rotation", "translation_mm")}
     return {"size_px": [pinhole.size.width_px, pinhole.size.height_px], **numbers}

@@ -1,4 +1,4 @@
-"""bundle.json: what a scan bundle says about itself, checked before a single pixel is read."""
+"""bundle.json: the description of a scan bundle, validated before a single pixel is read."""
 
 from __future__ import annotations
 
@@ -7,36 +7,36 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator, field_validator
 
-from slrig.bundle.validation import MOST_FAULTS, AwareMoment, Strict, read_description_of
+from slrig.bundle.validation import MAX_FAULTS, AwareMoment, Strict, read_json_model
 from slrig.errors import BundleError, PatternError
 from slrig.model import CameraFormat, Pattern, Size
 
 DESCRIPTION = "bundle.json"
-MOST_DESCRIPTION_BYTES = 16 * 2**20
-MOST_SIDE_PX = 2**15
-MOST_CAMERA_PX = 2**26
-MOST_CAPTURE_BYTES = 2**32
+MAX_DESCRIPTION_BYTES = 16 * 2**20
+MAX_SIDE_PX = 2**15
+MAX_CAMERA_PX = 2**26
+MAX_CAPTURE_BYTES = 2**32
 CAMERA_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 """Names of cameras become names of files."""
 PROJECTOR = "projector"
-"""The projector's name beside those of the cameras, wherever devices are told apart; no camera has it."""
+"""Name of the projector among those of the cameras; no camera may have it."""
 
-Side = Annotated[int, Field(ge=1, le=MOST_SIDE_PX)]
+Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]
 Extent = Annotated[list[Side], Field(min_length=2, max_length=2)]
 
 
-def _of_a_camera(name: str) -> str:
+def _refuse_projector_name(name: str) -> str:
     if name == PROJECTOR:
         message = f"expected a camera's own name, found '{name}', which is the projector's; rename the camera"
         raise ValueError(message)
     return name
 
 
-CameraName = Annotated[str, Field(pattern=CAMERA_NAME), AfterValidator(_of_a_camera)]
+CameraName = Annotated[str, Field(pattern=CAMERA_NAME), AfterValidator(_refuse_projector_name)]
 
 
 class ProjectorEntry(Strict):
-    """The projector: how many columns and rows it has."""
+    """The projector: its number of columns and rows."""
 
     size_px: Extent
 
@@ -48,33 +48,33 @@ class CameraEntry(Strict):
     bit_depth: Annotated[int, Field(ge=1, le=16)]
     compression_dn: Annotated[
         float,
-        Field(ge=0, le=1000, description="written by earlier versions; the frames tell it"),
+        Field(ge=0, le=1000, description="written by earlier versions; now measured in the frames"),
     ] = 0.0
 
     @field_validator("size_px")
     @classmethod
-    def _fits_memory(cls, size_px: list[int]) -> list[int]:
-        if size_px[0] * size_px[1] > MOST_CAMERA_PX:
+    def _check_frame_size(cls, size_px: list[int]) -> list[int]:
+        if size_px[0] * size_px[1] > MAX_CAMERA_PX:
             raise ValueError(
-                f"expected at most {MOST_CAMERA_PX} pixels per frame, found {size_px[0]} x {size_px[1]}; "
+                f"expected at most {MAX_CAMERA_PX} pixels per frame, found {size_px[0]} x {size_px[1]}; "
                 "crop or bin the frames"
             )
         return size_px
 
 
-def _possible(data: object, checked: ValidatorFunctionWrapHandler) -> Pattern:
+def _validate_pattern(data: object, handler: ValidatorFunctionWrapHandler) -> Pattern:
     try:
-        pattern: Pattern = checked(data)
+        pattern: Pattern = handler(data)
     except PatternError as cause:
         raise ValueError(str(cause)) from cause
     return pattern
 
 
-PatternEntry = Annotated[Pattern, Field(discriminator="kind"), WrapValidator(_possible)]
+PatternEntry = Annotated[Pattern, Field(discriminator="kind"), WrapValidator(_validate_pattern)]
 
 
 class FrameEntry(Strict):
-    """One frame: which pattern, which camera, which file (and page of it), and when.
+    """One frame: its pattern, camera, file, page of the file, and time.
 
     colour_file : the same picture in colour, of a white or black frame.
     """
@@ -89,7 +89,7 @@ class FrameEntry(Strict):
 
     @field_validator("file", "colour_file")
     @classmethod
-    def _inside(cls, file: str | None) -> str | None:
+    def _check_path(cls, file: str | None) -> str | None:
         if file is None:
             return None
         path = PurePosixPath(file)
@@ -128,7 +128,8 @@ class Description(Strict):
 
 
 def read_description(folder: Path) -> Description:
-    """Return the checked description of the bundle in `folder`.
+    """Return the validated description of the bundle in `folder`.
+
     Raises BundleError: every fault of bundle.json in one message.
     """
     path = folder / DESCRIPTION
@@ -136,17 +137,17 @@ def read_description(folder: Path) -> Description:
         found = "no such folder" if not folder.is_dir() else "a folder without it"
         message = f"{path}: expected the description of a scan bundle, found {found}; give the folder that holds it"
         raise BundleError(message)
-    what = "bundle description"
-    description = read_description_of(path, Description, what, most_bytes=MOST_DESCRIPTION_BYTES, error=BundleError)
-    faults = _cross_faults(description)
+    name = "bundle description"
+    description = read_json_model(path, Description, name, max_bytes=MAX_DESCRIPTION_BYTES, error=BundleError)
+    faults = _find_inconsistencies(description)
     if faults:
-        message = f"{path} is not a valid {what}:\n" + "\n".join(f"  {fault}" for fault in faults[:MOST_FAULTS])
+        message = f"{path} is not a valid {name}:\n" + "\n".join(f"  {fault}" for fault in faults[:MAX_FAULTS])
         raise BundleError(message)
     return description
 
 
-def _cross_faults(description: Description) -> list[str]:
-    """Faults that take two places of the file to see."""
+def _find_inconsistencies(description: Description) -> list[str]:
+    """Return faults between different parts of the file."""
     faults = []
     cameras = description.camera_formats()
     size_bytes = 0
@@ -165,9 +166,9 @@ def _cross_faults(description: Description) -> list[str]:
             continue
         images = 1 if frame.colour_file is None else 4
         size_bytes += images * camera.size.width_px * camera.size.height_px * (1 if camera.bit_depth <= 8 else 2)
-    if size_bytes > MOST_CAPTURE_BYTES:
+    if size_bytes > MAX_CAPTURE_BYTES:
         faults.append(
-            f"frames: expected at most {MOST_CAPTURE_BYTES / 1e9:.1f} GB of samples, "
+            f"frames: expected at most {MAX_CAPTURE_BYTES / 1e9:.1f} GB of samples, "
             f"found {size_bytes / 1e9:.1f} GB in {len(description.frames)} frames; split the bundle or crop its frames"
         )
     return faults

@@ -1,9 +1,9 @@
 """Frame files: PNG, TIFF, BMP and JPEG; headers are checked before a pixel is decoded.
 
 A few hundred kilobytes can declare an image of gigabytes, so extent and depth come from the header, and only a file
-that fits what bundle.json declares is decoded. A PNG's chunks are walked with their checksums: a cut or damaged file is
-told as that, not as a strange image. So are TIFF pages without compression or with zlib; a fault inside LZW data, which
-has no checksum, shows only where the decoder stumbles, and one inside a JPEG as a strange image.
+that fits bundle.json is decoded. The checksums of all chunks of a PNG are verified, so that a cut or damaged file is
+reported as damaged. The same holds for TIFF pages without compression or with zlib; damaged LZW data, which have no
+checksum, are noticed only if the decoder fails, and damage within a JPEG may give a wrong image.
 """
 
 from __future__ import annotations
@@ -31,224 +31,33 @@ _BITS = {8: 1, 24: 3}
 
 JPEG_SIGNATURE = b"\xff\xd8\xff"
 _END = b"\xff\xd9"
-_FRAMES = {0xC0, 0xC1, 0xC2}
-"""Baseline, extended sequential and progressive, all with Huffman codes: what everybody writes."""
-_OTHER_FRAMES = {0xC3, *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0)}
+_FRAME_MARKERS = {0xC0, 0xC1, 0xC2}
+"""Baseline, extended sequential and progressive, all with Huffman codes: the common ones."""
+_UNSUPPORTED_FRAMES = {0xC3, *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0)}
 _TABLES, _SCAN = 0xDB, 0xDA
-_REMARKS = {*range(0xE1, 0xEE), 0xEF, 0xFE}
-"""Applications' own segments but JFIF's and Adobe's, which say how colours are coded, and comments."""
-_NEXT_SCAN, _MOST_SCANS = b"\xff\xda", 64
-"""Each scan of a progressive file costs a pass over all pixels; usual are ten."""
+_METADATA_MARKERS = {*range(0xE1, 0xEE), 0xEF, 0xFE}
+"""Comments, and segments of applications except those of JFIF and Adobe, which define the colours."""
+_NEXT_SCAN, _MAX_SCANS = b"\xff\xda", 64
+"""Each scan of a progressive file takes a pass over all pixels; most files have ten."""
 
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-MOST_TIFF_PAGES = 65536
-"""As many as a page's number in bundle.json can name."""
-MOST_TIFF_TAGS = 256
+MAX_TIFF_PAGES = 65536
+"""The page numbers that bundle.json can hold."""
+MAX_TIFF_TAGS = 256
 
-
-def tiff_page_count(data: bytes) -> int:
-    """How many pages the chain of a TIFF's directories has, walked before anybody reads one.
-    Raises ValueError with words for a chain that leads out of the file, comes back to itself or does not end.
-    """
-    order = "<" if data.startswith(b"II") else ">"
-    big = data[2:4] in (b"+\0", b"\0+")
-    count_of, tag_bytes, next_of, first = ("Q", 20, "Q", 8) if big else ("H", 12, "I", 4)
-    seen: set[int] = set()
-    try:
-        (place,) = struct.unpack_from(order + next_of, data, first)
-        while place:
-            if place in seen or len(seen) == MOST_TIFF_PAGES:
-                raise ValueError(f"a chain of pages that does not end after {len(seen)}")
-            seen.add(place)
-            (tags,) = struct.unpack_from(order + count_of, data, place)
-            if tags > MOST_TIFF_TAGS:
-                raise ValueError(f"{tags} tags on page {len(seen) - 1}")
-            (place,) = struct.unpack_from(
-                order + next_of, data, place + struct.calcsize(order + count_of) + tags * tag_bytes
-            )
-    except (struct.error, OverflowError) as cause:
-        raise ValueError(f"a chain of pages cut after {len(seen)}") from cause
-    return len(seen)
-
-
-@dataclass(frozen=True, slots=True)
-class Bitmap:
-    """A BMP's header. first_byte : of the rows, each of `stride` bytes; upside_down : the last row comes first, as is
-    usual. palette_entries : of 4 bytes each, behind the header.
-    """
-
-    width: int
-    height: int
-    bits: int
-    first_byte: int
-    stride: int
-    upside_down: bool
-    header_bytes: int
-    palette_entries: int
-
-    @classmethod
-    def of(cls, data: bytes) -> Bitmap:
-        """Read the header. Raises ValueError with words for what it is instead of a BMP that can be read."""
-        if len(data) < _FILE_HEADER + _INFO_HEADER:
-            raise ValueError(f"{len(data)} bytes without a header")
-        (first_byte,) = struct.unpack_from("<I", data, 10)
-        size, width, height, _, bits, compression, _, _, _, colours = struct.unpack_from("<IiiHHIIiiI", data, 14)
-        if size < _INFO_HEADER or width < 1 or height == 0:
-            raise ValueError(f"a header of {size} bytes for {width} x {height} pixels")
-        if bits not in _BITS or compression:
-            raise ValueError(f"{bits} bits, {'compressed' if compression else 'uncompressed'}")
-        entries = (colours or 256) if bits == 8 else 0
-        found = cls(
-            width, abs(height), bits, first_byte, -(-bits * width // 32) * 4, height > 0, _FILE_HEADER + size, entries
-        )
-        if found.header_bytes + 4 * entries > first_byte or entries > 256:
-            raise ValueError("a palette that overlaps its pixels")
-        if first_byte + found.stride * found.height > len(data):
-            raise ValueError(f"one cut after {len(data)} bytes")
-        return found
-
-    def decoded(self, data: bytes) -> Pixels:
-        """(H, W) or, in colour, (H, W, 3) uint8, blue, green, red. Raises ValueError for a sample without a colour."""
-        rows = np.frombuffer(data, np.uint8, self.stride * self.height, self.first_byte).reshape(self.height, -1)
-        rows = rows[:: -1 if self.upside_down else 1, : self.width * _BITS[self.bits]]
-        if self.bits == 24:
-            return np.ascontiguousarray(rows).reshape(self.height, self.width, 3)
-        if int(rows.max()) >= self.palette_entries:
-            raise ValueError(f"a sample of {int(rows.max())} and a palette of {self.palette_entries}")
-        colours = np.frombuffer(data, np.uint8, 4 * self.palette_entries, self.header_bytes).reshape(-1, 4)[:, :3]
-        grey = (colours == colours[:, :1]).all()
-        return np.ascontiguousarray(colours[rows, 0] if grey else colours[rows])
-
-
-@dataclass(frozen=True, slots=True)
-class Jpeg:
-    """A JPEG's header. components : 1 or 3; remarks : first byte and end of each segment that has no part in the
-    picture, as Exif.
-    """
-
-    width: int
-    height: int
-    components: int
-    remarks: tuple[tuple[int, int], ...]
-
-    def plain(self, data: bytes) -> bytes:
-        """The file without its remarks, for a decoder that would read them."""
-        ends = (0, *(end for _, end in self.remarks))
-        return b"".join(data[a:b] for a, b in zip(ends, (*(a for a, _ in self.remarks), len(data)), strict=True))
-
-    @classmethod
-    def of(cls, data: bytes) -> Jpeg:
-        """Read the header. Raises ValueError with words for what it is instead of a JPEG that can be read."""
-        tables: set[int] = set()
-        frame: tuple[int, int, int, int] | None = None
-        remarks = []
-        place = 2
-        while True:
-            marker, length = struct.unpack(">HH", data[place : place + 4].ljust(4, b"\0"))
-            kind, segment = marker & 0xFF, data[place + 4 : place + 2 + length]
-            if marker >> 8 != 0xFF or length < 2 or len(segment) != length - 2:
-                raise ValueError(f"a header that breaks off at byte {place}")
-            if kind in _OTHER_FRAMES:
-                raise ValueError("a lossless, hierarchical or arithmetic one")
-            if kind in _FRAMES:
-                frame = _frame(segment)
-            elif kind == _TABLES:
-                tables |= _table_numbers(segment)
-            elif kind in _REMARKS:
-                remarks.append((place, place + 2 + length))
-            place += 2 + length
-            if kind == _SCAN:
-                break
-        if frame is None or frame[3] not in tables:
-            raise ValueError("a header without an image or its quantisers")
-        if not data.rstrip(b"\0").endswith(_END):
-            raise ValueError(f"one cut after {len(data)} bytes")
-        if data.count(_NEXT_SCAN, place) >= _MOST_SCANS:
-            raise ValueError(f"one of more than {_MOST_SCANS} scans")
-        height, width, components, _ = frame
-        return cls(width, height, components, tuple(remarks))
-
-
-def _frame(segment: bytes) -> tuple[int, int, int, int]:
-    """Height, width, components, and the quantisers of the first one, which is the grey."""
-    if len(segment) < 9:
-        raise ValueError("a header without an image")
-    bits, height, width, components = struct.unpack_from(">BHHB", segment)
-    if bits != 8 or components not in (1, 3) or not height or not width:
-        raise ValueError(f"{width} x {height} samples of {bits} bits, {components} for each pixel")
-    return height, width, components, segment[8]
-
-
-def _table_numbers(segment: bytes) -> set[int]:
-    """The numbers of the tables of quantisers that a segment holds."""
-    found, place = set(), 0
-    while place < len(segment):
-        size = 129 if segment[place] >> 4 else 65
-        if place + size > len(segment):
-            raise ValueError("a header with a part of a table")
-        found.add(segment[place] & 15)
-        place += size
-    return found
-
-
-SIGNATURE = b"\x89PNG\r\n\x1a\n"
-GREY, COLOUR = 0, 2
-FILTERS = 4
-"""The greatest number of a filter."""
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_GREY, PNG_COLOUR = 0, 2
+PNG_MAX_FILTER = 4
+"""Highest filter number."""
 
 _UP = 2
 _LEVEL = 1
-HEADER = struct.Struct(">IIBBBBB")
-"""Width, height, bits, colour, and ways of packing, filtering and interlacing."""
-
-
-def encode_frame(image: Pixels, name: str) -> bytes:
-    """A frame, (H, W) or, blue, green and red, (H, W, 3) uint8 or uint16, as PNG. name : for the error.
-    Raises BundleError: it is no such image.
-    """
-    kind = {(): GREY, (3,): COLOUR}.get(image.shape[2:])
-    if image.ndim < 2 or kind is None or image.size == 0 or image.dtype not in (np.uint8, np.uint16):
-        raise BundleError(f"{name}: expected an image of 8 or 16 bits, found {image.shape} {image.dtype}")
-    height, width = image.shape[:2]
-    # A PNG's colours are red, green and blue.
-    ordered = image if kind == GREY else cv2.cvtColor(image, cv2.COLOR_BGR2RGB).reshape(height, -1)
-    samples = np.ascontiguousarray(ordered, dtype=">u2" if image.itemsize == 2 else np.uint8).view(np.uint8)
-    rows = np.zeros((height, 1 + samples.shape[1]), dtype=np.uint8)
-    rows[:, 0] = _UP
-    rows[0, 1:] = samples[0]
-    np.subtract(samples[1:], samples[:-1], out=rows[1:, 1:])
-    header = HEADER.pack(width, height, 8 * image.itemsize, kind, 0, 0, 0)
-    return png_file(header, isal_zlib.compress(rows, _LEVEL))
-
-
-def png_file(header: bytes, packed: bytes) -> bytes:
-    """A PNG of these contents of its IHDR and IDAT chunks."""
-    parts = [SIGNATURE]
-    for kind, data in ((b"IHDR", header), (b"IDAT", packed), (b"IEND", b"")):
-        checksum = zlib.crc32(data, zlib.crc32(kind))
-        parts += [struct.pack(">I", len(data)), kind, data, struct.pack(">I", checksum)]
-    return b"".join(parts)
-
-
-def rows_above_added(rows: bytes, height: int, bits: int) -> Pixels | None:
-    """The (H, W) image whose rows were all filtered by differences to the row above; None where they were not.
-
-    rows : the unpacked rows of a grey image, each with the number of its filter first.
-    """
-    filtered = np.frombuffer(rows, dtype=np.uint8).reshape(height, -1)
-    if (filtered[:, 0] != _UP).any():
-        return None
-    samples = np.zeros((height, filtered.shape[1] - 1), dtype=np.uint8)
-    samples[0] = filtered[0, 1:]
-    # Row by row: an accumulation over the whole walks down the columns, and takes fifteen times as long.
-    for above, row, differences in zip(samples, samples[1:], filtered[1:, 1:], strict=False):
-        np.add(above, differences, out=row)
-    return samples if bits == 8 else samples.view(">u2").astype(np.uint16)
-
+PNG_HEADER = struct.Struct(">IIBBBBB")
+"""Width, height, bits, colour, and methods of compression, filtering and interlacing."""
 
 TIFF_ZLIB = (8, 32946)  # compression: Adobe's deflate and the older one
 TIFF_COMPRESSIONS = (1, 5, *TIFF_ZLIB)  # none, LZW
-MOST_FILE_BYTES = 2**31
+MAX_FILE_BYTES = 2**31
 TIFF_FAULTS = (
     tifffile.TiffFileError,
     struct.error,
@@ -261,23 +70,215 @@ TIFF_FAULTS = (
     TypeError,
     ValueError,
 )
-"""What reading a damaged TIFF header may raise."""
+"""Errors of reading a damaged TIFF header."""
+
+
+def count_tiff_pages(data: bytes) -> int:
+    """Return the number of pages of a TIFF, by following the chain of its directories before any of them is read.
+
+    Raises ValueError with a description of a chain that leads out of the file, is circular or does not end.
+    """
+    order = "<" if data.startswith(b"II") else ">"
+    is_big = data[2:4] in (b"+\0", b"\0+")
+    count_format, tag_bytes, offset_format, first = ("Q", 20, "Q", 8) if is_big else ("H", 12, "I", 4)
+    visited: set[int] = set()
+    try:
+        (offset,) = struct.unpack_from(order + offset_format, data, first)
+        while offset:
+            if offset in visited or len(visited) == MAX_TIFF_PAGES:
+                raise ValueError(f"a chain of pages that does not end after {len(visited)}")
+            visited.add(offset)
+            (tags,) = struct.unpack_from(order + count_format, data, offset)
+            if tags > MAX_TIFF_TAGS:
+                raise ValueError(f"{tags} tags on page {len(visited) - 1}")
+            (offset,) = struct.unpack_from(
+                order + offset_format, data, offset + struct.calcsize(order + count_format) + tags * tag_bytes
+            )
+    except (struct.error, OverflowError) as cause:
+        raise ValueError(f"a chain of pages cut after {len(visited)}") from cause
+    return len(visited)
+
+
+@dataclass(frozen=True, slots=True)
+class BmpHeader:
+    """Header of a BMP. first_byte : of the rows, each of `stride` bytes. upside_down : True if the last row comes
+    first, as usual. palette_entries : of 4 bytes each, after the header.
+    """
+
+    width: int
+    height: int
+    bits: int
+    first_byte: int
+    stride: int
+    upside_down: bool
+    header_bytes: int
+    palette_entries: int
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> BmpHeader:
+        """Read the header. Raises ValueError with a description of a file that is damaged or not supported."""
+        if len(data) < _FILE_HEADER + _INFO_HEADER:
+            raise ValueError(f"{len(data)} bytes without a header")
+        (first_byte,) = struct.unpack_from("<I", data, 10)
+        size, width, height, _, bits, compression, _, _, _, colours = struct.unpack_from("<IiiHHIIiiI", data, 14)
+        if size < _INFO_HEADER or width < 1 or height == 0:
+            raise ValueError(f"a header of {size} bytes for {width} x {height} pixels")
+        if bits not in _BITS or compression:
+            raise ValueError(f"{bits} bits, {'compressed' if compression else 'uncompressed'}")
+        entries = (colours or 256) if bits == 8 else 0
+        header = cls(
+            width, abs(height), bits, first_byte, -(-bits * width // 32) * 4, height > 0, _FILE_HEADER + size, entries
+        )
+        if header.header_bytes + 4 * entries > first_byte or entries > 256:
+            raise ValueError("a palette that overlaps its pixels")
+        if first_byte + header.stride * header.height > len(data):
+            raise ValueError(f"one cut after {len(data)} bytes")
+        return header
+
+    def decode(self, data: bytes) -> Pixels:
+        """Return (H, W) or, in colour, (H, W, 3) uint8, BGR. Raises ValueError if a sample is not in the palette."""
+        rows = np.frombuffer(data, np.uint8, self.stride * self.height, self.first_byte).reshape(self.height, -1)
+        rows = rows[:: -1 if self.upside_down else 1, : self.width * _BITS[self.bits]]
+        if self.bits == 24:
+            return np.ascontiguousarray(rows).reshape(self.height, self.width, 3)
+        if int(rows.max()) >= self.palette_entries:
+            raise ValueError(f"a sample of {int(rows.max())} and a palette of {self.palette_entries}")
+        colours = np.frombuffer(data, np.uint8, 4 * self.palette_entries, self.header_bytes).reshape(-1, 4)[:, :3]
+        is_grey = (colours == colours[:, :1]).all()
+        return np.ascontiguousarray(colours[rows, 0] if is_grey else colours[rows])
+
+
+@dataclass(frozen=True, slots=True)
+class JpegHeader:
+    """Header of a JPEG. components : 1 or 3. metadata : start and end of each segment without effect on the picture,
+    such as Exif.
+    """
+
+    width: int
+    height: int
+    components: int
+    metadata: tuple[tuple[int, int], ...]
+
+    def without_metadata(self, data: bytes) -> bytes:
+        """Return the file without metadata, which a decoder would read."""
+        ends = (0, *(end for _, end in self.metadata))
+        return b"".join(data[a:b] for a, b in zip(ends, (*(a for a, _ in self.metadata), len(data)), strict=True))
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> JpegHeader:
+        """Read the header. Raises ValueError with a description of a file that is damaged or not supported."""
+        tables: set[int] = set()
+        frame: tuple[int, int, int, int] | None = None
+        metadata = []
+        offset = 2
+        while True:
+            marker, length = struct.unpack(">HH", data[offset : offset + 4].ljust(4, b"\0"))
+            kind, segment = marker & 0xFF, data[offset + 4 : offset + 2 + length]
+            if marker >> 8 != 0xFF or length < 2 or len(segment) != length - 2:
+                raise ValueError(f"a header that breaks off at byte {offset}")
+            if kind in _UNSUPPORTED_FRAMES:
+                raise ValueError("a lossless, hierarchical or arithmetic one")
+            if kind in _FRAME_MARKERS:
+                frame = _frame(segment)
+            elif kind == _TABLES:
+                tables |= _table_numbers(segment)
+            elif kind in _METADATA_MARKERS:
+                metadata.append((offset, offset + 2 + length))
+            offset += 2 + length
+            if kind == _SCAN:
+                break
+        if frame is None or frame[3] not in tables:
+            raise ValueError("a header without an image or its quantisers")
+        if not data.rstrip(b"\0").endswith(_END):
+            raise ValueError(f"one cut after {len(data)} bytes")
+        if data.count(_NEXT_SCAN, offset) >= _MAX_SCANS:
+            raise ValueError(f"one of more than {_MAX_SCANS} scans")
+        height, width, components, _ = frame
+        return cls(width, height, components, tuple(metadata))
+
+
+def _frame(segment: bytes) -> tuple[int, int, int, int]:
+    """Return height, width, number of components, and the quantiser of the first component, which is grey."""
+    if len(segment) < 9:
+        raise ValueError("a header without an image")
+    bits, height, width, components = struct.unpack_from(">BHHB", segment)
+    if bits != 8 or components not in (1, 3) or not height or not width:
+        raise ValueError(f"{width} x {height} samples of {bits} bits, {components} for each pixel")
+    return height, width, components, segment[8]
+
+
+def _table_numbers(segment: bytes) -> set[int]:
+    """Return the numbers of the quantisation tables in a segment."""
+    numbers, offset = set(), 0
+    while offset < len(segment):
+        size = 129 if segment[offset] >> 4 else 65
+        if offset + size > len(segment):
+            raise ValueError("a header with a part of a table")
+        numbers.add(segment[offset] & 15)
+        offset += size
+    return numbers
+
+
+def encode_frame(image: Pixels, name: str) -> bytes:
+    """Encode a frame, (H, W) or, blue, green and red, (H, W, 3) uint8 or uint16, as PNG. name : for messages.
+
+    Raises BundleError: the image has another shape or type.
+    """
+    kind = {(): PNG_GREY, (3,): PNG_COLOUR}.get(image.shape[2:])
+    if image.ndim < 2 or kind is None or image.size == 0 or image.dtype not in (np.uint8, np.uint16):
+        raise BundleError(f"{name}: expected an image of 8 or 16 bits, found {image.shape} {image.dtype}")
+    height, width = image.shape[:2]
+    # A PNG's colours are red, green and blue.
+    ordered = image if kind == PNG_GREY else cv2.cvtColor(image, cv2.COLOR_BGR2RGB).reshape(height, -1)
+    samples = np.ascontiguousarray(ordered, dtype=">u2" if image.itemsize == 2 else np.uint8).view(np.uint8)
+    rows = np.zeros((height, 1 + samples.shape[1]), dtype=np.uint8)
+    rows[:, 0] = _UP
+    rows[0, 1:] = samples[0]
+    np.subtract(samples[1:], samples[:-1], out=rows[1:, 1:])
+    header = PNG_HEADER.pack(width, height, 8 * image.itemsize, kind, 0, 0, 0)
+    return assemble_png(header, isal_zlib.compress(rows, _LEVEL))
+
+
+def assemble_png(header: bytes, compressed: bytes) -> bytes:
+    """Return a PNG with these contents of its IHDR and IDAT chunks."""
+    parts = [PNG_SIGNATURE]
+    for name, data in ((b"IHDR", header), (b"IDAT", compressed), (b"IEND", b"")):
+        checksum = zlib.crc32(data, zlib.crc32(name))
+        parts += [struct.pack(">I", len(data)), name, data, struct.pack(">I", checksum)]
+    return b"".join(parts)
+
+
+def undo_up_filter(rows: bytes, height: int, bits: int) -> Pixels | None:
+    """Return the (H, W) image of rows that were all filtered by differences to the row above; None if they were not.
+
+    rows : decompressed rows of a grey image, each with the number of its filter first.
+    """
+    filtered = np.frombuffer(rows, dtype=np.uint8).reshape(height, -1)
+    if (filtered[:, 0] != _UP).any():
+        return None
+    samples = np.zeros((height, filtered.shape[1] - 1), dtype=np.uint8)
+    samples[0] = filtered[0, 1:]
+    # Row by row: np.cumsum along columns takes fifteen times as long.
+    for above, row, differences in zip(samples, samples[1:], filtered[1:, 1:], strict=False):
+        np.add(above, differences, out=row)
+    return samples if bits == 8 else samples.view(">u2").astype(np.uint16)
 
 
 def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[int, Pixels]:
-    """Return the wanted pages of a frame file, each (H, W) uint8 or uint16 of the camera's extent.
+    """Return pages of a frame file, each (H, W) uint8 or uint16 of the camera's extent.
 
-    Samples are right-aligned; colour becomes grey with the weights of Rec. 601.
-    Raises BundleError: the file is missing, cut, damaged, of another kind, extent or depth, or has no such page.
+    Samples are right-aligned; colour becomes grey with the weights of Rec. 601. Raises BundleError: the file is
+    missing, cut, damaged, of another kind, extent or depth, or has no such page.
     """
     return read_with_colour(path, pages, camera)[0]
 
 
 def read_colour(path: Path, camera: CameraFormat) -> Pixels:
-    """Return a file's picture in colour, (H, W, 3) of blue, green and red. Raises BundleError: see `read_pages`; or it
-    is grey, or a sample lies beyond the camera's full scale.
+    """Return the colour picture in a file, (H, W, 3) of blue, green and red.
+
+    Raises BundleError: see `read_pages`; or the picture is grey, or a sample is above the camera's full scale.
     """
-    found = read_with_colour(path, (0,), camera, coloured=(0,))[1]
+    found = read_with_colour(path, (0,), camera, colour_pages=(0,))[1]
     if not found:
         wanted = f"a colour image with samples of 0 to {camera.full_scale}"
         _refuse(path, wanted, "a grey one, or a brighter sample", "save it in colour, or leave colour_file out")
@@ -285,13 +286,15 @@ def read_colour(path: Path, camera: CameraFormat) -> Pixels:
 
 
 def read_with_colour(
-    path: Path, pages: Sequence[int], camera: CameraFormat, *, coloured: Collection[int] = ()
+    path: Path, pages: Sequence[int], camera: CameraFormat, *, colour_pages: Collection[int] = ()
 ) -> tuple[dict[int, Pixels], dict[int, Pixels]]:
-    """As `read_pages`, and of the pages `coloured` those that are in colour, (H, W, 3) of blue, green and red. Colour
-    that does not fit the camera's full scale is left out: the grey of it may. Raises as `read_pages` does.
+    """Return pages as `read_pages` does, and the colour of those in `colour_pages` that have any.
+
+    Colour is (H, W, 3) of blue, green and red. Colour above the camera's full scale is omitted, because its grey may
+    still fit. Raises as `read_pages` does.
     """
     data = _read_bytes(path)
-    readers = {SIGNATURE: _png, BMP_SIGNATURE: _bitmap, JPEG_SIGNATURE: _jpeg}
+    readers = {PNG_SIGNATURE: _png, BMP_SIGNATURE: _bitmap, JPEG_SIGNATURE: _jpeg}
     read = next((each for signature, each in readers.items() if data.startswith(signature)), None)
     if data.startswith(TIFF_SIGNATURES):
         _check_tiff(path, data, pages, camera)
@@ -304,26 +307,29 @@ def read_with_colour(
         found = "an empty file" if not data else f"a file that begins with {data[:8]!r}"
         _refuse(path, "a PNG, TIFF, BMP or JPEG file", found, "save the frame as PNG")
     grey = {page: _grey(path, page, image, camera) for page, image in images.items()}
-    kept = {page: image for page, image in images.items() if page in coloured and image is not None and image.ndim == 3}
-    return grey, {page: image for page, image in kept.items() if int(image.max()) <= camera.full_scale}
+    colours = {
+        page: image for page, image in images.items() if page in colour_pages and image is not None and image.ndim == 3
+    }
+    return grey, {page: image for page, image in colours.items() if int(image.max()) <= camera.full_scale}
 
 
-def frame_format(path: Path) -> CameraFormat:
-    """Extent and bits of the samples, 8 or 16, of the first page of a frame file, by its header alone.
-    Raises BundleError: the file is missing or cut, or is none that `read_pages` reads.
+def read_frame_format(path: Path) -> CameraFormat:
+    """Return extent and bits of the samples, 8 or 16, of the first page of a frame file, from its header alone.
+
+    Raises BundleError: the file is missing or cut, or `read_pages` does not read it.
     """
     data = _read_bytes(path)
     try:
-        if data.startswith(SIGNATURE) and data[12:16] == b"IHDR" and len(data) >= 33:
-            width, height, bits = HEADER.unpack(data[16:29])[:3]
+        if data.startswith(PNG_SIGNATURE) and data[12:16] == b"IHDR" and len(data) >= 33:
+            width, height, bits = PNG_HEADER.unpack(data[16:29])[:3]
         elif data.startswith(BMP_SIGNATURE):
-            bitmap = Bitmap.of(data)
+            bitmap = BmpHeader.from_bytes(data)
             width, height, bits = bitmap.width, bitmap.height, 8
         elif data.startswith(JPEG_SIGNATURE):
-            jpeg = Jpeg.of(data)
+            jpeg = JpegHeader.from_bytes(data)
             width, height, bits = jpeg.width, jpeg.height, 8
         elif data.startswith(TIFF_SIGNATURES):
-            tiff_page_count(data)
+            count_tiff_pages(data)
             with tifffile.TiffFile(io.BytesIO(data)) as tiff:
                 page = tiff.pages[0]
                 width, height, bits = page.imagewidth, page.imagelength, page.bitspersample
@@ -344,8 +350,8 @@ def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
 def _read_bytes(path: Path) -> bytes:
     try:
         size_bytes = path.stat().st_size
-        if size_bytes > MOST_FILE_BYTES:
-            _refuse(path, f"at most {MOST_FILE_BYTES} bytes", f"{size_bytes}", "split the frames over several files")
+        if size_bytes > MAX_FILE_BYTES:
+            _refuse(path, f"at most {MAX_FILE_BYTES} bytes", f"{size_bytes}", "split the frames over several files")
         return path.read_bytes()
     except OSError as cause:
         raise BundleError(
@@ -376,71 +382,71 @@ def _check_header(path: Path, width: int, height: int, bits: int, camera: Camera
 def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         _refuse(path, "a whole PNG file", f"{len(data)} bytes without a header", "copy the frame again")
-    width, height, bits, colour, _, _, interlaced = HEADER.unpack(data[16:29])
-    if colour not in (GREY, COLOUR):
+    width, height, bits, colour, _, _, interlaced = PNG_HEADER.unpack(data[16:29])
+    if colour not in (PNG_GREY, PNG_COLOUR):
         kind = "a palette" if colour == 3 else "an alpha channel"
         _refuse(path, "a grey or colour PNG", f"one with {kind}", "save the frame as grey")
     if interlaced:
         _refuse(path, "a PNG line by line", "an interlaced one", "save the frame without interlacing")
     _check_header(path, width, height, bits, camera)
-    place = len(SIGNATURE)
-    packed = bytearray()
+    offset = len(PNG_SIGNATURE)
+    compressed = bytearray()
     while True:
-        length, kind_of_chunk = struct.unpack(">I4s", data[place : place + 8].ljust(8, b"\xff"))
-        end = place + 12 + length
+        length, kind_of_chunk = struct.unpack(">I4s", data[offset : offset + 8].ljust(8, b"\xff"))
+        end = offset + 12 + length
         if end > len(data):
             _refuse(path, "a whole PNG file", f"one cut after {len(data)} bytes", "copy the frame again")
-        if zlib.crc32(memoryview(data)[place + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+        if zlib.crc32(memoryview(data)[offset + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             _refuse(path, "a sound PNG file", f"a wrong checksum at byte {end - 4}", "copy the frame again")
         if kind_of_chunk == b"tRNS":
             _refuse(path, "a grey or colour PNG", "one with a transparent colour", "save the frame as grey")
         if kind_of_chunk == b"IDAT":
-            packed += memoryview(data)[place + 8 : end - 4]
+            compressed += memoryview(data)[offset + 8 : end - 4]
         if kind_of_chunk == b"IEND":
             break
-        place = end
-    row_bytes = 1 + width * bits // 8 * (3 if colour == COLOUR else 1)
-    rows = _inflated(packed, row_bytes * height)
-    if rows is None or len(rows) != row_bytes * height or max(rows[::row_bytes]) > FILTERS:
+        offset = end
+    row_bytes = 1 + width * bits // 8 * (3 if colour == PNG_COLOUR else 1)
+    rows = _inflate(compressed, row_bytes * height)
+    if rows is None or len(rows) != row_bytes * height or max(rows[::row_bytes]) > PNG_MAX_FILTER:
         return None
-    image = rows_above_added(rows, height, bits) if colour == GREY else None
+    image = undo_up_filter(rows, height, bits) if colour == PNG_GREY else None
     if image is not None:
         return image
-    # The decoder gets a file of these rows alone: nothing that a stranger packed, and no chunk that the walk passed.
-    return _decoded(png_file(data[16:29], zlib.compress(rows, 0)))
+    # For safety, the decoder gets a new file with these rows alone.
+    return _decode(assemble_png(data[16:29], zlib.compress(rows, 0)))
 
 
-def _inflated(packed: bytearray | memoryview, most_bytes: int) -> bytes | None:
-    """What a zlib stream unpacks to, if it is whole, sound, and no longer than this."""
+def _inflate(compressed: bytearray | memoryview, max_bytes: int) -> bytes | None:
+    """Decompress a zlib stream; None if it is cut, damaged, or longer than `max_bytes`."""
     unpacker = zlib.decompressobj()
     try:
-        found = unpacker.decompress(packed, most_bytes + 1)
+        data = unpacker.decompress(compressed, max_bytes + 1)
     except zlib.error:
         return None
-    return found if unpacker.eof and len(found) <= most_bytes else None
+    return data if unpacker.eof and len(data) <= max_bytes else None
 
 
 def _bitmap(path: Path, data: bytes, camera: CameraFormat) -> Pixels:
     try:
-        found = Bitmap.of(data)
-        _check_header(path, found.width, found.height, 8, camera)
-        return found.decoded(data)
+        header = BmpHeader.from_bytes(data)
+        _check_header(path, header.width, header.height, 8, camera)
+        return header.decode(data)
     except ValueError as cause:
         _refuse(path, "a whole, uncompressed BMP of 8 or 24 bits", str(cause), "save the frame as PNG")
 
 
 def _jpeg(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     try:
-        found = Jpeg.of(data)
+        header = JpegHeader.from_bytes(data)
     except ValueError as cause:
         _refuse(path, "a whole JPEG of 8 bits, grey or in colour", str(cause), "copy the frame again")
-    _check_header(path, found.width, found.height, 8, camera)
-    return _decoded(found.plain(data))
+    _check_header(path, header.width, header.height, 8, camera)
+    return _decode(header.without_metadata(data))
 
 
 def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFormat) -> None:
     try:
-        count = tiff_page_count(data)
+        count = count_tiff_pages(data)
         with tifffile.TiffFile(io.BytesIO(data)) as tiff:
             if max(pages) >= count:
                 _refuse(path, f"a page {max(pages)}", f"{count} pages", "correct `page`, which counts from 0")
@@ -474,18 +480,18 @@ def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFor
 
 
 def _check_zlib(path: Path, index: int, data: bytes, page: Any) -> None:
-    # OpenCV goes on after a fault in an 8-bit TIFF and returns what it has, so zlib and its checksum are asked first.
-    # Tiles at an edge are padded, and strips may all name the same bytes: four times the page is enough for all.
-    left = 2**16 + page.imagewidth * page.imagelength * page.samplesperpixel * page.bitspersample // 2
+    # OpenCV returns the rest of a damaged 8-bit TIFF without an error, so zlib verifies the checksum first. Tiles at
+    # an edge are padded, and several strips may share their bytes: four times the page is enough for all.
+    remaining_bytes = 2**16 + page.imagewidth * page.imagelength * page.samplesperpixel * page.bitspersample // 2
     for offset, size in zip(page.dataoffsets, page.databytecounts, strict=True):
-        unpacked = _inflated(memoryview(data)[offset : offset + size], left)
-        if unpacked is None:
+        decompressed = _inflate(memoryview(data)[offset : offset + size], remaining_bytes)
+        if decompressed is None:
             _refuse(path, f"sound data on page {index}", "data that cannot be unpacked", "copy the frame again")
-        left -= len(unpacked)
+        remaining_bytes -= len(decompressed)
 
 
-def _decoded(data: bytes) -> Pixels | None:
-    """The one image of a file whose header was checked; None where OpenCV cannot decode it."""
+def _decode(data: bytes) -> Pixels | None:
+    """Decode the one image of a file with a checked header; None if OpenCV cannot decode it."""
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -497,7 +503,7 @@ def _tiff_page(data: bytes, page: int) -> Pixels | None:
     try:
         decoded, images = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED, None, pages)
     except cv2.error:
-        # libtiff is stricter than the header's check in some tags.
+        # libtiff is stricter than `_check_tiff` in some tags.
         return None
     return images[0] if decoded and images else None
 

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, fie
 from slrig.bundle.calibration import Vector3
 from slrig.bundle.description import CameraName
 from slrig.bundle.storage import json_bytes
-from slrig.bundle.validation import AwareMoment, FreeText, Strict, checked, read_description_of, read_toml
+from slrig.bundle.validation import AwareMoment, FreeText, Strict, read_json_model, read_toml, validate
 from slrig.errors import ConfigError
 from slrig.model import (
     MAX_EXPOSURES,
@@ -33,38 +33,53 @@ from slrig.model import (
     bracket_fault,
 )
 
-MOST_VIEWS = 1000
+MAX_VIEWS = 1000
 _POSES_MAX_BYTES = 8 * 2**20
-_ROUNDED = 3e-5
-"""How far R Rᵀ of numbers with five digits may be from 1: at most 2e-5 was found of 20 000 rotations."""
+_ROTATION_TOLERANCE = 3e-5
+"""Largest difference of R Rᵀ from 1 in a rotation written with five digits."""
 
 PoseRow = Annotated[list[float], Field(min_length=4, max_length=4)]
 
+MAX_HISTORY = 500
+"""Number of changes of the axis that are kept: a model an hour for three weeks."""
+_TURNTABLE_MAX_BYTES = 2 * 2**20
+_MAX_PLANES = 16
+
+MAX_REGION_BYTES = 2**20
+
+PRESET_VERSION: Final = 1
+EXPOSURE_KEYS = ("exposure_s", "exposures_s", "exposure_factors")
+"""Alternative keys for the exposure; one of them replaces all others."""
+
+T = TypeVar("T")
+
+PRESET_NAME = r"[a-z][a-z0-9_-]{0,39}"
+
 
 class AxisEntry(Strict):
-    """An axis in the frame of the views, the stage's angle counted about its direction, right-handed."""
+    """An axis in the frame of the views; the stage's angle is counted about its direction, right-handed."""
 
     point_mm: Vector3
     direction: Vector3
 
     @model_validator(mode="after")
-    def _points_somewhere(self) -> Self:
+    def _check_direction(self) -> Self:
         if not np.linalg.norm(self.direction) > 0:
             raise ValueError("direction: expected a vector with a length, found zeros")
         return self
 
 
-def _rigid(rows: list[PoseRow]) -> list[PoseRow]:
+def _check_rigid(rows: list[PoseRow]) -> list[PoseRow]:
     pose = np.array(rows)
     turn = pose[:3, :3]
-    rigid = np.abs(turn @ turn.T - np.eye(3)).max() < _ROUNDED and np.linalg.det(turn) > 0
+    rigid = np.abs(turn @ turn.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(turn) > 0
     if not rigid or (pose[3] != [0, 0, 0, 1]).any():
         raise ValueError(f"expected a rotation and a shift, and 0 0 0 1 below, found {rows}")
     return rows
 
 
-PoseEntry = Annotated[list[PoseRow], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
-"""A rigid motion, 4 x 4, to the digits that it is written with."""
+PoseEntry = Annotated[list[PoseRow], Field(min_length=4, max_length=4), AfterValidator(_check_rigid)]
+"""A rigid motion, 4 x 4, to its number of digits in the file."""
 
 
 class ViewEntry(Strict):
@@ -79,7 +94,7 @@ class PosesEntry(Strict):
 
     format: Literal["slrig-poses"]
     version: Literal[1]
-    views: list[ViewEntry] = Field(default_factory=list, max_length=MOST_VIEWS)
+    views: list[ViewEntry] = Field(default_factory=list, max_length=MAX_VIEWS)
     axis: AxisEntry | None = None
 
 
@@ -92,18 +107,18 @@ class Poses:
 
 
 def read_poses(path: Path) -> Poses:
-    """The poses and the axis in a file. Raises ConfigError: it cannot be read or is no such file, with every fault."""
-    entry = read_description_of(path, PosesEntry, "file of poses", most_bytes=_POSES_MAX_BYTES, error=ConfigError)
+    """Return the poses and the axis in a file. Raises ConfigError: it cannot be read or is wrong; with every fault."""
+    entry = read_json_model(path, PosesEntry, "file of poses", max_bytes=_POSES_MAX_BYTES, error=ConfigError)
     names = [view.name for view in entry.views]
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ConfigError(f"{path}: expected each view once, found two poses of '{twice}'; leave one out")
+        duplicate = next(name for name in names if names.count(name) > 1)
+        raise ConfigError(f"{path}: expected each view once, found two poses of '{duplicate}'; leave one out")
     axis = None if entry.axis is None else (np.array(entry.axis.point_mm), np.array(entry.axis.direction))
-    return Poses({view.name: rotating(view.pose) for view in entry.views}, axis)
+    return Poses({view.name: orthonormalise_pose(view.pose) for view in entry.views}, axis)
 
 
-def rotating(entry: Sequence[Sequence[float]]) -> FloatArray:
-    """(4, 4): the pose with the nearest rotation to what was written of it: the two agree to the digits that were."""
+def orthonormalise_pose(entry: Sequence[Sequence[float]]) -> FloatArray:
+    """(4, 4): the pose with the nearest rotation to the rounded one in a file."""
     pose = np.array(entry)
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right
@@ -111,7 +126,7 @@ def rotating(entry: Sequence[Sequence[float]]) -> FloatArray:
 
 
 def encode_poses(poses: Poses) -> bytes:
-    """The same as a file's bytes."""
+    """Return poses as a file's bytes."""
     data: dict[str, Any] = {
         "format": "slrig-poses",
         "version": 1,
@@ -122,17 +137,12 @@ def encode_poses(poses: Poses) -> bytes:
     return json_bytes(data)
 
 
-MOST_HISTORY = 500
-"""Changes of the axis that are kept, the newest: a model an hour for three weeks."""
-_TURNTABLE_MAX_BYTES = 2 * 2**20
-_MOST_PLANES = 16
-
 TurntableRow = Annotated[list[float], Field(min_length=6, max_length=6)]
 Length = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class AxisSource(StrEnum):
-    """What an axis was found by."""
+    """Origin of an axis."""
 
     BOARD = "board"
     MODEL = "model"
@@ -140,12 +150,12 @@ class AxisSource(StrEnum):
 
 
 class MeasuredEntry(AxisEntry):
-    """An axis, and how well it is known."""
+    """An axis and its uncertainty."""
 
     covariance: Annotated[list[TurntableRow], Field(min_length=6, max_length=6)]
 
     @model_validator(mode="after")
-    def _is_covariance(self) -> Self:
+    def _check_covariance(self) -> Self:
         found = np.array(self.covariance)
         scale = np.abs(found).max()
         if not np.allclose(found, found.T, atol=1e-6 * scale) or np.linalg.eigvalsh(found)[0] < -1e-6 * scale:
@@ -154,7 +164,7 @@ class MeasuredEntry(AxisEntry):
 
 
 class PlaneEntry(Strict):
-    """A plane, behind which and within whose margin nothing belongs to an object."""
+    """A plane; points behind it or within its margin do not belong to an object."""
 
     kind: Annotated[PlaneKind, Field(strict=False)]
     point_mm: Vector3
@@ -164,14 +174,14 @@ class PlaneEntry(Strict):
     margin_mm: Length
 
     @model_validator(mode="after")
-    def _faces_somewhere(self) -> Self:
+    def _check_normal(self) -> Self:
         if not np.linalg.norm(self.normal) > 0:
             raise ValueError("normal: expected a vector with a length, found zeros")
         return self
 
 
 class ChangeEntry(Strict):
-    """What an axis that was found did to the one on record."""
+    """Effect of a newly found axis on the one on record."""
 
     at: AwareMoment
     source: Annotated[AxisSource, Field(strict=False)] = Field(description="what it was found by")
@@ -192,13 +202,13 @@ class StageEntry(Strict):
     format: Literal["slrig-stage"]
     version: Literal[1]
     axis: MeasuredEntry | None = None
-    planes: list[PlaneEntry] = Field(default_factory=list, max_length=_MOST_PLANES)
-    history: list[ChangeEntry] = Field(default_factory=list, max_length=MOST_HISTORY)
+    planes: list[PlaneEntry] = Field(default_factory=list, max_length=_MAX_PLANES)
+    history: list[ChangeEntry] = Field(default_factory=list, max_length=MAX_HISTORY)
 
 
 @dataclass(frozen=True, slots=True)
 class StageRecord:
-    """What is known of a stage. history : from old to new."""
+    """Axis, planes and history of a stage. history : from old to new."""
 
     axis: MeasuredAxis | None = None
     planes: tuple[StagePlane, ...] = ()
@@ -206,22 +216,25 @@ class StageRecord:
 
 
 def read_stage(path: Path) -> StageRecord:
-    """What a file says of a stage. Raises ConfigError: it cannot be read or is no such file, with every fault."""
-    return stage_record(
-        read_description_of(path, StageEntry, "stage", most_bytes=_TURNTABLE_MAX_BYTES, error=ConfigError)
-    )
+    """Return the record of a stage in a file. Raises ConfigError: it cannot be read or is invalid, with every fault."""
+    return stage_record(read_json_model(path, StageEntry, "stage", max_bytes=_TURNTABLE_MAX_BYTES, error=ConfigError))
 
 
 def stage_record(entry: StageEntry) -> StageRecord:
-    """The same of a document that was checked."""
+    """Convert a validated document to a record."""
     axis = entry.axis
     return StageRecord(
         None
         if axis is None
-        else MeasuredAxis(np.array(axis.point_mm), _unit(axis.direction), np.array(axis.covariance)),
+        else MeasuredAxis(np.array(axis.point_mm), _normalise(axis.direction), np.array(axis.covariance)),
         tuple(
             StagePlane(
-                each.kind, np.array(each.point_mm), _unit(each.normal), each.sigma_mm, each.radius_mm, each.margin_mm
+                each.kind,
+                np.array(each.point_mm),
+                _normalise(each.normal),
+                each.sigma_mm,
+                each.radius_mm,
+                each.margin_mm,
             )
             for each in entry.planes
         ),
@@ -230,7 +243,7 @@ def stage_record(entry: StageEntry) -> StageRecord:
 
 
 def stage_entry(record: StageRecord) -> StageEntry:
-    """The inverse of `stage_record`."""
+    """Convert a record to a document, as the inverse of `stage_record`."""
     axis, measured = record.axis, None
     if axis is not None:
         point, direction, covariance = (each.tolist() for each in (axis.point_mm, axis.direction, axis.covariance))
@@ -247,23 +260,21 @@ def stage_entry(record: StageRecord) -> StageEntry:
         for each in record.planes
     ]
     return StageEntry(
-        format="slrig-stage", version=1, axis=measured, planes=planes, history=list(record.history[-MOST_HISTORY:])
+        format="slrig-stage", version=1, axis=measured, planes=planes, history=list(record.history[-MAX_HISTORY:])
     )
 
 
 def encode_stage(record: StageRecord) -> bytes:
-    """A stage as a file's bytes."""
+    """Return a stage as a file's bytes."""
     return json_bytes(stage_entry(record).model_dump(mode="json"))
 
 
-def _unit(vector: list[float]) -> FloatArray:
-    """The vector at length 1; one that was written so keeps its digits."""
-    found = np.array(vector, dtype=np.float64)
-    length = float(np.linalg.norm(found))
-    return found if abs(length - 1) < 1e-12 else np.asarray(found / length)
+def _normalise(vector: list[float]) -> FloatArray:
+    """Return the vector at length 1; one that has it already keeps its digits."""
+    array = np.array(vector, dtype=np.float64)
+    length = float(np.linalg.norm(array))
+    return array if abs(length - 1) < 1e-12 else np.asarray(array / length)
 
-
-MOST_REGION_BYTES = 2**20
 
 # A list in TOML and in JSON.
 _Corner = Annotated[tuple[float, float, float], Field(strict=False)]
@@ -275,30 +286,30 @@ _Polygon = Annotated[
 
 
 class RegionTable(Strict):
-    """A part of the scene, and limits of what counts as measured; all else is left out, before it costs time."""
+    """A part of the scene, and limits of valid measurements; everything else is omitted before it costs time."""
 
     box_mm: _Box | None = Field(
-        default=None, description="least and greatest corner of a box in the world, [[x, y, z], [x, y, z]]"
+        default=None, description="minimum and maximum corner of a box in the world, [[x, y, z], [x, y, z]]"
     )
     depth_mm: _Range | None = Field(
         default=None, description="nearest and furthest depth along each camera's optical axis"
     )
     polygons_px: dict[CameraName, _Polygon] = Field(
-        default_factory=dict, description="by camera, corners [x, y] of the part of its image that counts"
+        default_factory=dict, description="by camera, corners [x, y] of the valid part of its image"
     )
     masks: dict[CameraName, Annotated[str, Field(max_length=MAX_MASK_CHARACTERS)]] = Field(
         default_factory=dict,
-        description="by camera, the same as a PNG of the image's extent, in base64: what is not black counts",
+        description="by camera, the same as a PNG of the image's extent, in base64: black is invalid",
     )
     least_contrast: Annotated[float, Field(gt=0, lt=1)] | None = Field(
-        default=None, description="least white less black of a pixel, as a share of full scale"
+        default=None, description="minimum of white less black of a pixel, as a share of full scale"
     )
     most_sigma_mm: Annotated[float, Field(gt=0)] | None = Field(
-        default=None, description="greatest stated standard deviation of a vertex"
+        default=None, description="maximum stated standard deviation of a vertex"
     )
 
     @model_validator(mode="after")
-    def _limits_to_something(self) -> Self:
+    def _check_region(self) -> Self:
         try:
             self.region()
         except ConfigError as error:
@@ -306,38 +317,36 @@ class RegionTable(Strict):
         return self
 
     def region(self) -> Region:
-        """The same as a frozen value. Raises ConfigError: see there."""
+        """Return the region as a frozen value. Raises ConfigError: see there."""
         return Region(**self.__dict__)
 
 
 def read_region(path: Path) -> RegionTable:
-    """What a TOML file of the same keys describes. A mask may be the path of a PNG, beside the file.
+    """Return the region in a TOML file with the same keys. A mask may be the path of a PNG, relative to the file.
 
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, or is no region, with every fault in one message.
+    Raises ConfigError: the file cannot be read or is not a region, with every fault in one message.
     """
-    return checked(RegionTable, with_masks(read_toml(path, MOST_REGION_BYTES), path.parent), str(path))
+    return validate(RegionTable, embed_masks(read_toml(path, MAX_REGION_BYTES), path.parent), str(path))
 
 
-def with_masks(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """What a file says of a region, with the masks that it names by their paths, from its own folder on, in it.
-    Raises ConfigError: one of them cannot be read.
+def embed_masks(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a region table with the contents of the masks that it names by paths relative to `folder`.
+
+    Raises ConfigError: a mask cannot be read.
     """
     masks = table.get("masks")
     if not isinstance(masks, Mapping):
         return dict(table)
-    read = {
-        camera: base64.b64encode(_bytes_of(folder / named)).decode()
-        if isinstance(named, str) and named.lower().endswith(".png")
-        else named
-        for camera, named in masks.items()
+    embedded = {
+        camera: base64.b64encode(_read_mask(folder / mask)).decode()
+        if isinstance(mask, str) and mask.lower().endswith(".png")
+        else mask
+        for camera, mask in masks.items()
     }
-    return {**table, "masks": read}
+    return {**table, "masks": embedded}
 
 
-def _bytes_of(path: Path) -> bytes:
+def _read_mask(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
@@ -347,54 +356,46 @@ def _bytes_of(path: Path) -> bytes:
         raise ConfigError(message) from error
 
 
-PRESET_VERSION: Final = 1
-EXPOSURE_KEYS = ("exposure_s", "exposures_s", "exposure_factors")
-"""Three ways to say how long to expose: who says one of them says it all."""
-
-T = TypeVar("T")
-
-
-def _a_bracket(exposures_s: tuple[float, ...]) -> tuple[float, ...]:
+def _check_bracket(exposures_s: tuple[float, ...]) -> tuple[float, ...]:
     fault = bracket_fault(exposures_s)
     if fault is not None:
         raise ValueError(fault)
     return exposures_s
 
 
-def _factors(factors: tuple[float, ...]) -> tuple[float, ...]:
-    return factors if len(factors) == 1 else _a_bracket(factors)
+def _check_factors(factors: tuple[float, ...]) -> tuple[float, ...]:
+    return factors if len(factors) == 1 else _check_bracket(factors)
 
 
 ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
 BracketSeconds = Annotated[
     tuple[ExposureSeconds, ...],
-    # A list in TOML and in JSON. Its length is checked with the rest, or one wrong time would be told as two faults.
+    # A list in TOML and in JSON. `_check_bracket` checks its length, so that one wrong time is one fault only.
     Field(strict=False, json_schema_extra={"minItems": MIN_EXPOSURES, "maxItems": MAX_EXPOSURES}),
-    AfterValidator(_a_bracket),
+    AfterValidator(_check_bracket),
 ]
 ExposureFactors = Annotated[
     tuple[Annotated[float, Field(gt=0, le=1000)], ...],
     Field(strict=False, json_schema_extra={"minItems": 1, "maxItems": MAX_EXPOSURES}),
-    AfterValidator(_factors),
+    AfterValidator(_check_factors),
 ]
-PRESET_NAME = r"[a-z][a-z0-9_-]{0,39}"
 PresetName = Annotated[str, Field(pattern=f"^{PRESET_NAME}$")]
 
 
-def alone(asked: T, info: ValidationInfo, keys: Sequence[str] = EXPOSURE_KEYS) -> T:
-    """A validator of one of the keys. Raises ValueError: another one was given before it."""
-    before = [key for key in keys if info.data.get(key) is not None]
-    if asked is not None and before:
-        message = f"expected {before[0]} or {info.field_name}, found both; keep one of them"
+def refuse_alternatives(value: T, info: ValidationInfo, keys: Sequence[str] = EXPOSURE_KEYS) -> T:
+    """Validate one of several alternative keys. Raises ValueError: another one was given before it."""
+    given = [key for key in keys if info.data.get(key) is not None]
+    if value is not None and given:
+        message = f"expected {given[0]} or {info.field_name}, found both; keep one of them"
         raise ValueError(message)
-    return asked
+    return value
 
 
 class ScanDefaults(Strict):
-    """What a scan on this rig does unless its request says otherwise. The keys are those of a scan's plan."""
+    """Defaults of scans on this rig; a request may override them. The keys are those of a scan's plan."""
 
     sequence: Annotated[SequenceName, Field(strict=False)] | None = Field(
-        default=None, description="what stands where the other pattern options say nothing. Default: standard"
+        default=None, description="values of the pattern options that are not given. Default: standard"
     )
     line_shift: bool | None = None
     line_shift_period_px: Annotated[int, Field(ge=4)] | None = None
@@ -419,12 +420,12 @@ class ScanDefaults(Strict):
     )
     exposure_factors: ExposureFactors | None = Field(
         default=None,
-        description="in place of the others, times the exposure that the rig's cameras have by themselves, so that it "
-        "means the same on another rig: one, or two to six for a bracket. Where cameras differ, a bracket is of their "
-        "geometric mean. What a camera cannot do becomes the nearest that it can",
+        description="in place of the others, factors of the cameras' own exposures, so that they mean the same on "
+        "another rig: one, or two to six for a bracket. If cameras differ, a bracket uses their geometric mean. An "
+        "exposure that a camera cannot do becomes the nearest that it can",
     )
     colour: bool | None = Field(
-        default=None, description="keep white and black frames in colour. Default: where a camera has it"
+        default=None, description="keep white and black frames in colour. Default: if a camera has colour"
     )
     coloured_light: bool | None = Field(
         default=None, description="play white in red, green and blue too, for cameras without colour. Default: false"
@@ -432,30 +433,30 @@ class ScanDefaults(Strict):
 
     @field_validator("exposure_factors")
     @classmethod
-    def _one_bracket(cls, factors: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
-        # Beside exposure_s, which in a rig file is what the cameras have by themselves.
-        return alone(factors, info, EXPOSURE_KEYS[1:])
+    def _refuse_two_brackets(cls, factors: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+        # exposure_s may be given too: in a rig file it is the cameras' own exposure.
+        return refuse_alternatives(factors, info, EXPOSURE_KEYS[1:])
 
 
 class Preset(ScanDefaults):
-    """Options for a kind of object. They stand above the rig file's `[scan]`, and below what a request says itself."""
+    """Options for a kind of object. They override the rig file's `[scan]`; a request overrides them."""
 
-    description: FreeText | None = Field(default=None, description="what it is for")
+    description: FreeText | None = Field(default=None, description="purpose of the preset")
 
-    _one_exposure = field_validator("exposures_s", "exposure_factors")(alone)
+    _one_exposure = field_validator("exposures_s", "exposure_factors")(refuse_alternatives)
 
-    def over(self, usual: ScanDefaults) -> ScanDefaults:
-        """The usual options, but for what this one says; who says how long to expose says all of it."""
+    def apply_to(self, defaults: ScanDefaults) -> ScanDefaults:
+        """Return the defaults with these options; one exposure key replaces all exposure keys."""
         own = {key: value for key in ScanDefaults.model_fields if (value := getattr(self, key)) is not None}
-        other = dict.fromkeys(EXPOSURE_KEYS) if own.keys() & set(EXPOSURE_KEYS) else {}
-        return usual.model_copy(update={**other, **own})
+        cleared = dict.fromkeys(EXPOSURE_KEYS) if own.keys() & set(EXPOSURE_KEYS) else {}
+        return defaults.model_copy(update={**cleared, **own})
 
 
-def _a_known_version(version: object) -> object:
+def _check_version(version: object) -> object:
     if version != PRESET_VERSION:
         message = (
-            f"this slrig reads version {PRESET_VERSION} of presets, found {version!r}; bring slrig up to date, or have "
-            "the preset written by the version that runs here"
+            f"this slrig reads version {PRESET_VERSION} of presets, found {version!r}; update slrig, or write the "
+            "preset with the version that runs here"
         )
         raise ValueError(message)
     return version
@@ -465,11 +466,11 @@ class PresetDocument(Strict):
     """A preset as a file that rigs may share. Its name is not in it."""
 
     format: Literal["slrig-preset"] = "slrig-preset"
-    version: Annotated[Literal[1], BeforeValidator(_a_known_version)] = PRESET_VERSION
+    version: Annotated[Literal[1], BeforeValidator(_check_version)] = PRESET_VERSION
     scan: Preset
 
     @property
     def digest(self) -> str:
-        """Twelve hexadecimal digits that change with any option, and not with the description."""
+        """Twelve hexadecimal digits that depend on every option, but not on the description."""
         options: dict[str, Any] = self.scan.model_dump(mode="json", exclude_none=True, exclude={"description"})
         return hashlib.sha256(json_bytes(dict(sorted(options.items())))).hexdigest()[:12]

@@ -1,8 +1,8 @@
-"""Files beside the frames of a bundle: truth of a rendered scene, health, notes, refused frames, turntable.
+"""Further files of a bundle: truth of a rendered scene, health, notes, refused frames, stage angle.
 
-`truth.ply` is the surface (binary little endian), `visible_points.npy` the points of it that the first camera sees lit
-by the projector, `truth-CAMERA.npz` the maps of each camera. Maps and surface are float32 on disk: at a distance of one
-metre that is 0.06 micrometres, far below what is measured.
+`truth.ply` is the surface (binary little endian), `visible_points.npy` its points that the first camera sees lit by the
+projector, `truth-CAMERA.npz` the maps of each camera. Maps and surface are float32 on disk: at a distance of one metre
+that is 0.06 micrometres, far below any measurement.
 """
 
 from __future__ import annotations
@@ -19,22 +19,37 @@ from pydantic import Field
 
 from slrig.bundle.description import CameraName
 from slrig.bundle.storage import json_bytes, write_file
-from slrig.bundle.validation import Strict, read_description_of, read_json, read_text
+from slrig.bundle.validation import Strict, read_json, read_json_model, read_text
 from slrig.errors import BundleError
 from slrig.model import CameraTruth, FloatArray, Shot, Surface, Truth
 
 HEALTH_FILE = "health.json"
 HEALTH_MAX_BYTES = 2**20
 
+NOTES_FILE = "notes.json"
+NOTES_MAX_BYTES = 2**20
+
+REFUSED_FOLDER = "refused"
+REFUSED_LIST = "refused.json"
+_REFUSED_MAX_BYTES = 16 * 2**20
+
+TURNTABLE_FILE = "stage.json"
+TURNTABLE_MAX_BYTES = 2**16
+
+SURFACE_FILE = "truth.ply"
+VISIBLE_POINTS_FILE = "visible_points.npy"
+TRUTH_MAPS_FILE = "truth-{camera}.npz"
+
 
 def write_health(folder: Path, stamp: Mapping[str, Any]) -> None:
-    """Put a stamp beside the frames. Raises StorageError."""
+    """Write a health stamp into a bundle. Raises StorageError."""
     write_file(folder / HEALTH_FILE, json_bytes(stamp))
 
 
 def read_health(folder: Path) -> dict[str, Any] | None:
-    """The stamp of a bundle, None where it has none.
-    Raises BundleError: the file cannot be read, or is no JSON object.
+    """Return the health stamp of a bundle, None if it has none.
+
+    Raises BundleError: the file cannot be read, or is not a JSON object.
     """
     path = folder / HEALTH_FILE
     if not path.exists():
@@ -46,18 +61,14 @@ def read_health(folder: Path) -> dict[str, Any] | None:
     return found
 
 
-NOTES_FILE = "notes.json"
-NOTES_MAX_BYTES = 2**20
-
-
 def write_notes(folder: Path, notes: Sequence[str]) -> None:
-    """Put notes beside the frames, if there are any. Raises StorageError."""
+    """Write notes, if there are any, into a bundle. Raises StorageError."""
     if notes:
         write_file(folder / NOTES_FILE, json_bytes(list(notes)))
 
 
 def read_notes(folder: Path) -> tuple[str, ...]:
-    """The notes of a bundle. Raises BundleError: the file cannot be read, or is no list of sentences."""
+    """Return the notes of a bundle. Raises BundleError: the file cannot be read, or is not a list of strings."""
     path = folder / NOTES_FILE
     if not path.exists():
         return ()
@@ -68,17 +79,12 @@ def read_notes(folder: Path) -> tuple[str, ...]:
     return tuple(found)
 
 
-FOLDER = "refused"
-LIST = "refused.json"
-_REFUSED_MAX_BYTES = 16 * 2**20
-
-
 @dataclass(frozen=True, slots=True)
-class Refused:
-    """One exposure that did not count: which pattern and camera, which attempt at that pattern, and why.
+class RefusedFrame:
+    """One exposure that does not count: its pattern and camera, the attempt at that pattern, and the reason.
 
-    shot : its frame; None where no frame came, and where it had been accepted and `delivered` before. left_out : the
-    whole exposure is of no use to the camera, and is not shot again.
+    shot : its frame; None if no frame arrived, or if it had been accepted and `delivered` before. left_out : True if
+    the whole exposure is useless to the camera, and is not repeated.
     """
 
     pattern: int
@@ -91,7 +97,7 @@ class Refused:
 
 
 class RefusedEntry(Strict):
-    """One line of the list. `file` is None where no frame came; times are those of bundle.json."""
+    """One entry of the list. `file` is None if no frame arrived; times are those of bundle.json."""
 
     pattern: Annotated[int, Field(ge=0)]
     camera: CameraName
@@ -104,7 +110,7 @@ class RefusedEntry(Strict):
 
 
 class RefusedList(Strict):
-    """The whole of refused.json. `ended` says why the scan ended before its last pattern, None if it did not."""
+    """The whole of refused.json. ended : the reason why the scan ended before its last pattern, None if it did not."""
 
     format: Literal["slrig-refused"] = "slrig-refused"
     version: Literal[1] = 1
@@ -112,33 +118,30 @@ class RefusedList(Strict):
     frames: list[RefusedEntry]
 
 
-def read_refused(folder: Path) -> tuple[Refused, ...]:
-    """What was refused while the bundle in `folder` was captured, without the frames themselves; often nothing.
-    Raises BundleError: the list is there and is not as slrig wrote it.
+def read_refused(folder: Path) -> tuple[RefusedFrame, ...]:
+    """Return the frames that were refused during the capture, without their images.
+
+    Raises BundleError: the list exists but is not as slrig wrote it.
     """
-    path = folder / FOLDER / LIST
+    path = folder / REFUSED_FOLDER / REFUSED_LIST
     if not path.is_file():
         return ()
-    listed = read_description_of(
-        path, RefusedList, "list of refused frames", most_bytes=_REFUSED_MAX_BYTES, error=BundleError
+    listed = read_json_model(
+        path, RefusedList, "list of refused frames", max_bytes=_REFUSED_MAX_BYTES, error=BundleError
     )
     return tuple(
-        Refused(entry.pattern, entry.camera, entry.attempt, entry.cause, left_out=bool(entry.left_out))
+        RefusedFrame(entry.pattern, entry.camera, entry.attempt, entry.cause, left_out=bool(entry.left_out))
         for entry in listed.frames
     )
 
 
-TURNTABLE_FILE = "stage.json"
-TURNTABLE_MAX_BYTES = 2**16
-
-
 TurnedBy = Literal["table", "hand"]
-"""What turns the object on its stage: the rig's turntable, or a person."""
+"""The object is turned by the rig's turntable, or by a person."""
 
 
 class StageAngle(Strict):
-    """Where the stage stood. angle_deg : right-handed about its axis, from wherever its owner counts. count : equal
-    where a turntable's angles have one zero; None where nobody keeps that.
+    """Angle of the stage. angle_deg : right-handed about its axis, from an arbitrary zero. count : equal for angles of
+    a turntable with the same zero; None if that is not known.
     """
 
     angle_deg: Annotated[float, Field(allow_inf_nan=False)]
@@ -146,31 +149,26 @@ class StageAngle(Strict):
     count: Annotated[str, Field(max_length=80)] | None = None
 
     def document(self) -> dict[str, object]:
-        """As stage.json and a scan's report have it."""
+        """Return the angle as in stage.json and in a scan's report."""
         return self.model_dump(exclude_none=True)
 
 
 def write_stage(folder: Path, stage: StageAngle) -> None:
-    """Put the angle beside the frames. Raises StorageError."""
+    """Write the stage angle into a bundle. Raises StorageError."""
     write_file(folder / TURNTABLE_FILE, json_bytes(stage.document()))
 
 
 def read_stage(folder: Path) -> StageAngle | None:
-    """The angle of a bundle, None where it has none. Raises BundleError: the file cannot be read, or is wrong."""
+    """Return the stage angle of a bundle, None if it has none. Raises BundleError: the file is invalid."""
     path = folder / TURNTABLE_FILE
     if not path.exists():
         return None
-    return read_description_of(path, StageAngle, "angle of a stage", most_bytes=TURNTABLE_MAX_BYTES, error=BundleError)
-
-
-SURFACE = "truth.ply"
-VISIBLE = "visible_points.npy"
-MAPS = "truth-{camera}.npz"
+    return read_json_model(path, StageAngle, "angle of a stage", max_bytes=TURNTABLE_MAX_BYTES, error=BundleError)
 
 
 @dataclass(frozen=True, slots=True)
 class BundleTruth:
-    """Truth read from a bundle. Bundles of other renderers have no maps: `cameras` is empty then.
+    """Truth of a bundle. cameras : empty in bundles of other renderers, which have no maps.
 
     visible_points_mm : (n, 3) float64, world: surface points seen by the first camera and lit by the projector.
     """
@@ -181,15 +179,15 @@ class BundleTruth:
 
 
 def write_truth(folder: Path, truth: Truth) -> None:
-    """Write the truth into a bundle's folder, each file whole or not at all. Raises StorageError: the disk refused."""
+    """Write the truth into a bundle's folder, each file completely or not at all. Raises StorageError."""
     import trimesh
 
     mesh = trimesh.Trimesh(truth.surface.vertices_mm, truth.surface.faces, process=False)
-    write_file(folder / SURFACE, mesh.export(file_type="ply", vertex_normal=False))
+    write_file(folder / SURFACE_FILE, mesh.export(file_type="ply", vertex_normal=False))
     first = next(iter(truth.cameras.values()))
     data = io.BytesIO()
     np.save(data, first.visible_points_mm, allow_pickle=False)
-    write_file(folder / VISIBLE, data.getvalue())
+    write_file(folder / VISIBLE_POINTS_FILE, data.getvalue())
     for name, camera in truth.cameras.items():
         data = io.BytesIO()
         np.savez(
@@ -198,26 +196,27 @@ def write_truth(folder: Path, truth: Truth) -> None:
             projector_px=camera.projector_px.astype(np.float32),
             visible_points_mm=camera.visible_points_mm,
         )
-        write_file(folder / MAPS.format(camera=name), data.getvalue())
+        write_file(folder / TRUTH_MAPS_FILE.format(camera=name), data.getvalue())
 
 
 def read_truth(folder: Path) -> BundleTruth | None:
-    """Return the truth beside a bundle, or None where there is none.
+    """Return the truth of a bundle, or None if there is none.
+
     Raises BundleError: one of its files is missing, cut, or of another shape.
     """
-    if not (folder / SURFACE).exists() and not (folder / VISIBLE).exists():
+    if not (folder / SURFACE_FILE).exists() and not (folder / VISIBLE_POINTS_FILE).exists():
         return None
-    # A second, for what no live scan has.
+    # Takes a second to import, and no live scan has truth.
     import trimesh
 
-    path = folder / SURFACE
+    path = folder / SURFACE_FILE
     try:
         mesh = trimesh.load_mesh(path, process=False)
         surface = Surface(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32))
-        path = folder / VISIBLE
+        path = folder / VISIBLE_POINTS_FILE
         visible = _points(np.load(path, allow_pickle=False))
         cameras = {}
-        for path in sorted(folder.glob(MAPS.format(camera="*"))):
+        for path in sorted(folder.glob(TRUTH_MAPS_FILE.format(camera="*"))):
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as maps:
                 cameras[path.stem.removeprefix("truth-")] = CameraTruth(
                     np.asarray(maps["depth_mm"], dtype=np.float64),
@@ -225,7 +224,7 @@ def read_truth(folder: Path) -> BundleTruth | None:
                     _points(maps["visible_points_mm"]),
                 )
     except (OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as cause:
-        message = f"{path}: expected truth beside the bundle, found: {cause}; render the scene again"
+        message = f"{path}: expected truth of the bundle, found: {cause}; render the scene again"
         raise BundleError(message) from cause
     return BundleTruth(surface, visible, cameras)
 

@@ -1,7 +1,7 @@
-"""Validation of descriptions: every fault, in the words of the file, and limits of free text and times.
+"""Validation of files and requests: all faults in one message, and types for text and times.
 
-A description (bundle.json, calibration.json, a rig file) is checked by a pydantic model; what pydantic says is turned
-here into lines of the form `cameras.cam0.bit_depth: expected …, found …; do …`, all of them in one message.
+A description (bundle.json, calibration.json, a rig file) is validated by a pydantic model; its errors become lines of
+the form `cameras.cam0.bit_depth: expected …, found …; do …`, all of them in one message.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from pydantic_core import ErrorDetails
 from slrig.errors import ConfigError, InvalidInputError
 from slrig.printable import UNSAFE, unsafe
 
+MAX_FAULTS = 20
+MAX_VALUE_LENGTH = 60
+
 
 def _refuse_unsafe(text: str) -> str:
     found = unsafe.search(text)
@@ -34,7 +37,7 @@ def _refuse_unsafe(text: str) -> str:
 
 
 SafeText = Annotated[str, Field(json_schema_extra={"pattern": f"^[^{UNSAFE}]*$"}), AfterValidator(_refuse_unsafe)]
-"""Text of which no character does something to a terminal."""
+"""Text without characters that affect a terminal."""
 
 FreeText = Annotated[SafeText, Field(min_length=1, max_length=200)]
 """The same, of 1 to 200 characters."""
@@ -43,30 +46,26 @@ FreeText = Annotated[SafeText, Field(min_length=1, max_length=200)]
 _number = re.compile(r"\s*[+-]?[\d._]+(e[+-]?\d+)?\s*", re.IGNORECASE | re.ASCII)
 
 
-def _refuse_number(sent: object) -> object:
-    """Pydantic takes a text of digits for seconds since 1970."""
-    if isinstance(sent, (int, float)) or (isinstance(sent, str) and _number.fullmatch(sent)):
+def _refuse_number(value: object) -> object:
+    """Refuse numbers, which pydantic would take for seconds since 1970."""
+    if isinstance(value, (int, float)) or (isinstance(value, str) and _number.fullmatch(value)):
         message = (
-            f"expected a date and time with the offset from UTC, as 2026-11-20T06:00:00Z, found the number {sent}; "
+            f"expected a date and time with the offset from UTC, as 2026-11-20T06:00:00Z, found the number {value}; "
             "write it as ISO 8601 does"
         )
         raise ValueError(message)
-    return sent
+    return value
 
 
 Moment = Annotated[datetime, Field(strict=False), BeforeValidator(_refuse_number)]
-"""A date and time as ISO 8601 text. A number is none."""
+"""A date and time as ISO 8601 text, not a number."""
 
 AwareMoment = Annotated[AwareDatetime, Field(strict=False), BeforeValidator(_refuse_number)]
 """The same, with its offset from UTC."""
 
 
-MOST_FAULTS = 20
-LONGEST_VALUE = 60
-
-
 class Strict(BaseModel):
-    """A description in which every key is known, every number finite, and nothing is converted in silence."""
+    """A description without unknown keys, without numbers that are not finite, and without silent conversions."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
@@ -74,18 +73,19 @@ class Strict(BaseModel):
 Described = TypeVar("Described", bound=BaseModel)
 
 
-def read_text(path: Path, most_bytes: int, error: type[InvalidInputError]) -> str:
+def read_text(path: Path, max_bytes: int, error: type[InvalidInputError]) -> str:
     """Return the text of a small UTF-8 file.
-    Raises InvalidInputError, of the class `error`: the file is missing, larger than `most_bytes`, or not text.
+
+    Raises InvalidInputError, of the class `error`: the file is missing, larger than `max_bytes`, or not text.
     """
     try:
         with path.open("rb") as file:
-            data = file.read(most_bytes + 1)
+            data = file.read(max_bytes + 1)
     except OSError as cause:
         raise error(f"{path}: expected a readable file, found: {cause.strerror}; check the path") from cause
-    if len(data) > most_bytes:
+    if len(data) > max_bytes:
         raise error(
-            f"{path}: expected at most {most_bytes} bytes, found a larger file; "
+            f"{path}: expected at most {max_bytes} bytes, found a larger file; "
             "a description is short: check that this is the right file"
         )
     try:
@@ -96,25 +96,25 @@ def read_text(path: Path, most_bytes: int, error: type[InvalidInputError]) -> st
 
 
 def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
-    """Return the data of a strict JSON text: no NaN, no infinity, no key twice.
-    Raises InvalidInputError, of the class `error`, with the line where reading stopped.
+    """Return the data of a strict JSON text: no NaN, no infinity, no duplicate key.
+
+    Raises InvalidInputError, of the class `error`, with the line of the fault.
     """
 
     def refuse_constant(name: str) -> NoReturn:
         raise ValueError(f"found {name}, which is not JSON; every number must be finite, leave an unknown value out")
 
-    def refuse_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    def refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         data = dict(pairs)
         if len(data) != len(pairs):
             keys = [key for key, _ in pairs]
-            twice = sorted({key for key in keys if keys.count(key) > 1})
-            raise ValueError(
-                f"found the key {', '.join(map(shorten, twice[:MOST_FAULTS]))} twice in one object; keep one of them"
-            )
+            duplicates = sorted({key for key in keys if keys.count(key) > 1})
+            listed = ", ".join(map(shorten, duplicates[:MAX_FAULTS]))
+            raise ValueError(f"found the key {listed} twice in one object; keep one of them")
         return data
 
     try:
-        return json.loads(text, parse_constant=refuse_constant, object_pairs_hook=refuse_twice)
+        return json.loads(text, parse_constant=refuse_constant, object_pairs_hook=refuse_duplicates)
     except json.JSONDecodeError as cause:
         raise error(
             f"{source}: expected JSON, found a fault at line {cause.lineno} column {cause.colno} ({cause.msg}); "
@@ -127,9 +127,9 @@ def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
         raise error(f"{source}: {cause}") from cause
 
 
-def read_toml(path: Path, most_bytes: int) -> dict[str, Any]:
-    """Return the tables of a TOML file. Raises ConfigError: see `read_text`, or with the line where reading stopped."""
-    text = read_text(path, most_bytes, ConfigError)
+def read_toml(path: Path, max_bytes: int) -> dict[str, Any]:
+    """Return the tables of a TOML file. Raises ConfigError: see `read_text`; or with the line of the fault."""
+    text = read_text(path, max_bytes, ConfigError)
     try:
         return tomllib.loads(text)
     except RecursionError as cause:
@@ -139,43 +139,45 @@ def read_toml(path: Path, most_bytes: int) -> dict[str, Any]:
         raise ConfigError(f"{path}: expected TOML, found a fault: {cause}; correct that line") from cause
 
 
-def checked(
-    model: type[Described], data: object, what: str, *, hint: str = "", error: type[InvalidInputError] = ConfigError
+def validate(
+    model: type[Described], data: object, name: str, *, hint: str = "", error: type[InvalidInputError] = ConfigError
 ) -> Described:
     """Return `data` as a `model`.
-    Raises InvalidInputError, of the class `error`: says `what` is wrong, lists every fault, and ends with `hint`.
+
+    Raises InvalidInputError, of the class `error`: says that `name` is wrong, lists every fault, and ends with `hint`.
     """
     try:
         return model.model_validate(dict(data) if isinstance(data, Mapping) else data)
     except ValidationError as cause:
-        raise error(f"{what} is wrong:\n{explain(cause, data, keys_of(model))}{hint}") from cause
+        raise error(f"{name} is wrong:\n{describe_errors(cause, data, model_keys(model))}{hint}") from cause
 
 
-def read_description_of(
-    path: Path, model: type[Described], what: str, *, most_bytes: int, error: type[InvalidInputError]
+def read_json_model(
+    path: Path, model: type[Described], name: str, *, max_bytes: int, error: type[InvalidInputError]
 ) -> Described:
-    """Return what a file of JSON describes, as a `model`.
-    Raises InvalidInputError, of the class `error`: see `read_text` and `read_json`; or it is not a valid `what`, with
-    every fault in one message.
+    """Return the contents of a JSON file as a `model`.
+
+    Raises InvalidInputError, of the class `error`: see `read_text` and `read_json`; or the file is not a valid `name`,
+    with every fault in one message.
     """
-    text = read_text(path, most_bytes, error)
+    text = read_text(path, max_bytes, error)
     data = read_json(text, path, error)
     try:
         return model.model_validate_json(text)
     except ValidationError as cause:
-        raise error(f"{path} is not a valid {what}:\n{explain(cause, data, keys_of(model))}") from cause
+        raise error(f"{path} is not a valid {name}:\n{describe_errors(cause, data, model_keys(model))}") from cause
 
 
-def explain(cause: ValidationError, data: object, known: Sequence[str]) -> str:
-    """Return one line per fault; `known` are the keys to propose when one is misspelt."""
-    lines = [f"  {_line(fault, data, known)}" for fault in cause.errors(include_url=False)]
-    if len(lines) > MOST_FAULTS:
-        lines[MOST_FAULTS:] = [f"  … and {len(lines) - MOST_FAULTS} more"]
+def describe_errors(cause: ValidationError, data: object, known_keys: Sequence[str]) -> str:
+    """Return one line per fault. known_keys : keys to propose for a misspelt one."""
+    lines = [f"  {_line(fault, data, known_keys)}" for fault in cause.errors(include_url=False)]
+    if len(lines) > MAX_FAULTS:
+        lines[MAX_FAULTS:] = [f"  … and {len(lines) - MAX_FAULTS} more"]
     return "\n".join(lines)
 
 
-def keys_of(model: type[BaseModel]) -> tuple[str, ...]:
-    """Every key that a model and the models inside it know, for proposals."""
+def model_keys(model: type[BaseModel]) -> tuple[str, ...]:
+    """Every key of a model and of the models in it, for proposals."""
     schema = model.model_json_schema()
     return tuple(dict.fromkeys(_properties(schema)))
 
@@ -192,10 +194,10 @@ def _properties(schema: object) -> Iterator[str]:
             yield from _properties(part)
 
 
-def _line(fault: ErrorDetails, data: object, known: Sequence[str]) -> str:
+def _line(fault: ErrorDetails, data: object, known_keys: Sequence[str]) -> str:
     path = _path(fault["loc"], data, keep_last=fault["type"] == "missing")
     if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        near = difflib.get_close_matches(str(fault["loc"][-1]), known, n=1)
+        near = difflib.get_close_matches(str(fault["loc"][-1]), known_keys, n=1)
         remedy = f"did you mean '{near[0]}'?" if near else "remove it"
         return f"{path}: unknown key; {remedy}"
     if fault["type"] == "missing":
@@ -206,19 +208,19 @@ def _line(fault: ErrorDetails, data: object, known: Sequence[str]) -> str:
 
 
 def shorten(value: object) -> str:
-    """What was found, short enough for a line."""
+    """Return the value as text that fits into a line."""
     text = repr(value)
-    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
+    return text if len(text) <= MAX_VALUE_LENGTH else f"{text[: MAX_VALUE_LENGTH - 1]}…"
 
 
 def _path(loc: Sequence[int | str], data: object, *, keep_last: bool) -> str:
-    # Pydantic puts the tag of a union into the path; the file has no such step, so only steps found in the data count.
+    # Pydantic puts the tag of a union into the path, which the file does not have: only steps in the data count.
     path = ""
-    for place, step in enumerate(loc):
+    for position, step in enumerate(loc):
         if isinstance(step, int) and isinstance(data, Sequence) and step < len(data):
             data, path = data[step], f"{path}[{step}]"
         elif isinstance(data, Mapping) and step in data:
             data, path = data[step], f"{path}.{step}"
-        elif keep_last and place == len(loc) - 1:
+        elif keep_last and position == len(loc) - 1:
             path = f"{path}.{step}"
     return path.removeprefix(".") or "top level"

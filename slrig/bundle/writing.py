@@ -1,4 +1,4 @@
-"""Writing a scan bundle: each frame as it comes; the whole folder appears at once, or nothing."""
+"""Writing of a scan bundle: each frame when it arrives; the whole folder appears at once, or not at all."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from slrig.bundle.calibration import write_calibration
 from slrig.bundle.description import CAMERA_NAME, DESCRIPTION, PROJECTOR
 from slrig.bundle.images import encode_frame
 from slrig.bundle.reading import CALIBRATION
-from slrig.bundle.sidecars import FOLDER, LIST, Refused, RefusedEntry, RefusedList
+from slrig.bundle.sidecars import REFUSED_FOLDER, REFUSED_LIST, RefusedEntry, RefusedFrame, RefusedList
 from slrig.bundle.storage import json_bytes, sync_folder, write_durably
-from slrig.disk import refusals_of, staging_name
+from slrig.disk import staging_name, storage_errors
 from slrig.errors import BundleError, CalibrationError, StorageError
 from slrig.model import Calibration, CameraFormat, Capture, Pattern, Shot, Size
 
 
 @dataclass(slots=True)
-class _Place:
-    """Where a frame is listed; `vacant` from its refusal until another frame takes its place."""
+class _FrameSlot:
+    """Entry of a frame in the list; `vacant` from its refusal until another frame replaces it."""
 
     frame: dict[str, Any]
     vacant: bool = False
@@ -36,9 +36,10 @@ class _Place:
 class BundleWriter:
     """Writes a scan bundle while the frames arrive. A context manager.
 
-    The bundle grows in a hidden folder beside `folder`, which is renamed into place when the block ends well. Any
-    error, in the block or on the disk, removes it: the folder is whole or absent. Only `keep` leaves a bundle of a
-    capture that was cut short, and says so in it. captured_at : when the capture began, with the offset from UTC.
+    The bundle grows in a hidden folder next to `folder`, which is renamed when the block ends without an error. Any
+    error, in the block or on the disk, removes it: the folder is complete or absent. Only `keep` leaves the bundle of
+    an aborted capture, with a statement of that. captured_at : start of the capture, with the offset from UTC.
+
     Raises BundleError: `folder` exists already, a camera's name cannot be a file's name, or no frame was added;
     StorageError: the disk refused.
     """
@@ -67,7 +68,7 @@ class BundleWriter:
         self._cameras = dict(cameras)
         self._calibration = calibration
         self._captured_at = captured_at
-        self._places: list[_Place] = []
+        self._slots: list[_FrameSlot] = []
         self._refused: list[RefusedEntry] = []
         self._count: Counter[str] = Counter()
         self._ended: str | None = None
@@ -78,7 +79,7 @@ class BundleWriter:
                 f"{self.folder}: expected a new folder, found one that exists; "
                 "a bundle is never overwritten: remove it or choose another name"
             )
-        with refusals_of(self.folder):
+        with storage_errors(self.folder):
             try:
                 for name in self._cameras:
                     (self._staging / "frames" / name).mkdir(parents=True)
@@ -88,54 +89,56 @@ class BundleWriter:
         return self
 
     def add(self, shot: Shot) -> None:
-        """Write one frame to disk now. One that takes the place of a refused frame is listed where that was.
-        Raises BundleError: the frame names an unknown pattern or camera, or is not as that camera's frames are;
+        """Write one frame to disk. A frame that replaces a refused one takes its entry in the list.
+
+        Raises BundleError: the frame names an unknown pattern or camera, or does not have the format of that camera;
         StorageError: the disk refused.
         """
         self._check(shot)
         file = f"frames/{shot.camera}/{self._count[shot.camera]:03d}.png"
-        with refusals_of(self._staging / file):
+        with storage_errors(self._staging / file):
             write_durably(self._staging / file, encode_frame(shot.image, file))
         self._count[shot.camera] += 1
         frame: dict[str, Any] = {"pattern": shot.pattern, "camera": shot.camera, "file": file, **_times(shot)}
         if shot.colour is not None:
             frame["colour_file"] = file.replace(".png", "-colour.png")
-            with refusals_of(self._staging / frame["colour_file"]):
+            with storage_errors(self._staging / frame["colour_file"]):
                 write_durably(self._staging / frame["colour_file"], encode_frame(shot.colour, frame["colour_file"]))
-        place = self._latest(shot.pattern, shot.camera, vacant=True)
-        if place is None:
-            self._places.append(_Place(frame))
+        slot = self._latest_slot(shot.pattern, shot.camera, vacant=True)
+        if slot is None:
+            self._slots.append(_FrameSlot(frame))
         else:
-            place.frame, place.vacant = frame, False
+            slot.frame, slot.vacant = frame, False
 
-    def refuse(self, refused: Refused) -> None:
-        """Keep a refused frame apart: the one given, or the one that was added before, taken back.
+    def refuse(self, refused: RefusedFrame) -> None:
+        """Store a refused frame separately: the one given, or the one that was added before, withdrawn.
+
         Raises StorageError: the disk refused.
         """
-        file = f"{FOLDER}/{len(self._refused):03d}.png"
+        file = f"{REFUSED_FOLDER}/{len(self._refused):03d}.png"
         entry: dict[str, Any] = {"pattern": refused.pattern, "camera": refused.camera, "attempt": refused.attempt}
-        with refusals_of(self._staging / FOLDER):
-            (self._staging / FOLDER).mkdir(exist_ok=True)
-            place = self._latest(refused.pattern, refused.camera, vacant=not refused.delivered)
+        with storage_errors(self._staging / REFUSED_FOLDER):
+            (self._staging / REFUSED_FOLDER).mkdir(exist_ok=True)
+            slot = self._latest_slot(refused.pattern, refused.camera, vacant=not refused.delivered)
             if refused.shot is not None:
                 write_durably(self._staging / file, encode_frame(refused.shot.image, file))
                 entry |= {"file": file, **_times(refused.shot)}
-            elif refused.delivered and place is not None:
-                (self._staging / place.frame["file"]).rename(self._staging / file)
-                if "colour_file" in place.frame:
-                    # What was wrong with a frame shows in grey.
-                    (self._staging / place.frame.pop("colour_file")).unlink()
-                entry |= {**place.frame, "file": file}
-        if place is None:
-            # Frames stay in the order of their patterns, however often one is shot.
-            place = _Place({"pattern": refused.pattern, "camera": refused.camera})
-            self._places.append(place)
-        place.vacant = True
+            elif refused.delivered and slot is not None:
+                (self._staging / slot.frame["file"]).rename(self._staging / file)
+                if "colour_file" in slot.frame:
+                    # The grey frame is enough to find the fault.
+                    (self._staging / slot.frame.pop("colour_file")).unlink()
+                entry |= {**slot.frame, "file": file}
+        if slot is None:
+            # Frames stay in the order of their patterns, however often one is repeated.
+            slot = _FrameSlot({"pattern": refused.pattern, "camera": refused.camera})
+            self._slots.append(slot)
+        slot.vacant = True
         entry |= {"cause": refused.cause, "left_out": refused.left_out or None}
         self._refused.append(RefusedEntry.model_validate(entry))
 
     def keep(self, ended: str) -> None:
-        """Have what was written stay although the block will end with an error; `ended` says which."""
+        """Keep the written frames although the block will end with an error; `ended` is its message."""
         self._ended = ended
 
     def __exit__(
@@ -144,15 +147,15 @@ class BundleWriter:
         try:
             if error is None:
                 self._commit()
-            elif self._ended is not None and (self._places or self._refused):
-                # What ended the capture is the error to tell, not what its remains meet.
+            elif self._ended is not None and (self._slots or self._refused):
+                # The error that ended the capture matters, not those of keeping its frames.
                 with suppress(BundleError, CalibrationError, StorageError):
                     self._commit()
         finally:
             self._discard()
 
     def _commit(self) -> None:
-        frames = [place.frame for place in self._places if not place.vacant]
+        frames = [slot.frame for slot in self._slots if not slot.vacant]
         if not frames and self._ended is None:
             raise BundleError(f"{self.folder}: expected frames, found none; a bundle holds at least one frame")
         data: dict[str, Any] = {
@@ -163,16 +166,16 @@ class BundleWriter:
                 name: {"size_px": _extent(camera.size), "bit_depth": camera.bit_depth}
                 for name, camera in self._cameras.items()
             },
-            "patterns": [_pattern(pattern) for pattern in self._patterns],
+            "patterns": [_pattern_document(pattern) for pattern in self._patterns],
             "frames": frames,
         }
         if self._captured_at is not None:
             data["captured_at"] = self._captured_at.isoformat(timespec="seconds")
         if self._calibration is not None:
             write_calibration(self._staging / CALIBRATION, self._calibration)
-        with refusals_of(self.folder):
+        with storage_errors(self.folder):
             if frames:
-                # Without a frame it would be no bundle; what was refused is kept all the same.
+                # A bundle needs a frame; without one only the refused frames are kept.
                 write_durably(self._staging / DESCRIPTION, json_bytes(data))
             self._write_refused()
             for name in self._cameras:
@@ -182,18 +185,19 @@ class BundleWriter:
             self._staging.rename(self.folder)
             sync_folder(self.folder.parent)
 
-    def _latest(self, pattern: int, camera: str, *, vacant: bool) -> _Place | None:
-        """The last place of one pattern and camera that is vacant, or that is not."""
-        wanted = (pattern, camera, vacant)
-        mine = (p for p in reversed(self._places) if (p.frame["pattern"], p.frame["camera"], p.vacant) == wanted)
-        return next(mine, None)
+    def _latest_slot(self, pattern: int, camera: str, *, vacant: bool) -> _FrameSlot | None:
+        """Return the last slot of one pattern and camera that is vacant, or that is not."""
+        for slot in reversed(self._slots):
+            if (slot.frame["pattern"], slot.frame["camera"], slot.vacant) == (pattern, camera, vacant):
+                return slot
+        return None
 
     def _write_refused(self) -> None:
         if self._refused or self._ended is not None:
-            folder = self._staging / FOLDER
+            folder = self._staging / REFUSED_FOLDER
             folder.mkdir(exist_ok=True)
             listed = RefusedList(ended=self._ended, frames=self._refused)
-            write_durably(folder / LIST, json_bytes(listed.model_dump(exclude_none=True)))
+            write_durably(folder / REFUSED_LIST, json_bytes(listed.model_dump(exclude_none=True)))
             sync_folder(folder)
 
     def _discard(self) -> None:
@@ -214,22 +218,22 @@ class BundleWriter:
                 f"{self.folder}: expected a finite time and a positive exposure, found time {shot.time_s} s and "
                 f"exposure {shot.exposure_s} s; leave unknown ones out"
             )
-        wanted = "uint8" if camera.bit_depth <= 8 else "uint16"
+        dtype = "uint8" if camera.bit_depth <= 8 else "uint16"
         brightest = int(shot.image.max(initial=0))
         if shot.colour is not None:
             brightest = max(brightest, int(shot.colour.max(initial=0)))
-        fits = shot.image.dtype == wanted and (shot.colour is None or shot.colour.dtype == wanted)
+        fits = shot.image.dtype == dtype and (shot.colour is None or shot.colour.dtype == dtype)
         if shot.image.shape != camera.size.shape or not fits or brightest > camera.full_scale:
             rows, columns = shot.image.shape
             raise BundleError(
-                f"{self.folder}: expected {camera.size} {wanted} samples up to {camera.full_scale} from camera "
+                f"{self.folder}: expected {camera.size} {dtype} samples up to {camera.full_scale} from camera "
                 f"'{shot.camera}', found {columns} x {rows} {shot.image.dtype} up to {brightest}; "
                 "describe the camera's format as it delivers frames"
             )
 
 
 def write_bundle(folder: Path, capture: Capture, calibration: Calibration | None = None) -> None:
-    """Write a capture as a bundle, whole or not at all. Raises as `BundleWriter` does."""
+    """Write a capture as a bundle, completely or not at all. Raises as `BundleWriter` does."""
     with BundleWriter(folder, capture.projector, capture.patterns, capture.cameras, calibration) as writer:
         for shot in capture.shots:
             writer.add(shot)
@@ -244,6 +248,6 @@ def _extent(size: Size) -> list[int]:
     return [size.width_px, size.height_px]
 
 
-def _pattern(pattern: Pattern) -> dict[str, Any]:
+def _pattern_document(pattern: Pattern) -> dict[str, Any]:
     values = asdict(pattern)
     return {"kind": values.pop("kind"), **values}

@@ -8,7 +8,7 @@ from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.bundle.calibration import write_calibration, write_opencv_calibration
+from slrig.bundle import write_calibration, write_opencv_calibration
 from slrig.bundle.storage import write_durably
 from slrig.calibrate.pose_shooting import PoseDesk, outcome_of
 from slrig.calibrate.records import USUAL_PATTERNS, SessionRecord, SessionState
@@ -25,7 +25,7 @@ from slrig.errors import (
     CameraNotFoundError,
     StorageError,
 )
-from slrig.failure import disk_errors, failure_of
+from slrig.failure import disk_errors, job_failure
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.jobs.rig_jobs import RigJobs
@@ -107,7 +107,7 @@ class Calibrations:
         if job.state.final:
             if job.state is JobState.SUCCEEDED and not (place / READING).is_file():
                 message = f"The files of pose {number} are gone from {place}. Shoot it again."
-                self.register.jobs.lose_files(job.id, failure_of(StorageError(message)))
+                self.register.jobs.lose_files(job.id, job_failure(StorageError(message)))
         elif answer is None:
             self.poses.take_up(session_id, job)
         else:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.description import read_description
+from slrig.bundle import read_description
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import PoseRefusedError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White

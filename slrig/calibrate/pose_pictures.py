@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.description import read_description
-from slrig.bundle.images import read_pages
+from slrig.bundle import read_description, read_pages
 from slrig.calibrate.solving import ReadPose
 from slrig.calibrate.tools import Setting
 from slrig.calibration.board import Board, PoseObservation

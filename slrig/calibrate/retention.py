@@ -15,7 +15,7 @@ from uuid import UUID
 
 import structlog
 
-from slrig.bundle.calibration import read_calibration
+from slrig.bundle import read_calibration
 from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.records import SessionRecord
 from slrig.errors import CalibrationError, CalibrationNotFoundError, CalibrationStateError, StorageError

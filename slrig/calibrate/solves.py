@@ -9,7 +9,7 @@ from uuid import UUID
 
 import structlog
 
-from slrig.bundle.calibration import check_calibration, write_calibration
+from slrig.bundle import check_calibration, write_calibration
 from slrig.calibrate.records import SessionRecord, SessionState
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.store import CALIBRATION, REPORT

@@ -24,7 +24,7 @@ from uuid import UUID
 
 import numpy as np
 
-from slrig.bundle.calibration import read_calibration
+from slrig.bundle import read_calibration
 from slrig.bundle.storage import sync_folder, sync_tree, write_durably, write_file
 from slrig.calibrate.records import SessionRecord, session_from_json, session_json
 from slrig.calibrate.solving import ReadPose
@@ -212,7 +212,7 @@ class CalibrationStore:
 
     def _commit(self, staged: Path, place: Path) -> None:
         with disk_errors(staged):
-            sync_tree(staged, but=BUNDLE)
+            sync_tree(staged, except_folder=BUNDLE)
             staged.rename(place)
             sync_folder(place.parent)
 

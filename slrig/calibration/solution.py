@@ -27,8 +27,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import LENS_TERMS, Axis, Calibration, FloatArray, IntArray, Pinhole, depth_sensitive_cameras, triangulated_axis
-from slrig.model.lens import distortion_by_terms, distort
+from slrig.model import (
+    LENS_TERMS,
+    Axis,
+    Calibration,
+    FloatArray,
+    IntArray,
+    Pinhole,
+    depth_sensitive_cameras,
+    triangulated_axis,
+)
+from slrig.model.lens import distort, distortion_by_terms
 
 PARAMETERS = ("fx", "fy", "cx", "cy", *LENS_TERMS, "turn_x", "turn_y", "turn_z", "x_mm", "y_mm", "z_mm")
 _PARAMETER_COUNT = len(PARAMETERS)

@@ -17,7 +17,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle import RefusedFrame
 from slrig.capture.frame_checks import NEAR_SATURATION, NOISE_FLOOR_DN, Samples, describe_pattern
 from slrig.capture.verifier import EvidenceSummary, Sampler, check_capture
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
@@ -150,7 +150,7 @@ def _first_samples(exposure: ExposureSamples, patterns: Sequence[Pattern], kind:
 
 def bracket_summary(
     parts: Sequence[tuple[float, EvidenceSummary]],
-    refused: Sequence[Refused],
+    refused: Sequence[RefusedFrame],
     faults: Sequence[str],
     patterns: Sequence[Pattern],
 ) -> EvidenceSummary:
@@ -168,7 +168,7 @@ def bracket_summary(
     return replace(best, light_drift=drift, faults=(*exposure_faults, *faults)).with_refused(refused, patterns)
 
 
-def check_exposures(recorded: Capture, refused: Sequence[Refused] = ()) -> EvidenceSummary:
+def check_exposures(recorded: Capture, refused: Sequence[RefusedFrame] = ()) -> EvidenceSummary:
     """Verify a recorded capture as `slrig.capture.verifier.check_capture` does, a bracket by exposures."""
     groups = exposure_groups(shot.exposure_s for shot in recorded.shots)
     by_camera = {name: {groups[s.exposure_s] for s in recorded.shots if s.camera == name} for name in recorded.cameras}

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle import RefusedFrame
 from slrig.capture.frame_checks import describe_frame, describe_pattern
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
 from slrig.capture.verifier import RetryPolicy, describe_causes
@@ -224,9 +224,9 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
         period_s *= 2 if any(play.misses_every_second_pulse(name) for name in rig.cameras) else 1
         retries.evidence.clear()
         for index, name in play.delivered:
-            retries.refuse(Refused(index, name, number, causes[-1], delivered=True))
+            retries.refuse(RefusedFrame(index, name, number, causes[-1], delivered=True))
         for shot in play.withheld:
-            retries.refuse(Refused(shot.pattern, shot.camera, number, causes[-1], shot))
+            retries.refuse(RefusedFrame(shot.pattern, shot.camera, number, causes[-1], shot))
     message = f"the sequence was played {MAX_PLAYS} times by wire: {describe_causes(causes)}"
     raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
 

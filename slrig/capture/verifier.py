@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle import RefusedFrame
 from slrig.capture import frame_checks
 from slrig.capture.frame_checks import (
     Contradiction,
@@ -631,7 +631,7 @@ class EvidenceSummary:
         again = f", {self.shot_again} frame{'s' * (self.shot_again != 1)} shot again" if self.shot_again else ""
         return f"{self.verified}/{self.patterns} patterns verified{again}"
 
-    def with_refused(self, refused: Sequence[Refused], patterns: Sequence[Pattern]) -> EvidenceSummary:
+    def with_refused(self, refused: Sequence[RefusedFrame], patterns: Sequence[Pattern]) -> EvidenceSummary:
         """Return the summary with the data of rejected exposures."""
         shot = [each for each in refused if not each.left_out]
         return replace(
@@ -651,7 +651,7 @@ class Evidence:
     """
 
     def __init__(
-        self, patterns: Sequence[Pattern], cameras: Mapping[str, CameraFormat], refused: Sequence[Refused] = ()
+        self, patterns: Sequence[Pattern], cameras: Mapping[str, CameraFormat], refused: Sequence[RefusedFrame] = ()
     ) -> None:
         self._patterns = tuple(patterns)
         self._cameras = dict(cameras)
@@ -675,7 +675,7 @@ class Evidence:
         """Remove all frames. The record of rejected exposures remains."""
         self._verifiers = {name: FrameVerifier(name, form, self._patterns) for name, form in self._cameras.items()}
 
-    def record_refused(self, refused: Refused) -> None:
+    def record_refused(self, refused: RefusedFrame) -> None:
         """Record a rejected exposure."""
         self._refused.append(replace(refused, shot=None))
 
@@ -696,7 +696,7 @@ class Evidence:
         return summary.with_refused(self._refused, self._patterns)
 
 
-def check_capture(capture: Capture, refused: Sequence[Refused] = ()) -> EvidenceSummary:
+def check_capture(capture: Capture, refused: Sequence[RefusedFrame] = ()) -> EvidenceSummary:
     """Verify a recorded capture. Contradictions are listed in the summary, not raised.
 
     If a pattern has several exposure times, the one that most patterns share is checked. refused : exposures rejected
@@ -737,7 +737,7 @@ class RetryPolicy:
         self,
         sequence: PatternSequence,
         evidence: Evidence,
-        refused: Callable[[Refused], None],
+        refused: Callable[[RefusedFrame], None],
         *,
         since_ns: int | None = None,
         colour: Collection[str] = (),
@@ -787,7 +787,7 @@ class RetryPolicy:
         self._missing[shot.camera, index].clear()
         if fault is not None:
             self._causes[shot.camera, index].append(fault)
-            self._request_again(Refused(index, shot.camera, self._attempts[shot.camera, index], fault, shot))
+            self._request_again(RefusedFrame(index, shot.camera, self._attempts[shot.camera, index], fault, shot))
             self._raise_after_max_failures(shot.camera, [index])
             return None
         found = self.evidence.add_shot(shot)
@@ -797,7 +797,7 @@ class RetryPolicy:
         """Record that no frame came. Raises FrameTimeoutError: none came three times in a row."""
         missing = self._missing[camera, index]
         missing.append(cause)
-        self._request_again(Refused(index, camera, self._attempts[camera, index], cause))
+        self._request_again(RefusedFrame(index, camera, self._attempts[camera, index], cause))
         if len(missing) >= MAX_FAILURES:
             raise FrameTimeoutError(self._failure_message(camera, index, missing))
 
@@ -822,17 +822,17 @@ class RetryPolicy:
             is_current = pattern == shot.pattern
             attempt = self._attempts[camera, pattern]
             self._request_again(
-                Refused(pattern, camera, attempt, cause, shot if is_current else None, delivered=not is_current)
+                RefusedFrame(pattern, camera, attempt, cause, shot if is_current else None, delivered=not is_current)
             )
         self._raise_after_max_failures(camera, suspects)
         return frozenset(removed)
 
-    def refuse(self, refused: Refused) -> None:
+    def refuse(self, refused: RefusedFrame) -> None:
         """Record a rejected exposure and report it."""
         self.evidence.record_refused(refused)
         self._on_refused(refused)
 
-    def _request_again(self, refused: Refused) -> None:
+    def _request_again(self, refused: RefusedFrame) -> None:
         cameras = self.pending.setdefault(refused.pattern, [])
         if refused.camera not in cameras:
             cameras.append(refused.camera)

@@ -36,7 +36,7 @@ from slrig.config import RigConfig, read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
-from slrig.logs import set_up_logs_for_a_person
+from slrig.logs import set_up_console_logs
 from slrig.reports.page import begun
 
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
@@ -101,7 +101,7 @@ def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: 
     SlrigError
         As `run_acceptance`, or the rig file is wrong or the rig cannot be opened.
     """
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     config = read_rig(rig_file)
     if asked.wanted_mm is None:
         asked = replace(asked, wanted_mm=config.wanted_mm)

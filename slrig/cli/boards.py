@@ -11,7 +11,7 @@ import typer
 from slrig.bundle.storage import write_file
 from slrig.calibration.board import DEFAULT_BOARD, Board, BoardKind
 from slrig.cli.options import BoardOptions
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import CalibrationError
 
 
@@ -111,7 +111,7 @@ def write_board(board: Board, output: Path, *, page: str) -> None:
         message = f"--output: expected a name that ends in .pdf or .svg, found {output}"
         raise CalibrationError(message)
     content = board_pdf(board, page=page) if kind == ".pdf" else board_svg(board, page=page).encode()
-    with refusals_of(output.parent):
+    with storage_errors(output.parent):
         output.parent.mkdir(parents=True, exist_ok=True)
     write_file(output, content)
     typer.echo(f"written   {output}: {board.description}")

@@ -15,12 +15,12 @@ from pathlib import Path
 import typer
 from rich.table import Column
 
-from slrig.bundle.description import DESCRIPTION, read_description
-from slrig.bundle.storage import natural
+from slrig.bundle import DESCRIPTION, read_description
+from slrig.bundle.storage import natural_sort_key
 from slrig.cli.display import ProgressDisplay, print_table, progress_shown
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError
-from slrig.failure import UNEXPECTED, failure_of
+from slrig.failure import UNEXPECTED, job_failure
 from slrig.scan.artefacts import REPORT
 from slrig.scan.plan import Progress
 
@@ -42,7 +42,7 @@ def named_bundles(asked: Sequence[Path]) -> tuple[list[Path], bool]:
     found: dict[Path, Path] = {}
     several = False
     for one in asked:
-        with refusals_of(one):
+        with storage_errors(one):
             for path in matching(one):
                 inside = _bundles_inside(path)
                 several |= bool(inside)
@@ -103,7 +103,7 @@ def work_through(
 def matching(asked: Path) -> list[Path]:
     """What a pattern names, in natural order. A path stands for itself, and so does what matches nothing."""
     matching = [] if asked.exists() else glob(str(asked))  # noqa: PTH207 - Path.glob takes no absolute pattern
-    return sorted(map(Path, matching), key=natural) or [asked]
+    return sorted(map(Path, matching), key=natural_sort_key) or [asked]
 
 
 def _bundles_inside(folder: Path) -> list[Path]:
@@ -112,7 +112,7 @@ def _bundles_inside(folder: Path) -> list[Path]:
     """
     if not folder.is_dir() or (folder / DESCRIPTION).is_file():
         return []
-    inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural)
+    inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural_sort_key)
     # A scan of the service has its bundle beside its results.
     held = {each: [place for place in (each, each / BUNDLE) if (place / DESCRIPTION).is_file()][:1] for each in inside}
     found = [place for places in held.values() for place in places]
@@ -162,7 +162,7 @@ def _failure_told(bundle: Path, failed: dict[Path, str], display: ProgressDispla
     try:
         yield
     except Exception as error:  # noqa: BLE001 - whatever it is, the other bundles are worked on
-        failure = failure_of(error)
+        failure = job_failure(error)
         words = failure.message if failure.code != UNEXPECTED else f"a defect of slrig\n{traceback.format_exc()}"
         display.error(words if str(bundle) in words else f"{bundle}: {words}")
         failed[bundle] = failure.code

@@ -23,7 +23,7 @@ from slrig.cli.calibration_screen import checked, tell_check, tell_result
 from slrig.cli.display import ProgressDisplay, counted, print_json, progress_shown
 from slrig.cli.reconstruct import keep_kernels
 from slrig.errors import BundleError, ConfigError, PatternError, PoseRefusedError, SolveRefusedError
-from slrig.logs import set_up_logs_for_a_person
+from slrig.logs import set_up_console_logs
 from slrig.model import Size
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def _solved(
     wanted_mm: float | None,
 ) -> dict[str, Any]:
     """Solve, write the calibration and its report where a file is named, and return what is told of it."""
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     bundles = pose_bundles(folder)
     before = None if earlier is None else read_calibration(earlier)
     keep_kernels()

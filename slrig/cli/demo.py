@@ -21,7 +21,7 @@ from slrig import KEY_VARIABLE
 from slrig.cli.display import counted, progress_shown
 from slrig.cli.scan import scan_with, tell_result
 from slrig.client import Client
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ServiceError
 from slrig.scan.plan import Progress
 
@@ -39,7 +39,7 @@ def run_demo(rig: Path | None, output: Path) -> None:
     """
     rig = _rig_file(rig)
     data = output / "service"
-    with refusals_of(data):
+    with storage_errors(data):
         data.mkdir(parents=True, exist_ok=True)
     key = secrets.token_urlsafe(32)
     with progress_shown() as display:

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from slrig.cli.display import print_json
-from slrig.discovery import Findings, InstalledDriver, found_devices, installed_drivers
+from slrig.discovery import DiscoveredDevices, InstalledDriver, discover_devices, installed_drivers
 
 _STDOUT, _STDERR = 1, 2
 
@@ -33,7 +33,7 @@ def list_devices(*, as_json: bool) -> None:
     """Print the drivers that are installed, the devices that are plugged in, and what is missing to drive more."""
     with _only_ours_on_stdout():
         drivers = installed_drivers()
-        found = found_devices()
+        found = discover_devices()
     broken = broken_packages(drivers)
     if as_json:
         document = {
@@ -66,7 +66,7 @@ def broken_packages(drivers: Sequence[InstalledDriver]) -> tuple[BrokenPackage, 
     )
 
 
-def _tell_drivers(drivers: Sequence[InstalledDriver], found: Findings, console: Console) -> None:
+def _tell_drivers(drivers: Sequence[InstalledDriver], found: DiscoveredDevices, console: Console) -> None:
     missing = {library.driver for library in found.missing}
     elsewhere = {driver.driver for driver in found.elsewhere}
     table = _table("Installed drivers", "driver", "for a", "package", "state")
@@ -86,7 +86,7 @@ def _tell_drivers(drivers: Sequence[InstalledDriver], found: Findings, console: 
     console.print()
 
 
-def _tell_devices(found: Findings, console: Console) -> None:
+def _tell_devices(found: DiscoveredDevices, console: Console) -> None:
     if not found.devices:
         console.print(
             "No device is plugged in that an installed driver can find. Check cable and power; if the system does see "
@@ -100,7 +100,7 @@ def _tell_devices(found: Findings, console: Console) -> None:
     console.print("\nslrig init writes a rig file for them. Every option: slrig devices --options DRIVER")
 
 
-def _tell_remedies(found: Findings, broken: Sequence[BrokenPackage], told: set[str | None]) -> None:
+def _tell_remedies(found: DiscoveredDevices, broken: Sequence[BrokenPackage], told: set[str | None]) -> None:
     # Neither wrapped nor styled: commands are there to be copied whole.
     if found.missing:
         typer.echo("\nMore devices can be used after:")

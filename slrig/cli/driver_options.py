@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from slrig.cli.display import print_json
-from slrig.option_models import kinds_of, option_model
+from slrig.discovery import driver_kinds, option_model
 
 Schema = Mapping[str, Any]
 
@@ -56,7 +56,7 @@ def tell_options(driver: str, *, as_json: bool) -> None:
     DriverNotFoundError, DriverBrokenError
         There is no such driver, or what describes its options cannot be loaded.
     """
-    kinds, model = kinds_of(driver), option_model(driver)
+    kinds, model = driver_kinds(driver), option_model(driver)
     if as_json:
         print_json({} if model is None else model.model_json_schema())
         return

@@ -19,15 +19,13 @@ from slrig.capture import STEADY_TOLERANCE, CameraLatency, measure_latency
 from slrig.cli.display import print_json, progress_shown
 from slrig.cli.options import given
 from slrig.config import RigConfig, read_rig, read_settings
-from slrig.conformance import Outcome, Report, run
+from slrig.conformance import CheckOutcome, ConformanceReport, run_checks
 from slrig.devices import Rig, Synchronisation, Trigger
-from slrig.discovery import found_devices, installed_drivers, open_rig
-from slrig.doctor.doctor import Diagnosis, examine
-from slrig.doctor.findings import Severity
-from slrig.doctor.rig_file import refuse_existing, write_rig_file
+from slrig.discovery import discover_devices, installed_drivers, open_rig
+from slrig.doctor import Diagnosis, Severity, examine, refuse_existing, write_rig_file
 from slrig.errors import StorageError
 from slrig.jobs.examinations import keep
-from slrig.logs import set_up_logs_for_a_person
+from slrig.logs import set_up_console_logs
 from slrig.model import PatternSequence
 from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence
@@ -36,10 +34,10 @@ _COLOURS = {
     Severity.OK: "green",
     Severity.NOTE: "yellow",
     Severity.FAULT: "bold red",
-    Outcome.PASSED: "green",
-    Outcome.FAILED: "bold red",
-    Outcome.NOT_APPLICABLE: "dim",
-    Outcome.NOT_RUN: "yellow",
+    CheckOutcome.PASSED: "green",
+    CheckOutcome.FAILED: "bold red",
+    CheckOutcome.NOT_APPLICABLE: "dim",
+    CheckOutcome.NOT_RUN: "yellow",
 }
 
 
@@ -51,7 +49,7 @@ def doctor(
 
     Raises SlrigError where a rig file is wrong or cannot be written, or the rig cannot be opened.
     """
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     config = read_rig(rig_file)
     lines = _own_plan(config).named
     if output is not None:
@@ -60,7 +58,7 @@ def doctor(
         display("looking for displays", 0.0, "")
         # Light engines, trigger boxes, and outputs with a display.
         projectors = {driver.name for driver in installed_drivers() if driver.kind == "projector"}
-        displays = tuple(device for device in found_devices().devices if device.driver in projectors)
+        displays = tuple(device for device in discover_devices().devices if device.driver in projectors)
         display("opening the rig", 0.0, "")
         with open_rig(config) as rig:
             diagnosis = examine(
@@ -70,7 +68,7 @@ def doctor(
                 period_px=lines.period_px,
                 steps=lines.steps or lines.period_px,
                 search_s=search_s,
-                on_progress=display,
+                progress=display,
             )
     if output is not None:
         write_rig_file(diagnosis, rig_file, output, force=force)
@@ -88,13 +86,13 @@ def conform(rig: Path, *, data: Path | None, as_json: bool) -> bool:
 
     Raises SlrigError where the rig file is wrong, or the rig cannot be opened.
     """
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     config = read_rig(rig)
     with progress_shown() as display:
         display("opening the rig", 0.0, "")
         with open_rig(config) as opened:
             sequence = _own_sequence(opened, config)
-        report = run(lambda: open_rig(config), sequence, progress=display)
+        report = run_checks(lambda: open_rig(config), sequence, progress=display)
     _keep(data, "conform", report.document())
     if as_json:
         print_json(report.document())
@@ -119,7 +117,7 @@ def tell_latency(
     rig_file: Path, *, trials: int, search_s: float, exposure_s: float | None, trigger: str | None, as_json: bool
 ) -> None:
     """Measure a rig's latency, and print it in words with the table for its rig file, or as JSON."""
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     kind = None if trigger is None else Trigger(trigger)
     with open_rig(read_rig(rig_file)) as rig, progress_shown() as display:
         measured = measure_latency(
@@ -171,7 +169,7 @@ def _tell_diagnosis(diagnosis: Diagnosis, console: Console, *, rig_file: Path, o
             told += f"\n[bold]do[/bold] {escape(finding.remedy)}"
         table.add_row(_coloured(finding.severity), f"{told}  [dim]({finding.name})[/dim]")
     console.print(table)
-    faults, notes = len(diagnosis.of(Severity.FAULT)), len(diagnosis.of(Severity.NOTE))
+    faults, notes = len(diagnosis.with_severity(Severity.FAULT)), len(diagnosis.with_severity(Severity.NOTE))
     console.print(f"\n[bold]{_counted(faults, 'fault')}, {_counted(notes, 'note')}[/bold]")
     if output is not None:
         console.print(f"A rig file with these values: {escape(str(output))}")
@@ -179,31 +177,32 @@ def _tell_diagnosis(diagnosis: Diagnosis, console: Console, *, rig_file: Path, o
         console.print(f"For a rig file with these values: slrig doctor {escape(str(rig_file))} --output FILE.toml")
 
 
-def _tell_report(report: Report, console: Console) -> None:
+def _tell_report(report: ConformanceReport, console: Console) -> None:
     """Print a report for people: a row per check, then what is wrong, then the score."""
     heads = (Column("result", no_wrap=True), Column("s", justify="right", no_wrap=True), Column("check"))
     table = Table(*heads, box=None, title=f"Conformance of rig '{escape(report.rig)}'", title_justify="left")
     for result in report.results:
         told = escape(result.title)
-        if result.outcome is Outcome.NOT_APPLICABLE:
+        if result.outcome is CheckOutcome.NOT_APPLICABLE:
             told += f"\n[dim]{escape(result.reason or '')}[/dim]"
         table.add_row(_coloured(result.outcome), f"{result.seconds:.1f}", told)
     console.print(table)
     for result in report.results:
         if (failure := result.failure) is not None:
             console.print(f"\n[bold red]{escape(result.title)}[/bold red]  ({result.name})")
-            for what in ("where", "asked", "found", "do"):
-                if words := getattr(failure, what):
-                    console.print(f"  {what:<5}  {escape(words)}")
+            for label in ("where", "expected", "found", "remedy"):
+                if text := getattr(failure, label):
+                    console.print(f"  {label:<8}  {escape(text)}")
     if report.stopped is not None:
         console.print(f"\n[bold red]stopped[/bold red]  {escape(report.stopped)}")
+    passed, not_applicable = report.count(CheckOutcome.PASSED), report.count(CheckOutcome.NOT_APPLICABLE)
     console.print(
-        f"\n[bold]{report.percent} %[/bold]: {report.count(Outcome.PASSED)} of {report.applicable} checks that apply "
-        f"passed, {report.count(Outcome.NOT_APPLICABLE)} do not apply; {report.seconds:.0f} s"
+        f"\n[bold]{report.percent} %[/bold]: {passed} of {report.applicable} checks that apply passed, "
+        f"{not_applicable} do not apply; {report.seconds:.0f} s"
     )
 
 
-def _coloured(kind: Severity | Outcome) -> str:
+def _coloured(kind: Severity | CheckOutcome) -> str:
     return f"[{_COLOURS[kind]}]{kind}[/{_COLOURS[kind]}]"
 
 

@@ -18,14 +18,13 @@ import typer
 from pydantic import ValidationError
 
 from slrig.bundle.storage import write_file
-from slrig.bundle.validation import explain, keys_of
+from slrig.bundle.validation import describe_errors, model_keys
 from slrig.cli.driver_options import explained, option
-from slrig.config import rig_of
+from slrig.config import parse_rig
 from slrig.devices import FoundDevice
-from slrig.discovery import Findings, found_devices
-from slrig.doctor.rig_file import refuse_existing, toml_value
+from slrig.discovery import DiscoveredDevices, discover_devices, driver_kinds, option_model
+from slrig.doctor import refuse_existing, toml_value
 from slrig.errors import ConfigError, DeviceGoneError
-from slrig.option_models import kinds_of, option_model
 
 Answer = TypeVar("Answer")
 
@@ -74,13 +73,13 @@ def init(
     """
     refuse_existing(output, force=force)
     ask = not yes and terminal()
-    found = found_devices()
+    found = discover_devices()
     named = {
         "camera": _named_cameras(cameras, found),
         "projector": [] if projector is None else [_named("projector", projector, found, "projector")],
     }
     offered = {
-        kind: [device for device in found.devices if kind in kinds_of(device.driver)]
+        kind: [device for device in found.devices if kind in driver_kinds(device.driver)]
         for kind in ("camera", "projector", "head")
     }
     lacking = [kind for kind, parts in named.items() if not parts and not offered[kind]]
@@ -103,7 +102,7 @@ def terminal() -> bool:
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
-def _named_cameras(texts: Sequence[str], found: Findings) -> list[Part]:
+def _named_cameras(texts: Sequence[str], found: DiscoveredDevices) -> list[Part]:
     parts = []
     for number, text in enumerate(texts):
         name, _, rest = text.partition("=") if "=" in text.partition(":")[0] else ("", "", text)
@@ -111,10 +110,10 @@ def _named_cameras(texts: Sequence[str], found: Findings) -> list[Part]:
     return parts
 
 
-def _named(kind: str, text: str, found: Findings, name: str) -> Part:
+def _named(kind: str, text: str, found: DiscoveredDevices, name: str) -> Part:
     """What DRIVER:DEVICE means; a driver alone means its only device. Raises ConfigError, DriverNotFoundError."""
     driver, _, device = text.partition(":")
-    kinds = kinds_of(driver)
+    kinds = driver_kinds(driver)
     if kind not in kinds:
         message = f"--{kind} {text}: driver '{driver}' opens a {' and a '.join(kinds)}, no {kind}; see slrig devices"
         raise ConfigError(message)
@@ -243,7 +242,9 @@ def _listed(devices: Sequence[FoundDevice]) -> str:
     return "".join(f"\n  {each.driver}:{each.device}  {each.label}" for each in devices) + "\n"
 
 
-def _nothing_there(lacking: Sequence[str], offered: Mapping[str, Sequence[FoundDevice]], found: Findings) -> str:
+def _nothing_there(
+    lacking: Sequence[str], offered: Mapping[str, Sequence[FoundDevice]], found: DiscoveredDevices
+) -> str:
     """Words for a camera or a projector that is neither named nor plugged in, with what to check."""
     there = [f"{each.driver}:{each.device}" for kind in ("camera", "projector") for each in offered[kind]]
     flags = " ".join(f"--{kind} DRIVER:DEVICE" for kind in lacking)
@@ -318,7 +319,7 @@ def failure_of(driver: str, options: Mapping[str, object], key: str = "") -> str
         model.model_validate(dict(options))
     except ValidationError as cause:
         if not key or any(fault["loc"][:1] == (key,) for fault in cause.errors()):
-            return explain(cause, options, keys_of(model))
+            return describe_errors(cause, options, model_keys(model))
     return ""
 
 
@@ -328,7 +329,7 @@ def rig_text(path: Path, name: str, projector: Part, cameras: Sequence[Part], ex
     exposure_s : of every camera that has none of its own.
     """
     text = "\n".join(_lines(name, projector, cameras, exposure_s)) + "\n"
-    rig = rig_of(tomllib.loads(text), path)
+    rig = parse_rig(tomllib.loads(text), path)
     tables = {f"camera '{table.name}'": table for table in rig.cameras} | {"the projector": rig.projector}
     faults = [
         f"driver '{table.driver}' does not take these options of {what}:\n{fault}"

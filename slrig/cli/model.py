@@ -90,10 +90,10 @@ def model(
     from slrig.cli.reconstruct import keep_kernels
     from slrig.combine.offered import POSES, REPORT, REPORT_FORMAT
     from slrig.combine.plan import MARKER_DICTIONARY, MarkerPoses, StatedAxis, UnknownPoses
-    from slrig.logs import set_up_logs_for_a_person
+    from slrig.logs import set_up_console_logs
     from slrig.scan.artefacts import staged_folder
 
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     keep_kernels()
     known, notes = StageRecord() if stage is None else read_stage(stage), list[str]()
     told = _axis(axis, axis_point, axis_direction)
@@ -303,13 +303,13 @@ def _named_meshes(asked: Sequence[Path]) -> dict[str, Path]:
 
     Raises ConfigError: there is none, fewer than two, or two of one name.
     """
-    from slrig.bundle.storage import natural
+    from slrig.bundle.storage import natural_sort_key
     from slrig.cli.bundles import matching
     from slrig.scan.artefacts import MESH
 
     found: list[tuple[str, Path]] = []
     for path in (each for one in asked for each in matching(one)):
-        inside = [path / MESH] if (path / MESH).is_file() else sorted(path.glob(f"*/{MESH}"), key=natural)
+        inside = [path / MESH] if (path / MESH).is_file() else sorted(path.glob(f"*/{MESH}"), key=natural_sort_key)
         if path.is_file():
             inside = [path]
         if not inside:

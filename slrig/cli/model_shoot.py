@@ -13,8 +13,7 @@ from uuid import uuid4
 import typer
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.bundle.description import DESCRIPTION
-from slrig.bundle.sidecars import read_stage
+from slrig.bundle import DESCRIPTION, read_stage
 from slrig.cli.display import answered, progress_shown
 from slrig.cli.reconstruct import prepare_kernels
 from slrig.client import Client

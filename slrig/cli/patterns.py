@@ -48,13 +48,13 @@ def written_patterns(rig_file: Path, asked: Mapping[str, object]) -> str:
     from slrig.config import read_rig
     from slrig.devices import StoredPatternProjector
     from slrig.discovery import open_rig
-    from slrig.doctor.doctor import doctor_sequence
+    from slrig.doctor import doctor_sequence
     from slrig.errors import UnsupportedByDeviceError
-    from slrig.logs import set_up_logs_for_a_person
+    from slrig.logs import set_up_console_logs
     from slrig.patterns import merge_sequences
     from slrig.scan.plan_check import pattern_sequence
 
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     config = read_rig(rig_file)
     request = ScanRequest(patterns=PatternRequest.model_validate(asked))
     with open_rig(config) as rig:

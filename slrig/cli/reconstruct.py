@@ -11,8 +11,7 @@ from typing import Any
 import typer
 from rich.table import Column
 
-from slrig.bundle.calibration import read_calibration
-from slrig.bundle.description import read_description
+from slrig.bundle import read_calibration, read_description
 from slrig.bundle.storage import write_file
 from slrig.cli.bundles import Row, named_bundles, work_through
 from slrig.cli.display import counted, progress_shown
@@ -20,7 +19,7 @@ from slrig.cli.quality import quality_lines
 from slrig.errors import ConfigError, ExtraMissingError
 from slrig.jobs.worker import prepare_kernel_cache
 from slrig.jobs.worker_wait import PREPARING
-from slrig.logs import set_up_logs_for_a_person
+from slrig.logs import set_up_console_logs
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, write_converted
 from slrig.scan.offered import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand
 from slrig.scan.plan import Progress, ReconstructionPlan
@@ -33,7 +32,7 @@ def decode_and_tell(asked: Sequence[Path], output: Path) -> None:
     """
     from slrig.scan.decoding_only import decode_bundle
 
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     bundles, several = named_bundles(asked)
     if several:
 
@@ -72,7 +71,7 @@ def reconstruct_and_tell(
 
     further : names of files that are written as well; options : fields of `ReconstructionPlan` that were given.
     """
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     plan = ReconstructionPlan(**options)
     bundles, several = named_bundles(asked)
     # What is wrong with the files is said at once, not after a minute in which kernels are compiled.
@@ -172,15 +171,15 @@ def prepare_kernels(display: Progress) -> int:
     keep_kernels()
     display("loading", 0.0, "")
     # numba itself: a second.
-    from slrig.kernels import Prepared, all_kept, prepared
+    from slrig.kernels import KernelCount, are_all_cached, count_prepared
     from slrig.scan.reconstruct import warm_kernels
 
-    def told(now: Prepared) -> None:
+    def told(now: KernelCount) -> None:
         display(PREPARING, 0.0, f"first time only: {now.done} of {now.total}")
 
-    if not all_kept():
+    if not are_all_cached():
         warm_kernels(told)
-    return prepared().total
+    return count_prepared().total
 
 
 def keep_kernels() -> None:

@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from slrig.config import RigTable
-from slrig.option_models import described_drivers, kinds_of, option_model
+from slrig.discovery import driver_kinds, drivers_with_options, option_model
 
 PACKAGE = "slrig"
 _NULL = {"type": "null"}
@@ -28,7 +28,7 @@ def rig_schema() -> str:
     schema is among `anyOf` as well, where editors look for keys to propose (Taplo does not look into `then`). The last
     of these takes any driver.
     """
-    models = {name: model for name in described_drivers(PACKAGE) if (model := option_model(name)) is not None}
+    models = {name: model for name in drivers_with_options(PACKAGE) if (model := option_model(name)) is not None}
     every: list[type[BaseModel]] = [RigTable, *models.values()]
     parts, whole = models_json_schema([(model, "validation") for model in every], ref_template="#/$defs/{model}")
     defined: dict[str, Any] = _as_in_toml(whole["$defs"])
@@ -36,7 +36,7 @@ def rig_schema() -> str:
     offered: dict[str, list[str]] = {kind: [] for kind in _TABLES}
     for driver, model in models.items():
         own = defined.pop(_name(parts[model, "validation"]))
-        for kind in kinds_of(driver):
+        for kind in driver_kinds(driver):
             defined[f"{kind}_{driver}"] = _merged(defined[_TABLES[kind]], own, driver)
             offered[kind].append(driver)
     tables = {**rig["properties"], "camera": rig["properties"]["camera"]["items"]}

@@ -13,7 +13,7 @@ from rich.table import Column
 from slrig.cli.display import print_table, progress_shown
 from slrig.cli.quality import quality_lines
 from slrig.client import Client, ScanJob
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
 from slrig.scan.offered import PREFIXES, installed_by, offered
 
@@ -144,7 +144,7 @@ def _completed(
             if (command := installed_by(name)) is not None:
                 message += f" For {name}, {command} where the service runs; the scan need not be repeated."
         raise ServiceError(message)
-    with refusals_of(output):
+    with storage_errors(output):
         output.mkdir(parents=True, exist_ok=True)
     for name in files:
         told(f"fetching {name}", 1.0, "")

@@ -45,9 +45,9 @@ def axis(
     from slrig.cli.display import print_table, progress_shown
     from slrig.cli.reconstruct import keep_kernels
     from slrig.errors import PatternError, PoseRefusedError
-    from slrig.logs import set_up_logs_for_a_person
+    from slrig.logs import set_up_console_logs
 
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     bundles, board, rig, before = (
         pose_bundles(folder),
         chosen_board(asked),

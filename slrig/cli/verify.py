@@ -17,7 +17,7 @@ from slrig.cli.display import print_json, progress_shown
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.errors import CalibrationError
-from slrig.logs import set_up_logs_for_a_person
+from slrig.logs import set_up_console_logs
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import Progress, ScanPlan
@@ -36,7 +36,7 @@ def verify(source: Path, board: Board, calibration_file: Path | None, *, positio
     SlrigError
         There is no calibration, the rig cannot be opened, or the board is not to be seen.
     """
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     with progress_shown() as display:
         if source.is_dir():
             calibration = _calibration(calibration_file or source / "calibration.json")

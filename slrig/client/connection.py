@@ -18,7 +18,7 @@ import httpx2
 from slrig import KEY_VARIABLE
 from slrig.client.errors import UnreachableError, foreign, refusal
 from slrig.client.events import Event, event_of
-from slrig.disk import refusals_of, staging_name
+from slrig.disk import staging_name, storage_errors
 from slrig.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -149,13 +149,13 @@ class Connection:
         partial = staging_name(target)
         try:
             with self._stream(path) as response:
-                with refusals_of(target):
+                with storage_errors(target):
                     file = partial.open("xb")
                 with file:
                     for piece in response.iter_bytes():
-                        with refusals_of(target):
+                        with storage_errors(target):
                             file.write(piece)
-            with refusals_of(target):
+            with storage_errors(target):
                 partial.replace(target)
         except httpx2.TransportError as error:
             raise self._unreachable(error) from error

@@ -17,9 +17,9 @@ from slrig.combine.markers import markers_of
 from slrig.combine.offered import COARSE, MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT, SIDES, VIEW
 from slrig.combine.pictures import six_sides_png
 from slrig.combine.plan import START_ERROR_MM, GivenPoses, MarkerPoses, StartingPoses, TurntablePoses
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
-from slrig.kernels import compilations_told
+from slrig.kernels import report_compilations
 from slrig.meshing import open_borders
 from slrig.model import AlbedoMark, Mesh, StagePlane
 from slrig.multiview import (
@@ -101,7 +101,7 @@ def combine_into(
     def compiling(kernel: str) -> None:
         progress(*at, f"preparing kernels, first time only: {kernel}")
 
-    with compilations_told(compiling):
+    with report_compilations(compiling):
         names, views, removed, seen = list(meshes), [], [], list[MarkerObservations]()
         for number, (name, file) in enumerate(meshes.items()):
             entered("reading", 0.2 * number / len(meshes), name)
@@ -151,7 +151,7 @@ def combine_into(
 
 def read_mesh(file: Path) -> Mesh:
     """A view. Raises InvalidInputError: the file is not as slrig wrote it; StorageError: it cannot be read."""
-    with refusals_of(file):
+    with storage_errors(file):
         data = file.read_bytes()
     try:
         return decode_mesh_ply(data)

@@ -26,7 +26,7 @@ from slrig.combine.plan import (
 from slrig.combine.stage import StageStore
 from slrig.combine.store import ModelStore, found_axis, summary
 from slrig.errors import ConfigError, JobNotFoundError, QueueFullError, ScanStateError, StorageError
-from slrig.failure import failure_of
+from slrig.failure import job_failure
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.progress import ProgressRecorder
@@ -131,7 +131,7 @@ class ModelDesk:
                 message = (
                     f"{' and '.join(missing)} of this model is gone from {self.store.place(model_id)}. Make it again."
                 )
-                self.jobs.lose_files(model_id, failure_of(StorageError(message)))
+                self.jobs.lose_files(model_id, job_failure(StorageError(message)))
                 _log.warning("left by the last run", model=str(model_id), found="without files")
         for name in self.store.put_aside(set(states)):
             _log.warning("left by the last run", model=name, found="put aside")

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.description import DESCRIPTION
-from slrig.bundle.reading import open_bundle
+from slrig.bundle import DESCRIPTION, open_bundle
 from slrig.calibration.detection import (
     MAX_SIGMA_PX,
     SIGMA_FLOOR_PX,

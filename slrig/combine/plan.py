@@ -12,7 +12,7 @@ from uuid import UUID
 
 from pydantic import Field, TypeAdapter
 
-from slrig.bundle.sidecars import TurnedBy
+from slrig.bundle import TurnedBy
 from slrig.errors import ConfigError
 from slrig.model import FloatArray
 from slrig.scan.plan import ScanPlan, SeriesPlace

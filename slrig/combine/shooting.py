@@ -36,7 +36,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
     ViewsFailedError,
 )
-from slrig.failure import errors_by_code, failure_of
+from slrig.failure import errors_by_code, job_failure
 from slrig.jobs.records import JobProgress, JobRecord, JobState, acting_as, utc_now
 from slrig.jobs.store import JobStore
 from slrig.scan.records import plan_from_json as scan_plan_from_json
@@ -157,7 +157,7 @@ class ViewShooting:
             except StorageError as error:
                 # Its scans could not be put on record: it is not to wait for them.
                 with suppress(JobNotFoundError, StorageError):
-                    self._desk.jobs.finish(model_id, JobState.FAILED, fault=failure_of(error))
+                    self._desk.jobs.finish(model_id, JobState.FAILED, fault=job_failure(error))
                 raise
             self._tell(model_id, shoot)
         self._watch(model_id)
@@ -218,7 +218,7 @@ class ViewShooting:
             record = self._desk.jobs.get(model_id)
             if not plan_from_json(record.plan).being_shot:
                 return self._desk.cancel(model_id)
-            fault = failure_of(ScanCancelledError("The model was cancelled while its views were shot. They stay."))
+            fault = job_failure(ScanCancelledError("The model was cancelled while its views were shot. They stay."))
             self._desk.jobs.finish(model_id, JobState.CANCELLED, fault=fault)
             # Also of one that was cancelled before, and not wholly. The last first: no other one begins meanwhile.
             for scan in reversed(self._scans.of(model_id).get(model_id, [])):
@@ -294,7 +294,7 @@ class ViewShooting:
             self._desk.begin(record, replace(plan, scans=tuple(good.values()), poses=poses, notes=left_out))
         except SlrigError as error:
             _log.warning("a model failed", model=str(record.id), cause=str(error))
-            self._desk.jobs.finish(record.id, JobState.FAILED, fault=failure_of(error))
+            self._desk.jobs.finish(record.id, JobState.FAILED, fault=job_failure(error))
 
     def _waiting(self, model_id: UUID) -> tuple[JobRecord, ShootPlan, tuple[View, ...]]:
         """A model that waits for a hand. Raises JobNotFoundError, ScanStateError."""

@@ -15,7 +15,7 @@ import structlog
 
 from slrig.bundle.options import AxisSource, ChangeEntry, StageRecord, encode_stage, read_stage
 from slrig.bundle.storage import sync_folder, write_file
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.records import utc_now
 from slrig.model import MeasuredAxis, StagePlane
@@ -121,14 +121,14 @@ class StageStore:
         """Put a whole record in place of the one there is, unless that is damaged."""
         with self._lock:
             self.record()
-            with refusals_of(self._path):
+            with storage_errors(self._path):
                 self._path.parent.mkdir(exist_ok=True)
             write_file(self._path, encode_stage(record))
             return record
 
     def delete(self) -> None:
         """Forget the stage, whatever the file holds. Idempotent."""
-        with self._lock, refusals_of(self._path), suppress(FileNotFoundError):
+        with self._lock, storage_errors(self._path), suppress(FileNotFoundError):
             self._path.unlink()
             sync_folder(self._path.parent)
 

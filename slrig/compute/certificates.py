@@ -13,8 +13,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from slrig.bundle.storage import write_file
 from slrig.compute.security import AUTHORITY, CERTIFICATE, KEY
-from slrig.config import private_text
-from slrig.disk import refusals_of
+from slrig.config import read_private_text
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError
 from slrig.jobs.records import utc_now
 
@@ -49,7 +49,7 @@ def make_certificates(folder: Path, names: Sequence[str]) -> list[Path]:
                 "most, such as rig-7."
             )
             raise ConfigError(message)
-    with refusals_of(folder):
+    with storage_errors(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     key_path, certificate_path = folder / AUTHORITY_KEY, folder / AUTHORITY
     if not key_path.exists():
@@ -63,7 +63,7 @@ def make_certificates(folder: Path, names: Sequence[str]) -> list[Path]:
         place = folder / name
         if (place / CERTIFICATE).exists():
             continue
-        with refusals_of(place):
+        with storage_errors(place):
             place.mkdir(mode=0o700, exist_ok=True)
         own = ec.generate_private_key(ec.SECP256R1())
         _write_key(place / KEY, own)
@@ -76,7 +76,7 @@ def make_certificates(folder: Path, names: Sequence[str]) -> list[Path]:
 
 def _authority(key_path: Path, certificate_path: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
     try:
-        text = private_text(key_path, f"the authority's key {key_path}")
+        text = read_private_text(key_path, f"the authority's key {key_path}")
         key = serialization.load_pem_private_key(text.encode(), password=None)
         authority = x509.load_pem_x509_certificate(certificate_path.read_bytes())
     except (OSError, ValueError, TypeError) as cause:
@@ -123,6 +123,6 @@ def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
     text = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    with refusals_of(path):
+    with storage_errors(path):
         path.touch(mode=0o600)
         path.write_bytes(text)

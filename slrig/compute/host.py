@@ -18,7 +18,7 @@ from distributed import WorkerPlugin, get_worker
 
 from slrig.compute.store import PoolError, PoolStore
 from slrig.errors import ScanCancelledError, WorkerLostError
-from slrig.failure import JobFailure, failure_of
+from slrig.failure import JobFailure, job_failure
 from slrig.jobs.compute import Compute
 from slrig.jobs.worker_process import Task
 
@@ -111,7 +111,7 @@ class Host(WorkerPlugin):
         except BaseException as error:  # noqa: BLE001 - a panic of obstore, too: the rig is told, and computes by itself
             if not isinstance(error, ScanCancelledError):
                 _log.warning("an order came to nothing", job=order.job, cause=repr(error))
-            return Answer(fault=failure_of(error))
+            return Answer(fault=job_failure(error))
 
     def _computed(self, order: Order, tell: Tell, beat: Callable[[], None], stopped: Callable[[], bool]) -> Answer:
         # Of the process that computes: after an update of the files beneath, it is newer than this one.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from slrig.config import is_loopback, private_text
+from slrig.config import is_loopback, read_private_text
 from slrig.errors import ConfigError, ExtraMissingError
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def pool_security(address: str, certificates: Path | None) -> Security | None:
             "made, such as its folder 'worker'."
         )
         raise ConfigError(message)
-    private_text(certificates / KEY, "the key of this machine's certificate")
+    read_private_text(certificates / KEY, "the key of this machine's certificate")
     from distributed import Security
 
     authority, certificate, key = map(str, files)

@@ -22,7 +22,7 @@ from slrig.compute.cluster import CONNECT_S, join_logs
 from slrig.compute.host import Host, resource
 from slrig.compute.store import PoolStore
 from slrig.config import is_loopback
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ServiceError, WorkerLostError
 from slrig.jobs.versions import versions
 from slrig.jobs.worker import READY, Worker, prepare_kernel_cache
@@ -129,7 +129,7 @@ def _scratch() -> Iterator[None]:
     worker of the same user left that was killed.
     """
     place = Path(tempfile.gettempdir(), f"slrig-workers-{os.getuid()}")
-    with refusals_of(place):
+    with storage_errors(place):
         place.mkdir(mode=0o700, exist_ok=True)
         if place.lstat().st_uid != os.getuid():
             message = f"{place} belongs to somebody else. Set TMPDIR to a folder of your own."

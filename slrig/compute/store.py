@@ -21,8 +21,8 @@ import obstore
 from obstore.exceptions import BaseError
 from obstore.store import LocalStore, S3Store
 
-from slrig.config import is_loopback, private_text
-from slrig.disk import refusals_of
+from slrig.config import is_loopback, read_private_text
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class PoolStore:
             This machine's disk refused.
         """
         # Beside the bundle, where there is room; it has no name, and is gone however this ends.
-        with refusals_of(bundle.parent), tempfile.TemporaryFile(dir=bundle.parent) as packed:
+        with storage_errors(bundle.parent), tempfile.TemporaryFile(dir=bundle.parent) as packed:
             with tarfile.open(fileobj=packed, mode="w") as archive:
                 for path in sorted(bundle.rglob("*")):
                     if path.is_file():
@@ -87,7 +87,7 @@ class PoolStore:
 
     def fetch_bundle(self, key: str, bundle: Path, check: Check) -> None:
         """Unpack the bundle of a key into a new folder. Raises as `put_bundle` does."""
-        with refusals_of(bundle.parent), tempfile.TemporaryFile(dir=bundle.parent) as packed:
+        with storage_errors(bundle.parent), tempfile.TemporaryFile(dir=bundle.parent) as packed:
             self._fetch(_bundle(key), key, packed, check)
             packed.seek(0)
             with tarfile.open(fileobj=packed) as archive:
@@ -95,7 +95,7 @@ class PoolStore:
 
     def put_result(self, job: str, path: Path, check: Check) -> str:
         """Bring a file of a result to the store; return its hash. Raises as `put_bundle`."""
-        with refusals_of(path), path.open("rb") as file:
+        with storage_errors(path), path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
             file.seek(0)
             with self._faults():
@@ -112,7 +112,7 @@ class PoolStore:
                 raise PoolError(message)
             part = folder / f".{name}.part"
             try:
-                with refusals_of(folder):
+                with storage_errors(folder):
                     with part.open("wb") as file:
                         self._fetch(_result(job, name), digest, file, check)
                     part.replace(folder / name)
@@ -207,7 +207,7 @@ def open_store(address: str, login: Path | None = None) -> PoolStore:
         raise ConfigError(message)
     options: dict[str, Any] = {} if endpoint is None else {"endpoint": endpoint, "virtual_hosted_style_request": False}
     if login is not None:
-        name, found, secret = private_text(login, f"compute_login_file: {login}").strip().partition(":")
+        name, found, secret = read_private_text(login, f"compute_login_file: {login}").strip().partition(":")
         if not found:
             message = f"compute_login_file: {login} does not hold KEY ID:SECRET."
             raise ConfigError(message)

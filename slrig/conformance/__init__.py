@@ -1,9 +1,18 @@
-"""The contract of cameras and projectors, as checks that hold for every driver, and a scored report of a rig.
+"""Checks of the driver contract for cameras, projectors and positioners, and a scored report of a rig.
 
-`slrig conform RIG` runs them on a rig; a driver's own tests call `run`, or `Examination.judge` check by check.
+`slrig conform RIG` runs them on a rig; tests of a driver call `run_checks`, or `ConformanceRun.run_check` for each.
 """
 
 from slrig.conformance.bench import Check, Failure
-from slrig.conformance.running import CHECKS, Examination, Outcome, Progress, Report, Result, run
+from slrig.conformance.running import CHECKS, CheckOutcome, CheckResult, ConformanceReport, ConformanceRun, run_checks
 
-__all__ = ["CHECKS", "Check", "Examination", "Failure", "Outcome", "Progress", "Report", "Result", "run"]
+__all__ = [
+    "CHECKS",
+    "Check",
+    "CheckOutcome",
+    "CheckResult",
+    "ConformanceReport",
+    "ConformanceRun",
+    "Failure",
+    "run_checks",
+]

@@ -1,4 +1,4 @@
-"""An examination: one thread that owns the rig's devices, a limit of time for each check, and a scored report."""
+"""Run of all checks on a rig: one thread owns the devices, each check has a time limit, and the report has a score."""
 
 from __future__ import annotations
 
@@ -12,32 +12,34 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from types import TracebackType
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
-from slrig.conformance import declared, frames, freshness, positioners, sequences, settings, shutdown, states
-from slrig.conformance.bench import Check, ExpectationError, Failure, NotApplicableError, RigBench, failure_of
+from slrig.conformance import camera_checks, device_checks, rig_checks
+from slrig.conformance.bench import Check, ExpectationError, Failure, NotApplicableError, RigBench, failure_from
 from slrig.devices import Rig
 from slrig.errors import DeviceError
 from slrig.model import PatternSequence
 
 CHECKS = tuple(
     each
-    for module in (declared, states, settings, frames, freshness, sequences, positioners, shutdown)
+    for module in (device_checks, camera_checks, rig_checks)
     for each in vars(module).values()
     if isinstance(each, Check)
 )
-"""Every check, in the order in which a rig is examined: what is declared first, whole sequences and ways out last."""
+"""Every check, in the order in which they run: declarations first, whole sequences and closing last."""
 
 OPENING_LIMIT_S = 120.0
 CHECK_LIMIT_S = 60.0
 _CLOSING_LIMIT_S = 10.0
 _EXPOSURES_PER_PATTERN = 8  # more than any check makes
 
+ProgressCallback = Callable[[str, float, str], None]
+
 _Answer = TypeVar("_Answer")
 
 
-class Outcome(StrEnum):
-    """How a check ended. Not run: the examination was stopped before; it counts against the rig."""
+class CheckOutcome(StrEnum):
+    """Outcome of a check. Not run: the examination was stopped before it; it counts against the rig."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -46,39 +48,41 @@ class Outcome(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
-    """One check's outcome. `failure` says what is wrong; `reason` why it does not apply or was not run."""
+class CheckResult:
+    """Result of one check. `failure` describes a violation; `reason` why the check does not apply or was not run."""
 
     name: str
     title: str
-    outcome: Outcome
+    outcome: CheckOutcome
     seconds: float
     failure: Failure | None = None
     reason: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
-    """Every check's result, in order, and how long all took. `stopped` says why the examination ended early, if so."""
+class ConformanceReport:
+    """Results of all checks, in order, and their duration. stopped : why the examination ended early; None if it did
+    not.
+    """
 
     rig: str
-    results: tuple[Result, ...]
+    results: tuple[CheckResult, ...]
     seconds: float
     stopped: str | None = None
 
-    def count(self, outcome: Outcome) -> int:
-        """How many checks ended so."""
+    def count(self, outcome: CheckOutcome) -> int:
+        """Number of checks with this outcome."""
         return sum(result.outcome is outcome for result in self.results)
 
     @property
     def applicable(self) -> int:
-        """How many checks ask something of this rig."""
-        return len(self.results) - self.count(Outcome.NOT_APPLICABLE)
+        """Number of checks that apply to this rig."""
+        return len(self.results) - self.count(CheckOutcome.NOT_APPLICABLE)
 
     @property
     def score(self) -> float:
         """Passed checks over applicable ones, 0 to 1."""
-        return self.count(Outcome.PASSED) / self.applicable if self.applicable else 0.0
+        return self.count(CheckOutcome.PASSED) / self.applicable if self.applicable else 0.0
 
     @property
     def percent(self) -> int:
@@ -87,70 +91,69 @@ class Report:
 
     @property
     def conforms(self) -> bool:
-        """Whether every check that applies has passed."""
-        return self.applicable > 0 and self.count(Outcome.PASSED) == self.applicable
+        """True if every check that applies has passed."""
+        return self.applicable > 0 and self.count(CheckOutcome.PASSED) == self.applicable
 
     def document(self) -> dict[str, Any]:
-        """The report as JSON can hold it."""
+        """Return the report as JSON can hold it."""
         return {
             "rig": self.rig,
             "conforms": self.conforms,
             "score": self.score,
-            "passed": self.count(Outcome.PASSED),
+            "passed": self.count(CheckOutcome.PASSED),
             "applicable": self.applicable,
             "seconds": self.seconds,
             "stopped": self.stopped,
-            "checks": [asdict(result) for result in self.results],
+            "checks": [{**asdict(result), "failure": _failure_document(result.failure)} for result in self.results],
         }
 
 
-class Progress(Protocol):
-    """Told how far an examination is: the check, the fraction done (0 to 1), and a few words."""
-
-    def __call__(self, stage: str, fraction: float, detail: str, /) -> None:
-        """Take note."""
-        ...
-
-
-def run(
+def run_checks(
     open_rig: Callable[[], Rig],
     sequence: PatternSequence,
     *,
-    progress: Progress = lambda _stage, _fraction, _detail: None,
+    progress: ProgressCallback = lambda _stage, _fraction, _detail: None,
     checks: Sequence[Check] = CHECKS,
     limit_s: float | None = None,
-) -> Report:
+) -> ConformanceReport:
     """Examine a rig by every check.
 
-    open_rig : opens the rig afresh; called several times, each time after the rig was closed. sequence : patterns that
-    its projector can show, white and black first. progress : told about each check before and after it, in the caller's
-    thread. limit_s : how long a check may take; None is a minute, and more for long exposures.
+    open_rig : opens the rig; called several times, each time after the rig was closed. sequence : patterns that its
+    projector can show, white and black first. progress : called with the check, the fraction done and a detail before
+    and after each check, in the caller's thread. limit_s : time limit of a check; None is a minute, and more for long
+    exposures.
 
-    Raises what opening the rig for the first time raises: a rig that does not open cannot be examined.
+    Raises the errors of opening the rig for the first time.
     """
-    begun_s = time.monotonic()
-    results: list[Result] = []
-    with Examination(open_rig, sequence, limit_s=limit_s) as examination:
+    start_s = time.monotonic()
+    results: list[CheckResult] = []
+    with ConformanceRun(open_rig, sequence, limit_s=limit_s) as run:
         for count, each in enumerate(checks):
             progress(each.title, count / len(checks), "")
-            results.append(examination.judge(each))
+            results.append(run.run_check(each))
             progress(each.title, (count + 1) / len(checks), results[-1].outcome)
-        return Report(examination.name, tuple(results), time.monotonic() - begun_s, examination.stopped)
+        return ConformanceReport(run.name, tuple(results), time.monotonic() - start_s, run.stopped)
 
 
-class Examination:
-    """A rig under examination. A context manager: entering it opens the rig, leaving it closes the rig.
+def _failure_document(failure: Failure | None) -> dict[str, str] | None:
+    if failure is None:
+        return None
+    return {"asked": failure.expected, "found": failure.found, "do": failure.remedy, "where": failure.where}
 
-    The devices belong to one thread. A check that does not return keeps it, and with it the devices: nothing else is
-    asked of them any more, and `stopped` says so. Should the check come back later, the rig is closed then.
+
+class ConformanceRun:
+    """Examination of a rig. A context manager that opens and closes the rig.
+
+    The devices belong to one thread. A check that does not return blocks that thread: no further call is made to the
+    devices, and `stopped` gives the reason. If the check returns later, the rig is closed then.
     """
 
     def __init__(self, open_rig: Callable[[], Rig], sequence: PatternSequence, *, limit_s: float | None = None) -> None:
         self._bench = RigBench(open_rig, sequence)
         self._limit_s = limit_s
         self._work: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
-        # A device that never answers must not keep the program from ending.
-        self._owner = threading.Thread(target=self._do_work, name="conformance", daemon=True)
+        # A daemon, so that a device that never answers cannot keep the program running.
+        self._owner = threading.Thread(target=self._run_owner, name="conformance", daemon=True)
         self._stuck = False
         self.name = ""
         self.stopped: str | None = None
@@ -158,7 +161,7 @@ class Examination:
     def __enter__(self) -> Self:
         self._owner.start()
         try:
-            rig = self._opened()
+            rig = self._open()
         except BaseException:
             self._work.put(None)
             raise
@@ -176,78 +179,78 @@ class Examination:
         if not self._stuck:
             self._owner.join(_CLOSING_LIMIT_S)
 
-    def judge(self, check: Check) -> Result:
-        """Examine the rig by one check. Once the examination was stopped, no check is run any more."""
+    def run_check(self, check: Check) -> CheckResult:
+        """Run one check. After the examination was stopped, checks are not run any more."""
         if self.stopped is not None:
-            return Result(check.name, check.title, Outcome.NOT_RUN, 0.0, reason=self.stopped)
-        begun_s = time.monotonic()
-        judged = self._done(lambda: self._judged(check), self._limit_s)
-        if judged.done():
-            outcome, failure, reason = judged.result()
-            return Result(check.name, check.title, outcome, time.monotonic() - begun_s, failure, reason)
+            return CheckResult(check.name, check.title, CheckOutcome.NOT_RUN, 0.0, reason=self.stopped)
+        start_s = time.monotonic()
+        answer = self._run_in_owner(lambda: self._run_on_bench(check), self._limit_s)
+        if answer.done():
+            outcome, failure, reason = answer.result()
+            return CheckResult(check.name, check.title, outcome, time.monotonic() - start_s, failure, reason)
         self._stuck = True
         self.stopped = (
             f"'{check.title}' did not return in {self._limit_s:g} s, and holds the devices, which have one owner: "
-            "nothing more can be asked of them; end the program, unplug them if need be, and see that the projector "
-            "is dark"
+            "no further check can use them; end the program, unplug them if necessary, and make sure that the "
+            "projector is dark"
         )
         failure = Failure(
             "every call returns in bounded time",
             f"a check that did not return in {self._limit_s:g} s",
             "bound every wait for the device; read gives up after timeout_s",
         )
-        return Result(check.name, check.title, Outcome.FAILED, time.monotonic() - begun_s, failure)
+        return CheckResult(check.name, check.title, CheckOutcome.FAILED, time.monotonic() - start_s, failure)
 
-    def _opened(self) -> Rig:
-        opening = self._done(lambda: self._bench.rig, OPENING_LIMIT_S)
-        if not opening.done():
+    def _open(self) -> Rig:
+        answer = self._run_in_owner(lambda: self._bench.rig, OPENING_LIMIT_S)
+        if not answer.done():
             raise DeviceError(
-                f"asked the rig to open, and it did not in {OPENING_LIMIT_S:g} s; check its devices' power and cables, "
-                "and that no other program holds them"
+                f"the rig did not open in {OPENING_LIMIT_S:g} s; check its devices' power and cables, and that no "
+                "other program holds them"
             )
-        return opening.result()
+        return answer.result()
 
-    def _done(self, work: Callable[[], _Answer], limit_s: float | None) -> Future[_Answer]:
-        """Have the owner thread do something; what came of it, if that was in time."""
+    def _run_in_owner(self, work: Callable[[], _Answer], limit_s: float | None) -> Future[_Answer]:
+        """Run work in the owner thread, and return its future; it is not done if the time limit passed."""
         answer: Future[_Answer] = Future()
         self._work.put((work, answer))
         wait([answer], limit_s)
         return answer
 
-    def _do_work(self) -> None:
-        """What the owner thread does: work until there is no more, then close the rig."""
-        while (next_one := self._work.get()) is not None:
-            work, answer = next_one
+    def _run_owner(self) -> None:
+        """Body of the owner thread: do work until there is no more, then close the rig."""
+        while (task := self._work.get()) is not None:
+            work, answer = task
             try:
                 answer.set_result(work())
-            except Exception as error:  # noqa: BLE001 - a driver may raise anything; the asking thread tells it
+            except Exception as error:  # noqa: BLE001 - a driver may raise anything; the caller's thread reports it
                 answer.set_exception(error)
         with suppress(Exception):
             self._bench.close()
 
-    def _judged(self, check: Check) -> tuple[Outcome, Failure | None, str | None]:
+    def _run_on_bench(self, check: Check) -> tuple[CheckOutcome, Failure | None, str | None]:
         bench = self._bench
         try:
             if check.fresh:
                 bench.close()
             try:
-                rig = bench.opened_again()
+                rig = bench.reopen()
             except ExpectationError as error:
                 self.stopped = f"the rig does not open again: {error.__cause__}"
-                return Outcome.FAILED, error.failure, None
-            unmet = [why for need in check.needs if (why := need.unmet(rig, bench.sequence)) is not None]
+                return CheckOutcome.FAILED, error.failure, None
+            unmet = [why for need in check.needs if (why := need.unmet_reason(rig, bench.sequence)) is not None]
             if unmet:
-                return Outcome.NOT_APPLICABLE, None, "; ".join(unmet)
+                return CheckOutcome.NOT_APPLICABLE, None, "; ".join(unmet)
             check.function(bench)
             if check.fresh:
                 bench.close()
             else:
-                bench.rest()
+                bench.set_to_rest()
         except NotApplicableError as reason:
-            bench.rest()
-            return Outcome.NOT_APPLICABLE, None, str(reason)
-        except Exception as error:  # noqa: BLE001 - whatever a driver raises is what the report is about
-            # What comes next must not suffer from what is left behind.
+            bench.set_to_rest()
+            return CheckOutcome.NOT_APPLICABLE, None, str(reason)
+        except Exception as error:  # noqa: BLE001 - the report is about every error that a driver raises
+            # Close the rig, so that its state does not affect the next check.
             bench.close()
-            return Outcome.FAILED, failure_of(error), None
-        return Outcome.PASSED, None, None
+            return CheckOutcome.FAILED, failure_from(error), None
+        return CheckOutcome.PASSED, None, None

@@ -1,1 +1,15 @@
-"""The examination of a rig: its faults, and the values for a better rig file."""
+"""Examination of a rig: findings with remedies, and a rig file with the measured values."""
+
+from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine
+from slrig.doctor.light import Severity
+from slrig.doctor.rig_file import refuse_existing, toml_value, write_rig_file
+
+__all__ = [
+    "Diagnosis",
+    "Severity",
+    "doctor_sequence",
+    "examine",
+    "refuse_existing",
+    "toml_value",
+    "write_rig_file",
+]

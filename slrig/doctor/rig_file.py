@@ -1,4 +1,4 @@
-"""A rig file with the values that an examination found, each with a comment that says why."""
+"""Rig file with the values that an examination measured, each with a comment that gives the reason."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from typing import Any
 
 from slrig.bundle.storage import write_durably
 from slrig.bundle.validation import read_text
-from slrig.config import MOST_CONFIG_BYTES, read_rig
-from slrig.disk import refusals_of, staging_name
+from slrig.config import MAX_CONFIG_BYTES, read_rig
+from slrig.disk import staging_name, storage_errors
 from slrig.doctor.advice import ExposureAdvice
 from slrig.doctor.doctor import Diagnosis
-from slrig.doctor.findings import Severity, ms
+from slrig.doctor.light import Severity, format_ms
 from slrig.errors import ConfigError
 
 _WIDTH = 116
-_WAITS = "synchronisation"
+_SYNC = "synchronisation"
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
-Path_ = tuple[str | int, ...]
-Comments = Mapping[Path_, str]
+KeyPath = tuple[str | int, ...]
+Comments = Mapping[KeyPath, str]
 
 
 def write_rig_file(diagnosis: Diagnosis, source: Path, target: Path, *, force: bool) -> None:
-    """Write the rig file `source` to `target` with what was found: exposures, lines and the table [synchronisation].
+    """Write the rig file `source` to `target` with the measured exposures, lines and table [synchronisation].
 
-    Everything else stays; paths that are relative to the one file are made relative to the other. Its own comments are
-    not kept. Raises ConfigError where there is a file of that name and `force` is not given; StorageError.
+    All other values stay; paths relative to the one file become relative to the other. Comments are lost. Raises
+    ConfigError if the target exists and `force` is False; StorageError.
     """
     refuse_existing(target, force=force)
-    data = tomllib.loads(read_text(source, MOST_CONFIG_BYTES, ConfigError))
-    text = doctored(data, diagnosis, source=source.resolve(), target=target.resolve())
-    with refusals_of(target):
+    data = tomllib.loads(read_text(source, MAX_CONFIG_BYTES, ConfigError))
+    text = rig_file_text(data, diagnosis, source=source.resolve(), target=target.resolve())
+    with storage_errors(target):
         staged = staging_name(target)
         try:
             write_durably(staged, text.encode())
-            # Read before it takes its place: a rig file that nobody can read helps nobody.
+            # Validate it before it replaces a file.
             read_rig(staged)
             staged.replace(target)
         finally:
@@ -51,59 +51,61 @@ def write_rig_file(diagnosis: Diagnosis, source: Path, target: Path, *, force: b
 
 
 def refuse_existing(target: Path, *, force: bool) -> None:
-    """Raise ConfigError where a file would be overwritten and nobody asked for that."""
+    """Raise ConfigError if a file would be overwritten without `force`."""
     if target.exists() and not force:
-        message = f"{target} exists, and is kept; choose another name with --output, or overwrite it with --force"
+        message = f"{target} exists and is unchanged; choose another name with --output, or overwrite it with --force"
         raise ConfigError(message)
 
 
-def doctored(data: Mapping[str, Any], diagnosis: Diagnosis, *, source: Path, target: Path) -> str:
-    """Return the text of the new rig file. `data` : what the old one holds; source, target : absolute."""
+def rig_file_text(data: Mapping[str, Any], diagnosis: Diagnosis, *, source: Path, target: Path) -> str:
+    """Return the text of the new rig file. data : contents of the old one. source, target : absolute."""
     tables = copy.deepcopy(dict(data))
     if source.parent != target.parent:
-        tables = _moved(tables, source.parent, target.parent)
-    comments: dict[Path_, str] = {}
-    _expose(tables, diagnosis.exposures, comments)
+        tables = _rebase_paths(tables, source.parent, target.parent)
+    comments: dict[KeyPath, str] = {}
+    _set_exposures(tables, diagnosis.exposures, comments)
     lines = diagnosis.lines
     table: dict[str, Any]
     if lines is not None:
         table = tables.setdefault("scan", {})
-        # What belonged to other lines goes: half a period wide, and cells as wide, is the default.
+        # These belong to the old period; their defaults follow the new one.
         for key in ("line_width_px", "gray_cell_px"):
             table.pop(key, None)
         table |= {"line_shift_period_px": lines.period_px, "line_steps": lines.steps}
-        comments["scan", "line_shift_period_px"] = f"{lines.reason}; {lines.less_noise} is expected"
-    found = diagnosis.synchronisation
-    if found is not None:
-        latency_s, error_s = round(found.latency_s, 6), round(found.latency_error_s, 6)
+        comments["scan", "line_shift_period_px"] = f"{lines.reason}; {lines.gain_text} is expected"
+    measured = diagnosis.synchronisation
+    if measured is not None:
+        latency_s, error_s = round(measured.latency_s, 6), round(measured.latency_error_s, 6)
         table = {"latency_s": latency_s, "latency_error_s": error_s}
         comments |= {
-            (_WAITS, "latency_s"): "measured by flashes: how much later than the projector says its light comes, on "
-            "average",
-            (_WAITS, "latency_error_s"): "and how much later than that it may come, beyond what the projector states; "
+            (_SYNC, "latency_s"): "measured by flashes: mean delay of the light after the instant that the projector "
+            "states",
+            (_SYNC, "latency_error_s"): "and the longest further delay, beyond the error that the projector states; "
             "scans wait for both",
         }
-        if found.earliest_s is not None:
-            table["earliest_s"] = round(found.earliest_s, 6)
-            why = "when it begins to change at the earliest: with it, scans wait for no frame before the next pattern"
-            comments[_WAITS, "earliest_s"] = why
-        if "trigger_period_s" in tables.get(_WAITS, {}):
-            table["trigger_period_s"] = tables[_WAITS]["trigger_period_s"]
-        if found.line_time_s:
-            table["line_time_s"] = {name: round(seconds, 9) for name, seconds in found.line_time_s.items()}
+        if measured.earliest_s is not None:
+            table["earliest_s"] = round(measured.earliest_s, 6)
+            reason = "earliest instant of a change: with it, scans show the next pattern before the frames have arrived"
+            comments[_SYNC, "earliest_s"] = reason
+        if "trigger_period_s" in tables.get(_SYNC, {}):
+            table["trigger_period_s"] = tables[_SYNC]["trigger_period_s"]
+        if measured.line_time_s:
+            table["line_time_s"] = {name: round(seconds, 9) for name, seconds in measured.line_time_s.items()}
             rolling = "measured: a rolling shutter exposes each row this much later than the row above it"
-            comments |= dict.fromkeys(((_WAITS, "line_time_s", name) for name in found.line_time_s), rolling)
-        tables[_WAITS] = table
-    return "\n".join([*_heading(diagnosis, source), *_table(tables, (), comments)]) + "\n"
+            comments |= dict.fromkeys(((_SYNC, "line_time_s", name) for name in measured.line_time_s), rolling)
+        tables[_SYNC] = table
+    return "\n".join([*_heading(diagnosis, source), *_table_lines(tables, (), comments)]) + "\n"
 
 
-def _expose(tables: dict[str, Any], exposures: Mapping[str, ExposureAdvice], comments: dict[Path_, str]) -> None:
-    """Write the exposures; one of all scans would hide them."""
+def _set_exposures(
+    tables: dict[str, Any], exposures: Mapping[str, ExposureAdvice], comments: dict[KeyPath, str]
+) -> None:
+    """Write the exposure of each camera, or of a head, and remove the one of [scan], which would override them."""
     if not exposures:
         return
     if isinstance(tables.get("scan"), dict):
         tables["scan"].pop("exposure_s", None)
-    advised: list[tuple[Path_, dict[str, Any], ExposureAdvice]] = [
+    advised: list[tuple[KeyPath, dict[str, Any], ExposureAdvice]] = [
         (("camera", number), camera, exposures[camera["name"]])
         for number, camera in enumerate(tables.get("camera", ()))
         if camera["name"] in exposures
@@ -113,7 +115,9 @@ def _expose(tables: dict[str, Any], exposures: Mapping[str, ExposureAdvice], com
     for path, table, advice in advised:
         shortest_s, longest_s = advice.usable_s
         table["exposure_s"] = float(f"{advice.exposure_s:.6g}")
-        comments[(*path, "exposure_s")] = f"{advice.reason}; usable are {ms(shortest_s)} to {ms(longest_s)}"
+        comments[(*path, "exposure_s")] = (
+            f"{advice.reason}; usable are {format_ms(shortest_s)} to {format_ms(longest_s)}"
+        )
 
 
 def _heading(diagnosis: Diagnosis, source: Path) -> Iterator[str]:
@@ -123,7 +127,7 @@ def _heading(diagnosis: Diagnosis, source: Path) -> Iterator[str]:
     if diagnosis.response is not None:
         yield from _comment(f"Light grows with the grey value to the power of {diagnosis.response.gamma:.2f}.")
     for severity in (Severity.FAULT, Severity.NOTE):
-        for finding in diagnosis.of(severity):
+        for finding in diagnosis.with_severity(severity):
             yield from _comment(f"{severity.capitalize()}, {finding.subject}: {finding.found}. Do: {finding.remedy}.")
     yield ""
 
@@ -132,12 +136,12 @@ def _comment(text: str) -> list[str]:
     return textwrap.wrap(" ".join(text.split()), _WIDTH, initial_indent="# ", subsequent_indent="#   ")
 
 
-def _moved(value: Any, old: Path, new: Path) -> Any:
-    """The same with every text that names a file or folder relative to `old` made relative to `new`."""
+def _rebase_paths(value: Any, old: Path, new: Path) -> Any:
+    """Return the value with every text that names a file or folder relative to `old` made relative to `new`."""
     if isinstance(value, Mapping):
-        return {key: _moved(each, old, new) for key, each in value.items()}
+        return {key: _rebase_paths(each, old, new) for key, each in value.items()}
     if isinstance(value, list):
-        return [_moved(each, old, new) for each in value]
+        return [_rebase_paths(each, old, new) for each in value]
     if isinstance(value, str) and value and not Path(value).is_absolute() and _exists(old / value):
         return Path(os.path.relpath((old / value).resolve(), new)).as_posix()
     return value
@@ -150,22 +154,22 @@ def _exists(path: Path) -> bool:
         return False
 
 
-def _table(table: Mapping[str, Any], path: Path_, comments: Comments) -> Iterator[str]:
-    """The lines of a table: its values, then its tables, then its arrays of tables."""
+def _table_lines(table: Mapping[str, Any], path: KeyPath, comments: Comments) -> Iterator[str]:
+    """Yield the lines of a table: its values, then its tables, then its arrays of tables."""
     for key, value in table.items():
         if not _is_table(value):
             if (*path, key) in comments:
                 yield from _comment(comments[(*path, key)])
-            yield f"{_key(key)} = {toml_value(value)}"
+            yield f"{_format_key(key)} = {toml_value(value)}"
     for key, value in table.items():
         if not _is_table(value):
             continue
         for number, each in enumerate(value if isinstance(value, list) else [value]):
-            inner: Path_ = (*path, key, number) if isinstance(value, list) else (*path, key)
-            name = ".".join(_key(step) for step in inner if isinstance(step, str))
+            inner: KeyPath = (*path, key, number) if isinstance(value, list) else (*path, key)
+            name = ".".join(_format_key(step) for step in inner if isinstance(step, str))
             yield ""
             yield f"[[{name}]]" if isinstance(value, list) else f"[{name}]"
-            yield from _table(each, inner, comments)
+            yield from _table_lines(each, inner, comments)
 
 
 def _is_table(value: Any) -> bool:
@@ -174,26 +178,26 @@ def _is_table(value: Any) -> bool:
     return isinstance(value, Mapping)
 
 
-def _key(key: str) -> str:
-    return key if _BARE.fullmatch(key) else _text(key)
+def _format_key(key: str) -> str:
+    return key if _BARE.fullmatch(key) else _quote(key)
 
 
 def toml_value(value: Any) -> str:
-    """A TOML value on one line."""
+    """Return a TOML value on one line."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return _text(value)
+        return _quote(value)
     if isinstance(value, datetime.date | datetime.time):
         return value.isoformat()
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(key)} = {toml_value(each)}" for key, each in value.items()) + "}"
+        return "{" + ", ".join(f"{_format_key(key)} = {toml_value(each)}" for key, each in value.items()) + "}"
     if isinstance(value, Sequence):
         return "[" + ", ".join(map(toml_value, value)) + "]"
-    # Integers, and floats as Python writes them, are TOML's.
+    # Python's integers and floats are valid TOML.
     return repr(value)
 
 
-def _text(text: str) -> str:
-    """A TOML basic string: that of JSON, but for one character."""
+def _quote(text: str) -> str:
+    """Return a TOML basic string, which is a JSON string with DEL escaped as well."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

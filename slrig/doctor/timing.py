@@ -1,32 +1,67 @@
-"""How late the projector's light is, how the cameras' shutters work, and at which rate the display refreshes."""
+"""Latency of the projector's light, shutters of the cameras, refresh of the display, and flicker of the light.
+
+Refresh. A display changes at its refreshes only, so the instants at which patterns become visible lie on a grid. For
+its frequency f all phases 2π f t agree: R = |Σ exp(2πi f t)|/n is near 1, also for multiples of f, and far below for
+other frequencies if the patterns were requested at random moments. The true frequency has the highest R, because errors
+of the instants weigh more in its multiples.
+
+Flicker. Short exposures at uneven instants sample the brightness. The spectrum is that of Lomb and Scargle with a
+floating mean (M. Zechmeister and M. Kürster, A&A 496, 2009), which has no aliases for uneven samples. A free-running
+camera samples evenly, unless it has a rolling shutter, whose rows sample between its frames; frequencies that such
+samples cannot distinguish are reported together. Oscillations are removed one by one, the strongest first. An exposure
+of e seconds attenuates an oscillation of f hertz by sinc(f·e) = sin(π f e)/(π f e): whole periods cancel it.
+"""
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slrig.capture import CameraLatency, LatencyMeasurement, measure_latency
 from slrig.devices import CameraSettings, Rig, Synchronisation
-from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
-from slrig.doctor.light import Seen
-from slrig.doctor.measures.frequencies import refresh_hz
-from slrig.doctor.viewing import Viewer
+from slrig.doctor.light import CameraSession, Finding, LightMeasurement, camera_label, fault, format_ms, note, ok
 from slrig.errors import ScanEvidenceError
-from slrig.model import Black, PatternSequence, Size, White
+from slrig.model import Black, FloatArray, Frame, PatternSequence, Size, White
 
 _SHOWS = 48
-_LONGEST_PAUSE_S = 0.04
+_MAX_SHOW_PAUSE_S = 0.04
 _FLASHES = 24
-LATE_S = 1e-3
+MAX_LATENESS_S = 1e-3
 """Light that comes later than a scan waits, by more than this, gets into the wrong frames."""
 
-_NEEDLESS_S = 0.03
-_JITTER_S = 3e-3
-_STRANGE = 0.02
+_MAX_NEEDLESS_WAIT_S = 0.03
+_MAX_JITTER_S = 3e-3
+_MAX_STRANGE_LIGHT = 0.02
+
+_REFRESH_RANGE_HZ = (22.0, 260.0)
+_MIN_AGREEMENT = 0.8
+_REFRESH_OVERSAMPLING = 16
+_NEARLY_HIGHEST = 0.97
+
+_FLICKER_EXPOSURE_S = 0.002
+_FLICKER_FRAMES = 128
+_MAX_FLICKER_PAUSE_S = 0.025
+_BANDS = 8
+_MAINS_HZ = {100.0: 50, 120.0: 60, 50.0: 50, 60.0: 60}
+_SAME_FREQUENCY = 0.01
+_EXACT_FREQUENCY = 0.001
+_NOTE_FLICKER, _FAULT_FLICKER = 0.004, 0.01
+
+_LOWEST_HZ, _HIGHEST_HZ = 20.0, 400.0
+_MAX_OSCILLATIONS = 4
+_MAX_FALSE_ALARM = 1e-6
+_SPECTRUM_OVERSAMPLING = 5
+_ALIAS_SHARE = 0.9
+_MIN_SAMPLES = 16
+_MIN_ATTENUATION = 0.1
+
+
+# ---- Latency and refresh
 
 
 def white_and_black(size: Size) -> PatternSequence:
@@ -35,146 +70,388 @@ def white_and_black(size: Size) -> PatternSequence:
     return PatternSequence(size, (White(), Black()), profiles)
 
 
-def refresh(rig: Rig) -> tuple[float | None, list[Finding]]:
-    """Show patterns at random moments: the rate of the grid on which they become visible, Hz, None without one."""
+def measure_refresh(rig: Rig) -> tuple[float | None, list[Finding]]:
+    """Show patterns at random moments, and return the display's refresh rate, Hz; None if it has no grid."""
     never, rng = threading.Event(), np.random.default_rng(0)
-    seen_ns: list[int] = []
+    visible_ns: list[int] = []
     try:
         rig.projector.load(white_and_black(rig.projector.info.size))
         for number in range(_SHOWS):
-            seen_ns.append(rig.projector.show(number % 2).t_visible_ns)
-            waiting_ns = round(float(rng.uniform(0, _LONGEST_PAUSE_S)) * 1e9)
+            visible_ns.append(rig.projector.show(number % 2).t_visible_ns)
+            waiting_ns = round(float(rng.uniform(0, _MAX_SHOW_PAUSE_S)) * 1e9)
             rig.clock.wait_until(rig.clock.now_ns() + waiting_ns, never)
     finally:
         with suppress(Exception):
             rig.projector.blank()
-    rate = refresh_hz(seen_ns)
-    if rate is None:
-        found = "patterns become visible at any instant, by the driver's word: no refresh is to be waited for"
+    rate_hz = estimate_refresh_hz(visible_ns)
+    if rate_hz is None:
+        message = "according to its driver, patterns become visible at any instant, without refreshes to wait for"
     else:
-        found = f"patterns become visible at refreshes of {rate:.2f} Hz, {ms(1 / rate)} apart, by the driver's word"
-    return rate, [ok("timing.refresh", "projector", found)]
+        period = format_ms(1 / rate_hz)
+        message = f"according to its driver, patterns become visible at refreshes of {rate_hz:.2f} Hz, {period} apart"
+    return rate_hz, [ok("timing.refresh", "projector", message)]
 
 
-def latency(
+def estimate_refresh_hz(t_visible_ns: Sequence[int]) -> float | None:
+    """Return the refresh rate from 20 or more instants; None if they lie on no grid.
+
+    >>> rng = np.random.default_rng(0)
+    >>> on_a_grid = np.cumsum(rng.integers(1, 9, 40)) * 1e9 / 59.94
+    >>> round(estimate_refresh_hz([round(t) for t in on_a_grid]), 2)
+    59.94
+    >>> estimate_refresh_hz([round(t) for t in np.cumsum(rng.uniform(0.01, 0.08, 40)) * 1e9]) is None
+    True
+    """
+    t_s = (np.array(t_visible_ns, np.float64) - t_visible_ns[0]) / 1e9
+    span_s = float(np.ptp(t_s))
+    if span_s <= 0:
+        return None
+    step_hz = 1 / (_REFRESH_OVERSAMPLING * span_s)
+    frequencies = np.arange(*_REFRESH_RANGE_HZ, step_hz)
+    agreement = np.abs(np.exp(2j * np.pi * np.outer(frequencies, t_s)).mean(axis=1))
+    highest = float(agreement.max())
+    if highest < _MIN_AGREEMENT:
+        return None
+    # Multiples agree too if the instants are exact: take the lowest.
+    first = int(np.argmax(agreement > _NEARLY_HIGHEST * highest))
+    near = slice(max(first - _REFRESH_OVERSAMPLING, 0), first + _REFRESH_OVERSAMPLING)
+    top_hz = float(frequencies[near][np.argmax(agreement[near])])
+    finer = np.linspace(top_hz - step_hz, top_hz + step_hz, 4 * _REFRESH_OVERSAMPLING + 1)
+    return float(finer[np.argmax(np.abs(np.exp(2j * np.pi * np.outer(finer, t_s)).mean(axis=1)))])
+
+
+def measure_light_latency(
     rig: Rig,
-    seen: Mapping[str, Seen],
+    lights: Mapping[str, LightMeasurement],
     *,
     search_s: float,
-    told: Callable[[str, float, str], None],
+    progress: Callable[[str, float, str], None],
 ) -> tuple[LatencyMeasurement | None, list[Finding]]:
-    """Flash the projector before the cameras that see it; None where no flash can be seen as it happens.
+    """Flash the projector before the cameras that see it; the measurement is None if no camera sees a flash happen.
 
-    A camera that waits for triggers while the projector works may see none: what matters then is whether a frame that
-    is taken right after the projector's word has the new light alone.
+    A camera that needs triggers while the projector works may miss all flashes. For such a camera, check that frames
+    taken as soon as the projector states light hold the new light alone.
     """
-    settings = {name: CameraSettings(each.exposure_s, rig.settings[name].gain) for name, each in seen.items()}
-    watching = replace(rig, cameras={name: rig.cameras[name] for name in seen}, settings=settings)
+    settings = {name: CameraSettings(each.exposure_s, rig.settings[name].gain) for name, each in lights.items()}
+    watching = replace(rig, cameras={name: rig.cameras[name] for name in lights}, settings=settings)
     try:
-        measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, on_progress=told)
+        measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, on_progress=progress)
     except ScanEvidenceError as error:
-        return None, [punctual(watching, each, error) for each in seen.values()]
-    findings = [_late(measured, rig.synchronisation), *_jitter(measured, seen)]
-    for name, found in measured.cameras.items():
-        findings.append(_shutter(name, found, seen[name].skew_s, rig.synchronisation))
+        return None, [check_punctuality(watching, each, error) for each in lights.values()]
+    findings = [_check_latency(measured, rig.synchronisation), *_check_jitter(measured, lights)]
+    for name, camera in measured.cameras.items():
+        findings.append(_describe_shutter(name, camera, lights[name].skew_s, rig.synchronisation))
     return measured, findings
 
 
-def punctual(rig: Rig, seen: Seen, cause: ScanEvidenceError) -> Finding:
-    """Alternate white and black as a scan does, and look for light of the pattern before."""
-    viewer = Viewer(rig, seen.name)
+def check_punctuality(rig: Rig, light: LightMeasurement, cause: ScanEvidenceError) -> Finding:
+    """Alternate white and black as a scan does, and look for light of the previous pattern."""
+    session = CameraSession(rig, light.name)
     strange = 0.0
-    with viewer.armed(white_and_black(rig.projector.info.size), seen.exposure_s, _SHOWS):
+    with session.arm(white_and_black(rig.projector.info.size), light.exposure_s, _SHOWS):
         for number in range(_SHOWS):
-            level = seen.levels.level(viewer.frames(number % 2)[0].image)
+            level = light.levels.relative_level(session.capture_frames(number % 2)[0].image)
             strange = max(strange, abs(level - (1 - number % 2)))
-    subject = camera_named(seen.name)
-    if strange <= _STRANGE:
-        found = (
-            f"frames that are exposed right after the projector's word hold {1 - strange:.1%} of their own pattern's "
-            "light, or more; how much earlier they could be is not told by its trigger"
+    subject = camera_label(light.name)
+    if strange <= _MAX_STRANGE_LIGHT:
+        message = (
+            f"frames exposed as soon as the projector states light hold {1 - strange:.1%} of their own pattern's "
+            "light, or more; this trigger cannot show how much earlier they could be exposed"
         )
-        return ok("timing.punctual", subject, found)
-    found = (
-        f"frames that are exposed right after the projector's word miss up to {strange:.0%} of their own pattern's "
-        f"light; by how much it is late could not be measured: {cause}"
+        return ok("timing.punctual", subject, message)
+    message = (
+        f"frames exposed as soon as the projector states light miss up to {strange:.0%} of their own pattern's "
+        f"light; its delay could not be measured: {cause}"
     )
     remedy = (
-        "measure it: slrig latency --exposure-s with more than the projector's latency, or --trigger free; write what "
-        "it says into [synchronisation]"
+        "measure it: slrig latency --exposure-s with more than the projector's latency, or --trigger free; write the "
+        "result into [synchronisation]"
     )
-    return fault("timing.late", subject, found, remedy)
+    return fault("timing.late", subject, message, remedy)
 
 
-def waited_s(synchronisation: Synchronisation | None) -> float:
-    """How long a scan waits beyond what the projector states."""
+def waiting_time_s(synchronisation: Synchronisation | None) -> float:
+    """Time that a scan waits in addition to the projector's own statement."""
     return 0.0 if synchronisation is None else synchronisation.latency_s + synchronisation.latency_error_s
 
 
-def late_s(measured: LatencyMeasurement) -> float:
-    """How much later than the projector states, its error included, light is stable at the latest."""
+def lateness_s(measured: LatencyMeasurement) -> float:
+    """Longest time from the stated instant, its error included, until light is stable."""
     return measured.slowest.latest_s - measured.shown_error_s
 
 
-def _late(measured: LatencyMeasurement, known: Synchronisation | None) -> Finding:
+def _check_latency(measured: LatencyMeasurement, known: Synchronisation | None) -> Finding:
     slowest = measured.slowest
-    now_s = waited_s(known)
-    words = (
-        f"light comes {ms(slowest.latency_s)} ± {ms(slowest.standard_error_s)} after the instant that the projector "
-        f"states, and is stable {ms(slowest.latest_s)} after it at the latest"
+    now_s = waiting_time_s(known)
+    message = (
+        f"light comes {format_ms(slowest.latency_s)} ± {format_ms(slowest.standard_error_s)} after the instant that "
+        f"the projector states, and is stable {format_ms(slowest.latest_s)} after it at the latest"
     )
-    if late_s(measured) > now_s + LATE_S:
-        table = "its rig file has no [synchronisation]" if known is None else f"its rig file waits {ms(now_s)}"
+    if lateness_s(measured) > now_s + MAX_LATENESS_S:
+        table = "its rig file has no [synchronisation]" if known is None else f"its rig file waits {format_ms(now_s)}"
         remedy = (
             "use the table [synchronisation] of the rig file that --output writes; a game or low-latency mode of the "
             "projector, and no picture processing, make it faster"
         )
-        return fault("timing.late", "projector", f"{words}; {table}: frames would show the pattern before", remedy)
-    if now_s > waited_s(measured.synchronisation) + _NEEDLESS_S:
+        message = f"{message}; {table}: frames would show the previous pattern"
+        return fault("timing.late", "projector", message, remedy)
+    needed_s = waiting_time_s(measured.synchronisation)
+    if now_s > needed_s + _MAX_NEEDLESS_WAIT_S:
         remedy = "use the table [synchronisation] of the rig file that --output writes: scans get faster"
-        waits = f"scans wait {ms(now_s - waited_s(measured.synchronisation))} longer than they must"
-        return note("timing.needless", "projector", f"{words}; {waits}", remedy)
-    return ok("timing.late", "projector", words)
+        message = f"{message}; scans wait {format_ms(now_s - needed_s)} longer than necessary"
+        return note("timing.needless", "projector", message, remedy)
+    return ok("timing.late", "projector", message)
 
 
-def _jitter(measured: LatencyMeasurement, seen: Mapping[str, Seen]) -> list[Finding]:
+def _check_jitter(measured: LatencyMeasurement, lights: Mapping[str, LightMeasurement]) -> list[Finding]:
     slowest = measured.slowest
     jitter_s = slowest.jitter_s
-    if jitter_s <= max(_JITTER_S, 2 * measured.shown_error_s):
+    if jitter_s <= max(_MAX_JITTER_S, 2 * measured.shown_error_s):
         return []
-    found = (
-        f"the instant of light varies by {ms(jitter_s)} (standard deviation), the projector states "
-        f"± {ms(measured.shown_error_s)}"
+    message = (
+        f"the instant of light varies by {format_ms(jitter_s)} (standard deviation), the projector states "
+        f"± {format_ms(measured.shown_error_s)}"
     )
-    [name] = [each for each, of_it in measured.cameras.items() if of_it is slowest]
-    stamp_error_s = seen[name].stamp_error_s
+    [name] = [name for name, camera in measured.cameras.items() if camera is slowest]
+    stamp_error_s = lights[name].stamp_error_s
     if stamp_error_s >= jitter_s:
-        limit = (
-            f"{found}; but the time stamps of {camera_named(name)} are right within ± {ms(stamp_error_s)} only, by its "
-            "driver's word: they are the limit of what can be measured, and nothing says that the projector varies"
+        message = (
+            f"{message}; but according to its driver, the time stamps of {camera_label(name)} are right within "
+            f"± {format_ms(stamp_error_s)} only: they limit the measurement, and the projector may be regular"
         )
         remedy = (
             "scans wait for the latest light and stay right, only slower; to scan faster or to examine the projector, "
-            "use a camera whose frames carry time stamps of its own (drivers v4l2, genicam, depthai), or a trigger by "
-            "wire; with v4l2, readout_s in its table narrows what its stamps leave open"
+            "use a camera whose frames carry time stamps of the device (drivers v4l2, genicam, depthai), or a trigger "
+            "by wire; with v4l2, readout_s in its table makes the stamps more exact"
         )
-        return [note("timing.stamps", camera_named(name), limit, remedy)]
+        return [note("timing.stamps", camera_label(name), message, remedy)]
     remedy = (
         "switch off the desktop's compositor and triple buffering, end other programs that draw; scans wait for "
         "the latest light and stay right"
     )
-    return [note("timing.jitter", "projector", found, remedy)]
+    return [note("timing.jitter", "projector", message, remedy)]
 
 
-def _shutter(name: str, found: CameraLatency, skew_s: float, known: Synchronisation | None) -> Finding:
-    subject, line_us = camera_named(name), found.line_time_s * 1e6
-    if found.scanned:
-        words = f"the projector builds up its picture row by row, {-line_us:.1f} µs per camera row"
-        return ok("timing.shutter", subject, words)
-    if not found.rolling:
-        return ok("timing.shutter", subject, "global shutter, as far as the flashes tell")
-    words = f"rolling shutter: {line_us:.1f} µs from row to row, {ms(found.skew_s)} from the first to the last"
+def _describe_shutter(name: str, camera: CameraLatency, skew_s: float, known: Synchronisation | None) -> Finding:
+    subject, line_us = camera_label(name), camera.line_time_s * 1e6
+    if camera.scanned:
+        message = f"the projector builds up its picture row by row, {-line_us:.1f} µs per camera row"
+        return ok("timing.shutter", subject, message)
+    if not camera.rolling:
+        return ok("timing.shutter", subject, "global shutter, within the accuracy of the flashes")
+    skew = format_ms(camera.skew_s)
+    message = f"rolling shutter: {line_us:.1f} µs from row to row, {skew} from the first to the last"
     if skew_s > 0 or (known is not None and known.line_time_s.get(name, 0.0) > 0):
-        return ok("timing.shutter", subject, words)
-    where = f"{name} = {found.line_time_s:.9f} into [synchronisation.line_time_s], as the rig file of --output has it"
-    return note("timing.shutter", subject, f"{words}; neither its driver nor the rig file says so", f"write {where}")
+        return ok("timing.shutter", subject, message)
+    remedy = (
+        f"write {name} = {camera.line_time_s:.9f} into [synchronisation.line_time_s], as in the rig file that --output "
+        "writes"
+    )
+    return note("timing.shutter", subject, f"{message}; neither its driver nor the rig file states that", remedy)
+
+
+# ---- Flicker
+
+
+@dataclass(frozen=True, slots=True)
+class LightFlicker:
+    """Periodic change of the light. share : amplitude over the projector's white, not averaged by an exposure."""
+
+    source: str
+    frequency_hz: float
+    share: float
+    aliases_hz: tuple[float, ...] = ()
+
+    def remaining_share(self, exposure_s: float) -> float:
+        """Return the amplitude that exposures of this length keep, over the projector's white."""
+        return self.share * exposure_attenuation(self.frequency_hz, exposure_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Oscillation:
+    """Periodic part of samples. amplitude : from mean to peak, unit of the samples, not averaged by an exposure.
+
+    power : share of the samples' variance that it explains. aliases_hz : frequencies that explain them as well.
+    """
+
+    frequency_hz: float
+    amplitude: float
+    power: float
+    aliases_hz: tuple[float, ...] = ()
+
+
+def measure_flicker(
+    session: CameraSession, light: LightMeasurement, *, line_time_s: float
+) -> tuple[tuple[LightFlicker, ...], list[Finding]]:
+    """Watch black, then white, with short exposures at random moments, and return the flicker and the findings."""
+    pair = white_and_black(session.projector.info.size)
+    (dark_dn, dark), (bright_dn, bright) = (
+        _measure_oscillations(session, pair, index, light, line_time_s) for index in (1, 0)
+    )
+    white_dn = max(bright_dn - dark_dn, 1e-6)
+
+    def flicker(source: str, oscillation: Oscillation) -> LightFlicker:
+        share = oscillation.amplitude / white_dn
+        return LightFlicker(source, _prefer_mains_hz(oscillation), share, oscillation.aliases_hz)
+
+    def is_in_room(oscillation: Oscillation) -> bool:
+        hz = _prefer_mains_hz(oscillation)
+        return any(
+            abs(hz - each.frequency_hz) < _SAME_FREQUENCY * each.frequency_hz
+            and each.share * white_dn > oscillation.amplitude / 2
+            for each in room
+        )
+
+    room = [flicker("room", each) for each in dark]
+    lamp = [flicker("projector", each) for each in bright if not is_in_room(each)]
+    flickers = tuple(each for each in (*room, *lamp) if each.share >= _NOTE_FLICKER)
+    findings = [_describe_flicker(each, light, session.name) for each in flickers]
+    if not findings:
+        message = f"neither the room's light nor the projector's flickers by {_NOTE_FLICKER:.1%} of white"
+        findings = [ok("flicker.none", camera_label(session.name), message)]
+    return flickers, findings
+
+
+def _measure_oscillations(
+    session: CameraSession, pair: PatternSequence, index: int, light: LightMeasurement, line_time_s: float
+) -> tuple[float, tuple[Oscillation, ...]]:
+    """Return the mean of the usable pixels, DN, and their oscillations."""
+    rng = np.random.default_rng(index)
+    times_s: list[FloatArray] = []
+    values: list[FloatArray] = []
+    with session.arm(pair, min(_FLICKER_EXPOSURE_S, light.exposure_s), _FLICKER_FRAMES):
+        after_ns = session.show(index)
+        first_ns = after_ns
+        for _ in range(_FLICKER_FRAMES):
+            session.wait(float(rng.uniform(0, _MAX_FLICKER_PAUSE_S)))
+            frame = session.next_frame(after_ns)
+            after_ns = frame.t_end_ns
+            band_times_s, band_means = _band_means(frame, light, line_time_s)
+            times_s.append(band_times_s + (frame.t_start_ns - first_ns) / 1e9)
+            values.append(band_means)
+    by_band = np.array(values)
+    means = np.maximum(by_band.mean(axis=0), 1e-3)
+    mean_dn = float(by_band.mean())
+    samples = (by_band / means).ravel() * mean_dn
+    return mean_dn, find_oscillations(np.concatenate(times_s), samples, exposure_s=session.exposure_s)
+
+
+def _band_means(frame: Frame, light: LightMeasurement, line_time_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return the time of each band of rows from the start of the frame, s, and its mean, DN.
+
+    A global shutter has one band.
+    """
+    usable = light.levels.usable
+    lit_rows = np.flatnonzero(usable.any(axis=1))
+    bands = np.array_split(lit_rows, _BANDS if line_time_s > 0 else 1)
+    half_s = frame.exposure_s / 2
+    times_s = np.array([float(rows.mean()) * line_time_s + half_s for rows in bands if len(rows)])
+    values = np.array([float(frame.image[rows][usable[rows]].mean()) for rows in bands if len(rows)])
+    return times_s, values
+
+
+def _prefer_mains_hz(oscillation: Oscillation) -> float:
+    """Return the frequency to report: that of the mains if it is one of the possible ones."""
+    for mains_hz in _MAINS_HZ:
+        for candidate_hz in (oscillation.frequency_hz, *oscillation.aliases_hz):
+            if abs(candidate_hz - mains_hz) < _SAME_FREQUENCY * mains_hz:
+                return mains_hz if abs(candidate_hz - mains_hz) < _EXACT_FREQUENCY * mains_hz else candidate_hz
+    return oscillation.frequency_hz
+
+
+def _describe_flicker(flicker: LightFlicker, light: LightMeasurement, name: str) -> Finding:
+    own_s, hz = light.own_exposure_s, flicker.frequency_hz
+    remaining = flicker.remaining_share(own_s)
+    message = (
+        f"oscillates {hz:.1f} times a second by ±{flicker.share:.1%} of the projector's white; the rig's exposure of "
+        f"{format_ms(own_s)} leaves ±{remaining:.2%} of it, as {camera_label(name)} sees it"
+    )
+    if flicker.aliases_hz:
+        message += " (it samples evenly: the frequency may be another one)"
+    kind = fault if remaining > _FAULT_FLICKER else note
+    remedy = f"expose for a multiple of {format_ms(1 / hz)}"
+    if flicker.source == "room":
+        mains = [mains for mains_hz, mains in _MAINS_HZ.items() if abs(hz - mains_hz) < _SAME_FREQUENCY * mains_hz]
+        lamps = f"lamps on mains of {mains[0]} Hz" if mains else "a lamp"
+        remedy = f"{remedy}, or switch them off or shade them"
+        return kind("flicker.room", "room light", f"{lamps}: the light {message}", remedy)
+    remedy = (
+        f"{remedy}: a colour wheel or dimmed lamp shows its whole cycle only then; a static mode without colour wheel "
+        "or dimming (bright, single colour) avoids it"
+    )
+    return kind("flicker.projector", "projector", f"its light {message}", remedy)
+
+
+def exposure_attenuation(frequency_hz: float, exposure_s: float) -> float:
+    """Return the share of an oscillation that remains in an exposure, 0 to 1.
+
+    >>> round(exposure_attenuation(100.0, 0.01), 6), round(exposure_attenuation(100.0, 0.005), 4)
+    (0.0, 0.6366)
+    """
+    return abs(float(np.sinc(frequency_hz * exposure_s)))
+
+
+def find_oscillations(t_s: FloatArray, samples: FloatArray, *, exposure_s: float) -> tuple[Oscillation, ...]:
+    """Return the significant oscillations of samples of light, the strongest first.
+
+    t_s : (n,) float64, middle of each sample's exposure. samples : (n,) float64, brightness; 16 or more are needed.
+    exposure_s : of every sample.
+    """
+    # Takes half a second to import, and is needed here only.
+    from scipy.signal import lombscargle
+
+    if len(t_s) < _MIN_SAMPLES:
+        return ()
+    span_s = float(np.ptp(t_s))
+    frequencies = np.arange(_LOWEST_HZ, _HIGHEST_HZ, 1 / (_SPECTRUM_OVERSAMPLING * span_s))
+    rest, peaks = samples - samples.mean(), []
+    for _ in range(_MAX_OSCILLATIONS):
+        if not np.ptp(rest) > 0:
+            break
+        power = np.nan_to_num(lombscargle(t_s, rest, 2 * np.pi * frequencies, normalize=True, floating_mean=True))
+        top = int(np.argmax(power))
+        if _false_alarm_probability(float(power[top]), len(t_s), span_s) > _MAX_FALSE_ALARM:
+            break
+        refined_hz = _refine_frequency(t_s, rest, float(frequencies[top]), span_s)
+        peaks.append((refined_hz, float(power[top]), _aliases(frequencies, power, top, span_s)))
+        rest = samples - _fit_sines(t_s, samples, [hz for hz, _, _ in peaks])[0]
+    _, amplitudes = _fit_sines(t_s, samples, [hz for hz, _, _ in peaks])
+    return tuple(
+        Oscillation(hz, amplitude / max(exposure_attenuation(hz, exposure_s), _MIN_ATTENUATION), power, aliases)
+        for (hz, power, aliases), amplitude in zip(peaks, amplitudes, strict=True)
+    )
+
+
+def _refine_frequency(t_s: FloatArray, samples: FloatArray, frequency_hz: float, span_s: float) -> float:
+    """Return the exact top of a peak: a fitted sine that misses it would leave a part of the oscillation."""
+    from scipy.optimize import minimize_scalar
+
+    def residual(candidate_hz: float) -> float:
+        return float(np.sum((samples - _fit_sines(t_s, samples, [candidate_hz])[0]) ** 2))
+
+    half_hz = 1 / (_SPECTRUM_OVERSAMPLING * span_s)
+    limits = (frequency_hz - half_hz, frequency_hz + half_hz)
+    return float(minimize_scalar(residual, bounds=limits, method="bounded", options={"xatol": half_hz / 1000}).x)
+
+
+def _false_alarm_probability(power: float, samples: int, span_s: float) -> float:
+    """Return the probability that noise alone has such a peak anywhere in the spectrum."""
+    independent = span_s * (_HIGHEST_HZ - _LOWEST_HZ)
+    return independent * math.exp(0.5 * (samples - 3) * math.log(max(1 - power, 1e-300)))
+
+
+def _aliases(frequencies: FloatArray, power: FloatArray, top: int, span_s: float) -> tuple[float, ...]:
+    """Return the other peaks that are nearly as high."""
+    inner = power[1:-1]
+    is_peak = (inner >= power[:-2]) & (inner >= power[2:]) & (inner > _ALIAS_SHARE * power[top])
+    peaks = frequencies[1:-1][is_peak]
+    return tuple(float(each) for each in peaks[np.abs(peaks - frequencies[top]) > 2 / span_s])
+
+
+def _fit_sines(t_s: FloatArray, samples: FloatArray, frequencies: list[float]) -> tuple[FloatArray, list[float]]:
+    """Fit a constant and one sine per frequency by least squares: (n,) values, and the amplitudes."""
+    turns = [2 * np.pi * frequency * t_s for frequency in frequencies]
+    base = np.column_stack([np.ones_like(t_s), *(wave(turn) for turn in turns for wave in (np.cos, np.sin))])
+    weights = np.linalg.lstsq(base, samples, rcond=None)[0]
+    amplitudes = [float(np.hypot(*weights[1 + 2 * i : 3 + 2 * i])) for i in range(len(frequencies))]
+    return np.asarray(base @ weights, np.float64), amplitudes

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ExtraMissingError, NothingToReconstructError, StorageError
 from slrig.plugins import FileFormat
 
@@ -59,5 +59,5 @@ def encode_e57(cloud: OrganisedCloud) -> bytes:
         except E57Exception as cause:
             message = f"{path}: the disk refused: {cause}; free some space there"
             raise StorageError(message) from cause
-        with refusals_of(path):
+        with storage_errors(path):
             return path.read_bytes()

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import ExtraMissingError
 from slrig.plugins import FileFormat
 from slrig.ros_messages import PROJECTOR, TF_STATIC, Device, Messages, topic
@@ -74,7 +74,7 @@ def encode_bag(
     with TemporaryDirectory(prefix="slrig-") as parent:
         # Writes FOLDER/FOLDER.mcap.
         folder = Path(parent, Path(FORMAT.name).stem)
-        with refusals_of(folder):
+        with storage_errors(folder):
             # From version 9 on QoS is stated in words, which Humble does not read; later releases read both.
             writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
             # As chunks of the MCAP, which any reader of the format unpacks.

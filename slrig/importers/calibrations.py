@@ -13,20 +13,21 @@ import yaml
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from slrig.bundle.calibration import (
-    MOST_FILE_BYTES,
+from slrig.bundle import (
+    CAMERA_NAME,
+    MAX_SIDE_PX,
+    MAX_STORAGE_BYTES,
     Value,
-    five_terms,
+    five_distortion_terms,
     read_calibration,
     read_file_storage,
     read_opencv_calibration,
     write_calibration,
     write_opencv_calibration,
 )
-from slrig.bundle.description import CAMERA_NAME, MOST_SIDE_PX
 from slrig.bundle.storage import sync_folder, write_durably, write_file
-from slrig.bundle.validation import Strict, checked, read_text
-from slrig.disk import refusals_of, staging_name
+from slrig.bundle.validation import Strict, read_text, validate
+from slrig.disk import staging_name, storage_errors
 from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, Gray, Pinhole, Size
 from slrig.ros_messages import FRAME, MM_PER_M, PROJECTOR, WORLD, lens, pose
@@ -97,7 +98,7 @@ def yaml_bytes(data: object) -> bytes:
     return text.encode()
 
 
-Side = Annotated[int, Field(ge=1, le=MOST_SIDE_PX)]
+Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]
 
 
 class RosMatrix(Strict):
@@ -191,7 +192,7 @@ def read_ros(folder: Path) -> Calibration:
 
 
 def _read_ros_device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: str) -> Pinhole:
-    info = checked(RosCameraInfo, read_yaml(path), str(path), error=CalibrationError)
+    info = validate(RosCameraInfo, read_yaml(path), str(path), error=CalibrationError)
     terms = info.distortion_coefficients.array(f"{path}: distortion_coefficients").ravel()
     if info.distortion_model not in ("plumb_bob", "rational_polynomial") or terms[5:].any() or len(terms) < 4:
         raise CalibrationError(
@@ -216,7 +217,7 @@ def _read_ros_device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]]
 
 def _read_ros_poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return rotation and translation, mm, from the world to each frame. Raises CalibrationError."""
-    listed = checked(TfMessage, read_yaml(path), str(path), error=CalibrationError).transforms
+    listed = validate(TfMessage, read_yaml(path), str(path), error=CalibrationError).transforms
     parents = {each.child_frame_id: each for each in listed}
     if len(parents) < len(listed):
         raise CalibrationError(f"{path}: expected one parent for each frame, found two; keep one of them")
@@ -268,7 +269,7 @@ def write_ros(folder: Path, calibration: Calibration) -> None:
         transforms.append({"header": {"frame_id": WORLD}, "child_frame_id": name + FRAME, "transform": transform})
     texts[TRANSFORMS] = yaml_bytes({"transforms": transforms})
     staging = staging_name(folder)
-    with refusals_of(folder):
+    with storage_errors(folder):
         try:
             staging.mkdir()
             for file, text in texts.items():
@@ -351,7 +352,7 @@ def read_kalibr(path: Path) -> Calibration:
 
 
 def _check_kalibr_camera(path: Path, key: str, data: object) -> KalibrCamera:
-    entry = checked(KalibrCamera, data, f"{path}: {key}", error=CalibrationError)
+    entry = validate(KalibrCamera, data, f"{path}: {key}", error=CalibrationError)
     models = (entry.camera_model, entry.distortion_model)
     if models != ("pinhole", "radtan") or (len(entry.intrinsics), len(entry.distortion_coeffs)) != (4, 4):
         raise CalibrationError(
@@ -441,9 +442,9 @@ def read_program_calibration(
     if program == "scan3d-capture":
         second = _scale_cells_to_pixels(second, projector, bits)
     try:
-        terms = five_terms(first_lens, path, PROGRAM_KEYS[program][1])
+        terms = five_distortion_terms(first_lens, path, PROGRAM_KEYS[program][1])
         first_device = Pinhole(sizes[0], first, terms, np.eye(3), np.zeros(3))
-        terms = five_terms(second_lens, path, PROGRAM_KEYS[program][3])
+        terms = five_distortion_terms(second_lens, path, PROGRAM_KEYS[program][3])
         size = sizes[1] if both_cameras else projector
         second_device = Pinhole(size, second, terms, rotation, translation.ravel())
     except CalibrationError as cause:
@@ -486,7 +487,7 @@ def read_any_calibration(
         return read_ros(path)
     if path.suffix.lower() not in {".yml", ".yaml", ".xml"}:
         return read_calibration(path)
-    text = read_text(path, MOST_FILE_BYTES, CalibrationError)
+    text = read_text(path, MAX_STORAGE_BYTES, CalibrationError)
     if not text.removeprefix("\ufeff").startswith(("%YAML", "<")):
         return read_kalibr(path)
     root = read_file_storage(text, path)

@@ -11,13 +11,10 @@ from typing import NoReturn
 
 import numpy as np
 
-from slrig.bundle.calibration import check_calibration
-from slrig.bundle.description import MOST_CAMERA_PX
-from slrig.bundle.images import frame_format, read_with_colour
-from slrig.bundle.storage import natural
+from slrig.bundle import MAX_CAMERA_PX, BundleWriter, check_calibration, read_frame_format, read_with_colour
+from slrig.bundle.storage import natural_sort_key
 from slrig.bundle.validation import read_text
-from slrig.bundle.writing import BundleWriter
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
 from slrig.importers.calibrations import read_any_calibration
 from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Shot, Size, White
@@ -251,7 +248,7 @@ def import_capture(
     files with 16 bits. Raises BundleError, PatternError, CalibrationError: the images, the naming or the calibration do
     not fit; StorageError.
     """
-    with refusals_of(folder):
+    with storage_errors(folder):
         images = _assign_images(folder, code, naming)
     if names:
         if len(names) != len(images.cameras):
@@ -301,7 +298,7 @@ def _pattern_sequence(code: ProjectorCode, naming: ImageNaming, files: Sequence[
         return code.parse_sequence(naming.order)
     count = len(files)
     if naming.program == "opencv":
-        form = frame_format(files[0])
+        form = read_frame_format(files[0])
         # OpenCV leaves the place and order of white and black to the program that saves the images.
         for references_first, pair in ((False, files[-2:]), (True, files[:2])):
             images = [read_with_colour(each, (0,), form)[0][0] for each in pair]
@@ -317,7 +314,9 @@ def _group_by_camera(folder: Path) -> dict[str, list[Path]]:
     """Return the images in natural order, by subfolder, or by the part of their names before the last number."""
     images = _list_images(folder)
     if not images:
-        subfolders = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural)
+        subfolders = sorted(
+            (each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural_sort_key
+        )
         by_folder = {each.name: files for each in subfolders if (files := _list_images(each))}
         if not by_folder:
             raise BundleError(f"{folder}: expected images ({', '.join(sorted(IMAGES))}), found none in it or below it")
@@ -332,7 +331,7 @@ def _group_by_camera(folder: Path) -> dict[str, list[Path]]:
 
 def _list_images(folder: Path) -> list[Path]:
     files = (each for each in folder.iterdir() if each.suffix.lower() in IMAGES and each.name[0] != ".")
-    return sorted(files, key=natural)
+    return sorted(files, key=natural_sort_key)
 
 
 def _assign_by_names(folder: Path, code: ProjectorCode, naming: ImageNaming) -> ImageAssignment:
@@ -397,13 +396,13 @@ def _require_complete_codes(folder: Path, assigned: ImageAssignment) -> None:
 
 
 def _common_format(files: Sequence[tuple[Path, Pattern]], bit_depth: int | None) -> CameraFormat:
-    first = frame_format(files[0][0])
-    if first.size.width_px * first.size.height_px > MOST_CAMERA_PX:
+    first = read_frame_format(files[0][0])
+    if first.size.width_px * first.size.height_px > MAX_CAMERA_PX:
         raise BundleError(
-            f"{files[0][0]}: expected at most {MOST_CAMERA_PX} pixels, found {first.size}; crop the images"
+            f"{files[0][0]}: expected at most {MAX_CAMERA_PX} pixels, found {first.size}; crop the images"
         )
     for path, _ in files:
-        each = frame_format(path)
+        each = read_frame_format(path)
         if each != first:
             raise BundleError(
                 f"{path}: expected {first.size} of {first.bit_depth} bits as {files[0][0].name}, found {each.size} of "
@@ -428,7 +427,7 @@ def _write_camera(
     brightest = 0
     for path, pattern in files:
         coloured = (0,) if isinstance(pattern, White | Black) else ()
-        grey, colour = read_with_colour(path, (0,), form, coloured=coloured)
+        grey, colour = read_with_colour(path, (0,), form, colour_pages=coloured)
         writer.add(Shot(patterns.index(pattern), name, grey[0], colour=colour.get(0)))
         brightest = max(brightest, int(grey[0].max()))
         if isinstance(pattern, White | Black):

@@ -23,7 +23,7 @@ from typing import BinaryIO, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from slrig.bundle.storage import sync_folder, sync_tree
-from slrig.disk import refusals_of, staging_name
+from slrig.disk import staging_name, storage_errors
 from slrig.errors import StorageError
 from slrig.jobs.data_folder import DATABASE, ORPHANS, SCANS
 from slrig.jobs.database import PATIENCE_S
@@ -369,5 +369,5 @@ def _refusals(source: Path) -> Iterator[None]:
         if isinstance(error, PermissionError) and path.is_relative_to(source):
             message = f"{path} may not be read. Run this as the user that the service runs as: sudo -u slrig slrig …"
             raise StorageError(message) from error
-        with refusals_of(path):
+        with storage_errors(path):
             raise

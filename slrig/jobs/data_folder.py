@@ -239,7 +239,7 @@ class DataFolder:
         """Move what is staged for a job to its place, by one rename, durable: all but a bundle, which is so already."""
         staged = self.staging(job_id)
         with disk_errors(staged):
-            sync_tree(staged, but=BUNDLE)
+            sync_tree(staged, except_folder=BUNDLE)
             staged.rename(place)
             sync_folder(place.parent)
             sync_folder(self.incoming)

@@ -11,7 +11,7 @@ from uuid import UUID
 import structlog
 
 from slrig.errors import ScanCancelledError, ScanInterruptedError, StorageError
-from slrig.failure import UNEXPECTED, JobFailure, failure_of
+from slrig.failure import UNEXPECTED, JobFailure, job_failure
 from slrig.jobs.records import JobState
 from slrig.jobs.store import JobStore
 
@@ -36,7 +36,7 @@ def ending_by(error: Exception, job_id: UUID, *, hidden: str) -> Ending:
 
     hidden : left out of its message. The staging folder is gone when that is read.
     """
-    fault = failure_of(error)
+    fault = job_failure(error)
     fault = replace(fault, message=fault.message.replace(hidden, ""))
     state = JobState.FAILED
     if isinstance(error, ScanCancelledError):

@@ -23,7 +23,7 @@ from slrig.errors import (
     ScanCancelledError,
     SlrigError,
 )
-from slrig.failure import failure_of, interruption
+from slrig.failure import interruption_error, job_failure
 from slrig.jobs.job import Holder, Job, busy
 from slrig.rig.preview import Light, Previews, Watch
 from slrig.rig.session import RigSession, driver_errors
@@ -102,7 +102,7 @@ class JobQueue:
         self._refuse_while_stuck()
         with self._changed:
             if self._ending:
-                raise interruption()
+                raise interruption_error()
             waiting = self._due()
             ahead = self._active or (waiting[0] if waiting else None)
             if ahead is not None and not wait:
@@ -166,7 +166,7 @@ class JobQueue:
             raise CameraNotFoundError(message)
         with self._changed:
             if self._ending:
-                raise interruption()
+                raise interruption_error()
             if self._active is not None:
                 raise busy(self._active)
         return self._previews.watch(camera, light)
@@ -203,10 +203,10 @@ class JobQueue:
             for job in self._under_way():
                 job.stop.set()
             for job in cut_off:
-                job.conclude(interruption())
+                job.conclude(interruption_error())
             self._changed.notify_all()
         self._watchdog.stop()
-        self._previews.fail(interruption())
+        self._previews.fail(interruption_error())
         for job in cut_off:
             job.settle()
 
@@ -222,7 +222,7 @@ class JobQueue:
             self.rig.darken_from_outside()
         with self._changed:
             self._changed.wait_for(lambda: not self._computing, max(give_up - time.monotonic(), 0.0))
-        self._cut_off(interruption(), self._under_way)
+        self._cut_off(interruption_error(), self._under_way)
 
     def _refuse_while_stuck(self) -> None:
         call = self.rig.calls.stuck
@@ -307,7 +307,7 @@ class JobQueue:
                         job.work(self.rig, job)
                 error = None
             except Exception as raised:  # noqa: BLE001 - the owner thread outlives whatever happens to one job
-                error = interruption() if self._ending else raised
+                error = interruption_error() if self._ending else raised
             finally:
                 self.rig.darken()
             goes_on = error is None and self._begun_computing(job)
@@ -350,7 +350,7 @@ class JobQueue:
                         job.compute(job)
                 error = None
             except Exception as raised:  # noqa: BLE001 - it is told as the end of the job
-                error = interruption() if self._ending else raised
+                error = interruption_error() if self._ending else raised
             job.clear_up(error)
         except Exception:  # noqa: BLE001 - as on the owner thread
             _log.exception("the end of work that computes went wrong", work=job.holder.words)
@@ -370,7 +370,7 @@ class JobQueue:
         except Exception as error:  # noqa: BLE001 - the owner thread outlives whatever happens to a picture
             self.rig.let_go(error)
             self._log_unopened(error)
-            fault = failure_of(error)
+            fault = job_failure(error)
             self._previews.fail(error if isinstance(error, SlrigError) else DeviceError(fault.message))
             self._log_unopened(self.rig.recover())
 

@@ -11,7 +11,7 @@ from uuid import UUID
 import structlog
 
 from slrig.errors import ScanCancelledError, ScanInterruptedError, StorageError
-from slrig.failure import JobFailure, failure_of, interruption
+from slrig.failure import JobFailure, interruption_error, job_failure
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.endings import Ending, Endings, ending_by
 from slrig.jobs.job import Holder, Job
@@ -111,7 +111,7 @@ class RigJobs:
         elif resumes and record.state is JobState.COMPUTING and self.jobs.attempts(record.id) == 1:
             self.queue.add([self.job(record.id, replace(parts, capture=None), holder)])
         else:
-            work, error = _Work(record.id, parts, self, holder, resumable=False), interruption()
+            work, error = _Work(record.id, parts, self, holder, resumable=False), interruption_error()
             work.clear_up(error)
             work.job.conclude(error)
             work.job.settle()
@@ -123,7 +123,7 @@ class RigJobs:
         self.endings.settle()
         if job_id not in self.endings:
             # Nobody works on it, and nobody knows how it ended: the least that can be done is to let it go.
-            fault = failure_of(ScanInterruptedError("Nothing works on this any more. Start it again."))
+            fault = job_failure(ScanInterruptedError("Nothing works on this any more. Start it again."))
             self.jobs.finish(job_id, JobState.INTERRUPTED, fault=fault)
 
     def close(self) -> None:

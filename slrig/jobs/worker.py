@@ -25,7 +25,7 @@ import structlog
 
 from slrig import logs
 from slrig.errors import ScanCancelledError, WorkerBusyError, WorkerLostError
-from slrig.failure import errors_by_code, interruption
+from slrig.failure import errors_by_code, interruption_error
 from slrig.jobs.frame_feed import FrameFeed
 from slrig.jobs.worker_process import Failed, Fed, Preparing, Ready, Run, Task, Unloadable, received, sent, serve
 from slrig.jobs.worker_wait import POLL_S, PREPARING, JobWait, Made, Told
@@ -146,7 +146,7 @@ class Worker:
             self._heartbeat = RawValue(c_double, time.monotonic())
             self._process = self._spawning.Process(
                 target=serve,
-                args=(far_end, stops, self._heartbeat, self.module, logs.chosen()),
+                args=(far_end, stops, self._heartbeat, self.module, logs.log_settings()),
                 name="slrig-worker",
                 daemon=True,
             )
@@ -217,7 +217,7 @@ class Worker:
                 process, pipe, stops = self._process, self._pipe, self._stops
                 self._running = True
             if process is None or pipe is None or stops is None:
-                raise interruption()
+                raise interruption_error()
             number, fed = next(self._numbers), False
             # A process that was started since the capture has not seen its frames.
             if feed is not None and feed.receiver is pipe:
@@ -235,7 +235,7 @@ class Worker:
                 answer = job.answer()
             except WorkerLostError as error:
                 if self._closed:
-                    raise interruption() from error
+                    raise interruption_error() from error
                 if not self._loading and self._condition != READY:
                     message = f"The {task.what} did not begin: {self._condition}. {task.remedy}"
                     raise WorkerLostError(message) from error

@@ -22,7 +22,7 @@ from typing import Any
 
 import structlog
 
-from slrig.failure import JobFailure, failure_of
+from slrig.failure import JobFailure, job_failure
 from slrig.jobs.frame_feed import FedCaptures
 from slrig.logs import LogSettings, set_up_logs
 
@@ -230,7 +230,7 @@ def _answer(pipe: Connection, stops: Connection, run: Run, live: Any) -> Done | 
         # The parent is gone: nobody waits for an answer.
         raise
     except Exception as error:  # noqa: BLE001 - the traceback travels to the parent, which logs it
-        return Failed(run.number, failure_of(error), traceback.format_exc())
+        return Failed(run.number, job_failure(error), traceback.format_exc())
 
 
 def _called(task: Task, given: dict[str, Any]) -> Any:

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import structlog
 
-from slrig.bundle.calibration import check_calibration, check_rays
+from slrig.bundle import check_calibration, require_two_rays
 from slrig.devices import CameraInfo, ProjectorInfo, Rig, Turntable
 from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
-from slrig.failure import UNEXPECTED, JobFailure, failure_of
+from slrig.failure import UNEXPECTED, JobFailure, job_failure
 from slrig.model import Calibration, Size
 from slrig.rig.settings import SettingsInUse
 from slrig.rig.turn_count import CountedTurntable
@@ -101,7 +101,7 @@ class RigSession:
                 rig = self.calls.make(f"rig '{self.name}'", OPEN, OPEN_LIMIT_S, self._opened)
                 self.facts = _facts(rig)
             except Exception as error:
-                self.fault = failure_of(error)
+                self.fault = job_failure(error)
                 if rig is not None:
                     self._close(rig)
                 raise
@@ -130,7 +130,7 @@ class RigSession:
         try:
             source = f"calibration {active.name}"
             check_calibration(active.calibration, self.facts.projector.size, self.facts.sizes, source)
-            check_rays(active.calibration, self.facts.sizes, source)
+            require_two_rays(active.calibration, self.facts.sizes, source)
         except CalibrationError as error:
             return error
         return None
@@ -149,7 +149,7 @@ class RigSession:
     def doubt(self, error: Exception) -> None:
         """Let the rig go if an error leaves the state of its devices unknown; the next work opens them afresh."""
         failed = isinstance(error, DeviceError) and not isinstance(error, UnsupportedByDeviceError)
-        if failed or failure_of(error).code == UNEXPECTED:
+        if failed or job_failure(error).code == UNEXPECTED:
             self.let_go(error)
 
     def _opened(self) -> Rig:
@@ -206,7 +206,7 @@ class RigSession:
         """Close every device. `error` says why, where that is a failure."""
         rig, self._rig = self._rig, None
         if error is not None:
-            self.fault = failure_of(error)
+            self.fault = job_failure(error)
         if rig is not None:
             self._dropped = error is not None
             self._close(rig)
@@ -214,7 +214,7 @@ class RigSession:
 
     def give_up(self, call: Call) -> JobFailure:
         """Take note that a call hangs, and return what to tell of it. It ends the rig when it returns after all."""
-        fault = self.fault = failure_of(DeviceError(call.hangs()))
+        fault = self.fault = job_failure(DeviceError(call.hangs()))
         return fault
 
     def _close(self, rig: Rig) -> None:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from slrig.bundle.storage import write_file
 from slrig.devices import Turntable
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import StorageError
 from slrig.model import StageAxis
 
@@ -104,7 +104,7 @@ class CountedTurntable:
         self._table.close()
 
     def _keep(self, standing: _Standing) -> None:
-        with refusals_of(self._path):
+        with storage_errors(self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
         write_file(self._path, standing.model_dump_json().encode())
 

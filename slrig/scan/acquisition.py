@@ -20,8 +20,7 @@ from typing import Self
 
 import structlog
 
-from slrig.bundle import BundleWriter, write_truth
-from slrig.bundle.sidecars import FOLDER, Refused, StageAngle, write_notes, write_stage
+from slrig.bundle import REFUSED_FOLDER, BundleWriter, RefusedFrame, StageAngle, write_notes, write_stage, write_truth
 from slrig.capture import SETTINGS_TOLERANCE, choose_triggers, round_to_refresh_s
 from slrig.devices import Camera, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
@@ -81,7 +80,7 @@ class Recorder:
     def __init__(self, writer: BundleWriter, *, most_bytes: int = MOST_WAITING_BYTES) -> None:
         self._writer = writer
         self._most_bytes = most_bytes
-        self._waiting: queue.Queue[Shot | Refused | None] = queue.Queue()
+        self._waiting: queue.Queue[Shot | RefusedFrame | None] = queue.Queue()
         self._thread: threading.Thread | None = None
         self._stopped = False
         self._error: Exception | None = None
@@ -93,7 +92,7 @@ class Recorder:
         """Have a frame written; waits while too many are waiting already. Raises as `BundleWriter.add` does."""
         self._put(shot)
 
-    def refuse(self, refused: Refused) -> None:
+    def refuse(self, refused: RefusedFrame) -> None:
         """Have a refused frame kept apart. Raises as `BundleWriter.refuse` does."""
         self._put(refused)
 
@@ -116,7 +115,7 @@ class Recorder:
             self._waiting.put(None)
             self._thread.join()
 
-    def _put(self, item: Shot | Refused) -> None:
+    def _put(self, item: Shot | RefusedFrame) -> None:
         if self._error is not None:
             raise self._error
         if self._thread is None:
@@ -208,7 +207,10 @@ def capture_frames(
         except (ScanEvidenceError, FrameTimeoutError) as error:
             recorder.finish()
             writer.keep(str(error))
-            message = f"{error}. The frames are kept: see bundle.json for those that counted, {FOLDER}/ for the others"
+            message = (
+                f"{error}. The frames are kept: see bundle.json for those that counted, {REFUSED_FOLDER}/ for "
+                "the others"
+            )
             raise type(error)(message) from error
         if frames is not None:
             frames.end(exposing.summary())

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle.storage import sync_folder, sync_tree, write_file
-from slrig.disk import refusals_of, staging_name
+from slrig.disk import staging_name, storage_errors
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray, IntArray, Mesh, PointCurves
 from slrig.scan.mesh_formats import encode_mesh_obj, encode_mesh_stl
@@ -68,7 +68,7 @@ def write_converted(folder: Path, name: str) -> None:
     StorageError
         mesh.ply cannot be read, or the disk refused.
     """
-    with refusals_of(folder / MESH):
+    with storage_errors(folder / MESH):
         data = (folder / MESH).read_bytes()
     write_file(folder / name, converted(data, name))
 
@@ -287,11 +287,11 @@ def staged_folder(output: Path, replaces: str = REPORT_FORMAT) -> Iterator[Path]
     output = output.absolute()
     _require_replaceable(output, replaces)
     staging = staging_name(output)
-    with refusals_of(output):
+    with storage_errors(output):
         staging.mkdir(parents=True)
     try:
         yield staging
-        with refusals_of(output):
+        with storage_errors(output):
             sync_tree(staging)
             _put_in_place(staging, output)
             sync_folder(output.parent)

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle import RefusedFrame
 from slrig.capture import (
     NOISE_FLOOR_DN,
     Evidence,
@@ -65,7 +65,7 @@ class Exposing:
         exposures_s: Sequence[float],
         *,
         cancelled: Callable[[], bool],
-        refused: Callable[[Refused], None],
+        refused: Callable[[RefusedFrame], None],
         colour: Collection[str] = (),
     ) -> None:
         self._rig = rig
@@ -80,7 +80,7 @@ class Exposing:
         )
         self._runs: list[_Run] = []
         self._compared: dict[str, ExposureSamples] = {}
-        self._refused: list[Refused] = []
+        self._refused: list[RefusedFrame] = []
         self._done: set[tuple[float | None, int, str]] = set()
         self._begun_s: float | None = None
         self._causes: dict[str, str] = {}
@@ -197,7 +197,7 @@ class Exposing:
             samples = self._samplers[shot.camera].take(shot.image)
             run.samples.setdefault(shot.camera, {})[shot.pattern] = samples
 
-    def _take_refusal(self, run: _Run, refused: Refused) -> None:
+    def _take_refusal(self, run: _Run, refused: RefusedFrame) -> None:
         if self._bracket:
             shot = None if refused.shot is None else self._timed(refused.shot)
             if shot is not None:
@@ -207,7 +207,7 @@ class Exposing:
         run.refused[refused.pattern, refused.camera] += 1
         self._note(refused)
 
-    def _note(self, refused: Refused) -> None:
+    def _note(self, refused: RefusedFrame) -> None:
         self._refused.append(refused)
         self._tell(refused)
 
@@ -238,11 +238,11 @@ class Exposing:
             cause = f"{run.exposure_s:g} s is {told.fault} for camera '{name}': {told.description}{longer}"
             self._causes[name] = cause
             white = self._sequence.patterns.index(White())
-            self._note(Refused(white, name, run.refused[white, name] + 1, cause, left_out=True))
+            self._note(RefusedFrame(white, name, run.refused[white, name] + 1, cause, left_out=True))
         for pattern, name in sorted(run.standing):
             cause = self._causes[name] if name in unfit else again
             attempt = run.refused[pattern, name] + 1
-            self._note(Refused(pattern, name, attempt, cause, delivered=True, left_out=name in unfit))
+            self._note(RefusedFrame(pattern, name, attempt, cause, delivered=True, left_out=name in unfit))
         self._skip(run.exposure_s, set(unfit))
 
     def _skip(self, exposure_s: float | None, cameras: set[str]) -> None:

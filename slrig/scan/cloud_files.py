@@ -14,10 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.calibration import read_calibration
-from slrig.bundle.description import read_description
-from slrig.bundle.reading import CALIBRATION, BundleFiles, open_bundle
-from slrig.disk import refusals_of
+from slrig.bundle import CALIBRATION, BundleFiles, open_bundle, read_calibration, read_description
+from slrig.disk import storage_errors
 from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.jobs.data_folder import BUNDLE
 from slrig.model import Calibration, Mesh, Pinhole, Pixels, White
@@ -114,7 +112,7 @@ def _organised(folder: Path, mesh: Mesh, camera: str, device: Pinhole) -> Organi
 
 
 def _read(path: Path) -> bytes:
-    with refusals_of(path):
+    with storage_errors(path):
         return path.read_bytes()
 
 

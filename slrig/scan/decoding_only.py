@@ -15,9 +15,9 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from slrig.bundle.reading import read_capture
+from slrig.bundle import read_capture
 from slrig.bundle.storage import write_file
-from slrig.disk import refusals_of
+from slrig.disk import storage_errors
 from slrig.errors import PatternError, setting
 from slrig.model import Axis, Capture, Gray, Refusal, trim_incomplete_codes
 from slrig.patterns import cell_positions, index_of_word
@@ -122,7 +122,7 @@ def _decoded(capture: Capture, camera: str, axis: Axis, folder: Path) -> Decoded
     code = decode(frames, noise, index_of_word(frames.gray), len(cells), limits, unresolved=unresolved)
     position = position_map(frames, noise, code, cells).position
     name = f"{camera}-{axis.value}"
-    with refusals_of(folder):
+    with storage_errors(folder):
         tifffile.imwrite(folder / f"position-{name}.tiff", position)
     coloured = encode_png(_coloured(position, capture.projector.along(axis)))
     write_file(folder / f"position-{name}.png", coloured)

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import structlog
 
-from slrig.bundle.sidecars import write_health
+from slrig.bundle import write_health
 from slrig.capture import EvidenceSummary
 from slrig.devices import Rig
 from slrig.errors import StorageError

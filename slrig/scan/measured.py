@@ -13,11 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from slrig.bundle import read_calibration
-from slrig.bundle.calibration import check_rays
-from slrig.bundle.description import read_description
-from slrig.bundle.reading import CALIBRATION, BundleFiles, open_bundle
-from slrig.bundle.sidecars import read_refused
+from slrig.bundle import (
+    CALIBRATION,
+    BundleFiles,
+    open_bundle,
+    read_calibration,
+    read_description,
+    read_refused,
+    require_two_rays,
+)
 from slrig.capture import Evidence, EvidenceSummary, check_exposures, checked_frames
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
 from slrig.model import MIN_BASELINE_FRACTION, Axis, Calibration, CaptureHeader, Region, Shot, trim_incomplete_codes
@@ -160,7 +164,7 @@ def _require_calibration(folder: Path, names: list[str], found: Calibration | No
             f"calibrate {missing}, or use the names of the calibration"
         )
         raise CalibrationError(message)
-    check_rays(found, names, str(folder))
+    require_two_rays(found, names, str(folder))
     return found
 
 

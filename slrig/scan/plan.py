@@ -8,7 +8,7 @@ from datetime import datetime, timedelta
 from typing import Protocol
 from uuid import UUID
 
-from slrig.bundle.sidecars import TurnedBy
+from slrig.bundle import TurnedBy
 from slrig.errors import ConfigError, setting
 from slrig.model import Axis, FlipRule, Region, SequenceName, bracket_fault
 from slrig.patterns import SEQUENCES, SequenceOptions

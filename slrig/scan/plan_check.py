@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from slrig.bundle.description import MOST_CAPTURE_BYTES
+from slrig.bundle import MAX_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo
 from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import Axis, Black, Calibration, Pattern, PatternSequence, Size, White
@@ -124,9 +124,9 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
         size = camera.format.size
         images = count + (3 * ends if name in coloured else 0)
         total += images * size.width_px * size.height_px * (1 if camera.format.bit_depth <= 8 else 2)
-    if total > MOST_CAPTURE_BYTES:
+    if total > MAX_CAPTURE_BYTES:
         message = (
-            f"The frames of this scan would take {total / 1e9:.1f} GB, a bundle holds {MOST_CAPTURE_BYTES / 1e9:.1f} "
+            f"The frames of this scan would take {total / 1e9:.1f} GB, a bundle holds {MAX_CAPTURE_BYTES / 1e9:.1f} "
             "GB at most. Ask for fewer exposures or fewer patterns."
         )
         raise UnsupportedByDeviceError(message)

@@ -19,9 +19,9 @@ import numpy as np
 import structlog
 from numba import config
 
-from slrig.bundle.writing import write_bundle
+from slrig.bundle import write_bundle
 from slrig.errors import StorageError
-from slrig.kernels import Prepared, compilations_told, prepared
+from slrig.kernels import KernelCount, count_prepared, report_compilations
 from slrig.meshing import FIRST_STAGE
 from slrig.model import Calibration, CameraFormat, Capture, FloatArray, Pinhole, Pixels, Shot, Size
 from slrig.patterns import encode, scan_patterns
@@ -36,7 +36,7 @@ _CAMERA = "sample"
 _log = structlog.get_logger(__name__)
 
 
-def prepare_kernels(reconstruct: Callable[..., Any], told: Callable[[Prepared], None]) -> None:
+def prepare_kernels(reconstruct: Callable[..., Any], told: Callable[[KernelCount], None]) -> None:
     """Load every kernel that a usual scan needs; the first time they are compiled.
 
     reconstruct : `slrig.scan.reconstruct.reconstruct_bundle`. `told` hears how far that is, once for every kernel or
@@ -46,14 +46,14 @@ def prepare_kernels(reconstruct: Callable[..., Any], told: Callable[[Prepared], 
 
         def compiling(_: str) -> None:
             beside.start()
-            told(prepared())
+            told(count_prepared())
 
         def entered(stage: str, *_: object) -> None:
             if stage == FIRST_STAGE:
                 beside.join()
 
         try:
-            with compilations_told(compiling), TemporaryDirectory(prefix="slrig-") as folder:
+            with report_compilations(compiling), TemporaryDirectory(prefix="slrig-") as folder:
                 bundle = Path(folder, "bundle")
                 write_bundle(bundle, *sample_scan())
                 reconstruct(

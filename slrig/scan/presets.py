@@ -13,8 +13,8 @@ from pathlib import Path
 
 from slrig.bundle.options import PRESET_NAME, Preset, PresetDocument
 from slrig.bundle.storage import json_bytes, write_file
-from slrig.bundle.validation import read_description_of
-from slrig.disk import refusals_of
+from slrig.bundle.validation import read_json_model
+from slrig.disk import storage_errors
 from slrig.errors import ConfigError, PresetNotFoundError
 from slrig.model import SequenceName
 
@@ -104,7 +104,7 @@ class Presets:
         """
         path = self._path(name)
         if path.is_file():
-            return read_description_of(path, PresetDocument, "preset", most_bytes=MOST_PRESET_BYTES, error=ConfigError)
+            return read_json_model(path, PresetDocument, "preset", max_bytes=MOST_PRESET_BYTES, error=ConfigError)
         if name not in self._given:
             names = ", ".join(sorted(self._kept() | set(self._given)))
             message = f"There is no preset '{name}' here. There are: {names}."
@@ -113,7 +113,7 @@ class Presets:
 
     def put(self, name: str, document: PresetDocument) -> None:
         """Keep a preset, in place of what has its name. Raises StorageError."""
-        with refusals_of(self._folder):
+        with storage_errors(self._folder):
             self._folder.mkdir(mode=0o750, exist_ok=True)
         write_file(self._path(name), json_bytes(document.model_dump(mode="json", exclude_none=True)))
 
@@ -135,7 +135,7 @@ class Presets:
                 "deleted. One that is PUT by its name takes its place."
             )
             raise PresetNotFoundError(message)
-        with refusals_of(path):
+        with storage_errors(path):
             path.unlink(missing_ok=True)
 
     def _kept(self) -> set[str]:

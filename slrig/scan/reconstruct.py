@@ -14,15 +14,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import read_truth
-from slrig.bundle.sidecars import read_health, read_notes, read_stage
+from slrig.bundle import read_health, read_notes, read_stage, read_truth
 from slrig.bundle.storage import write_file
 from slrig.capture import EvidenceSummary
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
-from slrig.kernels import Prepared, compilations_told
-from slrig.memory import give_back
+from slrig.kernels import KernelCount, report_compilations, trim_malloc
 from slrig.meshing import MeshingLimits, MeshStage, build_surface, compact_mesh, mesh_figures, score
 from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region
 from slrig.reconstruction import (
@@ -156,7 +154,7 @@ def reconstruct_into(
         # Frames are read and checked one after another while those before them are decoded: that is no step back.
         if (stage, fraction, detail) != at and not (at[0] and stage in _BETWEEN):
             at = (stage, fraction, detail)
-            give_back()
+            trim_malloc()
             progress(stage, fraction, detail)
 
     def compiling(kernel: str) -> None:
@@ -167,7 +165,7 @@ def reconstruct_into(
         write_file(folder / name, data, durable=False)
         made(name)
 
-    with compilations_told(compiling), ThreadPoolExecutor(1, thread_name_prefix="slrig-pictures") as beside:
+    with report_compilations(compiling), ThreadPoolExecutor(1, thread_name_prefix="slrig-pictures") as beside:
         entered("read bundle", 0.0, str(bundle))
         walked, found = measured(bundle, calibration, live, entered, axis=plan.axis, region=plan.region, judged=judged)
         meshed = _meshed(bundle, found, walked, plan, entered)
@@ -220,7 +218,7 @@ def frame_receiver() -> FedFrames:
     return FedFrames(LiveScan)
 
 
-def warm_kernels(told: Callable[[Prepared], None]) -> None:
+def warm_kernels(told: Callable[[KernelCount], None]) -> None:
     """Load every kernel that a usual scan needs; see `slrig.scan.preparation.prepare_kernels`."""
     prepare_kernels(reconstruct_bundle, told)
 

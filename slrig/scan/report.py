@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.description import read_description
+from slrig.bundle import read_description
 from slrig.capture import EvidenceSummary
 from slrig.meshing import MeshStage, SurfaceMesh
 from slrig.model import (

@@ -8,7 +8,7 @@ from pathlib import Path
 from uuid import UUID
 
 from slrig.errors import StorageError
-from slrig.failure import failure_of, interruption
+from slrig.failure import interruption_error, job_failure
 from slrig.jobs.data_folder import DataFolder, missing_files, remove
 from slrig.jobs.records import JobState, acting_as
 from slrig.jobs.store import JobStore, unfinished_ids
@@ -55,7 +55,7 @@ def sweep(store: JobStore, folder: DataFolder) -> Swept:
             continue
         if whole:
             folder.keep_bundle(record.id)
-        store.finish(record.id, JobState.INTERRUPTED, fault=failure_of(interruption()))
+        store.finish(record.id, JobState.INTERRUPTED, fault=job_failure(interruption_error()))
         interrupted.append(record.id)
     for scan_id, state in store.states().items():
         if state is JobState.SUCCEEDED and (missing := missing_files(folder.scan(scan_id))):
@@ -63,7 +63,7 @@ def sweep(store: JobStore, folder: DataFolder) -> Swept:
                 store.delete(scan_id)
                 continue
             message = f"{' and '.join(missing)} of this scan is gone from {folder.scan(scan_id)}. Scan again."
-            store.lose_files(scan_id, failure_of(StorageError(message)))
+            store.lose_files(scan_id, job_failure(StorageError(message)))
             lost.append(scan_id)
     # Those of other kinds see to their own files.
     going_on = unfinished_ids(store.database)

@@ -8,7 +8,7 @@ from typing import get_args
 
 from pydantic import SecretStr
 
-from slrig.config import NoticeKind, ServiceSettings, private_text
+from slrig.config import NoticeKind, ServiceSettings, read_private_text
 from slrig.jobs.outbox import Outbox
 from slrig.plugins import RECEIVERS, load
 from slrig.schedule.sending import Sender
@@ -40,4 +40,4 @@ def secret_of(given: SecretStr | None, path: Path | None, name: str) -> tuple[st
     if given is not None or path is None:
         return None if given is None else given.get_secret_value(), name
     source = f"{name}_file: {path}"
-    return private_text(path, source), source
+    return read_private_text(path, source), source

@@ -27,7 +27,7 @@ from slrig.errors import (
     SlrigError,
     WorkerLostError,
 )
-from slrig.failure import JobFailure, errors_by_code, failure_of
+from slrig.failure import JobFailure, errors_by_code, job_failure
 from slrig.jobs.job import Holder
 from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobState
@@ -232,7 +232,7 @@ class AcceptanceTask:
         record = desk.get(test)
         if record.decision is None:
             desk.cancel(test)
-            raise error_of(record.fault or failure_of(RuntimeError("the test ended without a result")))
+            raise error_of(record.fault or job_failure(RuntimeError("the test ended without a result")))
         return {
             "acceptance": str(test),
             "decision": str(record.decision),

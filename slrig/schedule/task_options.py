@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import Field, ValidationError
 
-from slrig.bundle.validation import FreeText, Strict, explain, keys_of
+from slrig.bundle.validation import FreeText, Strict, describe_errors, model_keys
 from slrig.calibration.board import PRINT_SIGMA, Board, BoardKind
 from slrig.errors import ScheduleError
 from slrig.rig.session import RigFacts
@@ -73,7 +73,7 @@ def checked(model: type[Options], given: Mapping[str, Any], *, task: str) -> Opt
     try:
         return model.model_validate(dict(given))
     except ValidationError as error:
-        faults = "; ".join(line.strip() for line in explain(error, dict(given), keys_of(model)).splitlines())
+        faults = "; ".join(line.strip() for line in describe_errors(error, dict(given), model_keys(model)).splitlines())
         message = f"options: {faults}. The options of {task} are: {', '.join(model.model_fields)}"
         raise ScheduleError(message) from error
 

@@ -43,7 +43,7 @@ def test_broken_contracts_are_noticed(tmp_path: Path) -> None:
     assert "slrig.helpers" in result.stdout
 
 
-ROOMS = ("capture", "meshing", "patterns", "reconstruction", "multiview")
+ROOMS = ("capture", "conformance", "doctor", "meshing", "patterns", "reconstruction", "multiview")
 """Rooms whose `__init__` exports all that others import from them."""
 
 

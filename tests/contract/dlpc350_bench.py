@@ -27,7 +27,7 @@ from drivers.pattern_engine.finding import engines
 from drivers.pattern_engine.link import Link
 from slrig.capture.sequencer import capture
 from slrig.capture.verifier import Evidence
-from slrig.conformance import run
+from slrig.conformance import run_checks
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.model import PatternSequence
 from tests.contract import dlpc900_bench
@@ -145,7 +145,7 @@ def main(target: Path) -> None:
     _PLUGGED[id(table)] = UhidEngine(table.engine)
     _await_node(dlpc350.find_devices)
     bench = Bench(table.opened, whole_scan(MIRRORS, rows=True))
-    told: dict[str, object] = {"contract": run(bench.open_rig, bench.sequence).document()}
+    told: dict[str, object] = {"contract": run_checks(bench.open_rig, bench.sequence).document()}
     target.write_text(json.dumps(told, indent=1))
     for check in CHECKS:
         told[check.__name__] = outcome(partial(check, table))

@@ -23,7 +23,7 @@ import pytest
 from drivers import kms
 from drivers.kms import finding, holding
 from drivers.kms.card import Card
-from slrig.conformance import run
+from slrig.conformance import run_checks
 from slrig.devices import Projector
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.model import Size
@@ -303,7 +303,7 @@ def main(target: Path, host_folder: str, chosen: list[str]) -> None:
 
     if not chosen or "contract" in chosen:
         bench = Bench(open_head, sequence(HERE))
-        told["contract"] = run(bench.open_rig, bench.sequence).document()
+        told["contract"] = run_checks(bench.open_rig, bench.sequence).document()
         target.write_text(json.dumps(told, indent=1))
 
 

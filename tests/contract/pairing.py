@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture.frame_checks import Contradiction
 from slrig.capture.sequencer import capture
 from slrig.capture.verifier import Evidence
@@ -122,7 +122,7 @@ def wrong_pairings(
             evidence = (Evidence if proven else Unproven)(sequence.patterns, formats)
             latest: dict[tuple[str, int], Shot] = {}
 
-            def take_back(refused: Refused, latest: dict[tuple[str, int], Shot] = latest) -> None:
+            def take_back(refused: RefusedFrame, latest: dict[tuple[str, int], Shot] = latest) -> None:
                 if refused.delivered:
                     del latest[refused.camera, refused.pattern]
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from slrig.conformance import Examination
-from slrig.conformance.bench import usual_settings
+from slrig.conformance import ConformanceRun
+from slrig.conformance.bench import default_settings
 from slrig.devices import Camera, Clock, HasClock, Projector, Rig, ScannerHead, SystemClock
 from slrig.model import Calibration, PatternSequence, Size, Truth
 from slrig.patterns.sequence import encode, scan_patterns
@@ -40,8 +40,8 @@ class Bench:
     def open_rig(self) -> Rig:
         return rig_of(self.open_head())
 
-    def examination(self) -> Examination:
-        return Examination(self.open_rig, self.sequence)
+    def examination(self) -> ConformanceRun:
+        return ConformanceRun(self.open_rig, self.sequence)
 
 
 def sequence_for(projector: Size) -> PatternSequence:
@@ -56,7 +56,7 @@ def close(head: ScannerHead) -> None:
 
 
 def rig_of(head: ScannerHead) -> Rig:
-    settings = {name: usual_settings(camera) for name, camera in head.cameras.items()}
+    settings = {name: default_settings(camera) for name, camera in head.cameras.items()}
     clock = head.clock if isinstance(head, HasClock) else SystemClock()
     return Rig("bench", head.cameras, head.projector, settings, head.calibration, head, clock=clock)
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import pytest
 
-from slrig.conformance import CHECKS, Check, Examination, Outcome
+from slrig.conformance import CHECKS, Check, CheckOutcome, ConformanceRun
 from slrig.devices import Camera, HasClock, Projector, ScannerHead
 from tests.contract.benches import BENCHES, picamera2
 from tests.contract.suite import Bench
@@ -20,7 +20,7 @@ QUICK = ("simulated", "replay", "v4l2 (fake kernel)", "picamera2 (a stand-in for
 @pytest.fixture(
     scope="session", params=[pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in BENCHES]
 )
-def examination(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Examination]:
+def examination(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ConformanceRun]:
     bench = BENCHES[request.param](tmp_path_factory.mktemp("bench"))
     with bench.examination() as examination:
         yield examination
@@ -28,11 +28,11 @@ def examination(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
-def test_contract(examination: Examination, check: Check) -> None:
-    result = examination.judge(check)
-    if result.outcome is Outcome.NOT_APPLICABLE:
+def test_contract(examination: ConformanceRun, check: Check) -> None:
+    result = examination.run_check(check)
+    if result.outcome is CheckOutcome.NOT_APPLICABLE:
         pytest.skip(result.reason or "")
-    assert result.outcome is Outcome.PASSED, str(result.failure)
+    assert result.outcome is CheckOutcome.PASSED, str(result.failure)
 
 
 def members(protocol: type) -> list[str]:
@@ -73,6 +73,8 @@ def test_the_suite_uses_every_member_of_the_protocols(tmp_path: Path) -> None:
 
     with Bench(open_head, plain.sequence).examination() as examination:
         for check in CHECKS:
-            assert examination.judge(check).outcome in {Outcome.PASSED, Outcome.NOT_APPLICABLE}, check.name
+            assert examination.run_check(check).outcome in {CheckOutcome.PASSED, CheckOutcome.NOT_APPLICABLE}, (
+                check.name
+            )
     protocols = (Camera, Projector, ScannerHead)
     assert asked == {f"{protocol.__name__}.{name}" for protocol in protocols for name in members(protocol)}

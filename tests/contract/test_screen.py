@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers import screen
-from slrig.conformance import CHECKS, Check, Examination, Outcome
+from slrig.conformance import CHECKS, Check, CheckOutcome, ConformanceRun
 from slrig.model import Size
 from tests.contract.screen_bench import bench_on, let_go, rig_options, sequence
 from tests.contract.screen_server import DummyServer, OutputPixels
@@ -60,7 +60,7 @@ def test_every_pixel_of_every_pattern_is_on_its_output(
 
 
 @pytest.fixture(scope="module", params=["x11", "sdl"])
-def examination(request: pytest.FixtureRequest, server: DummyServer) -> Iterator[Examination]:
+def examination(request: pytest.FixtureRequest, server: DummyServer) -> Iterator[ConformanceRun]:
     if request.param == "sdl":
         pytest.importorskip("sdl2", reason="needs PySDL2: pip install 'slrig[screen]'")
     with bench_on(server, "DUMMY1", backend=request.param).examination() as examination:
@@ -68,8 +68,8 @@ def examination(request: pytest.FixtureRequest, server: DummyServer) -> Iterator
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
-def test_contract(examination: Examination, check: Check) -> None:
-    result = examination.judge(check)
-    if result.outcome is Outcome.NOT_APPLICABLE:
+def test_contract(examination: ConformanceRun, check: Check) -> None:
+    result = examination.run_check(check)
+    if result.outcome is CheckOutcome.NOT_APPLICABLE:
         pytest.skip(result.reason or "")
-    assert result.outcome is Outcome.PASSED, str(result.failure)
+    assert result.outcome is CheckOutcome.PASSED, str(result.failure)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from simulated_rig.device import SimulatedHead, simulated_head
-from slrig.conformance import CHECKS, Examination, Outcome
+from slrig.conformance import CHECKS, CheckOutcome, ConformanceRun
 from slrig.devices import Rig, Turntable
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from tests.contract.benches import PLATE, beamer, eyes
@@ -118,9 +118,9 @@ def test_it_conforms(bench: Bench) -> None:
         return replace(rig, positioner=bench.opened())
 
     check = next(check for check in CHECKS if check.name == "a_positioner_takes_its_poses_and_no_others")
-    with Examination(Maker(change=turned), sequence()) as examination:
-        result = examination.judge(check)
-    assert result.outcome is Outcome.PASSED, str(result.failure)
+    with ConformanceRun(Maker(change=turned), sequence()) as examination:
+        result = examination.run_check(check)
+    assert result.outcome is CheckOutcome.PASSED, str(result.failure)
 
 
 def test_refused_poses_are_named_and_move_nothing(bench: Bench) -> None:

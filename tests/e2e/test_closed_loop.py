@@ -34,7 +34,7 @@ from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import read_scene
 from simulated_rig.staging import Script
 from slrig.bundle.calibration import write_calibration
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig
 from slrig.discovery import open_rig
@@ -94,7 +94,7 @@ class World:
     def __init__(self, rig: Path, *, seed: int) -> None:
         head = read_rig(rig).head
         assert head is not None
-        options = checked(HeadOptions, head.options, str(rig))
+        options = validate(HeadOptions, head.options, str(rig))
         (camera,) = options.camera
         scene = rig.parent / options.scene
         lens = options.projector.pinhole()

@@ -23,7 +23,7 @@ import structlog
 
 from slrig import KEY_VARIABLE
 from slrig.api import server
-from slrig.config import ServiceSettings, rig_of
+from slrig.config import ServiceSettings, parse_rig
 from slrig.jobs import worker_process
 from tests.e2e.conftest import Start, ended
 from tests.unit.api.conftest import ServedBench
@@ -87,7 +87,7 @@ def main(data: Path) -> None:
     server._Server = Server  # type: ignore[misc] # `serve` makes one of these
     server.open_service = lambda *_, **__: bench.service
     settings = ServiceSettings(data_dir=data, port=0, log_format="json")
-    rig = rig_of({"name": "bench", "head": {"driver": "none"}}, data / "rig.toml")
+    rig = parse_rig({"name": "bench", "head": {"driver": "none"}}, data / "rig.toml")
     try:
         server.serve(settings, rig, say=lambda line: print(line, flush=True))  # noqa: T201 - as the command does
     finally:

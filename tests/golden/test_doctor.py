@@ -17,7 +17,7 @@ from slrig.config import read_rig
 from slrig.devices import FoundDevice, Rig
 from slrig.discovery import open_rig
 from slrig.doctor.doctor import Diagnosis, examine
-from slrig.doctor.findings import Severity
+from slrig.doctor.light import Severity
 from slrig.errors import ScanEvidenceError
 from slrig.model import PatternSequence
 from slrig.patterns.sequence import encode, scan_patterns
@@ -217,7 +217,7 @@ def test_a_projector_that_is_unplugged_is_a_finding(tmp_path: Path) -> None:
     path = written(tmp_path, planted(faults="unplug_projector_at_show = 60"))
     with open_rig(read_rig(path)) as rig:
         diagnosis = examine(rig, own_sequence=own_sequence(rig))
-    [told] = diagnosis.of(Severity.FAULT)
+    [told] = diagnosis.with_severity(Severity.FAULT)
     assert told.name == "device.failed"
     assert "the projector is gone" in told.found
     # What was found before that is told all the same.

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from slrig.cli import devices
 from slrig.cli.commands import app
 from slrig.devices import FoundDevice
-from slrig.discovery import Findings, InstalledDriver, MissingLibrary
+from slrig.discovery import DiscoveredDevices, InstalledDriver, MissingLibrary
 from slrig.errors import DriverBrokenError
 
 LIMIT_S = 2.0
@@ -24,13 +24,13 @@ LIBRARIES = ("depthai", "gi", "harvesters", "picamera2")
 """What the extras bring: the child is told that there is none of it."""
 
 FINDERS = ("depthai", "genicam", "gentl", "picamera2")
-NOTHING = Findings((), (), ())
+NOTHING = DiscoveredDevices((), (), ())
 INSTALL = "pip install 'slrig[depthai]'"
 
 
-def told(monkeypatch: pytest.MonkeyPatch, drivers: tuple[InstalledDriver, ...], found: Findings) -> str:
+def told(monkeypatch: pytest.MonkeyPatch, drivers: tuple[InstalledDriver, ...], found: DiscoveredDevices) -> str:
     monkeypatch.setattr(devices, "installed_drivers", lambda: drivers)
-    monkeypatch.setattr(devices, "found_devices", lambda: found)
+    monkeypatch.setattr(devices, "discover_devices", lambda: found)
     result = CliRunner().invoke(app, ["devices"], env={"COLUMNS": "60"})
     assert result.exit_code == 0, result.output
     return result.stdout
@@ -42,7 +42,7 @@ def driver(name: str, package: str, *, kind: str = "camera", fault: str | None =
 
 def test_a_command_to_copy_is_neither_wrapped_nor_styled_away(monkeypatch: pytest.MonkeyPatch) -> None:
     long = f"sudo apt install {' '.join(f'package-{number}' for number in range(20))} && {INSTALL}"
-    found = Findings((), (MissingLibrary("depthai", INSTALL, "…"), MissingLibrary("genicam", long, "…")), ())
+    found = DiscoveredDevices((), (MissingLibrary("depthai", INSTALL, "…"), MissingLibrary("genicam", long, "…")), ())
     shown = told(monkeypatch, (driver("depthai", "slrig"), driver("genicam", "slrig")), found)
     assert f"  depthai: {INSTALL}\n" in shown
     assert f"  genicam: {long}\n" in shown
@@ -54,7 +54,7 @@ def test_a_broken_package_is_listed_once_with_its_cause_and_its_removal(monkeypa
     faults = {kind: f"{kind} driver 'x' cannot be loaded: OSError: [/etc] is shut" for kind in ("camera", "finder")}
     drivers = tuple(driver("x", "x-package", kind=kind, fault=fault) for kind, fault in faults.items())
     fault = DriverBrokenError("finder driver 'y' failed: OSError: no bus")
-    found = Findings((), (), (DriverBrokenError(faults["finder"]), fault))
+    found = DiscoveredDevices((), (), (DriverBrokenError(faults["finder"]), fault))
     shown = told(monkeypatch, (*drivers, driver("y", "y-package")), found)
     assert shown.count("is shut") == 1
     assert faults["camera"] in shown
@@ -67,7 +67,7 @@ def test_a_broken_package_is_listed_once_with_its_cause_and_its_removal(monkeypa
 
 
 def test_devices_are_shown_as_a_rig_file_takes_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = Findings((FoundDevice("v4l2", "usb-[bus]-video-index0", "[red]webcam"),), (), ())
+    found = DiscoveredDevices((FoundDevice("v4l2", "usb-[bus]-video-index0", "[red]webcam"),), (), ())
     shown = told(monkeypatch, (driver("v4l2", "slrig"),), found)
     assert "usb-[bus]-video-index0" in shown
     assert "[red]webcam" in shown
@@ -77,14 +77,14 @@ def test_devices_are_shown_as_a_rig_file_takes_them(monkeypatch: pytest.MonkeyPa
 def test_what_drivers_print_is_not_part_of_the_answer(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def chatty() -> Findings:
+    def chatty() -> DiscoveredDevices:
         sys.stdout.write("from Python\n")
         # As a library that is not Python does.
         os.write(1, b"from below\n")
         return NOTHING
 
     monkeypatch.setattr(devices, "installed_drivers", lambda: ())
-    monkeypatch.setattr(devices, "found_devices", chatty)
+    monkeypatch.setattr(devices, "discover_devices", chatty)
     devices.list_devices(as_json=True)
     shown = capfd.readouterr()
     assert json.loads(shown.out)["devices"] == []

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from slrig.conformance import CHECKS, Check, Outcome, Report, run
+from slrig.conformance import CHECKS, Check, CheckOutcome, ConformanceReport, run_checks
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import DeviceGoneError
 from slrig.model import PatternSequence, Pixels, Size
@@ -61,8 +61,8 @@ def sequence() -> PatternSequence:
     return encode(patterns_for(PROJECTOR), PROJECTOR)
 
 
-def failures(report: Report) -> list[str]:
-    return [f"{result.name}: {result.failure}" for result in report.results if result.outcome is Outcome.FAILED]
+def failures(report: ConformanceReport) -> list[str]:
+    return [f"{result.name}: {result.failure}" for result in report.results if result.outcome is CheckOutcome.FAILED]
 
 
 def named(name: str) -> Check:
@@ -71,10 +71,10 @@ def named(name: str) -> Check:
 
 @pytest.mark.slow
 def test_the_example_conforms(tmp_path: Path) -> None:
-    report = run(before_a_stage(loaded(tmp_path)), sequence())
+    report = run_checks(before_a_stage(loaded(tmp_path)), sequence())
     assert failures(report) == []
     assert report.conforms
-    assert report.count(Outcome.PASSED) >= 30
+    assert report.count(CheckOutcome.PASSED) >= 30
 
 
 def test_without_its_time_rule_it_would_not(tmp_path: Path) -> None:
@@ -82,7 +82,9 @@ def test_without_its_time_rule_it_would_not(tmp_path: Path) -> None:
         assert text.count(RULE) == 1
         return text.replace(RULE, "True")
 
-    report = run(before_a_stage(loaded(tmp_path, unruly)), sequence(), checks=[named("read_passes_over_stale_frames")])
+    report = run_checks(
+        before_a_stage(loaded(tmp_path, unruly)), sequence(), checks=[named("read_passes_over_stale_frames")]
+    )
     # Which of the two it is goes by how long the machine takes to come to the frame.
     assert re.search("drop those that began before|delivers frames of an earlier pattern", failures(report)[0])
 
@@ -97,9 +99,9 @@ def test_as_it_stands_it_shows_its_ramp(tmp_path: Path) -> None:
 
     # It does not see the projector, and a sequence that does not begin with white does not ask it to.
     blind = encode(patterns_for(PROJECTOR)[1:], PROJECTOR)
-    report = run(opened, blind)
+    report = run_checks(opened, blind)
     assert failures(report) == []
-    assert report.count(Outcome.PASSED) >= 20
+    assert report.count(CheckOutcome.PASSED) >= 20
     assert [device.device for device in module.find_devices()] == ["ramp-0"]
     with pytest.raises(DeviceGoneError, match="asked for 'ramp-1', found ramp-0"):
         module.open_camera("left", {"device": "ramp-1"}, tmp_path)

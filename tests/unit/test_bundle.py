@@ -17,7 +17,7 @@ import pytest
 import tifffile
 
 from slrig.bundle import BundleWriter, read_bundle, read_truth, storage, write_bundle, write_calibration, write_truth
-from slrig.bundle.sidecars import Refused, read_refused
+from slrig.bundle.sidecars import RefusedFrame, read_refused
 from slrig.bundle.storage import write_file
 from slrig.errors import BundleError, ScanEvidenceError, StorageError
 from slrig.model import Black, CameraFormat, CameraTruth, Capture, Gray, LineShift, Shot, Size, Surface, Truth, White
@@ -269,7 +269,7 @@ def test_a_frame_that_was_shot_again_takes_the_place_of_the_first(tmp_path: Path
     with writer(folder) as bundle:
         bundle.add(shot(0, level=10))
         bundle.add(shot(1, level=11, time_s=0.1))
-        bundle.refuse(Refused(1, "left", 1, "it equals pattern 0", delivered=True))
+        bundle.refuse(RefusedFrame(1, "left", 1, "it equals pattern 0", delivered=True))
         bundle.add(shot(2, level=12))
         bundle.add(shot(1, level=21, time_s=0.3))
     assert listed(folder) == [(0, "left", 10), (1, "left", 21), (2, "left", 12)]
@@ -281,14 +281,14 @@ def test_a_frame_that_was_shot_again_takes_the_place_of_the_first(tmp_path: Path
     image = cv2.imread(str(folder / entry["file"]), cv2.IMREAD_UNCHANGED)
     assert image is not None
     assert image[0, 0] == 11
-    assert read_refused(folder) == (Refused(1, "left", 1, "it equals pattern 0"),)
+    assert read_refused(folder) == (RefusedFrame(1, "left", 1, "it equals pattern 0"),)
 
 
 def test_a_frame_that_failed_first_keeps_its_place(tmp_path: Path) -> None:
     folder = tmp_path / "bundle"
     with writer(folder) as bundle:
-        bundle.refuse(Refused(0, "left", 1, "damaged", shot(0, level=99)))
-        bundle.refuse(Refused(0, "right", 1, "no frame came"))
+        bundle.refuse(RefusedFrame(0, "left", 1, "damaged", shot(0, level=99)))
+        bundle.refuse(RefusedFrame(0, "right", 1, "no frame came"))
         bundle.add(shot(1, level=11))
         bundle.add(shot(0, "right", level=20))
         bundle.add(shot(0, level=10))
@@ -303,7 +303,7 @@ def test_only_what_is_taken_back_is_taken_back(tmp_path: Path) -> None:
     folder = tmp_path / "bundle"
     with writer(folder) as bundle:
         bundle.add(shot(0, level=10))
-        bundle.refuse(Refused(0, "left", 1, "no frame came"))
+        bundle.refuse(RefusedFrame(0, "left", 1, "no frame came"))
         bundle.add(shot(0, level=40))
     assert listed(folder) == [(0, "left", 10), (0, "left", 40)]
 
@@ -320,7 +320,7 @@ def cut_short(folder: Path, *, keep: bool, taken: bool = True) -> None:
         if taken:
             bundle.add(shot(0, level=10))
             bundle.add(shot(1, level=11))
-        bundle.refuse(Refused(1, "left", 1, "stale", delivered=taken))
+        bundle.refuse(RefusedFrame(1, "left", 1, "stale", delivered=taken))
         if keep:
             bundle.keep("pattern 1 failed 3 times")
         message = "pattern 1 failed 3 times"

@@ -79,13 +79,13 @@ def test_an_enormous_png_is_refused_from_its_header(folder: Path, monkeypatch: p
     assert len(bomb) < 2**20
     (folder / "frames/left/002.png").write_bytes(bomb)
     unpacked = []
-    real = images._inflated
+    real = images._inflate
 
     def inflated(packed: bytearray | memoryview, most_bytes: int) -> bytes | None:
         unpacked.append(most_bytes)
         return real(packed, most_bytes)
 
-    monkeypatch.setattr(images, "_inflated", inflated)
+    monkeypatch.setattr(images, "_inflate", inflated)
     before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     _fault(folder, "frames/left/002.png", "expected 40 x 30", "found 20000 x 20000", "replace the frame")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 64 * 1024

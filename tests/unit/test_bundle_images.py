@@ -14,7 +14,7 @@ import pytest
 
 from slrig.bundle import read_bundle, write_bundle
 from slrig.bundle.description import DESCRIPTION
-from slrig.bundle.images import encode_frame, read_pages, rows_above_added
+from slrig.bundle.images import encode_frame, read_pages, undo_up_filter
 from slrig.errors import BundleError
 from slrig.model import CameraFormat, Capture, Pixels, Shot, Size, White
 
@@ -94,7 +94,7 @@ def test_png_of_our_own_needs_no_other_decoder(tmp_path: Path, monkeypatch: pyte
 def test_rows_of_several_filters_are_left_to_a_decoder() -> None:
     rows = bytearray(bytes(4) * 3)
     rows[0], rows[4], rows[8] = 2, 2, 1
-    assert rows_above_added(bytes(rows), 3, 8) is None
+    assert undo_up_filter(bytes(rows), 3, 8) is None
 
 
 def test_png_of_our_own_is_at_most_a_quarter_larger_than_by_zlib() -> None:

@@ -18,7 +18,7 @@ from slrig.cli.init import failure_of, typed
 from slrig.cli.rig_schema import rig_schema
 from slrig.config import RigConfig, read_rig
 from slrig.devices import Camera, FoundDevice, Projector
-from slrig.discovery import Findings, MissingLibrary, open_rig
+from slrig.discovery import DiscoveredDevices, MissingLibrary, open_rig
 from slrig.errors import DriverBrokenError
 from tests.unit import test_discovery
 from tests.unit.command import slrig
@@ -46,10 +46,10 @@ class Bench:
         self._monkeypatch = monkeypatch
 
     def run(self, *arguments: str, found: tuple[FoundDevice, ...] = (), answers: str | None = None) -> tuple[int, str]:
-        return self.run_with(Findings(found, (), ()), *arguments, answers=answers)
+        return self.run_with(DiscoveredDevices(found, (), ()), *arguments, answers=answers)
 
-    def run_with(self, findings: Findings, *arguments: str, answers: str | None = None) -> tuple[int, str]:
-        self._monkeypatch.setattr(init, "found_devices", lambda: findings)
+    def run_with(self, findings: DiscoveredDevices, *arguments: str, answers: str | None = None) -> tuple[int, str]:
+        self._monkeypatch.setattr(init, "discover_devices", lambda: findings)
         self._monkeypatch.setattr(init, "terminal", lambda: answers is not None)
         result = slrig("init", "--output", self.path, *arguments, typed=answers)
         return result.exit_code, result.output
@@ -192,7 +192,7 @@ def test_a_wrong_answer_is_named_and_nothing_is_written(bench: Bench, arguments:
 def test_nothing_plugged_in_is_said_with_what_to_check(bench: Bench) -> None:
     install = "pip install 'slrig[depthai]'"
     fault = DriverBrokenError("finder 'x' failed: no bus")
-    code, shown = bench.run_with(Findings((), (MissingLibrary("depthai", install, "…"),), (fault,)))
+    code, shown = bench.run_with(DiscoveredDevices((), (MissingLibrary("depthai", install, "…"),), (fault,)))
     assert code == 2
     for words in ("no camera and no projector is plugged in", install, str(fault), "slrig demo", "HDMI"):
         assert words in shown
@@ -208,7 +208,7 @@ def test_a_file_is_kept_unless_it_may_go(bench: Bench) -> None:
     bench.path.write_text("mine\n")
     code, shown = bench.run(found=(LEFT, HDMI))
     assert code == 2
-    assert "exists, and is kept" in shown
+    assert "exists and is unchanged" in shown
     assert bench.path.read_text() == "mine\n"
     assert bench.run("--force", found=(LEFT, HDMI))[0] == 0
     assert bench.rig().name == "bench"
@@ -377,7 +377,7 @@ def test_drivers_of_others_are_shown_or_refused() -> None:
     assert "projector driver two_sided" in shown
     assert "head driver two_sided" in shown
     for driver, words in (
-        ("strange", "driver 'strange' of fake_drivers are no pydantic model"),
+        ("strange", "driver 'strange' of fake_drivers are not a pydantic model"),
         ("unloadable", "'unloadable' of fake_drivers cannot be loaded (no_such_module:Options): ModuleNotFoundError"),
         ("v4l", "no installed package provides a driver 'v4l'; installed: "),
     ):

@@ -13,9 +13,9 @@ from drivers.serial_projector.device import main as box
 from slrig.bundle.options import ScanDefaults
 from slrig.cli.init import failure_of
 from slrig.config import RigConfig, is_loopback, read_rig, read_settings
+from slrig.discovery import drivers_with_options
 from slrig.errors import ConfigError
 from slrig.model import FlipRule
-from slrig.option_models import described_drivers
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 
 BENCH = """
@@ -199,7 +199,7 @@ def taken_by_its_drivers(path: Path) -> RigConfig:
     tables = [table for table in (rig.head, rig.projector, *rig.cameras) if table is not None]
     assert tables
     for table in tables:
-        assert table.driver in described_drivers("slrig")
+        assert table.driver in drivers_with_options("slrig")
         assert failure_of(table.driver, table.options) == ""
     return rig
 

@@ -23,7 +23,7 @@ from slrig.devices import (
     Rig,
     Trigger,
 )
-from slrig.discovery import found_devices, installed_drivers, open_rig
+from slrig.discovery import discover_devices, installed_drivers, open_rig
 from slrig.errors import (
     CalibrationError,
     ConfigError,
@@ -281,7 +281,7 @@ def test_faults_of_several_tables_are_reported_together_and_all_is_closed(tmp_pa
     order = [
         "projector driver 'skreen'",
         "camera driver 'fkae'",
-        "camera driver 'strict' does not take",
+        "camera driver 'strict' refuses",
         "  speed: unknown key; remove it",
         "positioner driver 'tabel'",
     ]
@@ -298,7 +298,7 @@ def test_faults_of_several_tables_are_reported_together_and_all_is_closed(tmp_pa
         ("crashing", DriverBrokenError, "'crashing' failed: ZeroDivisionError: right; report it"),
         ("broken", DriverBrokenError, r"of fake_drivers 1\.2 cannot be loaded \(no_such_module:open_camera\)"),
         ("constant", DriverBrokenError, "cannot be called"),
-        ("nothing", DriverBrokenError, "returned tuple, which is no Camera"),
+        ("nothing", DriverBrokenError, "returned tuple, which is not a Camera"),
     ],
 )
 def test_devices_already_open_are_closed_when_one_fails(
@@ -339,6 +339,6 @@ def test_a_broken_driver_does_not_hide_the_others_and_one_of_two_packages_is_ref
 
 
 def test_a_failing_finder_does_not_hide_what_others_found() -> None:
-    findings = found_devices()
+    findings = discover_devices()
     assert FoundDevice("fake", "usb-1", "a fake camera") in findings.devices
     assert ["finder driver 'lost' failed: OSError: no bus" in str(fault) for fault in findings.faults] == [True]

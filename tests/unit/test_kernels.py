@@ -17,7 +17,7 @@ from numba import config
 from numba.core.errors import NumbaError
 
 from slrig import kernels
-from slrig.kernels import all_kept, compilations_told, in_bands, kernel, kernel_part
+from slrig.kernels import are_all_cached, in_bands, kernel, kernel_part, report_compilations
 
 _ADDS = """
 from slrig.kernels import kernel, kernel_part
@@ -56,7 +56,7 @@ def made(folder: Path, *, added: int, name: str = "adding") -> Any:
 
 def compiled_by(call: Callable[[], object]) -> list[str]:
     told: list[str] = []
-    with compilations_told(told.append):
+    with report_compilations(told.append):
         call()
     return told
 
@@ -115,7 +115,7 @@ def test_a_compiled_kernel_is_kept_and_a_changed_one_is_compiled_anew(tmp_path: 
 def test_nothing_is_prepared_ahead_once_every_kernel_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def kept(added: int) -> bool:
         monkeypatch.setattr(kernels, "_entries", [(made(tmp_path, added=added).sums, True)])
-        return all_kept()
+        return are_all_cached()
 
     assert not kept(1)
     made(tmp_path, added=1).sums(np.arange(3.0))
@@ -123,7 +123,7 @@ def test_nothing_is_prepared_ahead_once_every_kernel_is_kept(tmp_path: Path, mon
     # Its source changed: what lies there is of another kernel.
     assert not kept(2)
     monkeypatch.setattr(kernels, "_entries", [(made(tmp_path, added=2).sums, False)])
-    assert all_kept()
+    assert are_all_cached()
 
 
 def test_a_kernel_is_compiled_anew_where_only_a_part_in_another_file_changed(tmp_path: Path) -> None:

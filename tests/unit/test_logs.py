@@ -15,7 +15,7 @@ import pytest
 import structlog
 
 from slrig import logs
-from slrig.logs import LogFormat, set_up_logs, set_up_logs_for_a_person
+from slrig.logs import LogFormat, set_up_console_logs, set_up_logs
 from tests.unit.command import slrig
 
 
@@ -86,7 +86,7 @@ def test_command_that_works_by_itself_sets_up_logs(tmp_path: Path, command: str)
 
 
 def test_person_reads_warnings_and_no_more(capsys: pytest.CaptureFixture[str]) -> None:
-    set_up_logs_for_a_person()
+    set_up_console_logs()
     structlog.get_logger().info("a frame was shot again")
     structlog.get_logger().warning("the projector may still be lit")
     written = capsys.readouterr()

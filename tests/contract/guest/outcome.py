@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from slrig.conformance import Check, Outcome
+from slrig.conformance import Check, CheckOutcome
 from slrig.conformance.bench import Need
 from tests.contract.guest.machine import FILES, require_guest, run_in_guest
 
@@ -54,4 +54,4 @@ def require_passed(report: dict[str, Any], check: Check, *, lacking: set[Need], 
     result = next(each for each in report["checks"] if each["name"] == check.name)
     sys.stdout.write(f"{result['seconds']:.2f} s\n")
     applies = lacking.isdisjoint(check.needs) and check.name not in asks_nothing
-    assert result["outcome"] == (Outcome.PASSED if applies else Outcome.NOT_APPLICABLE), result["failure"]
+    assert result["outcome"] == (CheckOutcome.PASSED if applies else CheckOutcome.NOT_APPLICABLE), result["failure"]

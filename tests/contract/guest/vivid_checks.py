@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from drivers import v4l2
-from slrig.conformance import run
-from slrig.conformance.bench import usual_settings
+from slrig.conformance import run_checks
+from slrig.conformance.bench import default_settings
 from slrig.devices import Camera, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError
 from tests.contract import vivid_bench
@@ -51,7 +51,7 @@ BLACK, WHITE = 5, 6
 @contextmanager
 def armed(camera: Camera) -> Iterator[Camera]:
     try:
-        camera.configure(usual_settings(camera))
+        camera.configure(default_settings(camera))
         camera.arm(10_000, Trigger.FREE)
         yield camera
     finally:
@@ -253,7 +253,7 @@ def main(target: Path, chosen: list[str]) -> None:
         name = f"contract of {driver}"
         if not chosen or any(part in name for part in chosen):
             bench = vivid_bench.bench(target.parent, driver)
-            told[name] = run(bench.open_rig, bench.sequence).document()
+            told[name] = run_checks(bench.open_rig, bench.sequence).document()
     for name, check in ALL.items():
         if not chosen or any(part in name for part in chosen):
             told[name] = outcome(check)

@@ -17,11 +17,11 @@ from slrig.api.scopes import Scope
 from slrig.catalogue.store import Catalogue, open_catalogue
 from slrig.catalogue.tables import RigRow
 from slrig.config import ServiceSettings
-from slrig.conformance import Outcome, Report
+from slrig.conformance import CheckOutcome, ConformanceReport
 from slrig.conformance.bench import Failure
-from slrig.conformance.running import Result
+from slrig.conformance.running import CheckResult
 from slrig.doctor.doctor import Diagnosis
-from slrig.doctor.findings import fault, ok
+from slrig.doctor.light import fault, ok
 from slrig.jobs.examinations import keep
 from slrig.jobs.records import utc_now
 from tests.e2e.conftest import KEY, SLOW, Start, write_rig
@@ -90,11 +90,11 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
     # On a phone, by a key for looking.
     failure = Failure("every frame shows its own pattern", "light of another one", "wait for it", "camera 'left'")
     results = (
-        Result("frames", "Every frame shows its pattern", Outcome.FAILED, 1.0, failure),
-        Result("wires", "Wires trigger", Outcome.NOT_APPLICABLE, 0.0, None, "it needs a wire"),
-        *(Result(f"check {number}", "All is well", Outcome.PASSED, 0.1) for number in range(2)),
+        CheckResult("frames", "Every frame shows its pattern", CheckOutcome.FAILED, 1.0, failure),
+        CheckResult("wires", "Wires trigger", CheckOutcome.NOT_APPLICABLE, 0.0, None, "it needs a wire"),
+        *(CheckResult(f"check {number}", "All is well", CheckOutcome.PASSED, 0.1) for number in range(2)),
     )
-    keep(service.data, "conform", Report("small", results, 1.2).document())
+    keep(service.data, "conform", ConformanceReport("small", results, 1.2).document())
     secret = looking(service)
     page = visit(service, "devices", key=secret, size=PHONE, dark=True)
     page.get_by_text("66 %").wait_for()

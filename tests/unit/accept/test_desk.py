@@ -33,7 +33,7 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.failure import failure_of, interruption
+from slrig.failure import interruption_error, job_failure
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobRecord
@@ -212,7 +212,7 @@ def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks, queue:
     assert [each.id for each in desks().latest()] == [third.id, waiting.id]
 
 
-@pytest.mark.parametrize("ending", [PowerCut(), interruption()], ids=["killed", "ended in good order"])
+@pytest.mark.parametrize("ending", [PowerCut(), interruption_error()], ids=["killed", "ended in good order"])
 def test_test_that_was_cut_off_is_interrupted_and_goes_on(
     desks: Desks, queue: TameQueue, ending: BaseException
 ) -> None:
@@ -232,7 +232,7 @@ def test_test_that_was_cut_off_is_interrupted_and_goes_on(
     stray.mkdir(exist_ok=True)
     after = desks()
     assert after.get(test.id).state is AcceptanceState.INTERRUPTED
-    assert after.get(test.id).fault == failure_of(interruption())
+    assert after.get(test.id).fault == job_failure(interruption_error())
     assert not stray.exists()
     with pytest.raises(ArtefactNotReadyError, match="is interrupted"):
         after.file(test.id, "report.json")

@@ -15,7 +15,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.bundle.description import MOST_CAPTURE_BYTES
+from slrig.bundle.description import MAX_CAPTURE_BYTES
 from slrig.bundle.options import Preset, PresetDocument, ScanDefaults
 from slrig.config import read_rig
 from slrig.devices import CameraInfo, ProjectorInfo, Trigger
@@ -247,7 +247,7 @@ def test_plan_takes_as_many_bytes_as_it_plays_frames() -> None:
     assert check_plan(ScanPlan(exposures_s=(0.01, 0.02, 0.04)), facts(bit_depth=12)) == 6 * one
     lit = replace(plain, projector=replace(plain.projector, lights=True))
     assert check_plan(ScanPlan(coloured_light=True), lit) == one + 2 * 3 * 200 * 100
-    assert check_plan(ScanPlan(), facts(Size(8192, 5000))) < MOST_CAPTURE_BYTES
+    assert check_plan(ScanPlan(), facts(Size(8192, 5000))) < MAX_CAPTURE_BYTES
 
 
 BRACKET_S = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032)
@@ -347,7 +347,7 @@ def test_preset_replaces_a_shipped_one_until_it_is_deleted(client: TestClient, s
 @pytest.mark.parametrize(
     ("name", "sent", "words"),
     [
-        ("dark", {**document(), "version": 2}, "reads version 1 of presets, found 2; bring slrig up to date"),
+        ("dark", {**document(), "version": 2}, "reads version 1 of presets, found 2; update slrig"),
         ("dark", {**document(), "format": "slrig-bundle"}, "slrig-preset"),
         ("dark", document(exposure_factor=[2.0]), "no such field"),
         ("dark", document(exposure_factors=[]), "2 to 6 exposure times, found 0"),
@@ -365,14 +365,14 @@ def test_document_that_is_no_preset_is_refused(client: TestClient, name: str, se
 def test_preset_file_of_another_version_hides_no_other(tmp_path: Path) -> None:
     (tmp_path / "dark.json").write_text(json.dumps({**document(), "version": 3}))
     presets = Presets(tmp_path, {})
-    with pytest.raises(ConfigError, match=r"dark\.json is not a valid preset[^$]*found 3; bring slrig up to date"):
+    with pytest.raises(ConfigError, match=r"dark\.json is not a valid preset[^$]*found 3; update slrig"):
         presets.get("dark")
     assert presets.get("matt").scan == SHIPPED["matt"]
     (tmp_path / "By hand.json").write_text(json.dumps(document()))
     listed = {each.name: each for each in presets.listed()}
     assert set(listed) == set(SHIPPED)
     assert (listed["dark"].digest, listed["matt"].fault) == (None, None)
-    assert "bring slrig up to date" in (listed["dark"].fault or "")
+    assert "update slrig" in (listed["dark"].fault or "")
     presets.delete("dark")
     assert presets.get("dark").scan == SHIPPED["dark"]
 

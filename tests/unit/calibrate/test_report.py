@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from slrig.bundle.calibration import check_rays
+from slrig.bundle.calibration import require_two_rays
 from slrig.calibrate.charts import error_slices
 from slrig.calibrate.figures import baselines, device_figures, pose_figures
 from slrig.calibrate.pose_judging import judgement, summary
@@ -381,7 +381,7 @@ def test_each_pose_is_judged_without_a_word_of_light() -> None:
 
 def test_it_is_no_calibration_for_scans_and_is_compared_by_its_lens() -> None:
     with pytest.raises(CalibrationError) as refusal:
-        check_rays(of_one().calibration, ["left", "right"], "calibration 3f2a")
+        require_two_rays(of_one().calibration, ["left", "right"], "calibration 3f2a")
     assert str(refusal.value) == (
         "calibration 3f2a: expected a calibration with two rays for each point, found that of camera 'left' alone, "
         "without a projector: it tells no depth, and cannot scan; calibrate the camera together with the projector or "

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture.frame_checks import (
     NOISE_FLOOR_DN,
     ReferenceFrames,
@@ -573,8 +573,8 @@ def test_lines_accuse_the_code_until_one_of_them_agrees_with_it() -> None:
 def test_what_was_refused_stays_on_record_when_all_frames_are_forgotten() -> None:
     evidence = evidence_of()
     add(evidence, SHOTS[0])
-    evidence.record_refused(Refused(3, "left", 1, "stale", SHOTS[3]))
-    evidence.record_refused(Refused(3, "left", 2, "stale", SHOTS[3]))
+    evidence.record_refused(RefusedFrame(3, "left", 1, "stale", SHOTS[3]))
+    evidence.record_refused(RefusedFrame(3, "left", 2, "stale", SHOTS[3]))
     evidence.clear()
     summary = evidence.summary()
     assert (summary.patterns, summary.shot_again) == (0, 2)
@@ -584,7 +584,7 @@ def test_what_was_refused_stays_on_record_when_all_frames_are_forgotten() -> Non
 
 def test_a_recording_knows_what_was_shot_again() -> None:
     summary = check_capture(
-        recorded(SHOTS), [Refused(3, "left", 1, "stale"), Refused(99, "left", 1, "of another sequence")]
+        recorded(SHOTS), [RefusedFrame(3, "left", 1, "stale"), RefusedFrame(99, "left", 1, "of another sequence")]
     )
     assert str(summary) == "22/22 patterns verified, 1 frame shot again"
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture.exposure import (
     ExposureFault,
     ExposureSamples,
@@ -134,9 +134,9 @@ def summary(verified: int, *, drift: float = 0.0, lit: float = 0.5, faults: tupl
 def test_a_bracket_has_verified_what_its_best_exposure_has() -> None:
     parts = [(0.01, summary(12, drift=0.01)), (0.04, summary(20, drift=-0.03, lit=0.7)), (0.16, summary(18))]
     refused = [
-        Refused(0, "left", 1, "at 0.04 s, it is dark"),
-        Refused(0, "left", 1, "0.64 s is too bright", left_out=True),
-        Refused(1, "left", 1, "0.64 s is too bright", left_out=True),
+        RefusedFrame(0, "left", 1, "at 0.04 s, it is dark"),
+        RefusedFrame(0, "left", 1, "0.64 s is too bright", left_out=True),
+        RefusedFrame(1, "left", 1, "0.64 s is too bright", left_out=True),
     ]
     found = bracket_summary(parts, refused, ["something moved"], PATTERNS)
     assert str(found) == "20/20 patterns verified, 1 frame shot again"
@@ -170,6 +170,6 @@ def test_a_recorded_bracket_is_judged_exposure_by_exposure() -> None:
 
 def test_one_exposure_is_judged_as_ever() -> None:
     one = recorded(*shots_at(1.0))
-    refused = [Refused(3, "left", 1, "it is stale")]
+    refused = [RefusedFrame(3, "left", 1, "it is stale")]
     assert check_exposures(one, refused) == check_capture(one, refused)
     assert np.isfinite(check_exposures(one).noise_dn["left"])

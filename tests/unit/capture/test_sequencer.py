@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture.sequencer import capture
 from slrig.capture.triggering import frame_shift
 from slrig.capture.verifier import MAX_FAILURES, Evidence, EvidenceSummary, RetryPolicy
@@ -265,7 +265,7 @@ class Taken:
         self.fake = fake
         self.yielded: list[Shot] = []
         self.latest: dict[tuple[str, int], Shot] = {}
-        self.refused: list[Refused] = []
+        self.refused: list[RefusedFrame] = []
         self.summary: EvidenceSummary | None = None
 
     def run(self) -> Taken:
@@ -280,7 +280,7 @@ class Taken:
             assert self.fake.at_rest
         return self
 
-    def _refuse(self, refused: Refused) -> None:
+    def _refuse(self, refused: RefusedFrame) -> None:
         self.refused.append(refused)
         assert ((refused.camera, refused.pattern) in self.latest) == refused.delivered
         if refused.delivered:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.bundle.sidecars import Refused
+from slrig.bundle.sidecars import RefusedFrame
 from slrig.capture.sequencer import capture
 from slrig.capture.streaming import Cadence, FrameReader, _DisplayLead
 from slrig.devices import Camera, Synchronisation, Trigger
@@ -151,7 +151,7 @@ def test_a_camera_that_goes_ends_the_capture_and_its_thread() -> None:
 
 def test_a_frame_that_never_comes_is_waited_for_in_three_showings() -> None:
     rig = replace(live(Webcam(lost=1.0)).rig, synchronisation=Synchronisation(0.0, 0.0, earliest_s=0.0))
-    refused: list[Refused] = []
+    refused: list[RefusedFrame] = []
     with pytest.raises(FrameTimeoutError, match="failed 3 times"):
         list(capture(rig, SEQUENCE, timeout_s=0.1, refused=refused.append))
     assert [each.attempt for each in refused] == [1, 2, 3]

@@ -39,7 +39,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
     ViewsFailedError,
 )
-from slrig.failure import failure_of, interruption
+from slrig.failure import interruption_error, job_failure
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.records import JobProgress, JobRecord, JobState, utc_now
 from slrig.jobs.rig_jobs import Recorded
@@ -122,7 +122,7 @@ def test_views_are_cut_by_the_stages_planes_and_the_axis_found_is_noted(tmp_path
 def test_what_cannot_be_made_is_refused_before_it_is_on_record(bench: ModelBench) -> None:
     first, second = bench.kept_scans(0.0, None)
     failed = bench.store.create(scan_plan_json(ScanPlan()), rig="bench", label=None).id
-    bench.store.finish(failed, JobState.FAILED, fault=failure_of(StorageError("full")))
+    bench.store.finish(failed, JobState.FAILED, fault=job_failure(StorageError("full")))
     both = (first, second)
     refused: list[tuple[Callable[[], ModelPlan], type[SlrigError], str]] = [
         (lambda: ModelPlan((first,)), ConfigError, "expected two or more, found 1"),
@@ -211,7 +211,7 @@ def test_what_was_cut_off_is_made_once_more_and_no_file_is_lost(tmp_path: Path) 
     assert bench.over(queued).state is bench.over(once).state is JobState.SUCCEEDED
     assert len(bench.tame.asked) == 2
     ended = bench.over(twice)
-    assert (ended.state, ended.fault) == (JobState.INTERRUPTED, failure_of(interruption()))
+    assert (ended.state, ended.fault) == (JobState.INTERRUPTED, job_failure(interruption_error()))
     recovered = bench.over(placed)
     assert recovered.state is JobState.SUCCEEDED
     assert recovered.summary is not None
@@ -548,7 +548,7 @@ def test_after_a_kill_a_model_by_hand_waits_where_it_was(
     assert (waiting.state, bench.shot) == (JobState.CAPTURING, shot)
     bench.shooting.cancel(model_id)
     cancelled = ScanCancelledError("The model was cancelled while its views were shot. They stay.")
-    assert bench.over(model_id).fault == failure_of(cancelled)
+    assert bench.over(model_id).fault == job_failure(cancelled)
     bench.close()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.conformance import CHECKS, Check, Examination, Outcome, Result, run
+from slrig.conformance import CHECKS, Check, CheckOutcome, CheckResult, ConformanceRun, run_checks
 from slrig.devices import CameraInfo, Rig, Synchronisation, Trigger
 from slrig.errors import DeviceBusyError
 from slrig.model import Calibration, CameraFormat, Frame, Pinhole, Size
@@ -134,10 +134,10 @@ BROKEN: list[tuple[Maker, str, str]] = [
 ]
 
 
-def examined(maker: Maker, check: Check) -> Result:
+def examined(maker: Maker, check: Check) -> CheckResult:
     maker.rigs.clear()
-    with Examination(maker, sequence(), limit_s=20) as examination:
-        return examination.judge(check)
+    with ConformanceRun(maker, sequence(), limit_s=20) as examination:
+        return examination.run_check(check)
 
 
 def named(name: str) -> Check:
@@ -154,10 +154,10 @@ def identity(value: object) -> str | None:
 @pytest.mark.parametrize(("maker", "name", "words"), BROKEN, ids=identity)
 def test_a_broken_driver_is_found(maker: Maker, name: str, words: str) -> None:
     result = examined(maker, named(name))
-    assert result.outcome is Outcome.FAILED
+    assert result.outcome is CheckOutcome.FAILED
     assert words in str(result.failure)
     assert result.failure is not None
-    assert result.failure.do
+    assert result.failure.remedy
 
 
 def test_every_check_finds_a_broken_driver() -> None:
@@ -181,10 +181,10 @@ def test_a_rig_that_keeps_the_contract_has_a_full_score(
     camera = type("Camera", (ModelCamera,), {"triggers": frozenset(triggers)})
     projector = type("Projector", (ModelProjector,), {"plays": plays})
     maker = Maker(camera, projector, Calibration({"left": pinhole(CAMERA)}, pinhole(PROJECTOR)))
-    report = run(maker, sequence())
-    assert [str(result.failure) for result in report.results if result.outcome is Outcome.FAILED] == []
+    report = run_checks(maker, sequence())
+    assert [str(result.failure) for result in report.results if result.outcome is CheckOutcome.FAILED] == []
     assert (report.percent, report.conforms) == (100, True)
-    assert report.count(Outcome.NOT_APPLICABLE) == not_applicable
+    assert report.count(CheckOutcome.NOT_APPLICABLE) == not_applicable
     assert all(rig.projector.closed.is_set() for rig in maker.rigs)  # type: ignore[attr-defined]
 
 
@@ -194,8 +194,8 @@ def test_a_display_whose_latency_was_measured_is_waited_for() -> None:
 
     camera = type("Camera", (ModelCamera,), {"triggers": frozenset({Trigger.SOFTWARE, Trigger.FREE})})
     projector = type("Projector", (drivers.LightsLate,), {"plays": False})
-    report = run(Maker(camera, projector, change=measured), sequence())
-    assert [str(result.failure) for result in report.results if result.outcome is Outcome.FAILED] == []
+    report = run_checks(Maker(camera, projector, change=measured), sequence())
+    assert [str(result.failure) for result in report.results if result.outcome is CheckOutcome.FAILED] == []
 
 
 def test_a_frame_that_a_busy_host_gets_late_was_not_passed_over() -> None:
@@ -214,7 +214,7 @@ def test_a_frame_that_a_busy_host_gets_late_was_not_passed_over() -> None:
             return frame
 
     result = examined(Maker(ArrivesLate), named("stale_frames_never_come_back"))
-    assert (result.outcome, str(result.failure)) == (Outcome.PASSED, "None")
+    assert (result.outcome, str(result.failure)) == (CheckOutcome.PASSED, "None")
 
 
 def test_a_frame_that_has_to_be_shot_again_is_reported() -> None:
@@ -231,5 +231,5 @@ def test_a_frame_that_has_to_be_shot_again_is_reported() -> None:
     result = examined(
         Maker(LosesOne, type("Projector", (ModelProjector,), {"plays": False})), named("a_whole_sequence_is_proven")
     )
-    assert result.outcome is Outcome.FAILED
+    assert result.outcome is CheckOutcome.FAILED
     assert "1 shot again: " in str(result.failure)

@@ -14,8 +14,15 @@ from typer.testing import CliRunner
 
 from slrig.cli import examine
 from slrig.cli.commands import app
-from slrig.conformance import CHECKS, Examination, Failure, Outcome, Report, Result, run
-from slrig.conformance.bench import ExpectationError, Need, NotApplicableError, RigBench, check, learn_light
+from slrig.conformance import CHECKS, CheckOutcome, CheckResult, ConformanceReport, ConformanceRun, Failure, run_checks
+from slrig.conformance.bench import (
+    ExpectationError,
+    Need,
+    NotApplicableError,
+    RigBench,
+    check,
+    measure_reference_levels,
+)
 from slrig.devices import Rig
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.jobs.examinations import last_examination
@@ -40,18 +47,18 @@ def hanging() -> Iterator[type[Hangs]]:
 
 def test_a_device_that_never_answers_ends_the_examination_and_not_the_program(hanging: type[Hangs]) -> None:
     maker, before = Maker(hanging), owners()
-    report = run(maker, sequence(), limit_s=0.3)
-    first = next(result for result in report.results if result.outcome is Outcome.FAILED)
+    report = run_checks(maker, sequence(), limit_s=0.3)
+    first = next(result for result in report.results if result.outcome is CheckOutcome.FAILED)
     after = report.results[report.results.index(first) + 1 :]
     assert "did not return in 0.3 s" in str(first.failure)
     assert after
-    assert {result.outcome for result in after} == {Outcome.NOT_RUN}
+    assert {result.outcome for result in after} == {CheckOutcome.NOT_RUN}
     assert report.stopped is not None
     assert "one owner" in report.stopped
     assert all(result.reason == report.stopped for result in after)
     assert not report.conforms
     # What was not run counts: a rig that hangs does not have a good score for it.
-    assert report.score == pytest.approx(report.count(Outcome.PASSED) / len(CHECKS))
+    assert report.score == pytest.approx(report.count(CheckOutcome.PASSED) / len(CHECKS))
     # Should it answer after all, the rig is closed then.
     hanging.let_go.set()
     for owner in owners() - before:
@@ -67,7 +74,7 @@ def test_a_rig_that_does_not_open_is_not_examined() -> None:
 
     told: list[str] = []
     with pytest.raises(DeviceBusyError, match="4711"):
-        run(refuse, sequence(), progress=lambda stage, _fraction, _detail: told.append(stage))
+        run_checks(refuse, sequence(), progress=lambda stage, _fraction, _detail: told.append(stage))
     assert told == []
 
 
@@ -80,9 +87,9 @@ def test_a_rig_that_goes_away_ends_the_examination() -> None:
             raise DeviceGoneError(message)
         return maker()
 
-    report = run(open_or_fail, sequence())
-    assert report.count(Outcome.FAILED) == 1
-    assert report.count(Outcome.NOT_RUN) > 10
+    report = run_checks(open_or_fail, sequence())
+    assert report.count(CheckOutcome.FAILED) == 1
+    assert report.count(CheckOutcome.NOT_RUN) > 10
     assert report.stopped is not None
     assert "no camera is plugged in" in report.stopped
 
@@ -95,7 +102,7 @@ def test_an_examination_that_is_interrupted_closes_the_rig() -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(maker, sequence(), progress=interrupt)
+        run_checks(maker, sequence(), progress=interrupt)
     assert all(rig.projector.closed.is_set() for rig in maker.rigs)  # type: ignore[attr-defined]
     assert owners() <= before
 
@@ -104,7 +111,7 @@ def test_checks_have_names_and_progress_is_reported_before_and_after_each() -> N
     told: list[tuple[str, float, str]] = []
     assert len({each.name for each in CHECKS}) == len({each.title for each in CHECKS}) == len(CHECKS)
     first, second = CHECKS[:2]
-    run(Maker(), sequence(), checks=(first, second), progress=lambda *what: told.append(what))
+    run_checks(Maker(), sequence(), checks=(first, second), progress=lambda *what: told.append(what))
     assert told == [
         *((first.title, 0.0, ""), (first.title, 0.5, "passed")),
         *((second.title, 0.5, ""), (second.title, 1.0, "passed")),
@@ -126,9 +133,9 @@ def test_one_thread_owns_the_devices() -> None:
         owners.add(threading.get_ident())
         return maker()
 
-    with Examination(opened, sequence()) as examination:
-        examination.judge(remember_the_thread)
-        examination.judge(CHECKS[1])
+    with ConformanceRun(opened, sequence()) as examination:
+        examination.run_check(remember_the_thread)
+        examination.run_check(CHECKS[1])
     assert len(owners) == 1
     assert threading.get_ident() not in owners
 
@@ -136,16 +143,16 @@ def test_one_thread_owns_the_devices() -> None:
 def test_checks_share_a_rig_unless_they_want_a_fresh_one_or_the_last_one_failed() -> None:
     maker = Maker()
     shared = [each for each in CHECKS if not each.fresh and Need.WHITE_AND_BLACK not in each.needs]
-    with Examination(maker, sequence()) as examination:
-        assert {examination.judge(each).outcome for each in shared} == {Outcome.PASSED}
+    with ConformanceRun(maker, sequence()) as examination:
+        assert {examination.run_check(each).outcome for each in shared} == {CheckOutcome.PASSED}
         assert len(maker.rigs) == 1
-        examination.judge(next(each for each in CHECKS if each.fresh))
-        examination.judge(shared[0])
+        examination.run_check(next(each for each in CHECKS if each.fresh))
+        examination.run_check(shared[0])
         assert len(maker.rigs) == 3
     broken = Maker(DeliversStale)
-    with Examination(broken, sequence()) as examination:
-        results = [examination.judge(each) for each in shared]
-    failed = sum(result.outcome is Outcome.FAILED for result in results)
+    with ConformanceRun(broken, sequence()) as examination:
+        results = [examination.run_check(each) for each in shared]
+    failed = sum(result.outcome is CheckOutcome.FAILED for result in results)
     assert len(broken.rigs) == 1 + failed > 1
 
 
@@ -153,12 +160,12 @@ def test_what_a_driver_raises_is_a_failure_that_names_the_device() -> None:
     @check()
     def raises(bench: RigBench) -> None:
         """A driver fails."""
-        with bench.view(*next(bench.ways())):
+        with bench.arm_camera(*next(bench.stepped_cameras())):
             fault = "select failed"
             raise OSError(fault)
 
-    with Examination(Maker(), sequence()) as examination:
-        result = examination.judge(raises)
+    with ConformanceRun(Maker(), sequence()) as examination:
+        result = examination.run_check(raises)
     assert result.failure == Failure(
         "no error comes from a call that the contract allows",
         "OSError: select failed",
@@ -174,27 +181,31 @@ def test_a_check_may_find_out_that_it_has_nothing_to_ask() -> None:
         message = "it has one exposure"
         raise NotApplicableError(message)
 
-    report = run(Maker(), sequence(), checks=(has_nothing_to_ask, CHECKS[0]))
-    assert [result.outcome for result in report.results] == [Outcome.NOT_APPLICABLE, Outcome.PASSED]
+    report = run_checks(Maker(), sequence(), checks=(has_nothing_to_ask, CHECKS[0]))
+    assert [result.outcome for result in report.results] == [CheckOutcome.NOT_APPLICABLE, CheckOutcome.PASSED]
     assert (report.applicable, report.percent, report.conforms) == (1, 100, True)
     assert report.results[0].reason == "it has one exposure"
 
 
-def result(outcome: Outcome) -> Result:
-    return Result("check", "A check", outcome, 0.1)
+def result(outcome: CheckOutcome) -> CheckResult:
+    return CheckResult("check", "A check", outcome, 0.1)
 
 
 def test_a_score_is_100_only_if_nothing_failed() -> None:
-    report = Report("rig", (*(result(Outcome.PASSED) for _ in range(999)), result(Outcome.FAILED)), 1.0)
+    report = ConformanceReport(
+        "rig", (*(result(CheckOutcome.PASSED) for _ in range(999)), result(CheckOutcome.FAILED)), 1.0
+    )
     assert (report.percent, report.conforms) == (99, False)
-    assert Report("rig", (result(Outcome.NOT_APPLICABLE),), 1.0).conforms is False
-    assert Report("rig", (result(Outcome.PASSED), result(Outcome.NOT_APPLICABLE)), 1.0).percent == 100
-    assert Report("rig", (result(Outcome.PASSED), result(Outcome.NOT_RUN)), 1.0).percent == 50
+    assert ConformanceReport("rig", (result(CheckOutcome.NOT_APPLICABLE),), 1.0).conforms is False
+    assert (
+        ConformanceReport("rig", (result(CheckOutcome.PASSED), result(CheckOutcome.NOT_APPLICABLE)), 1.0).percent == 100
+    )
+    assert ConformanceReport("rig", (result(CheckOutcome.PASSED), result(CheckOutcome.NOT_RUN)), 1.0).percent == 50
 
 
 def test_a_report_can_be_written_as_json() -> None:
     examined = [each for each in CHECKS if each.fresh or Need.POSITIONER in each.needs]
-    report = run(Maker(DeliversStale, StaysLit), sequence(), checks=examined)
+    report = run_checks(Maker(DeliversStale, StaysLit), sequence(), checks=examined)
     document = json.loads(json.dumps(report.document()))
     assert document["conforms"] is False
     # The model has no positioner.
@@ -215,7 +226,7 @@ def images(*levels: float, noise_dn: float = 0.0) -> list[Pixels]:
 
 
 def test_the_level_of_light_is_that_of_the_lit_pixels_whatever_the_room_and_the_noise_are() -> None:
-    light = learn_light(images(90, 90, noise_dn=4), images(30, 30, noise_dn=4), full_scale=255)
+    light = measure_reference_levels(images(90, 90, noise_dn=4), images(30, 30, noise_dn=4), full_scale=255)
     assert light.lit[:, :32].mean() > 0.95
     assert light.lit[:, 32:].mean() < 0.01
     for level, expected in ((90, 1.0), (30, 0.0), (60, 0.5)):
@@ -225,7 +236,7 @@ def test_the_level_of_light_is_that_of_the_lit_pixels_whatever_the_room_and_the_
 def test_a_camera_that_does_not_see_the_projector_is_reported() -> None:
     for white, black in ((31, 30), (30, 90)):
         with pytest.raises(ExpectationError, match="switch the lamp on"):
-            learn_light(images(white, white, noise_dn=2), images(black, black, noise_dn=2), full_scale=255)
+            measure_reference_levels(images(white, white, noise_dn=2), images(black, black, noise_dn=2), full_scale=255)
 
 
 LATE = "a_frame_lies_wholly_in_its_pattern"
@@ -244,7 +255,7 @@ def test_conform_says_what_is_wrong_and_what_to_do(
 ) -> None:
     # Two checks of all: what comes of them is tested by `test_broken_drivers`.
     few = [check for check in CHECKS if check.name in {LATE, "show_needs_a_loaded_sequence"}]
-    monkeypatch.setattr(examine, "run", partial(run, checks=few))
+    monkeypatch.setattr(examine, "run_checks", partial(run_checks, checks=few))
     monkeypatch.setattr(examine, "open_rig", lambda _config: Maker(projector=projector)())
     data = tmp_path / "data"
     (data / "scans").mkdir(parents=True)
@@ -256,7 +267,7 @@ def test_conform_says_what_is_wrong_and_what_to_do(
     assert f"{kept.found['passed']} of {kept.found['applicable']} checks" in shown.stdout
     told = " ".join(shown.stdout.split())
     assert (f"({LATE})" in told) == (passed == 1)
-    assert ("do read returns frames whose whole exposure, all rows, lies after after_ns" in told) == (passed == 1)
+    assert ("remedy read returns frames whose whole exposure, all rows, lies after after_ns" in told) == (passed == 1)
     # As JSON, and into a folder that is none of the service's.
     shown = CliRunner().invoke(app, ["conform", str(rig), "--json", "--data", str(tmp_path)])
     document = json.loads(shown.stdout)

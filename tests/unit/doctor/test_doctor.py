@@ -18,12 +18,9 @@ from simulated_rig.device import SimulatedHead, open_head
 from slrig.devices import Camera, CameraSettings, Projector, Rig, Trigger
 from slrig.doctor import timing
 from slrig.doctor.doctor import Diagnosis, doctor_sequence, examine
-from slrig.doctor.findings import Finding, Severity
-from slrig.doctor.geometry import picture
-from slrig.doctor.light import look
-from slrig.doctor.measures.pictures import depth_mm_per_px
-from slrig.doctor.sharpening import sharpening
-from slrig.doctor.viewing import Viewer
+from slrig.doctor.image import check_sharpening
+from slrig.doctor.light import CameraSession, Finding, Severity, locate_picture, measure_light
+from slrig.doctor.measures import depth_mm_per_px
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Frame, PatternSequence, Pinhole, Pixels, Size, White
 from slrig.patterns.sequence import encode, scan_patterns
@@ -135,7 +132,7 @@ def examined(rig: Rig, **asked: Any) -> Diagnosis:
 
 
 def names(diagnosis: Diagnosis, severity: Severity) -> set[str]:
-    return {each.name for each in diagnosis.of(severity)}
+    return {each.name for each in diagnosis.with_severity(severity)}
 
 
 def holding(rig: Rig, held: PatternSequence, *, greys: bool = False) -> Rig:
@@ -148,10 +145,10 @@ def test_sound_rig_is_sound_by_any_trigger_though_frames_are_lost(rig: Rig, trig
     steps: list[str] = []
     diagnosis = examined(
         with_camera(rig, triggers=frozenset({trigger}), lose=range(5, 400, 31)),
-        told=lambda step, _fraction, _detail: steps.append(step),
+        progress=lambda step, _fraction, _detail: steps.append(step),
     )
-    assert diagnosis.of(Severity.FAULT) == ()
-    assert diagnosis.of(Severity.NOTE) == ()
+    assert diagnosis.with_severity(Severity.FAULT) == ()
+    assert diagnosis.with_severity(Severity.NOTE) == ()
     assert {"patterns.verified", "picture.upright", "focus.sharp", "sharpening.none", "flicker.none"} <= names(
         diagnosis, Severity.OK
     )
@@ -167,10 +164,10 @@ def test_sound_rig_is_sound_by_any_trigger_though_frames_are_lost(rig: Rig, trig
 
 def test_triggered_camera_that_sees_no_flash_happen_still_shows_late_light(tmp_path: Path) -> None:
     with small_rig(tmp_path, faults={"light_delay_s": 0.008}) as rig:
-        viewer = Viewer(rig, "eye", wait_s=0.5)
-        seen, _ = look(viewer, doctor_sequence(rig.projector.info.size), others="")
-        assert seen is not None
-        found = timing.punctual(rig, seen, ScanEvidenceError("no flash was seen as it happened"))
+        session = CameraSession(rig, "eye", wait_s=0.5)
+        light, _ = measure_light(session, doctor_sequence(rig.projector.info.size), displays="")
+        assert light is not None
+        found = timing.check_punctuality(rig, light, ScanEvidenceError("no flash was seen as it happened"))
     assert (found.name, found.severity) == ("timing.late", Severity.FAULT)
     assert "no flash was seen as it happened" in found.found
 
@@ -186,20 +183,22 @@ def test_vague_time_stamps_are_not_put_down_to_the_projector(rig: Rig, says_so: 
         return replace(frame, t_start_ns=start_ns, t_end_ns=end_ns, t_err_ns=10_000_000 if says_so else 0)
 
     rig = with_camera(rig, triggers=frozenset({Trigger.FREE}), change=vague)
-    seen, _ = look(Viewer(rig, "eye", wait_s=0.1), doctor_sequence(rig.projector.info.size), others="")
-    assert seen is not None
-    _, findings = timing.latency(rig, {"eye": seen}, search_s=0.1, told=lambda *_: None)
+    light, _ = measure_light(
+        CameraSession(rig, "eye", wait_s=0.1), doctor_sequence(rig.projector.info.size), displays=""
+    )
+    assert light is not None
+    _, findings = timing.measure_light_latency(rig, {"eye": light}, search_s=0.1, progress=lambda *_: None)
     [found] = [each for each in findings if each.name in {"timing.stamps", "timing.jitter"}]
     assert found.name == name
     assert found.subject == ("camera 'eye'" if says_so else "projector")
-    assert ("they are the limit of what can be measured" in found.found) is says_so
+    assert ("they limit the measurement" in found.found) is says_so
 
 
 def test_rig_without_calibration_has_its_picture_judged_and_its_drivers_notes_passed_on(rig: Rig) -> None:
     slow = with_camera(rig, triggers=frozenset({Trigger.FREE}), notes=("gives 5 frames per second",))
     diagnosis = examined(replace(slow, calibration=None))
-    assert names(diagnosis, Severity.NOTE) == {"device.uncalibrated", "device.told"}
-    [note] = [each for each in diagnosis.findings if each.name == "device.told"]
+    assert names(diagnosis, Severity.NOTE) == {"device.uncalibrated", "device.note"}
+    [note] = [each for each in diagnosis.findings if each.name == "device.note"]
     assert note.subject == "camera 'eye'"
     assert "gives 5 frames per second" in note.found
     assert "picture.upright" in names(diagnosis, Severity.OK)
@@ -207,7 +206,7 @@ def test_rig_without_calibration_has_its_picture_judged_and_its_drivers_notes_pa
 
 def test_camera_on_a_wire_is_left_alone_and_named(rig: Rig) -> None:
     diagnosis = examined(with_camera(rig, triggers=frozenset({Trigger.HARDWARE})))
-    [note] = diagnosis.of(Severity.NOTE)
+    [note] = diagnosis.with_severity(Severity.NOTE)
     assert note.name == "device.unexamined"
     assert "can be triggered by wire only (hardware)" in note.found
     assert diagnosis.healthy
@@ -216,8 +215,10 @@ def test_camera_on_a_wire_is_left_alone_and_named(rig: Rig) -> None:
 
 def test_projector_that_holds_its_patterns_is_examined_with_them(rig: Rig) -> None:
     diagnosis = examined(holding(rig, own(rig)))
-    assert diagnosis.of(Severity.FAULT) == ()
-    assert {"patterns.own", "response.binary", "picture.untold", "focus.untold"} <= names(diagnosis, Severity.OK)
+    assert diagnosis.with_severity(Severity.FAULT) == ()
+    assert {"patterns.own", "response.binary", "picture.unmeasured", "focus.unmeasured"} <= names(
+        diagnosis, Severity.OK
+    )
     assert diagnosis.response is None
     assert diagnosis.synchronisation is None
 
@@ -285,21 +286,21 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 def judged(rig: Rig, process: Process, *, calibrated: bool = True) -> Finding:
     """The finding on a camera that processes its pictures so."""
-    viewer = Viewer(
+    session = CameraSession(
         with_camera(rig, change=lambda frame: replace(frame, image=process(frame.image))), "eye", wait_s=0.1
     )
     sequence = doctor_sequence(rig.projector.info.size)
-    seen, _ = look(viewer, sequence, others="")
-    assert seen is not None
-    shown, _ = picture(viewer, sequence, seen, rig.calibration)
-    [found] = sharpening("eye", seen, shown, rig.calibration if calibrated else None)
+    light, _ = measure_light(session, sequence, displays="")
+    assert light is not None
+    picture, _ = locate_picture(session, sequence, light, rig.calibration)
+    [found] = check_sharpening("eye", light, picture, rig.calibration if calibrated else None)
     return found
 
 
 def test_an_unsharp_mask_is_named_with_its_cost(printed: Rig) -> None:
     found = judged(printed, unsharp(1.5))
     assert (found.name, found.severity) == ("sharpening.halo", Severity.FAULT)
-    assert "the camera sharpens: beside edges its pictures exceed white and black by" in found.found
+    assert "the camera sharpens: next to edges its pictures exceed white and black by" in found.found
     assert "mm of depth where the optical axes meet" in found.found
     assert "control sharpness" in found.remedy
     assert "mm of depth" not in judged(printed, unsharp(1.5), calibrated=False).found
@@ -349,12 +350,12 @@ def test_the_sense_of_the_current_is_found_and_all_else_waits_for_it(tmp_path: P
 
     # Not as on the LightCrafter 4500.
     inverted = False
-    shown = doctor_sequence(MIRRORS)
-    table = Table(tmp_path, shown, led_inverted=inverted)
+    picture = doctor_sequence(MIRRORS)
+    table = Table(tmp_path, picture, led_inverted=inverted)
     head = table.connected(led_current_inverted=None, image_load_s=0.05)
     settings = dict.fromkeys(head.cameras, CameraSettings(0.03))
     with replace(rig_of(head), settings=settings) as rig:
-        diagnosis = examine(rig, own_sequence=shown, search_s=0.1)
+        diagnosis = examine(rig, own_sequence=picture, search_s=0.1)
         assert table.engine.lit is None
     (found,) = (each for each in diagnosis.findings if each.name == "light.current")
     assert found.severity is Severity.NOTE

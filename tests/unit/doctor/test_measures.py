@@ -14,22 +14,23 @@ from scipy.spatial.transform import Rotation
 
 from slrig.config import read_rig
 from slrig.devices import Synchronisation
-from slrig.doctor.advice import ExposureAdvice, LineAdvice, exposure_advice, line_advice, unsnapped
+from slrig.doctor.advice import ExposureAdvice, LineAdvice, advise_exposure, advise_lines, check_refresh_multiple
 from slrig.doctor.doctor import Diagnosis
-from slrig.doctor.findings import Finding, Severity, fault, ok
-from slrig.doctor.flicker import Flicker
-from slrig.doctor.light import Seen
-from slrig.doctor.measures.frequencies import passed, refresh_hz, swings
-from slrig.doctor.measures.levels import LightLevels, camera_exponent, light_levels, response_curve
-from slrig.doctor.measures.pictures import (
-    apart_deg,
+from slrig.doctor.light import Finding, LightMeasurement, Severity, fault, ok
+from slrig.doctor.measures import (
+    LightLevels,
+    angle_between_deg,
     bar_blur_px,
     bar_contrast,
     edge_blur,
     expected_orientation,
-    orientation,
+    fit_camera_exponent,
+    fit_orientation,
+    fit_response_curve,
+    light_levels,
 )
 from slrig.doctor.rig_file import write_rig_file
+from slrig.doctor.timing import LightFlicker, estimate_refresh_hz, exposure_attenuation, find_oscillations
 from slrig.errors import ConfigError, StorageError
 from slrig.model import FloatArray, Pinhole, Pixels, Size
 
@@ -58,13 +59,13 @@ def test_levels_are_those_of_the_lit_part() -> None:
     white, black = lit_part(120.0, 20.0)
     levels = light_levels(frames(white, noise_dn=1.5), frames(black, noise_dn=1.5, seed=1), full_scale=255)
     assert levels.lit_share == pytest.approx(40 * 40 / (60 * 80))
-    assert levels.box == (10, 49, 20, 59)
+    assert levels.lit_box == (10, 49, 20, 59)
     assert levels.contrast_dn == pytest.approx(100, abs=1)
     assert levels.ambient_dn == pytest.approx(20, abs=1)
     assert levels.noise_dn == pytest.approx(1.5, rel=0.1)
     assert levels.saturated_share == 0
     half = frames((white + black) / 2, noise_dn=1.5, seed=2)[0]
-    assert levels.level(half) == pytest.approx(0.5, abs=0.005)
+    assert levels.relative_level(half) == pytest.approx(0.5, abs=0.005)
     # 90 % of full scale, from the 99th percentile of four frames' mean.
     assert levels.longest_exposure_s(0.01) == pytest.approx(0.01 * 0.9 * 255 / 122, rel=0.02)
     assert levels.shortest_exposure_s(0.01) == pytest.approx(0.01 * 10 / (100 / 1.5), rel=0.1)
@@ -89,7 +90,7 @@ def test_response_is_found_by_its_gamma_and_its_knees(gamma: float, black_knee: 
     values = np.linspace(0, 255, 33)
     light = np.clip((values - black_knee) / (white_knee - black_knee), 0, 1) ** gamma
     light += 0.002 * np.random.default_rng(0).standard_normal(33)
-    curve = response_curve(list(values), list(light))
+    curve = fit_response_curve(list(values), list(light))
     assert curve.gamma == pytest.approx(gamma, abs=0.08)
     assert curve.black_knee == pytest.approx(black_knee, abs=6)
     assert curve.white_knee == pytest.approx(white_knee, abs=6)
@@ -98,9 +99,9 @@ def test_response_is_found_by_its_gamma_and_its_knees(gamma: float, black_knee: 
     # Light that falls with the grey value.
     falling = values / 255
     falling[20] -= 0.2
-    assert response_curve(list(values), list(falling)).reversal == pytest.approx(0.2 - 1 / 32, abs=1e-6)
+    assert fit_response_curve(list(values), list(falling)).reversal == pytest.approx(0.2 - 1 / 32, abs=1e-6)
     exposures_s = [0.004, 0.008, 0.016]
-    assert camera_exponent(exposures_s, [e**0.45 for e in exposures_s]) == pytest.approx(0.45)
+    assert fit_camera_exponent(exposures_s, [e**0.45 for e in exposures_s]) == pytest.approx(0.45)
 
 
 def sampled(t_s: FloatArray, exposure_s: float, *parts: tuple[float, float], noise: float = 0.2) -> FloatArray:
@@ -114,21 +115,23 @@ def sampled(t_s: FloatArray, exposure_s: float, *parts: tuple[float, float], noi
 
 def test_swings_are_found_in_uneven_samples_whatever_the_mean_rate() -> None:
     t_s = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.05, 128))
-    found = swings(t_s, sampled(t_s, 0.002, (100.0, 5.0), (180.0, 2.0)), exposure_s=0.002)
+    found = find_oscillations(t_s, sampled(t_s, 0.002, (100.0, 5.0), (180.0, 2.0)), exposure_s=0.002)
     assert [swing.frequency_hz for swing in found] == pytest.approx([100.0, 180.0], abs=0.02)
     assert [swing.amplitude for swing in found] == pytest.approx([5.0, 2.0], abs=0.2)
     assert all(not swing.aliases_hz for swing in found)
-    assert swings(t_s, sampled(t_s, 0.002), exposure_s=0.002) == (), "noise alone"
-    assert swings(t_s, np.full(128, 7.0), exposure_s=0.002) == ()
-    assert passed(120.0, 1 / 60) == pytest.approx(0.0, abs=1e-12), "whole periods"
-    assert found[0].amplitude * passed(found[0].frequency_hz, 0.01) == pytest.approx(0.0, abs=0.01)
-    assert found[0].amplitude * passed(found[0].frequency_hz, 0.005) == pytest.approx(5 * 2 / np.pi, abs=0.2)
+    assert find_oscillations(t_s, sampled(t_s, 0.002), exposure_s=0.002) == (), "noise alone"
+    assert find_oscillations(t_s, np.full(128, 7.0), exposure_s=0.002) == ()
+    assert exposure_attenuation(120.0, 1 / 60) == pytest.approx(0.0, abs=1e-12), "whole periods"
+    assert found[0].amplitude * exposure_attenuation(found[0].frequency_hz, 0.01) == pytest.approx(0.0, abs=0.01)
+    assert found[0].amplitude * exposure_attenuation(found[0].frequency_hz, 0.005) == pytest.approx(
+        5 * 2 / np.pi, abs=0.2
+    )
 
 
 def test_even_samples_list_the_aliases() -> None:
     # 30 frames per second show 100 Hz as 10 Hz, as they show 20, 40, 50, 70, 80 … Hz.
     t_s = np.arange(128) / 30
-    [swing] = swings(t_s, sampled(t_s, 0.002, (100.0, 5.0)), exposure_s=0.002)
+    [swing] = find_oscillations(t_s, sampled(t_s, 0.002, (100.0, 5.0)), exposure_s=0.002)
     told_hz = (swing.frequency_hz, *swing.aliases_hz)
     for candidate_hz in (50.0, 80.0, 100.0, 130.0):
         assert min(abs(each - candidate_hz) for each in told_hz) < 0.1
@@ -139,14 +142,14 @@ def test_refresh_rate_is_found_from_random_instants(rate_hz: float) -> None:
     rng = np.random.default_rng(3)
     asked_s = np.cumsum(rng.uniform(0.02, 0.08, 48))
     shown_ns = np.ceil(asked_s * rate_hz) / rate_hz * 1e9 + rng.normal(0, 1e5, 48)
-    found = refresh_hz([round(t) for t in shown_ns])
+    found = estimate_refresh_hz([round(t) for t in shown_ns])
     assert found == pytest.approx(rate_hz, rel=5e-4)
 
 
 def test_instants_on_no_grid_give_no_refresh_rate() -> None:
     asked_ns = np.cumsum(np.random.default_rng(3).uniform(2e7, 8e7, 48))
-    assert refresh_hz([round(t) for t in asked_ns]) is None
-    assert refresh_hz([5, 5, 5]) is None
+    assert estimate_refresh_hz([round(t) for t in asked_ns]) is None
+    assert estimate_refresh_hz([5, 5, 5]) is None
 
 
 def positions(jacobian: list[list[float]]) -> tuple[FloatArray, FloatArray]:
@@ -173,9 +176,9 @@ def test_a_picture_is_mirrored_or_turned(jacobian: list[list[float]], mirrored: 
     rng = np.random.default_rng(0)
     wrong = rng.random(PICTURE) < 0.05
     column_px[wrong] = rng.uniform(0, 400, np.count_nonzero(wrong))
-    found = orientation(column_px, row_px, EVERYWHERE)
+    found = fit_orientation(column_px, row_px, EVERYWHERE)
     assert found is not None
-    assert found.mirrored is mirrored
+    assert found.is_mirrored is mirrored
     assert abs((found.turn_deg - turn_deg + 180) % 360 - 180) < 5
     assert found.camera_px == pytest.approx(abs(np.linalg.det(jacobian)) ** -0.5, rel=0.05)
 
@@ -184,8 +187,8 @@ def test_too_few_codes_give_no_orientation() -> None:
     column_px, row_px = positions([[1.0, 0.0], [0.0, 1.0]])
     few = np.zeros(PICTURE, np.bool_)
     few[:5, :5] = True
-    assert orientation(column_px, row_px, few) is None
-    assert orientation(np.zeros(PICTURE), row_px, EVERYWHERE) is None
+    assert fit_orientation(column_px, row_px, few) is None
+    assert fit_orientation(np.zeros(PICTURE), row_px, EVERYWHERE) is None
 
 
 def device(x_mm: float, turn_deg: float) -> Pinhole:
@@ -200,9 +203,9 @@ def test_a_calibration_foresees_how_a_picture_lies(turn_deg: float) -> None:
     upright = expected_orientation(device(-60.0, 0.0), device(90.0, 0.0))
     assert foreseen is not None
     assert upright is not None
-    assert not foreseen.mirrored
+    assert not foreseen.is_mirrored
     assert foreseen.camera_px == pytest.approx(1.0, rel=0.1)
-    assert apart_deg(foreseen, upright) == pytest.approx(turn_deg, abs=1)
+    assert angle_between_deg(foreseen, upright) == pytest.approx(turn_deg, abs=1)
     assert abs(upright.turn_deg) < 3
 
 
@@ -274,13 +277,13 @@ def levels() -> LightLevels:
     return light_levels(images[0], images[1], full_scale=255)
 
 
-def seen(own_exposure_s: float, *, shortest_s: float = 0.002, longest_s: float = 0.04) -> Seen:
-    return Seen("left", own_exposure_s, levels(), 0.02, levels(), shortest_s, longest_s, 0.0)
+def seen(own_exposure_s: float, *, shortest_s: float = 0.002, longest_s: float = 0.04) -> LightMeasurement:
+    return LightMeasurement("left", own_exposure_s, levels(), 0.02, levels(), shortest_s, longest_s, 0.0)
 
 
 LIMITS_S = (1e-5, 1.0)
-MAINS = Flicker("room", 100.0, 0.05)
-WHEEL = Flicker("projector", 180.0, 0.4)
+MAINS = LightFlicker("room", 100.0, 0.05)
+WHEEL = LightFlicker("projector", 180.0, 0.4)
 
 
 @pytest.mark.parametrize(
@@ -302,18 +305,18 @@ WHEEL = Flicker("projector", 180.0, 0.4)
     ],
 )
 def test_an_exposure_is_kept_or_snapped(
-    own_s: float, refresh_hz: float | None, flickers: tuple[Flicker, ...], expected_s: float
+    own_s: float, refresh_hz: float | None, flickers: tuple[LightFlicker, ...], expected_s: float
 ) -> None:
-    advice = exposure_advice(seen(own_s), LIMITS_S, refresh_hz=refresh_hz, flickers=flickers)
+    advice = advise_exposure(seen(own_s), LIMITS_S, refresh_hz=refresh_hz, flickers=flickers)
     assert advice.exposure_s == pytest.approx(expected_s, rel=1e-6)
-    assert ("kept" in advice.reason) is (expected_s == own_s)
+    assert ("unchanged" in advice.reason) is (expected_s == own_s)
 
 
 def test_advice_gives_its_reason_and_keeps_to_the_limits() -> None:
     def advised(
         own_s: float, longest_s: float, limits_s: tuple[float, float] = LIMITS_S, **more: Any
     ) -> ExposureAdvice:
-        return exposure_advice(
+        return advise_exposure(
             seen(own_s, longest_s=longest_s), limits_s, **{"refresh_hz": 60.0, "flickers": (), **more}
         )
 
@@ -330,9 +333,9 @@ def test_advice_gives_its_reason_and_keeps_to_the_limits() -> None:
 
 
 def test_exposure_that_misses_the_refresh_is_noted() -> None:
-    assert unsnapped(seen(0.02), None) == []
-    assert unsnapped(seen(1 / 30), 60.0) == []
-    [told] = unsnapped(seen(0.02), 60.0)
+    assert check_refresh_multiple(seen(0.02), None) == []
+    assert check_refresh_multiple(seen(1 / 30), 60.0) == []
+    [told] = check_refresh_multiple(seen(0.02), 60.0)
     assert (told.name, told.severity) == ("exposure.refresh", Severity.NOTE)
 
 
@@ -440,7 +443,7 @@ def test_the_new_file_is_the_old_one_with_what_was_measured(old: Path) -> None:
     for key, words in (
         ("exposure_s = 0.0166667", "# 1 × the refresh period; usable are 2 ms to 30 ms"),
         ("latency_s = 0.041235", "# measured by flashes"),
-        ("latency_error_s = 0.0031", "# and how much later"),
+        ("latency_error_s = 0.0031", "# and the longest further delay"),
     ):
         assert lines[lines.index(key) - 1].startswith(words)
     assert lines[0] == "# Written by slrig doctor, from old.toml."
@@ -449,7 +452,7 @@ def test_the_new_file_is_the_old_one_with_what_was_measured(old: Path) -> None:
 
 def test_lines_that_suit_the_blur_take_the_place_of_those_there(old: Path) -> None:
     old.write_text(old.read_text() + "line_width_px = 2\ngray_cell_px = 2\n")
-    advice = line_advice(3.5, 12, 12)
+    advice = advise_lines(3.5, 12, 12)
     assert advice is not None
     new = old.with_name("new.toml")
     write_rig_file(diagnosis(lines=advice), old, new, force=False)
@@ -463,7 +466,7 @@ def test_lines_that_suit_the_blur_take_the_place_of_those_there(old: Path) -> No
     [(0.0, None), (0.6, None), (1.5, None), (2.2, 16), (3.0, 16), (5.0, 32), (math.inf, None), (math.nan, None)],
 )
 def test_lines_are_advised_where_they_gain(blur_px: float, period_px: int | None) -> None:
-    advice = line_advice(blur_px, 8, 8)
+    advice = advise_lines(blur_px, 8, 8)
     assert (None if advice is None else advice.period_px) == period_px
     if advice is not None:
         # Against lines that are played, blurred and measured: a sine of their contrast under the same noise.
@@ -509,7 +512,7 @@ def test_a_head_has_one_exposure_the_shortest(tmp_path: Path) -> None:
 def test_a_file_is_overwritten_only_by_force(old: Path) -> None:
     new = old.with_name("new.toml")
     new.write_text("precious")
-    with pytest.raises(ConfigError, match="exists, and is kept; choose another name"):
+    with pytest.raises(ConfigError, match="exists and is unchanged; choose another name"):
         write_rig_file(diagnosis(), old, new, force=False)
     assert new.read_text() == "precious"
     write_rig_file(diagnosis(), old, new, force=True)

@@ -17,9 +17,9 @@ from drivers.depthai.library import ENVIRONMENT, library
 from drivers.genicam.library import install_command
 from drivers.genicam.library import library as aravis
 from drivers.genicam.producers import core
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
+from slrig.discovery import driver_kinds, drivers_with_options, option_model
 from slrig.errors import ConfigError, LibraryMissingError
-from slrig.option_models import described_drivers, kinds_of, option_model
 
 SHIPPED = {
     *("depthai", "genicam", "gentl", "opencv", "picamera2", "v4l2"),
@@ -35,14 +35,14 @@ def properties(schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def test_every_driver_of_slrig_describes_its_options() -> None:
-    assert set(described_drivers("slrig")) == SHIPPED
+    assert set(drivers_with_options("slrig")) == SHIPPED
 
 
 @pytest.mark.parametrize("driver", sorted(SHIPPED))
 def test_every_option_has_a_meaning_in_a_sentence(driver: str) -> None:
     model = option_model(driver)
     assert model is not None
-    assert kinds_of(driver)
+    assert driver_kinds(driver)
     told = dict(properties(model.model_json_schema()))
     assert told
     for name, part in told.items():
@@ -76,7 +76,7 @@ def test_every_fault_of_a_cameras_table_is_in_one_message(
     model = option_model(driver)
     assert model is not None
     with pytest.raises(ConfigError) as refused:
-        checked(model, table, "the table")
+        validate(model, table, "the table")
     assert [each for each in words if each not in str(refused.value)] == []
 
 
@@ -98,7 +98,7 @@ def test_a_finders_id_is_taken_by_device_or_by_what_a_model_marks() -> None:
 def test_no_vendors_library_is_needed() -> None:
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('depthai', 'gi', 'serial', 'sdl2')))\n"
-        "from slrig.option_models import option_model\n"
+        "from slrig.discovery import option_model\n"
         f"print(all(option_model(name) for name in {sorted(SHIPPED - {'simulated'})}), 'numba' in sys.modules)"
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603

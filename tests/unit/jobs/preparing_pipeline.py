@@ -8,16 +8,16 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from slrig.kernels import Prepared
+from slrig.kernels import KernelCount
 from tests.unit.scan.fake_pipeline import frame_receiver, reconstruct_into
 
 __all__ = ["frame_receiver", "reconstruct_into", "warm_kernels"]
 
 
-def warm_kernels(told: Callable[[Prepared], None]) -> None:
-    told(Prepared(41, 118))
+def warm_kernels(told: Callable[[KernelCount], None]) -> None:
+    told(KernelCount(41, 118))
     if "PREPARING_GATE" not in os.environ:
         os.kill(os.getpid(), signal.SIGKILL)
     while not Path(os.environ["PREPARING_GATE"]).exists():
         threading.Event().wait(0.01)
-    told(Prepared(42, 118))
+    told(KernelCount(42, 118))

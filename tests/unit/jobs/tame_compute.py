@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import Any
 
 from slrig.errors import ScanCancelledError
-from slrig.failure import interruption
+from slrig.failure import interruption_error
 from slrig.jobs.frame_feed import FedCaptures, FrameFeed
 from slrig.jobs.worker import READY, Worker
 from slrig.jobs.worker_process import Task
@@ -64,12 +64,12 @@ class TameCompute:
 
         def told(stage: str, fraction: float, detail: str) -> None:
             if self._closed.is_set():
-                raise interruption()
+                raise interruption_error()
             progress(stage, fraction, detail)
 
         while not self._turn.acquire(timeout=0.01):
             if self._closed.is_set():
-                raise interruption()
+                raise interruption_error()
             if cancelled():
                 raise ScanCancelledError(f"The {task.what} was cancelled.")
         try:

@@ -19,7 +19,7 @@ import pytest
 
 from slrig.api.server import ADDRESS_FILE
 from slrig.doctor.doctor import Diagnosis
-from slrig.doctor.findings import fault, ok
+from slrig.doctor.light import fault, ok
 from slrig.errors import DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs import backup

@@ -24,7 +24,7 @@ from slrig.errors import (
     StorageError,
     WorkerLostError,
 )
-from slrig.failure import JobFailure, interruption
+from slrig.failure import JobFailure, interruption_error
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.job import Holder, Job
@@ -410,7 +410,7 @@ def test_the_rig_is_free_before_the_frames_are_on_the_disk(tame: JobBench) -> No
         (Work(capture_error=DeviceGoneError("gone")), JobState.FAILED, "device-gone", "salvage True"),
         (Work(capture_error=OSError(5, "I/O")), JobState.FAILED, "device", "salvage True"),
         (Work(capture_error=ScanCancelledError("asked")), JobState.CANCELLED, "scan-cancelled", "failed by"),
-        (Work(capture_error=interruption()), JobState.INTERRUPTED, "scan-interrupted", "salvage True"),
+        (Work(capture_error=interruption_error()), JobState.INTERRUPTED, "scan-interrupted", "salvage True"),
         (Work(recording_error=StorageError("full")), JobState.FAILED, "storage", "salvage True"),
         (Work(compute_error=WorkerLostError("killed")), JobState.FAILED, "worker-lost", "salvage True"),
         (Work(compute_error=ZeroDivisionError("secret")), JobState.FAILED, "unexpected", "salvage True"),
@@ -449,11 +449,11 @@ def test_refused_job_is_on_no_record(tame: JobBench) -> None:
 
 
 def test_end_of_the_service_leaves_what_waits_or_computes_to_the_next_start(tame: JobBench) -> None:
-    tame.queue.error = interruption()
+    tame.queue.error = interruption_error()
     waiting = tame.submitted(Work())
     assert tame.store.get(waiting).state is JobState.QUEUED
     tame.queue.error = None
-    cut_off = Work(compute_error=interruption())
+    cut_off = Work(compute_error=interruption_error())
     computing = tame.submitted(cut_off)
     with tame.queue._changed:
         assert tame.queue._changed.wait_for(lambda: not tame.queue._computing, WAIT_S)

@@ -26,7 +26,7 @@ from slrig.errors import (
     WorkerBusyError,
     WorkerLostError,
 )
-from slrig.failure import failure_of, interruption
+from slrig.failure import interruption_error, job_failure
 from slrig.jobs import worker as worker_module
 from slrig.jobs import worker_wait
 from slrig.jobs.frame_feed import (
@@ -169,7 +169,7 @@ def test_an_answer_of_another_job_is_dropped() -> None:
         Progressed(6, "mesh", 0.5, ""),
         FileMade(6, "mesh.ply"),
         FileMade(7, "points.ply"),
-        Failed(8, failure_of(interruption()), ""),
+        Failed(8, job_failure(interruption_error()), ""),
     ):
         far.send(answer)
     far.send(Done(7, "its own"))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from slrig.kernels import _entries
+from slrig.kernels import _kernels
 from slrig.meshing import preparation
 
 _LATER = "slrig.meshing.rasteriser"
@@ -26,7 +26,7 @@ def compiled() -> set[str]:
     """Each kernel of the meshing that is loaded in this process, with the types that it is compiled for."""
     return {
         f"{each.py_func.__module__}.{each.py_func.__qualname__}{types}"
-        for each, _ in _entries
+        for each, _ in _kernels
         if each.py_func.__module__.startswith("slrig.meshing.") and each.py_func.__module__ != _LATER
         for types in each.signatures
     }

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from slrig.bundle import BundleWriter, read_bundle
-from slrig.bundle.sidecars import Refused, StageAngle, read_notes, read_refused, read_stage
+from slrig.bundle.sidecars import RefusedFrame, StageAngle, read_notes, read_refused, read_stage
 from slrig.capture.exposure import check_exposures
 from slrig.capture.verifier import EvidenceSummary, check_capture
 from slrig.devices import CameraSettings, Projector, Synchronisation, Trigger
@@ -361,7 +361,7 @@ def test_frames_are_written_in_order_by_a_thread_of_its_own(tmp_path: Path) -> N
     with writer, Recorder(writer) as recorder:
         for shot in SHOTS:
             recorder.add(shot)
-        recorder.refuse(Refused(0, "cam0", 1, "it was stale", delivered=True))
+        recorder.refuse(RefusedFrame(0, "cam0", 1, "it was stale", delivered=True))
         recorder.add(SHOTS[0])
         # All of this while the disk did nothing.
         writer.gate.set()

@@ -10,7 +10,7 @@ import pytest
 from numba import config
 
 from slrig.errors import StorageError
-from slrig.kernels import Prepared, compilations_told, prepared
+from slrig.kernels import KernelCount, count_prepared, report_compilations
 from slrig.scan import preparation
 from slrig.scan import reconstruct as pipeline
 from slrig.scan.job import PIPELINE, reconstruction
@@ -28,9 +28,9 @@ def test_the_production_pipeline_has_all_that_the_worker_looks_up() -> None:
 
 
 def test_every_kernel_of_a_usual_scan_is_prepared() -> None:
-    told: list[Prepared] = []
+    told: list[KernelCount] = []
     pipeline.warm_kernels(told.append)
-    done, total = prepared()
+    done, total = count_prepared()
     # Those that only some scans need are marked so at their definition.
     assert done == total > 40
     assert all(each.total == total for each in told)
@@ -42,7 +42,7 @@ def test_a_recorded_scan_compiles_nothing_more(shared: Path, tmp_path: Path) -> 
     pipeline.warm_kernels(lambda _: None)
     late: list[str] = []
     plan = ReconstructionPlan()
-    with compilations_told(late.append):
+    with report_compilations(late.append):
         pipeline.reconstruct_bundle(
             shared / "bundles" / "terrace",
             tmp_path / "out",

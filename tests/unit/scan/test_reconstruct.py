@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from slrig.bundle import BundleWriter, read_bundle, read_calibration, write_bundle, write_calibration
 from slrig.bundle.description import read_description
 from slrig.bundle.images import read_with_colour as read_frame_pages
-from slrig.bundle.reading import MOST_READERS, open_bundle
+from slrig.bundle.reading import MAX_READERS, open_bundle
 from slrig.bundle.sidecars import StageAngle, write_notes, write_stage
 from slrig.capture.verifier import check_capture
 from slrig.config import read_rig
@@ -460,7 +460,7 @@ def test_frames_are_read_a_few_ahead(both_axes: Path, monkeypatch: pytest.Monkey
     read.clear()
     order = [5, 3, 12, 0, 20, 21, 22, 23, 24]
     for taken, (index, shot) in enumerate(zip(order, files.shots(order), strict=True), start=1):
-        assert len(read) <= taken + MOST_READERS + 1
+        assert len(read) <= taken + MAX_READERS + 1
         assert np.array_equal(shot.image, whole.shots[index].image)
         assert (shot.pattern, shot.camera, shot.time_s) == (
             whole.shots[index].pattern, whole.shots[index].camera, whole.shots[index].time_s,

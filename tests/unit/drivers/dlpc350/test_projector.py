@@ -21,7 +21,7 @@ from drivers.pattern_engine.link import Link
 from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.planes import plane_of
 from drivers.pattern_engine.timing import Timing
-from slrig.bundle.validation import checked
+from slrig.bundle.validation import validate
 from slrig.devices import StoredPatternProjector
 from slrig.errors import (
     ConfigError,
@@ -295,7 +295,7 @@ def test_each_change_of_picture_swaps_the_buffer(
 def test_all_faults_of_the_options_are_reported_at_once() -> None:
     options: dict[str, Any] = {"patern": "p", "led": "ultraviolet", "hold_s": 1.0, "trigger_delay_us": 5.0}
     with pytest.raises(ConfigError) as refused:
-        checked(EngineOptions, options, "the table")
+        validate(EngineOptions, options, "the table")
     text = str(refused.value)
     for words in ("patern: unknown key; did you mean 'patterns'?", "patterns: missing", "led: ", "hold_s: ", "5.0"):
         assert words in text
@@ -304,7 +304,7 @@ def test_all_faults_of_the_options_are_reported_at_once() -> None:
 def test_the_led_current_is_limited() -> None:
     assert EngineOptions(patterns="p", led_current=0.4).current_byte == 102
     with pytest.raises(ConfigError, match=r"led_current is 0\.6, led_current_limit allows 0\.5"):
-        checked(EngineOptions, {"patterns": "p", "led_current": 0.6}, "the table")
+        validate(EngineOptions, {"patterns": "p", "led_current": 0.6}, "the table")
     assert EngineOptions(patterns="p", led_current=0.6, led_current_limit=0.6).colour is Colour.WHITE
 
 

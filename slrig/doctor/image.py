@@ -1,0 +1,310 @@
+"""Focus of both lenses, sharpening by the camera, and response of projector and camera to grey values."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.doctor.advice import advise_lines
+from slrig.doctor.light import CameraSession, Finding, LightMeasurement, LocatedPicture, camera_label, fault, note, ok
+from slrig.doctor.measures import (
+    BarContrast,
+    EdgeBlur,
+    Halo,
+    ResponseCurve,
+    bar_blur_px,
+    bar_contrast,
+    depth_mm_per_px,
+    edge_blur,
+    fit_camera_exponent,
+    fit_response_curve,
+    measure_halo,
+)
+from slrig.errors import DeviceError, DeviceGoneError
+from slrig.model import Axis, Black, Calibration, FloatArray, Pattern, PatternSequence, Size, White
+from slrig.patterns import edge_indices
+
+_WHOLE_PERIODS = 4
+_MIN_BAR_PIXELS = 200
+_NOTE_CONTRAST, _FAULT_CONTRAST = 0.5, 0.25
+_CAMERA_SHARE, _PROJECTOR_SHARE = 0.6, 0.35
+_BORDER_PX = 12
+
+_NOTE_OVERSHOOT, _FAULT_OVERSHOOT = 0.01, 0.04
+_MIN_OVERSHOOT_SNR = 4.0
+
+GREY_LEVELS = 33
+_GREY_FRAMES = 2
+_GAMMA_TOLERANCE = 0.1
+_EXPONENT_TOLERANCE = 0.1
+_MAX_KNEE = 10.0
+_MAX_REVERSAL = 0.03
+_ALL_WHITE = 0.9
+_EXPOSURE_SHARES = (1.0, 0.5, 0.25)
+
+
+# ---- Focus
+
+
+def check_focus(
+    name: str, sequence: PatternSequence, light: LightMeasurement, picture: LocatedPicture, *, period_px: int
+) -> tuple[float, list[Finding]]:
+    """Return the blur of the bars, standard deviation in projector pixels, and whether lines `period_px` apart survive.
+
+    The blur is that of projector, camera and pixels together, along the axis where it is greater: 0 if even the finest
+    bars are sharp, infinite if no bars are visible, NaN if no code can be read.
+    """
+    subject = camera_label(name)
+    orientation = picture.orientation
+    if orientation is None:
+        message = "the focus is unknown, because codes of both axes cannot be read"
+        return math.nan, [ok("focus.unmeasured", subject, message)]
+    blurs: list[tuple[float, float]] = []
+    for axis in Axis:
+        blur_px = bar_blur_px(_bar_contrasts(axis, sequence, light, picture))
+        # Length of one projector pixel across the bars, camera pixels.
+        camera_px = float(1 / np.linalg.norm(orientation.jacobian[0 if axis is Axis.COLUMN else 1]))
+        blurs.append((0.0 if blur_px is None else blur_px, camera_px))
+    worst_px, camera_px = max(blurs, key=lambda each: each[0])
+    contrast = math.exp(-2 * (math.pi * worst_px / period_px) ** 2)
+    blurred = (
+        f"bars are blurred by {worst_px:.2f} projector pixels ({worst_px * camera_px:.2f} camera pixels, standard "
+        "deviation)"
+        if math.isfinite(worst_px)
+        else "even wide bars are blurred beyond recognition"
+    )
+    message = f"{blurred}: lines {period_px} px apart keep {contrast:.0%} of their contrast"
+    if contrast >= _NOTE_CONTRAST:
+        return worst_px, [ok("focus.sharp", subject, message)]
+    kind = fault if contrast < _FAULT_CONTRAST else note
+    device, reason, remedy = _defocused_device(_object_edge_blur(sequence, light, picture), worst_px * camera_px)
+    advice = advise_lines(worst_px, period_px, period_px)
+    if advice is not None:
+        remedy += (
+            f"; until then line_shift_period_px = {advice.period_px} and line_steps = {advice.steps} in [scan]: "
+            f"{advice.gain_text} is expected"
+        )
+    subject = "projector" if device == "projector" else subject
+    return worst_px, [kind(f"focus.{device}", subject, f"{message}. {reason}", remedy)]
+
+
+def _bar_contrasts(
+    axis: Axis, sequence: PatternSequence, light: LightMeasurement, picture: LocatedPicture
+) -> list[BarContrast]:
+    """Return the contrast of each period of bars that repeats within the visible part of the projector."""
+    usable = light.levels.usable
+    if np.count_nonzero(usable) < _MIN_BAR_PIXELS:
+        return []
+    extent_px = float(sequence.projector.along(axis))
+    if picture.known.any():
+        low, high = np.percentile(picture.position_px[axis][picture.known], (2, 98))
+        extent_px = float(high - low) + picture.cell_px[axis]
+    contrasts = []
+    for each in picture.bars:
+        bit = each.pattern
+        period_px = float(2 * bit.cell_px * edge_indices(bit.bit, bit.bits)[1])
+        if bit.axis is axis and (period_px * _WHOLE_PERIODS <= extent_px or bit.bit == bit.bits - 1):
+            signal, white = each.difference[usable].astype(np.float64), light.levels.contrast[usable]
+            contrasts.append(bar_contrast(signal, white, noise_dn=light.levels.noise_dn, period_px=period_px))
+    return contrasts
+
+
+def _object_edge_blur(sequence: PatternSequence, light: LightMeasurement, picture: LocatedPicture) -> EdgeBlur | None:
+    """Return the blur of edges on the object: without the border of the projector's picture and saturated areas."""
+    levels = light.levels
+    excluded = levels.lit & ~levels.usable
+    for axis, position_px in picture.position_px.items():
+        cell_px = picture.cell_px[axis]
+        border = (position_px < 2 * cell_px) | (position_px > sequence.projector.along(axis) - 1 - 2 * cell_px)
+        excluded |= border & picture.known
+    region = _dilate(levels.lit, 3) & ~_dilate(excluded, _BORDER_PX)
+    # The mean of the four white frames has half the noise of one.
+    return edge_blur(levels.white, region, noise_dn=levels.noise_dn / 2)
+
+
+def _dilate(mask: NDArray[np.bool_], reach_px: int) -> NDArray[np.bool_]:
+    kernel = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0, np.bool_)
+
+
+def _defocused_device(edges: EdgeBlur | None, total_px: float) -> tuple[str, str, str]:
+    """Return which device is out of focus, the reason, and the remedy. total_px : blur of the bars, camera pixels."""
+    if edges is None:
+        reason = "Which lens is out of focus is unknown: the camera sees no sharp edges except those of the patterns"
+        remedy = (
+            "turn the projector's focus until the patterns look sharp on the object; then turn the camera's focus. Put "
+            "a printed page into view and run the doctor again to find out which lens it is"
+        )
+        return "unknown", reason, remedy
+    share = (edges.sigma_px / total_px) ** 2 if math.isfinite(total_px) else 0.0
+    measured = f"the sharpest edges on the object itself are blurred by {edges.sigma_px:.2f} camera pixels"
+    if share >= _CAMERA_SHARE:
+        remedy = (
+            "focus the camera on the object, or close its aperture; if nothing in view has sharp edges, put a printed "
+            "page there and run the doctor again"
+        )
+        return "camera", f"It is the camera's lens: {measured}, as much as the bars are", remedy
+    if share <= _PROJECTOR_SHARE:
+        remedy = (
+            "focus the projector on the object; set its input to the native resolution, unscaled, with sharpness "
+            "neutral"
+        )
+        return "projector", f"It is the projector's lens: {measured}, far less than the bars are", remedy
+    remedy = "focus the projector until the patterns are sharp on the object, then the camera, or close its aperture"
+    return "both", f"Both lenses contribute: {measured}", remedy
+
+
+# ---- Sharpening
+
+
+def check_sharpening(
+    name: str, light: LightMeasurement, picture: LocatedPicture, calibration: Calibration | None
+) -> list[Finding]:
+    """Look for halos at the edges of the bars."""
+    subject, levels = camera_label(name), light.levels
+    contrast = np.where(levels.usable, levels.contrast, np.inf)
+    halo = measure_halo((each.difference / contrast for each in picture.bars), levels.usable)
+    if halo is None:
+        message = "whether it sharpens is unknown: it sees too few edges of wide bars"
+        return [ok("sharpening.unmeasured", subject, message)]
+    measured = f"next to edges its pictures exceed white and black by {halo.overshoot:.1%} of the step"
+    if halo.overshoot <= max(_NOTE_OVERSHOOT, _MIN_OVERSHOOT_SNR * halo.error):
+        return [ok("sharpening.none", subject, f"{measured}: it does not sharpen")]
+    kind = fault if halo.overshoot > _FAULT_OVERSHOOT else note
+    effect = _sharpening_effect(halo, name, calibration)
+    message = f"the camera sharpens: {measured}, most of it {halo.reach_px:.1f} px from them. {effect}"
+    remedy = (
+        "set its sharpness to the minimum, by the control sharpness (the drivers v4l2 and opencv do so if there is "
+        "one; v4l2-ctl --list-ctrls lists all controls) or in the camera's own menu; switch off edge enhancement, "
+        "detail and super resolution; choose a size that the sensor has, not one that the camera enlarges. If "
+        "nothing switches it off, coat printed objects matt white, or use another camera"
+    )
+    return [kind("sharpening.halo", subject, message, remedy)]
+
+
+def _sharpening_effect(halo: Halo, name: str, calibration: Calibration | None) -> str:
+    effect = (
+        "On even surfaces that costs little; next to print that changes the brightness threefold it moves a stripe by "
+        f"{halo.shift_px:.2g} px or more"
+    )
+    depth_mm = float("nan")
+    if calibration is not None and calibration.projector is not None and name in calibration.cameras:
+        depth_mm = halo.shift_px * depth_mm_per_px(calibration.cameras[name], calibration.projector)
+    if not math.isfinite(depth_mm):
+        return effect
+    return f"{effect}, which is {depth_mm:.2g} mm of depth where the optical axes meet"
+
+
+# ---- Response to grey values
+
+
+def grey_fields(size: Size) -> tuple[FloatArray, PatternSequence]:
+    """(33,) float64, grey values from 0 to 255, and the sequence of even fields that shows them."""
+    values = np.rint(np.linspace(0, 255, GREY_LEVELS))
+    patterns: list[Pattern] = [Black(), *[White()] * (GREY_LEVELS - 1)]
+    profiles = tuple(np.full((1, 1), round(value), np.uint8) for value in values)
+    return values, PatternSequence(size, tuple(patterns), profiles)
+
+
+def measure_response(session: CameraSession, light: LightMeasurement) -> tuple[ResponseCurve | None, list[Finding]]:
+    """Show even greys, and return their curve, None if the projector cannot show greys, and the findings."""
+    values, sequence = grey_fields(session.projector.info.size)
+    try:
+        session.projector.load(sequence)
+    except DeviceGoneError:
+        raise
+    except DeviceError as error:
+        message = f"it shows no greys, so nothing can bend its black and white: {error}"
+        return None, [ok("response.binary", "projector", message)]
+    shares = _measure_greys(session, light, sequence)
+    if shares[1] > _ALL_WHITE:
+        return None, [ok("response.binary", "projector", "it shows every grey as white: nothing bends black and white")]
+    curve = fit_response_curve([float(value) for value in values], [float(share) for share in shares])
+    return curve, [*_check_projector_response(curve), *_check_camera_linearity(session, light, sequence)]
+
+
+def _measure_greys(session: CameraSession, light: LightMeasurement, sequence: PatternSequence) -> FloatArray:
+    """(33,) float64: light of each grey, 0 for black and 1 for white of this sequence."""
+    with session.arm(sequence, light.exposure_s, _GREY_FRAMES * len(sequence)):
+        shares = [
+            float(np.mean([light.levels.relative_level(f.image) for f in session.capture_frames(index, _GREY_FRAMES)]))
+            for index in range(len(sequence))
+        ]
+    levels = np.array(shares)
+    return np.asarray((levels - levels[0]) / (levels[-1] - levels[0]), np.float64)
+
+
+def _check_projector_response(curve: ResponseCurve) -> list[Finding]:
+    full_range = "set the output's range to full (0 to 255, not video levels), and the projector's"
+    faults = [
+        (
+            curve.reversal > _MAX_REVERSAL,
+            "reversed",
+            f"a higher grey value gives less light, by up to {curve.reversal:.0%} of white",
+            "switch off dynamic contrast, automatic iris, eco and image enhancement in the projector's menu",
+        ),
+        (
+            curve.black_knee > _MAX_KNEE,
+            "crushed",
+            f"grey values up to {curve.black_knee:.0f} of 255 are as dark as black",
+            f"{full_range} brightness higher",
+        ),
+        (
+            curve.white_knee < 255 - _MAX_KNEE,
+            "clipped",
+            f"grey values from {curve.white_knee:.0f} of 255 on are as bright as white",
+            f"{full_range} contrast lower",
+        ),
+        (
+            abs(curve.gamma - 1) > _GAMMA_TOLERANCE,
+            "gamma",
+            f"light grows with the grey value to the power of {curve.gamma:.2f}, not in proportion (rms "
+            f"{curve.residual:.1%} from that law)",
+            "black and white patterns do not suffer, unless something on their way makes greys of them: keep the "
+            "output at the projector's native resolution, unscaled, sharpness neutral. If the menu offers a gamma "
+            "of 1 (linear, DICOM off, no presentation mode), choose it",
+        ),
+    ]
+    findings = [
+        note(f"response.{name}", "projector", message, remedy) for is_wrong, name, message, remedy in faults if is_wrong
+    ]
+    proportional = f"light grows in proportion to the grey value (power {curve.gamma:.2f}, rms {curve.residual:.1%})"
+    return findings or [ok("response.straight", "projector", proportional)]
+
+
+def _check_camera_linearity(
+    session: CameraSession, light: LightMeasurement, sequence: PatternSequence
+) -> list[Finding]:
+    """Check that values grow in proportion to the exposure: a test of the camera alone."""
+    exposures_s: list[float] = []
+    contrast_dn: list[float] = []
+    usable = light.levels.usable
+    for share in _EXPOSURE_SHARES:
+        with session.arm(sequence, share * light.exposure_s, 2 * _GREY_FRAMES):
+            dark, bright = (
+                np.mean([frame.image[usable].mean() for frame in session.capture_frames(index, _GREY_FRAMES)])
+                for index in (0, len(sequence) - 1)
+            )
+        exposures_s.append(session.exposure_s)
+        contrast_dn.append(float(bright - dark))
+    if min(contrast_dn) <= 0 or exposures_s[-1] > 0.75 * exposures_s[0]:
+        return []
+    exponent = fit_camera_exponent(exposures_s, contrast_dn)
+    subject = camera_label(session.name)
+    if abs(exponent - 1) <= _EXPONENT_TOLERANCE:
+        message = f"its values grow in proportion to the exposure (power {exponent:.2f})"
+        return [ok("response.camera", subject, message)]
+    message = (
+        f"its values grow with the exposure to the power of {exponent:.2f}, not in proportion: that moves stripes "
+        "little, since white and black frames are bent alike, but scans state errors as for a linear camera"
+    )
+    remedy = (
+        "set gamma to 1 (the control gamma, 100 of a USB camera, which the drivers v4l2 and opencv set if there is "
+        "one), and switch off automatic gain, wide dynamic range and tone curves; many cameras bend their pictures "
+        "in every mode except raw formats (GREY, Y10, Bayer). If the camera is linear, the projector's light "
+        "flickers: see that finding"
+    )
+    return [note("response.camera", subject, message, remedy)]

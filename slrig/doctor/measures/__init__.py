@@ -1,1 +1,0 @@
-"""What the doctor measures of frames: pure, on arrays."""
