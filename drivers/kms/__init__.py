@@ -61,9 +61,9 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     told = checked(KmsOptions, options, "the [projector] table of driver 'kms'")
     require_linux(DRIVER, through="the kernel's display interface (DRM/KMS)", instead="use driver 'screen'")
     from drivers.display.projector import DisplayProjector
-    from drivers.kms.output import KmsStage
+    from drivers.kms.output import KmsOutput
 
-    return DisplayProjector(told, lambda: KmsStage(told))
+    return DisplayProjector(told, lambda: KmsOutput(told))
 
 
 def find_devices() -> tuple[FoundDevice, ...]:

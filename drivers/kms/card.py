@@ -14,21 +14,96 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.kms import kernel
-from drivers.kms.modes import Mode
+from drivers.kms.kernel import MODE_DOUBLE_CLOCK, MODE_DOUBLE_SCAN, MODE_INTERLACED, MODE_PREFERRED, ModeInfo
+from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Size
 
-Change = tuple[int, int, int]
+_CLOSE_HZ = 0.5
+_SHOWN = 12
+
+
+@dataclass(frozen=True, slots=True)
+class KmsMode:
+    """A video mode. content : as the kernel has it. plain : row after row, each once, each pixel once."""
+
+    size: Size
+    refresh_s: float
+    plain: bool
+    preferred: bool
+    content: bytes
+
+    @classmethod
+    def of(cls, info: ModeInfo) -> KmsMode:
+        """What the kernel tells."""
+        lines = info.vtotal * (2 if info.flags & MODE_DOUBLE_SCAN else 1) * max(info.vscan, 1)
+        pixels = info.htotal * lines / (2 if info.flags & MODE_INTERLACED else 1)
+        return cls(
+            Size(max(info.hdisplay, 1), max(info.vdisplay, 1)),
+            pixels / (info.clock * 1000) if info.clock and pixels else 0.0,
+            not info.flags & (MODE_INTERLACED | MODE_DOUBLE_SCAN | MODE_DOUBLE_CLOCK),
+            bool(info.type & MODE_PREFERRED),
+            bytes(info),
+        )
+
+    @property
+    def info(self) -> ModeInfo:
+        """As the kernel has it."""
+        return ModeInfo.from_buffer_copy(self.content.ljust(ctypes.sizeof(ModeInfo), b"\0"))
+
+    def __str__(self) -> str:
+        rate = f" at {1 / self.refresh_s:.2f} Hz" if self.refresh_s else ""
+        return f"{self.size}{rate}{'' if self.plain else ', interlaced or doubled'}"
+
+
+def choose_mode(output: str, modes: Sequence[KmsMode], *, native: Size | None, refresh_hz: float | None) -> KmsMode:
+    """Return the mode of the projector's own raster.
+
+    Parameters
+    ----------
+    modes
+        In the kernel's order: the best of each size comes first.
+    native, refresh_hz
+        As in `KmsOptions`.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        There is none, or nobody tells which it is.
+    """
+    there = ", ".join(dict.fromkeys(map(str, modes[:_SHOWN]))) or "none"
+    size = native or next((mode.size for mode in modes if mode.preferred), None)
+    if size is None:
+        message = (
+            f"output {output}: no EDID tells the projector's own raster; its modes are: {there}; write native_px = "
+            "[width, height] from the data sheet into the rig file"
+        )
+        raise UnsupportedByDeviceError(message)
+    fitting = [mode for mode in modes if mode.size == size and mode.plain and mode.refresh_s]
+    if refresh_hz is not None:
+        fitting = [mode for mode in fitting if abs(1 / mode.refresh_s - refresh_hz) <= _CLOSE_HZ]
+    if not fitting:
+        rate = "" if refresh_hz is None else f" at {refresh_hz:g} Hz"
+        message = (
+            f"output {output}: asked for {size}{rate}, row by row; its modes are: {there}; correct native_px or "
+            "refresh_hz in the rig file, or check cable and adapter, which may not carry that mode"
+        )
+        raise UnsupportedByDeviceError(message)
+    # Of equals, what the display itself prefers.
+    return next((mode for mode in fitting if mode.preferred), fitting[0])
+
+
+PropertyChange = tuple[int, int, int]
 """An object, one of its properties, and the property's value."""
 
 
 @dataclass(frozen=True, slots=True)
-class Connector:
+class CardConnector:
     """A connector. controllers : indices of those that can drive it. controller : the number of the one that does."""
 
     number: int
     name: str
     connected: bool
-    modes: tuple[Mode, ...]
+    modes: tuple[KmsMode, ...]
     controllers: frozenset[int]
     controller: int
 
@@ -43,7 +118,7 @@ class Property:
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
+class KmsPlane:
     """What a controller takes a picture from. controllers : a bit for each index of those that can."""
 
     number: int
@@ -52,7 +127,7 @@ class Plane:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class DumbBuffer:
     """A picture that can be scanned out. number : its frame buffer. pixels : (H, W) uint32, 0x00RRGGBB."""
 
     number: int
@@ -85,11 +160,11 @@ class Card:
         """Numbers of the controllers (CRTC), by index."""
         return self._resources()[0]
 
-    def connectors(self) -> tuple[Connector, ...]:
+    def connectors(self) -> tuple[CardConnector, ...]:
         """Every connector, as of the kernel's last look."""
         return tuple(self.connector(number, probe=False) for number in self._resources()[1])
 
-    def connector(self, number: int, *, probe: bool) -> Connector:
+    def connector(self, number: int, *, probe: bool) -> CardConnector:
         """One connector; `probe` looks anew at what is connected, which takes a part of a second."""
         told = kernel.GetConnector(connector_id=number, count_modes=0 if probe else 1)
         modes = (kernel.ModeInfo * 1)()
@@ -113,16 +188,16 @@ class Card:
         possible, controller = self._encoders(list(encoders[: there.count_encoders]), there.encoder_id)
         kind = there.connector_type
         word = kernel.CONNECTOR_TYPES[kind] if kind < len(kernel.CONNECTOR_TYPES) else f"Unknown{kind}"
-        return Connector(
+        return CardConnector(
             number,
             f"{word}-{there.connector_type_id}",
             there.connection != kernel.DISCONNECTED,
-            tuple(Mode.of(mode) for mode in modes[: there.count_modes]),
+            tuple(KmsMode.of(mode) for mode in modes[: there.count_modes]),
             frozenset(index for index in range(32) if possible >> index & 1),
             controller,
         )
 
-    def planes(self) -> tuple[Plane, ...]:
+    def planes(self) -> tuple[KmsPlane, ...]:
         """Every plane."""
         told = kernel.PlaneResources()
         self._ask(kernel.GET_PLANE_RESOURCES, told)
@@ -133,7 +208,7 @@ class Card:
         for number in numbers[: told.count_planes]:
             plane = kernel.GetPlane(plane_id=number)
             self._ask(kernel.GET_PLANE, plane)
-            found.append(Plane(number, plane.crtc_id, plane.possible_crtcs))
+            found.append(KmsPlane(number, plane.crtc_id, plane.possible_crtcs))
         return tuple(found)
 
     def properties(self, number: int, kind: int) -> dict[str, Property]:
@@ -159,12 +234,12 @@ class Card:
     def counts_refreshes(self, controller: int) -> bool:
         """Whether the driver knows when refreshes happen; else its time stamps are when it was done with a request."""
         try:
-            self._ask(kernel.CRTC_GET_SEQUENCE, kernel.Sequence(crtc_id=controller))
+            self._ask(kernel.CRTC_GET_SEQUENCE, kernel.CrtcSequence(crtc_id=controller))
         except OSError:
             return False
         return True
 
-    def picture(self, size: Size) -> Picture:
+    def picture(self, size: Size) -> DumbBuffer:
         """Make a black picture."""
         memory = kernel.CreateDumb(width=size.width_px, height=size.height_px, bpp=32)
         self._ask(kernel.CREATE_DUMB, memory)
@@ -173,19 +248,19 @@ class Card:
         self._ask(kernel.ADD_FB, buffer)
         place = kernel.MapDumb(handle=memory.handle)
         self._ask(kernel.MAP_DUMB, place)
-        rows = np.frombuffer(kernel.mapped(self.handle, memory.size, place.offset), np.uint8)
+        rows = np.frombuffer(kernel.map_memory(self.handle, memory.size, place.offset), np.uint8)
         rows = rows[: memory.pitch * size.height_px].reshape(size.height_px, memory.pitch)
         pixels = rows[:, : 4 * size.width_px].view("<u4")
         pixels[:] = 0
-        return Picture(buffer.fb_id, memory.handle, pixels)
+        return DumbBuffer(buffer.fb_id, memory.handle, pixels)
 
     def forget(self, pictures: Iterable[tuple[int, int]]) -> None:
         """Free pictures, each a frame buffer and its memory's handle. What is scanned out goes off with its picture."""
         for number, handle in pictures:
             with suppress(OSError):
-                self._ask(kernel.REMOVE_FB, kernel.Number(number=number))
+                self._ask(kernel.REMOVE_FB, kernel.ObjectNumber(number=number))
             with suppress(OSError):
-                self._ask(kernel.DESTROY_DUMB, kernel.Number(number=handle))
+                self._ask(kernel.DESTROY_DUMB, kernel.ObjectNumber(number=handle))
 
     def blob(self, content: bytes) -> int:
         """Give the kernel bytes that a property can refer to."""
@@ -194,7 +269,7 @@ class Card:
         self._ask(kernel.CREATE_BLOB, told)
         return int(told.blob_id)
 
-    def commit(self, changes: Sequence[Change], *, flags: int, number: int = 0) -> None:
+    def commit(self, changes: Sequence[PropertyChange], *, flags: int, number: int = 0) -> None:
         """Set properties of several objects at once."""
         by_object: dict[int, list[tuple[int, int]]] = {}
         for each, prop, value in changes:
@@ -265,7 +340,7 @@ class Card:
         """Whether this handle alone may say what the outputs show."""
         try:
             # As libdrm asks: the request is for masters only, and this number is nobody's.
-            self._ask(kernel.AUTH_MAGIC, kernel.Number(number=0))
+            self._ask(kernel.AUTH_MAGIC, kernel.ObjectNumber(number=0))
         except OSError as error:
             return error.errno != errno.EACCES
         return True
@@ -317,4 +392,4 @@ class Card:
         return told.name.decode(), {word.name.decode(): word.value for word in words[: there.count_enum_blobs]}
 
     def _ask(self, request: int, structure: ctypes.Structure) -> None:
-        kernel.ask(self.handle, request, structure)
+        kernel.ioctl(self.handle, request, structure)

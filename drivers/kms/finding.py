@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.display.edid import Edid, parse
+from drivers.display.edid import Edid, parse_edid
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 
 SYSTEM = Path("/sys/class/drm")
@@ -17,7 +17,7 @@ _NEVER = ("Writeback",)
 
 
 @dataclass(frozen=True, slots=True)
-class Connector:
+class ListedConnector:
     """A connector of a graphics card.
 
     card : the card's node. status : connected, disconnected or unknown, as of the kernel's last look. mode : the first
@@ -35,7 +35,7 @@ class Connector:
         return f"{self.name} ({told})"
 
 
-def connectors() -> tuple[Connector, ...]:
+def connectors() -> tuple[ListedConnector, ...]:
     """Every connector of every card, by name."""
     found = []
     for folder in SYSTEM.glob("card*-*"):
@@ -43,18 +43,18 @@ def connectors() -> tuple[Connector, ...]:
         if matched is not None and not matched[2].startswith(_NEVER):
             lines = _read(folder / "modes").decode("ascii", "replace").split()
             found.append(
-                Connector(
+                ListedConnector(
                     matched[2],
                     DEVICES / matched[1],
                     _read(folder / "status").decode("ascii", "replace").strip() or "unknown",
                     lines[0] if lines else "",
-                    parse(_read(folder / "edid")),
+                    parse_edid(_read(folder / "edid")),
                 )
             )
     return tuple(sorted(found, key=lambda connector: connector.name))
 
 
-def chosen(name: str) -> Connector:
+def find_connector(name: str) -> ListedConnector:
     """Return the connector of that name.
 
     Raises
@@ -81,7 +81,7 @@ def chosen(name: str) -> Connector:
     raise UnsupportedByDeviceError(message)
 
 
-def gone(name: str) -> DeviceGoneError:
+def not_connected_error(name: str) -> DeviceGoneError:
     """Nothing is connected: what to say of it."""
     others = "; ".join(str(each) for each in connectors() if each.status == "connected") or "none"
     message = (
@@ -96,9 +96,9 @@ def is_unplugged(name: str, card: Path) -> bool:
     return _read(SYSTEM / f"{card.name}-{name}" / "status").strip() == b"disconnected"
 
 
-def display(name: str, card: Path) -> Edid | None:
+def read_edid(name: str, card: Path) -> Edid | None:
     """What is connected, as of the kernel's last look."""
-    return parse(_read(SYSTEM / f"{card.name}-{name}" / "edid"))
+    return parse_edid(_read(SYSTEM / f"{card.name}-{name}" / "edid"))
 
 
 def _read(path: Path) -> bytes:

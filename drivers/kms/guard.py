@@ -5,8 +5,9 @@ The guard has the same open card: as long as it has, the card stays ours, and no
 black when the process that it watches has ended, or when it is told to (`cover` on its standard input, answered by the
 same line); it ends when it is told to (`release`; no answer), or some time after that process.
 
-A process of the same user may take the card over, after the one that is watched has ended: it connects to `address`,
-gets one line and the open card with it, and says when it has a guard of its own. No light is seen in between.
+A process of the same user may take the card over, after the one that is watched has ended: it connects to
+`guard_address`, gets one line and the open card with it, and says when it has a guard of its own. No light is seen in
+between.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _ANSWERS_IN_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Duty:
+class KmsGuardTask:
     """What to make black, by which open card, on behalf of which process, and for how long after its end.
 
     mode : as the kernel has it, in hexadecimal. black : the picture. pictures : all of them, as frame buffers with the
@@ -47,13 +48,13 @@ class Duty:
     dark_after_s: float
 
 
-def address(handle: int) -> str:
+def guard_address(handle: int) -> str:
     """Where the guard of an open card is reached: a socket without a file, one for each card."""
     return f"\0slrig-kms-{os.fstat(handle).st_rdev}"
 
 
-class _Guard:
-    def __init__(self, duty: Duty) -> None:
+class _KmsGuard:
+    def __init__(self, duty: KmsGuardTask) -> None:
         self._duty = duty
         self._listening = self._heard_of()
         self._process: int | None = None
@@ -136,7 +137,7 @@ class _Guard:
 
     def _heard_of(self) -> socket.socket:
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        listening.bind(address(self._duty.handle))
+        listening.bind(guard_address(self._duty.handle))
         listening.listen(1)
         return listening
 
@@ -146,14 +147,14 @@ class _Guard:
             os.write(sys.stdout.fileno(), f"{word}\n".encode())
 
 
-def described(duty: Duty) -> str:
+def described(duty: KmsGuardTask) -> str:
     """A duty as the guard's argument."""
     return json.dumps(asdict(duty))
 
 
 def main(arguments: Sequence[str]) -> None:
     """Do the duty that the first argument describes (JSON)."""
-    _Guard(Duty(**json.loads(arguments[0]))).run()
+    _KmsGuard(KmsGuardTask(**json.loads(arguments[0]))).run()
 
 
 if __name__ == "__main__":

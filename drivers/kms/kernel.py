@@ -123,7 +123,7 @@ class FrameBuffer(ctypes.Structure):
     _fields_ = tuple((name, _U32) for name in ("fb_id", "width", "height", "pitch", "bpp", "depth", "handle"))
 
 
-class Number(ctypes.Structure):
+class ObjectNumber(ctypes.Structure):
     """One number: what `RMFB`, `MODE_DESTROY_DUMB` and `AUTH_MAGIC` take."""
 
     _fields_ = (("number", _U32),)
@@ -230,7 +230,7 @@ class ClientCap(ctypes.Structure):
     _fields_ = (("capability", _U64), ("value", _U64))
 
 
-class Sequence(ctypes.Structure):
+class CrtcSequence(ctypes.Structure):
     """`drm_crtc_get_sequence`: the count of refreshes, by drivers that count them."""
 
     _fields_ = (("crtc_id", _U32), ("active", _U32), ("sequence", _U64), ("sequence_ns", ctypes.c_int64))
@@ -251,9 +251,9 @@ def _both_ways(number: int, structure: type[ctypes.Structure]) -> int:
     return 3 << 30 | ctypes.sizeof(structure) << 16 | ord("d") << 8 | number
 
 
-AUTH_MAGIC = 1 << 30 | ctypes.sizeof(Number) << 16 | ord("d") << 8 | 0x11
+AUTH_MAGIC = 1 << 30 | ctypes.sizeof(ObjectNumber) << 16 | ord("d") << 8 | 0x11
 SET_CLIENT_CAP = 1 << 30 | ctypes.sizeof(ClientCap) << 16 | ord("d") << 8 | 0x0D
-CRTC_GET_SEQUENCE = _both_ways(0x3B, Sequence)
+CRTC_GET_SEQUENCE = _both_ways(0x3B, CrtcSequence)
 GET_RESOURCES = _both_ways(0xA0, Resources)
 GET_CRTC = _both_ways(0xA1, Crtc)
 SET_CRTC = _both_ways(0xA2, Crtc)
@@ -263,11 +263,11 @@ GET_ENCODER = _both_ways(0xA6, GetEncoder)
 GET_CONNECTOR = _both_ways(0xA7, GetConnector)
 GET_PROPERTY = _both_ways(0xAA, GetProperty)
 ADD_FB = _both_ways(0xAE, FrameBuffer)
-REMOVE_FB = _both_ways(0xAF, Number)
+REMOVE_FB = _both_ways(0xAF, ObjectNumber)
 PAGE_FLIP = _both_ways(0xB0, PageFlip)
 CREATE_DUMB = _both_ways(0xB2, CreateDumb)
 MAP_DUMB = _both_ways(0xB3, MapDumb)
-DESTROY_DUMB = _both_ways(0xB4, Number)
+DESTROY_DUMB = _both_ways(0xB4, ObjectNumber)
 GET_PLANE_RESOURCES = _both_ways(0xB5, PlaneResources)
 GET_PLANE = _both_ways(0xB6, GetPlane)
 GET_PROPERTIES = _both_ways(0xB9, ObjectProperties)
@@ -276,12 +276,12 @@ ATOMIC = _both_ways(0xBC, Atomic)
 CREATE_BLOB = _both_ways(0xBD, CreateBlob)
 
 
-def opened(path: str) -> int:
+def open_card(path: str) -> int:
     """Open a card. Raises OSError."""
     return os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)
 
 
-def ask(handle: int, request: int, structure: ctypes.Structure) -> None:
+def ioctl(handle: int, request: int, structure: ctypes.Structure) -> None:
     """Make a request; the answer is in the structure. Raises OSError."""
     # Late, so that what looks at this module on another system is not refused.
     import fcntl
@@ -297,7 +297,7 @@ def ask(handle: int, request: int, structure: ctypes.Structure) -> None:
             return
 
 
-def mapped(handle: int, size: int, offset: int) -> mmap.mmap:
+def map_memory(handle: int, size: int, offset: int) -> mmap.mmap:
     """The memory behind an offset that `MAP_DUMB` gave. Raises OSError."""
     return mmap.mmap(handle, size, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset)
 
@@ -318,4 +318,4 @@ def set_mode(handle: int, controller: int, connector: int, mode: bytes, picture:
         mode_valid=1,
         mode=ModeInfo.from_buffer_copy(mode),
     )
-    ask(handle, SET_CRTC, order)
+    ioctl(handle, SET_CRTC, order)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from drivers.display.options import DisplayOptions
+from drivers.display.projector import DisplayOptions
 
 
 class KmsOptions(DisplayOptions, use_attribute_docstrings=True):

@@ -51,9 +51,9 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
         It cannot do what the options ask.
     """
     from drivers.opencv.camera import OpenCvCamera
-    from drivers.opencv.options import source_of
+    from drivers.opencv.options import parse_source
 
-    return OpenCvCamera(name, source_of(name, options, folder))
+    return OpenCvCamera(name, parse_source(name, options, folder))
 
 
 __all__ = ["open_camera"]

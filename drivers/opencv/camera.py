@@ -3,26 +3,98 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from drivers.opencv.controls import Controls, code_of, negotiate, size_of
-from drivers.opencv.feeds import DeviceFeed, FilmFeed, LiveFeed, Taken, opened
-from drivers.opencv.kernel import plain_pictures
-from drivers.opencv.options import Kind, Source
-from drivers.opencv.pixels import Picture, decoded_picture, raw_picture
-from drivers.opencv.reader import Reader
-from drivers.opencv.timing import Arrivals
-from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, prepare
+from drivers.opencv.controls import CaptureControls, negotiate, read_fourcc, read_size, switch_off_automatics
+from drivers.opencv.feeds import ArrivalTiming, DeviceFeed, FilmFeed, FrameReader, GrabbedFrame, LiveFeed, open_capture
+from drivers.opencv.options import CaptureSource, SourceKind
+from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, colour_image, grey_image, prepare
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import DeviceError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
-from slrig.model import Frame
+from slrig.model import CameraFormat, Frame, Pixels, Size
+
+
+@dataclass(frozen=True, slots=True)
+class FrameDecoder:
+    """What comes from OpenCV: the pixel format of raw data (None: decoded pictures), the camera's format, and whether
+    there is colour in it.
+    """
+
+    code: str | None
+    format: CameraFormat
+    has_colour: bool = False
+
+    def grey(self, data: NDArray[Any]) -> Pixels:
+        """Return (H, W), uint8 up to 8 bit and uint16 beyond.
+
+        Raises
+        ------
+        CorruptFrameError
+            Parts of it are missing, or it is of another extent, or brighter than the format allows.
+        """
+        image = self._decoded(data) if self.code is None else self._read(data, self.code)
+        if image.shape != self.format.size.shape:
+            message = f"it is {image.shape[1]} x {image.shape[0]}, the camera's frames are {self.format.size}"
+            raise CorruptFrameError(message)
+        wanted = np.uint8 if self.format.bit_depth <= 8 else np.uint16
+        brightest = int(image.max(initial=0))
+        if image.dtype != wanted or brightest > self.format.full_scale:
+            message = f"it is {image.dtype} up to {brightest}, {self.format.bit_depth} bits end at " + str(
+                self.format.full_scale
+            )
+            raise CorruptFrameError(message)
+        return image
+
+    def _decoded(self, data: NDArray[Any]) -> Pixels:
+        if data.ndim == 3 and data.shape[2] == 3:
+            return np.asarray(cv2.cvtColor(data, cv2.COLOR_BGR2GRAY))
+        return np.ascontiguousarray(data[..., 0] if data.ndim == 3 else data)
+
+    def colour(self, data: NDArray[Any]) -> Pixels:
+        """Return (H, W, 3), blue, green and red, of data that `grey` has taken and that has colour."""
+        return data if self.code is None else self._read(data, self.code, colour_image)
+
+    def _read(self, data: NDArray[Any], code: str, made: Callable[..., Pixels] = grey_image) -> Pixels:
+        layout, size = LAYOUTS[code], self.format.size
+        plain = np.ascontiguousarray(data).reshape(-1).view(np.uint8)
+        return made(plain, layout, size, stride_bytes=len(plain) // size.height_px)
+
+
+def raw_decoder(code: str | None, size: Size, bit_depth: int | None) -> FrameDecoder:
+    """Return what frames of this pixel format and extent are; of None, decoded pictures of 8 bits.
+
+    bit_depth : how many bits of a 16-bit sample are used; None for all of them.
+    """
+    depth = 8 if code is None else LAYOUTS[code].bit_depth
+    form = CameraFormat(size, bit_depth if depth == 16 and bit_depth is not None else depth)
+    return FrameDecoder(code, form, code is None or LAYOUTS[code].has_colour)
+
+
+def image_decoder(data: NDArray[Any], bit_depth: int | None) -> FrameDecoder:
+    """Return what a source's frames are, from the first that OpenCV has decoded.
+
+    Raises
+    ------
+    CorruptFrameError
+        Its samples are neither of 8 nor of 16 bits.
+    """
+    if data.dtype not in (np.uint8, np.uint16):
+        message = f"its samples are {data.dtype}, expected uint8 or uint16"
+        raise CorruptFrameError(message)
+    rows, columns = data.shape[:2]
+    depth = 8 if data.dtype == np.uint8 else bit_depth or 16
+    return FrameDecoder(None, CameraFormat(Size(columns, rows), depth), data.shape[2:] == (3,))
+
 
 _Feed = DeviceFeed | LiveFeed | FilmFeed
-_Open = tuple[_Feed, Picture, Controls | None]
+_Open = tuple[_Feed, FrameDecoder, CaptureControls | None]
 
 _SAME = 0.01
 _PATIENCE_S = 2.0
@@ -32,7 +104,7 @@ _USUAL_PERIOD_S = 1 / 30
 
 
 @dataclass(slots=True)
-class _PassedOver:
+class _RejectedFrames:
     """Frames that came and were not given, by cause."""
 
     stale: int = 0
@@ -59,7 +131,7 @@ class OpenCvCamera:
         See `drivers.opencv.open_camera`.
     """
 
-    def __init__(self, name: str, source: Source) -> None:
+    def __init__(self, name: str, source: CaptureSource) -> None:
         self._name = name
         self._source = source
         self._state = CameraState(name)
@@ -68,9 +140,13 @@ class OpenCvCamera:
         self._corrupt = 0
         self._exposure_s = source.options.source_exposure_s or 0.0
         self._notes: tuple[str, ...] = ()
-        opening = {Kind.DEVICE: self._open_device, Kind.LIVE: self._open_live, Kind.FILM: self._open_film}
+        opening = {
+            SourceKind.DEVICE: self._open_device,
+            SourceKind.LIVE: self._open_live,
+            SourceKind.FILM: self._open_film,
+        }
         self._feed, self._picture, self._controls = opening[source.kind]()
-        self._reader = Reader(self._feed, f"slrig-opencv-{name}")
+        self._reader = FrameReader(self._feed, f"slrig-opencv-{name}")
         exposures_s, gains = (self._exposure_s, self._exposure_s), (1.0, 1.0)
         self._applied = AppliedSettings(self._exposure_s, 1.0)
         if self._controls is not None:
@@ -87,7 +163,7 @@ class OpenCvCamera:
             notes=self._notes,
             colour=self._picture.has_colour,
         )
-        if source.kind is Kind.LIVE:
+        if source.kind is SourceKind.LIVE:
             self._reader.start()
 
     @property
@@ -125,7 +201,7 @@ class OpenCvCamera:
         self._state.check_arming(count, trigger, self._info)
         self._armed_ns = time.monotonic_ns()
         self._lost_before = self._corrupt = 0
-        if self._source.kind is Kind.LIVE:
+        if self._source.kind is SourceKind.LIVE:
             self._reader.forget()
             self._require_alive()
         else:
@@ -142,7 +218,7 @@ class OpenCvCamera:
         self._state.require_armed()
         until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         after_ns = max(after_ns, self._armed_ns)
-        passed = _PassedOver()
+        passed = _RejectedFrames()
         while True:
             taken = self._reader.next(until_ns)
             self._state.require_armed()
@@ -155,7 +231,7 @@ class OpenCvCamera:
     def disarm(self) -> None:
         """See `Camera`."""
         self._state.armed = None
-        if self._source.kind is not Kind.LIVE and not self._state.closed.is_set():
+        if self._source.kind is not SourceKind.LIVE and not self._state.closed.is_set():
             self._halt()
 
     def close(self) -> None:
@@ -163,7 +239,7 @@ class OpenCvCamera:
         if self._state.close():
             self._reader.close()
 
-    def _judged(self, taken: Taken, after_ns: int, passed: _PassedOver) -> Frame | None:
+    def _judged(self, taken: GrabbedFrame, after_ns: int, passed: _RejectedFrames) -> Frame | None:
         exposed = taken.exposed
         if exposed is None:
             passed.untimed += 1
@@ -178,7 +254,7 @@ class OpenCvCamera:
             passed.last_fault = str(fault)
             self._corrupt += 1
             return None
-        start_ns, end_ns, error_ns = exposed.centred(round(self._applied.exposure_s * 1e9))
+        start_ns, end_ns, error_ns = exposed.centred_exposure(round(self._applied.exposure_s * 1e9))
         return Frame(
             camera=self._name,
             image=image,
@@ -192,7 +268,7 @@ class OpenCvCamera:
             colour=partial(self._picture.colour, taken.data) if self._picture.has_colour else None,
         )
 
-    def _nothing_came(self, after_ns: int, timeout_s: float, passed: _PassedOver) -> str:
+    def _nothing_came(self, after_ns: int, timeout_s: float, passed: _RejectedFrames) -> str:
         advice = "wait longer, or check its cable or network"
         arrivals = None if isinstance(self._feed, FilmFeed) else self._feed.arrivals
         if arrivals is not None:
@@ -256,11 +332,11 @@ class OpenCvCamera:
 
     def _open_device(self) -> _Open:
         source = self._source
-        capture = opened(source)
+        capture = open_capture(source)
         try:
             negotiate(capture, source.options, source.label)
             capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
-            code: str | None = code_of(capture)
+            code: str | None = read_fourcc(capture)
             if code not in LAYOUTS:
                 code = None
                 capture.set(cv2.CAP_PROP_CONVERT_RGB, 1)
@@ -271,10 +347,10 @@ class OpenCvCamera:
             arrivals = None if source.options.delay_s is None else self._arrivals()
             feed = DeviceFeed(capture, source.label, period_ns, arrivals)
             self._exposure_s = self._exposure_s or period_ns / 1e9
-            skipped, self._notes = plain_pictures(source.label, source.options.skip_controls)
+            skipped, self._notes = switch_off_automatics(source.label, source.options.skip_controls)
             fixed_s = self._exposure_s
-            controls = Controls(capture, source.options, source.label, fixed_s=fixed_s, skipped=skipped)
-            picture = raw_picture(code, size_of(capture), source.options.bit_depth)
+            controls = CaptureControls(capture, source.options, source.label, fixed_s=fixed_s, skipped=skipped)
+            picture = raw_decoder(code, read_size(capture), source.options.bit_depth)
         except BaseException:
             capture.release()
             raise
@@ -290,10 +366,10 @@ class OpenCvCamera:
             # Several threads decode several frames at once, and give each of them later.
             cv2.CAP_PROP_N_THREADS: 1,
         }
-        capture = opened(source, [each for pair in parameters.items() for each in pair] if streamed else ())
+        capture = open_capture(source, [each for pair in parameters.items() for each in pair] if streamed else ())
         try:
             code = None
-            if streamed and code_of(capture) == "MJPG" and capture.set(cv2.CAP_PROP_FORMAT, -1):
+            if streamed and read_fourcc(capture) == "MJPG" and capture.set(cv2.CAP_PROP_FORMAT, -1):
                 code = "MJPG"
             elif not streamed:
                 negotiate(capture, options, source.label)
@@ -306,22 +382,22 @@ class OpenCvCamera:
 
     def _open_film(self) -> _Open:
         source = self._source
-        feed = LiveFeed(opened(source), source.label, Arrivals(exposure_ns=0, delay_ns=0, period_ns=0))
+        feed = LiveFeed(open_capture(source), source.label, ArrivalTiming(exposure_ns=0, delay_ns=0, period_ns=0))
         try:
             picture = self._first_picture(feed, None)
         finally:
             feed.release()
-        return FilmFeed(lambda: opened(source), source), picture, None
+        return FilmFeed(lambda: open_capture(source), source), picture, None
 
-    def _arrivals(self) -> Arrivals:
+    def _arrivals(self) -> ArrivalTiming:
         options = self._source.options
-        return Arrivals(
+        return ArrivalTiming(
             exposure_ns=round(self._exposure_s * 1e9),
             delay_ns=round((options.delay_s or 0) * 1e9),
             period_ns=round(1e9 / (options.frame_rate_hz or 1 / _USUAL_PERIOD_S)),
         )
 
-    def _first_picture(self, feed: LiveFeed, code: str | None) -> Picture:
+    def _first_picture(self, feed: LiveFeed, code: str | None) -> FrameDecoder:
         """What the frames are, from the first one that is whole."""
         fault: CorruptFrameError | None = None
         for _ in range(_FIRST_FRAMES):
@@ -329,9 +405,9 @@ class OpenCvCamera:
             try:
                 bit_depth = self._source.options.bit_depth
                 if code is None:
-                    picture = decoded_picture(data, bit_depth)
+                    picture = image_decoder(data, bit_depth)
                 else:
-                    picture = raw_picture(code, size_of(feed.capture), bit_depth)
+                    picture = raw_decoder(code, read_size(feed.capture), bit_depth)
                 picture.grey(data)
             except CorruptFrameError as error:
                 fault = error

@@ -8,15 +8,82 @@ does not have reads as -1. On other systems the numbers mean other things, and n
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
+from ctypes import Structure
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 
 from drivers.opencv.options import OpenCvOptions
 from drivers.v4l2 import controls as v4l2
+from drivers.v4l2 import kernel
+from drivers.v4l2.controls import AUTOGAIN, exclude_controls, list_controls, set_control, switch_off_processing
+from drivers.v4l2.finding import query_identity
 from slrig.devices import AppliedSettings, CameraSettings
-from slrig.errors import UnsupportedByDeviceError
+from slrig.errors import DeviceGoneError, SlrigError, UnsupportedByDeviceError
 from slrig.model import Size
+
+
+def require_free(path: str) -> None:
+    """Raise unless a camera is there and nobody streams from it: only who does may free its buffers.
+
+    Raises
+    ------
+    DeviceGoneError, DeviceBusyError, UnsupportedByDeviceError, DeviceError
+        It is not there, is used, gives no frames, may not be opened.
+    """
+    none = kernel.BufferRequest(count=0, type=kernel.CAPTURE, memory=kernel.MMAP)
+    _request_once(path, "asking for frames", kernel.REQBUFS, none)
+
+
+def require_present(path: str, otherwise: DeviceGoneError) -> None:
+    """Raise `otherwise` unless the camera answers."""
+    try:
+        _request_once(path, "asking what it is", kernel.QUERYCAP, kernel.Capability())
+    except SlrigError as error:
+        raise otherwise from error
+
+
+def switch_off_automatics(path: str, skipped: Sequence[str]) -> tuple[frozenset[int], tuple[str, ...]]:
+    """Switch a camera's automatic gain and its own image processing off, which OpenCV has no names for.
+
+    Return the numbers of the controls that are left alone, by the names that `skipped` has, and notes for a person.
+
+    Raises
+    ------
+    DeviceGoneError, DeviceError
+        It is not there, or fails.
+    UnsupportedByDeviceError
+        It has no control of such a name, or its automatic gain cannot be switched off.
+    """
+    node = Path(path)
+    try:
+        handle = kernel.open_node(node)
+        try:
+            everything = list_controls(handle)
+            mine = exclude_controls(everything, skipped, node)
+            if AUTOGAIN in mine:
+                set_control(handle, node, mine[AUTOGAIN], 0)
+            notes = switch_off_processing(handle, node, mine, named=(), is_uvc=query_identity(handle).is_uvc)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise kernel.device_error(node, "setting its controls", error) from error
+    return frozenset(everything.keys() - mine.keys()), notes
+
+
+def _request_once(path: str, doing: str, request: int, argument: Structure) -> None:
+    try:
+        handle = kernel.open_node(Path(path))
+        try:
+            kernel.ioctl(handle, request, argument)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise kernel.device_error(Path(path), doing, error) from error
+
 
 EXPOSURE_UNIT_S = 1e-4
 _ABSENT = -1.0
@@ -35,12 +102,12 @@ _KERNELS = {
 """The kernel's control behind each of OpenCV's numbers."""
 
 
-def code_of(capture: cv2.VideoCapture) -> str:
+def read_fourcc(capture: cv2.VideoCapture) -> str:
     """The four characters of the pixel format in use."""
     return int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=False).decode("latin-1")
 
 
-def size_of(capture: cv2.VideoCapture) -> Size:
+def read_size(capture: cv2.VideoCapture) -> Size:
     """The extent in use. Raises UnsupportedByDeviceError where OpenCV tells none."""
     width, height = (int(capture.get(number)) for number in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     if width < 1 or height < 1:
@@ -61,7 +128,7 @@ def negotiate(capture: cv2.VideoCapture, options: OpenCvOptions, label: str) -> 
     if options.fourcc is not None:
         asked = options.fourcc.ljust(4)
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*asked))
-        got = code_of(capture)
+        got = read_fourcc(capture)
         if got != asked:
             message = (
                 f"{label}: asked for pixel format {asked.strip()}, the driver gives {got.strip()}; choose one of "
@@ -71,7 +138,7 @@ def negotiate(capture: cv2.VideoCapture, options: OpenCvOptions, label: str) -> 
     if options.size is not None:
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, options.size.width_px)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, options.size.height_px)
-        found = size_of(capture)
+        found = read_size(capture)
         if found != options.size:
             message = (
                 f"{label}: asked for {options.size}, the driver gives {found}; choose one of "
@@ -91,14 +158,14 @@ def negotiate(capture: cv2.VideoCapture, options: OpenCvOptions, label: str) -> 
 
 
 @dataclass(frozen=True, slots=True)
-class Range:
+class ControlRange:
     """The numbers that a control takes."""
 
     least: float
     most: float
 
 
-class Controls:
+class CaptureControls:
     """The controls of an open camera. Made once it streams with its format; switches every automatic off.
 
     `exposure_s` of a device that cannot be set is `fixed_s`. Gain 1 is the least that the device can do, and each of
@@ -163,7 +230,7 @@ class Controls:
             gain = 1.0 + self._capture.get(cv2.CAP_PROP_GAIN) - self._gain.least
         return AppliedSettings(exposure_s, gain)
 
-    def _range(self, number: int, least: float, most: float) -> Range | None:
+    def _range(self, number: int, least: float, most: float) -> ControlRange | None:
         """Find the ends of a control's range, which OpenCV does not tell: the kernel clamps. Leaves it as it was."""
         if not self._has(number):
             return None
@@ -173,7 +240,7 @@ class Controls:
             self._capture.set(number, far)
             ends.append(self._capture.get(number))
         self._capture.set(number, before)
-        return Range(min(ends), max(ends))
+        return ControlRange(min(ends), max(ends))
 
     def _has(self, number: int) -> bool:
         return _KERNELS[number] not in self._skipped and self._capture.get(number) != _ABSENT

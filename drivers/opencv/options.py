@@ -23,7 +23,7 @@ Extent = Annotated[int, Field(ge=1, le=65_536)]
 _NUMBERED = re.compile(r"%0?\d*d")
 
 
-class Kind(StrEnum):
+class SourceKind(StrEnum):
     """What a source is to the driver."""
 
     DEVICE = "device"
@@ -89,13 +89,13 @@ class OpenCvOptions(Strict, use_attribute_docstrings=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class CaptureSource:
     """A checked source: what is opened, with which of OpenCV's back ends, and how the times of its frames are known.
 
     `label` names it in messages, without the password that a URL may carry.
     """
 
-    kind: Kind
+    kind: SourceKind
     target: int | str
     backend: int
     label: str
@@ -135,25 +135,25 @@ _NEEDED: Mapping[type[OpenCvOptions], str] = {
 }
 
 
-def source_of(name: str, options: Mapping[str, object], folder: Path) -> Source:
+def parse_source(name: str, options: Mapping[str, object], folder: Path) -> CaptureSource:
     """Return the source that a camera's options mean. Raises ConfigError with all their faults."""
     device = options.get("device")
     model: type[OpenCvOptions] = OpenCvOptions
-    kind, usual, target = Kind.LIVE, cv2.CAP_ANY, device
+    kind, usual, target = SourceKind.LIVE, cv2.CAP_ANY, device
     if isinstance(device, str) and "://" in device:
-        kind, model, usual = Kind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
+        kind, model, usual = SourceKind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
     elif isinstance(device, str) and device and not device.startswith("/dev/"):
         target = str(folder / device)
         kind, model, usual = _file(name, folder / device)
     elif sys.platform == "linux" and options.get("backend", "auto") in {"auto", "v4l2"}:
-        kind, usual = Kind.DEVICE, cv2.CAP_V4L2
+        kind, usual = SourceKind.DEVICE, cv2.CAP_V4L2
         if "delay_s" in options:
             model = _UnstampedOptions
     elif device is not None:
         model = _LiveOptions
     plain = checked(model, options, f"the table of camera '{name}'", hint=_NEEDED[model])
     backend = {**_backends(), "auto": usual}[plain.backend]
-    return Source(
+    return CaptureSource(
         kind, target if isinstance(target, int) else str(target), backend, _label(plain.device, target), plain
     )
 
@@ -170,18 +170,18 @@ def _label(device: int | str, target: object) -> str:
     return _without_password(device) if "://" in device else str(target)
 
 
-def _file(name: str, path: Path) -> tuple[Kind, type[OpenCvOptions], int]:
+def _file(name: str, path: Path) -> tuple[SourceKind, type[OpenCvOptions], int]:
     if _NUMBERED.search(path.name):
-        return Kind.FILM, _SeriesOptions, cv2.CAP_IMAGES
+        return SourceKind.FILM, _SeriesOptions, cv2.CAP_IMAGES
     try:
         mode = path.stat().st_mode
     except OSError as error:
         message = f"camera '{name}': device = \"{path}\": expected a file, found: {error.strerror}; correct the path"
         raise ConfigError(message) from error
     if stat.S_ISREG(mode):
-        return Kind.FILM, _FilmOptions, cv2.CAP_FFMPEG
+        return SourceKind.FILM, _FilmOptions, cv2.CAP_FFMPEG
     if stat.S_ISFIFO(mode):
-        return Kind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
+        return SourceKind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
     message = f"camera '{name}': device = \"{path}\": expected a film or a pipe, found something else; name a file"
     raise ConfigError(message)
 

@@ -7,8 +7,7 @@ libcamera's documents, and tried on a stand-in that behaves as these say; no Ras
 - https://libcamera.org/api-html/namespacelibcamera_1_1controls.html (controls and metadata)
 """
 
-from drivers.picamera2.camera import PiCamera, open_camera
-from drivers.picamera2.library import find_devices
+from drivers.picamera2.camera import PiCamera, find_devices, open_camera
 from drivers.picamera2.options import PiCameraOptions
 
 __all__ = ["PiCamera", "PiCameraOptions", "find_devices", "open_camera"]

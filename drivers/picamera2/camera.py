@@ -7,15 +7,22 @@ the frame before; a longer time between two stamps is frames that were lost, or 
 
 from __future__ import annotations
 
+import importlib
+import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import TimeoutError as JobTimeoutError
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivers.picamera2.library import cameras, library, told
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.picamera2.options import PiCameraOptions
-from drivers.picamera2.stream import Stream, configured
+from drivers.v4l2.formats import PixelLayout, SamplePacking, colour_image, grey_image
 from slrig.bundle.validation import checked
 from slrig.devices import (
     AppliedSettings,
@@ -24,11 +31,152 @@ from slrig.devices import (
     CameraSettings,
     CameraState,
     Clock,
+    FoundDevice,
     SystemClock,
     Trigger,
 )
-from slrig.errors import DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
-from slrig.model import CameraFormat, Frame
+from slrig.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceGoneError,
+    FrameTimeoutError,
+    LibraryMissingError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import CameraFormat, Frame, Pixels, Size
+
+INSTALL = "sudo apt install python3-libcamera && pip install 'slrig[picamera2]'"
+
+
+def load_library() -> Any:
+    """Return the class `Picamera2`.
+
+    Raises
+    ------
+    LibraryMissingError
+        picamera2, or libcamera beneath it, is not installed.
+    """
+    try:
+        return importlib.import_module("picamera2").Picamera2
+    except ImportError as cause:
+        message = (
+            f"cameras of a Raspberry Pi need picamera2 and the system's libcamera, found: {cause}; {INSTALL} (in a "
+            "virtual environment that was made with --system-site-packages)"
+        )
+        raise LibraryMissingError(message, install=INSTALL) from cause
+
+
+def list_cameras() -> tuple[dict[str, Any], ...]:
+    """What libcamera tells of each camera, in picamera2's order: Id, Model, Num and more."""
+    return tuple(load_library().global_camera_info())
+
+
+@contextmanager
+def translate_errors(name: str, doing: str) -> Iterator[None]:
+    """Turn the library's errors within the block into slrig's: it raises RuntimeError for whatever goes wrong.
+
+    Raises
+    ------
+    DeviceBusyError
+        Another program has acquired the camera.
+    DeviceError
+        Anything else.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        causes = " ".join(filter(None, (str(error), str(error.__cause__ or ""))))
+        what = f"camera '{name}', {doing}: {causes}"
+        if "busy" in causes.lower() or "in use" in causes.lower():
+            raise DeviceBusyError(f"{what}; another program holds the camera: close that program") from error
+        raise DeviceError(f"{what}; check the camera's cable, and try rpicam-hello --list-cameras") from error
+
+
+def find_devices() -> tuple[FoundDevice, ...]:
+    """Every camera that libcamera sees; opens none.
+
+    Raises
+    ------
+    LibraryMissingError
+        picamera2 is not installed.
+    """
+    return tuple(FoundDevice("picamera2", each["Id"], f"{each['Model']} (libcamera)") for each in list_cameras())
+
+
+_UNPACKED = re.compile(r"^(S(?P<bayer>[RGB]{4})|R)(?P<depth>8|10|12|14|16)$")
+_LEAST_MAIN = (64, 64)
+"""picamera2 always makes a main stream; beside a raw one nobody reads it."""
+
+
+@dataclass(frozen=True, slots=True)
+class PiStream:
+    """The stream that is read, as it was configured."""
+
+    name: str
+    layout: PixelLayout
+    size: Size
+    stride_bytes: int
+
+    def colour(self, data: NDArray[np.uint8]) -> Callable[[], Pixels] | None:
+        """What makes (H, W, 3), blue, green and red, of a buffer; None where there is none."""
+        if not self.layout.has_colour:
+            return None
+        return partial(colour_image, data, self.layout, self.size, stride_bytes=self.stride_bytes)
+
+    def image(self, data: NDArray[np.uint8]) -> Pixels:
+        """(H, W): the image in a buffer. Raises ValueError: it is too short."""
+        return grey_image(data, self.layout, self.size, stride_bytes=self.stride_bytes)
+
+
+def configure_stream(camera: Any, name: str, *, raw: bool, size_px: tuple[int, int] | None) -> PiStream:
+    """Configure the camera for a stream, and read back what it made of that.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        The sensor has no such mode, or libcamera gives another extent or a format that is not read.
+    """
+    modes = [mode for mode in camera.sensor_modes if "size" in mode]
+    sizes = sorted({tuple(mode["size"]) for mode in modes}, key=lambda size: size[0] * size[1])
+    wanted = sizes[-1] if size_px is None and sizes else size_px
+    offered = ", ".join(f"{width} x {height}" for width, height in sizes) or "none that has an extent"
+    if wanted not in sizes:
+        message = f"camera '{name}': asked for size_px {wanted}, its sensor has the modes {offered}; choose one of them"
+        raise UnsupportedByDeviceError(message)
+    mode = max((mode for mode in modes if tuple(mode["size"]) == wanted), key=lambda mode: mode["bit_depth"])
+    sensor = {"output_size": wanted, "bit_depth": mode["bit_depth"]}
+    if raw:
+        table = {"raw": {"format": mode["unpacked"], "size": wanted}, "main": {"size": _LEAST_MAIN}}
+    else:
+        table = {"main": {"format": "YUV420", "size": wanted}}
+    camera.configure(camera.create_video_configuration(**table, sensor=sensor, controls={}, display=None, encode=None))
+    which = "raw" if raw else "main"
+    got = camera.camera_configuration()[which]
+    layout = _layout(got["format"])
+    if layout is None or tuple(got["size"]) != wanted:
+        message = (
+            f"camera '{name}': asked for {table[which]}, libcamera gives {got['format']}, {got['size']}; "
+            f'write pixels = "{"luma" if raw else "raw"}", or another size_px (the sensor has {offered})'
+        )
+        raise UnsupportedByDeviceError(message)
+    return PiStream(which, layout, Size(*wanted), got["stride"])
+
+
+def _layout(form: str) -> PixelLayout | None:
+    """How a format of libcamera's lies in memory; None if it is not read.
+
+    >>> _layout("SRGGB10").bayer, _layout("R8").packing.name, _layout("RGGB16_PISP_COMP1")
+    ('RGGB', 'BYTES', None)
+    """
+    if form == "YUV420":
+        # Planes: all luma first, then the colours, which are not looked at.
+        return PixelLayout(8, SamplePacking.BYTES)
+    found = _UNPACKED.match(form)
+    if found is None:
+        return None
+    depth = int(found["depth"])
+    return PixelLayout(depth, SamplePacking.BYTES if depth == 8 else SamplePacking.WORDS, found["bayer"])
+
 
 FIXED: Mapping[str, object] = {
     "AeEnable": False,
@@ -86,19 +234,19 @@ class PiCamera:
         self._name, self._options = name, options
         self._clock = clock or SystemClock()
         self._state = CameraState(name)
-        known = cameras()
+        known = list_cameras()
         numbers = [number for number, each in enumerate(known) if each["Id"] == options.device]
         if not numbers:
             found = ", ".join(each["Id"] for each in known) or "none"
             message = f"camera '{name}': no camera '{options.device}' is connected; found: {found}; check its cable"
             raise DeviceGoneError(message)
         self._job: Any = None
-        with told(name, "opening it"):
-            self._camera = library()(numbers[0])
+        with translate_errors(name, "opening it"):
+            self._camera = load_library()(numbers[0])
         try:
-            with told(name, "configuring it"):
+            with translate_errors(name, "configuring it"):
                 raw = options.pixels == "raw"
-                self._stream: Stream = configured(self._camera, name, raw=raw, size_px=options.size_px)
+                self._stream: PiStream = configure_stream(self._camera, name, raw=raw, size_px=options.size_px)
                 self._controls = self._camera.camera_controls
                 self._camera.set_controls(self._fixed())
             self._info = self._declared(known[numbers[0]])
@@ -121,8 +269,8 @@ class PiCamera:
         """
         self._state.check_settings(settings, self._info)
         told_last = self._taken(settings.exposure_s, settings.gain, _SETTLING_FRAMES)
-        got = _applied(told_last)
-        if not _as_asked(told_last, settings.exposure_s, settings.gain):
+        got = _applied_settings(told_last)
+        if not _is_applied(told_last, settings.exposure_s, settings.gain):
             message = (
                 f"camera '{self._name}': asked for exposure_s {settings.exposure_s:g} and gain {settings.gain:g}, it "
                 f"gives {got.exposure_s:g} and {got.gain:g}; ask for that"
@@ -134,7 +282,7 @@ class PiCamera:
         """See `Camera`. Starts the camera afresh: no frame of an earlier arming can come."""
         self._state.check_arming(count, trigger, self._info)
         self._last_ns = self._number = self._dropped = 0
-        with told(self._name, "starting it"):
+        with translate_errors(self._name, "starting it"):
             self._camera.start()
         self._state.armed = trigger
 
@@ -149,7 +297,7 @@ class PiCamera:
         passed = 0
         while True:
             left_s = (until_ns - self._clock.now_ns()) / 1e9
-            with told(self._name, "waiting for a frame"):
+            with translate_errors(self._name, "waiting for a frame"):
                 request = self._next(max(min(left_s, _SLICE_S), 0.0))
             if request is not None:
                 try:
@@ -187,7 +335,7 @@ class PiCamera:
         exposure_us = round(exposure_s * 1e6)
         fastest_us = self._controls["FrameDurationLimits"][0]
         limits = (fastest_us, max(fastest_us, exposure_us + _BLANK_US))
-        with told(self._name, "setting exposure and gain"):
+        with translate_errors(self._name, "setting exposure and gain"):
             self._camera.set_controls(
                 {"ExposureTime": exposure_us, "AnalogueGain": gain, "FrameDurationLimits": limits}
             )
@@ -201,7 +349,7 @@ class PiCamera:
                     metadata: Mapping[str, Any] = request.get_metadata()
                     request.release()
                     most -= 1
-                    if _as_asked(metadata, exposure_s, gain) or most <= 0:
+                    if _is_applied(metadata, exposure_s, gain) or most <= 0:
                         return metadata
             finally:
                 self._stop()
@@ -222,7 +370,7 @@ class PiCamera:
             # Stopping waits for the jobs before it, and so forever where no frame comes any more.
             self._camera.cancel_all_and_flush()
             self._job = None
-        with told(self._name, "stopping it"):
+        with translate_errors(self._name, "stopping it"):
             self._camera.stop()
 
     def _frame(self, request: Any, after_ns: int) -> Frame | None:
@@ -287,16 +435,16 @@ class PiCamera:
         return fixed if focus is None else {**fixed, "AfMode": 0, "LensPosition": focus}
 
 
-def _applied(metadata: Mapping[str, Any]) -> AppliedSettings:
+def _applied_settings(metadata: Mapping[str, Any]) -> AppliedSettings:
     exposure_s, period_s = metadata["ExposureTime"] / 1e6, metadata["FrameDuration"] / 1e6
     return AppliedSettings(exposure_s, float(metadata["AnalogueGain"]), period_s)
 
 
-def _as_asked(metadata: Mapping[str, Any], exposure_s: float, gain: float) -> bool:
-    return _near(metadata["ExposureTime"], exposure_s * 1e6) and _near(metadata["AnalogueGain"], gain)
+def _is_applied(metadata: Mapping[str, Any], exposure_s: float, gain: float) -> bool:
+    return _is_close(metadata["ExposureTime"], exposure_s * 1e6) and _is_close(metadata["AnalogueGain"], gain)
 
 
-def _near(got: float, asked: float) -> bool:
+def _is_close(got: float, asked: float) -> bool:
     return abs(got - asked) <= max(_AS_ASKED * asked, 1e-3)
 
 

@@ -57,9 +57,9 @@ def find_devices() -> tuple[FoundDevice, ...]:
         This is not Linux.
     """
     _require_system()
-    from drivers.v4l2.finding import found_devices, nodes
+    from drivers.v4l2.finding import list_nodes, to_found_devices
 
-    return found_devices(nodes())
+    return to_found_devices(list_nodes())
 
 
 def _require_system() -> None:

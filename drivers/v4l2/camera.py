@@ -12,15 +12,12 @@ from functools import partial
 
 from drivers.v4l2 import controls as ctl
 from drivers.v4l2 import kernel
-from drivers.v4l2.finding import Identity, Node, identity_of, resolved
-from drivers.v4l2.formats import CorruptFrameError, Layout, colour_image, grey_image, prepare
-from drivers.v4l2.negotiation import agree
+from drivers.v4l2.controls import GainScale, exposure_scale, switch_off_processing
+from drivers.v4l2.finding import CameraNode, NodeIdentity, query_identity, resolve_node
+from drivers.v4l2.formats import CorruptFrameError, PixelLayout, colour_image, grey_image, prepare
 from drivers.v4l2.options import V4L2Options
-from drivers.v4l2.processing import switch_off_processing
-from drivers.v4l2.scales import GainScale, exposure_scale
-from drivers.v4l2.stream import Stream, Taken, Waker
-from drivers.v4l2.tally import Tally
-from drivers.v4l2.timing import Durations, Exposure, exposure_of
+from drivers.v4l2.stream import FilledBuffer, FrameCounter, V4L2Stream, Waker, negotiate_format
+from drivers.v4l2.timing import ExposureInterval, SensorDurations, exposure_interval
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Pixels
@@ -33,7 +30,7 @@ _PATIENCE_S = 2.0
 
 
 @dataclass(slots=True)
-class _PassedOver:
+class _SkippedFrames:
     """Frames that came and were not given, by cause."""
 
     stale: int = 0
@@ -61,34 +58,34 @@ class V4L2Camera:
     """
 
     def __init__(self, name: str, options: V4L2Options) -> None:
-        node = resolved(options.device)
+        node = resolve_node(options.device)
         self._name = name
         self._node = node.path
         self._options = options
         self._lock = threading.RLock()
         self._state = CameraState(name)
-        self._tally = Tally()
+        self._tally = FrameCounter()
         try:
             self._handle = kernel.open_node(node.path)
         except OSError as error:
-            raise kernel.fault(node.path, "opening", error) from error
+            raise kernel.device_error(node.path, "opening", error) from error
         self._held = ExitStack()
         self._held.callback(_close_quietly, self._handle)
         try:
             self._waker = Waker()
             self._held.callback(self._waker.close)
             identity = self._identity()
-            self._agreed = agree(self._handle, node.path, options)
+            self._agreed = negotiate_format(self._handle, node.path, options)
             prepare(self._agreed.layout)
-            self._stream = Stream(self._handle, node.path, options.buffers, self._waker)
+            self._stream = V4L2Stream(self._handle, node.path, options.buffers, self._waker)
             self._held.callback(self._stream.release)
             self._period_ns = self._agreed.period_ns
             try:
-                self._controls = ctl.without(ctl.controls_of(self._handle), options.skip_controls, node.path)
+                self._controls = ctl.exclude_controls(ctl.list_controls(self._handle), options.skip_controls, node.path)
                 width_px = self._agreed.size.width_px
                 self._exposure = exposure_scale(self._controls, self._handle, node.path, width_px=width_px)
             except OSError as error:
-                raise kernel.fault(node.path, "listing its controls", error) from error
+                raise kernel.device_error(node.path, "listing its controls", error) from error
             self._scale = GainScale(ctl.gain_control(self._controls), options.gain_unity)
             processed = switch_off_processing(
                 self._handle, node.path, self._controls, named=options.controls, is_uvc=identity.is_uvc
@@ -106,7 +103,7 @@ class V4L2Camera:
         return self._info
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> PixelLayout:
         """How the agreed pixel format is read."""
         return self._agreed.layout
 
@@ -159,7 +156,7 @@ class V4L2Camera:
         with self._lock:
             self._state.require_armed()
             until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
-            passed = _PassedOver()
+            passed = _SkippedFrames()
             while True:
                 taken = self._stream.take(until_ns)
                 if taken is not None:
@@ -188,7 +185,7 @@ class V4L2Camera:
             with self._lock:
                 self._held.close()
 
-    def _judged(self, taken: Taken, after_ns: int, passed: _PassedOver) -> Frame | None:
+    def _judged(self, taken: FilledBuffer, after_ns: int, passed: _SkippedFrames) -> Frame | None:
         """The frame if it may be given; None, and noted why, if not. The buffer goes back in any case."""
         is_new = self._tally.is_new(taken)
         exposure = self._exposure_of(taken)
@@ -199,13 +196,15 @@ class V4L2Camera:
         else:
             pictures = self._pictures(taken, passed)
             if pictures is not None:
-                self._stream.give_back(taken)
+                self._stream.requeue(taken)
                 return self._frame(*pictures, exposure)
             self._tally.note_corrupt()
-        self._stream.give_back(taken)
+        self._stream.requeue(taken)
         return None
 
-    def _pictures(self, taken: Taken, passed: _PassedOver) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
+    def _pictures(
+        self, taken: FilledBuffer, passed: _SkippedFrames
+    ) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
         if taken.corrupt:
             passed.corrupt += 1
             passed.last_fault = "the driver says that its data are damaged"
@@ -223,8 +222,8 @@ class V4L2Camera:
             passed.last_fault = str(fault)
             return None
 
-    def _frame(self, image: Pixels, colour: Callable[[], Pixels] | None, exposure: Exposure) -> Frame:
-        start_ns, end_ns, error_ns = exposure.centred(round(self._applied.exposure_s * 1e9))
+    def _frame(self, image: Pixels, colour: Callable[[], Pixels] | None, exposure: ExposureInterval) -> Frame:
+        start_ns, end_ns, error_ns = exposure.centred_exposure(round(self._applied.exposure_s * 1e9))
         return Frame(
             camera=self._name,
             image=image,
@@ -238,7 +237,7 @@ class V4L2Camera:
             colour=colour,
         )
 
-    def _exposure_of(self, taken: Taken) -> Exposure:
+    def _exposure_of(self, taken: FilledBuffer) -> ExposureInterval:
         exposure_ns = round(self._applied.exposure_s * 1e9)
         if self._exposure is None:
             exposure_ns = max(exposure_ns, self._period_ns)
@@ -246,14 +245,14 @@ class V4L2Camera:
         readout_ns = self._period_ns if readout_s is None else round(readout_s * 1e9)
         # A device that stamps frames with instants after their arrival stamps the others as late.
         delay_ns = max(round(self._options.stamp_delay_s * 1e9), self._tally.ahead_ns)
-        return exposure_of(taken.stamp, Durations(exposure_ns, readout_ns, delay_ns))
+        return exposure_interval(taken.stamp, SensorDurations(exposure_ns, readout_ns, delay_ns))
 
     def _settle(self) -> None:
         """Pass over the first frames, which may still be exposed as before, and measure the frame period."""
         wanted = self._options.settle_frames
         slowest_ns = max(self._agreed.period_ns, round(self._applied.exposure_s * 1e9))
         until_ns = time.monotonic_ns() + 4 * wanted * slowest_ns + round(_PATIENCE_S * 1e9)
-        passed = _PassedOver()
+        passed = _SkippedFrames()
         seen = 0
         while seen < wanted + 1:
             taken = self._stream.take(until_ns)
@@ -267,7 +266,7 @@ class V4L2Camera:
                 seen += 1
             else:
                 passed.repeated += 1
-            self._stream.give_back(taken)
+            self._stream.requeue(taken)
         self._period_ns = max(self._agreed.period_ns, self._tally.period_ns() or 0)
         self._require_unchanged()
 
@@ -291,26 +290,26 @@ class V4L2Camera:
             raise UnsupportedByDeviceError(message)
 
     def _set(self, exposure_units: int | None, gain_units: int | None) -> None:
-        for control, value in ctl.in_order(
+        for control, value in ctl.ordered_settings(
             self._controls, self._options, exposure_units=exposure_units, gain_units=gain_units, node=self._node
         ):
-            ctl.put(self._handle, self._node, control, value)
+            ctl.set_control(self._handle, self._node, control, value)
 
     def _read_back(self) -> AppliedSettings:
         exposure_s = self._agreed.period_ns / 1e9
         if self._exposure is not None:
-            exposure_s = ctl.value_of(self._handle, self._node, self._exposure.control) * self._exposure.unit_s
+            exposure_s = ctl.get_control(self._handle, self._node, self._exposure.control) * self._exposure.unit_s
         gain = 1.0
         if self._scale.control is not None:
-            gain = self._scale.gain(ctl.value_of(self._handle, self._node, self._scale.control))
+            gain = self._scale.gain(ctl.get_control(self._handle, self._node, self._scale.control))
         return AppliedSettings(exposure_s, gain, max(self._period_ns / 1e9, exposure_s))
 
-    def _identity(self) -> Identity:
+    def _identity(self) -> NodeIdentity:
         try:
-            identity = identity_of(self._handle)
+            identity = query_identity(self._handle)
         except OSError as error:
             if error.errno in kernel.GONE:
-                raise kernel.fault(self._node, "asking what it is", error) from error
+                raise kernel.device_error(self._node, "asking what it is", error) from error
             message = f"{self._node} is no video device ({error.strerror}); slrig devices lists those that are"
             raise UnsupportedByDeviceError(message) from error
         if not identity.captures:
@@ -322,7 +321,7 @@ class V4L2Camera:
             raise UnsupportedByDeviceError(message)
         return identity
 
-    def _described(self, identity: Identity, node: Node, notes: tuple[str, ...]) -> CameraInfo:
+    def _described(self, identity: NodeIdentity, node: CameraNode, notes: tuple[str, ...]) -> CameraInfo:
         period_s = self._agreed.period_ns / 1e9
         exposures = (period_s, period_s) if self._exposure is None else self._exposure.range_s
         return CameraInfo(

@@ -10,10 +10,12 @@ cause. Only ENODEV and its like say that it was unplugged.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -89,13 +91,13 @@ Controls = Mapping[int, Control]
 """A device's controls by their number."""
 
 
-def controls_of(handle: int) -> dict[int, Control]:
+def list_controls(handle: int) -> dict[int, Control]:
     """Every control that the device has and lets be written. Raises OSError: the device is gone."""
     found: dict[int, Control] = {}
     number = 0
     while True:
         try:
-            asked = _described(handle, number | kernel.CONTROL_NEXT)
+            asked = _query_control(handle, number | kernel.CONTROL_NEXT)
         except OSError as error:
             if error.errno in kernel.REFUSED:
                 return found
@@ -103,25 +105,25 @@ def controls_of(handle: int) -> dict[int, Control]:
                 raise
             break
         number = int(asked.id)
-        _note(asked, found)
+        _add_control(asked, found)
     # The next control cannot even be described, and keeps those behind it from being listed: ask for them one by one.
     for first in (_USER, _CAMERA, _SOURCE, _PROCESSING):
         for each in range(max(first, number + 1), first + _CLASS_LENGTH):
             try:
-                _note(_described(handle, each), found)
+                _add_control(_query_control(handle, each), found)
             except OSError as error:
                 if error.errno in kernel.GONE:
                     raise
     return found
 
 
-def _described(handle: int, number: int) -> kernel.ControlDescription:
+def _query_control(handle: int, number: int) -> kernel.ControlDescription:
     asked = kernel.ControlDescription(id=number)
-    kernel.ask(handle, kernel.QUERYCTRL, asked)
+    kernel.ioctl(handle, kernel.QUERYCTRL, asked)
     return asked
 
 
-def _note(asked: kernel.ControlDescription, found: dict[int, Control]) -> None:
+def _add_control(asked: kernel.ControlDescription, found: dict[int, Control]) -> None:
     if asked.flags & (kernel.CONTROL_DISABLED | kernel.CONTROL_READ_ONLY | kernel.CONTROL_WRITE_ONLY):
         return
     name = re.sub(r"[^a-z0-9]+", "_", asked.name.decode("utf-8", "replace").lower()).strip("_")
@@ -131,16 +133,16 @@ def _note(asked: kernel.ControlDescription, found: dict[int, Control]) -> None:
     )
 
 
-def without(controls: Controls, skipped: Sequence[str], node: Path) -> Controls:
+def exclude_controls(controls: Controls, skipped: Sequence[str], node: Path) -> Controls:
     """Return the controls but for those to be left alone. Raises UnsupportedByDeviceError for a name it has not."""
     names = {control.name for control in controls.values()}
     for name in skipped:
         if name not in names:
-            raise _lacks(name, controls, node)
+            raise _missing_control(name, controls, node)
     return {number: control for number, control in controls.items() if control.name not in skipped}
 
 
-def value_of(handle: int, node: Path, control: Control) -> int:
+def get_control(handle: int, node: Path, control: Control) -> int:
     """What a control is set to.
 
     Raises
@@ -152,16 +154,16 @@ def value_of(handle: int, node: Path, control: Control) -> int:
     """
     answer = kernel.ControlValue(id=control.number)
     try:
-        kernel.ask(handle, kernel.G_CTRL, answer)
+        kernel.ioctl(handle, kernel.G_CTRL, answer)
     except OSError as error:
         if error.errno in kernel.GONE:
-            raise kernel.fault(node, f"reading control {control.name}", error) from error
-        message = f"{node}: asked for the value of {control.name}, the driver {_refuses(error, control)}"
+            raise kernel.device_error(node, f"reading control {control.name}", error) from error
+        message = f"{node}: asked for the value of {control.name}, the driver {_refusal(error, control)}"
         raise UnsupportedByDeviceError(message) from error
     return int(answer.value)
 
 
-def put(handle: int, node: Path, control: Control, value: int) -> None:
+def set_control(handle: int, node: Path, control: Control, value: int) -> None:
     """Set a control and compare what it reads back.
 
     Raises
@@ -172,17 +174,17 @@ def put(handle: int, node: Path, control: Control, value: int) -> None:
         It is gone.
     """
     try:
-        kernel.ask(handle, kernel.S_CTRL, kernel.ControlValue(id=control.number, value=value))
+        kernel.ioctl(handle, kernel.S_CTRL, kernel.ControlValue(id=control.number, value=value))
     except OSError as error:
         if error.errno in kernel.GONE:
-            raise kernel.fault(node, f"setting control {control.name} to {value}", error) from error
+            raise kernel.device_error(node, f"setting control {control.name} to {value}", error) from error
         message = (
-            f"{node}: asked {control.name} = {value}, the driver {_refuses(error, control)}. It declares "
+            f"{node}: asked {control.name} = {value}, the driver {_refusal(error, control)}. It declares "
             f"{control.minimum} to {control.maximum} in steps of {control.step}: look at v4l2-ctl -d {node} "
             "--list-ctrls-menus for what holds it"
         )
         raise UnsupportedByDeviceError(message) from error
-    got = value_of(handle, node, control)
+    got = get_control(handle, node, control)
     if got != value:
         message = (
             f"{node}: asked {control.name} = {value}, driver gives {got}; write a value that the device can use into "
@@ -191,7 +193,7 @@ def put(handle: int, node: Path, control: Control, value: int) -> None:
         raise UnsupportedByDeviceError(message)
 
 
-def _refuses(error: OSError, control: Control) -> str:
+def _refusal(error: OSError, control: Control) -> str:
     number = error.errno or 0
     words = f"refuses it ({os.strerror(number)})"
     if number in (*kernel.REFUSED, errno.EACCES, errno.EBUSY):
@@ -212,7 +214,7 @@ def exposure_control(controls: Controls) -> Control | None:
     return controls.get(EXPOSURE_ABSOLUTE) or controls.get(EXPOSURE_LINES)
 
 
-def in_order(
+def ordered_settings(
     controls: Controls, options: V4L2Options, *, exposure_units: int | None, gain_units: int | None, node: Path
 ) -> tuple[tuple[Control, int], ...]:
     """Every control to set and its value, in the order in which devices take them.
@@ -226,7 +228,7 @@ def in_order(
         An option names a control that the device does not have or a value that it cannot take.
     """
     if options.focus is not None and FOCUS_ABSOLUTE not in controls:
-        raise _lacks("focus", controls, node)
+        raise _missing_control("focus", controls, node)
     steps: list[tuple[Control, int]] = []
     for control, value in (
         (controls.get(EXPOSURE_AUTO), _MANUAL),
@@ -247,7 +249,7 @@ def in_order(
     named = {control.name: control for control in controls.values()}
     for name, value in options.controls.items():
         if name not in named:
-            raise _lacks(name, controls, node)
+            raise _missing_control(name, controls, node)
         steps.append((named[name], value))
     for control, value in steps:
         if not control.takes(value):
@@ -259,6 +261,185 @@ def in_order(
     return tuple(steps)
 
 
-def _lacks(name: str, controls: Controls, node: Path) -> UnsupportedByDeviceError:
+def _missing_control(name: str, controls: Controls, node: Path) -> UnsupportedByDeviceError:
     known = ", ".join(sorted(control.name for control in controls.values())) or "none"
     return UnsupportedByDeviceError(f"{node}: asked for control '{name}', the device has: {known}; correct the name")
+
+
+_LINEAR_GAMMA = 100
+_KEEP_DEFAULT = (CONTRAST, ZOOM_ABSOLUTE, PAN_ABSOLUTE, TILT_ABSOLUTE)
+_SWITCHES = (
+    *(AUTOBRIGHTNESS, EXPOSURE_AUTO_PRIORITY, HDR_SENSOR_MODE, IMAGE_STABILIZATION, ISO_SENSITIVITY_AUTO),
+    *(PRESET_WHITE_BALANCE, SCENE_MODE, WIDE_DYNAMIC_RANGE),
+)
+_NAMED = re.compile(r"denoise|noise_reduction|(^|_)w?hdr(_|$)|wide_dynamic")
+
+
+def switch_off_processing(
+    handle: int, node: Path, controls: Controls, *, named: Collection[str], is_uvc: bool
+) -> tuple[str, ...]:
+    """Set what the device lets be set, read it back, and return what is not as it should be, in words.
+
+    named : controls that a person sets, which are left to that person. is_uvc : the camera is one of USB's class.
+
+    Raises
+    ------
+    DeviceGoneError
+        The device is gone. What it refuses is told, not raised: a camera without these controls does no better.
+    """
+    notes: list[str] = []
+    if _is_covered(handle):
+        notes.append("its privacy shutter is closed, and its pictures are black: open it")
+    for control in controls.values():
+        wanted = _neutral_value(control, is_uvc=is_uvc)
+        if wanted is None or control.name in named:
+            continue
+        if isinstance(wanted, str):
+            notes.append(f"{wanted}; write what is right as controls = {{ {control.name} = … }} into its table")
+            continue
+        try:
+            set_control(handle, node, control, wanted)
+        except UnsupportedByDeviceError as refusal:
+            notes.append(f"its own image processing cannot be switched off: {refusal}")
+    return tuple(notes)
+
+
+def _is_covered(handle: int) -> bool:
+    """Whether a camera says so that can; mostly a shutter that a person moves, and no program."""
+    answer = kernel.ControlValue(id=PRIVACY)
+    with suppress(OSError):
+        kernel.ioctl(handle, kernel.G_CTRL, answer)
+    return bool(answer.value)
+
+
+def _neutral_value(control: Control, *, is_uvc: bool) -> int | str | None:
+    """The value to set; words where none is known to be right; None for a control that is no business of ours."""
+    number = control.number
+    if number == SHARPNESS:
+        return control.minimum
+    if number in _KEEP_DEFAULT:
+        return control.default
+    if number == BACKLIGHT_COMPENSATION:
+        return 0 if control.takes(0) else control.minimum
+    if number == GAMMA:
+        if is_uvc and control.nearest(_LINEAR_GAMMA) == _LINEAR_GAMMA:
+            return _LINEAR_GAMMA
+        return (
+            f"which value of its control {control.name} ({control.minimum} to {control.maximum}) makes its values "
+            "grow with the light is not known, and slrig doctor measures whether they do"
+        )
+    if number in _SWITCHES:
+        return 0
+    if not _NAMED.search(control.name):
+        return None
+    if control.is_menu or not control.takes(0):
+        return f"its control {control.name} changes its pictures, and which of its values means off is not known"
+    return 0
+
+
+ABSOLUTE_UNIT_S = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureScale:
+    """An exposure control, and how long one of its units is, s."""
+
+    control: Control
+    unit_s: float
+
+    @property
+    def range_s(self) -> tuple[float, float]:
+        """Least and most exposure that the device declares."""
+        control = self.control
+        least = control.minimum if control.minimum > 0 else control.minimum + max(control.step, 1)
+        return (max(least, 1) * self.unit_s, control.maximum * self.unit_s)
+
+    def units(self, exposure_s: float) -> int:
+        """The number that is nearest to an exposure, 1 or more."""
+        return max(self.control.nearest(exposure_s / self.unit_s), 1)
+
+
+def exposure_scale(controls: Controls, handle: int, node: Path, *, width_px: int) -> ExposureScale | None:
+    """Return the exposure control that a device has, None without one. width_px : of a frame.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        It has one whose unit nothing tells.
+    """
+    absolute = controls.get(EXPOSURE_ABSOLUTE)
+    if absolute is not None:
+        return ExposureScale(absolute, ABSOLUTE_UNIT_S)
+    lines = controls.get(EXPOSURE_LINES)
+    if lines is None:
+        return None
+    blank_px, rate_hz = _blank_px(handle), _pixel_rate_hz(handle)
+    if blank_px is None or rate_hz is None:
+        missing = "horizontal blanking" if blank_px is None else "pixel rate"
+        message = (
+            f"{node}: its control {lines.name} counts in a unit that it does not tell: to be lines of a sensor, its "
+            f'{missing} is missing. Write skip_controls = ["{lines.name}"] into the camera\'s table: the camera is '
+            "then taken to expose for a whole frame period; set the exposure with the maker's program before"
+        )
+        raise UnsupportedByDeviceError(message)
+    return ExposureScale(lines, (width_px + blank_px) / rate_hz)
+
+
+def _blank_px(handle: int) -> int | None:
+    answer = kernel.ControlValue(id=HBLANK)
+    try:
+        kernel.ioctl(handle, kernel.G_CTRL, answer)
+    except OSError as error:
+        if error.errno in kernel.GONE:
+            raise
+        return None
+    return int(answer.value)
+
+
+def _pixel_rate_hz(handle: int) -> int | None:
+    asked = kernel.LongControlValue(id=PIXEL_RATE)
+    answer = kernel.LongControlValues(count=1, controls=ctypes.pointer(asked))
+    try:
+        kernel.ioctl(handle, kernel.G_EXT_CTRLS, answer)
+    except OSError as error:
+        if error.errno in kernel.GONE:
+            raise
+        return None
+    low, high = asked.halves
+    return int(high << 32 | low) or None
+
+
+@dataclass(frozen=True, slots=True)
+class GainScale:
+    """Gain as a factor, from the device's own numbers.
+
+    V4L2 does not say what a gain control's numbers mean. Without `unity` (option `gain_unity`), gain 1 is the least
+    that the device can do, and each number above it counts as 1 more: an order, not a ratio. With it, gain is the
+    control's value over the value at which the sensor's gain is 1.
+    """
+
+    control: Control | None
+    unity: int | None
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Least and most gain; (1, 1) for a device without gain control."""
+        if self.control is None:
+            return (1.0, 1.0)
+        least = self.gain(self.control.minimum)
+        if least <= 0:
+            least = self.gain(self.control.minimum + max(self.control.step, 1))
+        return (least, self.gain(self.control.maximum))
+
+    def gain(self, units: int) -> float:
+        """The factor that a number of the device means."""
+        if self.control is None:
+            return 1.0
+        return units / self.unity if self.unity is not None else 1.0 + (units - self.control.minimum)
+
+    def units(self, gain: float) -> int | None:
+        """The number nearest to a factor; None for a device without gain control."""
+        if self.control is None:
+            return None
+        wanted = gain * self.unity if self.unity is not None else self.control.minimum + gain - 1
+        return self.control.nearest(wanted)

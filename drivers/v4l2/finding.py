@@ -25,7 +25,7 @@ DEV = Path("/dev")
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class NodeIdentity:
     """What a node says of itself. `captures`: it gives frames in one plane, and streams them. `is_uvc`: the kernel's
     driver is that of USB Video Class cameras.
     """
@@ -38,7 +38,7 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class CameraNode:
     """A camera's node and its stable name. serial : the USB device's own, or ""."""
 
     path: Path
@@ -48,16 +48,16 @@ class Node:
     note: str = ""
 
 
-_NO_CAMERA = Identity(card="", bus="", captures=False)
+_NO_CAMERA = NodeIdentity(card="", bus="", captures=False)
 
 
-def identity_of(handle: int) -> Identity:
+def query_identity(handle: int) -> NodeIdentity:
     """Ask an open node who it is. Raises OSError."""
     answer = kernel.Capability()
-    kernel.ask(handle, kernel.QUERYCAP, answer)
+    kernel.ioctl(handle, kernel.QUERYCAP, answer)
     known = answer.capabilities & kernel.CAP_DEVICE_CAPS
     can = answer.device_caps if known else answer.capabilities
-    return Identity(
+    return NodeIdentity(
         card=answer.card.decode("utf-8", "replace"),
         bus=answer.bus_info.decode("utf-8", "replace"),
         captures=bool(can & kernel.CAP_VIDEO_CAPTURE and can & kernel.CAP_STREAMING),
@@ -66,7 +66,7 @@ def identity_of(handle: int) -> Identity:
     )
 
 
-def asked(path: Path) -> Identity | None:
+def probe_node(path: Path) -> NodeIdentity | None:
     """Open a node, ask who it is, and close it. None where we may not open it.
 
     The node of a camera that was unplugged stays for as long as a program has it open: it is no camera any more.
@@ -76,7 +76,7 @@ def asked(path: Path) -> Identity | None:
     except OSError as error:
         return None if error.errno in (errno.EACCES, errno.EPERM) else _NO_CAMERA
     try:
-        return identity_of(handle)
+        return query_identity(handle)
     except OSError:
         return _NO_CAMERA
     finally:
@@ -84,9 +84,9 @@ def asked(path: Path) -> Identity | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Candidate:
+class _NodeCandidate:
     path: Path
-    identity: Identity | None
+    identity: NodeIdentity | None
     index: str
     usb: tuple[str, str, str] | None
     label: str
@@ -96,7 +96,9 @@ class _Candidate:
         return (self.usb, self.index)
 
 
-def nodes(sysfs: Path = SYSFS, dev: Path = DEV, ask: Callable[[Path], Identity | None] = asked) -> tuple[Node, ...]:
+def list_nodes(
+    sysfs: Path = SYSFS, dev: Path = DEV, ask: Callable[[Path], NodeIdentity | None] = probe_node
+) -> tuple[CameraNode, ...]:
     """Return every camera that is plugged in, each under a name that no other has.
 
     Nodes that give no frames (metadata, outputs, codecs) are left out. A node that may not be opened is listed with a
@@ -112,11 +114,11 @@ def nodes(sysfs: Path = SYSFS, dev: Path = DEV, ask: Callable[[Path], Identity |
         name = (by_id.get(real) if own else None) or by_path.get(real) or _bus_name(candidate)
         serial = candidate.usb[2] if candidate.usb is not None else ""
         note = "" if candidate.identity is not None else "may not be opened: sudo usermod -aG video $USER"
-        found.append(Node(candidate.path, name, candidate.label, serial, note))
-    return _told_apart(found, {candidate.path: _bus_name(candidate) for candidate in candidates})
+        found.append(CameraNode(candidate.path, name, candidate.label, serial, note))
+    return _rename_duplicates(found, {candidate.path: _bus_name(candidate) for candidate in candidates})
 
 
-def found_devices(found: tuple[Node, ...]) -> tuple[FoundDevice, ...]:
+def to_found_devices(found: tuple[CameraNode, ...]) -> tuple[FoundDevice, ...]:
     """The nodes in the words of `slrig devices`."""
     return tuple(
         FoundDevice("v4l2", node.name, f"{node.card} ({node.path}){f', {node.note}' if node.note else ''}")
@@ -124,8 +126,8 @@ def found_devices(found: tuple[Node, ...]) -> tuple[FoundDevice, ...]:
     )
 
 
-def resolved(device: str, dev: Path = DEV, look: Callable[[], tuple[Node, ...]] = nodes) -> Node:
-    """Return the node that a rig file means: a path, or a name that `nodes` gives.
+def resolve_node(device: str, dev: Path = DEV, look: Callable[[], tuple[CameraNode, ...]] = list_nodes) -> CameraNode:
+    """Return the node that a rig file means: a path, or a name that `list_nodes` gives.
 
     Raises
     ------
@@ -140,15 +142,15 @@ def resolved(device: str, dev: Path = DEV, look: Callable[[], tuple[Node, ...]] 
             if os.path.realpath(node.path) == real:
                 return node
         if path.exists():
-            return Node(Path(real), device, device, "")
+            return CameraNode(Path(real), device, device, "")
     for node in found:
         if node.name == device:
             return node
-    # udev's names may be written even where `nodes` prefers another one.
+    # udev's names may be written even where `list_nodes` prefers another one.
     for folder in ("by-id", "by-path"):
         link = dev / "v4l" / folder / device
         if "/" not in device and link.exists():
-            return resolved(str(link), dev, look)
+            return resolve_node(str(link), dev, look)
     have = "; ".join(f"{node.name} ({node.card}, {node.path})" for node in found) or "no camera at all"
     message = f'device = "{device}": asked for this camera, found {have}; plug it in, or write one of those names'
     raise DeviceGoneError(message)
@@ -162,13 +164,13 @@ def _names(sysfs: Path) -> list[str]:
     return sorted((name for name in names if re.fullmatch(r"video\d+", name)), key=lambda name: int(name[5:]))
 
 
-def _candidate(entry: Path, node: Path, ask: Callable[[Path], Identity | None]) -> _Candidate | None:
+def _candidate(entry: Path, node: Path, ask: Callable[[Path], NodeIdentity | None]) -> _NodeCandidate | None:
     identity = ask(node)
     if identity is not None and not identity.captures:
         return None
     folder = Path(os.path.realpath(entry))
     label = identity.card if identity is not None else _text(folder / "name") or node.name
-    return _Candidate(node, identity, _text(folder / "index"), _usb(folder), label)
+    return _NodeCandidate(node, identity, _text(folder / "index"), _usb(folder), label)
 
 
 def _usb(folder: Path) -> tuple[str, str, str] | None:
@@ -180,7 +182,7 @@ def _usb(folder: Path) -> tuple[str, str, str] | None:
     return None
 
 
-def _bus_name(candidate: _Candidate) -> str:
+def _bus_name(candidate: _NodeCandidate) -> str:
     """The bus and the node's place on it: stable as long as the camera stays in its port."""
     bus = candidate.identity.bus if candidate.identity is not None else ""
     return f"{bus or candidate.path.name}#{candidate.index or '0'}"
@@ -202,7 +204,7 @@ def _text(path: Path) -> str:
         return ""
 
 
-def _told_apart(found: list[Node], buses: dict[Path, str]) -> tuple[Node, ...]:
+def _rename_duplicates(found: list[CameraNode], buses: dict[Path, str]) -> tuple[CameraNode, ...]:
     """Give those that share a name the name of their bus, and those that still do, their path."""
     for better in (buses, {path: str(path) for path in buses}):
         often = Counter(node.name for node in found)

@@ -28,7 +28,7 @@ class CorruptFrameError(ValueError):
     """A buffer does not hold a whole frame. The message says what is wrong; the frame is passed over."""
 
 
-class Packing(StrEnum):
+class SamplePacking(StrEnum):
     """How samples lie in memory."""
 
     BYTES = "bytes"
@@ -46,21 +46,21 @@ class Packing(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class PixelLayout:
     """How a pixel format is read. bayer : the first row's two colours and the second row's, None for grey.
 
     red_first : of two differences of colour, that of red comes before that of blue.
     """
 
     bit_depth: int
-    packing: Packing
+    packing: SamplePacking
     bayer: str | None = None
     red_first: bool = False
 
     @property
     def is_luma(self) -> bool:
         """Whether the samples are the luma of a colour image."""
-        return self.packing in (Packing.EVEN_BYTES, Packing.ODD_BYTES, Packing.JPEG)
+        return self.packing in (SamplePacking.EVEN_BYTES, SamplePacking.ODD_BYTES, SamplePacking.JPEG)
 
     @property
     def has_colour(self) -> bool:
@@ -68,30 +68,30 @@ class Layout:
         return self.bayer is not None or self.is_luma
 
 
-def _layouts() -> dict[str, Layout]:
+def _layouts() -> dict[str, PixelLayout]:
     found = {
-        "GREY": Layout(8, Packing.BYTES),
-        "Y10 ": Layout(10, Packing.WORDS),
-        "Y12 ": Layout(12, Packing.WORDS),
-        "Y14 ": Layout(14, Packing.WORDS),
-        "Y16 ": Layout(16, Packing.WORDS),
-        "Y10P": Layout(10, Packing.MIPI10),
-        "Y12P": Layout(12, Packing.MIPI12),
-        "YUYV": Layout(8, Packing.EVEN_BYTES),
-        "YVYU": Layout(8, Packing.EVEN_BYTES, red_first=True),
-        "UYVY": Layout(8, Packing.ODD_BYTES),
-        "VYUY": Layout(8, Packing.ODD_BYTES, red_first=True),
-        "MJPG": Layout(8, Packing.JPEG),
-        "JPEG": Layout(8, Packing.JPEG),
+        "GREY": PixelLayout(8, SamplePacking.BYTES),
+        "Y10 ": PixelLayout(10, SamplePacking.WORDS),
+        "Y12 ": PixelLayout(12, SamplePacking.WORDS),
+        "Y14 ": PixelLayout(14, SamplePacking.WORDS),
+        "Y16 ": PixelLayout(16, SamplePacking.WORDS),
+        "Y10P": PixelLayout(10, SamplePacking.MIPI10),
+        "Y12P": PixelLayout(12, SamplePacking.MIPI12),
+        "YUYV": PixelLayout(8, SamplePacking.EVEN_BYTES),
+        "YVYU": PixelLayout(8, SamplePacking.EVEN_BYTES, red_first=True),
+        "UYVY": PixelLayout(8, SamplePacking.ODD_BYTES),
+        "VYUY": PixelLayout(8, SamplePacking.ODD_BYTES, red_first=True),
+        "MJPG": PixelLayout(8, SamplePacking.JPEG),
+        "JPEG": PixelLayout(8, SamplePacking.JPEG),
     }
     # The kernel's four characters follow no rule here, so each is written out: 8, 10, 12, 16 bit, then packed 10, 12.
     kinds = (
-        (8, Packing.BYTES),
-        (10, Packing.WORDS),
-        (12, Packing.WORDS),
-        (16, Packing.WORDS),
-        (10, Packing.MIPI10),
-        (12, Packing.MIPI12),
+        (8, SamplePacking.BYTES),
+        (10, SamplePacking.WORDS),
+        (12, SamplePacking.WORDS),
+        (16, SamplePacking.WORDS),
+        (10, SamplePacking.MIPI10),
+        (12, SamplePacking.MIPI12),
     )
     for bayer, codes in {
         "BGGR": ("BA81", "BG10", "BG12", "BYR2", "pBAA", "pBCC"),
@@ -100,7 +100,7 @@ def _layouts() -> dict[str, Layout]:
         "RGGB": ("RGGB", "RG10", "RG12", "RG16", "pRAA", "pRCC"),
     }.items():
         for code, (bit_depth, packing) in zip(codes, kinds, strict=True):
-            found[code] = Layout(bit_depth, packing, bayer)
+            found[code] = PixelLayout(bit_depth, packing, bayer)
     return found
 
 
@@ -128,29 +128,31 @@ _DEMOSAIC = {
 }
 
 
-def least_stride_bytes(layout: Layout, size: Size) -> int:
+def min_stride_bytes(layout: PixelLayout, size: Size) -> int:
     """Bytes that one row of samples takes, without padding; 0 for a compressed format."""
     width = size.width_px
     match layout.packing:
-        case Packing.BYTES:
+        case SamplePacking.BYTES:
             return width
-        case Packing.WORDS | Packing.EVEN_BYTES | Packing.ODD_BYTES:
+        case SamplePacking.WORDS | SamplePacking.EVEN_BYTES | SamplePacking.ODD_BYTES:
             return 2 * width
-        case Packing.MIPI10:
+        case SamplePacking.MIPI10:
             return (width + 3) // 4 * 5
-        case Packing.MIPI12:
+        case SamplePacking.MIPI12:
             return (width + 1) // 2 * 3
-        case Packing.JPEG:
+        case SamplePacking.JPEG:
             return 0
 
 
-def prepare(layout: Layout) -> None:
+def prepare(layout: PixelLayout) -> None:
     """Do what takes long before frames come."""
-    if layout.packing is Packing.JPEG:
+    if layout.packing is SamplePacking.JPEG:
         jpeg.prepare()
 
 
-def grey_image(data: Bytes, layout: Layout, size: Size, *, stride_bytes: int, limited_luma: bool = False) -> Pixels:
+def grey_image(
+    data: Bytes, layout: PixelLayout, size: Size, *, stride_bytes: int, limited_luma: bool = False
+) -> Pixels:
     """Return a buffer as an image of its own, (H, W), uint8 up to 8 bit and uint16 beyond, right-aligned.
 
     Parameters
@@ -169,8 +171,8 @@ def grey_image(data: Bytes, layout: Layout, size: Size, *, stride_bytes: int, li
     CorruptFrameError
         Bytes are missing, or the JPEG is damaged.
     """
-    if layout.packing is Packing.JPEG:
-        image = _decoded(data, size, cv2.IMREAD_GRAYSCALE)
+    if layout.packing is SamplePacking.JPEG:
+        image = _decode_jpeg(data, size, cv2.IMREAD_GRAYSCALE)
     else:
         image = _UNPACK[layout.packing](_rows(data, layout, size, stride_bytes), size)
     if layout.bayer is not None:
@@ -180,23 +182,27 @@ def grey_image(data: Bytes, layout: Layout, size: Size, *, stride_bytes: int, li
     return image
 
 
-def colour_image(data: Bytes, layout: Layout, size: Size, *, stride_bytes: int, limited_luma: bool = False) -> Pixels:
+def colour_image(
+    data: Bytes, layout: PixelLayout, size: Size, *, stride_bytes: int, limited_luma: bool = False
+) -> Pixels:
     """Return a buffer of a layout that `has_colour` as (H, W, 3), blue, green and red, of `grey_image`'s type.
     Parameters, and what is raised, as there.
     """
-    if layout.packing is Packing.JPEG:
-        image = _decoded(data, size, cv2.IMREAD_COLOR)
+    if layout.packing is SamplePacking.JPEG:
+        image = _decode_jpeg(data, size, cv2.IMREAD_COLOR)
     else:
         rows = _rows(data, layout, size, stride_bytes)
         image = _UNPACK[layout.packing](rows, size)
         if layout.bayer is not None:
             return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_Bayer{layout.bayer}2BGR")))
-        first = 1 if layout.packing is Packing.EVEN_BYTES else 0
-        image = from_luma(image, *(rows[:, first + 2 * (second != layout.red_first) :: 4] for second in (False, True)))
+        first = 1 if layout.packing is SamplePacking.EVEN_BYTES else 0
+        image = bgr_from_luma(
+            image, *(rows[:, first + 2 * (second != layout.red_first) :: 4] for second in (False, True))
+        )
     return _SPREAD[image] if limited_luma else image
 
 
-def from_luma(luma: Pixels, blue: Bytes, red: Bytes) -> Pixels:
+def bgr_from_luma(luma: Pixels, blue: Bytes, red: Bytes) -> Pixels:
     """(H, W, 3) uint8, blue, green and red, of luma (H, W) and of the differences of blue and red, of fewer rows or
     columns: full range, 128 is none.
     """
@@ -207,9 +213,9 @@ def from_luma(luma: Pixels, blue: Bytes, red: Bytes) -> Pixels:
     return np.asarray(cv2.cvtColor(cv2.merge([luma, *planes]), cv2.COLOR_YCrCb2BGR), dtype=np.uint8)
 
 
-def _rows(data: Bytes, layout: Layout, size: Size, stride_bytes: int) -> Bytes:
+def _rows(data: Bytes, layout: PixelLayout, size: Size, stride_bytes: int) -> Bytes:
     """(H, least stride): the bytes of each row without padding; the last row may come without."""
-    used = least_stride_bytes(layout, size)
+    used = min_stride_bytes(layout, size)
     stride = max(stride_bytes, used)
     needed = stride * (size.height_px - 1) + used
     if len(data) < needed:
@@ -246,19 +252,19 @@ def _from_odd_bytes(rows: Bytes, size: Size) -> Pixels:
     return np.ascontiguousarray(rows[:, 1 : 2 * size.width_px : 2])
 
 
-_UNPACK: dict[Packing, Callable[[Bytes, Size], Pixels]] = {
-    Packing.BYTES: _from_bytes,
-    Packing.WORDS: _from_words,
-    Packing.MIPI10: _from_mipi10,
-    Packing.MIPI12: _from_mipi12,
-    Packing.EVEN_BYTES: _from_even_bytes,
-    Packing.ODD_BYTES: _from_odd_bytes,
+_UNPACK: dict[SamplePacking, Callable[[Bytes, Size], Pixels]] = {
+    SamplePacking.BYTES: _from_bytes,
+    SamplePacking.WORDS: _from_words,
+    SamplePacking.MIPI10: _from_mipi10,
+    SamplePacking.MIPI12: _from_mipi12,
+    SamplePacking.EVEN_BYTES: _from_even_bytes,
+    SamplePacking.ODD_BYTES: _from_odd_bytes,
 }
 
 _SPREAD: NDArray[np.uint8] = np.clip(np.rint((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
 
 
-def _decoded(data: Bytes, size: Size, flag: int) -> Pixels:
+def _decode_jpeg(data: Bytes, size: Size, flag: int) -> Pixels:
     if len(data) < 4 or data[0] != 0xFF or data[1] != 0xD8:
         message = f"{len(data)} bytes came that do not begin as a JPEG does"
         raise CorruptFrameError(message)

@@ -70,7 +70,7 @@ class FormatDescription(ctypes.Structure):
     )
 
 
-class PixelFormat(ctypes.Structure):
+class PixFormat(ctypes.Structure):
     """`v4l2_pix_format`: size, pixel format and layout of a frame."""
 
     _fields_ = (
@@ -91,7 +91,7 @@ class PixelFormat(ctypes.Structure):
 
 class _FormatUnion(ctypes.Union):
     # The window of an overlay holds pointers, so the kernel's union is aligned as a pointer is.
-    _fields_ = (("pix", PixelFormat), ("raw", ctypes.c_uint8 * 200), ("pointer", ctypes.c_void_p))
+    _fields_ = (("pix", PixFormat), ("raw", ctypes.c_uint8 * 200), ("pointer", ctypes.c_void_p))
 
 
 class Format(ctypes.Structure):
@@ -309,7 +309,7 @@ def open_node(node: Path) -> int:
     return os.open(node, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
 
-def ask(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
+def ioctl(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
     """Send a request; the answer is written into `argument`. Raises OSError."""
     # Late, so that what looks at this module on another system is not refused.
     import fcntl
@@ -322,25 +322,25 @@ def ask(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) ->
         return
 
 
-def text_of(code: int) -> str:
+def fourcc_text(code: int) -> str:
     """A pixel format's four characters.
 
-    >>> text_of(0x59455247)
+    >>> fourcc_text(0x59455247)
     'GREY'
     """
     return (code & 0x7FFF_FFFF).to_bytes(4, "little").decode("ascii", "replace")
 
 
-def code_of(text: str) -> int:
+def fourcc_code(text: str) -> int:
     """A pixel format's number; short names are filled up with blanks, as the kernel does.
 
-    >>> text_of(code_of("Y16"))
+    >>> fourcc_text(fourcc_code("Y16"))
     'Y16 '
     """
     return int.from_bytes(text.ljust(4).encode("ascii"), "little")
 
 
-def fault(node: Path, doing: str, error: OSError) -> DeviceError:
+def device_error(node: Path, doing: str, error: OSError) -> DeviceError:
     """Return what the kernel's refusal means, in words that tell what to do."""
     number = error.errno or 0
     cause = f"{node}: {doing}: {os.strerror(number)}"
@@ -349,7 +349,7 @@ def fault(node: Path, doing: str, error: OSError) -> DeviceError:
             f"{cause}; the camera is gone: plug it in again, and reopen it (slrig devices lists those that are there)"
         )
     if number == errno.EBUSY:
-        holders = holders_of(node)
+        holders = list_holders(node)
         by = f" by {', '.join(holders)}" if holders else ""
         return DeviceBusyError(f"{cause}; it is held{by}: close that program (fuser -v {node} lists who has it open)")
     if number in (errno.EACCES, errno.EPERM):
@@ -367,16 +367,16 @@ def fault(node: Path, doing: str, error: OSError) -> DeviceError:
     return DeviceError(f"{cause}; look for the kernel's own words with: dmesg | tail")
 
 
-def stream_fault(node: Path, doing: str, error: OSError) -> DeviceError:
+def stream_error(node: Path, doing: str, error: OSError) -> DeviceError:
     """The same of a request about the frames: EIO there says that the stream has died, of another that it failed."""
     if error.errno == errno.EIO:
         return DeviceGoneError(
             f"{node}: {doing}: {os.strerror(errno.EIO)}; its stream has died: plug it in again, and reopen it"
         )
-    return fault(node, doing, error)
+    return device_error(node, doing, error)
 
 
-def holders_of(node: Path) -> tuple[str, ...]:
+def list_holders(node: Path) -> tuple[str, ...]:
     """The other programs that have a node open, as far as we may see: "name (process id)"."""
     found = []
     target = os.path.realpath(node)

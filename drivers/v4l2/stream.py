@@ -7,30 +7,270 @@ import errno
 import mmap
 import os
 import select
+import statistics
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.v4l2 import kernel
-from drivers.v4l2.timing import Stamp, StampSource
+from drivers.v4l2.formats import LAYOUTS, PREFERRED, PixelLayout
+from drivers.v4l2.options import V4L2Options
+from drivers.v4l2.timing import OTHER_CLOCK_NS, BufferStamp, StampSource
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
+from slrig.model import Size
+
+MIN_RATE_HZ = 15.0
+"""Frames per second below which scanning is slow: every pattern waits for a frame or two."""
+
+_RATE_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class NegotiatedFormat:
+    """What driver and person agreed on. `period_ns`: from frame to frame. `notes`: what a person should know of it."""
+
+    layout: PixelLayout
+    size: Size
+    stride_bytes: int
+    period_ns: int
+    notes: tuple[str, ...] = ()
+
+
+def negotiate_format(handle: int, node: Path, options: V4L2Options) -> NegotiatedFormat:
+    """Set pixel format, size and frame rate as the options ask, and compare what the driver gives.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        The driver gives something else: "asked MJPG 640 x 360, driver gives YUYV 640 x 360".
+    DeviceBusyError
+        Another program streams from the device.
+    DeviceError
+        The device failed.
+    """
+    try:
+        offered = _offered_formats(handle)
+        code, size = _choose_format(handle, node, options, offered)
+        answer = kernel.Format(type=kernel.CAPTURE)
+        if size is None:
+            kernel.ioctl(handle, kernel.G_FMT, answer)
+            size = Size(answer.fmt.pix.width, answer.fmt.pix.height)
+        pix = answer.fmt.pix
+        pix.width, pix.height = size.width_px, size.height_px
+        pix.pixelformat, pix.field = kernel.fourcc_code(code), kernel.FIELD_NONE
+        # The driver fills in the rest; what was there belonged to another format.
+        pix.bytesperline = pix.sizeimage = 0
+        try:
+            kernel.ioctl(handle, kernel.S_FMT, answer)
+        except OSError as error:
+            raise kernel.device_error(node, f"asking for {code.strip()} {size}", error) from error
+        _require_format(handle, node, code, size, pix)
+        period_ns = _period_ns(handle, node, options, _rates_hz(handle, code, size))
+    except OSError as error:
+        raise kernel.device_error(node, "setting format and frame rate", error) from error
+    layout = _layout(code, options, node)
+    notes: tuple[str, ...] = ()
+    if options.frame_rate_hz is None and not _reaches(1e9 / period_ns, MIN_RATE_HZ):
+        notes = (
+            f"gives {1e9 / period_ns:.3g} frames per second in {code.strip()} {size}, which makes scans slow: choose a "
+            f"smaller size_px or another pixel_format (v4l2-ctl -d {node} --list-formats-ext lists what is faster)",
+        )
+    return NegotiatedFormat(layout, size, int(pix.bytesperline), period_ns, notes)
+
+
+def _choose_format(handle: int, node: Path, options: V4L2Options, offered: tuple[str, ...]) -> tuple[str, Size | None]:
+    """Pixel format and size: as asked for, else the first that is preferred of those that are fast enough.
+
+    A format is passed over for the next one if it is fast with less than half of its pixels only.
+    """
+    codes = tuple(code for code in PREFERRED if code in offered)
+    if options.pixel_format is not None:
+        codes = (options.pixel_format.ljust(4),)
+    if not codes:
+        message = (
+            f"{node}: offers the pixel formats {_list(offered)}, none of which can be read; "
+            f"those that can: {_list(tuple(LAYOUTS))}"
+        )
+        raise UnsupportedByDeviceError(message)
+    wanted_hz = options.frame_rate_hz or MIN_RATE_HZ
+    found: list[tuple[str, Size]] = []
+    for code in codes:
+        sizes = (options.size,) if options.size is not None else _sizes(handle, code)
+        if not sizes:
+            break
+        fast = [size for size in sizes if _is_fast(handle, code, size, wanted_hz)]
+        if fast:
+            found.append((code, max(fast, key=_pixels)))
+            if 2 * _pixels(found[-1][1]) >= max(map(_pixels, sizes)):
+                return found[-1]
+    if found:
+        return max(found, key=lambda each: _pixels(each[1]))
+    return codes[0], options.size or max(_sizes(handle, codes[0]), key=_pixels, default=None)
+
+
+def _pixels(size: Size) -> int:
+    return size.width_px * size.height_px
+
+
+def _is_fast(handle: int, code: str, size: Size, wanted_hz: float) -> bool:
+    """Whether a size comes at this rate, or the driver does not tell."""
+    rates_hz = _rates_hz(handle, code, size)
+    return not rates_hz or _reaches(max(rates_hz), wanted_hz)
+
+
+def _reaches(rate_hz: float, wanted_hz: float) -> bool:
+    return rate_hz >= wanted_hz * (1 - _RATE_TOLERANCE)
+
+
+def _layout(code: str, options: V4L2Options, node: Path) -> PixelLayout:
+    layout = LAYOUTS[code]
+    if options.bit_depth is None or options.bit_depth == layout.bit_depth:
+        return layout
+    if layout.bit_depth != 16:
+        message = (
+            f"{node}: asked bit_depth {options.bit_depth}, but {code.strip()} has {layout.bit_depth} bits; leave "
+            "bit_depth out, it is for 16-bit formats that the sensor does not fill"
+        )
+        raise UnsupportedByDeviceError(message)
+    return PixelLayout(options.bit_depth, layout.packing, layout.bayer)
+
+
+def _require_format(handle: int, node: Path, code: str, size: Size, pix: kernel.PixFormat) -> None:
+    got = kernel.fourcc_text(pix.pixelformat)
+    if (got, pix.width, pix.height) != (code, size.width_px, size.height_px):
+        sizes = ", ".join(str(have) for have in _sizes(handle, code)) or "no size that it tells"
+        message = (
+            f"{node}: asked {code.strip()} {size}, driver gives {got.strip()} {pix.width} x {pix.height}; it offers "
+            f"{_list(_offered_formats(handle))}, and {code.strip()} in {sizes}: write one of these as pixel_format and "
+            "size_px"
+        )
+        raise UnsupportedByDeviceError(message)
+    if pix.field not in (kernel.FIELD_ANY, kernel.FIELD_NONE):
+        message = (
+            f"{node}: asked whole frames, driver gives interlaced ones (field {pix.field}): two instants in one image; "
+            "choose a progressive size_px, or another camera"
+        )
+        raise UnsupportedByDeviceError(message)
+
+
+def _offered_formats(handle: int) -> tuple[str, ...]:
+    found: list[str] = []
+    while True:
+        answer = kernel.FormatDescription(index=len(found), type=kernel.CAPTURE)
+        try:
+            kernel.ioctl(handle, kernel.ENUM_FMT, answer)
+        except OSError as error:
+            if error.errno in kernel.REFUSED:
+                return tuple(found)
+            raise
+        found.append(kernel.fourcc_text(answer.pixelformat))
+
+
+def _sizes(handle: int, code: str) -> tuple[Size, ...]:
+    """The sizes of a format; of a range, its largest. Empty where the driver does not tell."""
+    found: list[Size] = []
+    while True:
+        answer = kernel.FrameSize(index=len(found), pixel_format=kernel.fourcc_code(code))
+        try:
+            kernel.ioctl(handle, kernel.ENUM_FRAMESIZES, answer)
+        except OSError as error:
+            if error.errno in kernel.REFUSED:
+                return tuple(found)
+            raise
+        if answer.type != kernel.SIZES_DISCRETE:
+            return (Size(answer.size.stepwise.max_width, answer.size.stepwise.max_height),)
+        found.append(Size(answer.size.discrete.width, answer.size.discrete.height))
+
+
+def _rates_hz(handle: int, code: str, size: Size) -> tuple[float, ...]:
+    """The frame rates of a format and size; of a range, its fastest. Empty where the driver does not tell."""
+    found: list[float] = []
+    while True:
+        answer = kernel.FrameInterval(
+            index=len(found), pixel_format=kernel.fourcc_code(code), width=size.width_px, height=size.height_px
+        )
+        try:
+            kernel.ioctl(handle, kernel.ENUM_FRAMEINTERVALS, answer)
+        except OSError as error:
+            if error.errno in kernel.REFUSED:
+                return tuple(found)
+            raise
+        is_discrete = answer.type == kernel.SIZES_DISCRETE
+        period = answer.interval.discrete if is_discrete else answer.interval.stepwise.min
+        found.append(float("inf") if not period.numerator else period.denominator / period.numerator)
+        if not is_discrete:
+            return tuple(found)
+
+
+def _period_ns(handle: int, node: Path, options: V4L2Options, offered_hz: tuple[float, ...]) -> int:
+    asked = options.frame_rate_hz
+    rate_hz = _rate_hz(handle) if asked is None else _set_rate_hz(handle, asked)
+    if asked is None and rate_hz is not None and not _reaches(rate_hz, MIN_RATE_HZ):
+        # As slow as is fast enough: exposures may be as long as a frame.
+        fast_hz = [each for each in offered_hz if _reaches(each, MIN_RATE_HZ) and each != float("inf")]
+        rate_hz = _set_rate_hz(handle, min(fast_hz)) if fast_hz else rate_hz
+    if rate_hz is None:
+        if asked is None:
+            message = (
+                f"{node}: the driver does not tell its frame rate, which bounds when a frame was exposed; write "
+                "frame_rate_hz into the camera's table"
+            )
+            raise UnsupportedByDeviceError(message)
+        return round(1e9 / asked)
+    if asked is not None and abs(rate_hz - asked) > _RATE_TOLERANCE * asked:
+        message = (
+            f"{node}: asked {asked:g} frames per second, driver gives {rate_hz:.6g}; write frame_rate_hz = "
+            f"{rate_hz:.6g}, or choose another size_px or pixel_format (v4l2-ctl -d {node} --list-formats-ext)"
+        )
+        raise UnsupportedByDeviceError(message)
+    return round(1e9 / rate_hz)
+
+
+def _set_rate_hz(handle: int, asked_hz: float) -> float | None:
+    answer = kernel.StreamParameters(type=kernel.CAPTURE)
+    period = Fraction(1 / asked_hz).limit_denominator(1_000_000)
+    answer.parm.capture.timeperframe = kernel.Fraction(period.numerator, period.denominator)
+    _ask_if_known(handle, kernel.S_PARM, answer)
+    return _rate_hz(handle)
+
+
+def _rate_hz(handle: int) -> float | None:
+    """The frame rate in use; None where the driver does not tell."""
+    answer = kernel.StreamParameters(type=kernel.CAPTURE)
+    _ask_if_known(handle, kernel.G_PARM, answer)
+    told = answer.parm.capture.timeperframe
+    return float(told.denominator / told.numerator) if told.numerator and told.denominator else None
+
+
+def _ask_if_known(handle: int, request: int, answer: kernel.StreamParameters) -> None:
+    try:
+        kernel.ioctl(handle, request, answer)
+    except OSError as error:
+        if error.errno not in kernel.REFUSED:
+            raise
+
+
+def _list(codes: tuple[str, ...]) -> str:
+    return ", ".join(code.strip() for code in codes) or "none"
+
 
 _BROKEN = select.POLLERR | select.POLLHUP | select.POLLNVAL
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
+class FilledBuffer:
     """A filled buffer that is ours until it is given back. `corrupt`: the driver says that its data are damaged."""
 
     index: int
     bytes_used: int
     corrupt: bool
     sequence: int
-    stamp: Stamp
+    stamp: BufferStamp
 
 
 class Waker:
@@ -55,7 +295,7 @@ class Waker:
         os.close(self._write)
 
 
-class Stream:
+class V4L2Stream:
     """The buffers of an open device. Holding them keeps other programs from streaming; `release` gives them back.
 
     Raises
@@ -88,7 +328,7 @@ class Stream:
                 self._queued_ns.append(0)
         except OSError as error:
             self.release()
-            raise kernel.fault(node, "mapping a buffer", error) from error
+            raise kernel.device_error(node, "mapping a buffer", error) from error
         except DeviceError:
             self.release()
             raise
@@ -100,7 +340,7 @@ class Stream:
         self._ask("starting the stream", kernel.STREAMON, ctypes.c_int(kernel.CAPTURE))
         self._on = True
 
-    def take(self, until_ns: int) -> Taken | None:
+    def take(self, until_ns: int) -> FilledBuffer | None:
         """Take the oldest filled buffer, waiting for it until then (CLOCK_MONOTONIC); None if none came.
 
         Raises
@@ -133,11 +373,11 @@ class Stream:
             if left_ms <= 0:
                 return None
 
-    def data(self, taken: Taken) -> NDArray[np.uint8]:
+    def data(self, taken: FilledBuffer) -> NDArray[np.uint8]:
         """(n,) uint8, a copy of the used bytes of a buffer, which may then be given back."""
         return np.frombuffer(self._maps[taken.index][: taken.bytes_used], dtype=np.uint8)
 
-    def give_back(self, taken: Taken) -> None:
+    def requeue(self, taken: FilledBuffer) -> None:
         """Let the camera fill the buffer again."""
         self._queue(taken.index)
 
@@ -165,25 +405,25 @@ class Stream:
         self._queued_ns[index] = time.monotonic_ns()
         self._ask("queueing a buffer", kernel.QBUF, self._buffer(index))
 
-    def _dequeue(self) -> Taken | None:
+    def _dequeue(self) -> FilledBuffer | None:
         buffer = self._buffer()
         try:
-            kernel.ask(self._handle, kernel.DQBUF, buffer)
+            kernel.ioctl(self._handle, kernel.DQBUF, buffer)
         except OSError as error:
             if error.errno == errno.EAGAIN:
                 return None
-            raise kernel.stream_fault(self._node, "taking a frame", error) from error
+            raise kernel.stream_error(self._node, "taking a frame", error) from error
         index = int(buffer.index)
         stamp_ns = buffer.timestamp.tv_sec * 1_000_000_000 + buffer.timestamp.tv_usec * 1000
-        stamp = Stamp(_source(buffer.flags), stamp_ns, self._queued_ns[index], time.monotonic_ns())
+        stamp = BufferStamp(_source(buffer.flags), stamp_ns, self._queued_ns[index], time.monotonic_ns())
         corrupt = bool(buffer.flags & kernel.BUFFER_ERROR)
-        return Taken(index, int(buffer.bytesused), corrupt, int(buffer.sequence), stamp)
+        return FilledBuffer(index, int(buffer.bytesused), corrupt, int(buffer.sequence), stamp)
 
     def _ask(self, doing: str, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
         try:
-            kernel.ask(self._handle, request, argument)
+            kernel.ioctl(self._handle, request, argument)
         except OSError as error:
-            raise kernel.stream_fault(self._node, doing, error) from error
+            raise kernel.stream_error(self._node, doing, error) from error
 
 
 def _source(flags: int) -> StampSource:
@@ -192,3 +432,68 @@ def _source(flags: int) -> StampSource:
     if flags & kernel.STAMP_SOURCE_MASK == kernel.STAMP_SOURCE_START:
         return StampSource.EXPOSURE_START
     return StampSource.FRAME_END
+
+
+_ROUND = 2**32
+_LARGEST_STEP = 2**31
+
+
+@dataclass(slots=True)
+class FrameCounter:
+    """Counts the frames of one stream. `number` goes on from stream to stream, as long as the camera is open.
+
+    `lost` are frames that the camera made while a buffer was free and that did not come, repeated ones and corrupt
+    ones. Those made while nobody read, when all buffers were full, are not: they would have been stale.
+    `ahead_ns` is how far a stamp was seen to lie after the instant at which its frame was here already.
+    """
+
+    number: int = -1
+    lost: int = 0
+    ahead_ns: int = 0
+    _last: FilledBuffer | None = None
+    _intervals_ns: list[float] = field(default_factory=list)
+
+    def begin(self) -> None:
+        """A stream starts: its sequence numbers start anew."""
+        self._last = None
+        self.ahead_ns = 0
+        self._intervals_ns.clear()
+
+    def forget_losses(self) -> None:
+        """From here on, losses count."""
+        self.lost = 0
+
+    def is_new(self, taken: FilledBuffer) -> bool:
+        """Note a frame. False if it came before: its stamp is not later than the last one's."""
+        last, self._last = self._last, taken
+        ahead_ns = taken.stamp.stamp_ns - taken.stamp.taken_ns
+        if taken.stamp.source is not StampSource.NONE and ahead_ns <= OTHER_CLOCK_NS:
+            self.ahead_ns = max(self.ahead_ns, ahead_ns)
+        if last is None:
+            self.number += 1
+            return True
+        step = (taken.sequence - last.sequence) % _ROUND
+        stamped = StampSource.NONE not in (taken.stamp.source, last.stamp.source)
+        if (taken.stamp.stamp_ns <= last.stamp.stamp_ns) if stamped else (step == 0):
+            self._last = last
+            self.lost += 1
+            return False
+        # A driver that does not count, or starts anew, tells nothing about losses.
+        step = step if 1 <= step < _LARGEST_STEP else 1
+        self.number += step
+        if stamped:
+            self._intervals_ns.append((taken.stamp.stamp_ns - last.stamp.stamp_ns) / step)
+        # Buffers are filled in the order in which they were queued. Had this one been free when the last frame was
+        # finished, the frames between would have come: they are lost. Otherwise there was no room for them.
+        finished_ns = last.stamp.stamp_ns if stamped else last.stamp.taken_ns
+        if taken.stamp.queued_ns <= finished_ns:
+            self.lost += step - 1
+        return True
+
+    def note_corrupt(self) -> None:
+        """A frame came and its data are damaged."""
+        self.lost += 1
+
+    def period_ns(self) -> int | None:
+        """The measured time from frame to frame (median); None with fewer than two stamped frames."""
+        return round(statistics.median(self._intervals_ns)) if self._intervals_ns else None

@@ -33,7 +33,7 @@ class StampSource(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Durations:
+class SensorDurations:
     """What is known of the sensor, ns. `readout_ns` from the first row to the last; `delay_ns`: stamps come so late."""
 
     exposure_ns: int
@@ -42,7 +42,7 @@ class Durations:
 
 
 @dataclass(frozen=True, slots=True)
-class Stamp:
+class BufferStamp:
     """What the driver said of one buffer, ns, CLOCK_MONOTONIC: its stamp, and when it was queued and taken."""
 
     source: StampSource
@@ -52,16 +52,16 @@ class Stamp:
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class ExposureInterval:
     """All rows were exposed between `earliest_ns` and `latest_ns`."""
 
     earliest_ns: int
     latest_ns: int
 
-    def centred(self, exposure_ns: int) -> tuple[int, int, int]:
+    def centred_exposure(self, exposure_ns: int) -> tuple[int, int, int]:
         """Start, end and error of an exposure of this length in the middle: both ends are right within the error.
 
-        >>> Exposure(100, 160).centred(20)
+        >>> ExposureInterval(100, 160).centred_exposure(20)
         (120, 140, 20)
         """
         spare_ns = max(self.latest_ns - self.earliest_ns - exposure_ns, 0)
@@ -70,21 +70,21 @@ class Exposure:
         return start_ns, start_ns + exposure_ns, error_ns
 
 
-def of_this_clock(stamp: Stamp, durations: Durations) -> bool:
+def is_monotonic_stamp(stamp: BufferStamp, durations: SensorDurations) -> bool:
     """Whether a stamp can be an instant of its frame: a clock other than CLOCK_MONOTONIC gives itself away."""
     least_ns = stamp.queued_ns - durations.readout_ns - durations.exposure_ns - OTHER_CLOCK_NS
     return least_ns <= stamp.stamp_ns <= stamp.taken_ns + OTHER_CLOCK_NS
 
 
-def exposure_of(stamp: Stamp, durations: Durations) -> Exposure:
+def exposure_interval(stamp: BufferStamp, durations: SensorDurations) -> ExposureInterval:
     """Return the interval in which every row was exposed, whatever the device meant by its stamp."""
     before_ns = durations.exposure_ns + durations.delay_ns
-    source = stamp.source if of_this_clock(stamp, durations) else StampSource.NONE
+    source = stamp.source if is_monotonic_stamp(stamp, durations) else StampSource.NONE
     match source:
         case StampSource.EXPOSURE_START:
             latest_ns = stamp.stamp_ns + durations.readout_ns + durations.exposure_ns
-            return Exposure(stamp.stamp_ns - before_ns, latest_ns)
+            return ExposureInterval(stamp.stamp_ns - before_ns, latest_ns)
         case StampSource.FRAME_END:
-            return Exposure(stamp.stamp_ns - durations.readout_ns - before_ns, stamp.stamp_ns)
+            return ExposureInterval(stamp.stamp_ns - durations.readout_ns - before_ns, stamp.stamp_ns)
         case StampSource.NONE:
-            return Exposure(stamp.queued_ns - durations.readout_ns - before_ns, stamp.taken_ns)
+            return ExposureInterval(stamp.queued_ns - durations.readout_ns - before_ns, stamp.taken_ns)

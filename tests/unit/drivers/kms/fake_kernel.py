@@ -90,14 +90,14 @@ class FakeKernel:
         (folder / "status").write_text("connected\n" if there else "disconnected\n")
         (folder / "modes").write_text("".join(f"{each.name.decode()}\n" for each in self.modes.get(number, [])))
 
-    def opened(self, _path: str) -> int:
+    def open_card(self, _path: str) -> int:
         return os.dup(self.ours.fileno())
 
-    def mapped(self, _handle: int, size: int, offset: int) -> mmap.mmap:
+    def map_memory(self, _handle: int, size: int, offset: int) -> mmap.mmap:
         assert len(self.memory[offset]) == size
         return self.memory[offset]
 
-    def ask(self, _handle: int, request: int, told: ctypes.Structure) -> None:
+    def ioctl(self, _handle: int, request: int, told: ctypes.Structure) -> None:
         self.asked.append((request, told))
         waiting = self.refusals.get(request)
         if waiting:

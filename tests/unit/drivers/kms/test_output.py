@@ -13,8 +13,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from drivers.kms import find_devices, finding, guard, holders, holding, kernel, open_projector
-from drivers.kms.modes import Mode
+from drivers.kms import find_devices, finding, guard, holding, kernel, open_projector
+from drivers.kms.card import KmsMode
 from slrig.devices import Projector
 from slrig.errors import ConfigError, DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
@@ -53,16 +53,16 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     def installed(**state: object) -> FakeKernel:
         fake = FakeKernel(tmp_path / "drm", **state)  # type: ignore[arg-type]
         monkeypatch.setattr(finding, "SYSTEM", fake.system)
-        for name in ("opened", "ask", "mapped"):
+        for name in ("open_card", "ioctl", "map_memory"):
             monkeypatch.setattr(kernel, name, getattr(fake, name))
-        monkeypatch.setattr(holding, "Guard", FakeGuard)
+        monkeypatch.setattr(holding, "GuardProcess", FakeGuard)
         fakes.append(fake)
         return fake
 
     yield installed
     while OPENED:
         OPENED.pop().close()
-    holding.release(finding.DEVICES / "card0")
+    holding.release_card(finding.DEVICES / "card0")
     for fake in fakes:
         fake.ours.close()
         fake.theirs.close()
@@ -239,7 +239,7 @@ def test_a_card_of_a_desktop_is_busy_and_its_holder_is_named(
     install(master=False)
     (tmp_path / "proc" / "812").mkdir(parents=True)
     (tmp_path / "proc" / "812" / "comm").write_text("gnome-shell\n")
-    monkeypatch.setattr(holders, "PROCESSES", tmp_path / "proc")
+    monkeypatch.setattr(holding, "PROCESSES", tmp_path / "proc")
     # The number of a socket's device: no guard listens for it.
     with pytest.raises(DeviceBusyError, match=r"held by gnome-shell \(process 812\).*Ctrl\+Alt\+F3"):
         opened()
@@ -261,7 +261,7 @@ def test_what_the_kernel_refuses_says_what_to_do(
 ) -> None:
     fake = install()
     if call == "open":
-        monkeypatch.setattr(kernel, "opened", mock.Mock(side_effect=OSError(number, "refused")))
+        monkeypatch.setattr(kernel, "open_card", mock.Mock(side_effect=OSError(number, "refused")))
     else:
         fake.refusals[kernel.ATOMIC] = [number]
     with pytest.raises(error, match=message):
@@ -274,7 +274,7 @@ def test_a_controller_that_drives_another_display_is_left_to_it(install: Install
     fake.driven = {11: CONTROLLERS[1], 12: CONTROLLERS[1]}
     opened().close()
     assert fake.values[(11, "CRTC_ID")] == CONTROLLERS[0]
-    holding.release(finding.DEVICES / "card0")
+    holding.release_card(finding.DEVICES / "card0")
     fake.possible = 0b10
     with pytest.raises(UnsupportedByDeviceError, match="HDMI-A-2; unplug a display"):
         opened()
@@ -296,7 +296,7 @@ def test_connectors_with_a_display_are_found_and_nothing_is_opened(
 ) -> None:
     fake = install()
     (fake.system / "card0-Writeback-1").mkdir()
-    monkeypatch.setattr(kernel, "opened", None)
+    monkeypatch.setattr(kernel, "open_card", None)
     assert [(each.device, each.label) for each in find_devices()] == [("HDMI-A-1", "HDMI-A-1 (1280x800)")]
     assert not fake.asked
 
@@ -310,9 +310,9 @@ def test_all_faults_of_a_table_come_in_one_message() -> None:
 
 # As a C compiler lays the kernel's headers out (6.1): numbers of requests on x86-64, which hold the structure's size.
 REQUESTS: dict[str, tuple[type[ctypes.Structure], int]] = {
-    "AUTH_MAGIC": (kernel.Number, 0x40046411),
+    "AUTH_MAGIC": (kernel.ObjectNumber, 0x40046411),
     "SET_CLIENT_CAP": (kernel.ClientCap, 0x4010640D),
-    "CRTC_GET_SEQUENCE": (kernel.Sequence, 0xC018643B),
+    "CRTC_GET_SEQUENCE": (kernel.CrtcSequence, 0xC018643B),
     "GET_RESOURCES": (kernel.Resources, 0xC04064A0),
     "GET_CRTC": (kernel.Crtc, 0xC06864A1),
     "SET_CRTC": (kernel.Crtc, 0xC06864A2),
@@ -322,11 +322,11 @@ REQUESTS: dict[str, tuple[type[ctypes.Structure], int]] = {
     "GET_CONNECTOR": (kernel.GetConnector, 0xC05064A7),
     "GET_PROPERTY": (kernel.GetProperty, 0xC04064AA),
     "ADD_FB": (kernel.FrameBuffer, 0xC01C64AE),
-    "REMOVE_FB": (kernel.Number, 0xC00464AF),
+    "REMOVE_FB": (kernel.ObjectNumber, 0xC00464AF),
     "PAGE_FLIP": (kernel.PageFlip, 0xC01864B0),
     "CREATE_DUMB": (kernel.CreateDumb, 0xC02064B2),
     "MAP_DUMB": (kernel.MapDumb, 0xC01064B3),
-    "DESTROY_DUMB": (kernel.Number, 0xC00464B4),
+    "DESTROY_DUMB": (kernel.ObjectNumber, 0xC00464B4),
     "GET_PLANE_RESOURCES": (kernel.PlaneResources, 0xC01064B5),
     "GET_PLANE": (kernel.GetPlane, 0xC02064B6),
     "GET_PROPERTIES": (kernel.ObjectProperties, 0xC02064B9),
@@ -380,11 +380,11 @@ def test_a_request_has_the_kernels_number(name: str) -> None:
     ],
 )
 def test_a_mode_has_the_time_of_a_frame(flags: int, refresh_s: float, plain: bool) -> None:
-    found = Mode.of(mode(1000, 500, rate=50, flags=flags))
+    found = KmsMode.of(mode(1000, 500, rate=50, flags=flags))
     assert (found.size, found.plain) == (Size(1000, 500), plain)
     assert found.refresh_s == pytest.approx(refresh_s)
     assert bytes(found.info) == found.content
 
 
 def test_a_mode_without_a_clock_has_none() -> None:
-    assert Mode.of(mode(640, 480, clock=0)).refresh_s == 0
+    assert KmsMode.of(mode(640, 480, clock=0)).refresh_s == 0

@@ -14,7 +14,7 @@ import pytest
 
 from drivers.opencv import open_camera
 from drivers.opencv.camera import OpenCvCamera
-from drivers.opencv.controls import Controls, negotiate
+from drivers.opencv.controls import CaptureControls, negotiate
 from drivers.opencv.options import OpenCvOptions
 from slrig.devices import CameraSettings, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
@@ -216,8 +216,8 @@ def obstinate(**more: Any) -> Any:
     return Obstinate(**more)
 
 
-def controls(capture: Any, **given: Any) -> Controls:
-    return Controls(capture, options(**given), "/dev/video0", fixed_s=0.033)
+def controls(capture: Any, **given: Any) -> CaptureControls:
+    return CaptureControls(capture, options(**given), "/dev/video0", fixed_s=0.033)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.opencv import open_camera
 from drivers.opencv.camera import OpenCvCamera
-from drivers.opencv.options import Kind, source_of
+from drivers.opencv.options import SourceKind, parse_source
 from slrig.devices import AppliedSettings, CameraSettings, Trigger
 from slrig.errors import ConfigError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Pixels
@@ -24,36 +24,36 @@ LIVE = {"source_exposure_s": 0.01, "delay_s": 0.1, "frame_rate_hz": 30.0}
 @pytest.mark.parametrize(
     ("options", "kind", "backend"),
     [
-        ({"device": 0}, Kind.DEVICE, cv2.CAP_V4L2),
-        ({"device": "/dev/video0"}, Kind.DEVICE, cv2.CAP_V4L2),
+        ({"device": 0}, SourceKind.DEVICE, cv2.CAP_V4L2),
+        ({"device": "/dev/video0"}, SourceKind.DEVICE, cv2.CAP_V4L2),
         # Without its stamps, and through another back end.
-        ({"device": 0, "delay_s": 0.1, "frame_rate_hz": 30}, Kind.DEVICE, cv2.CAP_V4L2),
-        ({"device": 0, "backend": "ffmpeg", **LIVE}, Kind.LIVE, cv2.CAP_FFMPEG),
+        ({"device": 0, "delay_s": 0.1, "frame_rate_hz": 30}, SourceKind.DEVICE, cv2.CAP_V4L2),
+        ({"device": 0, "backend": "ffmpeg", **LIVE}, SourceKind.LIVE, cv2.CAP_FFMPEG),
     ],
 )
 def test_a_camera_is_opened_through_the_kernels_interface(
-    tmp_path: Path, options: dict[str, object], kind: Kind, backend: int
+    tmp_path: Path, options: dict[str, object], kind: SourceKind, backend: int
 ) -> None:
-    source = source_of("eye", options, tmp_path)
+    source = parse_source("eye", options, tmp_path)
     assert (source.kind, source.backend, source.target) == (kind, backend, options["device"])
     assert source.label == "/dev/video0"
 
 
 def test_an_address_is_a_live_source_and_its_password_is_not_shown(tmp_path: Path) -> None:
     url = "rtsp://admin:secret@camera.local:554/stream?key=secret"
-    source = source_of("eye", {"device": url, **LIVE}, tmp_path)
-    assert (source.kind, source.backend, source.target) == (Kind.LIVE, cv2.CAP_FFMPEG, url)
+    source = parse_source("eye", {"device": url, **LIVE}, tmp_path)
+    assert (source.kind, source.backend, source.target) == (SourceKind.LIVE, cv2.CAP_FFMPEG, url)
     assert source.label == "rtsp://camera.local:554/stream"
 
 
 def test_files_are_films_and_pipes_are_live(tmp_path: Path) -> None:
     (tmp_path / "film.avi").touch()
     os.mkfifo(tmp_path / "pipe.mjpeg")
-    film = source_of("eye", {"device": "film.avi", "source_exposure_s": 0.01}, tmp_path)
-    assert (film.kind, film.target) == (Kind.FILM, str(tmp_path / "film.avi"))
-    series = source_of("eye", {"device": "f/%03d.png", "source_exposure_s": 0.01, "frame_rate_hz": 10}, tmp_path)
-    assert (series.kind, series.backend) == (Kind.FILM, cv2.CAP_IMAGES)
-    assert source_of("eye", {"device": "pipe.mjpeg", **LIVE}, tmp_path).kind is Kind.LIVE
+    film = parse_source("eye", {"device": "film.avi", "source_exposure_s": 0.01}, tmp_path)
+    assert (film.kind, film.target) == (SourceKind.FILM, str(tmp_path / "film.avi"))
+    series = parse_source("eye", {"device": "f/%03d.png", "source_exposure_s": 0.01, "frame_rate_hz": 10}, tmp_path)
+    assert (series.kind, series.backend) == (SourceKind.FILM, cv2.CAP_IMAGES)
+    assert parse_source("eye", {"device": "pipe.mjpeg", **LIVE}, tmp_path).kind is SourceKind.LIVE
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_files_are_films_and_pipes_are_live(tmp_path: Path) -> None:
 def test_options_are_checked(tmp_path: Path, options: dict[str, object], words: str) -> None:
     (tmp_path / "film.avi").touch()
     with pytest.raises(ConfigError, match=words):
-        source_of("eye", options, tmp_path)
+        parse_source("eye", options, tmp_path)
 
 
 RATE_HZ = 100.0
