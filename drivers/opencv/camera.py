@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drivers.opencv.controls import CaptureControls, negotiate, read_fourcc, read_size, switch_off_automatics
 from drivers.opencv.feeds import ArrivalTiming, DeviceFeed, FilmFeed, FrameReader, GrabbedFrame, LiveFeed, open_capture
 from drivers.opencv.options import CaptureSource, SourceKind
-from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, colour_image, grey_image, prepare
+from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, colour_image, grey_image
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import DeviceError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Pixels, Size
@@ -340,8 +340,6 @@ class OpenCvCamera:
             if code not in LAYOUTS:
                 code = None
                 capture.set(cv2.CAP_PROP_CONVERT_RGB, 1)
-            else:
-                prepare(LAYOUTS[code])
             rate_hz = capture.get(cv2.CAP_PROP_FPS)
             period_ns = round(1e9 / rate_hz if rate_hz > 0 else _USUAL_PERIOD_S * 1e9)
             arrivals = None if source.options.delay_s is None else self._arrivals()

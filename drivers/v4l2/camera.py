@@ -14,7 +14,7 @@ from drivers.v4l2 import controls as ctl
 from drivers.v4l2 import kernel
 from drivers.v4l2.controls import GainScale, exposure_scale, switch_off_processing
 from drivers.v4l2.finding import CameraNode, NodeIdentity, query_identity, resolve_node
-from drivers.v4l2.formats import CorruptFrameError, PixelLayout, colour_image, grey_image, prepare
+from drivers.v4l2.formats import CorruptFrameError, PixelLayout, colour_image, grey_image
 from drivers.v4l2.options import V4L2Options
 from drivers.v4l2.stream import FilledBuffer, FrameCounter, V4L2Stream, Waker, negotiate_format
 from drivers.v4l2.timing import ExposureInterval, SensorDurations, exposure_interval
@@ -76,7 +76,6 @@ class V4L2Camera:
             self._held.callback(self._waker.close)
             identity = self._identity()
             self._agreed = negotiate_format(self._handle, node.path, options)
-            prepare(self._agreed.layout)
             self._stream = V4L2Stream(self._handle, node.path, options.buffers, self._waker)
             self._held.callback(self._stream.release)
             self._period_ns = self._agreed.period_ns

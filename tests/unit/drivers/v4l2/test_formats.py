@@ -113,7 +113,7 @@ def test_a_jpeg_is_decoded_and_one_that_is_cut_or_of_another_size_is_corrupt() -
     assert np.abs(image.astype(int) - scene(size)).max() < 12
     for data, words in (
         (b"", "begin"),
-        (sent[:200], "early"),
+        (sent[:200], "damaged"),
         (encoded(scene(Size(64, 40)), "MJPG", 0), "64 x 40"),
         (bytes([7] * 3000), "begin"),
     ):
