@@ -1,7 +1,7 @@
-"""What the kernel's video interface (V4L2) exchanges: structures, request numbers, flags.
+"""The kernel's video interface (V4L2): structures, request numbers, flags, and errors.
 
-Facts: `include/uapi/linux/videodev2.h` and `v4l2-controls.h`, and the kernel's documentation "Video for Linux API".
-Names are the kernel's, without the prefix. Structures are laid out by `ctypes` for the machine that runs.
+Sources: `include/uapi/linux/videodev2.h` and `v4l2-controls.h`, and the kernel's documentation "Video for Linux API".
+Names are the kernel's, without the prefix. `ctypes` lays structures out for the running machine.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pathlib import Path
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 
 CAPTURE = 1
-"""Buffer type: a camera's frames, one plane."""
+"""Buffer type: frames of a camera in one plane."""
 MMAP = 1
-"""Buffer memory: the driver's own, mapped."""
+"""Buffer memory: mapped memory of the driver."""
 FIELD_ANY = 0
 FIELD_NONE = 1
 
@@ -39,11 +39,11 @@ CONTROL_READ_ONLY = 0x4
 CONTROL_WRITE_ONLY = 0x40
 CONTROL_NEXT = 0x8000_0000
 CONTROL_MENUS = (3, 9)
-"""Kinds of controls whose numbers stand for words."""
+"""Types of controls whose numbers are menu entries."""
 
 
 class Capability(ctypes.Structure):
-    """`v4l2_capability`: who the device is and what it can do."""
+    """`v4l2_capability`: identity and capabilities of a device."""
 
     _fields_ = (
         ("driver", ctypes.c_char * 16),
@@ -192,7 +192,7 @@ class BufferRequest(ctypes.Structure):
 
 
 class TimeValue(ctypes.Structure):
-    """`timeval`; on 32-bit machines the kernel tells by the request number which of its two forms is meant."""
+    """`timeval`; on 32-bit machines the request number distinguishes its two forms."""
 
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_usec", ctypes.c_long))
 
@@ -207,7 +207,7 @@ class _BufferMemory(ctypes.Union):
 
 
 class Buffer(ctypes.Structure):
-    """`v4l2_buffer`: one frame's place in memory, its time stamp, sequence number and flags."""
+    """`v4l2_buffer`: a frame's memory, time stamp, sequence number and flags."""
 
     _fields_ = (
         ("index", ctypes.c_uint32),
@@ -227,7 +227,7 @@ class Buffer(ctypes.Structure):
 
 
 class ControlDescription(ctypes.Structure):
-    """`v4l2_queryctrl`: a control's name, kind and range."""
+    """`v4l2_queryctrl`: a control's name, type and range."""
 
     _fields_ = (
         ("id", ctypes.c_uint32),
@@ -249,7 +249,7 @@ class ControlValue(ctypes.Structure):
 
 
 class LongControlValue(ctypes.Structure):
-    """`v4l2_ext_control` of a 64-bit control. The kernel packs it: its value, lower half first, is not aligned."""
+    """`v4l2_ext_control` of a 64-bit control. Packed: its value, lower half first, is not aligned."""
 
     _fields_ = (
         ("id", ctypes.c_uint32),
@@ -260,7 +260,7 @@ class LongControlValue(ctypes.Structure):
 
 
 class LongControlValues(ctypes.Structure):
-    """`v4l2_ext_controls`: a list of values to be read."""
+    """`v4l2_ext_controls`: a list of values to read."""
 
     _fields_ = (
         ("which", ctypes.c_uint32),
@@ -299,9 +299,9 @@ ENUM_FRAMESIZES = _request(_BOTH, 74, FrameSize)
 ENUM_FRAMEINTERVALS = _request(_BOTH, 75, FrameInterval)
 
 GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.ENOENT})
-"""What the kernel answers when the device is not there any more."""
+"""Errors of a device that is no longer connected."""
 REFUSED = frozenset({errno.EINVAL, errno.ERANGE, errno.ENOTTY, errno.EOPNOTSUPP})
-"""What the kernel answers to a request that the device cannot do."""
+"""Errors of a request that the device does not support."""
 
 
 def open_node(node: Path) -> int:
@@ -311,7 +311,7 @@ def open_node(node: Path) -> int:
 
 def ioctl(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
     """Send a request; the answer is written into `argument`. Raises OSError."""
-    # Late, so that what looks at this module on another system is not refused.
+    # Imported here, so that this module can be imported on other systems.
     import fcntl
 
     while True:
@@ -323,7 +323,7 @@ def ioctl(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) 
 
 
 def fourcc_text(code: int) -> str:
-    """A pixel format's four characters.
+    """Return a pixel format's four characters.
 
     >>> fourcc_text(0x59455247)
     'GREY'
@@ -332,7 +332,7 @@ def fourcc_text(code: int) -> str:
 
 
 def fourcc_code(text: str) -> int:
-    """A pixel format's number; short names are filled up with blanks, as the kernel does.
+    """Return a pixel format's number; short names are padded with blanks, as in the kernel.
 
     >>> fourcc_text(fourcc_code("Y16"))
     'Y16 '
@@ -340,13 +340,13 @@ def fourcc_code(text: str) -> int:
     return int.from_bytes(text.ljust(4).encode("ascii"), "little")
 
 
-def device_error(node: Path, doing: str, error: OSError) -> DeviceError:
-    """Return what the kernel's refusal means, in words that tell what to do."""
+def device_error(node: Path, action: str, error: OSError) -> DeviceError:
+    """Return the error for a request that the kernel refused, with what to do about it."""
     number = error.errno or 0
-    cause = f"{node}: {doing}: {os.strerror(number)}"
+    cause = f"{node}: {action}: {os.strerror(number)}"
     if number in GONE:
         return DeviceGoneError(
-            f"{cause}; the camera is gone: plug it in again, and reopen it (slrig devices lists those that are there)"
+            f"{cause}; the camera is gone: plug it in again, and reopen it (slrig devices lists the connected ones)"
         )
     if number == errno.EBUSY:
         holders = list_holders(node)
@@ -358,30 +358,30 @@ def device_error(node: Path, doing: str, error: OSError) -> DeviceError:
         )
     if number == errno.ENOSPC:
         return UnsupportedByDeviceError(
-            f"{cause}; the USB bus has not enough bandwidth left for this stream beside the others: plug the cameras "
-            "into different USB controllers (lsusb -t), or ask for a smaller size_px, a lower frame_rate_hz, or "
+            f"{cause}; the USB bus has not enough bandwidth left for this stream: plug the cameras "
+            "into different USB controllers (lsusb -t), or request a smaller size_px, a lower frame_rate_hz, or "
             'pixel_format = "MJPG"'
         )
     if number in REFUSED:
         return UnsupportedByDeviceError(f"{cause}; the device cannot do that (slrig devices lists the cameras)")
-    return DeviceError(f"{cause}; look for the kernel's own words with: dmesg | tail")
+    return DeviceError(f"{cause}; see the kernel's log: dmesg | tail")
 
 
-def stream_error(node: Path, doing: str, error: OSError) -> DeviceError:
-    """The same of a request about the frames: EIO there says that the stream has died, of another that it failed."""
+def stream_error(node: Path, action: str, error: OSError) -> DeviceError:
+    """As `device_error` for a request about frames, where EIO means that the stream has died."""
     if error.errno == errno.EIO:
         return DeviceGoneError(
-            f"{node}: {doing}: {os.strerror(errno.EIO)}; its stream has died: plug it in again, and reopen it"
+            f"{node}: {action}: {os.strerror(errno.EIO)}; its stream has died: plug it in again, and reopen it"
         )
-    return device_error(node, doing, error)
+    return device_error(node, action, error)
 
 
 def list_holders(node: Path) -> tuple[str, ...]:
-    """The other programs that have a node open, as far as we may see: "name (process id)"."""
+    """List the other programs that have a node open, as far as visible: "name (process id)"."""
     found = []
     target = os.path.realpath(node)
     for process in Path("/proc").glob("[0-9]*"):
-        # Processes end while we look, and those of other users are closed to us.
+        # Processes may end meanwhile, and those of other users cannot be read.
         with suppress(OSError):
             if int(process.name) == os.getpid():
                 continue

@@ -167,7 +167,7 @@ def test_a_camera_that_falls_silent_times_out_and_one_that_is_unplugged_is_gone(
     capture, device = plugged()
     camera = armed()
     capture.flows.clear()
-    with pytest.raises(FrameTimeoutError, match="no frame that was exposed wholly after"):
+    with pytest.raises(FrameTimeoutError, match="no frame exposed entirely after"):
         camera.read(time.monotonic_ns() + 20_000_000, 0.05)
     capture.flows.set()
     assert camera.read(time.monotonic_ns(), LONG_S).image.size
@@ -198,7 +198,7 @@ def test_image_processing_is_off_and_a_control_that_fails_is_noted(plugged: Plug
     _, device = plugged(controls=(*stuck, control(0x00980912, "Gain, Automatic", 0, 1, 1)))
     camera = opened(skip_controls=["backlight_compensation", "gain"])
     [note] = camera.info.notes
-    assert "asked contrast = 32, the driver refuses it" in note
+    assert "requested contrast = 32, the driver refuses it" in note
     assert camera.info.gain_range == (1.0, 1.0)
     known = device.kernel.controls_set
     assert (known["Sharpness"], known["Gamma"], known["Gain, Automatic"]) == (0, 100, 0)
@@ -223,9 +223,9 @@ def controls(capture: Any, **given: Any) -> CaptureControls:
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({"fourcc": "GREY"}, "asked for pixel format GREY, the driver gives YUYV; choose"),
-        ({"size_px": (1920, 1080)}, "asked for 1920 x 1080, the driver gives 640 x 480"),
-        ({"frame_rate_hz": 60.0}, "asked for 60 frames per second, the driver gives 30"),
+        ({"fourcc": "GREY"}, "requested pixel format GREY, the driver gives YUYV; choose"),
+        ({"size_px": (1920, 1080)}, "requested 1920 x 1080, the driver gives 640 x 480"),
+        ({"frame_rate_hz": 60.0}, "requested 60 frames per second, the driver gives 30"),
     ],
 )
 def test_what_the_driver_takes_otherwise_is_refused(asked: dict[str, Any], words: str) -> None:
@@ -256,7 +256,7 @@ def test_every_automatic_is_switched_off_before_what_it_governs() -> None:
 @pytest.mark.parametrize(
     ("which", "words"),
     [
-        (cv2.CAP_PROP_AUTO_EXPOSURE, "automatic exposure cannot be switched off: asked for 1, the driver gives 3"),
+        (cv2.CAP_PROP_AUTO_EXPOSURE, "automatic exposure cannot be switched off: requested 1, the driver gives 3"),
         (cv2.CAP_PROP_AUTOFOCUS, "autofocus cannot be switched off"),
         (cv2.CAP_PROP_AUTO_WB, "automatic white balance cannot"),
     ],

@@ -140,31 +140,31 @@ def test_a_stamp_of_another_clock_gives_itself_away() -> None:
 
 
 def test_a_frame_that_was_waited_for_arrived_after_the_wait_began() -> None:
-    exposed = arrivals().exposed(waited(100, 118))
+    exposed = arrivals().exposure(waited(100, 118))
     assert exposed == ExposureInterval((100 - 30 - 10) * MS, 118 * MS)
 
 
 def test_frames_that_came_without_a_wait_are_as_old_as_the_last_wait() -> None:
     rule = arrivals()
-    assert rule.exposed(waited(100, 118)) is not None
+    assert rule.exposure(waited(100, 118)) is not None
     # The reader was held up for half a second; what comes then has been lying there.
     for step in range(25):
-        exposed = rule.exposed(waited(620 + step, 621 + step))
+        exposed = rule.exposure(waited(620 + step, 621 + step))
         assert exposed is not None
         assert exposed.earliest_ns == (100 - 30 - 10) * MS
     assert rule.queued == 26
     # The queue is empty again once it waits again.
-    fresh = rule.exposed(waited(650, 660))
+    fresh = rule.exposure(waited(650, 660))
     assert fresh is not None
     assert fresh.earliest_ns == (650 - 30 - 10) * MS
 
 
 def test_nothing_is_known_of_a_frame_before_the_first_wait() -> None:
     rule = arrivals()
-    assert rule.exposed(waited(100, 101)) is None
+    assert rule.exposure(waited(100, 101)) is None
     # Decoding, and waiting for a processor, are no waits for a frame.
-    assert rule.exposed(waited(101, 140, slept_ms=0.5)) is None
-    assert rule.exposed(waited(140, 155)) is not None
+    assert rule.exposure(waited(101, 140, slept_ms=0.5)) is None
+    assert rule.exposure(waited(140, 155)) is not None
 
 
 def test_time_asleep_is_measured_without_time_at_work() -> None:

@@ -68,8 +68,8 @@ def test_a_device_without_controls_needs_none() -> None:
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"focus": 900}, "asked focus_absolute = 900, the device takes 0 to 250"),
-        ({"controls": {"gamma": 3}}, "asked gamma = 3, the device takes 72 to 500"),
+        ({"focus": 900}, "requested focus_absolute = 900, the device accepts 0 to 250"),
+        ({"controls": {"gamma": 3}}, "requested gamma = 3, the device accepts 72 to 500"),
     ],
 )
 def test_what_a_device_cannot_take_is_refused(more: dict[str, object], words: str) -> None:

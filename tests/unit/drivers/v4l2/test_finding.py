@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.v4l2.finding import NodeIdentity, list_nodes, probe_node, resolve_node, to_found_devices
+from drivers.v4l2.finding import NodeIdentity, list_nodes, probe_node, resolve_node
 from slrig.errors import DeviceGoneError
 
 
@@ -108,9 +108,9 @@ def test_nodes_of_one_parent_have_names_of_their_own(machine: Machine) -> None:
 def test_a_node_that_may_not_be_opened_is_listed_with_the_remedy(machine: Machine) -> None:
     machine.plug("video0", by_path=BY_PATH)
     machine.identities["video0"] = None
-    (found,) = to_found_devices(list_nodes(machine.sysfs, machine.dev, machine.ask))
-    assert (found.driver, found.device) == ("v4l2", BY_PATH)
-    assert "usermod -aG video" in found.label
+    (found,) = list_nodes(machine.sysfs, machine.dev, machine.ask)
+    assert found.name == BY_PATH
+    assert "usermod -aG video" in found.note
 
 
 def test_what_is_gone_or_no_video_device_is_no_camera(tmp_path: Path) -> None:

@@ -36,9 +36,9 @@ def test_the_claim_holds_the_exposure_whatever_the_stamp_meant(meant: str) -> No
             "none": (0, StampSource.NONE),
         }[meant]
         queued_ns = start_ns + int(exposure_ns) - int(rng.integers(0, 100 * MS))
-        taken_ns = arrived_ns + late_ns
+        dequeued_ns = arrived_ns + late_ns
         durations = SensorDurations(int(exposure_ns), int(period))
-        claim = exposure_interval(BufferStamp(source, stamp_ns, queued_ns, taken_ns), durations)
+        claim = exposure_interval(BufferStamp(source, stamp_ns, queued_ns, dequeued_ns), durations)
         assert claim.earliest_ns <= start_ns
         assert claim.latest_ns >= end_ns
         begin_ns, finish_ns, error_ns = claim.centred_exposure(int(exposure_ns))
