@@ -72,7 +72,7 @@ class DisplayOptions(Strict, use_attribute_docstrings=True):
     """True to read one picture of each sequence back from the frame buffer and compare it."""
 
     dark_after_s: Annotated[float, Field(ge=0, le=86_400)] = 600.0
-    """How long the output is kept black after the process that opened it has ended, in whatever way."""
+    """How long the output is kept black after the process that opened it has ended, even by a crash."""
 
     @property
     def native(self) -> Size | None:

@@ -20,8 +20,8 @@ _NEVER = ("Writeback",)
 class ListedConnector:
     """A connector of a graphics card.
 
-    card : the card's node. status : connected, disconnected or unknown, as of the kernel's last look. mode : the first
-    that its display offers, as WxH; empty where it offers none.
+    card : the card's node. status : connected, disconnected or unknown, as last detected. mode : the first mode of its
+    display, as WxH; empty without one.
     """
 
     name: str
@@ -31,12 +31,12 @@ class ListedConnector:
     edid: Edid | None
 
     def __str__(self) -> str:
-        told = ", ".join(part for part in (str(self.edid or ""), self.mode or self.status) if part)
-        return f"{self.name} ({told})"
+        display = ", ".join(part for part in (str(self.edid or ""), self.mode or self.status) if part)
+        return f"{self.name} ({display})"
 
 
-def connectors() -> tuple[ListedConnector, ...]:
-    """Every connector of every card, by name."""
+def list_connectors() -> tuple[ListedConnector, ...]:
+    """List every connector of every card, by name."""
     found = []
     for folder in SYSTEM.glob("card*-*"):
         matched = _CONNECTOR.fullmatch(folder.name)
@@ -60,30 +60,30 @@ def find_connector(name: str) -> ListedConnector:
     Raises
     ------
     UnsupportedByDeviceError
-        There is none, or no card at all. Names those that there are.
+        No connector has that name, or no card exists. Lists the connectors.
     """
-    there = connectors()
-    if not there:
+    connectors = list_connectors()
+    if not connectors:
         message = (
             f"output {name}: the kernel has no display output (nothing in {SYSTEM}); its graphics driver is not loaded "
             "(nomodeset in the kernel's command line, or nvidia_drm without modeset=1), or this is a container that "
             "was not given /dev/dri"
         )
         raise UnsupportedByDeviceError(message)
-    for connector in there:
+    for connector in connectors:
         if connector.name == name:
             return connector
-    listed = "; ".join(map(str, there))
+    names = "; ".join(map(str, connectors))
     message = (
-        f"output {name}: the kernel has no connector of that name; it has: {listed}; write one of these names into the "
-        "rig file (X names them otherwise: its HDMI-1 is HDMI-A-1 here)"
+        f"output {name}: the kernel has no connector of that name; it has: {names}; write one of these names into the "
+        "rig file (X names them differently: its HDMI-1 is HDMI-A-1 here)"
     )
     raise UnsupportedByDeviceError(message)
 
 
 def not_connected_error(name: str) -> DeviceGoneError:
-    """Nothing is connected: what to say of it."""
-    others = "; ".join(str(each) for each in connectors() if each.status == "connected") or "none"
+    """Return the error for an output with nothing connected."""
+    others = "; ".join(str(each) for each in list_connectors() if each.status == "connected") or "none"
     message = (
         f"output {name}: nothing is connected to it; connected are: {others}; check the cable and that the projector "
         "is on and not in stand-by, or write one of these names into the rig file"
@@ -92,12 +92,12 @@ def not_connected_error(name: str) -> DeviceGoneError:
 
 
 def is_unplugged(name: str, card: Path) -> bool:
-    """Whether the kernel has noticed that nothing is connected (any more)."""
+    """True if the kernel has noticed that nothing is connected."""
     return _read(SYSTEM / f"{card.name}-{name}" / "status").strip() == b"disconnected"
 
 
 def read_edid(name: str, card: Path) -> Edid | None:
-    """What is connected, as of the kernel's last look."""
+    """Return the EDID of the connected display, as last detected."""
     return parse_edid(_read(SYSTEM / f"{card.name}-{name}" / "edid"))
 
 
@@ -105,5 +105,5 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError:
-        # A card that was unplugged while we looked.
+        # The card was unplugged meanwhile.
         return b""

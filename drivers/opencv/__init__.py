@@ -44,7 +44,7 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     ConfigError
         The options have faults, all of them in one message.
     DeviceGoneError
-        There is no such device, no answer from the URL, or no frame comes.
+        The device is not connected, the URL does not answer, or no frame comes.
     DeviceBusyError
         Another program streams from the camera.
     UnsupportedByDeviceError

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.opencv.controls import CaptureControls, negotiate, read_fourcc, read_size, switch_off_automatics
-from drivers.opencv.feeds import ArrivalTiming, DeviceFeed, FilmFeed, FrameReader, GrabbedFrame, LiveFeed, open_capture
+from drivers.opencv.feeds import ArrivalTiming, DeviceFeed, FeedReader, FilmFeed, GrabbedFrame, LiveFeed, open_capture
 from drivers.opencv.options import CaptureSource, SourceKind
 from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, colour_image, grey_image
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
@@ -144,7 +144,7 @@ class OpenCvCamera:
             SourceKind.FILM: self._open_film,
         }
         self._feed, self._decoder, self._controls = opening[source.kind]()
-        self._reader = FrameReader(self._feed, f"slrig-opencv-{name}")
+        self._reader = FeedReader(self._feed, f"slrig-opencv-{name}")
         exposures_s, gains = (self._exposure_s, self._exposure_s), (1.0, 1.0)
         self._applied = AppliedSettings(self._exposure_s, 1.0)
         if self._controls is not None:
@@ -179,7 +179,7 @@ class OpenCvCamera:
         return replace(self._applied, least_period_s=self._least_period_s())
 
     def _least_period_s(self) -> float | None:
-        """Return the shortest frame period: from OpenCV for a camera, from options for a live source, None for a film."""
+        """Return the shortest frame period: from OpenCV for a camera, from options for a live source, else None."""
         if isinstance(self._feed, DeviceFeed):
             rate_hz = self._feed.capture.get(cv2.CAP_PROP_FPS)
             return max(1 / rate_hz, self._applied.exposure_s) if rate_hz > 0 else None

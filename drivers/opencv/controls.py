@@ -2,7 +2,7 @@
 
 From OpenCV's cap_v4l.cpp (4.x, 5.0) and tests on a kernel's camera: a pixel format that the device
 does not have leaves the one before; a value out of range is clamped; CAP_PROP_MODE 0 makes the numbers of controls the
-kernel's own (1 is manual exposure, exposure counts 100 µs), whatever the environment says; a control that the device
+kernel's own (1 is manual exposure, exposure counts 100 µs), in every environment; a control that the device
 does not have reads as -1. On other systems the numbers have other meanings, which cannot be verified.
 """
 
@@ -174,7 +174,7 @@ class CaptureControls:
     Raises
     ------
     UnsupportedByDeviceError
-        An automatic cannot be switched off, or a focus is requested and there is no focus control.
+        An automatic cannot be switched off, or a focus is requested and the focus control is missing.
     """
 
     def __init__(

@@ -120,7 +120,7 @@ class GrabbedFrame:
     lost: int = 0
 
 
-class FrameFeed(Protocol):
+class SourceFeed(Protocol):
     """A source of frames. Only the reading thread calls `begin`, `take` and `pause`."""
 
     def begin(self) -> None:
@@ -150,7 +150,7 @@ class _CaptureFeed:
         self._sleep: SleepMeter | None = None
 
     def begin(self) -> None:
-        """See `FrameFeed`."""
+        """See `SourceFeed`."""
         self._sleep = SleepMeter()
 
     def grab(self) -> tuple[NDArray[Any], GrabTimes]:
@@ -171,13 +171,13 @@ class _CaptureFeed:
         return data, GrabTimes(called_ns, returned_ns, returned_ns - called_ns - awake_ns)
 
     def pause(self) -> None:
-        """See `FrameFeed`."""
+        """See `SourceFeed`."""
         if self._sleep is not None:
             self._sleep.close()
             self._sleep = None
 
     def release(self) -> None:
-        """See `FrameFeed`."""
+        """See `SourceFeed`."""
         self.capture.release()
 
 
@@ -199,7 +199,7 @@ class DeviceFeed(_CaptureFeed):
         self._streams = False
 
     def begin(self) -> None:
-        """See `FrameFeed`."""
+        """See `SourceFeed`."""
         super().begin()
         self._streams = True
         # Frames that came before are not lost.
@@ -219,7 +219,7 @@ class DeviceFeed(_CaptureFeed):
         self.capture.set(cv2.CAP_PROP_BUFFERSIZE, count - 1 if count > _FEW_BUFFERS else count + 1)
 
     def take(self, stop: threading.Event) -> GrabbedFrame | None:
-        """See `FrameFeed`. None for a repeated frame, whose stamp has not advanced."""
+        """See `SourceFeed`. None for a repeated frame, whose stamp has not advanced."""
         called_ns = time.monotonic_ns()
         try:
             data, grabbed = self.grab()
@@ -264,7 +264,7 @@ class LiveFeed(_CaptureFeed):
         self.arrivals = arrivals
 
     def take(self, stop: threading.Event) -> GrabbedFrame | None:
-        """See `FrameFeed`."""
+        """See `SourceFeed`."""
         del stop
         data, grabbed = self.grab()
         return GrabbedFrame(data, self.arrivals.exposure(grabbed), self.number)
@@ -288,10 +288,10 @@ class FilmFeed:
         self.begun_ns = time.monotonic_ns()
 
     def begin(self) -> None:
-        """See `FrameFeed`."""
+        """See `SourceFeed`."""
 
     def take(self, stop: threading.Event) -> GrabbedFrame | None:
-        """See `FrameFeed`. Raises FrameTimeoutError at the film's end."""
+        """See `SourceFeed`. Raises FrameTimeoutError at the film's end."""
         film = self._film
         if film is None:
             return None
@@ -307,10 +307,10 @@ class FilmFeed:
         return GrabbedFrame(data, ExposureInterval(start_ns, start_ns + self._exposure_ns), film.number)
 
     def pause(self) -> None:
-        """See `FrameFeed`."""
+        """See `SourceFeed`."""
 
     def release(self) -> None:
-        """See `FrameFeed`."""
+        """See `SourceFeed`."""
         if self._film is not None:
             self._film.release()
             self._film = None
@@ -377,10 +377,10 @@ _MAX_FRAMES = 8
 _JOIN_S = 1.0
 
 
-class FrameReader:
+class FeedReader:
     """Reads a feed in a thread of its own and keeps the newest frames. The camera calls its methods."""
 
-    def __init__(self, feed: FrameFeed, name: str) -> None:
+    def __init__(self, feed: SourceFeed, name: str) -> None:
         self._feed = feed
         self._name = name
         self._came = threading.Condition()

@@ -1,8 +1,8 @@
-"""A Raspberry Pi's camera: settings that are read back from its frames, and frames that began after an instant.
+"""A Raspberry Pi's camera through picamera2.
 
-The sensor runs by itself, so `read` waits for a frame whose exposure began late enough. Settings are written while it
-is stopped: then the first frame has them. Each frame tells the exposure and gain it was taken with, and the time from
-the frame before; a longer time between two stamps is frames that were lost, or that nobody fetched.
+The sensor runs freely, so `read` waits for a frame whose exposure began late enough. Settings are written while it is
+stopped: then the first frame has them. Each frame's metadata contain its exposure, its gain and the time from the frame
+before; a longer time between two stamps means that frames were lost or not fetched.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def load_library() -> Any:
     Raises
     ------
     LibraryMissingError
-        picamera2, or libcamera beneath it, is not installed.
+        picamera2 or libcamera is not installed.
     """
     try:
         return importlib.import_module("picamera2").Picamera2
@@ -67,13 +67,13 @@ def load_library() -> Any:
 
 
 def list_cameras() -> tuple[dict[str, Any], ...]:
-    """What libcamera tells of each camera, in picamera2's order: Id, Model, Num and more."""
+    """Return libcamera's description of each camera, in picamera2's order: Id, Model, Num and more."""
     return tuple(load_library().global_camera_info())
 
 
 @contextmanager
-def translate_errors(name: str, doing: str) -> Iterator[None]:
-    """Turn the library's errors within the block into slrig's: it raises RuntimeError for whatever goes wrong.
+def translate_errors(name: str, action: str) -> Iterator[None]:
+    """Turn the library's RuntimeErrors within the block into slrig's errors.
 
     Raises
     ------
@@ -86,14 +86,14 @@ def translate_errors(name: str, doing: str) -> Iterator[None]:
         yield
     except RuntimeError as error:
         causes = " ".join(filter(None, (str(error), str(error.__cause__ or ""))))
-        what = f"camera '{name}', {doing}: {causes}"
+        failure = f"camera '{name}', {action}: {causes}"
         if "busy" in causes.lower() or "in use" in causes.lower():
-            raise DeviceBusyError(f"{what}; another program holds the camera: close that program") from error
-        raise DeviceError(f"{what}; check the camera's cable, and try rpicam-hello --list-cameras") from error
+            raise DeviceBusyError(f"{failure}; another program uses the camera: close that program") from error
+        raise DeviceError(f"{failure}; check the camera's cable, and try rpicam-hello --list-cameras") from error
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """Every camera that libcamera sees; opens none.
+    """Return every camera that libcamera finds; opens none.
 
     Raises
     ------
@@ -104,13 +104,13 @@ def find_devices() -> tuple[FoundDevice, ...]:
 
 
 _UNPACKED = re.compile(r"^(S(?P<bayer>[RGB]{4})|R)(?P<depth>8|10|12|14|16)$")
-_LEAST_MAIN = (64, 64)
-"""picamera2 always makes a main stream; beside a raw one nobody reads it."""
+_MIN_MAIN_SIZE = (64, 64)
+"""Size of the main stream that picamera2 always makes, where only the raw one is read."""
 
 
 @dataclass(frozen=True, slots=True)
 class PiStream:
-    """The stream that is read, as it was configured."""
+    """The configured stream that is read."""
 
     name: str
     layout: PixelLayout
@@ -118,35 +118,35 @@ class PiStream:
     stride_bytes: int
 
     def colour(self, data: NDArray[np.uint8]) -> Callable[[], Pixels] | None:
-        """What makes (H, W, 3), blue, green and red, of a buffer; None where there is none."""
+        """Return a function that converts a buffer to (H, W, 3), blue, green and red; None without colour."""
         if not self.layout.has_colour:
             return None
         return partial(colour_image, data, self.layout, self.size, stride_bytes=self.stride_bytes)
 
     def image(self, data: NDArray[np.uint8]) -> Pixels:
-        """(H, W): the image in a buffer. Raises ValueError: it is too short."""
+        """Return the grey image of a buffer, (H, W). Raises ValueError if the buffer is too short."""
         return grey_image(data, self.layout, self.size, stride_bytes=self.stride_bytes)
 
 
 def configure_stream(camera: Any, name: str, *, raw: bool, size_px: tuple[int, int] | None) -> PiStream:
-    """Configure the camera for a stream, and read back what it made of that.
+    """Configure the camera for a stream and read the result back.
 
     Raises
     ------
     UnsupportedByDeviceError
-        The sensor has no such mode, or libcamera gives another extent or a format that is not read.
+        The sensor has no such mode, or libcamera gives another size or an unknown format.
     """
     modes = [mode for mode in camera.sensor_modes if "size" in mode]
     sizes = sorted({tuple(mode["size"]) for mode in modes}, key=lambda size: size[0] * size[1])
     wanted = sizes[-1] if size_px is None and sizes else size_px
-    offered = ", ".join(f"{width} x {height}" for width, height in sizes) or "none that has an extent"
+    offered = ", ".join(f"{width} x {height}" for width, height in sizes) or "none with a size"
     if wanted not in sizes:
-        message = f"camera '{name}': asked for size_px {wanted}, its sensor has the modes {offered}; choose one of them"
+        message = f"camera '{name}': requested size_px {wanted}, its sensor has the modes {offered}; choose one of them"
         raise UnsupportedByDeviceError(message)
     mode = max((mode for mode in modes if tuple(mode["size"]) == wanted), key=lambda mode: mode["bit_depth"])
     sensor = {"output_size": wanted, "bit_depth": mode["bit_depth"]}
     if raw:
-        table = {"raw": {"format": mode["unpacked"], "size": wanted}, "main": {"size": _LEAST_MAIN}}
+        table = {"raw": {"format": mode["unpacked"], "size": wanted}, "main": {"size": _MIN_MAIN_SIZE}}
     else:
         table = {"main": {"format": "YUV420", "size": wanted}}
     camera.configure(camera.create_video_configuration(**table, sensor=sensor, controls={}, display=None, encode=None))
@@ -155,7 +155,7 @@ def configure_stream(camera: Any, name: str, *, raw: bool, size_px: tuple[int, i
     layout = _layout(got["format"])
     if layout is None or tuple(got["size"]) != wanted:
         message = (
-            f"camera '{name}': asked for {table[which]}, libcamera gives {got['format']}, {got['size']}; "
+            f"camera '{name}': requested {table[which]}, libcamera gives {got['format']}, {got['size']}; "
             f'write pixels = "{"luma" if raw else "raw"}", or another size_px (the sensor has {offered})'
         )
         raise UnsupportedByDeviceError(message)
@@ -163,13 +163,13 @@ def configure_stream(camera: Any, name: str, *, raw: bool, size_px: tuple[int, i
 
 
 def _layout(form: str) -> PixelLayout | None:
-    """How a format of libcamera's lies in memory; None if it is not read.
+    """Return the layout of a format of libcamera; None if it is unknown.
 
     >>> _layout("SRGGB10").bayer, _layout("R8").packing.name, _layout("RGGB16_PISP_COMP1")
     ('RGGB', 'BYTES', None)
     """
     if form == "YUV420":
-        # Planes: all luma first, then the colours, which are not looked at.
+        # Planes: all luma first, then the colours, which are not used.
         return PixelLayout(8, SamplePacking.BYTES)
     found = _UNPACKED.match(form)
     if found is None:
@@ -188,21 +188,21 @@ FIXED: Mapping[str, object] = {
     "Contrast": 1.0,
     "Brightness": 0.0,
 }
-"""Nothing automatic, nothing that mixes neighbours or bends grey levels; set where the camera has it. 0 is "off"."""
+"""Values that switch automatic and image processing controls off; set where the camera has the control."""
 
-LONGEST_S = 1.0
-"""The longest exposure that is declared: some sensors take minutes, which no check waits for."""
+MAX_EXPOSURE_S = 1.0
+"""Longest exposure declared: some sensors allow minutes, too long for any check to wait."""
 
 _BLANK_US = 5_000
-"""What a frame may take beyond its exposure; libcamera takes no more of it than the sensor needs."""
+"""Frame duration allowed beyond the exposure; libcamera uses no more of it than the sensor needs."""
 
 _ERROR_NS = 1_000_000
-"""How late the kernel may notice the start of a frame on the wire."""
+"""Delay with which the kernel may notice the start of a frame on the wire."""
 
-_AS_ASKED = 0.01
+_SETTING_TOLERANCE = 0.01
 _SETTLING_FRAMES = 12
-_SLICE_S = 0.05
-_LATE_S = 3.0
+_WAIT_SLICE_S = 0.05
+_FRAME_TIMEOUT_S = 3.0
 _SUSPENDED_NS = 1_000_000
 
 
@@ -212,22 +212,22 @@ class PiCamera:
     Parameters
     ----------
     name
-        As the rig file calls it.
+        Its name in the rig file.
     options
-        Checked already.
+        Checked options.
     clock
-        CLOCK_MONOTONIC; in tests that of the stand-in for the library.
+        CLOCK_MONOTONIC; in tests the clock of the stand-in.
 
     Raises
     ------
     LibraryMissingError
         picamera2 is not installed.
     DeviceGoneError
-        There is no such camera.
+        No such camera is connected.
     DeviceBusyError
-        Another program holds it.
+        Another program uses it.
     UnsupportedByDeviceError
-        It cannot do what an option asks.
+        It cannot do what an option requests.
     """
 
     def __init__(self, name: str, options: PiCameraOptions, *, clock: Clock | None = None) -> None:
@@ -238,7 +238,7 @@ class PiCamera:
         numbers = [number for number, each in enumerate(known) if each["Id"] == options.device]
         if not numbers:
             found = ", ".join(each["Id"] for each in known) or "none"
-            message = f"camera '{name}': no camera '{options.device}' is connected; found: {found}; check its cable"
+            message = f"camera '{name}': camera '{options.device}' is not connected; found: {found}; check its cable"
             raise DeviceGoneError(message)
         self._job: Any = None
         with translate_errors(name, "opening it"):
@@ -248,8 +248,8 @@ class PiCamera:
                 raw = options.pixels == "raw"
                 self._stream: PiStream = configure_stream(self._camera, name, raw=raw, size_px=options.size_px)
                 self._controls = self._camera.camera_controls
-                self._camera.set_controls(self._fixed())
-            self._info = self._declared(known[numbers[0]])
+                self._camera.set_controls(self._fixed_controls())
+            self._info = self._describe(known[numbers[0]])
         except BaseException:
             self._camera.close()
             raise
@@ -260,7 +260,7 @@ class PiCamera:
         return self._info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. Runs the camera until a frame comes that was taken so.
+        """See `Camera`. Runs the camera until a frame with these settings comes.
 
         Raises
         ------
@@ -268,18 +268,18 @@ class PiCamera:
             The camera delivers no frame.
         """
         self._state.check_settings(settings, self._info)
-        told_last = self._taken(settings.exposure_s, settings.gain, _SETTLING_FRAMES)
-        got = _applied_settings(told_last)
-        if not _is_applied(told_last, settings.exposure_s, settings.gain):
+        metadata = self._run_until_applied(settings.exposure_s, settings.gain, _SETTLING_FRAMES)
+        got = _applied_settings(metadata)
+        if not _is_applied(metadata, settings.exposure_s, settings.gain):
             message = (
-                f"camera '{self._name}': asked for exposure_s {settings.exposure_s:g} and gain {settings.gain:g}, it "
-                f"gives {got.exposure_s:g} and {got.gain:g}; ask for that"
+                f"camera '{self._name}': requested exposure_s {settings.exposure_s:g} and gain {settings.gain:g}, it "
+                f"gives {got.exposure_s:g} and {got.gain:g}; use these values"
             )
             raise UnsupportedByDeviceError(message)
         return got
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`. Starts the camera afresh: no frame of an earlier arming can come."""
+        """See `Camera`. Starts the camera again: no frame of an earlier arming can come."""
         self._state.check_arming(count, trigger, self._info)
         self._last_ns = self._number = self._dropped = 0
         with translate_errors(self._name, "starting it"):
@@ -287,18 +287,18 @@ class PiCamera:
         self._state.armed = trigger
 
     def trigger(self) -> None:
-        """See `Camera`. libcamera triggers no sensor by software."""
+        """See `Camera`. libcamera has no software trigger."""
         self._state.require_armed(Trigger.SOFTWARE)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`. A frame may have begun earlier than it says by the error of its stamp: that is allowed for."""
+        """See `Camera`. Allows for the error of time stamps."""
         self._state.require_armed()
         until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        passed = 0
+        skipped = 0
         while True:
             left_s = (until_ns - self._clock.now_ns()) / 1e9
             with translate_errors(self._name, "waiting for a frame"):
-                request = self._next(max(min(left_s, _SLICE_S), 0.0))
+                request = self._next(max(min(left_s, _WAIT_SLICE_S), 0.0))
             if request is not None:
                 try:
                     self._state.require_armed()  # another thread may have closed it meanwhile
@@ -307,12 +307,12 @@ class PiCamera:
                     request.release()
                 if frame is not None:
                     return frame
-                passed += 1
+                skipped += 1
             self._state.require_armed()
             if left_s <= 0:
                 message = (
-                    f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s ({passed} "
-                    f"that began earlier were passed over); check its cable, and that the Pi keeps up"
+                    f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s "
+                    f"({skipped} that began earlier were skipped); check its cable, and that the Pi keeps up"
                 )
                 raise FrameTimeoutError(message)
 
@@ -328,9 +328,13 @@ class PiCamera:
         if self._state.close():
             self._camera.close()
 
-    def _taken(self, exposure_s: float, gain: float, most: int) -> Mapping[str, Any]:
-        """Run the camera with these settings; what its first frame tells that was taken so, or after so many the last.
-        Raises FrameTimeoutError: it delivers no frame.
+    def _run_until_applied(self, exposure_s: float, gain: float, max_frames: int) -> Mapping[str, Any]:
+        """Run the camera and return the metadata of its first frame with these settings, or of the last one.
+
+        Raises
+        ------
+        FrameTimeoutError
+            It delivers no frame.
         """
         exposure_us = round(exposure_s * 1e6)
         fastest_us = self._controls["FrameDurationLimits"][0]
@@ -342,24 +346,24 @@ class PiCamera:
             self._camera.start()
             try:
                 while True:
-                    request = self._next(exposure_s + _LATE_S)
+                    request = self._next(exposure_s + _FRAME_TIMEOUT_S)
                     if request is None:
                         message = f"camera '{self._name}' delivers no frame at {exposure_s:g} s; check its cable"
                         raise FrameTimeoutError(message)
                     metadata: Mapping[str, Any] = request.get_metadata()
                     request.release()
-                    most -= 1
-                    if _is_applied(metadata, exposure_s, gain) or most <= 0:
+                    max_frames -= 1
+                    if _is_applied(metadata, exposure_s, gain) or max_frames <= 0:
                         return metadata
             finally:
                 self._stop()
 
-    def _next(self, most_s: float) -> Any:
-        """The next request that is complete, waited for no longer; None if none came. It must be released."""
+    def _next(self, timeout_s: float) -> Any:
+        """Return the next complete request, to be released by the caller; None after `timeout_s`."""
         if self._job is None:
             self._job = self._camera.capture_request(wait=False)
         try:
-            request = self._camera.wait(self._job, timeout=most_s)
+            request = self._camera.wait(self._job, timeout=timeout_s)
         except (JobTimeoutError, TimeoutError):
             return None
         self._job = None
@@ -367,14 +371,14 @@ class PiCamera:
 
     def _stop(self) -> None:
         if self._job is not None:
-            # Stopping waits for the jobs before it, and so forever where no frame comes any more.
+            # Stopping waits for earlier jobs, and so would not end if no frame comes.
             self._camera.cancel_all_and_flush()
             self._job = None
         with translate_errors(self._name, "stopping it"):
             self._camera.stop()
 
     def _frame(self, request: Any, after_ns: int) -> Frame | None:
-        """The frame of a request; None if it began before."""
+        """Return the frame of a request; None if it began before `after_ns`."""
         metadata = request.get_metadata()
         now_ns = self._clock.now_ns()
         exposure_ns = round(metadata["ExposureTime"] * 1e3)
@@ -387,7 +391,7 @@ class PiCamera:
         start_ns = stamp_ns - (exposure_ns if self._options.time_stamp == "readout" else 0)
         if start_ns - _ERROR_NS < after_ns:
             return None
-        # All rows are read out within a frame of the fastest mode, and were by the time the frame was here.
+        # All rows are read out within a frame of the fastest mode, and before the frame arrived.
         skew_ns = 0 if self._options.global_shutter else round(self._controls["FrameDurationLimits"][0] * 1e3)
         skew_ns = max(min(skew_ns, now_ns - start_ns - exposure_ns), 0)
         data = request.make_buffer(self._stream.name)
@@ -405,31 +409,33 @@ class PiCamera:
             colour=self._stream.colour(data),
         )
 
-    def _declared(self, known: Mapping[str, Any]) -> CameraInfo:
-        least, most = self._controls["AnalogueGain"][:2]
-        most_us = self._controls["ExposureTime"][1]
-        # libcamera may say 0, which stands for "automatic": a frame tells what the sensor's least is.
-        shortest = self._taken(max(self._controls["ExposureTime"][0], 1) / 1e6, max(float(least), 1.0), 1)
+    def _describe(self, known: Mapping[str, Any]) -> CameraInfo:
+        min_gain, max_gain = self._controls["AnalogueGain"][:2]
+        max_us = self._controls["ExposureTime"][1]
+        # libcamera may report 0 for "automatic": the metadata of a frame have the sensor's minimum.
+        shortest = self._run_until_applied(
+            max(self._controls["ExposureTime"][0], 1) / 1e6, max(float(min_gain), 1.0), 1
+        )
         return CameraInfo(
             name=self._name,
             model=str(known["Model"]),
             serial=self._options.device,
             format=CameraFormat(self._stream.size, self._stream.layout.bit_depth),
             triggers=frozenset({Trigger.FREE}),
-            exposure_range_s=(shortest["ExposureTime"] / 1e6, min(most_us / 1e6, LONGEST_S)),
-            gain_range=(max(float(least), 1.0), float(most)),
+            exposure_range_s=(shortest["ExposureTime"] / 1e6, min(max_us / 1e6, MAX_EXPOSURE_S)),
+            gain_range=(max(float(min_gain), 1.0), float(max_gain)),
             colour=self._stream.layout.has_colour,
         )
 
-    def _fixed(self) -> dict[str, object]:
-        """What is set once. Raises UnsupportedByDeviceError: a lens that can be moved has no place."""
+    def _fixed_controls(self) -> dict[str, object]:
+        """Return the controls to set once. Raises UnsupportedByDeviceError if lens and option do not match."""
         fixed = {control: value for control, value in FIXED.items() if control in self._controls}
         focus = self._options.focus_dioptres
         if ("LensPosition" in self._controls) != (focus is not None):
             message = (
-                f"camera '{self._name}' has a lens that moves by itself; write focus_dioptres, 1 / the distance in m"
+                f"camera '{self._name}' has a motorised lens; write focus_dioptres, 1 / the distance in m"
                 if focus is None
-                else f"camera '{self._name}': asked for focus_dioptres {focus:g}, its lens is fixed; leave that out"
+                else f"camera '{self._name}': requested focus_dioptres {focus:g}, its lens is fixed; leave that out"
             )
             raise UnsupportedByDeviceError(message)
         return fixed if focus is None else {**fixed, "AfMode": 0, "LensPosition": focus}
@@ -444,15 +450,15 @@ def _is_applied(metadata: Mapping[str, Any], exposure_s: float, gain: float) -> 
     return _is_close(metadata["ExposureTime"], exposure_s * 1e6) and _is_close(metadata["AnalogueGain"], gain)
 
 
-def _is_close(got: float, asked: float) -> bool:
-    return abs(got - asked) <= max(_AS_ASKED * asked, 1e-3)
+def _is_close(got: float, wanted: float) -> bool:
+    return abs(got - wanted) <= max(_SETTING_TOLERANCE * wanted, 1e-3)
 
 
 def _monotonic(stamp_ns: int, now_ns: int) -> int:
-    """A time stamp on CLOCK_MONOTONIC.
+    """Convert a time stamp to CLOCK_MONOTONIC.
 
-    libcamera's document says CLOCK_BOOTTIME, which also counts the time that the machine was suspended; the receivers
-    of a Raspberry Pi stamp by CLOCK_MONOTONIC. Where the two differ, a frame that came just now tells which it is.
+    libcamera documents CLOCK_BOOTTIME, which also counts the time that the machine was suspended; the receivers of a
+    Raspberry Pi stamp by CLOCK_MONOTONIC. Where the two differ, the clock nearer to the present is the stamp's.
     """
     suspended_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
     if suspended_ns > _SUSPENDED_NS and abs(stamp_ns - suspended_ns - now_ns) < abs(stamp_ns - now_ns):

@@ -55,7 +55,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceBusyError
         Another process shows patterns there.
     DeviceError
-        There is no graphical session, or it does not let this user in.
+        No graphical session runs, or it does not let this user in.
     """
     from drivers.display.projector import DisplayProjector
     from drivers.screen.options import ScreenOptions
@@ -67,7 +67,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """Return the outputs that a display is connected to; none where there is no graphical session.
+    """Return the outputs that a display is connected to; none without a graphical session.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """A process that keeps an output black under the patterns and after them.
 
-The X server removes the windows of a client that ends, in whatever way it ends: without the guard, the desktop below
+The X server removes the windows of a client that ends, even by a crash: without the guard, the desktop below
 the patterns would light the scene from then on. The guard's black window is there already, so no light gets through in
 between. The guard ends on request, when the next guard takes over, with the output or the X server, or some time after
 the process that it watches.
@@ -190,7 +190,7 @@ class _ScreenGuard:
 
 def main() -> None:
     """Run the task that the first argument describes (JSON)."""
-    # Without the X server there is no light either.
+    # Without the X server the output is dark.
     with suppress(DeviceGoneError):
         _ScreenGuard(ScreenGuardTask(**json.loads(sys.argv[1]))).run()
 

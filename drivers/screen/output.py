@@ -88,7 +88,7 @@ class ReservedOutput:
     DeviceBusyError
         Another process shows patterns there.
     DeviceError
-        There is no X server, or it does not let this user in.
+        No X server runs, or it does not let this user in.
     """
 
     def __init__(self, connection: XConnection, options: ScreenOptions) -> None:

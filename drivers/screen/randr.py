@@ -190,7 +190,7 @@ def find_output(outputs: Sequence[Output], name: str) -> Output:
     Raises
     ------
     UnsupportedByDeviceError
-        There is no output of that name. Lists the connected ones.
+        No output has that name. Lists the connected ones.
     DeviceGoneError
         Nothing is connected to it.
     """

@@ -92,7 +92,7 @@ class XConnection:
     LibraryMissingError
         xcffib or libxcb is not installed.
     DeviceError
-        There is no X server, or it does not let this user in.
+        No X server runs, or it does not let this user in.
     """
 
     def __init__(self, display: str | None = None) -> None:

@@ -139,13 +139,19 @@ def _query_control(handle: int, number: int) -> kernel.ControlDescription:
     return description
 
 
-def _add_control(asked: kernel.ControlDescription, found: dict[int, Control]) -> None:
-    if asked.flags & (kernel.CONTROL_DISABLED | kernel.CONTROL_READ_ONLY | kernel.CONTROL_WRITE_ONLY):
+def _add_control(description: kernel.ControlDescription, found: dict[int, Control]) -> None:
+    if description.flags & (kernel.CONTROL_DISABLED | kernel.CONTROL_READ_ONLY | kernel.CONTROL_WRITE_ONLY):
         return
-    name = re.sub(r"[^a-z0-9]+", "_", asked.name.decode("utf-8", "replace").lower()).strip("_")
-    is_menu = asked.type in kernel.CONTROL_MENUS
-    found[int(asked.id)] = Control(
-        int(asked.id), name, asked.minimum, asked.maximum, asked.step, asked.default_value, is_menu
+    name = re.sub(r"[^a-z0-9]+", "_", description.name.decode("utf-8", "replace").lower()).strip("_")
+    is_menu = description.type in kernel.CONTROL_MENUS
+    found[int(description.id)] = Control(
+        int(description.id),
+        name,
+        description.minimum,
+        description.maximum,
+        description.step,
+        description.default_value,
+        is_menu,
     )
 
 
@@ -413,15 +419,15 @@ def _blank_px(handle: int) -> int | None:
 
 
 def _pixel_rate_hz(handle: int) -> int | None:
-    asked = kernel.LongControlValue(id=PIXEL_RATE)
-    answer = kernel.LongControlValues(count=1, controls=ctypes.pointer(asked))
+    rate = kernel.LongControlValue(id=PIXEL_RATE)
+    answer = kernel.LongControlValues(count=1, controls=ctypes.pointer(rate))
     try:
         kernel.ioctl(handle, kernel.G_EXT_CTRLS, answer)
     except OSError as error:
         if error.errno in kernel.GONE:
             raise
         return None
-    low, high = asked.halves
+    low, high = rate.halves
     return int(high << 32 | low) or None
 
 

@@ -155,8 +155,8 @@ class FakeKernel:
         words = WORDS.get(name, {})
         told.name, told.flags = name.encode(), kernel.PROPERTY_ENUM if words else 0
         if told.enum_blob_ptr and told.count_enum_blobs >= len(words):
-            array = (kernel.PropertyWord * len(words))(
-                *(kernel.PropertyWord(value=value, name=word.encode()) for word, value in words.items())
+            array = (kernel.PropertyEnum * len(words))(
+                *(kernel.PropertyEnum(value=value, name=word.encode()) for word, value in words.items())
             )
             ctypes.memmove(told.enum_blob_ptr, array, ctypes.sizeof(array))
         told.count_enum_blobs = len(words)

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.opencv.feeds import (
     ArrivalTiming,
-    FrameReader,
+    FeedReader,
     GrabbedFrame,
     GrabTimes,
     SleepMeter,
@@ -61,7 +61,7 @@ def soon() -> int:
 
 def test_the_newest_frames_are_kept_in_order() -> None:
     feed = ScriptedFeed(20)
-    reader = FrameReader(feed, "reader")
+    reader = FeedReader(feed, "reader")
     reader.start()
     assert feed.waiting.wait(LONG_S)
     kept = [taken.number for taken in (reader.next(soon()) for _ in range(8)) if taken is not None]
@@ -79,7 +79,7 @@ def test_the_newest_frames_are_kept_in_order() -> None:
 def test_a_source_that_does_not_return_is_left_to_its_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drivers.opencv.feeds._JOIN_S", 0.01)
     feed = ScriptedFeed(1)
-    reader = FrameReader(feed, "reader")
+    reader = FeedReader(feed, "reader")
     reader.start()
     assert feed.waiting.wait(LONG_S)
     assert not reader.stop()
@@ -93,7 +93,7 @@ def test_a_source_that_does_not_return_is_left_to_its_thread(monkeypatch: pytest
 def test_starting_again_forgets_what_was_before() -> None:
     feed = ScriptedFeed(3)
     feed.go_on.set()
-    reader = FrameReader(feed, "reader")
+    reader = FeedReader(feed, "reader")
     reader.start()
     assert feed.waiting.wait(LONG_S)
     assert reader.stop()

@@ -54,9 +54,9 @@ def test_a_camera_is_found_by_the_id_of_libcamera() -> None:
         (found,) = find_devices()
         assert found.driver == "picamera2"
         assert found.device.endswith("ov9281@60")
-        with pytest.raises(DeviceGoneError, match=r"no camera 'Acme' is connected; found: .*ov9281@60"):
+        with pytest.raises(DeviceGoneError, match=r"camera 'Acme' is not connected; found: .*ov9281@60"):
             open_camera("left", {"device": "Acme"}, Path())
-    with pytest.raises(DeviceBusyError, match="another program holds"):
+    with pytest.raises(DeviceBusyError, match="another program uses"):
         pi(held_elsewhere=True).opened()
 
 
