@@ -218,11 +218,11 @@ class OpenCvCamera:
         after_ns = max(after_ns, self._armed_ns)
         rejected = _RejectedFrames()
         while True:
-            taken = self._reader.next(until_ns)
+            grabbed = self._reader.next(until_ns)
             self._state.require_armed()
-            if taken is None:
+            if grabbed is None:
                 raise FrameTimeoutError(self._timeout_message(after_ns, timeout_s, rejected))
-            frame = self._accept(taken, after_ns, rejected)
+            frame = self._accept(grabbed, after_ns, rejected)
             if frame is not None:
                 return frame
 
@@ -237,34 +237,34 @@ class OpenCvCamera:
         if self._state.close():
             self._reader.close()
 
-    def _accept(self, taken: GrabbedFrame, after_ns: int, rejected: _RejectedFrames) -> Frame | None:
+    def _accept(self, grabbed: GrabbedFrame, after_ns: int, rejected: _RejectedFrames) -> Frame | None:
         """Return the frame if it is acceptable; else None, and count the cause."""
-        exposed = taken.exposed
-        if exposed is None:
+        exposure = grabbed.exposure
+        if exposure is None:
             rejected.untimed += 1
             return None
-        if exposed.earliest_ns < after_ns:
+        if exposure.earliest_ns < after_ns:
             rejected.stale += 1
             return None
         try:
-            image = self._decoder.grey(taken.data)
+            image = self._decoder.grey(grabbed.data)
         except CorruptFrameError as fault:
             rejected.corrupt += 1
             rejected.last_fault = str(fault)
             self._corrupt += 1
             return None
-        start_ns, end_ns, error_ns = exposed.centred_exposure(round(self._applied.exposure_s * 1e9))
+        start_ns, end_ns, error_ns = exposure.centred_exposure(round(self._applied.exposure_s * 1e9))
         return Frame(
             camera=self._name,
             image=image,
             t_start_ns=start_ns,
             t_end_ns=end_ns,
             t_err_ns=error_ns,
-            sequence_number=taken.number,
-            dropped_count=taken.lost - self._lost_before + self._corrupt,
+            sequence_number=grabbed.number,
+            dropped_count=grabbed.lost - self._lost_before + self._corrupt,
             exposure_s=self._applied.exposure_s,
             gain=self._applied.gain,
-            colour=partial(self._decoder.colour, taken.data) if self._decoder.has_colour else None,
+            colour=partial(self._decoder.colour, grabbed.data) if self._decoder.has_colour else None,
         )
 
     def _timeout_message(self, after_ns: int, timeout_s: float, rejected: _RejectedFrames) -> str:
@@ -307,16 +307,16 @@ class OpenCvCamera:
         slowest_ns = max(feed.period_ns, feed.exposure_ns)
         until_ns = self._armed_ns + 4 * settling * slowest_ns + round(_START_TOLERANCE_S * 1e9)
         while came <= settling:
-            taken = self._reader.next(until_ns)
-            if taken is None:
+            grabbed = self._reader.next(until_ns)
+            if grabbed is None:
                 message = (
                     f"camera '{self._name}': {came} of the first {settling + 1} frames came in time; check its cable "
                     "and bandwidth (dmesg | tail)"
                 )
                 raise FrameTimeoutError(message)
-            if taken.exposed is not None and taken.exposed.earliest_ns >= self._armed_ns:
+            if grabbed.exposure is not None and grabbed.exposure.earliest_ns >= self._armed_ns:
                 came += 1
-                self._lost_before = taken.lost
+                self._lost_before = grabbed.lost
         # A camera may be slower than OpenCV reports.
         if feed.arrivals is None:
             feed.period_ns = max(feed.period_ns, round(float(np.median(np.diff(feed.stamps_ns)))))

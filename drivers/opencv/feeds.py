@@ -112,10 +112,10 @@ _DEAD_NS = 2_000_000_000  # of grabs that fail at once, one after the other
 
 @dataclass(frozen=True, slots=True)
 class GrabbedFrame:
-    """A frame from OpenCV. exposed : None if unknown. number, lost : counts of the source so far."""
+    """A frame from OpenCV. exposure : None if unknown. number, lost : counts of the source so far."""
 
     data: NDArray[Any]
-    exposed: ExposureInterval | None
+    exposure: ExposureInterval | None
     number: int
     lost: int = 0
 
@@ -252,8 +252,8 @@ class DeviceFeed(_CaptureFeed):
             self._lost += max(round((stamp_ns - self._last_ns) / self.period_ns) - 1, 0)
         self._last_ns = stamp_ns
         self.stamps_ns = [*self.stamps_ns[-15:], stamp_ns]
-        exposed = exposure_from_stamp(stamp_ns, grabbed, exposure_ns=self.exposure_ns, period_ns=self.period_ns)
-        return GrabbedFrame(data, exposed, self.number + self._lost, self._lost)
+        exposure = exposure_from_stamp(stamp_ns, grabbed, exposure_ns=self.exposure_ns, period_ns=self.period_ns)
+        return GrabbedFrame(data, exposure, self.number + self._lost, self._lost)
 
 
 class LiveFeed(_CaptureFeed):
@@ -449,10 +449,10 @@ class FeedReader:
         try:
             self._feed.begin()
             while not stop.is_set():
-                taken = self._feed.take(stop)
-                if taken is not None and not stop.is_set():
+                frame = self._feed.take(stop)
+                if frame is not None and not stop.is_set():
                     with self._came:
-                        self._frames.append(taken)
+                        self._frames.append(frame)
                         self._came.notify_all()
         except Exception as error:  # noqa: BLE001 - any error of OpenCV; `next` raises it
             with self._came:

@@ -166,9 +166,9 @@ class V4L2Camera:
             until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
             skipped = _SkippedFrames()
             while True:
-                taken = self._stream.take(until_ns)
-                if taken is not None:
-                    frame = self._accept(taken, after_ns, skipped)
+                buffer = self._stream.take(until_ns)
+                if buffer is not None:
+                    frame = self._accept(buffer, after_ns, skipped)
                     if frame is not None:
                         return frame
                 if time.monotonic_ns() >= until_ns:
@@ -193,32 +193,32 @@ class V4L2Camera:
             with self._lock:
                 self._resources.close()
 
-    def _accept(self, taken: FilledBuffer, after_ns: int, skipped: _SkippedFrames) -> Frame | None:
+    def _accept(self, buffer: FilledBuffer, after_ns: int, skipped: _SkippedFrames) -> Frame | None:
         """Return the frame if it is acceptable; else None, and count the cause. Queues the buffer again."""
-        is_new = self._counter.is_new(taken)
-        exposure = self._exposure_interval(taken)
+        is_new = self._counter.is_new(buffer)
+        exposure = self._exposure_interval(buffer)
         if not is_new:
             skipped.repeated += 1
-        elif not taken.corrupt and exposure.earliest_ns < after_ns:
+        elif not buffer.corrupt and exposure.earliest_ns < after_ns:
             skipped.stale += 1
         else:
-            images = self._convert(taken, skipped)
+            images = self._convert(buffer, skipped)
             if images is not None:
-                self._stream.requeue(taken)
+                self._stream.requeue(buffer)
                 return self._frame(*images, exposure)
             self._counter.note_corrupt()
-        self._stream.requeue(taken)
+        self._stream.requeue(buffer)
         return None
 
     def _convert(
-        self, taken: FilledBuffer, skipped: _SkippedFrames
+        self, buffer: FilledBuffer, skipped: _SkippedFrames
     ) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
-        if taken.corrupt:
+        if buffer.corrupt:
             skipped.corrupt += 1
             skipped.last_fault = "the driver reports damaged data"
             return None
         negotiated = self._format
-        source = self._stream.data(taken), negotiated.layout, negotiated.size
+        source = self._stream.data(buffer), negotiated.layout, negotiated.size
         grey, colour = (
             partial(convert, *source, stride_bytes=negotiated.stride_bytes, limited_luma=self._options.limited_luma)
             for convert in (grey_image, colour_image)
@@ -245,7 +245,7 @@ class V4L2Camera:
             colour=colour,
         )
 
-    def _exposure_interval(self, taken: FilledBuffer) -> ExposureInterval:
+    def _exposure_interval(self, buffer: FilledBuffer) -> ExposureInterval:
         exposure_ns = round(self._applied.exposure_s * 1e9)
         if self._exposure is None:
             exposure_ns = max(exposure_ns, self._period_ns)
@@ -253,7 +253,7 @@ class V4L2Camera:
         readout_ns = self._period_ns if readout_s is None else round(readout_s * 1e9)
         # A device that stamps some frames after their arrival stamps the others as late.
         delay_ns = max(round(self._options.stamp_delay_s * 1e9), self._counter.ahead_ns)
-        return exposure_interval(taken.stamp, SensorDurations(exposure_ns, readout_ns, delay_ns))
+        return exposure_interval(buffer.stamp, SensorDurations(exposure_ns, readout_ns, delay_ns))
 
     def _settle(self) -> None:
         """Skip the first frames, which may be exposed with earlier settings, and measure the frame period."""
@@ -263,18 +263,18 @@ class V4L2Camera:
         skipped = _SkippedFrames()
         came = 0
         while came < settling + 1:
-            taken = self._stream.take(until_ns)
-            if taken is None:
+            buffer = self._stream.take(until_ns)
+            if buffer is None:
                 message = (
                     f"camera '{self._name}': its stream started, and {came} of the first {settling + 1} frames came "
                     f"in time; skipped: {skipped}. Check cable and bandwidth (dmesg | tail)"
                 )
                 raise FrameTimeoutError(message)
-            if self._counter.is_new(taken):
+            if self._counter.is_new(buffer):
                 came += 1
             else:
                 skipped.repeated += 1
-            self._stream.requeue(taken)
+            self._stream.requeue(buffer)
         self._period_ns = max(self._format.period_ns, self._counter.period_ns() or 0)
         self._require_unchanged()
 

@@ -42,6 +42,10 @@ CONTROL_MENUS = (3, 9)
 """Types of controls whose numbers are menu entries."""
 
 
+def _u32(*names: str) -> tuple[tuple[str, type[ctypes.c_uint32]], ...]:
+    return tuple((name, ctypes.c_uint32) for name in names)
+
+
 class Capability(ctypes.Structure):
     """`v4l2_capability`: identity and capabilities of a device."""
 
@@ -49,9 +53,7 @@ class Capability(ctypes.Structure):
         ("driver", ctypes.c_char * 16),
         ("card", ctypes.c_char * 32),
         ("bus_info", ctypes.c_char * 32),
-        ("version", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
-        ("device_caps", ctypes.c_uint32),
+        *_u32("version", "capabilities", "device_caps"),
         ("reserved", ctypes.c_uint32 * 3),
     )
 
@@ -60,9 +62,7 @@ class FormatDescription(ctypes.Structure):
     """`v4l2_fmtdesc`: one pixel format that the device offers."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
+        *_u32("index", "type", "flags"),
         ("description", ctypes.c_char * 32),
         ("pixelformat", ctypes.c_uint32),
         ("mbus_code", ctypes.c_uint32),
@@ -74,18 +74,8 @@ class PixFormat(ctypes.Structure):
     """`v4l2_pix_format`: size, pixel format and layout of a frame."""
 
     _fields_ = (
-        ("width", ctypes.c_uint32),
-        ("height", ctypes.c_uint32),
-        ("pixelformat", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
-        ("bytesperline", ctypes.c_uint32),
-        ("sizeimage", ctypes.c_uint32),
-        ("colorspace", ctypes.c_uint32),
-        ("priv", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
-        ("ycbcr_enc", ctypes.c_uint32),
-        ("quantization", ctypes.c_uint32),
-        ("xfer_func", ctypes.c_uint32),
+        *_u32("width", "height", "pixelformat", "field", "bytesperline", "sizeimage", "colorspace", "priv", "flags"),
+        *_u32("ycbcr_enc", "quantization", "xfer_func"),
     )
 
 
@@ -101,10 +91,7 @@ class Format(ctypes.Structure):
 
 
 class _SizeSteps(ctypes.Structure):
-    _fields_ = tuple(
-        (name, ctypes.c_uint32)
-        for name in ("min_width", "max_width", "step_width", "min_height", "max_height", "step_height")
-    )
+    _fields_ = _u32("min_width", "max_width", "step_width", "min_height", "max_height", "step_height")
 
 
 class _SizeDiscrete(ctypes.Structure):
@@ -119,9 +106,7 @@ class FrameSize(ctypes.Structure):
     """`v4l2_frmsizeenum`: one size, or a range of sizes, of a pixel format."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("pixel_format", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
+        *_u32("index", "pixel_format", "type"),
         ("size", _SizeUnion),
         ("reserved", ctypes.c_uint32 * 2),
     )
@@ -145,11 +130,7 @@ class FrameInterval(ctypes.Structure):
     """`v4l2_frmivalenum`: one time per frame, or a range of them, of a pixel format and size."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("pixel_format", ctypes.c_uint32),
-        ("width", ctypes.c_uint32),
-        ("height", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
+        *_u32("index", "pixel_format", "width", "height", "type"),
         ("interval", _IntervalUnion),
         ("reserved", ctypes.c_uint32 * 2),
     )
@@ -182,10 +163,7 @@ class BufferRequest(ctypes.Structure):
     """`v4l2_requestbuffers`."""
 
     _fields_ = (
-        ("count", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("memory", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
+        *_u32("count", "type", "memory", "capabilities"),
         ("flags", ctypes.c_uint8),
         ("reserved", ctypes.c_uint8 * 3),
     )
@@ -210,11 +188,7 @@ class Buffer(ctypes.Structure):
     """`v4l2_buffer`: a frame's memory, time stamp, sequence number and flags."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("bytesused", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
+        *_u32("index", "type", "bytesused", "flags", "field"),
         ("timestamp", TimeValue),
         ("timecode", ctypes.c_uint32 * 4),
         ("sequence", ctypes.c_uint32),
@@ -252,9 +226,7 @@ class LongControlValue(ctypes.Structure):
     """`v4l2_ext_control` of a 64-bit control. Packed: its value, lower half first, is not aligned."""
 
     _fields_ = (
-        ("id", ctypes.c_uint32),
-        ("size", ctypes.c_uint32),
-        ("reserved2", ctypes.c_uint32),
+        *_u32("id", "size", "reserved2"),
         ("halves", ctypes.c_uint32 * 2),
     )
 
@@ -263,9 +235,7 @@ class LongControlValues(ctypes.Structure):
     """`v4l2_ext_controls`: a list of values to read."""
 
     _fields_ = (
-        ("which", ctypes.c_uint32),
-        ("count", ctypes.c_uint32),
-        ("error_idx", ctypes.c_uint32),
+        *_u32("which", "count", "error_idx"),
         ("request_fd", ctypes.c_int32),
         ("reserved", ctypes.c_uint32),
         ("controls", ctypes.POINTER(LongControlValue)),

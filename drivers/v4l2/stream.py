@@ -360,9 +360,9 @@ class V4L2Stream:
                 message = f"{self._node}: the camera was closed during the wait for a frame; open it again"
                 raise DeviceStateError(message)
             if self._handle in events:
-                taken = self._dequeue()
-                if taken is not None:
-                    return taken
+                filled = self._dequeue()
+                if filled is not None:
+                    return filled
                 if events[self._handle] & _BROKEN:
                     message = (
                         f"{self._node}: the stream has died; the camera is gone or has failed: plug it in again, and "
@@ -373,13 +373,13 @@ class V4L2Stream:
             if left_ms <= 0:
                 return None
 
-    def data(self, taken: FilledBuffer) -> NDArray[np.uint8]:
+    def data(self, filled: FilledBuffer) -> NDArray[np.uint8]:
         """Return a copy of the used bytes of a buffer, (n,) uint8."""
-        return np.frombuffer(self._maps[taken.index][: taken.bytes_used], dtype=np.uint8)
+        return np.frombuffer(self._maps[filled.index][: filled.bytes_used], dtype=np.uint8)
 
-    def requeue(self, taken: FilledBuffer) -> None:
+    def requeue(self, filled: FilledBuffer) -> None:
         """Queue the buffer for the camera to fill again."""
-        self._queue(taken.index)
+        self._queue(filled.index)
 
     def stop(self) -> None:
         """End the stream, in any state of the device. Idempotent."""
@@ -463,18 +463,18 @@ class FrameCounter:
         """Set the count of lost frames to 0."""
         self.lost = 0
 
-    def is_new(self, taken: FilledBuffer) -> bool:
+    def is_new(self, filled: FilledBuffer) -> bool:
         """Count a frame. False if it is a repetition: its stamp is not later than the last one's."""
-        last, self._last = self._last, taken
-        ahead_ns = taken.stamp.stamp_ns - taken.stamp.dequeued_ns
-        if taken.stamp.source is not StampSource.NONE and ahead_ns <= OTHER_CLOCK_NS:
+        last, self._last = self._last, filled
+        ahead_ns = filled.stamp.stamp_ns - filled.stamp.dequeued_ns
+        if filled.stamp.source is not StampSource.NONE and ahead_ns <= OTHER_CLOCK_NS:
             self.ahead_ns = max(self.ahead_ns, ahead_ns)
         if last is None:
             self.number += 1
             return True
-        step = (taken.sequence - last.sequence) % _SEQUENCE_MODULUS
-        stamped = StampSource.NONE not in (taken.stamp.source, last.stamp.source)
-        if (taken.stamp.stamp_ns <= last.stamp.stamp_ns) if stamped else (step == 0):
+        step = (filled.sequence - last.sequence) % _SEQUENCE_MODULUS
+        stamped = StampSource.NONE not in (filled.stamp.source, last.stamp.source)
+        if (filled.stamp.stamp_ns <= last.stamp.stamp_ns) if stamped else (step == 0):
             self._last = last
             self.lost += 1
             return False
@@ -482,11 +482,11 @@ class FrameCounter:
         step = step if 1 <= step < _MAX_STEP else 1
         self.number += step
         if stamped:
-            self._intervals_ns.append((taken.stamp.stamp_ns - last.stamp.stamp_ns) / step)
+            self._intervals_ns.append((filled.stamp.stamp_ns - last.stamp.stamp_ns) / step)
         # Buffers are filled in the order in which they were queued. If this one was free when the last frame was
         # finished, the frames between are lost. Otherwise no buffer was free for them.
         finished_ns = last.stamp.stamp_ns if stamped else last.stamp.dequeued_ns
-        if taken.stamp.queued_ns <= finished_ns:
+        if filled.stamp.queued_ns <= finished_ns:
             self.lost += step - 1
         return True
 
