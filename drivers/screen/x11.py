@@ -48,6 +48,8 @@ _Z_PIXMAP = 2
 _ALL_PLANES = 0xFFFFFFFF
 _COMPLETE_MASK = 2
 
+_PUT_IMAGE_OPCODE = 72
+_PUT_IMAGE = struct.Struct("<IIHHhhBBxx")
 _PRESENT_PIXMAP = struct.Struct("<IIIIIhhIIIIxxxxQQQ")
 _COMPLETE_NOTIFY = struct.Struct("<BBIIIQ")
 
@@ -143,10 +145,14 @@ class XConnection:
         with self._translate_errors(request):
             getattr(self._api(extension), request)(*arguments, is_checked=True).check()
 
-    def do_packed(self, opcode: int, body: bytes, *, extension: str) -> None:
-        """Send a request that xcffib lacks, given as bytes after its header. Waits and raises as `do`."""
-        with self._translate_errors(f"{extension} {opcode}"):
-            self._api(extension).send_request(opcode, BytesIO(bytes(4) + body), is_checked=True).check()
+    def do_packed(self, opcode: int, body: bytes, *, data: int = 0, extension: str | None = None) -> None:
+        """Send a request given as bytes after its header, of which `data` is the second byte. Waits and raises as `do`.
+
+        For requests that xcffib lacks, and for images, which it packs slowly.
+        """
+        with self._translate_errors(f"{extension or 'core'} {opcode}"):
+            request = BytesIO(bytes((0, data, 0, 0)) + body)
+            self._api(extension).send_request(opcode, request, is_checked=True).check()
 
     def events(self) -> Iterator[Any]:
         """Yield the events that have arrived. Raises DeviceGoneError."""
@@ -335,10 +341,9 @@ def put_levels(
     connection: XConnection, drawable: int, context: int, levels: Pixels, pattern: Pattern | None = None
 ) -> None:
     """Draw a pattern's levels, (H, W) uint8, in its colour at the upper left of a drawable with 24 bits in 32."""
-    data = rgb_pixels(levels, pattern).tobytes()
     height_px, width_px = levels.shape
-    depth = connection.screen.depth
-    connection.do("PutImage", _Z_PIXMAP, drawable, context, width_px, height_px, 0, 0, 0, depth, len(data), data)
+    head = _PUT_IMAGE.pack(drawable, context, width_px, height_px, 0, 0, 0, connection.screen.depth)
+    connection.do_packed(_PUT_IMAGE_OPCODE, head + rgb_pixels(levels, pattern).tobytes(), data=_Z_PIXMAP)
 
 
 def fill_tiled(connection: XConnection, drawable: int, context: int, tile: int, size: Size) -> None:
