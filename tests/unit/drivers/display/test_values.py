@@ -63,7 +63,7 @@ def test_an_edid_names_its_display_and_a_damaged_one_none() -> None:
     ],
     ids=["flipped", "copied", "queued"],
 )
-def test_when_light_is_whole(
+def test_full_light_time(
     presented: ScanoutStart, latency_s: float, error_s: float, earliest_ms: float, latest_ms: float
 ) -> None:
     lit, err = full_light_time(presented, refresh_s=0.02, latency_s=latency_s, latency_error_s=error_s)
@@ -72,7 +72,7 @@ def test_when_light_is_whole(
     assert err / 1e6 <= (latest_ms - earliest_ms) / 2 + 1
 
 
-def test_what_is_done_on_the_own_thread_is_done_there_and_one_that_hangs_is_reported() -> None:
+def test_jobs_run_on_the_worker_thread_and_a_hang_is_reported() -> None:
     thread, hang = WorkerThread("the screen"), threading.Event()
     assert thread.run(threading.get_ident, timeout_s=5) not in (threading.get_ident(), 0)
     with pytest.raises(DeviceGoneError, match="pulled"):
@@ -89,6 +89,6 @@ def test_what_is_done_on_the_own_thread_is_done_there_and_one_that_hangs_is_repo
     thread.end(timeout_s=5)
 
 
-def test_white_in_one_light_has_pixels_of_that_colour() -> None:
+def test_white_in_one_primary_has_pixels_of_that_colour() -> None:
     words = [int(rgb_pixels(np.full((1, 1), 255, np.uint8), pattern)[0, 0]) for pattern in LIGHTS]
     assert words == [0xFF0000, 0x00FF00, 0x0000FF, 0xFFFFFF]

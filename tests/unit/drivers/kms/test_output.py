@@ -87,7 +87,7 @@ def scanned_out(fake: FakeKernel) -> np.ndarray[tuple[int, ...], np.dtype[np.uin
 
 
 @pytest.mark.parametrize("atomic", [True, False])
-def test_patterns_are_shown_as_they_are(install: Install, atomic: bool) -> None:
+def test_patterns_are_shown_unchanged(install: Install, atomic: bool) -> None:
     fake = install(atomic=atomic)
     projector = opened()
     assert projector.info.size == SIZE
@@ -103,7 +103,7 @@ def test_patterns_are_shown_as_they_are(install: Install, atomic: bool) -> None:
 
 
 @pytest.mark.parametrize("atomic", [True, False])
-def test_everything_that_would_change_a_picture_is_off(install: Install, atomic: bool) -> None:
+def test_everything_that_changes_pictures_is_switched_off(install: Install, atomic: bool) -> None:
     fake = install(atomic=atomic)
     opened().close()
     assert fake.values[(11, "Broadcast RGB")] == 1
@@ -120,7 +120,7 @@ def test_everything_that_would_change_a_picture_is_off(install: Install, atomic:
     assert [value / 65536 for value in source] == shown == [0, 0, 1280, 800]
 
 
-def test_a_flips_stamp_is_when_its_scan_out_began(install: Install) -> None:
+def test_a_flips_stamp_is_the_start_of_its_scan_out(install: Install) -> None:
     fake = install()
     projector = loaded()
     stamps: list[int] = []
@@ -137,7 +137,7 @@ def test_a_flips_stamp_is_when_its_scan_out_began(install: Install) -> None:
 
 
 @pytest.mark.parametrize("state", [{"counts": False}, {"stamp": lambda: 0}], ids=["not counted", "zero"])
-def test_a_stamp_that_means_nothing_is_not_believed(install: Install, state: dict[str, object]) -> None:
+def test_an_unusable_stamp_is_replaced_by_the_times_of_the_call(install: Install, state: dict[str, object]) -> None:
     install(**state)
     projector = loaded()
     asked_ns = time.monotonic_ns()
@@ -148,7 +148,7 @@ def test_a_stamp_that_means_nothing_is_not_believed(install: Install, state: dic
     assert ("does not count" in projector.info.model) == ("counts" in state)
 
 
-def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
+def test_an_event_of_an_earlier_flip_is_ignored(install: Install) -> None:
     fake = install()
     projector = loaded()
     fake.flipped(5)
@@ -156,7 +156,7 @@ def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
     assert projector.show(1).index == 1
 
 
-def test_a_display_that_makes_no_refresh_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_display_without_refreshes_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = install()
     projector = loaded()
     monkeypatch.setattr("drivers.kms.output._FLIP_TIMEOUT_S", 0.05)
@@ -165,7 +165,7 @@ def test_a_display_that_makes_no_refresh_is_reported(install: Install, monkeypat
         projector.show(1)
 
 
-def test_a_display_that_is_pulled_or_exchanged_is_reported(install: Install) -> None:
+def test_an_unplugged_or_exchanged_display_is_reported(install: Install) -> None:
     fake = install()
     projector = loaded()
     fake.plug(11, False)
@@ -178,7 +178,7 @@ def test_a_display_that_is_pulled_or_exchanged_is_reported(install: Install) -> 
         projector.load(SEQUENCE)
 
 
-def test_what_the_frame_buffer_does_not_hold_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_pixels_in_the_frame_buffer_are_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = install()
     projector = loaded()
     send = fake.flipped
@@ -206,7 +206,7 @@ def test_what_the_frame_buffer_does_not_hold_is_reported(install: Install, monke
         ({"output": "HDMI-1"}, None, "it has: HDMI-A-1 .*; HDMI-A-2 .*X names them differently"),
     ],
 )
-def test_what_is_not_exact_or_not_there_is_refused(
+def test_inexact_and_missing_outputs_are_refused(
     install: Install, table: dict[str, object], modes: list[kernel.ModeInfo] | None, message: str
 ) -> None:
     fake = install()
@@ -233,7 +233,7 @@ def test_a_machine_without_a_graphics_driver_is_reported(tmp_path: Path, monkeyp
         opened()
 
 
-def test_a_card_of_a_desktop_is_busy_and_its_holder_is_named(
+def test_a_card_of_a_desktop_is_busy_and_its_program_is_named(
     install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(master=False)
@@ -256,7 +256,7 @@ def test_a_card_of_a_desktop_is_busy_and_its_holder_is_named(
         ("commit", errno.ENOSPC, DeviceError, "may lack this mode"),
     ],
 )
-def test_what_the_kernel_refuses_says_what_to_do(
+def test_errors_of_the_kernel_say_what_to_do(
     install: Install, monkeypatch: pytest.MonkeyPatch, call: str, number: int, error: type[Exception], message: str
 ) -> None:
     fake = install()
@@ -268,7 +268,7 @@ def test_what_the_kernel_refuses_says_what_to_do(
         opened()
 
 
-def test_a_controller_that_drives_another_display_is_left_to_it(install: Install) -> None:
+def test_a_controller_of_another_display_is_not_used(install: Install) -> None:
     fake = install()
     fake.plug(12, True)
     fake.driven = {11: CONTROLLERS[1], 12: CONTROLLERS[1]}
@@ -291,7 +291,7 @@ def test_a_card_stays_ours_and_its_memory_does_not_grow(install: Install) -> Non
     assert len(fake.buffers) == len(fake.memory) == 3
 
 
-def test_connectors_with_a_display_are_found_and_nothing_is_opened(
+def test_connectors_with_a_display_are_found_without_opening_cards(
     install: Install, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fake = install()
@@ -379,7 +379,7 @@ def test_a_request_has_the_kernels_number(name: str) -> None:
         (kernel.MODE_DOUBLE_CLOCK, 0.02, False),
     ],
 )
-def test_a_mode_has_the_time_of_a_frame(flags: int, refresh_s: float, plain: bool) -> None:
+def test_a_mode_has_a_frame_duration(flags: int, refresh_s: float, plain: bool) -> None:
     found = KmsMode.from_info(mode(1000, 500, rate=50, flags=flags))
     assert (found.size, found.plain) == (Size(1000, 500), plain)
     assert found.refresh_s == pytest.approx(refresh_s)

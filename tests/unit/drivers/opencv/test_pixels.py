@@ -84,7 +84,7 @@ def test_frames_of_another_kind_are_refused(picture: FrameDecoder, image: Pixels
         picture.grey(image)
 
 
-def test_colour_comes_of_what_has_it() -> None:
+def test_formats_with_colour_give_colour() -> None:
     bgr = np.dstack([RAMP, RAMP // 2, 255 - RAMP])
     assert np.array_equal(image_decoder(bgr, None).colour(bgr), bgr)
     assert raw_decoder(None, SIZE, None).has_colour

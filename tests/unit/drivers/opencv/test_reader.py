@@ -76,7 +76,7 @@ def test_the_newest_frames_are_kept_in_order() -> None:
     assert feed.pauses == 1
 
 
-def test_a_source_that_does_not_return_is_left_to_its_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_source_that_does_not_return_is_released_by_its_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drivers.opencv.feeds._JOIN_S", 0.01)
     feed = ScriptedFeed(1)
     reader = FeedReader(feed, "reader")
@@ -90,7 +90,7 @@ def test_a_source_that_does_not_return_is_left_to_its_thread(monkeypatch: pytest
     assert feed.released.wait(LONG_S)
 
 
-def test_starting_again_forgets_what_was_before() -> None:
+def test_starting_again_discards_earlier_frames() -> None:
     feed = ScriptedFeed(3)
     feed.go_on.set()
     reader = FeedReader(feed, "reader")
@@ -121,7 +121,7 @@ def waited(asked_ms: float, returned_ms: float, slept_ms: float | None = None) -
     return GrabTimes(round(asked_ms * MS), round(returned_ms * MS), round(slept * MS))
 
 
-def test_a_stamp_may_name_either_end_of_the_exposure() -> None:
+def test_a_stamp_may_mark_either_end_of_the_exposure() -> None:
     exposed = exposure_from_stamp(1000 * MS, waited(900, 2000), exposure_ns=EXPOSURE_NS, period_ns=PERIOD_NS)
     # Of an end stamp: a read-out of one period before, and the exposure before that.
     assert exposed.earliest_ns == (1000 - 20 - 10) * MS
@@ -132,7 +132,7 @@ def test_a_stamp_may_name_either_end_of_the_exposure() -> None:
     assert soon.latest_ns == 1005 * MS
 
 
-def test_a_stamp_of_another_clock_gives_itself_away() -> None:
+def test_a_stamp_of_another_clock_is_detected() -> None:
     grabbed = waited(50_000, 50_010)
     assert is_monotonic_stamp(50_001 * MS, grabbed)
     assert not is_monotonic_stamp(1_700_000_000_000 * MS, grabbed)
@@ -144,7 +144,7 @@ def test_a_frame_that_was_waited_for_arrived_after_the_wait_began() -> None:
     assert exposed == ExposureInterval((100 - 30 - 10) * MS, 118 * MS)
 
 
-def test_frames_that_came_without_a_wait_are_as_old_as_the_last_wait() -> None:
+def test_queued_frames_may_be_as_old_as_the_last_wait() -> None:
     rule = arrivals()
     assert rule.exposure(waited(100, 118)) is not None
     # The reader was held up for half a second; what comes then has been lying there.
@@ -159,7 +159,7 @@ def test_frames_that_came_without_a_wait_are_as_old_as_the_last_wait() -> None:
     assert fresh.earliest_ns == (650 - 30 - 10) * MS
 
 
-def test_nothing_is_known_of_a_frame_before_the_first_wait() -> None:
+def test_the_exposure_is_unknown_before_the_first_wait() -> None:
     rule = arrivals()
     assert rule.exposure(waited(100, 101)) is None
     # Decoding, and waiting for a processor, are no waits for a frame.
@@ -167,7 +167,7 @@ def test_nothing_is_known_of_a_frame_before_the_first_wait() -> None:
     assert rule.exposure(waited(140, 155)) is not None
 
 
-def test_time_asleep_is_measured_without_time_at_work() -> None:
+def test_time_asleep_excludes_time_on_the_processor() -> None:
     sleep = SleepMeter()
     before_ns, awake_ns = time.monotonic_ns(), sleep.awake_ns()
     threading.Event().wait(0.05)

@@ -59,9 +59,7 @@ def is_black(pixels: OutputPixels) -> bool:
     ("backend", "number"),
     [("x11", signal.SIGKILL), ("x11", signal.SIGTERM), ("x11", signal.SIGINT), ("sdl", signal.SIGKILL)],
 )
-def test_dark_when_the_process_is_killed_and_never_lit_by_what_is_below(
-    right: OutputPixels, backend: str, number: int
-) -> None:
+def test_the_output_is_black_when_the_process_is_killed(right: OutputPixels, backend: str, number: int) -> None:
     with started(backend, dark_after_s=1.5) as child:
         assert is_white(right)
         child.send_signal(number)
@@ -79,7 +77,7 @@ def test_dark_when_the_process_is_killed_and_never_lit_by_what_is_below(
         child.wait(FAR_S)
 
 
-def test_another_process_takes_the_output_over_from_the_guard_of_one_that_was_killed(right: OutputPixels) -> None:
+def test_another_process_takes_the_output_over_from_the_guard_of_a_killed_one(right: OutputPixels) -> None:
     with started("x11", dark_after_s=600) as child:
         child.kill()
         child.wait(FAR_S)

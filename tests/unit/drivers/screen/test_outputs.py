@@ -100,7 +100,7 @@ def test_no_session_has_no_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else "",
 )
-def test_an_output_that_is_set_otherwise_is_refused_and_mended_by_the_command_in_the_message(
+def test_an_inexact_output_is_refused_and_corrected_by_the_command_in_the_message(
     server: DummyServer, right: OutputPixels, command: tuple[str, str], words: str
 ) -> None:
     server.mode(RIGHT, Size(160, 120))
@@ -118,7 +118,7 @@ def test_an_output_that_is_set_otherwise_is_refused_and_mended_by_the_command_in
     opened().close()
 
 
-def test_an_output_that_is_panned_is_refused_and_mended_by_the_command_in_the_message(tmp_path: Path) -> None:
+def test_a_panned_output_is_refused_and_corrected_by_the_command_in_the_message(tmp_path: Path) -> None:
     # On a server of its own: some of it stays.
     with DummyServer(tmp_path) as panning, pytest.MonkeyPatch.context() as patch:
         patch.setenv("DISPLAY", panning.display)
@@ -131,7 +131,7 @@ def test_an_output_that_is_panned_is_refused_and_mended_by_the_command_in_the_me
         let_go(RIGHT)
 
 
-def test_what_the_graphics_driver_does_to_levels_is_read_from_its_properties(server: DummyServer) -> None:
+def test_changes_of_levels_are_read_from_the_graphics_drivers_properties(server: DummyServer) -> None:
     with client(server) as connection:
         output_property(connection, RIGHT, "Broadcast RGB", "Limited 16:235")
         with pytest.raises(UnsupportedByDeviceError, match="16 to 235"):
@@ -140,7 +140,7 @@ def test_what_the_graphics_driver_does_to_levels_is_read_from_its_properties(ser
     opened().close()
 
 
-def test_an_output_in_use_is_refused_with_the_process_that_holds_it(right: OutputPixels) -> None:
+def test_an_output_in_use_is_refused_with_its_process(right: OutputPixels) -> None:
     with showing() as projector:
         projector.show(0)
         with pytest.raises(DeviceBusyError, match=f"in use by process {os.getpid()} "):
@@ -201,7 +201,7 @@ def test_pixels_that_are_not_the_patterns_are_found_once_per_sequence(
         assert right.colours().min() == 255
 
 
-def test_a_compositor_that_does_not_let_go_is_refused_unless_trusted(server: DummyServer) -> None:
+def test_a_compositor_that_redirects_the_window_is_refused_unless_trusted(server: DummyServer) -> None:
     with client(server) as connection:
         connection.ask("QueryVersion", 0, 4, extension="Composite")
         owner = x11.hidden_window(connection)
@@ -216,7 +216,7 @@ def test_a_compositor_that_does_not_let_go_is_refused_unless_trusted(server: Dum
             projector.show(0)
 
 
-def test_the_server_does_not_blank_its_displays_meanwhile(server: DummyServer) -> None:
+def test_the_server_does_not_blank_its_displays(server: DummyServer) -> None:
     def is_saving(connection: XConnection) -> bool:
         info = connection.ask("QueryInfo", connection.screen.root, extension="MIT-SCREEN-SAVER")
         return bool(info.state == 1)

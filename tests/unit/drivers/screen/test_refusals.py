@@ -106,7 +106,7 @@ SHARED = "eDP-1 shows the same part of the screen; xrandr --output HDMI-1 --righ
         (shown(mode=DESK, size=DESK.size, rotation=2, gamma=RAMP // 2), {}, ("raster", "turned left", "gamma")),
     ],
 )
-def test_what_would_change_a_picture_is_refused_with_the_command_that_mends_it(
+def test_faults_of_an_output_are_refused_with_the_command_that_corrects_them(
     output: Output, wanted: dict[str, Any], words: tuple[str, ...]
 ) -> None:
     with pytest.raises(UnsupportedByDeviceError) as caught:
@@ -129,7 +129,7 @@ def test_what_would_change_a_picture_is_refused_with_the_command_that_mends_it(
     ],
 )
 @pytest.mark.parametrize(("native", "monitor"), [(None, "PJ 720"), (NATIVE.size, "EPS PJ 720"), (None, None)])
-def test_an_exact_output_is_taken(output: Output, native: Size | None, monitor: str | None) -> None:
+def test_an_exact_output_is_accepted(output: Output, native: Size | None, monitor: str | None) -> None:
     assert require_exact(output, (DESKTOP, output), native=native, monitor=monitor) is output.crtc
 
 
@@ -197,7 +197,7 @@ class PowerManaged:
             assert (request, *arguments) == ("ForceScreenSaver", 0)
 
 
-def test_displays_that_sleep_are_woken_kept_awake_and_allowed_to_sleep_again() -> None:
+def test_displays_are_woken_kept_awake_and_released() -> None:
     server = PowerManaged(level=3)
     waking = DisplayWakeLock(server)  # type: ignore[arg-type]
     assert (server.level, server.enabled, server.timeout_s) == (0, False, 0)

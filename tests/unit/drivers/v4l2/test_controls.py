@@ -44,7 +44,7 @@ def names(steps: tuple[tuple[Control, int], ...]) -> list[tuple[str, int]]:
     return [(control.name, value) for control, value in steps]
 
 
-def test_automatics_are_off_before_what_they_govern_is_set() -> None:
+def test_automatic_controls_are_off_before_manual_values_are_set() -> None:
     asked = options(focus=30, controls={"gamma": 100})
     assert names(ctl.ordered_settings(webcam(), asked, exposure_units=167, gain_units=16, node=NODE)) == [
         ("auto_exposure", 1),
@@ -72,7 +72,7 @@ def test_a_device_without_controls_needs_none() -> None:
         ({"controls": {"gamma": 3}}, "requested gamma = 3, the device accepts 72 to 500"),
     ],
 )
-def test_what_a_device_cannot_take_is_refused(more: dict[str, object], words: str) -> None:
+def test_values_out_of_range_are_refused(more: dict[str, object], words: str) -> None:
     with pytest.raises(UnsupportedByDeviceError, match=words):
         ctl.ordered_settings(webcam(), options(**more), exposure_units=None, gain_units=None, node=NODE)
     with pytest.raises(UnsupportedByDeviceError, match="'focus'"):
@@ -80,7 +80,7 @@ def test_what_a_device_cannot_take_is_refused(more: dict[str, object], words: st
 
 
 @pytest.mark.parametrize(("asked", "units"), [(16.7, 17), (0, 3), (9999, 2047), (3.4, 3)])
-def test_a_value_goes_to_the_devices_grid(asked: float, units: int) -> None:
+def test_values_are_rounded_to_the_devices_grid(asked: float, units: int) -> None:
     assert webcam()[ctl.EXPOSURE_ABSOLUTE].nearest(asked) == units
     assert webcam()[ctl.FOCUS_ABSOLUTE].nearest(13) == 15
 
@@ -123,14 +123,14 @@ def test_gain_in_the_devices_numbers(
         (errno.ENOMEM, DeviceError, "dmesg"),
     ],
 )
-def test_a_refusal_tells_what_to_do(number: int, kind: type[DeviceError], words: str) -> None:
+def test_error_messages_say_what_to_do(number: int, kind: type[DeviceError], words: str) -> None:
     found = kernel.device_error(NODE, "starting the stream", OSError(number, os.strerror(number)))
     assert type(found) is kind
     assert words in str(found)
     assert str(found).startswith("/dev/video7: starting the stream: ")
 
 
-def test_only_a_streams_fault_says_that_the_stream_has_died() -> None:
+def test_only_faults_of_streams_report_a_dead_stream() -> None:
     broken = OSError(errno.EIO, os.strerror(errno.EIO))
     assert type(kernel.stream_error(NODE, "taking a frame", broken)) is DeviceGoneError
     assert type(kernel.stream_error(NODE, "taking a frame", OSError(errno.ENOMEM, "memory"))) is DeviceError

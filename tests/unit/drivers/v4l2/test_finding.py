@@ -91,7 +91,7 @@ def test_cameras_that_share_a_serial_number_are_named_by_their_port(machine: Mac
     assert machine.names() == ["pci-2-video-index0", "pci-3-video-index0"]
 
 
-def test_nodes_of_one_parent_have_names_of_their_own(machine: Machine) -> None:
+def test_nodes_of_one_parent_have_different_names(machine: Machine) -> None:
     # Two nodes of one platform device get one by-path name; what their driver calls their bus differs.
     machine.plug("video0", port="vivid.0", by_path="platform-vivid.0-video-index0", bus="platform:vivid-000")
     machine.plug("video4", port="vivid.0/b", by_path="platform-vivid.0-video-index0", bus="platform:vivid-001")
@@ -113,7 +113,7 @@ def test_a_node_that_may_not_be_opened_is_listed_with_the_remedy(machine: Machin
     assert "usermod -aG video" in found.note
 
 
-def test_what_is_gone_or_no_video_device_is_no_camera(tmp_path: Path) -> None:
+def test_missing_and_other_devices_are_not_cameras(tmp_path: Path) -> None:
     for path in (tmp_path / "video0", Path("/dev/null")):
         identity = probe_node(path)
         assert identity is not None
@@ -124,7 +124,7 @@ def test_a_machine_without_cameras_has_none(tmp_path: Path) -> None:
     assert list_nodes(tmp_path / "none", tmp_path) == ()
 
 
-def test_a_missing_camera_is_refused_with_a_list_of_those_that_are_there(machine: Machine) -> None:
+def test_a_missing_camera_is_refused_with_a_list_of_connected_ones(machine: Machine) -> None:
     machine.plug("video0", by_path=BY_PATH)
     with pytest.raises(DeviceGoneError, match=f"usb-other.*{BY_PATH}"):
         machine.resolved("usb-other")

@@ -93,7 +93,7 @@ def test_every_format_that_can_be_read_has_its_rank() -> None:
     assert PREFERRED.index("GREY") < PREFERRED.index("YUYV") < PREFERRED.index("MJPG")
 
 
-def test_limited_luma_is_spread() -> None:
+def test_limited_luma_is_expanded() -> None:
     row = np.array([16, 128, 235, 128, 0, 128, 255, 128], np.uint8)
     image = grey_image(row, LAYOUTS["YUYV"], Size(4, 1), stride_bytes=8, limited_luma=True)
     assert image.tolist() == [[0, 255, 0, 255]]
@@ -161,7 +161,7 @@ def test_colour_formats_give_blue_green_and_red(code: str) -> None:
     assert cv2.cvtColor(seen, cv2.COLOR_BGR2GRAY).dtype == grey.dtype
 
 
-def test_colour_of_limited_luma_is_spread() -> None:
+def test_colour_of_limited_luma_is_expanded() -> None:
     rows = np.array([16, 128, 235, 128, 126, 128, 126, 128], np.uint8)
     seen = colour_image(rows, LAYOUTS["YUYV"], Size(4, 1), stride_bytes=8, limited_luma=True)
     assert seen.tolist() == [[[0] * 3, [255] * 3, [128] * 3, [128] * 3]]
