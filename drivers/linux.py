@@ -1,4 +1,4 @@
-"""The check of drivers that speak to a device through the kernel of Linux."""
+"""Operating system check of drivers that use interfaces of the Linux kernel."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _NAMES = {"win32": "Windows", "darwin": "macOS"}
 
 
 def require_linux(driver: str, *, through: str, instead: str) -> None:
-    """Raise unless this is Linux and Python has the module `fcntl`, by which it speaks to the kernel.
+    """Raise unless this is Linux and Python has the module `fcntl`, which the drivers need.
 
     Raises
     ------
@@ -19,7 +19,7 @@ def require_linux(driver: str, *, through: str, instead: str) -> None:
     """
     found = _NAMES.get(sys.platform, sys.platform)
     try:
-        import fcntl  # noqa: F401 - it is there, or it is not
+        import fcntl  # noqa: F401 - only its presence matters
     except ImportError:
         found += " without fcntl"
     if found == "linux":

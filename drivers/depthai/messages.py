@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.depthai.library import microseconds, nanoseconds
 from drivers.depthai.options import Stream
-from drivers.v4l2.formats import from_luma
+from drivers.v4l2.formats import bgr_from_luma
 from slrig.model import Pixels
 
 
@@ -84,7 +84,7 @@ def coloured(message: Any, luma: Pixels) -> Callable[[], Pixels]:
     stride, (rows, columns) = message.getStride(), luma.shape
     planes = np.asarray(message.getData(), dtype=np.uint8)[stride * rows :][: stride * (rows // 2)]
     differences = planes.reshape(-1, stride)[:, :columns].copy()
-    return lambda: from_luma(luma, differences[:, ::2], differences[:, 1::2])
+    return lambda: bgr_from_luma(luma, differences[:, ::2], differences[:, 1::2])
 
 
 def kind_of(stream: Stream, vendor: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What the drivers of display outputs share: options, the projector above a stage, its thread, its guard, its times.
+"""Display outputs as projectors: what the drivers `screen` and `kms` share.
 
-A driver gives a `drivers.display.stage.Stage`, which puts pictures on an output and says when; no driver itself.
+A driver provides a `PatternOutput` (`drivers.display.projector`); `DisplayProjector` makes a projector of it.
 """

@@ -1,4 +1,4 @@
-"""What a display says of itself over its cable: the EDID (VESA E-EDID, release A, base block)."""
+"""EDID: how a display identifies itself over its cable (VESA E-EDID, release A, base block)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _NAME, _SERIAL = 0xFC, 0xFF
 
 @dataclass(frozen=True, slots=True)
 class Edid:
-    """A display's maker (three letters), model name and serial number; the texts are empty where it has none."""
+    """A display's maker (three letters), model name and serial number; name and serial may be empty."""
 
     maker: str
     name: str
@@ -22,10 +22,10 @@ class Edid:
         return " ".join(part for part in (self.maker, self.name) if part)
 
 
-def parse(block: bytes) -> Edid | None:
-    """Return what an EDID says; None where it is none, or damaged.
+def parse_edid(block: bytes) -> Edid | None:
+    """Parse an EDID; return None if it is damaged or of another kind.
 
-    >>> parse(b"") is None
+    >>> parse_edid(b"") is None
     True
     """
     base = block[:128]

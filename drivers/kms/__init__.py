@@ -1,17 +1,19 @@
-"""A projector on a display output of this computer (HDMI, DisplayPort), without X or Wayland: by the kernel alone.
+"""A projector on a display output of this computer (HDMI, DisplayPort) through the kernel, without X or Wayland.
 
-Linux. The driver has the graphics card for itself (it is "DRM master"), sets the projector's own mode, switches off
-what scales, recolours or covers pictures, and flips from one to the next at a refresh. `t_visible` is the kernel's time
-stamp of the flip + one refresh (the rows come one after the other) + the display's own delay, `latency_s`. Where the
-graphics driver does not count refreshes (virtual machines, some adapters on USB), all that is known is when it was done
-with the request; the stated error is larger by half of that time and of a refresh.
+Experimental: tested with a fake kernel and virtual graphics cards, not yet with a projector.
 
-One program at a time has a graphics card: no desktop may run on it. What to do where one does is said by the error; to
-list outputs (`slrig devices`), no card is opened.
+Linux only. The driver has the graphics card to itself (as "DRM master"), sets the projector's own mode, switches off
+scaling, colour changes and overlays, and flips from one picture to the next at a refresh. `t_visible` is the kernel's
+time stamp of the flip + one refresh (rows arrive one after the other) + the display's own delay, `latency_s`. Where the
+graphics driver does not count refreshes (virtual machines, some adapters on USB), only the duration of the request is
+known; the stated error is larger by half of that time and of a refresh.
 
-A small process of its own keeps the output black between scans, after `close` and for `dark_after_s` after slrig has
-ended, even by kill -9; then the text console comes back. It hands the card over to the next slrig of the same user. A
-service manager that ends all processes of a service ends that one too (systemd: KillMode=process leaves it).
+One program at a time has a graphics card: no desktop may run on it. The error says what to do where one does. Listing
+outputs (`slrig devices`) opens no card.
+
+A guard process keeps the output black between scans, after `close` and for `dark_after_s` after slrig has ended, even
+by kill -9; then the text console returns. It passes the card on to the next slrig of the same user. A service manager
+that ends all processes of a service ends that one too (systemd: KillMode=process leaves it).
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    # The guard is a module of this package, and starts in a tenth of the time without what they bring along.
+    # The guard is a module of this package, and starts ten times as fast without these imports.
     from collections.abc import Mapping
     from pathlib import Path
 
@@ -36,7 +38,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     options
         `drivers.kms.options.KmsOptions`.
     folder
-        The rig file's own; unused, a display is not a file of the rig.
+        The rig file's folder; unused.
 
     Raises
     ------
@@ -45,7 +47,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     WrongSystemError
         This is not Linux.
     UnsupportedByDeviceError
-        The output cannot show patterns pixel for pixel, or there is none of that name.
+        The output cannot show patterns pixel for pixel, or no output has that name.
     DeviceGoneError
         Nothing is connected to it.
     DeviceBusyError
@@ -58,12 +60,12 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     from slrig.bundle.validation import validate
 
     del folder
-    told = validate(KmsOptions, options, "the [projector] table of driver 'kms'")
+    kms_options = validate(KmsOptions, options, "the [projector] table of driver 'kms'")
     require_linux(DRIVER, through="the kernel's display interface (DRM/KMS)", instead="use driver 'screen'")
     from drivers.display.projector import DisplayProjector
-    from drivers.kms.output import KmsStage
+    from drivers.kms.output import KmsOutput
 
-    return DisplayProjector(told, lambda: KmsStage(told))
+    return DisplayProjector(kms_options, lambda: KmsOutput(kms_options))
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
@@ -71,8 +73,8 @@ def find_devices() -> tuple[FoundDevice, ...]:
     from drivers.kms import finding
     from slrig.devices import FoundDevice
 
-    there = [each for each in finding.connectors() if each.status != "disconnected"]
-    return tuple(FoundDevice(DRIVER, each.name, str(each)) for each in there)
+    found = [each for each in finding.list_connectors() if each.status != "disconnected"]
+    return tuple(FoundDevice(DRIVER, each.name, str(each)) for each in found)
 
 
 __all__ = ["find_devices", "open_projector"]

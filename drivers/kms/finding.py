@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.display.edid import Edid, parse
+from drivers.display.edid import Edid, parse_edid
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 
 SYSTEM = Path("/sys/class/drm")
@@ -17,11 +17,11 @@ _NEVER = ("Writeback",)
 
 
 @dataclass(frozen=True, slots=True)
-class Connector:
+class ListedConnector:
     """A connector of a graphics card.
 
-    card : the card's node. status : connected, disconnected or unknown, as of the kernel's last look. mode : the first
-    that its display offers, as WxH; empty where it offers none.
+    card : the card's node. status : connected, disconnected or unknown, as last detected. mode : the first mode of its
+    display, as WxH; empty without one.
     """
 
     name: str
@@ -31,59 +31,59 @@ class Connector:
     edid: Edid | None
 
     def __str__(self) -> str:
-        told = ", ".join(part for part in (str(self.edid or ""), self.mode or self.status) if part)
-        return f"{self.name} ({told})"
+        display = ", ".join(part for part in (str(self.edid or ""), self.mode or self.status) if part)
+        return f"{self.name} ({display})"
 
 
-def connectors() -> tuple[Connector, ...]:
-    """Every connector of every card, by name."""
+def list_connectors() -> tuple[ListedConnector, ...]:
+    """List every connector of every card, by name."""
     found = []
     for folder in SYSTEM.glob("card*-*"):
         matched = _CONNECTOR.fullmatch(folder.name)
         if matched is not None and not matched[2].startswith(_NEVER):
             lines = _read(folder / "modes").decode("ascii", "replace").split()
             found.append(
-                Connector(
+                ListedConnector(
                     matched[2],
                     DEVICES / matched[1],
                     _read(folder / "status").decode("ascii", "replace").strip() or "unknown",
                     lines[0] if lines else "",
-                    parse(_read(folder / "edid")),
+                    parse_edid(_read(folder / "edid")),
                 )
             )
     return tuple(sorted(found, key=lambda connector: connector.name))
 
 
-def chosen(name: str) -> Connector:
+def find_connector(name: str) -> ListedConnector:
     """Return the connector of that name.
 
     Raises
     ------
     UnsupportedByDeviceError
-        There is none, or no card at all. Names those that there are.
+        No connector has that name, or no card exists. Lists the connectors.
     """
-    there = connectors()
-    if not there:
+    connectors = list_connectors()
+    if not connectors:
         message = (
             f"output {name}: the kernel has no display output (nothing in {SYSTEM}); its graphics driver is not loaded "
             "(nomodeset in the kernel's command line, or nvidia_drm without modeset=1), or this is a container that "
             "was not given /dev/dri"
         )
         raise UnsupportedByDeviceError(message)
-    for connector in there:
+    for connector in connectors:
         if connector.name == name:
             return connector
-    listed = "; ".join(map(str, there))
+    names = "; ".join(map(str, connectors))
     message = (
-        f"output {name}: the kernel has no connector of that name; it has: {listed}; write one of these names into the "
-        "rig file (X names them otherwise: its HDMI-1 is HDMI-A-1 here)"
+        f"output {name}: the kernel has no connector of that name; it has: {names}; write one of these names into the "
+        "rig file (X names them differently: its HDMI-1 is HDMI-A-1 here)"
     )
     raise UnsupportedByDeviceError(message)
 
 
-def gone(name: str) -> DeviceGoneError:
-    """Nothing is connected: what to say of it."""
-    others = "; ".join(str(each) for each in connectors() if each.status == "connected") or "none"
+def not_connected_error(name: str) -> DeviceGoneError:
+    """Return the error for an output with nothing connected."""
+    others = "; ".join(str(each) for each in list_connectors() if each.status == "connected") or "none"
     message = (
         f"output {name}: nothing is connected to it; connected are: {others}; check the cable and that the projector "
         "is on and not in stand-by, or write one of these names into the rig file"
@@ -92,18 +92,18 @@ def gone(name: str) -> DeviceGoneError:
 
 
 def is_unplugged(name: str, card: Path) -> bool:
-    """Whether the kernel has noticed that nothing is connected (any more)."""
+    """True if the kernel has noticed that nothing is connected."""
     return _read(SYSTEM / f"{card.name}-{name}" / "status").strip() == b"disconnected"
 
 
-def display(name: str, card: Path) -> Edid | None:
-    """What is connected, as of the kernel's last look."""
-    return parse(_read(SYSTEM / f"{card.name}-{name}" / "edid"))
+def read_edid(name: str, card: Path) -> Edid | None:
+    """Return the EDID of the connected display, as last detected."""
+    return parse_edid(_read(SYSTEM / f"{card.name}-{name}" / "edid"))
 
 
 def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError:
-        # A card that was unplugged while we looked.
+        # The card was unplugged meanwhile.
         return b""

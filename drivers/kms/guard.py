@@ -1,12 +1,12 @@
-"""A process of its own that keeps an output black after the process that shows patterns has ended, however it did.
+"""A process that keeps an output black after the process that shows patterns has ended, even by a crash.
 
-The kernel takes away the pictures of a program that ends, and puts the text console in their place: with light in it.
-The guard has the same open card: as long as it has, the card stays ours, and nothing else is shown. It makes the output
-black when the process that it watches has ended, or when it is told to (`cover` on its standard input, answered by the
-same line); it ends when it is told to (`release`; no answer), or some time after that process.
+The kernel removes the pictures of a program that ends and shows the text console, which is not black. The guard has the
+same card open, so that nothing else is shown. It makes the output black when the process that it watches has ended, or
+on request (`cover` on its standard input, answered by the same line); it ends on request (`release`; no answer), or
+some time after that process.
 
-A process of the same user may take the card over, after the one that is watched has ended: it connects to `address`,
-gets one line and the open card with it, and says when it has a guard of its own. No light is seen in between.
+A process of the same user may take the card over after the watched process has ended: it connects to `guard_address`,
+receives one line and the open card with it, and confirms when its own guard runs. No light is visible in between.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from dataclasses import asdict, dataclass
 from drivers.kms import kernel
 
 TAKEN = b"taken\n"
-_ANSWERS_IN_S = 2.0
+_ANSWER_TIMEOUT_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Duty:
-    """What to make black, by which open card, on behalf of which process, and for how long after its end.
+class KmsGuardTask:
+    """The output to make black, its open card, the process it is done for, and for how long after that process's end.
 
-    mode : as the kernel has it, in hexadecimal. black : the picture. pictures : all of them, as frame buffers with the
-    handles of their memory.
+    mode : the kernel's mode structure in hexadecimal. black : frame buffer of the black picture. buffers : all frame
+    buffers with the handles of their memory.
     """
 
     handle: int
@@ -42,118 +42,119 @@ class Duty:
     connector: int
     mode: str
     black: int
-    pictures: list[tuple[int, int]]
+    buffers: list[tuple[int, int]]
     process: int
     dark_after_s: float
 
 
-def address(handle: int) -> str:
-    """Where the guard of an open card is reached: a socket without a file, one for each card."""
+def guard_address(handle: int) -> str:
+    """Return the abstract socket address of the guard of an open card."""
     return f"\0slrig-kms-{os.fstat(handle).st_rdev}"
 
 
-class _Guard:
-    def __init__(self, duty: Duty) -> None:
-        self._duty = duty
-        self._listening = self._heard_of()
+class _KmsGuard:
+    def __init__(self, task: KmsGuardTask) -> None:
+        self._task = task
+        self._socket = self._listen()
         self._process: int | None = None
         with suppress(OSError, AttributeError):
             # A child of the watched process may hold the other end of the pipe open.
-            self._process = os.pidfd_open(duty.process)
-        self._asked = b""
-        self._orders: int | None = sys.stdin.fileno()
-        self._until_s: float | None = None
+            self._process = os.pidfd_open(task.process)
+        self._input = b""
+        self._requests: int | None = sys.stdin.fileno()
+        self._end_s: float | None = None
 
     def run(self) -> None:
-        """Keep the output black until somebody or something ends that."""
-        self._say("ready")
-        while self._until_s is None or time.monotonic() < self._until_s:
-            left_s = None if self._until_s is None else max(self._until_s - time.monotonic(), 0)
-            heard = [each for each in (self._orders, self._process, self._listening) if each is not None]
-            ready = select.select(heard, [], [], left_s)[0]
-            if self._orders in ready and self._released():
+        """Keep the output black until one of the reasons in the module's docstring ends it."""
+        self._answer("ready")
+        while self._end_s is None or time.monotonic() < self._end_s:
+            left_s = None if self._end_s is None else max(self._end_s - time.monotonic(), 0)
+            watched = [each for each in (self._requests, self._process, self._socket) if each is not None]
+            ready = select.select(watched, [], [], left_s)[0]
+            if self._requests in ready and self._is_released():
                 return
             if self._process is not None and self._process in ready:
-                self._mourn()
-            if self._listening in ready and self._relieved():
+                self._outlive_process()
+            if self._socket in ready and self._is_relieved():
                 return
 
-    def _released(self) -> bool:
-        heard = os.read(sys.stdin.fileno(), 4096)
-        *lines, self._asked = (self._asked + heard).split(b"\n")
+    def _is_released(self) -> bool:
+        """Handle requests. True if the guard is to end."""
+        received = os.read(sys.stdin.fileno(), 4096)
+        *lines, self._input = (self._input + received).split(b"\n")
         for line in lines:
             if line == b"release":
                 return True
-            # Whoever asked hears nothing where the kernel refuses.
+            # No answer where the kernel refuses.
             with suppress(OSError):
                 self._darken()
-                self._say(line.decode())
-        if not heard:
-            self._mourn()
+                self._answer(line.decode())
+        if not received:
+            self._outlive_process()
         return False
 
-    def _mourn(self) -> None:
-        """The watched process is gone: stay for the time that was asked for."""
-        self._orders = self._process = None
+    def _outlive_process(self) -> None:
+        """Show black for `dark_after_s`: the watched process has ended."""
+        self._requests = self._process = None
         # The display may be unplugged.
         with suppress(OSError):
             self._darken()
-        if self._until_s is None:
-            self._until_s = time.monotonic() + self._duty.dark_after_s
+        if self._end_s is None:
+            self._end_s = time.monotonic() + self._task.dark_after_s
 
     def _darken(self) -> None:
-        duty = self._duty
-        kernel.set_mode(duty.handle, duty.controller, duty.connector, bytes.fromhex(duty.mode), duty.black)
+        task = self._task
+        kernel.set_mode(task.handle, task.controller, task.connector, bytes.fromhex(task.mode), task.black)
 
-    def _relieved(self) -> bool:
-        """Whether another process has the card now."""
-        visitor, _ = self._listening.accept()
-        with visitor:
-            visitor.settimeout(_ANSWERS_IN_S)
-            # It may have given up, or be killed: then everything is as before.
+    def _is_relieved(self) -> bool:
+        """Handle a connection. True if another process has taken the card over."""
+        client, _ = self._socket.accept()
+        with client:
+            client.settimeout(_ANSWER_TIMEOUT_S)
+            # If the client has given up or was killed, everything stays as before.
             with suppress(OSError):
-                credentials = visitor.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+                credentials = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
                 user = struct.unpack("3i", credentials)[1]
-                watching = self._until_s is None
-                told = json.dumps({"process": self._duty.process, "output": self._duty.output, "busy": watching})
+                watching = self._end_s is None
+                answer = json.dumps({"process": self._task.process, "output": self._task.output, "busy": watching})
                 if watching or user not in (0, os.getuid()):
-                    visitor.sendall(f"{told}\n".encode())
+                    client.sendall(f"{answer}\n".encode())
                     return False
-                told = json.dumps({"busy": False, "pictures": self._duty.pictures})
-                socket.send_fds(visitor, [f"{told}\n".encode()], [self._duty.handle])
-                # As long as it takes: the other one sets a mode, and a guard of its own, before it answers.
-                visitor.settimeout(None)
-                self._listening.close()
-                if visitor.recv(len(TAKEN)) == TAKEN:
+                answer = json.dumps({"busy": False, "pictures": self._task.buffers})
+                socket.send_fds(client, [f"{answer}\n".encode()], [self._task.handle])
+                # Without limit: the client sets a mode and starts its own guard before it answers.
+                client.settimeout(None)
+                self._socket.close()
+                if client.recv(len(TAKEN)) == TAKEN:
                     return True
         try:
-            self._listening = self._heard_of()
+            self._socket = self._listen()
         except OSError:
-            # It said nothing any more, but the guard that it has set is there.
+            # The client did not answer, but its guard runs.
             return True
-        self._mourn()
+        self._outlive_process()
         return False
 
-    def _heard_of(self) -> socket.socket:
-        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        listening.bind(address(self._duty.handle))
-        listening.listen(1)
-        return listening
+    def _listen(self) -> socket.socket:
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        listener.bind(guard_address(self._task.handle))
+        listener.listen(1)
+        return listener
 
-    def _say(self, word: str) -> None:
-        # Nobody may be there to hear it.
+    def _answer(self, line: str) -> None:
+        # The other end of the pipe may be closed.
         with suppress(OSError):
-            os.write(sys.stdout.fileno(), f"{word}\n".encode())
+            os.write(sys.stdout.fileno(), f"{line}\n".encode())
 
 
-def described(duty: Duty) -> str:
-    """A duty as the guard's argument."""
-    return json.dumps(asdict(duty))
+def encode_task(task: KmsGuardTask) -> str:
+    """Return a task as the guard's argument."""
+    return json.dumps(asdict(task))
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Do the duty that the first argument describes (JSON)."""
-    _Guard(Duty(**json.loads(arguments[0]))).run()
+    """Run the task that the first argument describes (JSON)."""
+    _KmsGuard(KmsGuardTask(**json.loads(arguments[0]))).run()
 
 
 if __name__ == "__main__":

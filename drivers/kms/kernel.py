@@ -1,7 +1,7 @@
-"""What the kernel's interface of displays (DRM/KMS) exchanges: structures, request numbers, flags, and the calls.
+"""The kernel's display interface (DRM/KMS): structures, request numbers, flags and calls.
 
-Facts: `include/uapi/drm/drm.h` and `drm_mode.h`, and the kernel's documentation "Kernel Mode Setting (KMS)". Names are
-the kernel's, without the prefix. Structures are laid out by `ctypes` for the machine that runs.
+Sources: `include/uapi/drm/drm.h` and `drm_mode.h`, and the kernel's documentation "Kernel Mode Setting (KMS)". Names
+are the kernel's, without the prefix. `ctypes` lays structures out for the running machine.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CONNECTOR_TYPES = (
     *("Unknown", "VGA", "DVI-I", "DVI-D", "DVI-A", "Composite", "SVIDEO", "LVDS", "Component", "DIN", "DP", "HDMI-A"),
     *("HDMI-B", "TV", "eDP", "Virtual", "DSI", "DPI", "Writeback", "SPI", "USB"),
 )
-"""How the kernel names connectors in /sys/class/drm, by their type's number (`drm_connector.c`)."""
+"""Names of connectors in /sys/class/drm, by their type's number (`drm_connector.c`)."""
 
 _U16, _U32, _U64 = ctypes.c_uint16, ctypes.c_uint32, ctypes.c_uint64
 
@@ -74,7 +74,7 @@ class Resources(ctypes.Structure):
 
 
 class GetConnector(ctypes.Structure):
-    """`drm_mode_get_connector`. Asked with `count_modes` 0, the kernel looks anew at what is connected."""
+    """`drm_mode_get_connector`. With `count_modes` 0, the kernel detects the connected display again."""
 
     _fields_ = (
         *((name, _U64) for name in ("encoders_ptr", "modes_ptr", "props_ptr", "prop_values_ptr")),
@@ -123,8 +123,8 @@ class FrameBuffer(ctypes.Structure):
     _fields_ = tuple((name, _U32) for name in ("fb_id", "width", "height", "pitch", "bpp", "depth", "handle"))
 
 
-class Number(ctypes.Structure):
-    """One number: what `RMFB`, `MODE_DESTROY_DUMB` and `AUTH_MAGIC` take."""
+class ObjectNumber(ctypes.Structure):
+    """One number, the argument of `RMFB`, `MODE_DESTROY_DUMB` and `AUTH_MAGIC`."""
 
     _fields_ = (("number", _U32),)
 
@@ -187,8 +187,8 @@ class SetProperty(ctypes.Structure):
     _fields_ = (("value", _U64), *((name, _U32) for name in ("prop_id", "obj_id", "obj_type")))
 
 
-class PropertyWord(ctypes.Structure):
-    """`drm_mode_property_enum`: one word that a property may have, and its number."""
+class PropertyEnum(ctypes.Structure):
+    """`drm_mode_property_enum`: one named value of a property."""
 
     _fields_ = (("value", _U64), ("name", ctypes.c_char * 32))
 
@@ -208,7 +208,7 @@ class GetProperty(ctypes.Structure):
 
 
 class Atomic(ctypes.Structure):
-    """`drm_mode_atomic`: properties of several objects, set at once or not at all."""
+    """`drm_mode_atomic`: properties of several objects, set together or not at all."""
 
     _fields_ = (
         ("flags", _U32),
@@ -230,14 +230,14 @@ class ClientCap(ctypes.Structure):
     _fields_ = (("capability", _U64), ("value", _U64))
 
 
-class Sequence(ctypes.Structure):
+class CrtcSequence(ctypes.Structure):
     """`drm_crtc_get_sequence`: the count of refreshes, by drivers that count them."""
 
     _fields_ = (("crtc_id", _U32), ("active", _U32), ("sequence", _U64), ("sequence_ns", ctypes.c_int64))
 
 
 class FlipEvent(ctypes.Structure):
-    """`drm_event_vblank`: a picture has been flipped to, at this time of CLOCK_MONOTONIC."""
+    """`drm_event_vblank`: a flip has happened, at this time of CLOCK_MONOTONIC."""
 
     _fields_ = (
         ("type", _U32),
@@ -251,9 +251,9 @@ def _both_ways(number: int, structure: type[ctypes.Structure]) -> int:
     return 3 << 30 | ctypes.sizeof(structure) << 16 | ord("d") << 8 | number
 
 
-AUTH_MAGIC = 1 << 30 | ctypes.sizeof(Number) << 16 | ord("d") << 8 | 0x11
+AUTH_MAGIC = 1 << 30 | ctypes.sizeof(ObjectNumber) << 16 | ord("d") << 8 | 0x11
 SET_CLIENT_CAP = 1 << 30 | ctypes.sizeof(ClientCap) << 16 | ord("d") << 8 | 0x0D
-CRTC_GET_SEQUENCE = _both_ways(0x3B, Sequence)
+CRTC_GET_SEQUENCE = _both_ways(0x3B, CrtcSequence)
 GET_RESOURCES = _both_ways(0xA0, Resources)
 GET_CRTC = _both_ways(0xA1, Crtc)
 SET_CRTC = _both_ways(0xA2, Crtc)
@@ -263,11 +263,11 @@ GET_ENCODER = _both_ways(0xA6, GetEncoder)
 GET_CONNECTOR = _both_ways(0xA7, GetConnector)
 GET_PROPERTY = _both_ways(0xAA, GetProperty)
 ADD_FB = _both_ways(0xAE, FrameBuffer)
-REMOVE_FB = _both_ways(0xAF, Number)
+REMOVE_FB = _both_ways(0xAF, ObjectNumber)
 PAGE_FLIP = _both_ways(0xB0, PageFlip)
 CREATE_DUMB = _both_ways(0xB2, CreateDumb)
 MAP_DUMB = _both_ways(0xB3, MapDumb)
-DESTROY_DUMB = _both_ways(0xB4, Number)
+DESTROY_DUMB = _both_ways(0xB4, ObjectNumber)
 GET_PLANE_RESOURCES = _both_ways(0xB5, PlaneResources)
 GET_PLANE = _both_ways(0xB6, GetPlane)
 GET_PROPERTIES = _both_ways(0xB9, ObjectProperties)
@@ -276,14 +276,14 @@ ATOMIC = _both_ways(0xBC, Atomic)
 CREATE_BLOB = _both_ways(0xBD, CreateBlob)
 
 
-def opened(path: str) -> int:
+def open_card(path: str) -> int:
     """Open a card. Raises OSError."""
     return os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)
 
 
-def ask(handle: int, request: int, structure: ctypes.Structure) -> None:
-    """Make a request; the answer is in the structure. Raises OSError."""
-    # Late, so that what looks at this module on another system is not refused.
+def ioctl(handle: int, request: int, structure: ctypes.Structure) -> None:
+    """Send a request; the answer is written into the structure. Raises OSError."""
+    # Imported here, so that this module can be imported on other systems.
     import fcntl
 
     while True:
@@ -297,13 +297,13 @@ def ask(handle: int, request: int, structure: ctypes.Structure) -> None:
             return
 
 
-def mapped(handle: int, size: int, offset: int) -> mmap.mmap:
-    """The memory behind an offset that `MAP_DUMB` gave. Raises OSError."""
+def map_memory(handle: int, size: int, offset: int) -> mmap.mmap:
+    """Map the memory at an offset from `MAP_DUMB`. Raises OSError."""
     return mmap.mmap(handle, size, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset)
 
 
 def set_mode(handle: int, controller: int, connector: int, mode: bytes, picture: int) -> None:
-    """Have a controller scan a picture out to a connector, by a mode; returns when it does. For every driver.
+    """Make a controller scan a picture out to a connector in a mode, and wait for it. Works with every driver.
 
     Raises
     ------
@@ -318,4 +318,4 @@ def set_mode(handle: int, controller: int, connector: int, mode: bytes, picture:
         mode_valid=1,
         mode=ModeInfo.from_buffer_copy(mode),
     )
-    ask(handle, SET_CRTC, order)
+    ioctl(handle, SET_CRTC, order)

@@ -1,4 +1,4 @@
-"""What a rig file says of a source, and which kind of source that is."""
+"""Options of the driver `opencv`, and the source that they describe."""
 
 from __future__ import annotations
 
@@ -23,59 +23,58 @@ Extent = Annotated[int, Field(ge=1, le=65_536)]
 _NUMBERED = re.compile(r"%0?\d*d")
 
 
-class Kind(StrEnum):
-    """What a source is to the driver."""
+class SourceKind(StrEnum):
+    """How the driver treats a source."""
 
     DEVICE = "device"
-    """A camera of the kernel's, with controls: read from `arm` to `disarm`, timed by stamps, or else by arrival."""
+    """A camera of the kernel, with controls: read from `arm` to `disarm`, timed by stamps, or else by arrival."""
     LIVE = "live"
     """A stream: read from opening to `close`, timed by arrival."""
     FILM = "film"
-    """A recording: begun anew by `arm`, timed by itself."""
+    """A recording: starts again at `arm`, with its own times."""
 
 
 class OpenCvOptions(Strict, use_attribute_docstrings=True):
-    """The keys of a `[[camera]]` table with `driver = "opencv"` (beside name, exposure_s and gain)."""
+    """The keys of a `[[camera]]` table with `driver = "opencv"` (in addition to name, exposure_s and gain)."""
 
     device: Annotated[int, Field(ge=0, le=255)] | Annotated[str, Field(min_length=1)]
     """An index, a device's path, a URL, a file, or a numbered series ("frames/%03d.png")."""
 
     backend: str = "auto"
-    """OpenCV's name of it (v4l2, ffmpeg, gstreamer, …). "auto" is v4l2 for cameras on Linux, ffmpeg for URLs and films,
-    images for a series, and for anything else what OpenCV finds."""
+    """OpenCV's name of the backend (v4l2, ffmpeg, gstreamer, …). "auto" is v4l2 for cameras on Linux, ffmpeg for URLs
+    and films, images for a series, and for others OpenCV's choice."""
 
     size_px: Annotated[tuple[Extent, Extent], Field(strict=False)] | None = None
-    """[width, height]; else as the source has it."""
+    """[width, height]; else the source's own size."""
 
     fourcc: Annotated[str, Field(pattern=r"^[\x20-\x7e]{3,4}$")] | None = None
     """The pixel format's four characters."""
 
     frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)] | None = None
-    """Of a camera, what it is set to; of a live source, what it sends at most; of a film, the rate in place of its
-    own."""
+    """Rate to set a camera to; highest rate of a live source; rate of a film, in place of its own."""
 
     bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
-    """How many low bits of a 16-bit sample the sensor fills; else all that the format has."""
+    """Number of low bits of a 16-bit sample that the sensor fills; else all of the format."""
 
     source_exposure_s: Annotated[float, Field(gt=0, le=60)] | None = None
-    """The exposure (at most) of a source that OpenCV cannot set; unused where it can."""
+    """Longest exposure of a source that OpenCV cannot set; unused where it can."""
 
     delay_s: Annotated[float, Field(ge=0, le=60)] | None = None
-    """Of a source without time stamps, the longest time from the end of an exposure to the frame's arrival, all buffers
-    between them included; given for a camera with time stamps, they are not trusted."""
+    """Longest time from the end of an exposure to the frame's arrival, including all buffers, for a source without time
+    stamps; for a camera with time stamps, it replaces them."""
 
     settle_frames: Annotated[int, Field(ge=1, le=1000)] = 5
-    """Of a camera, frames discarded after it starts, until its settings have taken effect."""
+    """Frames of a camera discarded after it starts, until its settings have taken effect."""
 
     focus: float | None = None
     """Value of a camera's focus control; autofocus is off in any case."""
 
     skip_controls: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    """Of a camera, controls to be left as they are, by the names that `v4l2-ctl --list-ctrls` gives them."""
+    """Controls of a camera to leave as they are, by their names in `v4l2-ctl --list-ctrls`."""
 
     @field_validator("backend")
     @classmethod
-    def _known(cls, name: str) -> str:
+    def _check_backend(cls, name: str) -> str:
         known = sorted(_backends())
         if name not in {"auto", *known}:
             message = f"expected auto or one of {', '.join(known)}, found '{name}'; this OpenCV has no other"
@@ -84,18 +83,18 @@ class OpenCvOptions(Strict, use_attribute_docstrings=True):
 
     @property
     def size(self) -> Size | None:
-        """The frame's extent, if one is asked for."""
+        """The requested size of frames, if any."""
         return None if self.size_px is None else Size(*self.size_px)
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
-    """A checked source: what is opened, with which of OpenCV's back ends, and how the times of its frames are known.
+class CaptureSource:
+    """A source: what OpenCV opens, with which backend, and how it is timed.
 
-    `label` names it in messages, without the password that a URL may carry.
+    `label` names it in messages, without the password that a URL may contain.
     """
 
-    kind: Kind
+    kind: SourceKind
     target: int | str
     backend: int
     label: str
@@ -124,37 +123,36 @@ class _SeriesOptions(_FilmOptions):
 
 _NEEDED: Mapping[type[OpenCvOptions], str] = {
     OpenCvOptions: "",
-    _LiveOptions: "\n(No time stamps come from this source. To know when a frame was exposed, its driver needs the "
-    "longest exposure (source_exposure_s), the longest delay (delay_s) and the most frames per second "
-    "(frame_rate_hz).)",
-    _UnstampedOptions: "\n(With delay_s, time stamps are not used. To know when a frame was exposed, the driver then "
-    "needs the most frames per second, too: frame_rate_hz.)",
-    _FilmOptions: "\n(Of a film, its driver needs to know how long each frame was exposed: source_exposure_s.)",
-    _SeriesOptions: "\n(Of a series of images, its driver needs to know how long each was exposed, source_exposure_s, "
-    "and how many were taken per second, frame_rate_hz.)",
+    _LiveOptions: "\n(This source has no time stamps. For exposure times, the driver needs the longest exposure "
+    "(source_exposure_s), the longest delay (delay_s) and the highest frame rate (frame_rate_hz).)",
+    _UnstampedOptions: "\n(With delay_s, time stamps are not used. For exposure times, the driver then also needs the "
+    "highest frame rate: frame_rate_hz.)",
+    _FilmOptions: "\n(For a film, the driver needs the exposure of its frames: source_exposure_s.)",
+    _SeriesOptions: "\n(For a series of images, the driver needs their exposure, source_exposure_s, and their rate, "
+    "frame_rate_hz.)",
 }
 
 
-def source_of(name: str, options: Mapping[str, object], folder: Path) -> Source:
-    """Return the source that a camera's options mean. Raises ConfigError with all their faults."""
+def parse_source(name: str, options: Mapping[str, object], folder: Path) -> CaptureSource:
+    """Return the source that a camera's options describe. Raises ConfigError with all their faults."""
     device = options.get("device")
     model: type[OpenCvOptions] = OpenCvOptions
-    kind, usual, target = Kind.LIVE, cv2.CAP_ANY, device
+    kind, default_backend, target = SourceKind.LIVE, cv2.CAP_ANY, device
     if isinstance(device, str) and "://" in device:
-        kind, model, usual = Kind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
+        kind, model, default_backend = SourceKind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
     elif isinstance(device, str) and device and not device.startswith("/dev/"):
         target = str(folder / device)
-        kind, model, usual = _file(name, folder / device)
+        kind, model, default_backend = _classify_file(name, folder / device)
     elif sys.platform == "linux" and options.get("backend", "auto") in {"auto", "v4l2"}:
-        kind, usual = Kind.DEVICE, cv2.CAP_V4L2
+        kind, default_backend = SourceKind.DEVICE, cv2.CAP_V4L2
         if "delay_s" in options:
             model = _UnstampedOptions
     elif device is not None:
         model = _LiveOptions
-    plain = validate(model, options, f"the table of camera '{name}'", hint=_NEEDED[model])
-    backend = {**_backends(), "auto": usual}[plain.backend]
-    return Source(
-        kind, target if isinstance(target, int) else str(target), backend, _label(plain.device, target), plain
+    parsed = validate(model, options, f"the table of camera '{name}'", hint=_NEEDED[model])
+    backend = {**_backends(), "auto": default_backend}[parsed.backend]
+    return CaptureSource(
+        kind, target if isinstance(target, int) else str(target), backend, _label(parsed.device, target), parsed
     )
 
 
@@ -170,19 +168,19 @@ def _label(device: int | str, target: object) -> str:
     return _without_password(device) if "://" in device else str(target)
 
 
-def _file(name: str, path: Path) -> tuple[Kind, type[OpenCvOptions], int]:
+def _classify_file(name: str, path: Path) -> tuple[SourceKind, type[OpenCvOptions], int]:
     if _NUMBERED.search(path.name):
-        return Kind.FILM, _SeriesOptions, cv2.CAP_IMAGES
+        return SourceKind.FILM, _SeriesOptions, cv2.CAP_IMAGES
     try:
         mode = path.stat().st_mode
     except OSError as error:
         message = f"camera '{name}': device = \"{path}\": expected a file, found: {error.strerror}; correct the path"
         raise ConfigError(message) from error
     if stat.S_ISREG(mode):
-        return Kind.FILM, _FilmOptions, cv2.CAP_FFMPEG
+        return SourceKind.FILM, _FilmOptions, cv2.CAP_FFMPEG
     if stat.S_ISFIFO(mode):
-        return Kind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
-    message = f"camera '{name}': device = \"{path}\": expected a film or a pipe, found something else; name a file"
+        return SourceKind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
+    message = f"camera '{name}': device = \"{path}\": expected a film or a pipe, found another kind of file; correct it"
     raise ConfigError(message)
 
 

@@ -1,21 +1,28 @@
-"""A Raspberry Pi's camera: settings that are read back from its frames, and frames that began after an instant.
+"""A Raspberry Pi's camera through picamera2.
 
-The sensor runs by itself, so `read` waits for a frame whose exposure began late enough. Settings are written while it
-is stopped: then the first frame has them. Each frame tells the exposure and gain it was taken with, and the time from
-the frame before; a longer time between two stamps is frames that were lost, or that nobody fetched.
+The sensor runs freely, so `read` waits for a frame whose exposure began late enough. Settings are written while it is
+stopped: then the first frame has them. Each frame's metadata contain its exposure, its gain and the time from the frame
+before; a longer time between two stamps means that frames were lost or not fetched.
 """
 
 from __future__ import annotations
 
+import importlib
+import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import TimeoutError as JobTimeoutError
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from drivers.picamera2.library import cameras, library, told
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.picamera2.options import PiCameraOptions
-from drivers.picamera2.stream import Stream, configured
+from drivers.v4l2.formats import PixelLayout, SamplePacking, colour_image, grey_image
 from slrig.bundle.validation import validate
 from slrig.devices import (
     AppliedSettings,
@@ -24,11 +31,152 @@ from slrig.devices import (
     CameraSettings,
     CameraState,
     Clock,
+    FoundDevice,
     SystemClock,
     Trigger,
 )
-from slrig.errors import DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
-from slrig.model import CameraFormat, Frame
+from slrig.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceGoneError,
+    FrameTimeoutError,
+    LibraryMissingError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import CameraFormat, Frame, Pixels, Size
+
+INSTALL = "sudo apt install python3-libcamera && pip install 'slrig[picamera2]'"
+
+
+def load_library() -> Any:
+    """Return the class `Picamera2`.
+
+    Raises
+    ------
+    LibraryMissingError
+        picamera2 or libcamera is not installed.
+    """
+    try:
+        return importlib.import_module("picamera2").Picamera2
+    except ImportError as cause:
+        message = (
+            f"cameras of a Raspberry Pi need picamera2 and the system's libcamera, found: {cause}; {INSTALL} (in a "
+            "virtual environment that was made with --system-site-packages)"
+        )
+        raise LibraryMissingError(message, install=INSTALL) from cause
+
+
+def list_cameras() -> tuple[dict[str, Any], ...]:
+    """Return libcamera's description of each camera, in picamera2's order: Id, Model, Num and more."""
+    return tuple(load_library().global_camera_info())
+
+
+@contextmanager
+def translate_errors(name: str, action: str) -> Iterator[None]:
+    """Turn the library's RuntimeErrors within the block into slrig's errors.
+
+    Raises
+    ------
+    DeviceBusyError
+        Another program has acquired the camera.
+    DeviceError
+        Anything else.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        causes = " ".join(filter(None, (str(error), str(error.__cause__ or ""))))
+        failure = f"camera '{name}', {action}: {causes}"
+        if "busy" in causes.lower() or "in use" in causes.lower():
+            raise DeviceBusyError(f"{failure}; another program uses the camera: close that program") from error
+        raise DeviceError(f"{failure}; check the camera's cable, and try rpicam-hello --list-cameras") from error
+
+
+def find_devices() -> tuple[FoundDevice, ...]:
+    """Return every camera that libcamera finds; opens none.
+
+    Raises
+    ------
+    LibraryMissingError
+        picamera2 is not installed.
+    """
+    return tuple(FoundDevice("picamera2", each["Id"], f"{each['Model']} (libcamera)") for each in list_cameras())
+
+
+_UNPACKED = re.compile(r"^(S(?P<bayer>[RGB]{4})|R)(?P<depth>8|10|12|14|16)$")
+_MIN_MAIN_SIZE = (64, 64)
+"""Size of the main stream that picamera2 always makes, where only the raw one is read."""
+
+
+@dataclass(frozen=True, slots=True)
+class PiStream:
+    """The configured stream that is read."""
+
+    name: str
+    layout: PixelLayout
+    size: Size
+    stride_bytes: int
+
+    def colour(self, data: NDArray[np.uint8]) -> Callable[[], Pixels] | None:
+        """Return a function that converts a buffer to (H, W, 3), blue, green and red; None without colour."""
+        if not self.layout.has_colour:
+            return None
+        return partial(colour_image, data, self.layout, self.size, stride_bytes=self.stride_bytes)
+
+    def image(self, data: NDArray[np.uint8]) -> Pixels:
+        """Return the grey image of a buffer, (H, W). Raises ValueError if the buffer is too short."""
+        return grey_image(data, self.layout, self.size, stride_bytes=self.stride_bytes)
+
+
+def configure_stream(camera: Any, name: str, *, raw: bool, size_px: tuple[int, int] | None) -> PiStream:
+    """Configure the camera for a stream and read the result back.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        The sensor has no such mode, or libcamera gives another size or an unknown format.
+    """
+    modes = [mode for mode in camera.sensor_modes if "size" in mode]
+    sizes = sorted({tuple(mode["size"]) for mode in modes}, key=lambda size: size[0] * size[1])
+    wanted = sizes[-1] if size_px is None and sizes else size_px
+    offered = ", ".join(f"{width} x {height}" for width, height in sizes) or "none with a size"
+    if wanted not in sizes:
+        message = f"camera '{name}': requested size_px {wanted}, its sensor has the modes {offered}; choose one of them"
+        raise UnsupportedByDeviceError(message)
+    mode = max((mode for mode in modes if tuple(mode["size"]) == wanted), key=lambda mode: mode["bit_depth"])
+    sensor = {"output_size": wanted, "bit_depth": mode["bit_depth"]}
+    if raw:
+        table = {"raw": {"format": mode["unpacked"], "size": wanted}, "main": {"size": _MIN_MAIN_SIZE}}
+    else:
+        table = {"main": {"format": "YUV420", "size": wanted}}
+    camera.configure(camera.create_video_configuration(**table, sensor=sensor, controls={}, display=None, encode=None))
+    which = "raw" if raw else "main"
+    got = camera.camera_configuration()[which]
+    layout = _layout(got["format"])
+    if layout is None or tuple(got["size"]) != wanted:
+        message = (
+            f"camera '{name}': requested {table[which]}, libcamera gives {got['format']}, {got['size']}; "
+            f'write pixels = "{"luma" if raw else "raw"}", or another size_px (the sensor has {offered})'
+        )
+        raise UnsupportedByDeviceError(message)
+    return PiStream(which, layout, Size(*wanted), got["stride"])
+
+
+def _layout(form: str) -> PixelLayout | None:
+    """Return the layout of a format of libcamera; None if it is unknown.
+
+    >>> _layout("SRGGB10").bayer, _layout("R8").packing.name, _layout("RGGB16_PISP_COMP1")
+    ('RGGB', 'BYTES', None)
+    """
+    if form == "YUV420":
+        # Planes: all luma first, then the colours, which are not used.
+        return PixelLayout(8, SamplePacking.BYTES)
+    found = _UNPACKED.match(form)
+    if found is None:
+        return None
+    depth = int(found["depth"])
+    return PixelLayout(depth, SamplePacking.BYTES if depth == 8 else SamplePacking.WORDS, found["bayer"])
+
 
 FIXED: Mapping[str, object] = {
     "AeEnable": False,
@@ -40,21 +188,21 @@ FIXED: Mapping[str, object] = {
     "Contrast": 1.0,
     "Brightness": 0.0,
 }
-"""Nothing automatic, nothing that mixes neighbours or bends grey levels; set where the camera has it. 0 is "off"."""
+"""Values that switch automatic and image processing controls off; set where the camera has the control."""
 
-LONGEST_S = 1.0
-"""The longest exposure that is declared: some sensors take minutes, which no check waits for."""
+MAX_EXPOSURE_S = 1.0
+"""Longest exposure declared: some sensors allow minutes, too long for any check to wait."""
 
 _BLANK_US = 5_000
-"""What a frame may take beyond its exposure; libcamera takes no more of it than the sensor needs."""
+"""Frame duration allowed beyond the exposure; libcamera uses no more of it than the sensor needs."""
 
 _ERROR_NS = 1_000_000
-"""How late the kernel may notice the start of a frame on the wire."""
+"""Delay with which the kernel may notice the start of a frame on the wire."""
 
-_AS_ASKED = 0.01
+_SETTING_TOLERANCE = 0.01
 _SETTLING_FRAMES = 12
-_SLICE_S = 0.05
-_LATE_S = 3.0
+_WAIT_SLICE_S = 0.05
+_FRAME_TIMEOUT_S = 3.0
 _SUSPENDED_NS = 1_000_000
 
 
@@ -64,44 +212,44 @@ class PiCamera:
     Parameters
     ----------
     name
-        As the rig file calls it.
+        Its name in the rig file.
     options
-        Checked already.
+        Checked options.
     clock
-        CLOCK_MONOTONIC; in tests that of the stand-in for the library.
+        CLOCK_MONOTONIC; in tests the clock of the stand-in.
 
     Raises
     ------
     LibraryMissingError
         picamera2 is not installed.
     DeviceGoneError
-        There is no such camera.
+        No such camera is connected.
     DeviceBusyError
-        Another program holds it.
+        Another program uses it.
     UnsupportedByDeviceError
-        It cannot do what an option asks.
+        It cannot do what an option requests.
     """
 
     def __init__(self, name: str, options: PiCameraOptions, *, clock: Clock | None = None) -> None:
         self._name, self._options = name, options
         self._clock = clock or SystemClock()
         self._state = CameraState(name)
-        known = cameras()
+        known = list_cameras()
         numbers = [number for number, each in enumerate(known) if each["Id"] == options.device]
         if not numbers:
             found = ", ".join(each["Id"] for each in known) or "none"
-            message = f"camera '{name}': no camera '{options.device}' is connected; found: {found}; check its cable"
+            message = f"camera '{name}': camera '{options.device}' is not connected; found: {found}; check its cable"
             raise DeviceGoneError(message)
         self._job: Any = None
-        with told(name, "opening it"):
-            self._camera = library()(numbers[0])
+        with translate_errors(name, "opening it"):
+            self._camera = load_library()(numbers[0])
         try:
-            with told(name, "configuring it"):
+            with translate_errors(name, "configuring it"):
                 raw = options.pixels == "raw"
-                self._stream: Stream = configured(self._camera, name, raw=raw, size_px=options.size_px)
+                self._stream: PiStream = configure_stream(self._camera, name, raw=raw, size_px=options.size_px)
                 self._controls = self._camera.camera_controls
-                self._camera.set_controls(self._fixed())
-            self._info = self._declared(known[numbers[0]])
+                self._camera.set_controls(self._fixed_controls())
+            self._info = self._describe(known[numbers[0]])
         except BaseException:
             self._camera.close()
             raise
@@ -112,7 +260,7 @@ class PiCamera:
         return self._info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. Runs the camera until a frame comes that was taken so.
+        """See `Camera`. Runs the camera until a frame with these settings comes.
 
         Raises
         ------
@@ -120,37 +268,37 @@ class PiCamera:
             The camera delivers no frame.
         """
         self._state.check_settings(settings, self._info)
-        told_last = self._taken(settings.exposure_s, settings.gain, _SETTLING_FRAMES)
-        got = _applied(told_last)
-        if not _as_asked(told_last, settings.exposure_s, settings.gain):
+        metadata = self._run_until_applied(settings.exposure_s, settings.gain, _SETTLING_FRAMES)
+        got = _applied_settings(metadata)
+        if not _is_applied(metadata, settings.exposure_s, settings.gain):
             message = (
-                f"camera '{self._name}': asked for exposure_s {settings.exposure_s:g} and gain {settings.gain:g}, it "
-                f"gives {got.exposure_s:g} and {got.gain:g}; ask for that"
+                f"camera '{self._name}': requested exposure_s {settings.exposure_s:g} and gain {settings.gain:g}, it "
+                f"gives {got.exposure_s:g} and {got.gain:g}; use these values"
             )
             raise UnsupportedByDeviceError(message)
         return got
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`. Starts the camera afresh: no frame of an earlier arming can come."""
+        """See `Camera`. Starts the camera again: no frame of an earlier arming can come."""
         self._state.check_arming(count, trigger, self._info)
         self._last_ns = self._number = self._dropped = 0
-        with told(self._name, "starting it"):
+        with translate_errors(self._name, "starting it"):
             self._camera.start()
         self._state.armed = trigger
 
     def trigger(self) -> None:
-        """See `Camera`. libcamera triggers no sensor by software."""
+        """See `Camera`. libcamera has no software trigger."""
         self._state.require_armed(Trigger.SOFTWARE)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`. A frame may have begun earlier than it says by the error of its stamp: that is allowed for."""
+        """See `Camera`. Allows for the error of time stamps."""
         self._state.require_armed()
         until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        passed = 0
+        skipped = 0
         while True:
             left_s = (until_ns - self._clock.now_ns()) / 1e9
-            with told(self._name, "waiting for a frame"):
-                request = self._next(max(min(left_s, _SLICE_S), 0.0))
+            with translate_errors(self._name, "waiting for a frame"):
+                request = self._next(max(min(left_s, _WAIT_SLICE_S), 0.0))
             if request is not None:
                 try:
                     self._state.require_armed()  # another thread may have closed it meanwhile
@@ -159,12 +307,12 @@ class PiCamera:
                     request.release()
                 if frame is not None:
                     return frame
-                passed += 1
+                skipped += 1
             self._state.require_armed()
             if left_s <= 0:
                 message = (
-                    f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s ({passed} "
-                    f"that began earlier were passed over); check its cable, and that the Pi keeps up"
+                    f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s "
+                    f"({skipped} that began earlier were skipped); check its cable, and that the Pi keeps up"
                 )
                 raise FrameTimeoutError(message)
 
@@ -180,38 +328,42 @@ class PiCamera:
         if self._state.close():
             self._camera.close()
 
-    def _taken(self, exposure_s: float, gain: float, most: int) -> Mapping[str, Any]:
-        """Run the camera with these settings; what its first frame tells that was taken so, or after so many the last.
-        Raises FrameTimeoutError: it delivers no frame.
+    def _run_until_applied(self, exposure_s: float, gain: float, max_frames: int) -> Mapping[str, Any]:
+        """Run the camera and return the metadata of its first frame with these settings, or of the last one.
+
+        Raises
+        ------
+        FrameTimeoutError
+            It delivers no frame.
         """
         exposure_us = round(exposure_s * 1e6)
         fastest_us = self._controls["FrameDurationLimits"][0]
         limits = (fastest_us, max(fastest_us, exposure_us + _BLANK_US))
-        with told(self._name, "setting exposure and gain"):
+        with translate_errors(self._name, "setting exposure and gain"):
             self._camera.set_controls(
                 {"ExposureTime": exposure_us, "AnalogueGain": gain, "FrameDurationLimits": limits}
             )
             self._camera.start()
             try:
                 while True:
-                    request = self._next(exposure_s + _LATE_S)
+                    request = self._next(exposure_s + _FRAME_TIMEOUT_S)
                     if request is None:
                         message = f"camera '{self._name}' delivers no frame at {exposure_s:g} s; check its cable"
                         raise FrameTimeoutError(message)
                     metadata: Mapping[str, Any] = request.get_metadata()
                     request.release()
-                    most -= 1
-                    if _as_asked(metadata, exposure_s, gain) or most <= 0:
+                    max_frames -= 1
+                    if _is_applied(metadata, exposure_s, gain) or max_frames <= 0:
                         return metadata
             finally:
                 self._stop()
 
-    def _next(self, most_s: float) -> Any:
-        """The next request that is complete, waited for no longer; None if none came. It must be released."""
+    def _next(self, timeout_s: float) -> Any:
+        """Return the next complete request, to be released by the caller; None after `timeout_s`."""
         if self._job is None:
             self._job = self._camera.capture_request(wait=False)
         try:
-            request = self._camera.wait(self._job, timeout=most_s)
+            request = self._camera.wait(self._job, timeout=timeout_s)
         except (JobTimeoutError, TimeoutError):
             return None
         self._job = None
@@ -219,14 +371,14 @@ class PiCamera:
 
     def _stop(self) -> None:
         if self._job is not None:
-            # Stopping waits for the jobs before it, and so forever where no frame comes any more.
+            # Stopping waits for earlier jobs, and so would not end if no frame comes.
             self._camera.cancel_all_and_flush()
             self._job = None
-        with told(self._name, "stopping it"):
+        with translate_errors(self._name, "stopping it"):
             self._camera.stop()
 
     def _frame(self, request: Any, after_ns: int) -> Frame | None:
-        """The frame of a request; None if it began before."""
+        """Return the frame of a request; None if it began before `after_ns`."""
         metadata = request.get_metadata()
         now_ns = self._clock.now_ns()
         exposure_ns = round(metadata["ExposureTime"] * 1e3)
@@ -239,7 +391,7 @@ class PiCamera:
         start_ns = stamp_ns - (exposure_ns if self._options.time_stamp == "readout" else 0)
         if start_ns - _ERROR_NS < after_ns:
             return None
-        # All rows are read out within a frame of the fastest mode, and were by the time the frame was here.
+        # All rows are read out within a frame of the fastest mode, and before the frame arrived.
         skew_ns = 0 if self._options.global_shutter else round(self._controls["FrameDurationLimits"][0] * 1e3)
         skew_ns = max(min(skew_ns, now_ns - start_ns - exposure_ns), 0)
         data = request.make_buffer(self._stream.name)
@@ -257,54 +409,56 @@ class PiCamera:
             colour=self._stream.colour(data),
         )
 
-    def _declared(self, known: Mapping[str, Any]) -> CameraInfo:
-        least, most = self._controls["AnalogueGain"][:2]
-        most_us = self._controls["ExposureTime"][1]
-        # libcamera may say 0, which stands for "automatic": a frame tells what the sensor's least is.
-        shortest = self._taken(max(self._controls["ExposureTime"][0], 1) / 1e6, max(float(least), 1.0), 1)
+    def _describe(self, known: Mapping[str, Any]) -> CameraInfo:
+        min_gain, max_gain = self._controls["AnalogueGain"][:2]
+        max_us = self._controls["ExposureTime"][1]
+        # libcamera may report 0 for "automatic": the metadata of a frame have the sensor's minimum.
+        shortest = self._run_until_applied(
+            max(self._controls["ExposureTime"][0], 1) / 1e6, max(float(min_gain), 1.0), 1
+        )
         return CameraInfo(
             name=self._name,
             model=str(known["Model"]),
             serial=self._options.device,
             format=CameraFormat(self._stream.size, self._stream.layout.bit_depth),
             triggers=frozenset({Trigger.FREE}),
-            exposure_range_s=(shortest["ExposureTime"] / 1e6, min(most_us / 1e6, LONGEST_S)),
-            gain_range=(max(float(least), 1.0), float(most)),
+            exposure_range_s=(shortest["ExposureTime"] / 1e6, min(max_us / 1e6, MAX_EXPOSURE_S)),
+            gain_range=(max(float(min_gain), 1.0), float(max_gain)),
             colour=self._stream.layout.has_colour,
         )
 
-    def _fixed(self) -> dict[str, object]:
-        """What is set once. Raises UnsupportedByDeviceError: a lens that can be moved has no place."""
+    def _fixed_controls(self) -> dict[str, object]:
+        """Return the controls to set once. Raises UnsupportedByDeviceError if lens and option do not match."""
         fixed = {control: value for control, value in FIXED.items() if control in self._controls}
         focus = self._options.focus_dioptres
         if ("LensPosition" in self._controls) != (focus is not None):
             message = (
-                f"camera '{self._name}' has a lens that moves by itself; write focus_dioptres, 1 / the distance in m"
+                f"camera '{self._name}' has a motorised lens; write focus_dioptres, 1 / the distance in m"
                 if focus is None
-                else f"camera '{self._name}': asked for focus_dioptres {focus:g}, its lens is fixed; leave that out"
+                else f"camera '{self._name}': requested focus_dioptres {focus:g}, its lens is fixed; leave that out"
             )
             raise UnsupportedByDeviceError(message)
         return fixed if focus is None else {**fixed, "AfMode": 0, "LensPosition": focus}
 
 
-def _applied(metadata: Mapping[str, Any]) -> AppliedSettings:
+def _applied_settings(metadata: Mapping[str, Any]) -> AppliedSettings:
     exposure_s, period_s = metadata["ExposureTime"] / 1e6, metadata["FrameDuration"] / 1e6
     return AppliedSettings(exposure_s, float(metadata["AnalogueGain"]), period_s)
 
 
-def _as_asked(metadata: Mapping[str, Any], exposure_s: float, gain: float) -> bool:
-    return _near(metadata["ExposureTime"], exposure_s * 1e6) and _near(metadata["AnalogueGain"], gain)
+def _is_applied(metadata: Mapping[str, Any], exposure_s: float, gain: float) -> bool:
+    return _is_close(metadata["ExposureTime"], exposure_s * 1e6) and _is_close(metadata["AnalogueGain"], gain)
 
 
-def _near(got: float, asked: float) -> bool:
-    return abs(got - asked) <= max(_AS_ASKED * asked, 1e-3)
+def _is_close(got: float, wanted: float) -> bool:
+    return abs(got - wanted) <= max(_SETTING_TOLERANCE * wanted, 1e-3)
 
 
 def _monotonic(stamp_ns: int, now_ns: int) -> int:
-    """A time stamp on CLOCK_MONOTONIC.
+    """Convert a time stamp to CLOCK_MONOTONIC.
 
-    libcamera's document says CLOCK_BOOTTIME, which also counts the time that the machine was suspended; the receivers
-    of a Raspberry Pi stamp by CLOCK_MONOTONIC. Where the two differ, a frame that came just now tells which it is.
+    libcamera documents CLOCK_BOOTTIME, which also counts the time that the machine was suspended; the receivers of a
+    Raspberry Pi stamp by CLOCK_MONOTONIC. Where the two differ, the clock nearer to the present is the stamp's.
     """
     suspended_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
     if suspended_ns > _SUSPENDED_NS and abs(stamp_ns - suspended_ns - now_ns) < abs(stamp_ns - now_ns):

@@ -1,21 +1,21 @@
 """A projector on a display output of this computer (HDMI, DisplayPort, VGA), chosen by its connector's name.
 
-Patterns are worth something only if every pixel of the pattern is one pixel of the projector, as bright as asked, on
-that output alone, and if it is known since when. So an output is refused, with the command that mends it, where
-its mode is not the projector's own raster, is rotated, transformed, panned or mirrored, where its gamma ramp or colour
-matrix is not the identity (a night light), where a compositor draws the window, or where another program holds it.
-Its display is kept awake. One picture of each sequence is read back from the frame buffer and compared.
+Patterns are useful only if every pixel of the pattern is one pixel of the projector, with the requested brightness, on
+that output alone, at a known time. So an output is refused, with the command that corrects it, where its mode is not
+the projector's own raster, is rotated, transformed, panned or mirrored, where its gamma ramp or colour matrix is not
+the identity (a night light), where a compositor draws the window, or where another program uses it. The display is kept
+awake. One picture of each sequence is read back from the frame buffer and compared.
 
-Through X (`backend = "x11"`, the default where there is an X server; needs libxcb, no Python package) flip times come
-from the Present extension: t_visible is that stamp + one refresh (the rows come one after the other) + the display's
-own delay, `latency_s`. Through SDL (`backend = "sdl"`, `pip install 'slrig[screen]'`) nothing is known but when calls
-return; the stated error is larger by some refreshes, and patterns take that much longer. On Wayland, Windows and macOS
-there is only SDL, and nobody tells a program what becomes of its pixels: refused unless `trust_compositor = true`, and
-nothing keeps the output black when slrig is killed.
+Through X (`backend = "x11"`, the default where there is an X server), flip times come from the Present extension:
+t_visible is that stamp + one refresh (rows arrive one after the other) + the display's own delay, `latency_s`. Through
+SDL (`backend = "sdl"`) only the time at which calls return is known; the stated error is larger by some refreshes, and
+patterns take that much longer. On Wayland, Windows and macOS there is only SDL, and no program can find out what
+happens to its pixels: refused unless `trust_compositor = true`, and nothing keeps the output black when slrig is
+killed. Both need `pip install 'slrig[screen]'`, X also libxcb.
 
-On X a small process of its own keeps the output black below the patterns, between scans, after `close` and for
-`dark_after_s` after slrig has ended, even by kill -9. A service manager that ends all processes of a service ends that
-one too (systemd: KillMode=process leaves it).
+On X a guard process keeps the output black below the patterns, between scans, after `close` and for `dark_after_s`
+after slrig has ended, even by kill -9. A service manager that ends all processes of a service ends that one too
+(systemd: KillMode=process leaves it).
 """
 
 from __future__ import annotations
@@ -40,70 +40,68 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     options
         `drivers.screen.options.ScreenOptions`.
     folder
-        The rig file's own; unused, a display is not a file of the rig.
+        The rig file's folder; unused.
 
     Raises
     ------
     ConfigError
         The options have faults, all of them in one message.
     LibraryMissingError
-        libxcb or PySDL2 is not installed, whichever is needed.
+        xcffib, libxcb or PySDL2 is not installed, whichever is needed.
     UnsupportedByDeviceError
-        The output would not show patterns pixel for pixel, or there is none of that name.
+        The output would not show patterns pixel for pixel, or no output has that name.
     DeviceGoneError
         Nothing is connected to it.
     DeviceBusyError
         Another process shows patterns there.
     DeviceError
-        There is no graphical session, or it does not let this user in.
+        No graphical session runs, or it does not let this user in.
     """
     from drivers.display.projector import DisplayProjector
     from drivers.screen.options import ScreenOptions
-    from drivers.screen.stage import opened
+    from drivers.screen.output import open_output
 
     del folder
-    told = validate(ScreenOptions, options, "the [projector] table of driver 'screen'")
-    return DisplayProjector(told, lambda: opened(told))
+    screen_options = validate(ScreenOptions, options, "the [projector] table of driver 'screen'")
+    return DisplayProjector(screen_options, lambda: open_output(screen_options))
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """Return the outputs that a display is connected to; none where there is no graphical session.
+    """Return the outputs that a display is connected to; none without a graphical session.
 
     Raises
     ------
     LibraryMissingError
-        libxcb or PySDL2 is not installed, whichever is needed.
+        xcffib, libxcb or PySDL2 is not installed, whichever is needed.
     """
     if sys.platform == "linux" and os.environ.get("DISPLAY") and not os.environ.get("WAYLAND_DISPLAY"):
         return _x11_outputs()
     if sys.platform == "linux" and not os.environ.get("WAYLAND_DISPLAY"):
         return ()
-    return _sdl_displays()
+    from drivers.screen.sdl import list_displays
+
+    return tuple(
+        FoundDevice(DRIVER, name, f"{name} ({size} at {rate_hz} Hz)") for name, size, rate_hz in list_displays()
+    )
 
 
 def _x11_outputs() -> tuple[FoundDevice, ...]:
-    from drivers.screen import randr
-    from drivers.screen.connection import Connection
+    from drivers.screen.randr import list_outputs, require_randr
+    from drivers.screen.x11 import XConnection
 
     try:
-        connection = Connection()
+        connection = XConnection()
     except LibraryMissingError:
         raise
     except DeviceError:
-        # DISPLAY names a server that is not there: nothing is plugged into it.
+        # DISPLAY names a server that does not run: no outputs.
         return ()
     try:
-        randr.require(connection)
-        connected = [output for output in randr.outputs(connection, probe=True) if output.connected]
+        require_randr(connection)
+        connected = [output for output in list_outputs(connection, probe=True) if output.connected]
     finally:
         connection.close()
     return tuple(FoundDevice(DRIVER, output.name, str(output)) for output in connected)
-
-
-def _sdl_displays() -> tuple[FoundDevice, ...]:
-    from drivers.screen import sdl
-
-    return tuple(FoundDevice(DRIVER, name, f"{name} ({size} at {rate_hz} Hz)") for name, size, rate_hz in sdl.listed())
 
 
 __all__ = ["find_devices", "open_projector"]

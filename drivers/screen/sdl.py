@@ -1,7 +1,7 @@
-"""Pictures shown through SDL 2, which runs everywhere and tells no flip times.
+"""Windows of SDL 2, which runs on every system and reports no flip times.
 
-SDL's present call returns when a picture is queued, up to `timing.QUEUED` refreshes before it is seen; each picture is
-presented twice, so that the first one is through when the second one returns, and the rest is stated as error.
+SDL's present call returns when a picture is queued, up to `MAX_QUEUED_FRAMES` refreshes before it is visible. Each
+picture is presented twice, so the first one is out when the second call returns; the rest is stated as error.
 """
 
 from __future__ import annotations
@@ -17,54 +17,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.display.pixels import coloured
-from drivers.display.timing import Presented, queued
+from drivers.display.projector import ScanoutStart, rgb_pixels, start_of_queued
 from drivers.screen.options import ScreenOptions
-from drivers.screen.station import Station
 from slrig.errors import DeviceError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Pixels, Size
 
 _HINTS = (
-    # Signals belong to the service.
+    # The service handles signals.
     (b"SDL_NO_SIGNAL_HANDLERS", b"1"),
     (b"SDL_VIDEO_MINIMIZE_ON_FOCUS_LOSS", b"0"),
     (b"SDL_RENDER_SCALE_QUALITY", b"0"),
     (b"SDL_VIDEO_X11_NET_WM_BYPASS_COMPOSITOR", b"1"),
 )
-_SETTLES_IN_S = 2.0
-_LOOKS_EVERY_S = 0.02
+_RESIZE_TIMEOUT_S = 2.0
+_POLL_INTERVAL_S = 0.02
 _CENTRED = 0x2FFF0000
 _OPAQUE = np.uint32(0xFF000000)
 
 
-class SdlSurface:
-    """Shows patterns in a window of SDL's, exactly over a station's own. The station's thread uses it."""
+class SdlOutput:
+    """A full-screen window on a display that SDL knows, without an X server. Implements `PatternOutput`."""
 
-    def __init__(self, station: Station) -> None:
-        sdl = _started((b"SDL_VIDEODRIVER", b"x11"), (b"SDL_X11_FORCE_OVERRIDE_REDIRECT", b"1"))
-        picture = station.picture
-        self._canvas = _Canvas(sdl, (picture.x, picture.y), picture.size, sdl.SDL_WINDOW_BORDERLESS)
-        self._refresh_s = station.refresh_s
-        self.window = self._canvas.x11_window()
-        station.watch(self.window)
-
-    def load(self, sequence: PatternSequence) -> None:
-        """Take the patterns of a sequence."""
-        self._canvas.sequence = sequence
-
-    def show(self, index: int | None) -> Presented:
-        """Show a pattern of the sequence, None the dark, and return when that may have happened."""
-        return self._canvas.show(index, self._refresh_s)
-
-    def close(self) -> None:
-        """Let the window go."""
-        self._canvas.close()
-
-
-class SdlWindow:
-    """A display that SDL knows, where there is no X server to ask. One thread uses it. Implements `Stage`."""
-
-    def __init__(self, canvas: _Canvas, name: str, refresh_s: float) -> None:
+    def __init__(self, canvas: Canvas, name: str, refresh_s: float) -> None:
         self._canvas = canvas
         self.size = canvas.size
         self.refresh_s = refresh_s
@@ -76,38 +50,38 @@ class SdlWindow:
         """Take the patterns of a sequence."""
         self._canvas.sequence = sequence
 
-    def show(self, index: int | None) -> Presented:
-        """Show a pattern of the sequence, None the dark."""
+    def show(self, index: int | None) -> ScanoutStart:
+        """Show a pattern of the sequence, None for black."""
         return self._canvas.show(index, self.refresh_s)
 
     def compare(self, levels: Pixels) -> None:
-        """Nobody may read what a Wayland compositor shows."""
+        """Do nothing: no program may read what a Wayland compositor shows."""
 
     def cover(self) -> bool:
-        """There is nobody to ask but this window's own thread."""
+        """Return False: only this window's own thread can make it black."""
         return False
 
     def close(self) -> None:
-        """Go dark, and let the window go: what is behind it is seen again."""
+        """Show black and destroy the window: the desktop behind it is visible again."""
         with suppress(DeviceError):
             self.show(None)
         self._canvas.close()
 
 
-def fullscreen(options: ScreenOptions) -> SdlWindow:
-    """Fill the display of the name `options.output`. Raises UnsupportedByDeviceError, LibraryMissingError."""
-    sdl = _started()
+def open_fullscreen(options: ScreenOptions) -> SdlOutput:
+    """Open a window over the display `options.output`. Raises UnsupportedByDeviceError, LibraryMissingError."""
+    sdl = start_sdl()
     try:
-        index, (name, size, rate_hz) = _chosen(displays(sdl), options)
+        index, (name, size, rate_hz) = _choose_display(_displays(sdl), options)
         centre = _CENTRED | index
-        canvas = _Canvas(sdl, (centre, centre), size, sdl.SDL_WINDOW_FULLSCREEN_DESKTOP | sdl.SDL_WINDOW_BORDERLESS)
+        canvas = Canvas(sdl, (centre, centre), size, sdl.SDL_WINDOW_FULLSCREEN_DESKTOP | sdl.SDL_WINDOW_BORDERLESS)
     except BaseException:
-        _stopped(sdl)
+        _stop_sdl(sdl)
         raise
-    return SdlWindow(canvas, name, 1 / rate_hz)
+    return SdlOutput(canvas, name, 1 / rate_hz)
 
 
-def _chosen(found: list[tuple[str, Size, int]], options: ScreenOptions) -> tuple[int, tuple[str, Size, int]]:
+def _choose_display(found: list[tuple[str, Size, int]], options: ScreenOptions) -> tuple[int, tuple[str, Size, int]]:
     matching = [index for index, (name, _, _) in enumerate(found) if name == options.output]
     if len(matching) != 1:
         there = "; ".join(f"'{name}' ({size} at {rate_hz} Hz)" for name, size, rate_hz in found) or "none"
@@ -122,13 +96,13 @@ def _chosen(found: list[tuple[str, Size, int]], options: ScreenOptions) -> tuple
         )
         raise UnsupportedByDeviceError(message)
     if rate_hz < 1:
-        message = f"output {name} does not tell its refresh rate; set one in the system's display settings"
+        message = f"output {name} does not state its refresh rate; set one in the system's display settings"
         raise UnsupportedByDeviceError(message)
     return matching[0], found[matching[0]]
 
 
-def displays(sdl: Any) -> list[tuple[str, Size, int]]:
-    """The displays that SDL knows: name, extent, refresh rate in Hz (0: unknown)."""
+def _displays(sdl: Any) -> list[tuple[str, Size, int]]:
+    """Return name, extent and refresh rate in Hz (0: unknown) of each display that SDL knows."""
     found = []
     for index in range(sdl.SDL_GetNumVideoDisplays()):
         mode = sdl.SDL_DisplayMode()
@@ -138,17 +112,17 @@ def displays(sdl: Any) -> list[tuple[str, Size, int]]:
     return found
 
 
-def listed() -> list[tuple[str, Size, int]]:
-    """As `displays`, for a look. Raises LibraryMissingError, DeviceError."""
-    sdl = _started()
+def list_displays() -> list[tuple[str, Size, int]]:
+    """List name, extent and refresh rate in Hz of each display. Raises LibraryMissingError, DeviceError."""
+    sdl = start_sdl()
     try:
-        return displays(sdl)
+        return _displays(sdl)
     finally:
-        _stopped(sdl)
+        _stop_sdl(sdl)
 
 
-class _Canvas:
-    """A window of SDL's with a renderer and one texture of exactly its size, black at first."""
+class Canvas:
+    """An SDL window with a renderer and one texture of exactly its size, black at first."""
 
     def __init__(self, sdl: Any, place: tuple[int, int], size: Size, flags: int) -> None:
         self._sdl = sdl
@@ -159,53 +133,56 @@ class _Canvas:
         width_px, height_px = size.width_px, size.height_px
         self._window = sdl.SDL_CreateWindow(b"slrig", *place, width_px, height_px, flags | sdl.SDL_WINDOW_SHOWN)
         try:
-            self._made(self._window, "window")
+            self._require_created(self._window, "window")
             sdl.SDL_ShowCursor(0)
             self._renderer = sdl.SDL_CreateRenderer(self._window, -1, sdl.SDL_RENDERER_PRESENTVSYNC)
             if not self._renderer:
                 self._renderer = sdl.SDL_CreateRenderer(self._window, -1, 0)
-            self._made(self._renderer, "renderer")
+            self._require_created(self._renderer, "renderer")
             self._require_size()
             self._texture = sdl.SDL_CreateTexture(
                 self._renderer, sdl.SDL_PIXELFORMAT_ARGB8888, sdl.SDL_TEXTUREACCESS_STREAMING, width_px, height_px
             )
-            self._made(self._texture, "texture")
+            self._require_created(self._texture, "texture")
             sdl.SDL_SetTextureBlendMode(self._texture, sdl.SDL_BLENDMODE_NONE)
         except BaseException:
             self._destroy()
             raise
 
-    def show(self, index: int | None, refresh_s: float) -> Presented:
-        """Show a pattern of the sequence, None the dark."""
+    def show(self, index: int | None, refresh_s: float) -> ScanoutStart:
+        """Show a pattern of the sequence, None for black."""
         sdl = self._sdl
         if index is None or self.sequence is None:
             words: NDArray[np.uint32] = np.full(self.size.shape, _OPAQUE, np.uint32)
         else:
-            words = np.ascontiguousarray(coloured(self.sequence.image(index), self.sequence.patterns[index]) | _OPAQUE)
+            words = np.ascontiguousarray(
+                rgb_pixels(self.sequence.image(index), self.sequence.patterns[index]) | _OPAQUE
+            )
         sdl.SDL_PumpEvents()
-        self._done(sdl.SDL_UpdateTexture(self._texture, None, words.ctypes.data, words.strides[0]), "take a picture")
-        asked_ns = time.monotonic_ns()
+        code = sdl.SDL_UpdateTexture(self._texture, None, words.ctypes.data, words.strides[0])
+        self._require_success(code, "take a picture")
+        requested_ns = time.monotonic_ns()
         for _ in range(2):
-            self._done(sdl.SDL_RenderCopy(self._renderer, self._texture, None, None), "draw")
+            self._require_success(sdl.SDL_RenderCopy(self._renderer, self._texture, None, None), "draw")
             sdl.SDL_RenderPresent(self._renderer)
-        return queued(asked_ns, time.monotonic_ns(), refresh_s)
+        return start_of_queued(requested_ns, time.monotonic_ns(), refresh_s)
 
     def x11_window(self) -> int:
-        """The X server's number for the window."""
+        """Return the X server's number for the window."""
         info = self._sdl.SDL_SysWMinfo()
         self._sdl.SDL_VERSION(info.version)
-        self._made(self._sdl.SDL_GetWindowWMInfo(self._window, ctypes.byref(info)), "window of X")
-        _outlive_the_server(info.info.x11.display)
+        self._require_created(self._sdl.SDL_GetWindowWMInfo(self._window, ctypes.byref(info)), "window of X")
+        _survive_server_end(info.info.x11.display)
         return int(info.info.x11.window)
 
     def close(self) -> None:
-        """Let everything go."""
+        """Destroy the window and leave SDL."""
         self._destroy()
-        _stopped(self._sdl)
+        _stop_sdl(self._sdl)
 
     def _require_size(self) -> None:
-        """Wait until the window has its extent: a window system may take its time to give it."""
-        until_s = time.monotonic() + _SETTLES_IN_S
+        """Wait until the window has its extent, which some window systems set late."""
+        until_s = time.monotonic() + _RESIZE_TIMEOUT_S
         while True:
             self._sdl.SDL_PumpEvents()
             width_px, height_px = ctypes.c_int(), ctypes.c_int()
@@ -214,28 +191,28 @@ class _Canvas:
                 return
             if time.monotonic() > until_s:
                 message = (
-                    f"asked SDL for a window of {self.size} pixels, it gives {width_px.value} x {height_px.value}: the "
+                    f"requested an SDL window of {self.size} pixels, got {width_px.value} x {height_px.value}: the "
                     "desktop scales; set the projector's scale to 100 %"
                 )
                 raise UnsupportedByDeviceError(message)
-            time.sleep(_LOOKS_EVERY_S)
+            time.sleep(_POLL_INTERVAL_S)
 
     def _destroy(self) -> None:
         sdl = self._sdl
-        for destroy, thing in (
+        for destroy, handle in (
             (sdl.SDL_DestroyTexture, self._texture),
             (sdl.SDL_DestroyRenderer, self._renderer),
             (sdl.SDL_DestroyWindow, self._window),
         ):
-            if thing:
-                destroy(thing)
+            if handle:
+                destroy(handle)
         self._window = self._renderer = self._texture = None
 
-    def _made(self, thing: object, name: str) -> None:
-        if not thing:
+    def _require_created(self, handle: object, name: str) -> None:
+        if not handle:
             self._fail(f"make a {name}")
 
-    def _done(self, code: int, what: str) -> None:
+    def _require_success(self, code: int, what: str) -> None:
         if code:
             self._fail(what)
 
@@ -247,8 +224,9 @@ class _Canvas:
         raise DeviceError(message)
 
 
-def _started(*hints: tuple[bytes, bytes]) -> Any:
-    sdl = _library()
+def start_sdl(*hints: tuple[bytes, bytes]) -> Any:
+    """Start SDL's video with these hints and return its module. Raises LibraryMissingError, DeviceError."""
+    sdl = _import_sdl()
     for name, value in (*_HINTS, *hints):
         sdl.SDL_SetHint(name, value)
     if sdl.SDL_InitSubSystem(sdl.SDL_INIT_VIDEO):
@@ -260,15 +238,15 @@ def _started(*hints: tuple[bytes, bytes]) -> Any:
     return sdl
 
 
-def _stopped(sdl: Any) -> None:
+def _stop_sdl(sdl: Any) -> None:
     sdl.SDL_QuitSubSystem(sdl.SDL_INIT_VIDEO)
 
 
 @cache
-def _library() -> Any:
+def _import_sdl() -> Any:
     try:
         with warnings.catch_warnings():
-            # It tells of the library that it found by a warning.
+            # PySDL2 reports the library that it found by a warning.
             warnings.simplefilter("ignore")
             return importlib.import_module("sdl2")
     except ImportError as cause:
@@ -277,16 +255,16 @@ def _library() -> Any:
         raise LibraryMissingError(message, install=install) from cause
 
 
-def _outlive_the_server(display: int) -> None:
+def _survive_server_end(display: int) -> None:
     """Keep Xlib from ending the whole process when the server ends (libX11 1.7 and later) or refuses a request."""
     with suppress(OSError, AttributeError):
         xlib = ctypes.CDLL("libX11.so.6")
         xlib.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
         xlib.XSetIOErrorExitHandler.restype = None
-        xlib.XSetIOErrorExitHandler(display, _GOES_ON, None)
+        xlib.XSetIOErrorExitHandler(display, _IGNORE_IO_ERROR, None)
         xlib.XSetErrorHandler.argtypes, xlib.XSetErrorHandler.restype = [ctypes.c_void_p], ctypes.c_void_p
-        xlib.XSetErrorHandler(_PASSES_OVER)
+        xlib.XSetErrorHandler(_IGNORE_ERROR)
 
 
-_GOES_ON = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _data: None)
-_PASSES_OVER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _error: 0)
+_IGNORE_IO_ERROR = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _data: None)
+_IGNORE_ERROR = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _error: 0)

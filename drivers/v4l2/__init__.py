@@ -1,6 +1,6 @@
 """Cameras through the kernel's video interface (V4L2): webcams, USB3 cameras with a kernel driver, capture cards.
 
-Linux only. Free-running: V4L2 has no software trigger. Needs no library beyond Python's own and OpenCV.
+Linux only. Free-running: V4L2 has no software trigger. Needs no extra.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     Parameters
     ----------
     name
-        The rig's name for it.
+        The camera's name in the rig.
     options
         `drivers.v4l2.options.V4L2Options`.
     folder
-        The rig file's own; unused, a device is not a file of the rig.
+        The rig file's folder; unused.
 
     Raises
     ------
@@ -34,11 +34,11 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     DeviceBusyError
         Another program streams from it.
     UnsupportedByDeviceError
-        It cannot do what the options ask.
+        The device cannot do what the options request.
     WrongSystemError
         This is not Linux.
     DeviceError
-        It may not be opened, or failed.
+        This user may not open it, or it failed.
     """
     _require_system()
     from drivers.v4l2.camera import V4L2Camera
@@ -49,7 +49,7 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """Return the cameras that are plugged in, each under a name that stays the same and that no other has.
+    """Return the cameras that are plugged in, each under a permanent and unique name.
 
     Raises
     ------
@@ -57,9 +57,12 @@ def find_devices() -> tuple[FoundDevice, ...]:
         This is not Linux.
     """
     _require_system()
-    from drivers.v4l2.finding import found_devices, nodes
+    from drivers.v4l2.finding import list_nodes
 
-    return found_devices(nodes())
+    return tuple(
+        FoundDevice("v4l2", node.name, f"{node.card} ({node.path}){f', {node.note}' if node.note else ''}")
+        for node in list_nodes()
+    )
 
 
 def _require_system() -> None:

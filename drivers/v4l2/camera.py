@@ -1,4 +1,4 @@
-"""A V4L2 camera that never gives a stale, repeated or corrupt frame."""
+"""A V4L2 camera that never returns a stale, repeated or corrupt frame."""
 
 from __future__ import annotations
 
@@ -10,31 +10,37 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 
-from drivers.v4l2 import controls as ctl
 from drivers.v4l2 import kernel
-from drivers.v4l2.finding import Identity, Node, identity_of, resolved
-from drivers.v4l2.formats import CorruptFrameError, Layout, colour_image, grey_image, prepare
-from drivers.v4l2.negotiation import agree
+from drivers.v4l2.controls import (
+    GainScale,
+    exclude_controls,
+    exposure_scale,
+    gain_control,
+    get_control,
+    list_controls,
+    ordered_settings,
+    set_control,
+    switch_off_processing,
+)
+from drivers.v4l2.finding import CameraNode, NodeIdentity, query_identity, resolve_node
+from drivers.v4l2.formats import CorruptFrameError, PixelLayout, colour_image, grey_image
 from drivers.v4l2.options import V4L2Options
-from drivers.v4l2.processing import switch_off_processing
-from drivers.v4l2.scales import GainScale, exposure_scale
-from drivers.v4l2.stream import Stream, Taken, Waker
-from drivers.v4l2.tally import Tally
-from drivers.v4l2.timing import Durations, Exposure, exposure_of
+from drivers.v4l2.stream import FilledBuffer, FrameCounter, V4L2Stream, Waker, negotiate_format
+from drivers.v4l2.timing import ExposureInterval, SensorDurations, exposure_interval
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Pixels
 
-_SAME_PERIOD = 0.02
-"""How much longer than the frame period an exposure may seem before it is impossible."""
+_PERIOD_TOLERANCE = 0.02
+"""Part of the frame period by which an exposure may exceed it."""
 
-_PATIENCE_S = 2.0
-"""How long the first frames may take beyond what they should."""
+_START_TOLERANCE_S = 2.0
+"""Time allowed for the first frames beyond their usual one."""
 
 
 @dataclass(slots=True)
-class _PassedOver:
-    """Frames that came and were not given, by cause."""
+class _SkippedFrames:
+    """Numbers of frames that came and were not returned, by cause."""
 
     stale: int = 0
     corrupt: int = 0
@@ -42,17 +48,18 @@ class _PassedOver:
     last_fault: str = ""
 
     def __str__(self) -> str:
-        told = f"{self.stale} stale, {self.corrupt} corrupt, {self.repeated} repeated"
-        return f"{told}; the last corrupt one: {self.last_fault}" if self.last_fault else told
+        counts = f"{self.stale} stale, {self.corrupt} corrupt, {self.repeated} repeated"
+        return f"{counts}; the last corrupt one: {self.last_fault}" if self.last_fault else counts
 
 
 class V4L2Camera:
-    """Implements `slrig.devices.Camera`. Opening sets format, size and rate, and switches every automatic off.
+    """Implements `slrig.devices.Camera`. Opening sets format, size and rate, and switches every automatic
+    control off.
 
-    The device is held by its buffers from opening to `close`; it streams from `arm` to `disarm`.
+    Its buffers reserve the device from opening to `close`; it streams from `arm` to `disarm`.
 
-    Exposure is a multiple of the device's unit (`scales`), rounded to its step. A device without exposure control is
-    taken to expose for a whole frame period. Gain: see `scales.GainScale`.
+    Exposure is a multiple of the device's unit (`ExposureScale`), rounded to its step. A device without exposure
+    control is assumed to expose for a whole frame period. Gain: see `GainScale`.
 
     Raises
     ------
@@ -61,44 +68,43 @@ class V4L2Camera:
     """
 
     def __init__(self, name: str, options: V4L2Options) -> None:
-        node = resolved(options.device)
+        node = resolve_node(options.device)
         self._name = name
         self._node = node.path
         self._options = options
         self._lock = threading.RLock()
         self._state = CameraState(name)
-        self._tally = Tally()
+        self._counter = FrameCounter()
         try:
             self._handle = kernel.open_node(node.path)
         except OSError as error:
-            raise kernel.fault(node.path, "opening", error) from error
-        self._held = ExitStack()
-        self._held.callback(_close_quietly, self._handle)
+            raise kernel.device_error(node.path, "opening", error) from error
+        self._resources = ExitStack()
+        self._resources.callback(_close_quietly, self._handle)
         try:
             self._waker = Waker()
-            self._held.callback(self._waker.close)
+            self._resources.callback(self._waker.close)
             identity = self._identity()
-            self._agreed = agree(self._handle, node.path, options)
-            prepare(self._agreed.layout)
-            self._stream = Stream(self._handle, node.path, options.buffers, self._waker)
-            self._held.callback(self._stream.release)
-            self._period_ns = self._agreed.period_ns
+            self._format = negotiate_format(self._handle, node.path, options)
+            self._stream = V4L2Stream(self._handle, node.path, options.buffers, self._waker)
+            self._resources.callback(self._stream.release)
+            self._period_ns = self._format.period_ns
             try:
-                self._controls = ctl.without(ctl.controls_of(self._handle), options.skip_controls, node.path)
-                width_px = self._agreed.size.width_px
+                self._controls = exclude_controls(list_controls(self._handle), options.skip_controls, node.path)
+                width_px = self._format.size.width_px
                 self._exposure = exposure_scale(self._controls, self._handle, node.path, width_px=width_px)
             except OSError as error:
-                raise kernel.fault(node.path, "listing its controls", error) from error
-            self._scale = GainScale(ctl.gain_control(self._controls), options.gain_unity)
+                raise kernel.device_error(node.path, "listing its controls", error) from error
+            self._scale = GainScale(gain_control(self._controls), options.gain_unity)
             processed = switch_off_processing(
                 self._handle, node.path, self._controls, named=options.controls, is_uvc=identity.is_uvc
             )
-            self._set(None, None)
+            self._set_controls(None, None)
             self._applied = self._read_back()
         except BaseException:
-            self._held.close()
+            self._resources.close()
             raise
-        self._info = self._described(identity, node, (*self._agreed.notes, *processed))
+        self._info = self._describe(identity, node, (*self._format.notes, *processed))
 
     @property
     def info(self) -> CameraInfo:
@@ -106,48 +112,47 @@ class V4L2Camera:
         return self._info
 
     @property
-    def layout(self) -> Layout:
-        """How the agreed pixel format is read."""
-        return self._agreed.layout
+    def layout(self) -> PixelLayout:
+        """Layout of the pixel format in use."""
+        return self._format.layout
 
     @property
     def period_ns(self) -> int:
-        """From frame to frame: as agreed, and once armed, as measured where that is longer."""
+        """Frame period: as negotiated, and once armed, as measured where that is longer."""
         return self._period_ns
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. Exposure and gain are rounded to the device's steps, and every control is read back."""
+        """See `Camera`. Rounds exposure and gain to the device's steps and reads every control back."""
         with self._lock:
             self._state.check_settings(settings, self._info)
             units = None
             if self._exposure is not None:
                 units = self._exposure.units(settings.exposure_s)
-            self._set(units, self._scale.units(settings.gain))
+            self._set_controls(units, self._scale.units(settings.gain))
             self._applied = self._read_back()
             return self._applied
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`. Starts the stream, and returns when the settings have taken effect. More than `count` frames
-        can be had.
+        """See `Camera`. Starts the stream, and returns when the settings have taken effect.
 
         Raises
         ------
         UnsupportedByDeviceError
-            Another trigger than FREE; USB bandwidth is lacking; the exposure does not fit into the frame period, or
-            was changed by the device.
+            The trigger is not FREE, USB bandwidth is insufficient, or the exposure does not fit into the frame period
+            or was changed by the device.
         FrameTimeoutError
             No frames come.
         """
         with self._lock:
             self._state.check_arming(count, trigger, self._info)
-            self._tally.begin()
+            self._counter.begin()
             try:
                 self._stream.start()
                 self._settle()
             except BaseException:
                 self._stream.stop()
                 raise
-            self._tally.forget_losses()
+            self._counter.forget_losses()
             self._state.armed = trigger
 
     def trigger(self) -> None:
@@ -155,21 +160,21 @@ class V4L2Camera:
         self._state.require_armed(Trigger.SOFTWARE)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`. The exposure began after `after_ns` at the earliest, whatever the device's stamps mean."""
+        """See `Camera`. The exposure began after `after_ns`, for any meaning of the device's stamps."""
         with self._lock:
             self._state.require_armed()
             until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
-            passed = _PassedOver()
+            skipped = _SkippedFrames()
             while True:
-                taken = self._stream.take(until_ns)
-                if taken is not None:
-                    frame = self._judged(taken, after_ns, passed)
+                buffer = self._stream.take(until_ns)
+                if buffer is not None:
+                    frame = self._accept(buffer, after_ns, skipped)
                     if frame is not None:
                         return frame
                 if time.monotonic_ns() >= until_ns:
                     message = (
-                        f"camera '{self._name}': no frame that was exposed wholly after {after_ns} ns came in "
-                        f"{timeout_s:g} s; passed over: {passed}. Frames come every {self._period_ns / 1e6:.3g} ms, "
+                        f"camera '{self._name}': no frame exposed entirely after {after_ns} ns came in "
+                        f"{timeout_s:g} s; skipped: {skipped}. Frames come every {self._period_ns / 1e6:.3g} ms, "
                         f"exposed for {self._applied.exposure_s * 1e3:.3g} ms: wait longer, or check cable and "
                         "bandwidth (dmesg | tail)"
                     )
@@ -182,159 +187,161 @@ class V4L2Camera:
             self._stream.stop()
 
     def close(self) -> None:
-        """See `Camera`. From another thread, it ends a `read` that waits."""
+        """See `Camera`. From another thread, it ends a waiting `read`."""
         if self._state.close():
             self._waker.wake()
             with self._lock:
-                self._held.close()
+                self._resources.close()
 
-    def _judged(self, taken: Taken, after_ns: int, passed: _PassedOver) -> Frame | None:
-        """The frame if it may be given; None, and noted why, if not. The buffer goes back in any case."""
-        is_new = self._tally.is_new(taken)
-        exposure = self._exposure_of(taken)
+    def _accept(self, buffer: FilledBuffer, after_ns: int, skipped: _SkippedFrames) -> Frame | None:
+        """Return the frame if it is acceptable; else None, and count the cause. Queues the buffer again."""
+        is_new = self._counter.is_new(buffer)
+        exposure = self._exposure_interval(buffer)
         if not is_new:
-            passed.repeated += 1
-        elif not taken.corrupt and exposure.earliest_ns < after_ns:
-            passed.stale += 1
+            skipped.repeated += 1
+        elif not buffer.corrupt and exposure.earliest_ns < after_ns:
+            skipped.stale += 1
         else:
-            pictures = self._pictures(taken, passed)
-            if pictures is not None:
-                self._stream.give_back(taken)
-                return self._frame(*pictures, exposure)
-            self._tally.note_corrupt()
-        self._stream.give_back(taken)
+            images = self._convert(buffer, skipped)
+            if images is not None:
+                self._stream.requeue(buffer)
+                return self._frame(*images, exposure)
+            self._counter.note_corrupt()
+        self._stream.requeue(buffer)
         return None
 
-    def _pictures(self, taken: Taken, passed: _PassedOver) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
-        if taken.corrupt:
-            passed.corrupt += 1
-            passed.last_fault = "the driver says that its data are damaged"
+    def _convert(
+        self, buffer: FilledBuffer, skipped: _SkippedFrames
+    ) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
+        if buffer.corrupt:
+            skipped.corrupt += 1
+            skipped.last_fault = "the driver reports damaged data"
             return None
-        agreed = self._agreed
-        sent = self._stream.data(taken), agreed.layout, agreed.size
+        negotiated = self._format
+        source = self._stream.data(buffer), negotiated.layout, negotiated.size
         grey, colour = (
-            partial(made, *sent, stride_bytes=agreed.stride_bytes, limited_luma=self._options.limited_luma)
-            for made in (grey_image, colour_image)
+            partial(convert, *source, stride_bytes=negotiated.stride_bytes, limited_luma=self._options.limited_luma)
+            for convert in (grey_image, colour_image)
         )
         try:
-            return grey(), colour if agreed.layout.has_colour else None
+            return grey(), colour if negotiated.layout.has_colour else None
         except CorruptFrameError as fault:
-            passed.corrupt += 1
-            passed.last_fault = str(fault)
+            skipped.corrupt += 1
+            skipped.last_fault = str(fault)
             return None
 
-    def _frame(self, image: Pixels, colour: Callable[[], Pixels] | None, exposure: Exposure) -> Frame:
-        start_ns, end_ns, error_ns = exposure.centred(round(self._applied.exposure_s * 1e9))
+    def _frame(self, image: Pixels, colour: Callable[[], Pixels] | None, exposure: ExposureInterval) -> Frame:
+        start_ns, end_ns, error_ns = exposure.centred_exposure(round(self._applied.exposure_s * 1e9))
         return Frame(
             camera=self._name,
             image=image,
             t_start_ns=start_ns,
             t_end_ns=end_ns,
             t_err_ns=error_ns,
-            sequence_number=self._tally.number,
-            dropped_count=self._tally.lost,
+            sequence_number=self._counter.number,
+            dropped_count=self._counter.lost,
             exposure_s=self._applied.exposure_s,
             gain=self._applied.gain,
             colour=colour,
         )
 
-    def _exposure_of(self, taken: Taken) -> Exposure:
+    def _exposure_interval(self, buffer: FilledBuffer) -> ExposureInterval:
         exposure_ns = round(self._applied.exposure_s * 1e9)
         if self._exposure is None:
             exposure_ns = max(exposure_ns, self._period_ns)
         readout_s = self._options.readout_s
         readout_ns = self._period_ns if readout_s is None else round(readout_s * 1e9)
-        # A device that stamps frames with instants after their arrival stamps the others as late.
-        delay_ns = max(round(self._options.stamp_delay_s * 1e9), self._tally.ahead_ns)
-        return exposure_of(taken.stamp, Durations(exposure_ns, readout_ns, delay_ns))
+        # A device that stamps some frames after their arrival stamps the others as late.
+        delay_ns = max(round(self._options.stamp_delay_s * 1e9), self._counter.ahead_ns)
+        return exposure_interval(buffer.stamp, SensorDurations(exposure_ns, readout_ns, delay_ns))
 
     def _settle(self) -> None:
-        """Pass over the first frames, which may still be exposed as before, and measure the frame period."""
-        wanted = self._options.settle_frames
-        slowest_ns = max(self._agreed.period_ns, round(self._applied.exposure_s * 1e9))
-        until_ns = time.monotonic_ns() + 4 * wanted * slowest_ns + round(_PATIENCE_S * 1e9)
-        passed = _PassedOver()
-        seen = 0
-        while seen < wanted + 1:
-            taken = self._stream.take(until_ns)
-            if taken is None:
+        """Skip the first frames, which may be exposed with earlier settings, and measure the frame period."""
+        settling = self._options.settle_frames
+        slowest_ns = max(self._format.period_ns, round(self._applied.exposure_s * 1e9))
+        until_ns = time.monotonic_ns() + 4 * settling * slowest_ns + round(_START_TOLERANCE_S * 1e9)
+        skipped = _SkippedFrames()
+        came = 0
+        while came < settling + 1:
+            buffer = self._stream.take(until_ns)
+            if buffer is None:
                 message = (
-                    f"camera '{self._name}': its stream started, and {seen} of the first {wanted + 1} frames came in "
-                    f"time; passed over: {passed}. Check cable and bandwidth (dmesg | tail)"
+                    f"camera '{self._name}': its stream started, and {came} of the first {settling + 1} frames came "
+                    f"in time; skipped: {skipped}. Check cable and bandwidth (dmesg | tail)"
                 )
                 raise FrameTimeoutError(message)
-            if self._tally.is_new(taken):
-                seen += 1
+            if self._counter.is_new(buffer):
+                came += 1
             else:
-                passed.repeated += 1
-            self._stream.give_back(taken)
-        self._period_ns = max(self._agreed.period_ns, self._tally.period_ns() or 0)
+                skipped.repeated += 1
+            self._stream.requeue(buffer)
+        self._period_ns = max(self._format.period_ns, self._counter.period_ns() or 0)
         self._require_unchanged()
 
     def _require_unchanged(self) -> None:
-        """Refuse settings that the device did not keep, or cannot have meant."""
+        """Raise if the device changed its settings, or the exposure does not fit into the frame period."""
         now = self._read_back()
         if (now.exposure_s, now.gain) != (self._applied.exposure_s, self._applied.gain):
             message = (
                 f"camera '{self._name}': set to exposure {self._applied.exposure_s:.6g} s and gain "
                 f"{self._applied.gain:.6g}, and once the stream ran, it used {now.exposure_s:.6g} s and {now.gain:.6g}:"
-                " something else sets it; close other programs, or use a camera that obeys"
+                " another program or the camera changes it; close other programs, or use another camera"
             )
             raise UnsupportedByDeviceError(message)
         period_s = self._period_ns / 1e9
-        if self._applied.exposure_s > period_s * (1 + _SAME_PERIOD) and self._exposure is not None:
+        if self._applied.exposure_s > period_s * (1 + _PERIOD_TOLERANCE) and self._exposure is not None:
             message = (
-                f"camera '{self._name}': asked for an exposure of {self._applied.exposure_s:.6g} s, and its frames "
-                f"come every {period_s:.6g} s: it cannot have exposed them so long; ask for a shorter exposure_s, or a "
+                f"camera '{self._name}': requested an exposure of {self._applied.exposure_s:.6g} s, and its frames "
+                f"come every {period_s:.6g} s, which is shorter; request a shorter exposure_s, or a "
                 f"frame_rate_hz of {1 / self._applied.exposure_s:.4g} or less"
             )
             raise UnsupportedByDeviceError(message)
 
-    def _set(self, exposure_units: int | None, gain_units: int | None) -> None:
-        for control, value in ctl.in_order(
+    def _set_controls(self, exposure_units: int | None, gain_units: int | None) -> None:
+        for control, value in ordered_settings(
             self._controls, self._options, exposure_units=exposure_units, gain_units=gain_units, node=self._node
         ):
-            ctl.put(self._handle, self._node, control, value)
+            set_control(self._handle, self._node, control, value)
 
     def _read_back(self) -> AppliedSettings:
-        exposure_s = self._agreed.period_ns / 1e9
+        exposure_s = self._format.period_ns / 1e9
         if self._exposure is not None:
-            exposure_s = ctl.value_of(self._handle, self._node, self._exposure.control) * self._exposure.unit_s
+            exposure_s = get_control(self._handle, self._node, self._exposure.control) * self._exposure.unit_s
         gain = 1.0
         if self._scale.control is not None:
-            gain = self._scale.gain(ctl.value_of(self._handle, self._node, self._scale.control))
+            gain = self._scale.gain(get_control(self._handle, self._node, self._scale.control))
         return AppliedSettings(exposure_s, gain, max(self._period_ns / 1e9, exposure_s))
 
-    def _identity(self) -> Identity:
+    def _identity(self) -> NodeIdentity:
         try:
-            identity = identity_of(self._handle)
+            identity = query_identity(self._handle)
         except OSError as error:
             if error.errno in kernel.GONE:
-                raise kernel.fault(self._node, "asking what it is", error) from error
-            message = f"{self._node} is no video device ({error.strerror}); slrig devices lists those that are"
+                raise kernel.device_error(self._node, "reading its identity", error) from error
+            message = f"{self._node} is not a video device ({error.strerror}); slrig devices lists video devices"
             raise UnsupportedByDeviceError(message) from error
         if not identity.captures:
-            why = "it gives frames in several planes only" if identity.several_planes else "it gives no frames"
+            cause = "it has frames in several planes only" if identity.several_planes else "it has no frames"
             message = (
-                f"{self._node} ({identity.card}) cannot be used: {why}; a camera has several nodes: slrig devices "
+                f"{self._node} ({identity.card}) cannot be used: {cause}; a camera has several nodes: slrig devices "
                 "lists the one to use"
             )
             raise UnsupportedByDeviceError(message)
         return identity
 
-    def _described(self, identity: Identity, node: Node, notes: tuple[str, ...]) -> CameraInfo:
-        period_s = self._agreed.period_ns / 1e9
+    def _describe(self, identity: NodeIdentity, node: CameraNode, notes: tuple[str, ...]) -> CameraInfo:
+        period_s = self._format.period_ns / 1e9
         exposures = (period_s, period_s) if self._exposure is None else self._exposure.range_s
         return CameraInfo(
             name=self._name,
             model=identity.card,
             serial=node.serial or identity.bus,
-            format=CameraFormat(self._agreed.size, self._agreed.layout.bit_depth),
+            format=CameraFormat(self._format.size, self._format.layout.bit_depth),
             triggers=frozenset({Trigger.FREE}),
             exposure_range_s=exposures,
             gain_range=self._scale.range,
             notes=notes,
-            colour=self._agreed.layout.has_colour,
+            colour=self._format.layout.has_colour,
         )
 
 

@@ -1,7 +1,7 @@
-"""Which cameras are plugged in, under names that stay the same and never stand for two.
+"""Cameras that are plugged in, under permanent and unique names.
 
-A node number (`/dev/video0`) depends on the order of plugging in. udev's `by-id` names hold the USB serial number; two
-cameras of one model without serial numbers share one, so such a name is taken only where a serial number is present
+A node number (`/dev/video0`) depends on the order of plugging in. udev's `by-id` names contain the USB serial number;
+two cameras of one model without serial numbers share one, so such a name is used only where a serial number is present
 and no other node has the same. Next comes udev's `by-path` name (the port), then the bus as the driver names it.
 """
 
@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drivers.v4l2 import kernel
-from slrig.devices import FoundDevice
 from slrig.errors import DeviceGoneError
 
 SYSFS = Path("/sys/class/video4linux")
@@ -25,9 +24,9 @@ DEV = Path("/dev")
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
-    """What a node says of itself. `captures`: it gives frames in one plane, and streams them. `is_uvc`: the kernel's
-    driver is that of USB Video Class cameras.
+class NodeIdentity:
+    """Identity of a node. captures : it streams frames in one plane. is_uvc : it uses the kernel's driver for USB Video
+    Class cameras.
     """
 
     card: str
@@ -38,8 +37,8 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
-    """A camera's node and its stable name. serial : the USB device's own, or ""."""
+class CameraNode:
+    """A camera's node and its permanent name. serial : serial number of the USB device, or ""."""
 
     path: Path
     name: str
@@ -48,16 +47,16 @@ class Node:
     note: str = ""
 
 
-_NO_CAMERA = Identity(card="", bus="", captures=False)
+_NO_CAMERA = NodeIdentity(card="", bus="", captures=False)
 
 
-def identity_of(handle: int) -> Identity:
-    """Ask an open node who it is. Raises OSError."""
+def query_identity(handle: int) -> NodeIdentity:
+    """Read the identity of an open node. Raises OSError."""
     answer = kernel.Capability()
-    kernel.ask(handle, kernel.QUERYCAP, answer)
+    kernel.ioctl(handle, kernel.QUERYCAP, answer)
     known = answer.capabilities & kernel.CAP_DEVICE_CAPS
     can = answer.device_caps if known else answer.capabilities
-    return Identity(
+    return NodeIdentity(
         card=answer.card.decode("utf-8", "replace"),
         bus=answer.bus_info.decode("utf-8", "replace"),
         captures=bool(can & kernel.CAP_VIDEO_CAPTURE and can & kernel.CAP_STREAMING),
@@ -66,17 +65,17 @@ def identity_of(handle: int) -> Identity:
     )
 
 
-def asked(path: Path) -> Identity | None:
-    """Open a node, ask who it is, and close it. None where we may not open it.
+def probe_node(path: Path) -> NodeIdentity | None:
+    """Open a node, read its identity, and close it. None if this user may not open it.
 
-    The node of a camera that was unplugged stays for as long as a program has it open: it is no camera any more.
+    The node of an unplugged camera stays as long as a program has it open, and does not count as a camera.
     """
     try:
         handle = kernel.open_node(path)
     except OSError as error:
         return None if error.errno in (errno.EACCES, errno.EPERM) else _NO_CAMERA
     try:
-        return identity_of(handle)
+        return query_identity(handle)
     except OSError:
         return _NO_CAMERA
     finally:
@@ -84,9 +83,9 @@ def asked(path: Path) -> Identity | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Candidate:
+class _NodeCandidate:
     path: Path
-    identity: Identity | None
+    identity: NodeIdentity | None
     index: str
     usb: tuple[str, str, str] | None
     label: str
@@ -96,43 +95,36 @@ class _Candidate:
         return (self.usb, self.index)
 
 
-def nodes(sysfs: Path = SYSFS, dev: Path = DEV, ask: Callable[[Path], Identity | None] = asked) -> tuple[Node, ...]:
-    """Return every camera that is plugged in, each under a name that no other has.
+def list_nodes(
+    sysfs: Path = SYSFS, dev: Path = DEV, probe: Callable[[Path], NodeIdentity | None] = probe_node
+) -> tuple[CameraNode, ...]:
+    """Return every camera that is plugged in, each under a unique name.
 
-    Nodes that give no frames (metadata, outputs, codecs) are left out. A node that may not be opened is listed with a
-    note, for its user to see why it cannot be used.
+    Nodes without frames (metadata, outputs, codecs) are left out. A node that this user may not open has a note.
     """
-    candidates = [candidate for name in _names(sysfs) if (candidate := _candidate(sysfs / name, dev / name, ask))]
+    candidates = [candidate for name in _names(sysfs) if (candidate := _candidate(sysfs / name, dev / name, probe))]
     serials = Counter(candidate.key for candidate in candidates)
     by_id, by_path = _links(dev / "v4l" / "by-id"), _links(dev / "v4l" / "by-path")
     found = []
     for candidate in candidates:
-        own = candidate.usb is not None and bool(candidate.usb[2]) and serials[candidate.key] == 1
+        is_unique = candidate.usb is not None and bool(candidate.usb[2]) and serials[candidate.key] == 1
         real = os.path.realpath(candidate.path)
-        name = (by_id.get(real) if own else None) or by_path.get(real) or _bus_name(candidate)
+        name = (by_id.get(real) if is_unique else None) or by_path.get(real) or _bus_name(candidate)
         serial = candidate.usb[2] if candidate.usb is not None else ""
         note = "" if candidate.identity is not None else "may not be opened: sudo usermod -aG video $USER"
-        found.append(Node(candidate.path, name, candidate.label, serial, note))
-    return _told_apart(found, {candidate.path: _bus_name(candidate) for candidate in candidates})
+        found.append(CameraNode(candidate.path, name, candidate.label, serial, note))
+    return _rename_duplicates(found, {candidate.path: _bus_name(candidate) for candidate in candidates})
 
 
-def found_devices(found: tuple[Node, ...]) -> tuple[FoundDevice, ...]:
-    """The nodes in the words of `slrig devices`."""
-    return tuple(
-        FoundDevice("v4l2", node.name, f"{node.card} ({node.path}){f', {node.note}' if node.note else ''}")
-        for node in found
-    )
-
-
-def resolved(device: str, dev: Path = DEV, look: Callable[[], tuple[Node, ...]] = nodes) -> Node:
-    """Return the node that a rig file means: a path, or a name that `nodes` gives.
+def resolve_node(device: str, dev: Path = DEV, find: Callable[[], tuple[CameraNode, ...]] = list_nodes) -> CameraNode:
+    """Return the node of a path or of a name that `list_nodes` returns.
 
     Raises
     ------
     DeviceGoneError
-        There is none such now.
+        No such camera is connected.
     """
-    found = look()
+    found = find()
     if device.startswith("/"):
         path = Path(device)
         real = os.path.realpath(path)
@@ -140,17 +132,17 @@ def resolved(device: str, dev: Path = DEV, look: Callable[[], tuple[Node, ...]] 
             if os.path.realpath(node.path) == real:
                 return node
         if path.exists():
-            return Node(Path(real), device, device, "")
+            return CameraNode(Path(real), device, device, "")
     for node in found:
         if node.name == device:
             return node
-    # udev's names may be written even where `nodes` prefers another one.
+    # udev's names are accepted even where `list_nodes` prefers another one.
     for folder in ("by-id", "by-path"):
         link = dev / "v4l" / folder / device
         if "/" not in device and link.exists():
-            return resolved(str(link), dev, look)
-    have = "; ".join(f"{node.name} ({node.card}, {node.path})" for node in found) or "no camera at all"
-    message = f'device = "{device}": asked for this camera, found {have}; plug it in, or write one of those names'
+            return resolve_node(str(link), dev, find)
+    have = "; ".join(f"{node.name} ({node.card}, {node.path})" for node in found) or "no camera"
+    message = f'device = "{device}": this camera was requested, found {have}; plug it in, or write one of those names'
     raise DeviceGoneError(message)
 
 
@@ -162,17 +154,17 @@ def _names(sysfs: Path) -> list[str]:
     return sorted((name for name in names if re.fullmatch(r"video\d+", name)), key=lambda name: int(name[5:]))
 
 
-def _candidate(entry: Path, node: Path, ask: Callable[[Path], Identity | None]) -> _Candidate | None:
-    identity = ask(node)
+def _candidate(entry: Path, node: Path, probe: Callable[[Path], NodeIdentity | None]) -> _NodeCandidate | None:
+    identity = probe(node)
     if identity is not None and not identity.captures:
         return None
     folder = Path(os.path.realpath(entry))
     label = identity.card if identity is not None else _text(folder / "name") or node.name
-    return _Candidate(node, identity, _text(folder / "index"), _usb(folder), label)
+    return _NodeCandidate(node, identity, _text(folder / "index"), _usb(folder), label)
 
 
 def _usb(folder: Path) -> tuple[str, str, str] | None:
-    """Vendor, product and serial number ("" if it has none) of the USB device that a node belongs to."""
+    """Return vendor, product and serial number ("" without one) of the USB device that a node belongs to."""
     for parent in folder.parents:
         vendor = _text(parent / "idVendor")
         if vendor:
@@ -180,14 +172,14 @@ def _usb(folder: Path) -> tuple[str, str, str] | None:
     return None
 
 
-def _bus_name(candidate: _Candidate) -> str:
-    """The bus and the node's place on it: stable as long as the camera stays in its port."""
+def _bus_name(candidate: _NodeCandidate) -> str:
+    """Return the bus and the node's index on it: permanent while the camera stays in its port."""
     bus = candidate.identity.bus if candidate.identity is not None else ""
     return f"{bus or candidate.path.name}#{candidate.index or '0'}"
 
 
 def _links(folder: Path) -> dict[str, str]:
-    """Names that udev made, by the real path of their node; of several for one node, the first in order."""
+    """Return names that udev made, by the real path of their node; the first in order if a node has several."""
     found: dict[str, str] = {}
     with suppress(OSError):
         for link in sorted(folder.iterdir()):
@@ -202,8 +194,8 @@ def _text(path: Path) -> str:
         return ""
 
 
-def _told_apart(found: list[Node], buses: dict[Path, str]) -> tuple[Node, ...]:
-    """Give those that share a name the name of their bus, and those that still do, their path."""
+def _rename_duplicates(found: list[CameraNode], buses: dict[Path, str]) -> tuple[CameraNode, ...]:
+    """Name nodes that share a name by their bus, and if they still do, by their path."""
     for better in (buses, {path: str(path) for path in buses}):
         often = Counter(node.name for node in found)
         found = [replace(node, name=better[node.path]) if often[node.name] > 1 else node for node in found]

@@ -1,35 +1,36 @@
-"""Pixel formats: a buffer's bytes as a grey image, and in colour.
+"""Pixel formats: a buffer's bytes as a grey image and as a colour image.
 
-Bayer samples are raw, and turned to grey by OpenCV's interpolation: a stripe detector needs one brightness per pixel,
-and under any light that is not white for this sensor the bare samples are a chequered pattern that it would take for
-stripes. The interpolation costs resolution (each grey value is a mean over 3 x 3 pixels) and mixes red, green and blue
-as 0.30, 0.59, 0.11; a monochrome sensor is the better choice. MJPG costs more: its blocks of 8 x 8 pixels are coarse.
-Luma of YUV formats and MJPG is as the camera encodes it, in general not proportional to light; nor are their colours,
-which come of luma and of differences of bent red, green and blue by the weights of Rec. 601, as JFIF has them.
+OpenCV's interpolation makes raw Bayer samples grey: stripe detection needs one brightness per pixel, and under any
+light that is not white for this sensor the raw samples are a chequered pattern. The interpolation costs resolution
+(each grey value is a mean over 3 x 3 pixels) and mixes red, green and blue as 0.30, 0.59, 0.11; a monochrome sensor is
+the better choice. MJPG costs more: its blocks of 8 x 8 pixels are coarse. Luma of YUV formats and MJPG is as the camera
+encodes it, in general not proportional to light. Their colours are computed from luma and colour differences by the
+weights of Rec. 601, as JFIF defines them.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
 import cv2
 import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
 
-from drivers.v4l2 import jpeg
 from slrig.model import Pixels, Size
 
 Bytes = NDArray[np.uint8]
 
 
 class CorruptFrameError(ValueError):
-    """A buffer does not hold a whole frame. The message says what is wrong; the frame is passed over."""
+    """A buffer does not hold a whole frame, for the cause in the message; the frame is skipped."""
 
 
-class Packing(StrEnum):
-    """How samples lie in memory."""
+class SamplePacking(StrEnum):
+    """Arrangement of samples in memory."""
 
     BYTES = "bytes"
     WORDS = "words"
@@ -46,52 +47,52 @@ class Packing(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """How a pixel format is read. bayer : the first row's two colours and the second row's, None for grey.
+class PixelLayout:
+    """Layout of a pixel format. bayer : the first row's two colours and the second row's, None for grey.
 
-    red_first : of two differences of colour, that of red comes before that of blue.
+    red_first : the colour difference of red comes before that of blue.
     """
 
     bit_depth: int
-    packing: Packing
+    packing: SamplePacking
     bayer: str | None = None
     red_first: bool = False
 
     @property
     def is_luma(self) -> bool:
-        """Whether the samples are the luma of a colour image."""
-        return self.packing in (Packing.EVEN_BYTES, Packing.ODD_BYTES, Packing.JPEG)
+        """True if the samples are the luma of a colour image."""
+        return self.packing in (SamplePacking.EVEN_BYTES, SamplePacking.ODD_BYTES, SamplePacking.JPEG)
 
     @property
     def has_colour(self) -> bool:
-        """Whether `colour_image` reads it."""
+        """True if `colour_image` can read it."""
         return self.bayer is not None or self.is_luma
 
 
-def _layouts() -> dict[str, Layout]:
-    found = {
-        "GREY": Layout(8, Packing.BYTES),
-        "Y10 ": Layout(10, Packing.WORDS),
-        "Y12 ": Layout(12, Packing.WORDS),
-        "Y14 ": Layout(14, Packing.WORDS),
-        "Y16 ": Layout(16, Packing.WORDS),
-        "Y10P": Layout(10, Packing.MIPI10),
-        "Y12P": Layout(12, Packing.MIPI12),
-        "YUYV": Layout(8, Packing.EVEN_BYTES),
-        "YVYU": Layout(8, Packing.EVEN_BYTES, red_first=True),
-        "UYVY": Layout(8, Packing.ODD_BYTES),
-        "VYUY": Layout(8, Packing.ODD_BYTES, red_first=True),
-        "MJPG": Layout(8, Packing.JPEG),
-        "JPEG": Layout(8, Packing.JPEG),
+def _layouts() -> dict[str, PixelLayout]:
+    layouts = {
+        "GREY": PixelLayout(8, SamplePacking.BYTES),
+        "Y10 ": PixelLayout(10, SamplePacking.WORDS),
+        "Y12 ": PixelLayout(12, SamplePacking.WORDS),
+        "Y14 ": PixelLayout(14, SamplePacking.WORDS),
+        "Y16 ": PixelLayout(16, SamplePacking.WORDS),
+        "Y10P": PixelLayout(10, SamplePacking.MIPI10),
+        "Y12P": PixelLayout(12, SamplePacking.MIPI12),
+        "YUYV": PixelLayout(8, SamplePacking.EVEN_BYTES),
+        "YVYU": PixelLayout(8, SamplePacking.EVEN_BYTES, red_first=True),
+        "UYVY": PixelLayout(8, SamplePacking.ODD_BYTES),
+        "VYUY": PixelLayout(8, SamplePacking.ODD_BYTES, red_first=True),
+        "MJPG": PixelLayout(8, SamplePacking.JPEG),
+        "JPEG": PixelLayout(8, SamplePacking.JPEG),
     }
-    # The kernel's four characters follow no rule here, so each is written out: 8, 10, 12, 16 bit, then packed 10, 12.
-    kinds = (
-        (8, Packing.BYTES),
-        (10, Packing.WORDS),
-        (12, Packing.WORDS),
-        (16, Packing.WORDS),
-        (10, Packing.MIPI10),
-        (12, Packing.MIPI12),
+    # The kernel's codes of Bayer formats follow no rule: 8, 10, 12, 16 bit, then packed 10, 12.
+    packings = (
+        (8, SamplePacking.BYTES),
+        (10, SamplePacking.WORDS),
+        (12, SamplePacking.WORDS),
+        (16, SamplePacking.WORDS),
+        (10, SamplePacking.MIPI10),
+        (12, SamplePacking.MIPI12),
     )
     for bayer, codes in {
         "BGGR": ("BA81", "BG10", "BG12", "BYR2", "pBAA", "pBCC"),
@@ -99,9 +100,9 @@ def _layouts() -> dict[str, Layout]:
         "GRBG": ("GRBG", "BA10", "BA12", "GR16", "pgAA", "pgCC"),
         "RGGB": ("RGGB", "RG10", "RG12", "RG16", "pRAA", "pRCC"),
     }.items():
-        for code, (bit_depth, packing) in zip(codes, kinds, strict=True):
-            found[code] = Layout(bit_depth, packing, bayer)
-    return found
+        for code, (bit_depth, packing) in zip(codes, packings, strict=True):
+            layouts[code] = PixelLayout(bit_depth, packing, bayer)
+    return layouts
 
 
 LAYOUTS = _layouts()
@@ -114,9 +115,9 @@ PREFERRED = (
     *(code for code, layout in LAYOUTS.items() if layout.bayer and layout.bit_depth == 16),
     *("YUYV", "UYVY", "YVYU", "VYUY", "MJPG", "JPEG"),
 )
-"""Which format is taken when none is asked for: linear before encoded, grey before colour, deep before shallow.
+"""Order in which formats are preferred: linear before encoded, grey before colour, deep before shallow.
 
-Y16 comes late: most sensors fill only some of its bits, and which of them no driver tells (option `bit_depth`).
+Y16 comes late: most sensors fill only some of its bits, and drivers do not report which (option `bit_depth`).
 """
 
 # OpenCV names a mosaic by the second row's second and third sample; these names are by the first pixel's.
@@ -127,78 +128,85 @@ _DEMOSAIC = {
     "RGGB": cv2.COLOR_BayerRGGB2GRAY,
 }
 
+_FULL_RANGE: NDArray[np.uint8] = np.clip(np.rint((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
+"""Luma of 16..235 as 0..255."""
 
-def least_stride_bytes(layout: Layout, size: Size) -> int:
-    """Bytes that one row of samples takes, without padding; 0 for a compressed format."""
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_NO_END = "Premature end of JPEG file"
+_STRAY_BYTES = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
+_MAX_STRAY_BYTES = 16
+"""Bytes allowed between the last block of a JPEG and its end marker: some cameras leave a few there."""
+
+
+def min_stride_bytes(layout: PixelLayout, size: Size) -> int:
+    """Return the bytes of one row of samples without padding; 0 for a compressed format."""
     width = size.width_px
     match layout.packing:
-        case Packing.BYTES:
+        case SamplePacking.BYTES:
             return width
-        case Packing.WORDS | Packing.EVEN_BYTES | Packing.ODD_BYTES:
+        case SamplePacking.WORDS | SamplePacking.EVEN_BYTES | SamplePacking.ODD_BYTES:
             return 2 * width
-        case Packing.MIPI10:
+        case SamplePacking.MIPI10:
             return (width + 3) // 4 * 5
-        case Packing.MIPI12:
+        case SamplePacking.MIPI12:
             return (width + 1) // 2 * 3
-        case Packing.JPEG:
+        case SamplePacking.JPEG:
             return 0
 
 
-def prepare(layout: Layout) -> None:
-    """Do what takes long before frames come."""
-    if layout.packing is Packing.JPEG:
-        jpeg.prepare()
-
-
-def grey_image(data: Bytes, layout: Layout, size: Size, *, stride_bytes: int, limited_luma: bool = False) -> Pixels:
-    """Return a buffer as an image of its own, (H, W), uint8 up to 8 bit and uint16 beyond, right-aligned.
+def grey_image(
+    data: Bytes, layout: PixelLayout, size: Size, *, stride_bytes: int, limited_luma: bool = False
+) -> Pixels:
+    """Convert a buffer to a grey image, (H, W), uint8 up to 8 bit and uint16 beyond, right-aligned.
 
     Parameters
     ----------
     data
-        (n,) uint8: the bytes that the driver says it used.
+        (n,) uint8: the bytes that the driver reports as used.
     layout, size
         Of the pixel format.
     stride_bytes
         From one row to the next.
     limited_luma
-        Spread luma from 16..235 to 0..255.
+        Expand luma from 16..235 to 0..255.
 
     Raises
     ------
     CorruptFrameError
         Bytes are missing, or the JPEG is damaged.
     """
-    if layout.packing is Packing.JPEG:
-        image = _decoded(data, size, cv2.IMREAD_GRAYSCALE)
+    if layout.packing is SamplePacking.JPEG:
+        image = _decode_jpeg(data, size, "GRAY")[..., 0]
     else:
         image = _UNPACK[layout.packing](_rows(data, layout, size, stride_bytes), size)
     if layout.bayer is not None:
         image = np.asarray(cv2.cvtColor(image, _DEMOSAIC[layout.bayer]))
     if limited_luma and layout.is_luma:
-        image = _SPREAD[image]
+        image = _FULL_RANGE[image]
     return image
 
 
-def colour_image(data: Bytes, layout: Layout, size: Size, *, stride_bytes: int, limited_luma: bool = False) -> Pixels:
-    """Return a buffer of a layout that `has_colour` as (H, W, 3), blue, green and red, of `grey_image`'s type.
-    Parameters, and what is raised, as there.
-    """
-    if layout.packing is Packing.JPEG:
-        image = _decoded(data, size, cv2.IMREAD_COLOR)
+def colour_image(
+    data: Bytes, layout: PixelLayout, size: Size, *, stride_bytes: int, limited_luma: bool = False
+) -> Pixels:
+    """Convert a buffer of a layout that `has_colour` to (H, W, 3), blue, green, red. See `grey_image`."""
+    if layout.packing is SamplePacking.JPEG:
+        image = _decode_jpeg(data, size, "BGR")
     else:
         rows = _rows(data, layout, size, stride_bytes)
         image = _UNPACK[layout.packing](rows, size)
         if layout.bayer is not None:
             return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_Bayer{layout.bayer}2BGR")))
-        first = 1 if layout.packing is Packing.EVEN_BYTES else 0
-        image = from_luma(image, *(rows[:, first + 2 * (second != layout.red_first) :: 4] for second in (False, True)))
-    return _SPREAD[image] if limited_luma else image
+        first = 1 if layout.packing is SamplePacking.EVEN_BYTES else 0
+        blue, red = (rows[:, first + 2 * (second != layout.red_first) :: 4] for second in (False, True))
+        image = bgr_from_luma(image, blue, red)
+    return _FULL_RANGE[image] if limited_luma else image
 
 
-def from_luma(luma: Pixels, blue: Bytes, red: Bytes) -> Pixels:
-    """(H, W, 3) uint8, blue, green and red, of luma (H, W) and of the differences of blue and red, of fewer rows or
-    columns: full range, 128 is none.
+def bgr_from_luma(luma: Pixels, blue: Bytes, red: Bytes) -> Pixels:
+    """Convert luma, (H, W), and full-range colour differences to (H, W, 3) uint8, blue, green, red.
+
+    blue, red : differences with 128 for none; they may have fewer rows and columns.
     """
     planes = [
         cv2.resize(np.ascontiguousarray(each), luma.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -207,9 +215,9 @@ def from_luma(luma: Pixels, blue: Bytes, red: Bytes) -> Pixels:
     return np.asarray(cv2.cvtColor(cv2.merge([luma, *planes]), cv2.COLOR_YCrCb2BGR), dtype=np.uint8)
 
 
-def _rows(data: Bytes, layout: Layout, size: Size, stride_bytes: int) -> Bytes:
-    """(H, least stride): the bytes of each row without padding; the last row may come without."""
-    used = least_stride_bytes(layout, size)
+def _rows(data: Bytes, layout: PixelLayout, size: Size, stride_bytes: int) -> Bytes:
+    """Return the bytes of each row without padding, (H, smallest stride); the last row may come without padding."""
+    used = min_stride_bytes(layout, size)
     stride = max(stride_bytes, used)
     needed = stride * (size.height_px - 1) + used
     if len(data) < needed:
@@ -246,29 +254,33 @@ def _from_odd_bytes(rows: Bytes, size: Size) -> Pixels:
     return np.ascontiguousarray(rows[:, 1 : 2 * size.width_px : 2])
 
 
-_UNPACK: dict[Packing, Callable[[Bytes, Size], Pixels]] = {
-    Packing.BYTES: _from_bytes,
-    Packing.WORDS: _from_words,
-    Packing.MIPI10: _from_mipi10,
-    Packing.MIPI12: _from_mipi12,
-    Packing.EVEN_BYTES: _from_even_bytes,
-    Packing.ODD_BYTES: _from_odd_bytes,
+_UNPACK: dict[SamplePacking, Callable[[Bytes, Size], Pixels]] = {
+    SamplePacking.BYTES: _from_bytes,
+    SamplePacking.WORDS: _from_words,
+    SamplePacking.MIPI10: _from_mipi10,
+    SamplePacking.MIPI12: _from_mipi12,
+    SamplePacking.EVEN_BYTES: _from_even_bytes,
+    SamplePacking.ODD_BYTES: _from_odd_bytes,
 }
 
-_SPREAD: NDArray[np.uint8] = np.clip(np.rint((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
 
-
-def _decoded(data: Bytes, size: Size, flag: int) -> Pixels:
-    if len(data) < 4 or data[0] != 0xFF or data[1] != 0xD8:
+def _decode_jpeg(data: Bytes, size: Size, colorspace: str) -> Pixels:
+    """Decode a whole JPEG to (H, W, 1 or 3). Raises CorruptFrameError where a decoder would fill in lost data."""
+    if data[:2].tobytes() != _JPEG_START:
         message = f"{len(data)} bytes came that do not begin as a JPEG does"
         raise CorruptFrameError(message)
-    fault = jpeg.fault_of(data)
-    if fault:
-        message = f"the JPEG is damaged: {fault}"
-        raise CorruptFrameError(message)
-    image = cv2.imdecode(data, flag | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None or image.shape[:2] != size.shape:
-        found = "nothing" if image is None else f"{image.shape[1]} x {image.shape[0]}"
-        message = f"the JPEG decodes to {found}, expected {size}"
-        raise CorruptFrameError(message)
-    return np.asarray(image, dtype=np.uint8)
+    try:
+        height_px, width_px, *_ = simplejpeg.decode_jpeg_header(data, strict=True)
+        if (height_px, width_px) == size.shape:
+            return np.asarray(simplejpeg.decode_jpeg(data, colorspace, strict=True))
+    except ValueError as error:
+        stray = _STRAY_BYTES.search(str(error))
+        if stray is not None and int(stray[1]) <= _MAX_STRAY_BYTES:
+            return np.asarray(simplejpeg.decode_jpeg(data, colorspace, strict=False))
+        if _NO_END in str(error) and data[-2:].tobytes() != _JPEG_END:
+            # Some cameras leave the end marker out; data that end early are found with it, too.
+            return _decode_jpeg(np.append(data, np.frombuffer(_JPEG_END, np.uint8)), size, colorspace)
+        message = f"the JPEG is damaged: {error}"
+        raise CorruptFrameError(message) from error
+    message = f"the JPEG decodes to {width_px} x {height_px}, expected {size}"
+    raise CorruptFrameError(message)

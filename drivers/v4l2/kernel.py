@@ -1,7 +1,7 @@
-"""What the kernel's video interface (V4L2) exchanges: structures, request numbers, flags.
+"""The kernel's video interface (V4L2): structures, request numbers, flags, and errors.
 
-Facts: `include/uapi/linux/videodev2.h` and `v4l2-controls.h`, and the kernel's documentation "Video for Linux API".
-Names are the kernel's, without the prefix. Structures are laid out by `ctypes` for the machine that runs.
+Sources: `include/uapi/linux/videodev2.h` and `v4l2-controls.h`, and the kernel's documentation "Video for Linux API".
+Names are the kernel's, without the prefix. `ctypes` lays structures out for the running machine.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pathlib import Path
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 
 CAPTURE = 1
-"""Buffer type: a camera's frames, one plane."""
+"""Buffer type: frames of a camera in one plane."""
 MMAP = 1
-"""Buffer memory: the driver's own, mapped."""
+"""Buffer memory: mapped memory of the driver."""
 FIELD_ANY = 0
 FIELD_NONE = 1
 
@@ -39,19 +39,21 @@ CONTROL_READ_ONLY = 0x4
 CONTROL_WRITE_ONLY = 0x40
 CONTROL_NEXT = 0x8000_0000
 CONTROL_MENUS = (3, 9)
-"""Kinds of controls whose numbers stand for words."""
+"""Types of controls whose numbers are menu entries."""
+
+
+def _u32(*names: str) -> tuple[tuple[str, type[ctypes.c_uint32]], ...]:
+    return tuple((name, ctypes.c_uint32) for name in names)
 
 
 class Capability(ctypes.Structure):
-    """`v4l2_capability`: who the device is and what it can do."""
+    """`v4l2_capability`: identity and capabilities of a device."""
 
     _fields_ = (
         ("driver", ctypes.c_char * 16),
         ("card", ctypes.c_char * 32),
         ("bus_info", ctypes.c_char * 32),
-        ("version", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
-        ("device_caps", ctypes.c_uint32),
+        *_u32("version", "capabilities", "device_caps"),
         ("reserved", ctypes.c_uint32 * 3),
     )
 
@@ -60,9 +62,7 @@ class FormatDescription(ctypes.Structure):
     """`v4l2_fmtdesc`: one pixel format that the device offers."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
+        *_u32("index", "type", "flags"),
         ("description", ctypes.c_char * 32),
         ("pixelformat", ctypes.c_uint32),
         ("mbus_code", ctypes.c_uint32),
@@ -70,28 +70,18 @@ class FormatDescription(ctypes.Structure):
     )
 
 
-class PixelFormat(ctypes.Structure):
+class PixFormat(ctypes.Structure):
     """`v4l2_pix_format`: size, pixel format and layout of a frame."""
 
     _fields_ = (
-        ("width", ctypes.c_uint32),
-        ("height", ctypes.c_uint32),
-        ("pixelformat", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
-        ("bytesperline", ctypes.c_uint32),
-        ("sizeimage", ctypes.c_uint32),
-        ("colorspace", ctypes.c_uint32),
-        ("priv", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
-        ("ycbcr_enc", ctypes.c_uint32),
-        ("quantization", ctypes.c_uint32),
-        ("xfer_func", ctypes.c_uint32),
+        *_u32("width", "height", "pixelformat", "field", "bytesperline", "sizeimage", "colorspace", "priv", "flags"),
+        *_u32("ycbcr_enc", "quantization", "xfer_func"),
     )
 
 
 class _FormatUnion(ctypes.Union):
     # The window of an overlay holds pointers, so the kernel's union is aligned as a pointer is.
-    _fields_ = (("pix", PixelFormat), ("raw", ctypes.c_uint8 * 200), ("pointer", ctypes.c_void_p))
+    _fields_ = (("pix", PixFormat), ("raw", ctypes.c_uint8 * 200), ("pointer", ctypes.c_void_p))
 
 
 class Format(ctypes.Structure):
@@ -101,10 +91,7 @@ class Format(ctypes.Structure):
 
 
 class _SizeSteps(ctypes.Structure):
-    _fields_ = tuple(
-        (name, ctypes.c_uint32)
-        for name in ("min_width", "max_width", "step_width", "min_height", "max_height", "step_height")
-    )
+    _fields_ = _u32("min_width", "max_width", "step_width", "min_height", "max_height", "step_height")
 
 
 class _SizeDiscrete(ctypes.Structure):
@@ -119,9 +106,7 @@ class FrameSize(ctypes.Structure):
     """`v4l2_frmsizeenum`: one size, or a range of sizes, of a pixel format."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("pixel_format", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
+        *_u32("index", "pixel_format", "type"),
         ("size", _SizeUnion),
         ("reserved", ctypes.c_uint32 * 2),
     )
@@ -145,11 +130,7 @@ class FrameInterval(ctypes.Structure):
     """`v4l2_frmivalenum`: one time per frame, or a range of them, of a pixel format and size."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("pixel_format", ctypes.c_uint32),
-        ("width", ctypes.c_uint32),
-        ("height", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
+        *_u32("index", "pixel_format", "width", "height", "type"),
         ("interval", _IntervalUnion),
         ("reserved", ctypes.c_uint32 * 2),
     )
@@ -182,17 +163,14 @@ class BufferRequest(ctypes.Structure):
     """`v4l2_requestbuffers`."""
 
     _fields_ = (
-        ("count", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("memory", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
+        *_u32("count", "type", "memory", "capabilities"),
         ("flags", ctypes.c_uint8),
         ("reserved", ctypes.c_uint8 * 3),
     )
 
 
 class TimeValue(ctypes.Structure):
-    """`timeval`; on 32-bit machines the kernel tells by the request number which of its two forms is meant."""
+    """`timeval`; on 32-bit machines the request number distinguishes its two forms."""
 
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_usec", ctypes.c_long))
 
@@ -207,14 +185,10 @@ class _BufferMemory(ctypes.Union):
 
 
 class Buffer(ctypes.Structure):
-    """`v4l2_buffer`: one frame's place in memory, its time stamp, sequence number and flags."""
+    """`v4l2_buffer`: a frame's memory, time stamp, sequence number and flags."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("bytesused", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
+        *_u32("index", "type", "bytesused", "flags", "field"),
         ("timestamp", TimeValue),
         ("timecode", ctypes.c_uint32 * 4),
         ("sequence", ctypes.c_uint32),
@@ -227,7 +201,7 @@ class Buffer(ctypes.Structure):
 
 
 class ControlDescription(ctypes.Structure):
-    """`v4l2_queryctrl`: a control's name, kind and range."""
+    """`v4l2_queryctrl`: a control's name, type and range."""
 
     _fields_ = (
         ("id", ctypes.c_uint32),
@@ -249,23 +223,19 @@ class ControlValue(ctypes.Structure):
 
 
 class LongControlValue(ctypes.Structure):
-    """`v4l2_ext_control` of a 64-bit control. The kernel packs it: its value, lower half first, is not aligned."""
+    """`v4l2_ext_control` of a 64-bit control. Packed: its value, lower half first, is not aligned."""
 
     _fields_ = (
-        ("id", ctypes.c_uint32),
-        ("size", ctypes.c_uint32),
-        ("reserved2", ctypes.c_uint32),
+        *_u32("id", "size", "reserved2"),
         ("halves", ctypes.c_uint32 * 2),
     )
 
 
 class LongControlValues(ctypes.Structure):
-    """`v4l2_ext_controls`: a list of values to be read."""
+    """`v4l2_ext_controls`: a list of values to read."""
 
     _fields_ = (
-        ("which", ctypes.c_uint32),
-        ("count", ctypes.c_uint32),
-        ("error_idx", ctypes.c_uint32),
+        *_u32("which", "count", "error_idx"),
         ("request_fd", ctypes.c_int32),
         ("reserved", ctypes.c_uint32),
         ("controls", ctypes.POINTER(LongControlValue)),
@@ -299,9 +269,9 @@ ENUM_FRAMESIZES = _request(_BOTH, 74, FrameSize)
 ENUM_FRAMEINTERVALS = _request(_BOTH, 75, FrameInterval)
 
 GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.ENOENT})
-"""What the kernel answers when the device is not there any more."""
+"""Errors of a device that is no longer connected."""
 REFUSED = frozenset({errno.EINVAL, errno.ERANGE, errno.ENOTTY, errno.EOPNOTSUPP})
-"""What the kernel answers to a request that the device cannot do."""
+"""Errors of a request that the device does not support."""
 
 
 def open_node(node: Path) -> int:
@@ -309,9 +279,9 @@ def open_node(node: Path) -> int:
     return os.open(node, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
 
-def ask(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
+def ioctl(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
     """Send a request; the answer is written into `argument`. Raises OSError."""
-    # Late, so that what looks at this module on another system is not refused.
+    # Imported here, so that this module can be imported on other systems.
     import fcntl
 
     while True:
@@ -322,34 +292,34 @@ def ask(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) ->
         return
 
 
-def text_of(code: int) -> str:
-    """A pixel format's four characters.
+def fourcc_text(code: int) -> str:
+    """Return a pixel format's four characters.
 
-    >>> text_of(0x59455247)
+    >>> fourcc_text(0x59455247)
     'GREY'
     """
     return (code & 0x7FFF_FFFF).to_bytes(4, "little").decode("ascii", "replace")
 
 
-def code_of(text: str) -> int:
-    """A pixel format's number; short names are filled up with blanks, as the kernel does.
+def fourcc_code(text: str) -> int:
+    """Return a pixel format's number; short names are padded with blanks, as in the kernel.
 
-    >>> text_of(code_of("Y16"))
+    >>> fourcc_text(fourcc_code("Y16"))
     'Y16 '
     """
     return int.from_bytes(text.ljust(4).encode("ascii"), "little")
 
 
-def fault(node: Path, doing: str, error: OSError) -> DeviceError:
-    """Return what the kernel's refusal means, in words that tell what to do."""
+def device_error(node: Path, action: str, error: OSError) -> DeviceError:
+    """Return the error for a request that the kernel refused, with what to do about it."""
     number = error.errno or 0
-    cause = f"{node}: {doing}: {os.strerror(number)}"
+    cause = f"{node}: {action}: {os.strerror(number)}"
     if number in GONE:
         return DeviceGoneError(
-            f"{cause}; the camera is gone: plug it in again, and reopen it (slrig devices lists those that are there)"
+            f"{cause}; the camera is gone: plug it in again, and reopen it (slrig devices lists the connected ones)"
         )
     if number == errno.EBUSY:
-        holders = holders_of(node)
+        holders = list_holders(node)
         by = f" by {', '.join(holders)}" if holders else ""
         return DeviceBusyError(f"{cause}; it is held{by}: close that program (fuser -v {node} lists who has it open)")
     if number in (errno.EACCES, errno.EPERM):
@@ -358,30 +328,30 @@ def fault(node: Path, doing: str, error: OSError) -> DeviceError:
         )
     if number == errno.ENOSPC:
         return UnsupportedByDeviceError(
-            f"{cause}; the USB bus has not enough bandwidth left for this stream beside the others: plug the cameras "
-            "into different USB controllers (lsusb -t), or ask for a smaller size_px, a lower frame_rate_hz, or "
+            f"{cause}; the USB bus has not enough bandwidth left for this stream: plug the cameras "
+            "into different USB controllers (lsusb -t), or request a smaller size_px, a lower frame_rate_hz, or "
             'pixel_format = "MJPG"'
         )
     if number in REFUSED:
         return UnsupportedByDeviceError(f"{cause}; the device cannot do that (slrig devices lists the cameras)")
-    return DeviceError(f"{cause}; look for the kernel's own words with: dmesg | tail")
+    return DeviceError(f"{cause}; see the kernel's log: dmesg | tail")
 
 
-def stream_fault(node: Path, doing: str, error: OSError) -> DeviceError:
-    """The same of a request about the frames: EIO there says that the stream has died, of another that it failed."""
+def stream_error(node: Path, action: str, error: OSError) -> DeviceError:
+    """As `device_error` for a request about frames, where EIO means that the stream has died."""
     if error.errno == errno.EIO:
         return DeviceGoneError(
-            f"{node}: {doing}: {os.strerror(errno.EIO)}; its stream has died: plug it in again, and reopen it"
+            f"{node}: {action}: {os.strerror(errno.EIO)}; its stream has died: plug it in again, and reopen it"
         )
-    return fault(node, doing, error)
+    return device_error(node, action, error)
 
 
-def holders_of(node: Path) -> tuple[str, ...]:
-    """The other programs that have a node open, as far as we may see: "name (process id)"."""
+def list_holders(node: Path) -> tuple[str, ...]:
+    """List the other programs that have a node open, as far as visible: "name (process id)"."""
     found = []
     target = os.path.realpath(node)
     for process in Path("/proc").glob("[0-9]*"):
-        # Processes end while we look, and those of other users are closed to us.
+        # Processes may end meanwhile, and those of other users cannot be read.
         with suppress(OSError):
             if int(process.name) == os.getpid():
                 continue

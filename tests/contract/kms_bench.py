@@ -67,7 +67,7 @@ def opened(output: str = FIRST, **more: object) -> Iterator[Projector]:
         yield projector
     finally:
         projector.close()
-        holding.release(finding.chosen(output).card)
+        holding.release_card(finding.find_connector(output).card)
 
 
 def is_dark(head: HeadPixels) -> bool:
@@ -239,7 +239,7 @@ def the_next_process_takes_over_in_the_dark(heads: Heads, notes: Notes) -> None:
     assert int(heads.first.grey().min()) == 255
     projector.close()
     assert is_dark(heads.first)
-    holding.release(finding.chosen(FIRST).card)
+    holding.release_card(finding.find_connector(FIRST).card)
     # The first guard has left, too.
     until(lambda: is_console(heads.first))
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.display.options import UNMEASURED_S
-from drivers.display.timing import flipped, whole_light
-from drivers.v4l2.timing import Durations, Exposure, Stamp, StampSource, exposure_of
+from drivers.display.projector import UNMEASURED_LATENCY_S, full_light_time, start_of_flip
+from drivers.v4l2.timing import BufferStamp, ExposureInterval, SensorDurations, StampSource, exposure_interval
 from slrig.devices import (
     AppliedSettings,
     CameraInfo,
@@ -41,16 +40,16 @@ class LiveDisplay(StagedProjector):
     @property
     def info(self) -> ProjectorInfo:
         refresh_s = self.refresh_ns / 1e9
-        return replace(super().info, latency_s=2 * UNMEASURED_S + 2 * refresh_s, refresh_s=refresh_s)
+        return replace(super().info, latency_s=2 * UNMEASURED_LATENCY_S + 2 * refresh_s, refresh_s=refresh_s)
 
     def show(self, index: int) -> DisplayedPattern:
         """See `Projector`. Waits for the next refresh."""
         flip_ns = self._flip(self._state.require_pattern(index).profiles[index])
-        t_visible_ns, t_err_ns = whole_light(
-            flipped(flip_ns),
+        t_visible_ns, t_err_ns = full_light_time(
+            start_of_flip(flip_ns),
             refresh_s=self.refresh_ns / 1e9,
-            latency_s=UNMEASURED_S,
-            latency_error_s=UNMEASURED_S,
+            latency_s=UNMEASURED_LATENCY_S,
+            latency_error_s=UNMEASURED_LATENCY_S,
         )
         return DisplayedPattern(index, t_visible_ns, t_err_ns)
 
@@ -122,7 +121,7 @@ class LiveCamera:
                 self._number = kept.number
                 exposure = self._claimed(kept, stamp_ns)
                 if exposure.earliest_ns >= after_ns:
-                    start_ns, end_ns, error_ns = exposure.centred(self._exposure_ns)
+                    start_ns, end_ns, error_ns = exposure.centred_exposure(self._exposure_ns)
                     image = self._image(kept)
                     exposure_s = self._exposure_ns / 1e9
                     return Frame(
@@ -154,9 +153,9 @@ class LiveCamera:
             stamp_ns = end_ns + round(self._webcam.jitter_s * float(self._rng.random()) * 1e9)
             self._kept.append((Exposed(number, start_ns, end_ns), stamp_ns))
 
-    def _claimed(self, kept: Exposed, stamp_ns: int) -> Exposure:
-        stamp = Stamp(StampSource.EXPOSURE_START, stamp_ns, kept.t_start_ns, self._stage.clock.now_ns())
-        return exposure_of(stamp, Durations(self._exposure_ns, self._period_ns))
+    def _claimed(self, kept: Exposed, stamp_ns: int) -> ExposureInterval:
+        stamp = BufferStamp(StampSource.EXPOSURE_START, stamp_ns, kept.t_start_ns, self._stage.clock.now_ns())
+        return exposure_interval(stamp, SensorDurations(self._exposure_ns, self._period_ns))
 
     def _image(self, kept: Exposed) -> Pixels:
         image = self._stage.exposed(kept.t_start_ns, kept.t_end_ns)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import screen
-from drivers.screen import guarding
+from drivers.screen.guard import release_guard
 from slrig.devices import CameraSettings, SystemClock, Trigger
 from slrig.model import Frame, PatternSequence, Pixels, Size
 from tests.contract.screen_server import DummyServer, OutputPixels
@@ -126,4 +126,4 @@ def let_go(*outputs: str) -> None:
     """End the guards that this process has set on outputs of the environment's server."""
     for output in outputs:
         with suppress(OSError):
-            guarding.release(None, output)
+            release_guard(None, output)

@@ -20,7 +20,7 @@ from unittest import mock
 
 from drivers.v4l2 import kernel, open_camera
 from drivers.v4l2.camera import V4L2Camera
-from drivers.v4l2.finding import Node
+from drivers.v4l2.finding import CameraNode
 from slrig.devices import Clock
 from slrig.model import Size
 from tests.contract.stage import Stage, StagedProjector
@@ -208,8 +208,8 @@ class VirtualDevice:
         times = SimpleNamespace(monotonic_ns=self.clock.now_ns)
         for target, stand_in in {
             "kernel.open_node": self._opened,
-            "kernel.ask": self._ask,
-            "camera.resolved": lambda device: Node(Path(device), device, "Bench camera", "S123"),
+            "kernel.ioctl": self._ask,
+            "camera.resolve_node": lambda device: CameraNode(Path(device), device, "Bench camera", "S123"),
             "camera.time": times,
             "stream.time": times,
             "stream.mmap": SimpleNamespace(mmap=self._mapped, MAP_SHARED=0, PROT_READ=0),

@@ -142,15 +142,14 @@ class Output(Node):
         super().__init__(path)
         form = kernel.Format(type=_OUTPUT)
         pix = form.fmt.pix
-        pix.width, pix.height, pix.pixelformat = width_px, height_px, kernel.code_of(pixel_format)
+        pix.width, pix.height, pix.pixelformat = width_px, height_px, kernel.fourcc_code(pixel_format)
         pix.field = kernel.FIELD_NONE
         self._ask(kernel.S_FMT, form)
         request = kernel.BufferRequest(count=2, type=_OUTPUT, memory=kernel.MMAP)
         self._ask(kernel.REQBUFS, request)
         if request.count != 2 or len(dark) != pix.sizeimage:
-            message = (
-                f"{path}: {request.count} buffers of {pix.sizeimage} bytes, format {kernel.text_of(pix.pixelformat)}"
-            )
+            name = kernel.fourcc_text(pix.pixelformat)
+            message = f"{path}: {request.count} buffers of {pix.sizeimage} bytes, format {name}"
             raise RuntimeError(message)
         self._memory: list[mmap.mmap] = []
         for index in range(request.count):

@@ -80,9 +80,9 @@ def opened(node: Path) -> None:
 
 def let_in() -> None:
     """Raises DeviceError where the X server does not let this user in."""
-    from drivers.screen.connection import Connection
+    from drivers.screen.x11 import XConnection
 
-    Connection().close()
+    XConnection().close()
     sys.stderr.write("in\n")
 
 

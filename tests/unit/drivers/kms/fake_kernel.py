@@ -90,14 +90,14 @@ class FakeKernel:
         (folder / "status").write_text("connected\n" if there else "disconnected\n")
         (folder / "modes").write_text("".join(f"{each.name.decode()}\n" for each in self.modes.get(number, [])))
 
-    def opened(self, _path: str) -> int:
+    def open_card(self, _path: str) -> int:
         return os.dup(self.ours.fileno())
 
-    def mapped(self, _handle: int, size: int, offset: int) -> mmap.mmap:
+    def map_memory(self, _handle: int, size: int, offset: int) -> mmap.mmap:
         assert len(self.memory[offset]) == size
         return self.memory[offset]
 
-    def ask(self, _handle: int, request: int, told: ctypes.Structure) -> None:
+    def ioctl(self, _handle: int, request: int, told: ctypes.Structure) -> None:
         self.asked.append((request, told))
         waiting = self.refusals.get(request)
         if waiting:
@@ -155,8 +155,8 @@ class FakeKernel:
         words = WORDS.get(name, {})
         told.name, told.flags = name.encode(), kernel.PROPERTY_ENUM if words else 0
         if told.enum_blob_ptr and told.count_enum_blobs >= len(words):
-            array = (kernel.PropertyWord * len(words))(
-                *(kernel.PropertyWord(value=value, name=word.encode()) for word, value in words.items())
+            array = (kernel.PropertyEnum * len(words))(
+                *(kernel.PropertyEnum(value=value, name=word.encode()) for word, value in words.items())
             )
             ctypes.memmove(told.enum_blob_ptr, array, ctypes.sizeof(array))
         told.count_enum_blobs = len(words)

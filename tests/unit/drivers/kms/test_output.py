@@ -13,8 +13,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from drivers.kms import find_devices, finding, guard, holders, holding, kernel, open_projector
-from drivers.kms.modes import Mode
+from drivers.kms import find_devices, finding, guard, holding, kernel, open_projector
+from drivers.kms.card import KmsMode
 from slrig.devices import Projector
 from slrig.errors import ConfigError, DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
@@ -53,16 +53,16 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     def installed(**state: object) -> FakeKernel:
         fake = FakeKernel(tmp_path / "drm", **state)  # type: ignore[arg-type]
         monkeypatch.setattr(finding, "SYSTEM", fake.system)
-        for name in ("opened", "ask", "mapped"):
+        for name in ("open_card", "ioctl", "map_memory"):
             monkeypatch.setattr(kernel, name, getattr(fake, name))
-        monkeypatch.setattr(holding, "Guard", FakeGuard)
+        monkeypatch.setattr(holding, "GuardProcess", FakeGuard)
         fakes.append(fake)
         return fake
 
     yield installed
     while OPENED:
         OPENED.pop().close()
-    holding.release(finding.DEVICES / "card0")
+    holding.release_card(finding.DEVICES / "card0")
     for fake in fakes:
         fake.ours.close()
         fake.theirs.close()
@@ -87,7 +87,7 @@ def scanned_out(fake: FakeKernel) -> np.ndarray[tuple[int, ...], np.dtype[np.uin
 
 
 @pytest.mark.parametrize("atomic", [True, False])
-def test_patterns_are_shown_as_they_are(install: Install, atomic: bool) -> None:
+def test_patterns_are_shown_unchanged(install: Install, atomic: bool) -> None:
     fake = install(atomic=atomic)
     projector = opened()
     assert projector.info.size == SIZE
@@ -103,7 +103,7 @@ def test_patterns_are_shown_as_they_are(install: Install, atomic: bool) -> None:
 
 
 @pytest.mark.parametrize("atomic", [True, False])
-def test_everything_that_would_change_a_picture_is_off(install: Install, atomic: bool) -> None:
+def test_everything_that_changes_pictures_is_switched_off(install: Install, atomic: bool) -> None:
     fake = install(atomic=atomic)
     opened().close()
     assert fake.values[(11, "Broadcast RGB")] == 1
@@ -120,7 +120,7 @@ def test_everything_that_would_change_a_picture_is_off(install: Install, atomic:
     assert [value / 65536 for value in source] == shown == [0, 0, 1280, 800]
 
 
-def test_a_flips_stamp_is_when_its_scan_out_began(install: Install) -> None:
+def test_a_flips_stamp_is_the_start_of_its_scan_out(install: Install) -> None:
     fake = install()
     projector = loaded()
     stamps: list[int] = []
@@ -137,7 +137,7 @@ def test_a_flips_stamp_is_when_its_scan_out_began(install: Install) -> None:
 
 
 @pytest.mark.parametrize("state", [{"counts": False}, {"stamp": lambda: 0}], ids=["not counted", "zero"])
-def test_a_stamp_that_means_nothing_is_not_believed(install: Install, state: dict[str, object]) -> None:
+def test_an_unusable_stamp_is_replaced_by_the_times_of_the_call(install: Install, state: dict[str, object]) -> None:
     install(**state)
     projector = loaded()
     asked_ns = time.monotonic_ns()
@@ -145,10 +145,10 @@ def test_a_stamp_that_means_nothing_is_not_believed(install: Install, state: dic
     period_ns = round((projector.info.refresh_s or 0) * 1e9)
     assert shown.t_err_ns >= period_ns // 2
     assert shown.t_visible_ns + shown.t_err_ns >= asked_ns + 2 * period_ns
-    assert ("does not tell" in projector.info.model) == ("counts" in state)
+    assert ("does not count" in projector.info.model) == ("counts" in state)
 
 
-def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
+def test_an_event_of_an_earlier_flip_is_ignored(install: Install) -> None:
     fake = install()
     projector = loaded()
     fake.flipped(5)
@@ -156,16 +156,16 @@ def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
     assert projector.show(1).index == 1
 
 
-def test_a_display_that_makes_no_refresh_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_display_without_refreshes_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = install()
     projector = loaded()
-    monkeypatch.setattr("drivers.kms.output._FLIPS_IN_S", 0.05)
+    monkeypatch.setattr("drivers.kms.output._FLIP_TIMEOUT_S", 0.05)
     monkeypatch.setattr(fake, "flipped", lambda _: None)
     with pytest.raises(DeviceError, match="made no refresh"):
         projector.show(1)
 
 
-def test_a_display_that_is_pulled_or_exchanged_is_reported(install: Install) -> None:
+def test_an_unplugged_or_exchanged_display_is_reported(install: Install) -> None:
     fake = install()
     projector = loaded()
     fake.plug(11, False)
@@ -178,7 +178,7 @@ def test_a_display_that_is_pulled_or_exchanged_is_reported(install: Install) -> 
         projector.load(SEQUENCE)
 
 
-def test_what_the_frame_buffer_does_not_hold_is_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_pixels_in_the_frame_buffer_are_reported(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = install()
     projector = loaded()
     send = fake.flipped
@@ -196,17 +196,17 @@ def test_what_the_frame_buffer_does_not_hold_is_reported(install: Install, monke
 @pytest.mark.parametrize(
     ("table", "modes", "message"),
     [
-        ({"native_px": [1024, 768]}, None, r"asked for 1024 x 768, row by row; its modes are: 1280 x 800 at 60\.00 Hz"),
-        ({"refresh_hz": 120}, None, "asked for 1280 x 800 at 120 Hz"),
-        ({}, [mode(1280, 800)], "no EDID tells the projector's own raster"),
+        ({"native_px": [1024, 768]}, None, r"requested 1024 x 768, row by row; its modes are: 1280 x 800 at 60\.00 Hz"),
+        ({"refresh_hz": 120}, None, "requested 1280 x 800 at 120 Hz"),
+        ({}, [mode(1280, 800)], "no EDID states the projector's own raster"),
         ({}, [mode(1920, 1080, flags=kernel.MODE_INTERLACED, preferred=True)], "interlaced or doubled"),
         ({}, [], "its modes are: none"),
         ({"monitor": "EPS PJ 720"}, None, "found 'a display without EDID'"),
         ({"output": "HDMI-A-2"}, None, r"connected are: HDMI-A-1 \(1280x800\)"),
-        ({"output": "HDMI-1"}, None, "it has: HDMI-A-1 .*; HDMI-A-2 .*X names them otherwise"),
+        ({"output": "HDMI-1"}, None, "it has: HDMI-A-1 .*; HDMI-A-2 .*X names them differently"),
     ],
 )
-def test_what_is_not_exact_or_not_there_is_refused(
+def test_inexact_and_missing_outputs_are_refused(
     install: Install, table: dict[str, object], modes: list[kernel.ModeInfo] | None, message: str
 ) -> None:
     fake = install()
@@ -216,7 +216,7 @@ def test_what_is_not_exact_or_not_there_is_refused(
         opened(**table)
     assert isinstance(refused.value, DeviceGoneError) == (table.get("output") == "HDMI-A-2")
     # The card was let go: another program may have it.
-    assert not holding._held
+    assert not holding._held_cards
 
 
 def test_of_equal_sizes_the_rate_may_be_chosen(install: Install) -> None:
@@ -233,13 +233,13 @@ def test_a_machine_without_a_graphics_driver_is_reported(tmp_path: Path, monkeyp
         opened()
 
 
-def test_a_card_of_a_desktop_is_busy_and_its_holder_is_named(
+def test_a_card_of_a_desktop_is_busy_and_its_program_is_named(
     install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(master=False)
     (tmp_path / "proc" / "812").mkdir(parents=True)
     (tmp_path / "proc" / "812" / "comm").write_text("gnome-shell\n")
-    monkeypatch.setattr(holders, "PROCESSES", tmp_path / "proc")
+    monkeypatch.setattr(holding, "PROCESSES", tmp_path / "proc")
     # The number of a socket's device: no guard listens for it.
     with pytest.raises(DeviceBusyError, match=r"held by gnome-shell \(process 812\).*Ctrl\+Alt\+F3"):
         opened()
@@ -250,33 +250,33 @@ def test_a_card_of_a_desktop_is_busy_and_its_holder_is_named(
     [
         ("open", errno.EACCES, DeviceError, "usermod -aG video"),
         ("open", errno.EPERM, DeviceError, "DeviceAllow=char-drm"),
-        ("open", errno.ENOENT, DeviceGoneError, "was not given"),
+        ("open", errno.ENOENT, DeviceGoneError, "has no access"),
         ("commit", errno.EACCES, DeviceBusyError, "another program has taken"),
         ("commit", errno.ENODEV, DeviceGoneError, "was unplugged"),
-        ("commit", errno.ENOSPC, DeviceError, "may not have this mode"),
+        ("commit", errno.ENOSPC, DeviceError, "may lack this mode"),
     ],
 )
-def test_what_the_kernel_refuses_says_what_to_do(
+def test_errors_of_the_kernel_say_what_to_do(
     install: Install, monkeypatch: pytest.MonkeyPatch, call: str, number: int, error: type[Exception], message: str
 ) -> None:
     fake = install()
     if call == "open":
-        monkeypatch.setattr(kernel, "opened", mock.Mock(side_effect=OSError(number, "refused")))
+        monkeypatch.setattr(kernel, "open_card", mock.Mock(side_effect=OSError(number, "refused")))
     else:
         fake.refusals[kernel.ATOMIC] = [number]
     with pytest.raises(error, match=message):
         opened()
 
 
-def test_a_controller_that_drives_another_display_is_left_to_it(install: Install) -> None:
+def test_a_controller_of_another_display_is_not_used(install: Install) -> None:
     fake = install()
     fake.plug(12, True)
     fake.driven = {11: CONTROLLERS[1], 12: CONTROLLERS[1]}
     opened().close()
     assert fake.values[(11, "CRTC_ID")] == CONTROLLERS[0]
-    holding.release(finding.DEVICES / "card0")
+    holding.release_card(finding.DEVICES / "card0")
     fake.possible = 0b10
-    with pytest.raises(UnsupportedByDeviceError, match="HDMI-A-2; unplug a display"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"\(HDMI-A-2\); unplug a display"):
         opened()
 
 
@@ -291,12 +291,12 @@ def test_a_card_stays_ours_and_its_memory_does_not_grow(install: Install) -> Non
     assert len(fake.buffers) == len(fake.memory) == 3
 
 
-def test_connectors_with_a_display_are_found_and_nothing_is_opened(
+def test_connectors_with_a_display_are_found_without_opening_cards(
     install: Install, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fake = install()
     (fake.system / "card0-Writeback-1").mkdir()
-    monkeypatch.setattr(kernel, "opened", None)
+    monkeypatch.setattr(kernel, "open_card", None)
     assert [(each.device, each.label) for each in find_devices()] == [("HDMI-A-1", "HDMI-A-1 (1280x800)")]
     assert not fake.asked
 
@@ -310,9 +310,9 @@ def test_all_faults_of_a_table_come_in_one_message() -> None:
 
 # As a C compiler lays the kernel's headers out (6.1): numbers of requests on x86-64, which hold the structure's size.
 REQUESTS: dict[str, tuple[type[ctypes.Structure], int]] = {
-    "AUTH_MAGIC": (kernel.Number, 0x40046411),
+    "AUTH_MAGIC": (kernel.ObjectNumber, 0x40046411),
     "SET_CLIENT_CAP": (kernel.ClientCap, 0x4010640D),
-    "CRTC_GET_SEQUENCE": (kernel.Sequence, 0xC018643B),
+    "CRTC_GET_SEQUENCE": (kernel.CrtcSequence, 0xC018643B),
     "GET_RESOURCES": (kernel.Resources, 0xC04064A0),
     "GET_CRTC": (kernel.Crtc, 0xC06864A1),
     "SET_CRTC": (kernel.Crtc, 0xC06864A2),
@@ -322,11 +322,11 @@ REQUESTS: dict[str, tuple[type[ctypes.Structure], int]] = {
     "GET_CONNECTOR": (kernel.GetConnector, 0xC05064A7),
     "GET_PROPERTY": (kernel.GetProperty, 0xC04064AA),
     "ADD_FB": (kernel.FrameBuffer, 0xC01C64AE),
-    "REMOVE_FB": (kernel.Number, 0xC00464AF),
+    "REMOVE_FB": (kernel.ObjectNumber, 0xC00464AF),
     "PAGE_FLIP": (kernel.PageFlip, 0xC01864B0),
     "CREATE_DUMB": (kernel.CreateDumb, 0xC02064B2),
     "MAP_DUMB": (kernel.MapDumb, 0xC01064B3),
-    "DESTROY_DUMB": (kernel.Number, 0xC00464B4),
+    "DESTROY_DUMB": (kernel.ObjectNumber, 0xC00464B4),
     "GET_PLANE_RESOURCES": (kernel.PlaneResources, 0xC01064B5),
     "GET_PLANE": (kernel.GetPlane, 0xC02064B6),
     "GET_PROPERTIES": (kernel.ObjectProperties, 0xC02064B9),
@@ -336,7 +336,7 @@ REQUESTS: dict[str, tuple[type[ctypes.Structure], int]] = {
 }
 SIZES: dict[type[ctypes.Structure], int] = {
     **{structure: number >> 16 & 0x3FFF for structure, number in REQUESTS.values()},
-    **{kernel.ModeInfo: 68, kernel.PropertyWord: 40, kernel.FlipEvent: 32},
+    **{kernel.ModeInfo: 68, kernel.PropertyEnum: 40, kernel.FlipEvent: 32},
 }
 ON_32_BITS: dict[type[ctypes.Structure], int] = {
     kernel.PlaneResources: 12,
@@ -379,12 +379,12 @@ def test_a_request_has_the_kernels_number(name: str) -> None:
         (kernel.MODE_DOUBLE_CLOCK, 0.02, False),
     ],
 )
-def test_a_mode_has_the_time_of_a_frame(flags: int, refresh_s: float, plain: bool) -> None:
-    found = Mode.of(mode(1000, 500, rate=50, flags=flags))
+def test_a_mode_has_a_frame_duration(flags: int, refresh_s: float, plain: bool) -> None:
+    found = KmsMode.from_info(mode(1000, 500, rate=50, flags=flags))
     assert (found.size, found.plain) == (Size(1000, 500), plain)
     assert found.refresh_s == pytest.approx(refresh_s)
     assert bytes(found.info) == found.content
 
 
 def test_a_mode_without_a_clock_has_none() -> None:
-    assert Mode.of(mode(640, 480, clock=0)).refresh_s == 0
+    assert KmsMode.from_info(mode(640, 480, clock=0)).refresh_s == 0

@@ -14,7 +14,7 @@ import pytest
 
 from drivers.opencv import open_camera
 from drivers.opencv.camera import OpenCvCamera
-from drivers.opencv.controls import Controls, negotiate
+from drivers.opencv.controls import CaptureControls, negotiate
 from drivers.opencv.options import OpenCvOptions
 from slrig.devices import CameraSettings, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
@@ -154,7 +154,7 @@ def test_a_camera_is_what_the_kernel_says_and_its_frames_are_those_of_its_stamps
     camera.close()
 
 
-def test_a_device_that_another_program_holds_is_busy(plugged: Plug) -> None:
+def test_a_device_in_use_by_another_program_is_busy(plugged: Plug) -> None:
     _, device = plugged()
     device.fault("busy")
     with pytest.raises(DeviceBusyError, match=r"/dev/video0: .*it is held"):
@@ -167,7 +167,7 @@ def test_a_camera_that_falls_silent_times_out_and_one_that_is_unplugged_is_gone(
     capture, device = plugged()
     camera = armed()
     capture.flows.clear()
-    with pytest.raises(FrameTimeoutError, match="no frame that was exposed wholly after"):
+    with pytest.raises(FrameTimeoutError, match="no frame exposed entirely after"):
         camera.read(time.monotonic_ns() + 20_000_000, 0.05)
     capture.flows.set()
     assert camera.read(time.monotonic_ns(), LONG_S).image.size
@@ -198,7 +198,7 @@ def test_image_processing_is_off_and_a_control_that_fails_is_noted(plugged: Plug
     _, device = plugged(controls=(*stuck, control(0x00980912, "Gain, Automatic", 0, 1, 1)))
     camera = opened(skip_controls=["backlight_compensation", "gain"])
     [note] = camera.info.notes
-    assert "asked contrast = 32, the driver refuses it" in note
+    assert "requested contrast = 32, the driver refuses it" in note
     assert camera.info.gain_range == (1.0, 1.0)
     known = device.kernel.controls_set
     assert (known["Sharpness"], known["Gamma"], known["Gain, Automatic"]) == (0, 100, 0)
@@ -216,24 +216,24 @@ def obstinate(**more: Any) -> Any:
     return Obstinate(**more)
 
 
-def controls(capture: Any, **given: Any) -> Controls:
-    return Controls(capture, options(**given), "/dev/video0", fixed_s=0.033)
+def controls(capture: Any, **given: Any) -> CaptureControls:
+    return CaptureControls(capture, options(**given), "/dev/video0", fixed_s=0.033)
 
 
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({"fourcc": "GREY"}, "asked for pixel format GREY, the driver gives YUYV; choose"),
-        ({"size_px": (1920, 1080)}, "asked for 1920 x 1080, the driver gives 640 x 480"),
-        ({"frame_rate_hz": 60.0}, "asked for 60 frames per second, the driver gives 30"),
+        ({"fourcc": "GREY"}, "requested pixel format GREY, the driver gives YUYV; choose"),
+        ({"size_px": (1920, 1080)}, "requested 1920 x 1080, the driver gives 640 x 480"),
+        ({"frame_rate_hz": 60.0}, "requested 60 frames per second, the driver gives 30"),
     ],
 )
-def test_what_the_driver_takes_otherwise_is_refused(asked: dict[str, Any], words: str) -> None:
+def test_settings_that_the_driver_changes_are_refused(asked: dict[str, Any], words: str) -> None:
     with pytest.raises(UnsupportedByDeviceError, match=words):
         negotiate(obstinate(fixed={cv2.CAP_PROP_FPS}), options(**asked), "/dev/video0")
 
 
-def test_what_the_driver_takes_is_agreed() -> None:
+def test_settings_that_the_driver_accepts_are_used() -> None:
     capture = obstinate()
     negotiate(capture, options(fourcc="MJPG", size_px=(1280, 720), frame_rate_hz=29.97), "/dev/video0")
     # A pixel format first: it decides which extents and rates there are.
@@ -243,7 +243,7 @@ def test_what_the_driver_takes_is_agreed() -> None:
     ]
 
 
-def test_every_automatic_is_switched_off_before_what_it_governs() -> None:
+def test_automatic_controls_are_switched_off_first() -> None:
     capture = obstinate()
     controls(capture, focus=30.0)
     for off, value in ((cv2.CAP_PROP_AUTO_EXPOSURE, 1), (cv2.CAP_PROP_AUTOFOCUS, 0), (cv2.CAP_PROP_AUTO_WB, 0)):
@@ -256,7 +256,7 @@ def test_every_automatic_is_switched_off_before_what_it_governs() -> None:
 @pytest.mark.parametrize(
     ("which", "words"),
     [
-        (cv2.CAP_PROP_AUTO_EXPOSURE, "automatic exposure cannot be switched off: asked for 1, the driver gives 3"),
+        (cv2.CAP_PROP_AUTO_EXPOSURE, "automatic exposure cannot be switched off: requested 1, the driver gives 3"),
         (cv2.CAP_PROP_AUTOFOCUS, "autofocus cannot be switched off"),
         (cv2.CAP_PROP_AUTO_WB, "automatic white balance cannot"),
     ],
@@ -266,7 +266,7 @@ def test_an_automatic_that_stays_on_is_refused(which: int, words: str) -> None:
         controls(obstinate(fixed={which}))
 
 
-def test_ranges_are_found_out_and_left_as_they_were() -> None:
+def test_ranges_are_probed_and_values_restored() -> None:
     capture = obstinate()
     found = controls(capture)
     assert found.exposure_range_s == pytest.approx((0.0003, 0.2047))
@@ -281,7 +281,7 @@ def test_settings_are_rounded_to_the_devices_steps_and_read_back() -> None:
     assert (capture.get(cv2.CAP_PROP_EXPOSURE), capture.get(cv2.CAP_PROP_GAIN)) == (167, 20)
 
 
-def test_a_setting_that_is_taken_otherwise_is_refused() -> None:
+def test_a_setting_that_the_device_changes_is_refused() -> None:
     capture = obstinate()
     set_up = controls(capture)
     capture.ranges[cv2.CAP_PROP_EXPOSURE] = (3, 100)
@@ -293,7 +293,7 @@ def test_a_setting_that_is_taken_otherwise_is_refused() -> None:
         controls(obstinate(absent=[cv2.CAP_PROP_FOCUS]), focus=30.0)
 
 
-def test_a_camera_without_controls_has_what_it_has() -> None:
+def test_a_camera_without_controls_has_fixed_settings() -> None:
     capture = obstinate(absent=[cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_GAIN])
     found = controls(capture)
     assert (found.exposure_range_s, found.gain_range) == ((0.033, 0.033), (1.0, 1.0))

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.opencv import open_camera
 from drivers.opencv.camera import OpenCvCamera
-from drivers.opencv.options import Kind, source_of
+from drivers.opencv.options import SourceKind, parse_source
 from slrig.devices import AppliedSettings, CameraSettings, Trigger
 from slrig.errors import ConfigError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Pixels
@@ -24,36 +24,36 @@ LIVE = {"source_exposure_s": 0.01, "delay_s": 0.1, "frame_rate_hz": 30.0}
 @pytest.mark.parametrize(
     ("options", "kind", "backend"),
     [
-        ({"device": 0}, Kind.DEVICE, cv2.CAP_V4L2),
-        ({"device": "/dev/video0"}, Kind.DEVICE, cv2.CAP_V4L2),
+        ({"device": 0}, SourceKind.DEVICE, cv2.CAP_V4L2),
+        ({"device": "/dev/video0"}, SourceKind.DEVICE, cv2.CAP_V4L2),
         # Without its stamps, and through another back end.
-        ({"device": 0, "delay_s": 0.1, "frame_rate_hz": 30}, Kind.DEVICE, cv2.CAP_V4L2),
-        ({"device": 0, "backend": "ffmpeg", **LIVE}, Kind.LIVE, cv2.CAP_FFMPEG),
+        ({"device": 0, "delay_s": 0.1, "frame_rate_hz": 30}, SourceKind.DEVICE, cv2.CAP_V4L2),
+        ({"device": 0, "backend": "ffmpeg", **LIVE}, SourceKind.LIVE, cv2.CAP_FFMPEG),
     ],
 )
 def test_a_camera_is_opened_through_the_kernels_interface(
-    tmp_path: Path, options: dict[str, object], kind: Kind, backend: int
+    tmp_path: Path, options: dict[str, object], kind: SourceKind, backend: int
 ) -> None:
-    source = source_of("eye", options, tmp_path)
+    source = parse_source("eye", options, tmp_path)
     assert (source.kind, source.backend, source.target) == (kind, backend, options["device"])
     assert source.label == "/dev/video0"
 
 
 def test_an_address_is_a_live_source_and_its_password_is_not_shown(tmp_path: Path) -> None:
     url = "rtsp://admin:secret@camera.local:554/stream?key=secret"
-    source = source_of("eye", {"device": url, **LIVE}, tmp_path)
-    assert (source.kind, source.backend, source.target) == (Kind.LIVE, cv2.CAP_FFMPEG, url)
+    source = parse_source("eye", {"device": url, **LIVE}, tmp_path)
+    assert (source.kind, source.backend, source.target) == (SourceKind.LIVE, cv2.CAP_FFMPEG, url)
     assert source.label == "rtsp://camera.local:554/stream"
 
 
 def test_files_are_films_and_pipes_are_live(tmp_path: Path) -> None:
     (tmp_path / "film.avi").touch()
     os.mkfifo(tmp_path / "pipe.mjpeg")
-    film = source_of("eye", {"device": "film.avi", "source_exposure_s": 0.01}, tmp_path)
-    assert (film.kind, film.target) == (Kind.FILM, str(tmp_path / "film.avi"))
-    series = source_of("eye", {"device": "f/%03d.png", "source_exposure_s": 0.01, "frame_rate_hz": 10}, tmp_path)
-    assert (series.kind, series.backend) == (Kind.FILM, cv2.CAP_IMAGES)
-    assert source_of("eye", {"device": "pipe.mjpeg", **LIVE}, tmp_path).kind is Kind.LIVE
+    film = parse_source("eye", {"device": "film.avi", "source_exposure_s": 0.01}, tmp_path)
+    assert (film.kind, film.target) == (SourceKind.FILM, str(tmp_path / "film.avi"))
+    series = parse_source("eye", {"device": "f/%03d.png", "source_exposure_s": 0.01, "frame_rate_hz": 10}, tmp_path)
+    assert (series.kind, series.backend) == (SourceKind.FILM, cv2.CAP_IMAGES)
+    assert parse_source("eye", {"device": "pipe.mjpeg", **LIVE}, tmp_path).kind is SourceKind.LIVE
 
 
 @pytest.mark.parametrize(
@@ -65,11 +65,11 @@ def test_files_are_films_and_pipes_are_live(tmp_path: Path) -> None:
         ({"device": 0, "backend": "magic"}, "backend: expected auto or one of .*v4l2.*found 'magic'"),
         (
             {"device": "http://eye/video"},
-            r"(?s)frame_rate_hz: missing.*source_exposure_s: missing.*delay_s: missing.*No time stamps come from",
+            r"(?s)frame_rate_hz: missing.*source_exposure_s: missing.*delay_s: missing.*no time stamps",
         ),
         ({"device": "http://eye/video", **LIVE, "frame_rate_hz": 0}, "frame_rate_hz: .*greater than 0"),
         ({"device": 0, "delay_s": 0.1}, r"(?s)frame_rate_hz: missing.*With delay_s, time stamps are not used"),
-        ({"device": "film.avi"}, "(?s)source_exposure_s: missing.*how long each frame was exposed"),
+        ({"device": "film.avi"}, "(?s)source_exposure_s: missing.*the exposure of its frames"),
         ({"device": "film.avi", "source_exposure_s": 0.01, "delay_s": 0.1}, "delay_s"),
         ({"device": "%03d.png", "source_exposure_s": 0.01}, "frame_rate_hz: missing"),
         ({"device": "nothing.avi", "source_exposure_s": 0.01}, "nothing.avi.*No such file"),
@@ -81,7 +81,7 @@ def test_files_are_films_and_pipes_are_live(tmp_path: Path) -> None:
 def test_options_are_checked(tmp_path: Path, options: dict[str, object], words: str) -> None:
     (tmp_path / "film.avi").touch()
     with pytest.raises(ConfigError, match=words):
-        source_of("eye", options, tmp_path)
+        parse_source("eye", options, tmp_path)
 
 
 RATE_HZ = 100.0
@@ -122,7 +122,7 @@ def test_frames_come_in_order_at_the_films_times(tmp_path: Path) -> None:
     starts_ns = [frame.t_start_ns for frame in frames]
     assert np.diff(starts_ns) == pytest.approx(np.full(9, 1e9 / RATE_HZ), abs=1)
     assert {(frame.t_end_ns - frame.t_start_ns, frame.t_err_ns) for frame in frames} == {(8_000_000, 0)}
-    with pytest.raises(FrameTimeoutError, match="the film is over after 10 frames; arm"):
+    with pytest.raises(FrameTimeoutError, match="the film has ended after 10 frames; arm"):
         camera.read(0, 5)
 
 

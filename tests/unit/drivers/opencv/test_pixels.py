@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.opencv.pixels import Picture, decoded_picture, raw_picture
+from drivers.opencv.camera import FrameDecoder, image_decoder, raw_decoder
 from drivers.v4l2.formats import CorruptFrameError
 from slrig.model import CameraFormat, Pixels, Size
 
@@ -15,33 +15,33 @@ RAMP = np.arange(128, dtype=np.uint8).reshape(SIZE.shape)
 
 
 def test_raw_grey_of_any_depth_keeps_its_values() -> None:
-    assert np.array_equal(raw_picture("GREY", SIZE, None).grey(RAMP), RAMP)
+    assert np.array_equal(raw_decoder("GREY", SIZE, None).grey(RAMP), RAMP)
     deep = RAMP.astype(np.uint16) * 31
     for code, bit_depth in (("Y12 ", 12), ("Y16 ", 16)):
-        picture = raw_picture(code, SIZE, None)
+        picture = raw_decoder(code, SIZE, None)
         assert picture.format == CameraFormat(SIZE, bit_depth)
         assert np.array_equal(picture.grey(deep), deep)
-    assert raw_picture("Y16 ", SIZE, 12).format.bit_depth == 12
-    assert raw_picture("GREY", SIZE, 12).format.bit_depth == 8
+    assert raw_decoder("Y16 ", SIZE, 12).format.bit_depth == 12
+    assert raw_decoder("GREY", SIZE, 12).format.bit_depth == 8
 
 
 def test_mosaics_come_in_one_row_of_bytes() -> None:
     # As measured: OpenCV gives every format that it does not know as 1 x N bytes.
-    assert np.array_equal(raw_picture("RGGB", SIZE, None).grey(np.full((1, 128), 77, np.uint8)), np.full((8, 16), 77))
+    assert np.array_equal(raw_decoder("RGGB", SIZE, None).grey(np.full((1, 128), 77, np.uint8)), np.full((8, 16), 77))
     ten = np.full(128, 500, "<u2").view(np.uint8).reshape(1, -1)
-    picture = raw_picture("RG10", SIZE, None)
+    picture = raw_decoder("RG10", SIZE, None)
     assert picture.format.bit_depth == 10
     assert np.array_equal(picture.grey(ten), np.full((8, 16), 500))
 
 
 def test_decoded_colour_becomes_grey_without_loss() -> None:
-    picture = decoded_picture(cv2.cvtColor(RAMP, cv2.COLOR_GRAY2BGR), None)
-    assert picture == Picture(None, CameraFormat(SIZE, 8), has_colour=True)
+    picture = image_decoder(cv2.cvtColor(RAMP, cv2.COLOR_GRAY2BGR), None)
+    assert picture == FrameDecoder(None, CameraFormat(SIZE, 8), has_colour=True)
     assert np.array_equal(picture.grey(cv2.cvtColor(RAMP, cv2.COLOR_GRAY2BGR)), RAMP)
-    deep = decoded_picture(RAMP.astype(np.uint16) * 8, 10)
+    deep = image_decoder(RAMP.astype(np.uint16) * 8, 10)
     assert deep.format.bit_depth == 10
     with pytest.raises(CorruptFrameError, match="float"):
-        decoded_picture(RAMP.astype(np.float64), None)
+        image_decoder(RAMP.astype(np.float64), None)
 
 
 def jpeg() -> Pixels:
@@ -52,37 +52,45 @@ def jpeg() -> Pixels:
 
 def test_a_jpeg_is_whole_or_refused() -> None:
     data = jpeg()
-    picture = raw_picture("MJPG", SIZE, None)
+    picture = raw_decoder("MJPG", SIZE, None)
     padded = np.concatenate([data, np.zeros(40, np.uint8)])
     for whole in (data.reshape(1, -1), padded):
         assert np.abs(picture.grey(whole).astype(int) - RAMP).max() <= 2
     with pytest.raises(CorruptFrameError, match="JPEG"):
         picture.grey(data[: len(data) // 2])
     with pytest.raises(CorruptFrameError, match="16 x 8, expected 16 x 16"):
-        raw_picture("MJPG", Size(16, 16), None).grey(data)
+        raw_decoder("MJPG", Size(16, 16), None).grey(data)
 
 
 @pytest.mark.parametrize(
     ("picture", "image", "words"),
     [
-        (Picture(None, CameraFormat(SIZE, 8)), np.zeros((8, 15), np.uint8), "15 x 8, the camera's frames are 16 x 8"),
-        (Picture(None, CameraFormat(SIZE, 8)), np.zeros((8, 16), np.uint16), "uint16"),
-        (Picture(None, CameraFormat(SIZE, 12)), np.full((8, 16), 4096, np.uint16), "up to 4096, 12 bits end at 4095"),
-        (raw_picture("RG10", SIZE, None), np.zeros((1, 200), np.uint8), "bytes"),
+        (
+            FrameDecoder(None, CameraFormat(SIZE, 8)),
+            np.zeros((8, 15), np.uint8),
+            "15 x 8, the camera's frames are 16 x 8",
+        ),
+        (FrameDecoder(None, CameraFormat(SIZE, 8)), np.zeros((8, 16), np.uint16), "uint16"),
+        (
+            FrameDecoder(None, CameraFormat(SIZE, 12)),
+            np.full((8, 16), 4096, np.uint16),
+            "up to 4096, 12 bits end at 4095",
+        ),
+        (raw_decoder("RG10", SIZE, None), np.zeros((1, 200), np.uint8), "bytes"),
     ],
 )
-def test_frames_of_another_kind_are_refused(picture: Picture, image: Pixels, words: str) -> None:
+def test_frames_of_another_kind_are_refused(picture: FrameDecoder, image: Pixels, words: str) -> None:
     with pytest.raises(CorruptFrameError, match=words):
         picture.grey(image)
 
 
-def test_colour_comes_of_what_has_it() -> None:
+def test_formats_with_colour_give_colour() -> None:
     bgr = np.dstack([RAMP, RAMP // 2, 255 - RAMP])
-    assert np.array_equal(decoded_picture(bgr, None).colour(bgr), bgr)
-    assert raw_picture(None, SIZE, None).has_colour
-    assert not decoded_picture(RAMP, None).has_colour
-    assert not raw_picture("GREY", SIZE, None).has_colour
+    assert np.array_equal(image_decoder(bgr, None).colour(bgr), bgr)
+    assert raw_decoder(None, SIZE, None).has_colour
+    assert not image_decoder(RAMP, None).has_colour
+    assert not raw_decoder("GREY", SIZE, None).has_colour
     for code, sent in (("MJPG", jpeg()), ("YUYV", np.dstack([RAMP, np.full(SIZE.shape, 128, np.uint8)]))):
-        picture = raw_picture(code, SIZE, None)
+        picture = raw_decoder(code, SIZE, None)
         assert picture.has_colour
         assert np.array_equal(picture.colour(sent), cv2.cvtColor(picture.grey(sent), cv2.COLOR_GRAY2BGR))

@@ -9,10 +9,16 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from drivers.opencv.feeds import Taken
-from drivers.opencv.reader import Reader
-from drivers.opencv.timing import Arrivals, Grabbed, Sleep, by_stamp, is_of_this_clock
-from drivers.v4l2.timing import Exposure
+from drivers.opencv.feeds import (
+    ArrivalTiming,
+    FeedReader,
+    GrabbedFrame,
+    GrabTimes,
+    SleepMeter,
+    exposure_from_stamp,
+    is_monotonic_stamp,
+)
+from drivers.v4l2.timing import ExposureInterval
 from slrig.errors import DeviceGoneError
 
 LONG_S = 20.0
@@ -31,12 +37,12 @@ class ScriptedFeed:
     def begin(self) -> None:
         """Do nothing."""
 
-    def take(self, stop: threading.Event) -> Taken | None:
+    def take(self, stop: threading.Event) -> GrabbedFrame | None:
         # As OpenCV does, it takes no notice of who wants it to stop.
         del stop
         number = next(self.numbers, None)
         if number is not None:
-            return Taken(np.zeros((1, 1), np.uint8), None, number)
+            return GrabbedFrame(np.zeros((1, 1), np.uint8), None, number)
         self.waiting.set()
         assert self.go_on.wait(LONG_S)
         message = "unplugged"
@@ -55,7 +61,7 @@ def soon() -> int:
 
 def test_the_newest_frames_are_kept_in_order() -> None:
     feed = ScriptedFeed(20)
-    reader = Reader(feed, "reader")
+    reader = FeedReader(feed, "reader")
     reader.start()
     assert feed.waiting.wait(LONG_S)
     kept = [taken.number for taken in (reader.next(soon()) for _ in range(8)) if taken is not None]
@@ -70,10 +76,10 @@ def test_the_newest_frames_are_kept_in_order() -> None:
     assert feed.pauses == 1
 
 
-def test_a_source_that_does_not_return_is_left_to_its_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.opencv.reader._JOIN_S", 0.01)
+def test_a_source_that_does_not_return_is_released_by_its_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.opencv.feeds._JOIN_S", 0.01)
     feed = ScriptedFeed(1)
-    reader = Reader(feed, "reader")
+    reader = FeedReader(feed, "reader")
     reader.start()
     assert feed.waiting.wait(LONG_S)
     assert not reader.stop()
@@ -84,10 +90,10 @@ def test_a_source_that_does_not_return_is_left_to_its_thread(monkeypatch: pytest
     assert feed.released.wait(LONG_S)
 
 
-def test_starting_again_forgets_what_was_before() -> None:
+def test_starting_again_discards_earlier_frames() -> None:
     feed = ScriptedFeed(3)
     feed.go_on.set()
-    reader = Reader(feed, "reader")
+    reader = FeedReader(feed, "reader")
     reader.start()
     assert feed.waiting.wait(LONG_S)
     assert reader.stop()
@@ -106,63 +112,63 @@ MS = 1_000_000
 PERIOD_NS, EXPOSURE_NS, DELAY_NS = 20 * MS, 10 * MS, 30 * MS
 
 
-def arrivals() -> Arrivals:
-    return Arrivals(exposure_ns=EXPOSURE_NS, delay_ns=DELAY_NS, period_ns=PERIOD_NS)
+def arrivals() -> ArrivalTiming:
+    return ArrivalTiming(exposure_ns=EXPOSURE_NS, delay_ns=DELAY_NS, period_ns=PERIOD_NS)
 
 
-def waited(asked_ms: float, returned_ms: float, slept_ms: float | None = None) -> Grabbed:
+def waited(asked_ms: float, returned_ms: float, slept_ms: float | None = None) -> GrabTimes:
     slept = returned_ms - asked_ms if slept_ms is None else slept_ms
-    return Grabbed(round(asked_ms * MS), round(returned_ms * MS), round(slept * MS))
+    return GrabTimes(round(asked_ms * MS), round(returned_ms * MS), round(slept * MS))
 
 
-def test_a_stamp_may_name_either_end_of_the_exposure() -> None:
-    exposed = by_stamp(1000 * MS, waited(900, 2000), exposure_ns=EXPOSURE_NS, period_ns=PERIOD_NS)
+def test_a_stamp_may_mark_either_end_of_the_exposure() -> None:
+    exposed = exposure_from_stamp(1000 * MS, waited(900, 2000), exposure_ns=EXPOSURE_NS, period_ns=PERIOD_NS)
     # Of an end stamp: a read-out of one period before, and the exposure before that.
     assert exposed.earliest_ns == (1000 - 20 - 10) * MS
     # Of a start stamp: the last row ends a read-out later.
     assert exposed.latest_ns == (1000 + 20 + 10) * MS
     # What is in hand is over.
-    soon = by_stamp(1000 * MS, waited(990, 1005), exposure_ns=EXPOSURE_NS, period_ns=PERIOD_NS)
+    soon = exposure_from_stamp(1000 * MS, waited(990, 1005), exposure_ns=EXPOSURE_NS, period_ns=PERIOD_NS)
     assert soon.latest_ns == 1005 * MS
 
 
-def test_a_stamp_of_another_clock_gives_itself_away() -> None:
+def test_a_stamp_of_another_clock_is_detected() -> None:
     grabbed = waited(50_000, 50_010)
-    assert is_of_this_clock(50_001 * MS, grabbed)
-    assert not is_of_this_clock(1_700_000_000_000 * MS, grabbed)
-    assert not is_of_this_clock(0, grabbed)
+    assert is_monotonic_stamp(50_001 * MS, grabbed)
+    assert not is_monotonic_stamp(1_700_000_000_000 * MS, grabbed)
+    assert not is_monotonic_stamp(0, grabbed)
 
 
 def test_a_frame_that_was_waited_for_arrived_after_the_wait_began() -> None:
-    exposed = arrivals().exposed(waited(100, 118))
-    assert exposed == Exposure((100 - 30 - 10) * MS, 118 * MS)
+    exposed = arrivals().exposure(waited(100, 118))
+    assert exposed == ExposureInterval((100 - 30 - 10) * MS, 118 * MS)
 
 
-def test_frames_that_came_without_a_wait_are_as_old_as_the_last_wait() -> None:
+def test_queued_frames_may_be_as_old_as_the_last_wait() -> None:
     rule = arrivals()
-    assert rule.exposed(waited(100, 118)) is not None
+    assert rule.exposure(waited(100, 118)) is not None
     # The reader was held up for half a second; what comes then has been lying there.
     for step in range(25):
-        exposed = rule.exposed(waited(620 + step, 621 + step))
+        exposed = rule.exposure(waited(620 + step, 621 + step))
         assert exposed is not None
         assert exposed.earliest_ns == (100 - 30 - 10) * MS
     assert rule.queued == 26
     # The queue is empty again once it waits again.
-    fresh = rule.exposed(waited(650, 660))
+    fresh = rule.exposure(waited(650, 660))
     assert fresh is not None
     assert fresh.earliest_ns == (650 - 30 - 10) * MS
 
 
-def test_nothing_is_known_of_a_frame_before_the_first_wait() -> None:
+def test_the_exposure_is_unknown_before_the_first_wait() -> None:
     rule = arrivals()
-    assert rule.exposed(waited(100, 101)) is None
+    assert rule.exposure(waited(100, 101)) is None
     # Decoding, and waiting for a processor, are no waits for a frame.
-    assert rule.exposed(waited(101, 140, slept_ms=0.5)) is None
-    assert rule.exposed(waited(140, 155)) is not None
+    assert rule.exposure(waited(101, 140, slept_ms=0.5)) is None
+    assert rule.exposure(waited(140, 155)) is not None
 
 
-def test_time_asleep_is_measured_without_time_at_work() -> None:
-    sleep = Sleep()
+def test_time_asleep_excludes_time_on_the_processor() -> None:
+    sleep = SleepMeter()
     before_ns, awake_ns = time.monotonic_ns(), sleep.awake_ns()
     threading.Event().wait(0.05)
     slept_ns = time.monotonic_ns() - before_ns - (sleep.awake_ns() - awake_ns)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.display.projector import DisplayProjector
-from drivers.display.timing import Presented
-from drivers.screen import guarding, open_projector
+from drivers.display.projector import DisplayProjector, ScanoutStart
+from drivers.screen import guard as screen_guard
+from drivers.screen import open_projector
 from slrig.errors import DeviceStateError
 from slrig.model import Size
 from tests.contract.screen_bench import rig_options, sequence
@@ -59,9 +59,7 @@ def is_black(pixels: OutputPixels) -> bool:
     ("backend", "number"),
     [("x11", signal.SIGKILL), ("x11", signal.SIGTERM), ("x11", signal.SIGINT), ("sdl", signal.SIGKILL)],
 )
-def test_dark_when_the_process_is_killed_and_never_lit_by_what_is_below(
-    right: OutputPixels, backend: str, number: int
-) -> None:
+def test_the_output_is_black_when_the_process_is_killed(right: OutputPixels, backend: str, number: int) -> None:
     with started(backend, dark_after_s=1.5) as child:
         assert is_white(right)
         child.send_signal(number)
@@ -79,7 +77,7 @@ def test_dark_when_the_process_is_killed_and_never_lit_by_what_is_below(
         child.wait(FAR_S)
 
 
-def test_another_process_takes_the_output_over_from_the_guard_of_one_that_was_killed(right: OutputPixels) -> None:
+def test_another_process_takes_the_output_over_from_the_guard_of_a_killed_one(right: OutputPixels) -> None:
     with started("x11", dark_after_s=600) as child:
         child.kill()
         child.wait(FAR_S)
@@ -89,7 +87,7 @@ def test_another_process_takes_the_output_over_from_the_guard_of_one_that_was_ki
         projector.blank()
         assert is_black(right)
         projector.close()
-    guarding.release(None, RIGHT)
+    screen_guard.release_guard(None, RIGHT)
     # The first guard has left, too: nothing else would show the desktop now.
     assert until(lambda: is_white(right)) < FAR_S
 
@@ -98,19 +96,19 @@ def test_blank_from_another_thread_interrupts_a_show(right: OutputPixels, monkey
     projector = opened()
     projector.load(sequence(SIZE))
     darkening = threading.Thread(target=projector.blank)
-    present = projector._stage.show
+    present = projector._output.show
 
-    def darkened_meanwhile(index: int | None) -> Presented:
+    def darkened_meanwhile(index: int | None) -> ScanoutStart:
         presented = present(index)
         if index == WHITE:
             # The picture is there, and `show` has yet to return.
             assert is_white(right)
             darkening.start()
-            assert projector._darkened.wait(FAR_S)
+            assert projector._blanked.wait(FAR_S)
         return presented
 
-    monkeypatch.setattr(projector._stage, "show", darkened_meanwhile)
-    with pytest.raises(DeviceStateError, match="darkened from outside"):
+    monkeypatch.setattr(projector._output, "show", darkened_meanwhile)
+    with pytest.raises(DeviceStateError, match="blanked from outside"):
         projector.show(WHITE)
     darkening.join(FAR_S)
     assert is_black(right)
@@ -119,7 +117,7 @@ def test_blank_from_another_thread_interrupts_a_show(right: OutputPixels, monkey
 def test_the_guard_covers_a_window_whose_thread_hangs(right: OutputPixels) -> None:
     projector = lit(opened())
     hang = threading.Event()
-    stuck = threading.Thread(target=lambda: projector._thread.do(hang.wait, timeout_s=FAR_S))
+    stuck = threading.Thread(target=lambda: projector._thread.run(hang.wait, timeout_s=FAR_S))
     stuck.start()
     outside = threading.Thread(target=projector.blank)
     outside.start()
@@ -137,14 +135,14 @@ def test_the_guard_covers_a_window_whose_thread_hangs(right: OutputPixels) -> No
 
 def test_a_guard_that_is_killed_is_replaced_when_the_rig_is_opened_again(right: OutputPixels) -> None:
     opened().close()
-    _, guard = guarding._kept[(None, RIGHT)]
+    _, guard = screen_guard._guards[(None, RIGHT)]
     os.kill(guard._process.pid, signal.SIGKILL)
     until(lambda: is_white(right))
     assert not guard.cover()
     projector = lit(opened())
     projector.close()
     assert is_black(right)
-    assert guarding._kept[(None, RIGHT)][1] is not guard
+    assert screen_guard._guards[(None, RIGHT)][1] is not guard
 
 
 def test_the_guard_goes_where_its_output_goes_and_ends_with_it(server: DummyServer, right: OutputPixels) -> None:
@@ -158,7 +156,7 @@ def test_the_guard_goes_where_its_output_goes_and_ends_with_it(server: DummyServ
     until(lambda: is_white(left))
     moved.close()
     left.close()
-    _, guard = guarding._kept[(None, RIGHT)]
+    _, guard = screen_guard._guards[(None, RIGHT)]
     assert guard.is_alive
     server.run("xrandr", "--output", RIGHT, "--off")
     until(lambda: not guard.is_alive)

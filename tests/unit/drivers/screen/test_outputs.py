@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.screen import find_devices, open_projector, requests
-from drivers.screen.connection import Connection
+from drivers.screen import find_devices, open_projector, x11
+from drivers.screen.x11 import XConnection
 from slrig.devices import FoundDevice, Projector
 from slrig.errors import (
     DeviceBusyError,
@@ -50,8 +49,8 @@ def showing(**options: object) -> Iterator[Projector]:
 
 
 @contextmanager
-def client(server: DummyServer) -> Iterator[Connection]:
-    connection = Connection(server.display)
+def client(server: DummyServer) -> Iterator[XConnection]:
+    connection = XConnection(server.display)
     yield connection
     connection.close()
 
@@ -64,14 +63,12 @@ def awaited(condition: Callable[[], bool]) -> bool:
     return True
 
 
-def output_property(connection: Connection, output: str, name: str, value: str) -> None:
-    """Set a word as a property of an output, as graphics drivers do (RandR 1.3, requests 12 and 13)."""
-    resources = connection.ask(25, struct.pack("<I", connection.screen.root), extension="RANDR")
-    controllers, count = struct.unpack_from("<HH", resources, 16)
-    number = struct.unpack_from(f"<{count}I", resources, 32 + 4 * controllers)[int(output.removeprefix("DUMMY"))]
-    atom = requests.atom(connection, name)
-    body = struct.pack("<IIIBBxxI", number, atom, 4, 32, 0, 1)
-    connection.do(13, body + struct.pack("<I", requests.atom(connection, value)), extension="RANDR")
+def output_property(connection: XConnection, output: str, name: str, value: str) -> None:
+    """Set a word as a property of an output, as graphics drivers do."""
+    resources = connection.ask("GetScreenResourcesCurrent", connection.screen.root, extension="RANDR")
+    number, atom = resources.outputs[int(output.removeprefix("DUMMY"))], x11.atom(connection, name)
+    data = x11.atom(connection, value).to_bytes(4, "little")
+    connection.do("ChangeOutputProperty", number, atom, 4, 32, 0, 1, data, extension="RANDR")
 
 
 def test_outputs_are_found() -> None:
@@ -103,7 +100,7 @@ def test_no_session_has_no_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else "",
 )
-def test_an_output_that_is_set_otherwise_is_refused_and_mended_by_the_command_in_the_message(
+def test_an_inexact_output_is_refused_and_corrected_by_the_command_in_the_message(
     server: DummyServer, right: OutputPixels, command: tuple[str, str], words: str
 ) -> None:
     server.mode(RIGHT, Size(160, 120))
@@ -121,7 +118,7 @@ def test_an_output_that_is_set_otherwise_is_refused_and_mended_by_the_command_in
     opened().close()
 
 
-def test_an_output_that_is_panned_is_refused_and_mended_by_the_command_in_the_message(tmp_path: Path) -> None:
+def test_a_panned_output_is_refused_and_corrected_by_the_command_in_the_message(tmp_path: Path) -> None:
     # On a server of its own: some of it stays.
     with DummyServer(tmp_path) as panning, pytest.MonkeyPatch.context() as patch:
         patch.setenv("DISPLAY", panning.display)
@@ -134,7 +131,7 @@ def test_an_output_that_is_panned_is_refused_and_mended_by_the_command_in_the_me
         let_go(RIGHT)
 
 
-def test_what_the_graphics_driver_does_to_levels_is_read_from_its_properties(server: DummyServer) -> None:
+def test_changes_of_levels_are_read_from_the_graphics_drivers_properties(server: DummyServer) -> None:
     with client(server) as connection:
         output_property(connection, RIGHT, "Broadcast RGB", "Limited 16:235")
         with pytest.raises(UnsupportedByDeviceError, match="16 to 235"):
@@ -143,7 +140,7 @@ def test_what_the_graphics_driver_does_to_levels_is_read_from_its_properties(ser
     opened().close()
 
 
-def test_an_output_in_use_is_refused_with_the_process_that_holds_it(right: OutputPixels) -> None:
+def test_an_output_in_use_is_refused_with_its_process(right: OutputPixels) -> None:
     with showing() as projector:
         projector.show(0)
         with pytest.raises(DeviceBusyError, match=f"in use by process {os.getpid()} "):
@@ -185,7 +182,7 @@ def test_a_window_that_came_above_the_patterns_goes_below_them(
 ) -> None:
     with showing(backend=backend) as projector, client(server) as connection:
         projector.show(0)
-        requests.black_window(connection, SIZE.width_px, 0, SIZE)
+        x11.black_window(connection, SIZE.width_px, 0, SIZE)
         assert not right.colours().any()
         projector.show(0)
         assert right.colours().min() == 255
@@ -195,7 +192,7 @@ def test_pixels_that_are_not_the_patterns_are_found_once_per_sequence(
     right: OutputPixels, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with showing() as projector, monkeypatch.context() as patch:
-        patch.setattr("drivers.screen.present.fill_tiled", lambda *_: None)
+        patch.setattr("drivers.screen.output.fill_tiled", lambda *_: None)
         with pytest.raises(UnsupportedByDeviceError, match=r"of 12288 pixels are not the pattern's.*#ffffff was shown"):
             projector.show(0)
         assert not right.colours().any()
@@ -204,25 +201,25 @@ def test_pixels_that_are_not_the_patterns_are_found_once_per_sequence(
         assert right.colours().min() == 255
 
 
-def test_a_compositor_that_does_not_let_go_is_refused_unless_trusted(server: DummyServer) -> None:
+def test_a_compositor_that_redirects_the_window_is_refused_unless_trusted(server: DummyServer) -> None:
     with client(server) as connection:
-        connection.ask(0, struct.pack("<II", 0, 4), extension="Composite")
-        owner = requests.hidden_window(connection)
+        connection.ask("QueryVersion", 0, 4, extension="Composite")
+        owner = x11.hidden_window(connection)
         words = b"fancy effects"
-        name = requests.atom(connection, "_NET_WM_NAME")
-        connection.do(18, struct.pack("<IIIBxxxI", owner, name, 31, 8, len(words)) + words)
-        requests.take_selection(connection, requests.atom(connection, "_NET_WM_CM_S0"), owner, from_another=True)
-        connection.do(2, struct.pack("<IBxxx", connection.screen.root, 0), extension="Composite")
+        name = x11.atom(connection, "_NET_WM_NAME")
+        connection.do("ChangeProperty", 0, owner, name, 31, 8, len(words), words)
+        x11.take_selection(connection, x11.atom(connection, "_NET_WM_CM_S0"), owner, from_another=True)
+        connection.do("RedirectSubwindows", connection.screen.root, 0, extension="Composite")
         with pytest.raises(UnsupportedByDeviceError, match=r"drawn by a compositor \(fancy effects\)"), showing():
             pytest.fail(_NEVER)
         with showing(trust_compositor=True) as projector:
             projector.show(0)
 
 
-def test_the_server_does_not_blank_its_displays_meanwhile(server: DummyServer) -> None:
-    def is_saving(connection: Connection) -> bool:
-        reply = connection.ask(1, struct.pack("<I", connection.screen.root), extension="MIT-SCREEN-SAVER")
-        return reply[1] == 1
+def test_the_server_does_not_blank_its_displays(server: DummyServer) -> None:
+    def is_saving(connection: XConnection) -> bool:
+        info = connection.ask("QueryInfo", connection.screen.root, extension="MIT-SCREEN-SAVER")
+        return bool(info.state == 1)
 
     with client(server) as connection:
         server.run("xset", "s", "1", "1")

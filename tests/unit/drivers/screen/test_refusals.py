@@ -4,45 +4,53 @@ from __future__ import annotations
 
 import ctypes
 import importlib
-import struct
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
 
 from drivers.display.edid import Edid
-from drivers.screen import connection, find_devices, open_projector, power, sdl
-from drivers.screen.connection import XScreen
+from drivers.screen import find_devices, open_projector, sdl, x11
 from drivers.screen.options import ScreenOptions
-from drivers.screen.randr import IDENTITY, UPRIGHT, Mode, Output, Picture
-from drivers.screen.refusals import chosen, require_exact, require_true_colour
+from drivers.screen.randr import (
+    IDENTITY,
+    UPRIGHT,
+    CrtcConfig,
+    Output,
+    XMode,
+    find_output,
+    require_exact,
+    require_true_colour,
+)
+from drivers.screen.x11 import DisplayWakeLock, XScreen
 from slrig.errors import ConfigError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import Size
 from tests.contract.screen_bench import sequence
 
-NATIVE = Mode(1, Size(1280, 800), 1 / 60)
+NATIVE = XMode(1, Size(1280, 800), 1 / 60)
 RAMP = np.tile(np.linspace(0, 65535, 256).round().astype(np.uint16), (3, 1))
-PICTURE = Picture(7, 1920, 0, NATIVE.size, NATIVE, UPRIGHT, IDENTITY, (0, 0, 0, 0), RAMP, ("HDMI-1",))
-OUTPUT = Output("HDMI-1", True, (NATIVE,), PICTURE, Edid("EPS", "PJ 720", "1"))
-DESK = Mode(2, Size(1920, 1080), 1 / 60)
+CRTC = CrtcConfig(7, 1920, 0, NATIVE.size, NATIVE, UPRIGHT, IDENTITY, (0, 0, 0, 0), RAMP, ("HDMI-1",))
+OUTPUT = Output("HDMI-1", True, (NATIVE,), CRTC, Edid("EPS", "PJ 720", "1"))
+DESK = XMode(2, Size(1920, 1080), 1 / 60)
 DESKTOP = Output(
-    "eDP-1", True, (DESK,), replace(PICTURE, controller=6, x=0, size=DESK.size, mode=DESK, outputs=("eDP-1",))
+    "eDP-1", True, (DESK,), replace(CRTC, controller=6, x=0, size=DESK.size, mode=DESK, outputs=("eDP-1",))
 )
 
 
 def shown(**changes: Any) -> Output:
-    return replace(OUTPUT, picture=replace(PICTURE, **changes))
+    return replace(OUTPUT, crtc=replace(CRTC, **changes))
 
 
 def ctm(*values: int) -> Output:
     return replace(OUTPUT, properties={"CTM": values})
 
 
-OFF = replace(OUTPUT, picture=None)
+OFF = replace(OUTPUT, crtc=None)
 BENT = (65535 * np.linspace(0, 1, 256) ** 0.9).astype(np.uint16)
 SHARED = "eDP-1 shows the same part of the screen; xrandr --output HDMI-1 --right-of eDP-1"
 
@@ -62,7 +70,7 @@ SHARED = "eDP-1 shows the same part of the screen; xrandr --output HDMI-1 --righ
         (OUTPUT, {"native": Size(854, 480)}, ("raster is 854 x 480 (the rig file's native_px)", "--mode 854x480")),
         (replace(OUTPUT, preferred=()), {}, ("write native_px = [width, height]",)),
         (shown(mode=replace(NATIVE, interlaced=True)), {}, ("every other row is late",)),
-        (shown(mode=replace(NATIVE, refresh_s=None)), {}, ("does not tell the time of a frame",)),
+        (shown(mode=replace(NATIVE, refresh_s=None)), {}, ("does not state the duration of a frame",)),
         (shown(rotation=2), {}, ("turned left", "--rotate normal --reflect normal")),
         (shown(rotation=4), {}, ("turned upside down",)),
         (shown(rotation=1 | 16), {}, ("mirrored in x",)),
@@ -98,7 +106,7 @@ SHARED = "eDP-1 shows the same part of the screen; xrandr --output HDMI-1 --righ
         (shown(mode=DESK, size=DESK.size, rotation=2, gamma=RAMP // 2), {}, ("raster", "turned left", "gamma")),
     ],
 )
-def test_what_would_change_a_picture_is_refused_with_the_command_that_mends_it(
+def test_faults_of_an_output_are_refused_with_the_command_that_corrects_them(
     output: Output, wanted: dict[str, Any], words: tuple[str, ...]
 ) -> None:
     with pytest.raises(UnsupportedByDeviceError) as caught:
@@ -121,25 +129,25 @@ def test_what_would_change_a_picture_is_refused_with_the_command_that_mends_it(
     ],
 )
 @pytest.mark.parametrize(("native", "monitor"), [(None, "PJ 720"), (NATIVE.size, "EPS PJ 720"), (None, None)])
-def test_an_exact_output_is_taken(output: Output, native: Size | None, monitor: str | None) -> None:
-    assert require_exact(output, (DESKTOP, output), native=native, monitor=monitor) is output.picture
+def test_an_exact_output_is_accepted(output: Output, native: Size | None, monitor: str | None) -> None:
+    assert require_exact(output, (DESKTOP, output), native=native, monitor=monitor) is output.crtc
 
 
 def test_an_output_is_chosen_by_its_name_alone() -> None:
     unplugged = Output("DP-2", False, (), None)
-    assert chosen((DESKTOP, OUTPUT, unplugged), "HDMI-1") is OUTPUT
+    assert find_output((DESKTOP, OUTPUT, unplugged), "HDMI-1") is OUTPUT
     there = r"eDP-1 \(1920 x 1080 at 60.00 Hz\); HDMI-1 \(EPS PJ 720, 1280 x 800 at 60.00 Hz\)"
     with pytest.raises(DeviceGoneError, match=f"DP-2: nothing is connected to it; connected are: {there}"):
-        chosen((DESKTOP, OUTPUT, unplugged), "DP-2")
-    with pytest.raises(UnsupportedByDeviceError, match=f"HDMI-A-1: there is none of that name; connected are: {there}"):
-        chosen((DESKTOP, OUTPUT, unplugged), "HDMI-A-1")
+        find_output((DESKTOP, OUTPUT, unplugged), "DP-2")
+    with pytest.raises(UnsupportedByDeviceError, match=f"HDMI-A-1: no output has that name; connected are: {there}"):
+        find_output((DESKTOP, OUTPUT, unplugged), "HDMI-A-1")
 
 
 @pytest.mark.parametrize(
     "changes", [{"depth": 30, "colour_masks": (0x3FF00000, 0xFFC00, 0x3FF)}, {"depth": 16, "bits_per_pixel": 16}]
 )
 def test_a_screen_without_8_bits_per_colour_is_refused(changes: dict[str, Any]) -> None:
-    usual = XScreen(1, 2, 24, 100, 100, (0xFF0000, 0xFF00, 0xFF), 32, True)
+    usual = XScreen(1, 24, 100, 100, (0xFF0000, 0xFF00, 0xFF), 32, True)
     require_true_colour(usual)
     with pytest.raises(UnsupportedByDeviceError, match="DefaultDepth 24"):
         require_true_colour(replace(usual, **changes))
@@ -171,45 +179,44 @@ class PowerManaged:
     def has(self, extension: str) -> bool:
         return extension == "DPMS"
 
-    def ask(self, opcode: int, body: bytes = b"", *, extension: str | None = None) -> bytes:
-        del body
+    def ask(self, request: str, *, extension: str | None = None) -> SimpleNamespace:
         if extension == "DPMS":
-            assert opcode == 7
-            return bytes(8) + struct.pack("<HB", self.level, self.enabled) + bytes(21)
-        assert opcode == 108
-        return bytes(8) + struct.pack("<HHBB", self.timeout_s, 600, 1, 1) + bytes(18)
+            assert request == "Info"
+            return SimpleNamespace(power_level=self.level, state=self.enabled)
+        assert request == "GetScreenSaver"
+        return SimpleNamespace(timeout=self.timeout_s, interval=600, prefer_blanking=1, allow_exposures=1)
 
-    def do(self, opcode: int, body: bytes = b"", *, data: int = 0, extension: str | None = None) -> None:
-        if extension == "DPMS" and opcode == 6:
-            (self.level,) = struct.unpack_from("<H", body)
+    def do(self, request: str, *arguments: int, extension: str | None = None) -> None:
+        if extension == "DPMS" and request == "ForceLevel":
+            (self.level,) = arguments
         elif extension == "DPMS":
-            self.enabled = opcode == 4
-        elif opcode == 107:
-            (self.timeout_s,) = struct.unpack_from("<h", body)
+            self.enabled = {"Enable": True, "Disable": False}[request]
+        elif request == "SetScreenSaver":
+            self.timeout_s = arguments[0]
         else:
-            assert (opcode, data) == (115, 0)
+            assert (request, *arguments) == ("ForceScreenSaver", 0)
 
 
-def test_displays_that_sleep_are_woken_kept_awake_and_allowed_to_sleep_again() -> None:
+def test_displays_are_woken_kept_awake_and_released() -> None:
     server = PowerManaged(level=3)
-    waking = power.Waking(server)  # type: ignore[arg-type]
+    waking = DisplayWakeLock(server)  # type: ignore[arg-type]
     assert (server.level, server.enabled, server.timeout_s) == (0, False, 0)
     waking.require_awake()
     server.level = 2
     with pytest.raises(UnsupportedByDeviceError, match=r"put to sleep \(suspended\)"):
         waking.require_awake()
-    waking.end()
+    waking.release()
     assert (server.enabled, server.timeout_s) == (True, 600)
 
 
 def test_a_missing_library_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DISPLAY", ":0")
-    connection._library.cache_clear()
-    monkeypatch.setattr("ctypes.CDLL", mock.Mock(side_effect=OSError))
+    x11._import_xcffib.cache_clear()
+    monkeypatch.setitem(sys.modules, "xcffib", None)
     for attempt in (lambda: open_projector({"output": "HDMI-1"}, Path()), find_devices):
         with pytest.raises(LibraryMissingError) as caught:
             attempt()
-        assert caught.value.install == "apt install libxcb1"
+        assert caught.value.install == "apt install libxcb1 && pip install 'slrig[screen]'"
 
 
 @pytest.fixture
@@ -279,9 +286,9 @@ def test_a_display_of_another_name_or_size_is_refused() -> None:
 def test_two_displays_of_one_name_are_refused() -> None:
     twins = [("PJ", Size(1280, 800), 60)] * 2
     with pytest.raises(UnsupportedByDeviceError, match="2 displays are of that name"):
-        sdl._chosen(twins, ScreenOptions(output="PJ"))
-    with pytest.raises(UnsupportedByDeviceError, match="does not tell its refresh rate"):
-        sdl._chosen([("PJ", Size(1280, 800), 0)], ScreenOptions(output="PJ"))
+        sdl._choose_display(twins, ScreenOptions(output="PJ"))
+    with pytest.raises(UnsupportedByDeviceError, match="does not state its refresh rate"):
+        sdl._choose_display([("PJ", Size(1280, 800), 0)], ScreenOptions(output="PJ"))
 
 
 def test_a_missing_library_of_sdl_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,7 +297,7 @@ def test_a_missing_library_of_sdl_is_named_with_the_command(monkeypatch: pytest.
 
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
-    sdl._library.cache_clear()
+    sdl._import_sdl.cache_clear()
     monkeypatch.setattr(importlib, "import_module", lacking)
     with pytest.raises(LibraryMissingError) as opening:
         open_projector(table("PJ"), Path())

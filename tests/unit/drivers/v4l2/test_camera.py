@@ -55,16 +55,16 @@ def armed(device: VirtualDevice, settings: CameraSettings | None = None, **optio
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"pixel_format": "MJPG"}, "asked MJPG 80 x 60, driver gives YUYV 80 x 60; it offers YUYV, Y10"),
-        ({"pixel_format": "Y10", "size_px": [1280, 720]}, "asked Y10 1280 x 720, driver gives Y10 80 x 60"),
-        ({"frame_rate_hz": 60.0}, "asked 60 frames per second, driver gives 50"),
+        ({"pixel_format": "MJPG"}, "requested MJPG 80 x 60, driver gives YUYV 80 x 60; it offers YUYV, Y10"),
+        ({"pixel_format": "Y10", "size_px": [1280, 720]}, "requested Y10 1280 x 720, driver gives Y10 80 x 60"),
+        ({"frame_rate_hz": 60.0}, "requested 60 frames per second, driver gives 50"),
         ({"bit_depth": 9}, "Y10 has 10 bits"),
         ({"controls": {"brightness": 3, "gama": 1}}, "control 'gama', the device has: auto_exposure, backlight"),
         ({"skip_controls": ["sharpnes"]}, r"control 'sharpnes', the device has: auto_exposure, .*sharpness"),
-        ({"device": "/dev/null"}, "no video device"),
+        ({"device": "/dev/null"}, "is not a video device"),
     ],
 )
-def test_an_option_that_the_device_does_not_take_is_refused(
+def test_options_that_the_device_does_not_support_are_refused(
     plugged: Plug, options: dict[str, object], words: str
 ) -> None:
     device = plugged(Faked(formats={"YUYV": SIZES, "Y10 ": SIZES}))
@@ -74,10 +74,10 @@ def test_an_option_that_the_device_does_not_take_is_refused(
     device.open_camera()
 
 
-def test_a_control_that_takes_another_value_is_refused(plugged: Plug) -> None:
+def test_a_control_that_keeps_another_value_is_refused(plugged: Plug) -> None:
     camera = plugged(Faked(controls=changed("Exposure Time, Absolute", insists_on=100))).open_camera(**FAST)
     assert camera.configure(CameraSettings(0.01)).exposure_s == pytest.approx(0.01)
-    with pytest.raises(UnsupportedByDeviceError, match="asked exposure_time_absolute = 20, driver gives 100"):
+    with pytest.raises(UnsupportedByDeviceError, match="requested exposure_time_absolute = 20, driver gives 100"):
         camera.configure(CameraSettings(0.002))
 
 
@@ -104,7 +104,7 @@ SLOW, FULL, SMALL = ((1, 5),), (160, 120), (80, 60)
         ({"YUYV": [FULL, SMALL]}, ["YUYV 160 x 120"], "YUYV", SMALL),
     ],
 )
-def test_without_options_the_best_format_that_is_fast_is_taken(
+def test_without_options_the_best_fast_format_is_used(
     plugged: Plug, formats: dict[str, list[tuple[int, int]]], slow: list[str], code: str, taken: tuple[int, int]
 ) -> None:
     device = plugged(Faked(formats=formats, rates=((1, 30),), rates_of=dict.fromkeys(slow, SLOW)))
@@ -158,7 +158,7 @@ def test_the_frame_period_is_measured(
     assert camera.period_ns == pytest.approx(period_ns, rel=0.02)
 
 
-def test_a_device_that_does_not_tell_its_frame_rate_needs_it_as_an_option(plugged: Plug) -> None:
+def test_a_device_without_a_frame_rate_needs_it_as_an_option(plugged: Plug) -> None:
     with pytest.raises(UnsupportedByDeviceError, match="write frame_rate_hz"):
         plugged(Faked(tells_rate=False)).open_camera()
 
@@ -246,11 +246,11 @@ def test_options_overrule_what_the_driver_sets(plugged: Plug) -> None:
     assert known["Sharpness"] == 2
     assert not known.keys() & {"Backlight Compensation", "Gain"}
     assert camera.info.gain_range == (1.0, 1.0)
-    with pytest.raises(ConfigError, match="sharpness: named in controls, to be set, and in skip_controls"):
+    with pytest.raises(ConfigError, match="sharpness: named in controls, to set, and in skip_controls"):
         device.open_camera(controls={"sharpness": 2}, skip_controls=["sharpness"])
 
 
-def test_no_value_of_an_unknown_unit_is_guessed(plugged: Plug) -> None:
+def test_values_of_unknown_unit_are_not_guessed(plugged: Plug) -> None:
     noise = control(0x0A046D01, "Noise Reduction", 0, 2, 0, kind=3)
     device = plugged(Faked(controls=(*changed("Gamma", minimum=1, maximum=10, default=5), noise)))
     gamma, menu = device.open_camera(**FAST).info.notes
@@ -268,7 +268,7 @@ def test_a_control_that_fails_and_is_not_needed_is_noted(plugged: Plug, number: 
     device = plugged(Faked(controls=changed("Sharpness", stalls=["set"], errno=number)))
     camera = device.open_camera(**FAST)
     [note] = camera.info.notes
-    assert "asked sharpness = 0, the driver refuses it" in note
+    assert "requested sharpness = 0, the driver refuses it" in note
     assert 'skip_controls = ["sharpness"]' in note
     camera.close()
     assert device.open_camera(**FAST, skip_controls=["sharpness"]).info.notes == ()
@@ -277,7 +277,7 @@ def test_a_control_that_fails_and_is_not_needed_is_noted(plugged: Plug, number: 
 @pytest.mark.parametrize("request_", ["set", "get"])
 def test_a_control_that_fails_and_is_needed_is_refused(plugged: Plug, request_: str) -> None:
     device = plugged(Faked(controls=changed("Auto Exposure", stalls=[request_], errno=errno.EIO)))
-    with pytest.raises(UnsupportedByDeviceError, match=r'still there; skip_controls = \["auto_exposure"\]'):
+    with pytest.raises(UnsupportedByDeviceError, match=r'still connected; skip_controls = \["auto_exposure"\]'):
         device.open_camera(**FAST)
 
 
@@ -329,7 +329,7 @@ def test_settings_have_taken_effect_when_the_camera_is_armed(plugged: Plug) -> N
         camera.disarm()
 
 
-def test_a_known_read_out_narrows_the_claim(plugged: Plug) -> None:
+def test_a_known_read_out_narrows_the_interval(plugged: Plug) -> None:
     device = plugged(Faked(stamp="end", readout_s=0.001))
     errors_ns = []
     options: dict[str, Any]
@@ -340,7 +340,7 @@ def test_a_known_read_out_narrows_the_claim(plugged: Plug) -> None:
     assert errors_ns[1] < errors_ns[0] / 4
 
 
-def test_corrupt_frames_are_passed_over_and_counted(plugged: Plug) -> None:
+def test_corrupt_frames_are_skipped_and_counted(plugged: Plug) -> None:
     stage = virtually()
     stage.show(WHITE)
     camera = armed(plugged(Faked(corrupt=0.5), stage), **UNHURRIED)
@@ -376,10 +376,10 @@ def test_lost_frames_are_counted_and_idle_ones_are_not(plugged: Plug) -> None:
     assert later.dropped_count == 0
 
 
-def test_a_read_that_times_out_says_what_it_passed_over(plugged: Plug) -> None:
+def test_a_timeout_reports_the_skipped_frames(plugged: Plug) -> None:
     device = plugged()
     camera = armed(device)
-    with pytest.raises(FrameTimeoutError, match=r"passed over: [1-9]\d* stale, 0 corrupt, 0 repeated"):
+    with pytest.raises(FrameTimeoutError, match=r"skipped: [1-9]\d* stale, 0 corrupt, 0 repeated"):
         camera.read(device.clock.now_ns() + 10**12, 0.1)
     device.fault("silent")
     with pytest.raises(FrameTimeoutError, match="0 corrupt"):
@@ -391,7 +391,7 @@ def test_a_read_that_times_out_says_what_it_passed_over(plugged: Plug) -> None:
 # ---- faults
 
 
-def test_a_camera_that_another_program_holds_is_busy(plugged: Plug) -> None:
+def test_a_camera_in_use_by_another_program_is_busy(plugged: Plug) -> None:
     device = plugged()
     camera = device.open_camera()
     with pytest.raises(DeviceBusyError, match=r"/dev/video0: .*fuser"):
@@ -411,7 +411,7 @@ def test_a_camera_that_another_program_holds_is_busy(plugged: Plug) -> None:
         ("silent", FrameTimeoutError, "0 of the first 2 frames"),
     ],
 )
-def test_a_stream_that_does_not_begin_is_refused_and_may_begin_later(
+def test_a_stream_that_does_not_start_is_refused_and_may_start_later(
     plugged: Plug, fault: str, kind: type[DeviceError], words: str
 ) -> None:
     device = plugged()
@@ -426,7 +426,7 @@ def test_a_stream_that_does_not_begin_is_refused_and_may_begin_later(
 
 @pytest.mark.parametrize("fault", ["unplugged", "dead"])
 @pytest.mark.parametrize("waits", [False, True])
-def test_a_camera_that_is_gone_says_so_at_every_step(plugged: Plug, fault: str, waits: bool) -> None:
+def test_an_unplugged_camera_is_reported_at_every_step(plugged: Plug, fault: str, waits: bool) -> None:
     device = plugged()
     camera = armed(device)
     now_ns = device.clock.now_ns()
@@ -461,7 +461,7 @@ def test_closing_from_another_thread_ends_a_read(plugged: Plug) -> None:
     device.open_camera()
 
 
-def test_a_node_that_gives_no_frames_is_refused(plugged: Plug) -> None:
+def test_a_node_without_frames_is_refused(plugged: Plug) -> None:
     device = plugged(Faked(nodes={"video0": {"capabilities": 0x04A00000}}))
-    with pytest.raises(UnsupportedByDeviceError, match="gives no frames"):
+    with pytest.raises(UnsupportedByDeviceError, match="has no frames"):
         device.open_camera()

@@ -12,9 +12,8 @@ import pytest
 
 from drivers.v4l2 import controls as ctl
 from drivers.v4l2 import kernel
-from drivers.v4l2.controls import Control
+from drivers.v4l2.controls import Control, ExposureScale, GainScale
 from drivers.v4l2.options import V4L2Options
-from drivers.v4l2.scales import ExposureScale, GainScale
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 
 NODE = Path("/dev/video7")
@@ -45,9 +44,9 @@ def names(steps: tuple[tuple[Control, int], ...]) -> list[tuple[str, int]]:
     return [(control.name, value) for control, value in steps]
 
 
-def test_automatics_are_off_before_what_they_govern_is_set() -> None:
+def test_automatic_controls_are_off_before_manual_values_are_set() -> None:
     asked = options(focus=30, controls={"gamma": 100})
-    assert names(ctl.in_order(webcam(), asked, exposure_units=167, gain_units=16, node=NODE)) == [
+    assert names(ctl.ordered_settings(webcam(), asked, exposure_units=167, gain_units=16, node=NODE)) == [
         ("auto_exposure", 1),
         ("exposure_time_absolute", 167),
         ("gain_automatic", 0),
@@ -61,27 +60,27 @@ def test_automatics_are_off_before_what_they_govern_is_set() -> None:
 
 
 def test_a_device_without_controls_needs_none() -> None:
-    assert ctl.in_order({}, options(), exposure_units=None, gain_units=None, node=NODE) == ()
+    assert ctl.ordered_settings({}, options(), exposure_units=None, gain_units=None, node=NODE) == ()
     filtering = {ctl.POWER_LINE_FREQUENCY: Control(ctl.POWER_LINE_FREQUENCY, "power_line_frequency", 1, 2, 1, 0)}
-    assert ctl.in_order(filtering, options(), exposure_units=None, gain_units=None, node=NODE) == ()
+    assert ctl.ordered_settings(filtering, options(), exposure_units=None, gain_units=None, node=NODE) == ()
 
 
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"focus": 900}, "asked focus_absolute = 900, the device takes 0 to 250"),
-        ({"controls": {"gamma": 3}}, "asked gamma = 3, the device takes 72 to 500"),
+        ({"focus": 900}, "requested focus_absolute = 900, the device accepts 0 to 250"),
+        ({"controls": {"gamma": 3}}, "requested gamma = 3, the device accepts 72 to 500"),
     ],
 )
-def test_what_a_device_cannot_take_is_refused(more: dict[str, object], words: str) -> None:
+def test_values_out_of_range_are_refused(more: dict[str, object], words: str) -> None:
     with pytest.raises(UnsupportedByDeviceError, match=words):
-        ctl.in_order(webcam(), options(**more), exposure_units=None, gain_units=None, node=NODE)
+        ctl.ordered_settings(webcam(), options(**more), exposure_units=None, gain_units=None, node=NODE)
     with pytest.raises(UnsupportedByDeviceError, match="'focus'"):
-        ctl.in_order({}, options(focus=3), exposure_units=None, gain_units=None, node=NODE)
+        ctl.ordered_settings({}, options(focus=3), exposure_units=None, gain_units=None, node=NODE)
 
 
 @pytest.mark.parametrize(("asked", "units"), [(16.7, 17), (0, 3), (9999, 2047), (3.4, 3)])
-def test_a_value_goes_to_the_devices_grid(asked: float, units: int) -> None:
+def test_values_are_rounded_to_the_devices_grid(asked: float, units: int) -> None:
     assert webcam()[ctl.EXPOSURE_ABSOLUTE].nearest(asked) == units
     assert webcam()[ctl.FOCUS_ABSOLUTE].nearest(13) == 15
 
@@ -124,17 +123,17 @@ def test_gain_in_the_devices_numbers(
         (errno.ENOMEM, DeviceError, "dmesg"),
     ],
 )
-def test_a_refusal_tells_what_to_do(number: int, kind: type[DeviceError], words: str) -> None:
-    found = kernel.fault(NODE, "starting the stream", OSError(number, os.strerror(number)))
+def test_error_messages_say_what_to_do(number: int, kind: type[DeviceError], words: str) -> None:
+    found = kernel.device_error(NODE, "starting the stream", OSError(number, os.strerror(number)))
     assert type(found) is kind
     assert words in str(found)
     assert str(found).startswith("/dev/video7: starting the stream: ")
 
 
-def test_only_a_streams_fault_says_that_the_stream_has_died() -> None:
+def test_only_faults_of_streams_report_a_dead_stream() -> None:
     broken = OSError(errno.EIO, os.strerror(errno.EIO))
-    assert type(kernel.stream_fault(NODE, "taking a frame", broken)) is DeviceGoneError
-    assert type(kernel.stream_fault(NODE, "taking a frame", OSError(errno.ENOMEM, "memory"))) is DeviceError
+    assert type(kernel.stream_error(NODE, "taking a frame", broken)) is DeviceGoneError
+    assert type(kernel.stream_error(NODE, "taking a frame", OSError(errno.ENOMEM, "memory"))) is DeviceError
 
 
 def test_a_program_that_holds_a_device_is_named(tmp_path: Path) -> None:
@@ -146,7 +145,7 @@ def test_a_program_that_holds_a_device_is_named(tmp_path: Path) -> None:
     ) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "open\n"
-        message = str(kernel.fault(node, "opening", OSError(errno.EBUSY, "busy")))
+        message = str(kernel.device_error(node, "opening", OSError(errno.EBUSY, "busy")))
         holder.communicate()
     assert f"({holder.pid})" in message
-    assert kernel.holders_of(node) == ()
+    assert kernel.list_holders(node) == ()

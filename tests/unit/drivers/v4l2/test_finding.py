@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.v4l2.finding import Identity, asked, found_devices, nodes, resolved
+from drivers.v4l2.finding import NodeIdentity, list_nodes, probe_node, resolve_node
 from slrig.errors import DeviceGoneError
 
 
@@ -17,7 +17,7 @@ class Machine:
         self.sysfs, self.dev = root / "sys" / "class" / "video4linux", root / "dev"
         self.sysfs.mkdir(parents=True)
         self.devices = root / "sys" / "devices"
-        self.identities: dict[str, Identity | None] = {}
+        self.identities: dict[str, NodeIdentity | None] = {}
 
     def plug(
         self,
@@ -42,7 +42,7 @@ class Machine:
         (self.sysfs / name).symlink_to(folder)
         self.dev.mkdir(exist_ok=True)
         (self.dev / name).touch()
-        self.identities[name] = Identity("Bench camera", more.get("bus", f"usb-{port}"), captures)
+        self.identities[name] = NodeIdentity("Bench camera", more.get("bus", f"usb-{port}"), captures)
         for kind in ("id", "path"):
             if f"by_{kind}" in more:
                 link = self.dev / "v4l" / f"by-{kind}" / more[f"by_{kind}"]
@@ -50,14 +50,14 @@ class Machine:
                 link.unlink(missing_ok=True)
                 link.symlink_to(self.dev / name)
 
-    def ask(self, path: Path) -> Identity | None:
+    def ask(self, path: Path) -> NodeIdentity | None:
         return self.identities[path.name]
 
     def names(self) -> list[str]:
-        return [node.name for node in nodes(self.sysfs, self.dev, self.ask)]
+        return [node.name for node in list_nodes(self.sysfs, self.dev, self.ask)]
 
     def resolved(self, device: str) -> Path:
-        return resolved(device, self.dev, lambda: nodes(self.sysfs, self.dev, self.ask)).path
+        return resolve_node(device, self.dev, lambda: list_nodes(self.sysfs, self.dev, self.ask)).path
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def test_cameras_that_share_a_serial_number_are_named_by_their_port(machine: Mac
     assert machine.names() == ["pci-2-video-index0", "pci-3-video-index0"]
 
 
-def test_nodes_of_one_parent_have_names_of_their_own(machine: Machine) -> None:
+def test_nodes_of_one_parent_have_different_names(machine: Machine) -> None:
     # Two nodes of one platform device get one by-path name; what their driver calls their bus differs.
     machine.plug("video0", port="vivid.0", by_path="platform-vivid.0-video-index0", bus="platform:vivid-000")
     machine.plug("video4", port="vivid.0/b", by_path="platform-vivid.0-video-index0", bus="platform:vivid-001")
@@ -108,23 +108,23 @@ def test_nodes_of_one_parent_have_names_of_their_own(machine: Machine) -> None:
 def test_a_node_that_may_not_be_opened_is_listed_with_the_remedy(machine: Machine) -> None:
     machine.plug("video0", by_path=BY_PATH)
     machine.identities["video0"] = None
-    (found,) = found_devices(nodes(machine.sysfs, machine.dev, machine.ask))
-    assert (found.driver, found.device) == ("v4l2", BY_PATH)
-    assert "usermod -aG video" in found.label
+    (found,) = list_nodes(machine.sysfs, machine.dev, machine.ask)
+    assert found.name == BY_PATH
+    assert "usermod -aG video" in found.note
 
 
-def test_what_is_gone_or_no_video_device_is_no_camera(tmp_path: Path) -> None:
+def test_missing_and_other_devices_are_not_cameras(tmp_path: Path) -> None:
     for path in (tmp_path / "video0", Path("/dev/null")):
-        identity = asked(path)
+        identity = probe_node(path)
         assert identity is not None
         assert not identity.captures
 
 
 def test_a_machine_without_cameras_has_none(tmp_path: Path) -> None:
-    assert nodes(tmp_path / "none", tmp_path) == ()
+    assert list_nodes(tmp_path / "none", tmp_path) == ()
 
 
-def test_a_missing_camera_is_refused_with_a_list_of_those_that_are_there(machine: Machine) -> None:
+def test_a_missing_camera_is_refused_with_a_list_of_connected_ones(machine: Machine) -> None:
     machine.plug("video0", by_path=BY_PATH)
     with pytest.raises(DeviceGoneError, match=f"usb-other.*{BY_PATH}"):
         machine.resolved("usb-other")

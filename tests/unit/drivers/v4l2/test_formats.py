@@ -12,11 +12,11 @@ from drivers.v4l2.formats import (
     LAYOUTS,
     PREFERRED,
     CorruptFrameError,
-    Layout,
-    Packing,
+    PixelLayout,
+    SamplePacking,
     colour_image,
     grey_image,
-    least_stride_bytes,
+    min_stride_bytes,
 )
 from slrig.model import Pixels, Size
 from tests.contract.v4l2_sensor import BIT_DEPTHS, encoded
@@ -34,7 +34,7 @@ def ramp(bit_depth: int, size: Size = SIZE) -> Pixels:
 def test_samples_come_back_as_they_were_sent(code: str, padding_bytes: int) -> None:
     layout, size = LAYOUTS[code], Size(12, 6)
     sent = ramp(BIT_DEPTHS[code], size)
-    stride = least_stride_bytes(layout, size) + padding_bytes
+    stride = min_stride_bytes(layout, size) + padding_bytes
     data = np.frombuffer(encoded(sent, code, stride), np.uint8)
     image = grey_image(data, layout, size, stride_bytes=stride)
     np.testing.assert_array_equal(image, sent)
@@ -69,15 +69,15 @@ def test_known_bytes_give_known_samples(code: str, row: list[int], samples: list
 @pytest.mark.parametrize("bayer", ["BGGR", "GBRG", "GRBG", "RGGB"])
 def test_a_mosaic_under_one_colour_has_that_colours_brightness(bayer: str, bit_depth: int) -> None:
     size, full = Size(16, 12), 2**bit_depth - 1
-    packing = Packing.BYTES if bit_depth == 8 else Packing.WORDS
+    packing = SamplePacking.BYTES if bit_depth == 8 else SamplePacking.WORDS
     for colour, weight in {"R": 0.299, "G": 0.587, "B": 0.114}.items():
         mosaic = np.zeros(size.shape, "<u2" if bit_depth > 8 else np.uint8)
         for (y, x), name in zip(itertools.product((0, 1), (0, 1)), bayer, strict=True):
             if name == colour:
                 mosaic[y::2, x::2] = full
         data = np.frombuffer(mosaic.tobytes(), np.uint8)
-        layout = Layout(bit_depth, packing, bayer)
-        image = grey_image(data, layout, size, stride_bytes=least_stride_bytes(layout, size))
+        layout = PixelLayout(bit_depth, packing, bayer)
+        image = grey_image(data, layout, size, stride_bytes=min_stride_bytes(layout, size))
         np.testing.assert_allclose(image[2:-2, 2:-2], weight * full, atol=2 + 0.002 * full)
 
 
@@ -93,7 +93,7 @@ def test_every_format_that_can_be_read_has_its_rank() -> None:
     assert PREFERRED.index("GREY") < PREFERRED.index("YUYV") < PREFERRED.index("MJPG")
 
 
-def test_limited_luma_is_spread() -> None:
+def test_limited_luma_is_expanded() -> None:
     row = np.array([16, 128, 235, 128, 0, 128, 255, 128], np.uint8)
     image = grey_image(row, LAYOUTS["YUYV"], Size(4, 1), stride_bytes=8, limited_luma=True)
     assert image.tolist() == [[0, 255, 0, 255]]
@@ -113,7 +113,7 @@ def test_a_jpeg_is_decoded_and_one_that_is_cut_or_of_another_size_is_corrupt() -
     assert np.abs(image.astype(int) - scene(size)).max() < 12
     for data, words in (
         (b"", "begin"),
-        (sent[:200], "early"),
+        (sent[:200], "damaged"),
         (encoded(scene(Size(64, 40)), "MJPG", 0), "64 x 40"),
         (bytes([7] * 3000), "begin"),
     ):
@@ -126,7 +126,7 @@ def plain_colour(code: str, size: Size) -> tuple[bytes, int, Pixels]:
     ramp_ = np.linspace(0.2, 0.9, size.height_px)[:, None, None] * np.array([40.0, 120.0, 200.0])
     colour = np.rint(np.broadcast_to(ramp_, (*size.shape, 3))).astype(np.uint8)
     layout = LAYOUTS[code]
-    if layout.packing is Packing.JPEG:
+    if layout.packing is SamplePacking.JPEG:
         done, data = cv2.imencode(".jpg", colour, [cv2.IMWRITE_JPEG_QUALITY, 100])
         assert done
         return data.tobytes(), 0, colour
@@ -161,7 +161,7 @@ def test_colour_formats_give_blue_green_and_red(code: str) -> None:
     assert cv2.cvtColor(seen, cv2.COLOR_BGR2GRAY).dtype == grey.dtype
 
 
-def test_colour_of_limited_luma_is_spread() -> None:
+def test_colour_of_limited_luma_is_expanded() -> None:
     rows = np.array([16, 128, 235, 128, 126, 128, 126, 128], np.uint8)
     seen = colour_image(rows, LAYOUTS["YUYV"], Size(4, 1), stride_bytes=8, limited_luma=True)
     assert seen.tolist() == [[[0] * 3, [255] * 3, [128] * 3, [128] * 3]]
