@@ -28,7 +28,7 @@ _BUSY = {errno.EAGAIN, errno.EBUSY}
 _ABSENT = {errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO}
 
 
-class Port(Protocol):
+class BytePort(Protocol):
     """Bytes to and from a device."""
 
     def read(self, timeout_s: float) -> bytes:
@@ -45,7 +45,7 @@ class Port(Protocol):
 
 
 class SerialPort:
-    """Implements `Port` with pyserial, on a port's name or a pyserial URL (`socket://…`, `rfc2217://…`).
+    """Implements `BytePort` with pyserial, on a port's name or a pyserial URL (`socket://…`, `rfc2217://…`).
 
     device : what is behind it, in words, as "trigger box"; driver : whose port it is; both for errors.
 
@@ -64,7 +64,7 @@ class SerialPort:
     def __init__(self, name: str, *, baud: int, device: str, driver: str) -> None:
         serial = _library(driver)
         self._name, self._device, self._driver = name, device, driver
-        target = resolved(name)
+        target = resolve_port(name)
         # Two programs on one port read one another's answers; a URL's handler has no lock.
         exclusive = {} if "://" in target else {"exclusive": True}
         try:
@@ -72,13 +72,13 @@ class SerialPort:
                 target, baudrate=baud, timeout=SLICE_S, write_timeout=_WRITE_S, **exclusive
             )
         except (serial.SerialException, OSError, ValueError) as error:
-            raise _unopened(name, target, error, device) from error
+            raise _open_error(name, target, error, device) from error
         with suppress(Exception):
             # FTDI bridges hold bytes back for 16 ms otherwise. Others have no such mode, and say so in many ways.
             self._serial.set_low_latency_mode(True)
 
     def read(self, timeout_s: float) -> bytes:
-        """See `Port`."""
+        """See `BytePort`."""
         until_s = time.monotonic() + timeout_s
         with self._told("read from"):
             while True:
@@ -89,12 +89,12 @@ class SerialPort:
                     return data
 
     def write(self, data: bytes) -> None:
-        """See `Port`."""
+        """See `BytePort`."""
         with self._told("write to"):
             self._serial.write(data)
 
     def close(self) -> None:
-        """See `Port`."""
+        """See `BytePort`."""
         with suppress(Exception):
             self._serial.close()
 
@@ -132,7 +132,7 @@ class SerialPort:
             raise DeviceGoneError(message) from error
 
 
-def resolved(name: str) -> str:
+def resolve_port(name: str) -> str:
     """Return the port that a rig file means: a path, a URL, a system name (COM3), or a name in /dev/serial/by-id."""
     link = _BY_ID / name
     return str(link) if "/" not in name and link.exists() else name
@@ -155,11 +155,11 @@ def _line_discipline_error() -> type[Exception]:
     return termios.error
 
 
-def _unopened(name: str, target: str, error: Exception, device: str) -> DeviceError:
+def _open_error(name: str, target: str, error: Exception, device: str) -> DeviceError:
     """What it means that a port does not open."""
     number = _error_number(error)
     if number in _BUSY or "exclusively lock" in str(error):
-        holders = " and ".join(_holders(target)) or "another program (or you may not see whose it is)"
+        holders = " and ".join(_find_holders(target)) or "another program (or you may not see whose it is)"
         return DeviceBusyError(f"port {name} is held by {holders}; end that, or use another port")
     if number in _ABSENT or "could not find" in str(error).lower():
         return DeviceGoneError(
@@ -180,7 +180,7 @@ def _error_number(error: Exception) -> int | None:
     return int(found.group(1)) if found else None
 
 
-def _holders(target: str) -> list[str]:
+def _find_holders(target: str) -> list[str]:
     """The programs that have a port open, as far as the system tells: name and process number."""
     found = []
     real = os.path.realpath(target)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from simulated_rig.placed import Standing
-from simulated_rig.shapes import Part, bent_sheet, rectangle_between
+from simulated_rig.placed import SceneObject
+from simulated_rig.shapes import MeshPart, bent_sheet, rectangle_between
 from simulated_rig.tables import NotNegative, Positive
 from slrig.model import FloatArray
 
@@ -26,7 +26,7 @@ Corners = Annotated[int, Field(ge=2, le=60)]
 
 
 @dataclass(frozen=True, slots=True)
-class Print:
+class BoardPrint:
     """What is printed on a flat or bent sheet, in coordinates along it, mm, from its frame's origin.
 
     across_mm, down_mm : (n,), (m,) float64, ascending lines; dark : (m - 1, n - 1) uint8, 1 where the rectangle
@@ -43,7 +43,7 @@ class Print:
     curvature_per_mm: float
 
 
-class Board(Standing):
+class PrintedBoard(SceneObject):
     """A calibration board: `shape = "board"`.
 
     kind, columns, rows : "chessboard" or "charuco" with so many inner corners, or "circles": rows of so many circles,
@@ -72,7 +72,7 @@ class Board(Standing):
     bow_mm: float = 0.0
 
     @model_validator(mode="after")
-    def _printable(self) -> Board:
+    def _printable(self) -> PrintedBoard:
         if self.albedo_dark >= self.albedo_light:
             message = "albedo_dark must lie below albedo_light"
             raise ValueError(message)
@@ -147,28 +147,28 @@ class Board(Standing):
         reach = half_mm
         for _ in range(20):
             curvature = self.bow_mm / reach**2
-            reach = float(across_of(np.array([half_mm]), curvature)[0])
+            reach = float(x_at_arc_length_mm(np.array([half_mm]), curvature)[0])
         return self.bow_mm / reach**2
 
     def on_sheet_mm(self, along_mm: FloatArray) -> FloatArray:
         """(n, 3) float64: points of the sheet in the board's own frame, from (n, 2) coordinates along it."""
         curvature = self.curvature_per_mm
-        x = across_of(along_mm[:, 0], curvature)
+        x = x_at_arc_length_mm(along_mm[:, 0], curvature)
         return np.column_stack([x, along_mm[:, 1], curvature * x**2])
 
-    def parts(self, _folder: Path) -> list[Part]:
+    def parts(self, _folder: Path) -> list[MeshPart]:
         """The paper: a rectangle, or a bent sheet."""
         least, most = self.paper_mm
         if self.bow_mm == 0:
             return [rectangle_between(least, most)]
-        reach = float(across_of(most[:1], self.curvature_per_mm)[0])
+        reach = float(x_at_arc_length_mm(most[:1], self.curvature_per_mm)[0])
         return [bent_sheet((-reach, reach), (least[1], most[1]), self.curvature_per_mm)]
 
     def material(self) -> tuple[float, ...]:
         """See `Placed.material`: that of the light paper."""
         return (self.albedo_light, 0.0, 0.0, 1.0, self.specular.strength, self.specular.exponent)
 
-    def printed(self) -> Print:
+    def printed(self) -> BoardPrint:
         """What is printed."""
         ratio = self.albedo_dark / self.albedo_light
         if self.kind == "circles":
@@ -178,13 +178,13 @@ class Board(Standing):
             none = np.zeros(2)
             # A printer that stretches unequally makes ellipses: discs of the mean radius stand for them.
             radius = self._circle_mm / 2 * float(np.sqrt(self.scale[0] * self.scale[1]))
-            return Print(none, none, np.zeros((1, 1), np.uint8), centres, radius, ratio, self.curvature_per_mm)
+            return BoardPrint(none, none, np.zeros((1, 1), np.uint8), centres, radius, ratio, self.curvature_per_mm)
         across, down, dark = self._rectangles()
         across, down = (across - self.middle_mm[0]) * self.scale[0], (down - self.middle_mm[1]) * self.scale[1]
         if self.mirrored:
             across, dark = -across[::-1], dark[:, ::-1]
         dark = np.ascontiguousarray(dark)
-        return Print(across, down, dark, np.zeros((0, 2)), 0.0, ratio, self.curvature_per_mm)
+        return BoardPrint(across, down, dark, np.zeros((0, 2)), 0.0, ratio, self.curvature_per_mm)
 
     def _rectangles(self) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
         """Lines across and down from corner 0, mm, and which rectangles between them are dark, as designed."""
@@ -210,7 +210,7 @@ class Board(Standing):
         return across, down, dark
 
 
-def along_of(x_mm: FloatArray, curvature_per_mm: float) -> FloatArray:
+def arc_length_mm(x_mm: FloatArray, curvature_per_mm: float) -> FloatArray:
     """Length along z = c x² from 0 to x, mm: x √(1 + 4c²x²) / 2 + asinh(2 c x) / (4 c)."""
     if curvature_per_mm == 0:
         return x_mm
@@ -218,9 +218,9 @@ def along_of(x_mm: FloatArray, curvature_per_mm: float) -> FloatArray:
     return np.asarray(x_mm * np.sqrt(1 + steep**2) / 2 + np.arcsinh(steep) / (4 * curvature_per_mm), np.float64)
 
 
-def across_of(along_mm: FloatArray, curvature_per_mm: float) -> FloatArray:
-    """The x of the points so far along z = c x², mm: the inverse of `along_of`, by Newton's method."""
+def x_at_arc_length_mm(along_mm: FloatArray, curvature_per_mm: float) -> FloatArray:
+    """The x of the points so far along z = c x², mm: the inverse of `arc_length_mm`, by Newton's method."""
     x = np.array(along_mm, np.float64)
     for _ in range(8):
-        x = x - (along_of(x, curvature_per_mm) - along_mm) / np.sqrt(1 + (2 * curvature_per_mm * x) ** 2)
+        x = x - (arc_length_mm(x, curvature_per_mm) - along_mm) / np.sqrt(1 + (2 * curvature_per_mm * x) ** 2)
     return x

@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 
 from simulated_rig.light import Float32Array, LightTable
-from simulated_rig.options import CameraOptions, Faults
-from simulated_rig.rendering import View
-from simulated_rig.world import Flicker, Lamp, nanoseconds
+from simulated_rig.options import Faults, SimulatedCameraOptions
+from simulated_rig.rendering import CameraView
+from simulated_rig.world import Lamp, LightFlicker, nanoseconds
 from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings, CameraState, Clock, Trigger
 from slrig.errors import DeviceGoneError, FrameTimeoutError
 from slrig.model import CameraFormat, Frame, Pixels
@@ -21,7 +21,7 @@ _NOISE, _FATE, _GARBLE, _STALE, _CORRUPT, _START, _DELIVERY, _COLOUR = range(8)
 
 
 @dataclass(frozen=True, slots=True)
-class _Exposure:
+class _ExposureTimes:
     """One exposure of the sensor; `t_ready_ns` is when its frame can be read."""
 
     number: int
@@ -38,14 +38,14 @@ class SimulatedCamera:
 
     def __init__(
         self,
-        options: CameraOptions,
-        view: View,
+        options: SimulatedCameraOptions,
+        view: CameraView,
         lamp: Lamp,
         clock: Clock,
         *,
         faults: Faults,
         seed: tuple[int, int],
-        ambient_flicker: Flicker | None = None,
+        ambient_flicker: LightFlicker | None = None,
     ) -> None:
         self._options = options
         self._view = view
@@ -57,7 +57,7 @@ class SimulatedCamera:
         self._sensor = options.sensor()
         self._settings = AppliedSettings(options.exposure_s, 1.0)
         self._state = CameraState(options.name)
-        self._pending: deque[_Exposure] = deque()
+        self._pending: deque[_ExposureTimes] = deque()
         self._made = self._armed_at = 0
         self._dropped = 0
         self._t_armed_ns = 0
@@ -164,13 +164,13 @@ class SimulatedCamera:
         """From the first row's start to the last row's end."""
         return nanoseconds(self._settings.exposure_s) + nanoseconds(self._options.shutter_skew_s)
 
-    def _exposure(self, number: int, start_ns: int) -> _Exposure:
+    def _exposure(self, number: int, start_ns: int) -> _ExposureTimes:
         end_ns = start_ns + self._span_ns
         late_s = self._faults.late_s if self._befalls(self._faults.late_frames, number) else 0.0
         late_s += self._jitter_s(_DELIVERY, number)
-        return _Exposure(number, start_ns, end_ns, end_ns + nanoseconds(self._options.readout_s + late_s))
+        return _ExposureTimes(number, start_ns, end_ns, end_ns + nanoseconds(self._options.readout_s + late_s))
 
-    def _upcoming(self, after_ns: int, deadline_ns: int) -> _Exposure | None:
+    def _upcoming(self, after_ns: int, deadline_ns: int) -> _ExposureTimes | None:
         """Return the first exposure that lies wholly after `after_ns`, passing over earlier ones, or None."""
         earliest_ns = after_ns + nanoseconds(self._options.stamp_error_s)
         while True:
@@ -211,7 +211,7 @@ class SimulatedCamera:
         first_ns = self._t_armed_ns + self._span_ns + nanoseconds(self._options.readout_s)
         return max((t_ns - first_ns) // self._period_ns + 1, 0)
 
-    def _frame(self, exposure: _Exposure) -> Frame:
+    def _frame(self, exposure: _ExposureTimes) -> Frame:
         stale = self._befalls(self._faults.stale_frames, exposure.number) or self._chance(
             self._faults.stale_probability, _STALE, exposure.number
         )
@@ -239,7 +239,7 @@ class SimulatedCamera:
             colour=self._last_colour,
         )
 
-    def _rendered(self, exposure: _Exposure) -> Pixels:
+    def _rendered(self, exposure: _ExposureTimes) -> Pixels:
         mean = self._view.image(self._lights(exposure), ambient=self._ambient(exposure))
         exposure_s = self._settings.exposure_s * self._crept(exposure.number)
         electrons = self._sensor.electrons(mean, exposure_s)
@@ -258,7 +258,7 @@ class SimulatedCamera:
         drift = (1 + self._options.exposure_drift) ** max(number - self._armed_at, 0)
         return float(drift * self._faults.exposure_step**steps)
 
-    def _lights(self, exposure: _Exposure) -> Sequence[tuple[float | Float32Array, LightTable]]:
+    def _lights(self, exposure: _ExposureTimes) -> Sequence[tuple[float | Float32Array, LightTable]]:
         """Each light that an exposure saw, with its fraction: one number, or (H, 1) when each row saw its own."""
         together = self._lamp.light_between(exposure.t_start_ns, exposure.t_end_ns)
         if self._options.line_time_s == 0 or (len(together) == 1 and self._lamp.flicker is None):
@@ -271,11 +271,11 @@ class SimulatedCamera:
                 fractions[id(light)][row] += np.float32(fraction)
         return [(fractions[key], light) for key, light in lights.items()]
 
-    def _row_times_ns(self, exposure: _Exposure, row: int) -> tuple[int, int]:
+    def _row_times_ns(self, exposure: _ExposureTimes, row: int) -> tuple[int, int]:
         begin_ns = exposure.t_start_ns + nanoseconds(row * self._options.line_time_s)
         return begin_ns, begin_ns + nanoseconds(self._settings.exposure_s)
 
-    def _ambient(self, exposure: _Exposure) -> Float32Array | None:
+    def _ambient(self, exposure: _ExposureTimes) -> Float32Array | None:
         """The room's light over its mean: (1, 1), or (H, 1) when each row saw its own; None if it does not flicker."""
         if self._ambient_flicker is None:
             return None

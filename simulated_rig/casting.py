@@ -20,7 +20,7 @@ except ImportError:  # no wheel for this processor
     EMBREE = False
 
 
-class Caster(Protocol):
+class RayCaster(Protocol):
     """A surface that rays can be cast at."""
 
     def first_hit(self, origin_mm: FloatArray, directions: FloatArray) -> IntArray:
@@ -45,7 +45,7 @@ class EmbreeCaster:
         TriangleMesh(scene=self._scene, vertices=vertices, indices=np.ascontiguousarray(faces, np.int32))
 
     def first_hit(self, origin_mm: FloatArray, directions: FloatArray) -> IntArray:
-        """See `Caster`. Runs without the interpreter's lock."""
+        """See `RayCaster`. Runs without the interpreter's lock."""
         origins = np.broadcast_to((origin_mm - self._middle).astype(np.float32), directions.shape)
         found: NDArray[np.int32] = self._scene.run(
             np.ascontiguousarray(origins), np.ascontiguousarray(directions, np.float32)
@@ -61,12 +61,12 @@ class TreeCaster:
         self._mesh = trimesh.ray.ray_triangle.RayMeshIntersector(mesh)
 
     def first_hit(self, origin_mm: FloatArray, directions: FloatArray) -> IntArray:
-        """See `Caster`."""
+        """See `RayCaster`."""
         origins = np.broadcast_to(origin_mm, directions.shape)
         return np.asarray(self._mesh.intersects_first(origins, directions), np.int32)
 
 
-def caster(vertices_mm: FloatArray, faces: IntArray) -> Caster:
+def build_caster(vertices_mm: FloatArray, faces: IntArray) -> RayCaster:
     """Return the fastest caster that this machine has. Raises ConfigError when it has none."""
     if EMBREE:
         return EmbreeCaster(vertices_mm, faces)

@@ -11,11 +11,11 @@ import numpy as np
 from simulated_rig.camera import SimulatedCamera
 from simulated_rig.options import HeadOptions
 from simulated_rig.projector import SimulatedProjector
-from simulated_rig.rendering import Stage, View
+from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import read_scene
-from simulated_rig.staging import Script, Staging
+from simulated_rig.staging import PoseScript, SceneController
 from simulated_rig.turning import RenderedTurntable
-from simulated_rig.world import Flicker, VirtualClock
+from simulated_rig.world import LightFlicker, VirtualClock
 from slrig.bundle.validation import checked
 from slrig.devices import Camera, Clock, Head, Positioner, SystemClock, progress_reporter
 from slrig.kernels import compilations_told
@@ -29,10 +29,10 @@ class SimulatedHead:
     stands where.
     """
 
-    def __init__(self, options: HeadOptions, script: Script) -> None:
+    def __init__(self, options: HeadOptions, script: PoseScript) -> None:
         self.clock: Clock = SystemClock() if options.realtime else VirtualClock()
         lens = options.projector.pinhole()
-        self._stage = Stage(
+        self._stage = SceneState(
             script.surface(0),
             lens,
             working_distance_mm=options.projector.working_distance_mm or float(np.linalg.norm(lens.centre_mm)),
@@ -40,9 +40,9 @@ class SimulatedHead:
         )
         swing = None
         if options.ambient_flicker_depth > 0:
-            swing = Flicker(options.ambient_flicker_hz, options.ambient_flicker_depth)
+            swing = LightFlicker(options.ambient_flicker_hz, options.ambient_flicker_depth)
         self._views = {
-            camera.name: View(
+            camera.name: CameraView(
                 camera.pinhole(),
                 self._stage,
                 blur_px=camera.blur_px,
@@ -55,7 +55,7 @@ class SimulatedHead:
             )
             for camera in options.camera
         }
-        self._staging = Staging(options, script, self._stage, self._views, self.clock)
+        self._staging = SceneController(options, script, self._stage, self._views, self.clock)
         self._positioner: Positioner | None = self._staging if self._staging.poses else None
         if options.turntable is not None:
             self._positioner = RenderedTurntable(options.turntable, self._staging.turn_table, seed=options.seed)
@@ -103,7 +103,7 @@ class SimulatedHead:
         tell = progress_reporter()
         with compilations_told(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")):
             for name, view in self._views.items():
-                view.prepare(told=partial(_tell_traced, tell, name))
+                view.prepare(told=partial(_report_tracing, tell, name))
 
     @property
     def positioner(self) -> Positioner | None:
@@ -124,7 +124,7 @@ class SimulatedHead:
         return known
 
 
-def _tell_traced(tell: Callable[[str], None], camera: str, share: float) -> None:
+def _report_tracing(tell: Callable[[str], None], camera: str, share: float) -> None:
     tell(f"tracing light for camera '{camera}', {share:.0%}")
 
 
@@ -138,13 +138,13 @@ def open_head(options: Mapping[str, object], folder: Path) -> Head:
     ConfigError
         The options or the scene have faults: all of them, in one message.
     """
-    head = simulated_head(options, folder)
+    head = open_simulated_head(options, folder)
     head.prepare()
     return head
 
 
-def simulated_head(options: Mapping[str, object], folder: Path) -> SimulatedHead:
+def open_simulated_head(options: Mapping[str, object], folder: Path) -> SimulatedHead:
     """Return `open_head`'s instrument under its own type."""
     table = checked(HeadOptions, options, "the [head] table of the rendered rig")
     path = folder / table.scene
-    return SimulatedHead(table, Script(table, read_scene(path), path.parent))
+    return SimulatedHead(table, PoseScript(table, read_scene(path), path.parent))

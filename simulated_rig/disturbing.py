@@ -19,7 +19,7 @@ PROJECTOR = "projector"
 Index = Annotated[int, Field(ge=0)]
 
 
-class Push(Strict, use_attribute_docstrings=True):
+class PoseChange(Strict, use_attribute_docstrings=True):
     """A device's change of pose, in its own frame: X' = turn (X + shift). The stated calibration does not follow."""
 
     device: Annotated[str, Field(min_length=1)]
@@ -32,7 +32,7 @@ class Push(Strict, use_attribute_docstrings=True):
     """Along its x, y and z axis."""
 
 
-class Bump(Push):
+class BumpFault(PoseChange):
     """A device is bumped when a pose is taken, and stays so: `[[head.faults.bump]]`.
 
     Whoever goes back to an earlier pose finds it as it was before the bump.
@@ -42,7 +42,7 @@ class Bump(Push):
     """Number of the pose, from 0."""
 
 
-class Drift(Push):
+class PoseDrift(PoseChange):
     """A device drifts towards a change of pose as 1 - exp(-t / settling): `[[head.drift]]`.
 
     t counts from the opening of the rig in the world's time for settle_s, or in captures for settle_captures. During
@@ -56,7 +56,7 @@ class Drift(Push):
     """How many captures settling takes, of a drift by captures."""
 
     @model_validator(mode="after")
-    def _one_clock(self) -> Drift:
+    def _one_clock(self) -> PoseDrift:
         if (self.settle_s is None) == (self.settle_captures is None):
             message = "a drift needs settle_s or settle_captures, and not both"
             raise ValueError(message)
@@ -69,7 +69,7 @@ class Drift(Push):
         return 1 - math.exp(-captures / (self.settle_captures or 1.0))
 
 
-class Moving(Strict, use_attribute_docstrings=True):
+class ObjectMotion(Strict, use_attribute_docstrings=True):
     """What is moved does not stand still while a pose is captured: `[[head.faults.moving]]`."""
 
     pose: Index | None = None
@@ -85,7 +85,7 @@ class Moving(Strict, use_attribute_docstrings=True):
     """In how many equal steps."""
 
 
-def pushed(device: Pinhole, push: Push, *, share: float = 1.0) -> Pinhole:
+def apply_pose_change(device: Pinhole, push: PoseChange, *, share: float = 1.0) -> Pinhole:
     """Return a device after a share of a push."""
     turn = Rotation.from_rotvec(share * np.deg2rad(push.turn_deg)).as_matrix()
     translation = turn @ (device.translation_mm + share * np.array(push.shift_mm))

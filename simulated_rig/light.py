@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from simulated_rig.defocus import ALWAYS_SHARP, LEVELS_PX, Focus
-from simulated_rig.transport import Paths
+from simulated_rig.transport import LightPaths
 from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, Pixels, Size
 
@@ -88,13 +88,13 @@ def light_table(profile: Pixels, projector: Size, response: Response) -> LightTa
     down = np.broadcast_to(light[:, 0], projector.height_px) if light.shape[0] > 1 else np.ones(projector.height_px)
     beyond = LEVELS_PX[1:] if response.focus.far_px else ()
     sharp, *softer = (
-        LightTable(_spread(across, blur_px), _spread(down, blur_px), _margin_px(blur_px))
+        LightTable(_spread_profile(across, blur_px), _spread_profile(down, blur_px), _margin_px(blur_px))
         for blur_px in (response.blur_px, *(math.hypot(response.blur_px, level) for level in beyond))
     )
     return replace(sharp, softer=tuple(softer))
 
 
-def no_light(projector: Size) -> LightTable:
+def dark_table(projector: Size) -> LightTable:
     """Return the table of a lamp that is off."""
     return LightTable(
         np.zeros(projector.width_px * NODES_PER_PX, np.float32),
@@ -103,7 +103,7 @@ def no_light(projector: Size) -> LightTable:
     )
 
 
-def desktop_light(projector: Size, response: Response) -> LightTable:
+def desktop_table(projector: Size, response: Response) -> LightTable:
     """Return the light of a computer's desktop: a bright ground, two windows side by side, a dark bar at the foot."""
     across, down = np.full((1, projector.width_px), 180, np.uint8), np.full((projector.height_px, 1), 255, np.uint8)
     across[:, projector.width_px // 8 : projector.width_px // 2] = 255
@@ -113,7 +113,7 @@ def desktop_light(projector: Size, response: Response) -> LightTable:
     return LightTable(windows.columns, bar.rows, windows.margin_px)
 
 
-def radiance(paths: Paths, table: LightTable, *, blur_px: float) -> Float32Array:
+def radiance(paths: LightPaths, table: LightTable, *, blur_px: float) -> Float32Array:
     """(H, W) float32: light that reaches each camera pixel from the projector, a white diffuser giving 1.
 
     The lens spreads the samples' light first, by a Gaussian of standard deviation blur_px; the pixel's square collects
@@ -122,8 +122,8 @@ def radiance(paths: Paths, table: LightTable, *, blur_px: float) -> Float32Array
     in the middle of their cells.
     """
     height, width, count = paths.weight.shape
-    shares = _pixel_shares(blur_px, math.isqrt(count))
-    across: Float32Array = _gather(
+    shares = _pixel_weights(blur_px, math.isqrt(count))
+    across: Float32Array = _filter_rows(
         paths.column_px,
         paths.row_px,
         paths.weight,
@@ -131,13 +131,13 @@ def radiance(paths: Paths, table: LightTable, *, blur_px: float) -> Float32Array
         table.rows,
         np.float32(table.margin_px),
         shares,
-        _mirrored(width, shares.shape),
+        _mirror_indices(width, shares.shape),
     )
-    light: Float32Array = _collected(across, shares, _mirrored(height, shares.shape))
+    light: Float32Array = _filter_columns(across, shares, _mirror_indices(height, shares.shape))
     return light
 
 
-def blurred(image: Float32Array, blur_px: float) -> Float32Array:
+def blur_image(image: Float32Array, blur_px: float) -> Float32Array:
     """An image of pixels as the lens spreads it, a Gaussian of standard deviation blur_px: for light without detail."""
     if blur_px == 0:
         return image
@@ -149,7 +149,7 @@ def _margin_px(blur_px: float) -> int:
 
 
 @lru_cache(maxsize=32)
-def _spread_of_one_pixel(blur_px: float) -> FloatArray:
+def _pixel_spread(blur_px: float) -> FloatArray:
     """A unit square pixel blurred by a Gaussian, sampled at the nodes from -margin to +margin."""
     margin = _margin_px(blur_px)
     x = np.arange(-margin * NODES_PER_PX, margin * NODES_PER_PX + 1) / NODES_PER_PX
@@ -158,9 +158,9 @@ def _spread_of_one_pixel(blur_px: float) -> FloatArray:
     return np.asarray(ndtr((x + 0.5) / blur_px) - ndtr((x - 0.5) / blur_px), dtype=np.float64)
 
 
-def _spread(light: FloatArray, blur_px: float) -> Float32Array:
+def _spread_profile(light: FloatArray, blur_px: float) -> Float32Array:
     """The light of pixels in a row, at all nodes. scipy.signal has it too, and takes half a second to import."""
-    one = _spread_of_one_pixel(blur_px)
+    one = _pixel_spread(blur_px)
     taps = -(-len(one) // NODES_PER_PX)
     by_node = np.pad(one, (0, taps * NODES_PER_PX - len(one))).reshape(taps, NODES_PER_PX)
     beside = np.lib.stride_tricks.sliding_window_view(np.pad(light, taps - 1), taps)
@@ -168,7 +168,7 @@ def _spread(light: FloatArray, blur_px: float) -> Float32Array:
 
 
 @kernel_part
-def _looked_up(table: Float32Array, position: np.float32, margin: np.float32) -> np.float32:
+def _look_up(table: Float32Array, position: np.float32, margin: np.float32) -> np.float32:
     at = (position + margin) * np.float32(NODES_PER_PX)
     if not (at >= 0) or at >= len(table) - 1:
         return np.float32(0)
@@ -177,7 +177,7 @@ def _looked_up(table: Float32Array, position: np.float32, margin: np.float32) ->
     return np.float32(table[node] + part * (table[node + 1] - table[node]))
 
 
-def _pixel_shares(blur_px: float, per_axis: int) -> Float32Array:
+def _pixel_weights(blur_px: float, per_axis: int) -> Float32Array:
     """(2 m + 1, S): what a pixel takes from sample s of the pixel i - m beside it, along one axis; the sum is 1.
 
     A Gaussian convolved with a square of 1 px, at the samples' distances d: Φ((d + ½)/σ) - Φ((d - ½)/σ).
@@ -191,7 +191,7 @@ def _pixel_shares(blur_px: float, per_axis: int) -> Float32Array:
     return np.asarray(share / share.sum(), np.float32)
 
 
-def _mirrored(length_px: int, shape: tuple[int, ...]) -> NDArray[np.intp]:
+def _mirror_indices(length_px: int, shape: tuple[int, ...]) -> NDArray[np.intp]:
     """(m + length + m, S) indices of samples along an axis, mirrored beyond both ends. shape : of the shares."""
     taps, per_axis = shape
     around = np.pad(np.arange(length_px * per_axis), taps // 2 * per_axis, mode="symmetric")
@@ -199,7 +199,7 @@ def _mirrored(length_px: int, shape: tuple[int, ...]) -> NDArray[np.intp]:
 
 
 @kernel(in_every_scan=False)
-def _gather(
+def _filter_rows(
     column: Float32Array,
     row: Float32Array,
     weight: Float32Array,
@@ -223,9 +223,9 @@ def _gather(
                 light = np.float32(0)
                 share = weight[r, c, first + s]
                 if share > 0:
-                    light = _looked_up(columns, column[r, c, first + s], margin)
+                    light = _look_up(columns, column[r, c, first + s], margin)
                     if light > 0:
-                        light *= share * _looked_up(rows, row[r, c, first + s], margin)
+                        light *= share * _look_up(rows, row[r, c, first + s], margin)
                 lines[s, reach + c] = light
         for i in range(reach):
             for beyond in (i, reach + width + i):
@@ -242,7 +242,7 @@ def _gather(
 
 
 @kernel(in_every_scan=False)
-def _collected(across: Float32Array, shares: Float32Array, source: NDArray[np.intp]) -> Float32Array:
+def _filter_columns(across: Float32Array, shares: Float32Array, source: NDArray[np.intp]) -> Float32Array:
     """(H, W): rows of samples, filtered down the columns at the pixels."""
     taps, per_axis = shares.shape
     width = across.shape[1]

@@ -27,7 +27,7 @@ def lens_array(device: Pinhole) -> LensArray:
 
 
 @kernel_part
-def distorted(x: float, y: float, lens: LensArray) -> tuple[float, float]:
+def distort(x: float, y: float, lens: LensArray) -> tuple[float, float]:
     """Where the lens sends the undistorted normalised point (x, y)."""
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
     r2 = x * x + y * y
@@ -39,12 +39,12 @@ def distorted(x: float, y: float, lens: LensArray) -> tuple[float, float]:
 
 
 @kernel_part
-def undistorted(xd: float, yd: float, lens: LensArray) -> tuple[float, float]:
+def undistort(xd: float, yd: float, lens: LensArray) -> tuple[float, float]:
     """The normalised point that the lens sends to (xd, yd), by Newton's method on the two equations."""
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
     x, y = xd, yd
     for _ in range(_NEWTON_STEPS):
-        fx, fy = distorted(x, y, lens)
+        fx, fy = distort(x, y, lens)
         ex, ey = fx - xd, fy - yd
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -69,7 +69,7 @@ def world_directions(
     """(n, 3) float64: unit directions in the world of the rays through the pixel positions u, v ((n,) float64)."""
     out = np.zeros((len(u), 3))
     for i in range(len(u)):
-        x, y = undistorted((u[i] - lens[2]) / lens[0], (v[i] - lens[3]) / lens[1], lens)
+        x, y = undistort((u[i] - lens[2]) / lens[0], (v[i] - lens[3]) / lens[1], lens)
         scale = 1.0 / np.sqrt(x * x + y * y + 1.0)
         for axis in range(3):
             out[i, axis] = scale * (rotation[0, axis] * x + rotation[1, axis] * y + rotation[2, axis])
@@ -115,5 +115,5 @@ def image_positions(points_mm: FloatArray, device: Pinhole) -> FloatArray:
     at = points_mm @ device.rotation.T + device.translation_mm
     x, y = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2]
     lens = lens_array(device)
-    xd, yd = distorted.py_func(x, y, lens)
+    xd, yd = distort.py_func(x, y, lens)
     return np.column_stack([lens[0] * xd + lens[2], lens[1] * yd + lens[3]])

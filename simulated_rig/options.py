@@ -8,12 +8,12 @@ import numpy as np
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from simulated_rig.defocus import Focus
-from simulated_rig.disturbing import PROJECTOR, Bump, Drift, Moving
+from simulated_rig.disturbing import PROJECTOR, BumpFault, ObjectMotion, PoseDrift
 from simulated_rig.light import Response
 from simulated_rig.optics import look_at
-from simulated_rig.poses import Pose, PoseSeries
-from simulated_rig.sensor import Sensor
-from simulated_rig.tables import Fraction, Names, NotNegative, Pair, Positive, Triple, at_least_one
+from simulated_rig.poses import PoseSeries, ScriptedPose
+from simulated_rig.sensor import SensorModel
+from simulated_rig.tables import Fraction, Names, NotNegative, Pair, Positive, Triple, require_one
 from simulated_rig.turning import TurntableOptions
 from slrig.bundle.validation import Strict
 from slrig.errors import CalibrationError
@@ -25,7 +25,7 @@ PixelExtent = Annotated[int, Field(ge=16, le=16384)]
 Row = Triple
 
 
-class Device(Strict, use_attribute_docstrings=True):
+class DeviceOptions(Strict, use_attribute_docstrings=True):
     """Lens and pose of a camera or the projector.
 
     The pose is either position_mm and target_mm (a look-at, `down` pointing down in the image), or rotation and
@@ -69,7 +69,7 @@ class Device(Strict, use_attribute_docstrings=True):
     """Standard deviation of the further spread of a point far away; at a distance d it is that times |1 - focus/d|."""
 
     @model_validator(mode="after")
-    def _posed(self) -> Device:
+    def _posed(self) -> DeviceOptions:
         look = (self.position_mm is not None, self.target_mm is not None)
         matrix = (self.rotation is not None, self.translation_mm is not None)
         if not ((all(look) and not any(matrix)) or (all(matrix) and not any(look))):
@@ -105,7 +105,7 @@ class Device(Strict, use_attribute_docstrings=True):
         return Pinhole(self.size, matrix, np.array(self.distortion, np.float64), rotation, translation)
 
 
-class ProjectorOptions(Device):
+class SimulatedProjectorOptions(DeviceOptions):
     """The projector: `[head.projector]`. Its response is that of `light.Response`."""
 
     gamma: Annotated[float, Field(gt=0, le=5)] = 1.0
@@ -152,8 +152,8 @@ class ProjectorOptions(Device):
         )
 
 
-class CameraOptions(Device):
-    """One camera: `[[head.camera]]`. Its noise is that of `sensor.Sensor`."""
+class SimulatedCameraOptions(DeviceOptions):
+    """One camera: `[[head.camera]]`. Its noise is that of `sensor.SensorModel`."""
 
     name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_-]+$")]
     """The rig's name for it."""
@@ -218,7 +218,7 @@ class CameraOptions(Device):
         return (self.size.height_px - 1) * self.line_time_s
 
     @model_validator(mode="after")
-    def _consistent(self) -> CameraOptions:
+    def _consistent(self) -> SimulatedCameraOptions:
         if not self.exposure_min_s <= self.exposure_s <= self.exposure_max_s:
             message = (
                 f"exposure_s must lie between exposure_min_s and exposure_max_s ({self.exposure_min_s} to "
@@ -233,9 +233,9 @@ class CameraOptions(Device):
             raise ValueError(message)
         return self
 
-    def sensor(self) -> Sensor:
+    def sensor(self) -> SensorModel:
         """Return the sensor."""
-        return Sensor(
+        return SensorModel(
             bit_depth=self.bit_depth,
             full_well_e=self.full_well_e,
             read_noise_e=self.read_noise_e,
@@ -305,10 +305,10 @@ class Faults(Strict, use_attribute_docstrings=True):
     other_display_glow: Fraction = 0.0
     """White that the other display sends to the scene, as a fraction of the projector's."""
 
-    bump: Annotated[tuple[Bump, ...], Field(strict=False)] = ()
+    bump: Annotated[tuple[BumpFault, ...], Field(strict=False)] = ()
     """Devices that are moved at a pose."""
 
-    moving: Annotated[tuple[Moving, ...], Field(strict=False)] = ()
+    moving: Annotated[tuple[ObjectMotion, ...], Field(strict=False)] = ()
     """Poses of which the object does not stand still."""
 
 
@@ -342,10 +342,10 @@ class HeadOptions(Strict, use_attribute_docstrings=True):
     workers: Annotated[int, Field(ge=1, le=64)] = 2
     """Threads that trace."""
 
-    projector: ProjectorOptions
+    projector: SimulatedProjectorOptions
     """The projector."""
 
-    camera: Annotated[tuple[CameraOptions, ...], Field(strict=False), AfterValidator(at_least_one)]
+    camera: Annotated[tuple[SimulatedCameraOptions, ...], Field(strict=False), AfterValidator(require_one)]
     """The cameras, one or more."""
 
     faults: Faults = Faults()
@@ -354,7 +354,7 @@ class HeadOptions(Strict, use_attribute_docstrings=True):
     carries_calibration: bool = True
     """Whether the head knows its own calibration, exactly, but for what faults.bump and drift do to it."""
 
-    pose: Annotated[tuple[Pose, ...], Field(strict=False)] = ()
+    pose: Annotated[tuple[ScriptedPose, ...], Field(strict=False)] = ()
     """A script for the scene's board, or another object, listed; the first pose is taken at the start."""
 
     poses: PoseSeries | None = None
@@ -363,12 +363,12 @@ class HeadOptions(Strict, use_attribute_docstrings=True):
     turntable: TurntableOptions | None = None
     """What turns the scene's objects, instead of a script."""
 
-    drift: Annotated[tuple[Drift, ...], Field(strict=False)] = ()
+    drift: Annotated[tuple[PoseDrift, ...], Field(strict=False)] = ()
     """Devices that move slowly."""
 
     @field_validator("camera")
     @classmethod
-    def _different_names(cls, cameras: tuple[CameraOptions, ...]) -> tuple[CameraOptions, ...]:
+    def _different_names(cls, cameras: tuple[SimulatedCameraOptions, ...]) -> tuple[SimulatedCameraOptions, ...]:
         names = [camera.name for camera in cameras]
         if len(set(names)) != len(names):
             message = f"each camera needs a name of its own, found {names}"

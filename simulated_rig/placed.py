@@ -41,7 +41,7 @@ class Specular(Strict):
     exponent: Annotated[float, Field(ge=1)] = 20.0
 
 
-class Standing(Strict):
+class SceneObject(Strict):
     """An object in a pose (rotation about its own x, then y, then z axis as fixed axes), with a gloss."""
 
     name: str = ""
@@ -54,7 +54,7 @@ class Standing(Strict):
         return WHITE, WHITE
 
 
-class Placed(Standing):
+class TexturedObject(SceneObject):
     """An object of one albedo and colour, or of those that a texture varies."""
 
     albedo: Annotated[float, Field(gt=0, le=1)] = 0.8
@@ -68,20 +68,20 @@ class Placed(Standing):
         return (self.albedo, kind, texture.contrast, texture.scale_mm, lobe.strength, lobe.exponent)
 
     def colours(self) -> tuple[Colour, Colour]:
-        """See `Standing`."""
+        """See `SceneObject`."""
         return self.colour, self.colour if self.texture.colour is None else self.texture.colour
 
 
-PlacedThing = TypeVar("PlacedThing", bound=Standing)
+ObjectT = TypeVar("ObjectT", bound=SceneObject)
 
 
-def put(thing: PlacedThing, position_mm: FloatArray, rotation: FloatArray) -> PlacedThing:
+def place_object(thing: ObjectT, position_mm: FloatArray, rotation: FloatArray) -> ObjectT:
     """The same object in another pose. rotation : (3, 3), object to world."""
     x, y, z = (float(each) for each in position_mm)
     a, b, c = (float(each) for each in Rotation.from_matrix(rotation).as_euler("xyz", degrees=True))
     return thing.model_copy(update={"position_mm": (x, y, z), "rotation_deg": (a, b, c)})
 
 
-def turned_by(rotation_deg: Triple) -> FloatArray:
+def rotation_matrix(rotation_deg: Triple) -> FloatArray:
     """(3, 3) float64: object to world, of a pose's rotation."""
     return np.asarray(Rotation.from_euler("xyz", rotation_deg, degrees=True).as_matrix(), np.float64)

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from simulated_rig.boards import Board
+from simulated_rig.boards import PrintedBoard
 from simulated_rig.optics import field_radius, image_positions
 from simulated_rig.tables import NotNegative, Pair, Triple
 from slrig.bundle.validation import Strict
@@ -29,7 +29,7 @@ _SIDES = (1, 5, 3, 7, 0, 4, 2, 6)
 """Eighths of a turn: corners are odd."""
 
 
-class Pose(Strict, use_attribute_docstrings=True):
+class ScriptedPose(Strict, use_attribute_docstrings=True):
     """One pose: `[[head.pose]]`. Position and rotation are as of an object of a scene."""
 
     name: str = ""
@@ -78,7 +78,7 @@ class PoseSeries(Strict, use_attribute_docstrings=True):
         return self
 
 
-def made_up(series: PoseSeries, board: Board, devices: Sequence[Pinhole]) -> tuple[Pose, ...]:
+def generate_poses(series: PoseSeries, board: PrintedBoard, devices: Sequence[Pinhole]) -> tuple[ScriptedPose, ...]:
     """Return the poses of a series.
 
     Tilt axes go round by the golden angle, so that any few of them lie well apart. The board is slid from the middle
@@ -93,11 +93,11 @@ def made_up(series: PoseSeries, board: Board, devices: Sequence[Pinhole]) -> tup
     fields = [(device, field_radius(device)) for device in devices]
     centre = np.array(series.centre_mm)
     away = centre - np.mean([device.centre_mm for device in devices], axis=0)
-    facing = _facing(away / np.linalg.norm(away))
+    facing = _facing_rotation(away / np.linalg.norm(away))
     least, most = board.paper_mm
     rim = np.array([(x, y) for x in np.linspace(least[0], most[0], 5) for y in np.linspace(least[1], most[1], 5)])
     paper = board.on_sheet_mm(rim)
-    poses: list[Pose] = []
+    poses: list[ScriptedPose] = []
     slid = 0
     for number in range(series.count):
         # Two in nine stay near the middle; the others go to each corner, then to each side, and so on.
@@ -107,8 +107,8 @@ def made_up(series: PoseSeries, board: Board, devices: Sequence[Pinhole]) -> tup
         slid += share == 1.0
         for _try in range(_TRIES):
             # Depth and tilt are spread evenly, each in an order of its own, and jittered.
-            depth = _spread(series.depth_mm, (number * 7 + 3) % series.count, series.count, rng)
-            tilt = np.deg2rad(_spread(series.tilt_deg, (number * 3 + 1) % series.count, series.count, rng))
+            depth = _stratified(series.depth_mm, (number * 7 + 3) % series.count, series.count, rng)
+            tilt = np.deg2rad(_stratified(series.tilt_deg, (number * 3 + 1) % series.count, series.count, rng))
             about = number * _GOLDEN_TURN + rng.uniform(-0.2, 0.2)
             towards = side * np.pi / 4 + rng.uniform(-0.15, 0.15)
             # A board that is turned much leaves the corner free into which it is slid.
@@ -118,14 +118,14 @@ def made_up(series: PoseSeries, board: Board, devices: Sequence[Pinhole]) -> tup
             rotation = facing @ (leaning * Rotation.from_rotvec([0.0, 0.0, roll])).as_matrix()
             middle = centre + depth * facing[:, 2]
             held = paper @ rotation.T + middle
-            if not _inside(held, fields, series.edge_px):
+            if not _is_visible_to_all(held, fields, series.edge_px):
                 continue
             across, down = np.cos(towards) * facing[:, 0], 0.75 * np.sin(towards) * facing[:, 1]
             slide = np.zeros(3)
             # Together until the first border, then each alone: so corners are reached.
             for sideways in (across + down, across, down):
-                slide += _reach(held + slide, sideways, fields, series.edge_px) * sideways
-            poses.append(_pose(number, middle + share * slide, rotation))
+                slide += _free_distance(held + slide, sideways, fields, series.edge_px) * sideways
+            poses.append(_rounded_pose(number, middle + share * slide, rotation))
             break
         else:
             message = (
@@ -137,43 +137,45 @@ def made_up(series: PoseSeries, board: Board, devices: Sequence[Pinhole]) -> tup
     return tuple(poses)
 
 
-def _spread(bounds: tuple[float, float], step: int, count: int, rng: np.random.Generator) -> float:
+def _stratified(bounds: tuple[float, float], step: int, count: int, rng: np.random.Generator) -> float:
     return bounds[0] + (bounds[1] - bounds[0]) * (step + float(rng.random())) / count
 
 
-def _facing(away: FloatArray) -> FloatArray:
+def _facing_rotation(away: FloatArray) -> FloatArray:
     """(3, 3): board to world of a board across `away`, its x as near the world's as that allows."""
     right = np.array([1.0, 0.0, 0.0]) - away[0] * away
     right /= np.linalg.norm(right)
     return np.column_stack([right, np.cross(away, right), away])
 
 
-def _pose(number: int, middle: FloatArray, rotation: FloatArray) -> Pose:
+def _rounded_pose(number: int, middle: FloatArray, rotation: FloatArray) -> ScriptedPose:
     # Rounded, so that what a log or a listing says of a pose is the pose.
     turn = Rotation.from_matrix(rotation).as_euler("xyz", degrees=True)
     x, y, z = (round(float(each), 4) for each in middle)
     a, b, c = (round(float(each), 4) for each in turn)
-    return Pose(name=f"pose {number + 1}", position_mm=(x, y, z), rotation_deg=(a, b, c))
+    return ScriptedPose(name=f"pose {number + 1}", position_mm=(x, y, z), rotation_deg=(a, b, c))
 
 
-def _reach(held: FloatArray, sideways: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float) -> float:
+def _free_distance(
+    held: FloatArray, sideways: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float
+) -> float:
     """How many times `sideways`, mm, a board can be slid until it touches a border."""
     low, high = 0.0, _FARTHEST_MM
     for _ in range(_HALVINGS):
         half = (low + high) / 2
-        if _inside(held + half * sideways, fields, edge_px):
+        if _is_visible_to_all(held + half * sideways, fields, edge_px):
             low = half
         else:
             high = half
     return low
 
 
-def _inside(points: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float) -> bool:
+def _is_visible_to_all(points: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float) -> bool:
     """Whether every device images all points; a field is a device and the radius that its lens images."""
-    return all(_in_image(points, device, radius, edge_px) for device, radius in fields)
+    return all(_is_in_image(points, device, radius, edge_px) for device, radius in fields)
 
 
-def _in_image(points: FloatArray, device: Pinhole, radius: float, edge_px: float) -> bool:
+def _is_in_image(points: FloatArray, device: Pinhole, radius: float, edge_px: float) -> bool:
     at = points @ device.rotation.T + device.translation_mm
     if (at[:, 2] <= 0).any() or (np.hypot(at[:, 0], at[:, 1]) > radius * at[:, 2]).any():
         return False

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from simulated_rig.boards import Print
-from simulated_rig.optics import LensArray, lens_array, undistorted
+from simulated_rig.boards import BoardPrint
+from simulated_rig.optics import LensArray, lens_array, undistort
 from simulated_rig.scene import SceneSurface
 from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, IntArray, Pinhole
@@ -18,10 +18,10 @@ from slrig.model import FloatArray, IntArray, Pinhole
 _REACH = 0.9
 """Of a cell's side: more than half its diagonal, with room for the lens's stretch. Farther edges need no clipping."""
 
-_MOST_CORNERS = 12
+_MAX_CORNERS = 12
 
 
-def pigment(
+def print_reflectance(
     points: FloatArray,
     normals: FloatArray,
     triangle: IntArray,
@@ -39,7 +39,7 @@ def pigment(
     """
     out = np.ones(len(u))
     for part, shown in surface.prints.items():
-        _fill(
+        _fill_reflectance(
             out,
             points,
             normals,
@@ -59,7 +59,7 @@ def pigment(
 
 
 def _numbers(
-    shown: Print,
+    shown: BoardPrint,
 ) -> tuple[FloatArray, FloatArray, NDArray[np.uint8], FloatArray, float, float, float]:
     return (
         shown.across_mm,
@@ -73,7 +73,7 @@ def _numbers(
 
 
 @kernel_part
-def _along(x: float, curvature: float) -> float:
+def _arc_length(x: float, curvature: float) -> float:
     """Length along the sheet z = c x² from 0 to x."""
     if curvature == 0.0:
         return x
@@ -82,7 +82,7 @@ def _along(x: float, curvature: float) -> float:
 
 
 @kernel_part
-def _clipped(polygon: FloatArray, count: int, a: float, b: float, limit: float, out: FloatArray) -> int:
+def _clip_polygon(polygon: FloatArray, count: int, a: float, b: float, limit: float, out: FloatArray) -> int:
     """Keep of a convex polygon what has a x + b y <= limit (Sutherland and Hodgman 1974). Returns its corner count."""
     kept = 0
     for i in range(count):
@@ -138,17 +138,17 @@ def _dark_in_rectangles(
                 break
             if dark[i, j] == 0:
                 continue
-            count = _clipped(cell, 4, -1.0, 0.0, -(across[j] - x0), first)
-            count = _clipped(first, count, 1.0, 0.0, across[j + 1] - x0, second)
-            count = _clipped(second, count, 0.0, -1.0, -(down[i] - y0), first)
-            count = _clipped(first, count, 0.0, 1.0, down[i + 1] - y0, second)
+            count = _clip_polygon(cell, 4, -1.0, 0.0, -(across[j] - x0), first)
+            count = _clip_polygon(first, count, 1.0, 0.0, across[j + 1] - x0, second)
+            count = _clip_polygon(second, count, 0.0, -1.0, -(down[i] - y0), first)
+            count = _clip_polygon(first, count, 0.0, 1.0, down[i + 1] - y0, second)
             a, x, y = _moments(second, count)
             area, mx, my = area + a, mx + x, my + y
     return area, mx, my
 
 
 @kernel_part
-def _nearest(x: float, y: float, centres: FloatArray) -> tuple[int, float]:
+def _nearest_disc(x: float, y: float, centres: FloatArray) -> tuple[int, float]:
     best, least = 0, np.inf
     for k in range(len(centres)):
         square = (centres[k, 0] - x) ** 2 + (centres[k, 1] - y) ** 2
@@ -158,7 +158,7 @@ def _nearest(x: float, y: float, centres: FloatArray) -> tuple[int, float]:
 
 
 @kernel_part
-def _at_point(
+def _print_at_point(
     x: float,
     y: float,
     reach: float,
@@ -170,7 +170,7 @@ def _at_point(
 ) -> tuple[bool, bool]:
     """Whether the print is dark at a point, and whether it is the same everywhere within `reach` of it."""
     if len(centres) > 0:
-        _best, distance = _nearest(x, y, centres)
+        _best, distance = _nearest_disc(x, y, centres)
         return distance < radius, abs(distance - radius) > reach
     j, i = np.searchsorted(across, x, "right") - 1, np.searchsorted(down, y, "right") - 1
     if i < 0 or j < 0 or i >= len(down) - 1 or j >= len(across) - 1:
@@ -181,7 +181,7 @@ def _at_point(
 
 
 @kernel(in_every_scan=False)
-def _fill(
+def _fill_reflectance(
     out: FloatArray,
     points: FloatArray,
     normals: FloatArray,
@@ -203,9 +203,9 @@ def _fill(
     dark_share: float,
     curvature: float,
 ) -> None:
-    """Fill `out` at the hits of part `own`, and move their points. See `pigment`."""
+    """Fill `out` at the hits of part `own`, and move their points. See `print_reflectance`."""
     cell = np.zeros((4, 2))
-    first, second = np.zeros((_MOST_CORNERS, 2)), np.zeros((_MOST_CORNERS, 2))
+    first, second = np.zeros((_MAX_CORNERS, 2)), np.zeros((_MAX_CORNERS, 2))
     ray = np.zeros(3)
     narrow = min(lens[0], lens[1])
     for k in range(len(u)):
@@ -214,13 +214,13 @@ def _fill(
         p, n = points[k], normals[k]
         x = frame[0, 0] * p[0] + frame[0, 1] * p[1] + frame[0, 2] * p[2] + frame[0, 3]
         y = frame[1, 0] * p[0] + frame[1, 1] * p[1] + frame[1, 2] * p[2] + frame[1, 3]
-        s = _along(x, curvature)
+        s = _arc_length(x, curvature)
         d0, d1, d2 = p[0] - eye[0], p[1] - eye[1], p[2] - eye[2]
         distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
         # Distance to the sheet's plane; over the distance along the ray, the cosine at which it is met.
         height = -(n[0] * d0 + n[1] * d1 + n[2] * d2)
         reach = _REACH * footprint * distance / narrow * distance / max(height, 1e-9)
-        inked, same = _at_point(s, y, reach, across, down, dark, centres, radius)
+        inked, same = _print_at_point(s, y, reach, across, down, dark, centres, radius)
         if same or footprint == 0.0:
             if inked:
                 out[k] = dark_share
@@ -231,22 +231,20 @@ def _fill(
         for corner in range(4):
             du = -0.5 if corner == 0 or corner == 3 else 0.5
             dv = -0.5 if corner < 2 else 0.5
-            a, b = undistorted(
-                (cu + du * footprint - lens[2]) / lens[0], (cv + dv * footprint - lens[3]) / lens[1], lens
-            )
+            a, b = undistort((cu + du * footprint - lens[2]) / lens[0], (cv + dv * footprint - lens[3]) / lens[1], lens)
             for axis in range(3):
                 ray[axis] = rotation[0, axis] * a + rotation[1, axis] * b + rotation[2, axis]
             t = -height / (n[0] * ray[0] + n[1] * ray[1] + n[2] * ray[2])
             q0, q1, q2 = eye[0] + t * ray[0], eye[1] + t * ray[1], eye[2] + t * ray[2]
             qx = frame[0, 0] * q0 + frame[0, 1] * q1 + frame[0, 2] * q2 + frame[0, 3]
             qy = frame[1, 0] * q0 + frame[1, 1] * q1 + frame[1, 2] * q2 + frame[1, 3]
-            cell[corner, 0], cell[corner, 1] = _along(qx, curvature) - s, qy - y
+            cell[corner, 0], cell[corner, 1] = _arc_length(qx, curvature) - s, qy - y
         area, mx, my = _moments(cell, 4)
         if len(centres) > 0:
             # So near its rim a disc of many cells is a half-plane.
-            best, off = _nearest(s, y, centres)
+            best, off = _nearest_disc(s, y, centres)
             a, b = (s - centres[best, 0]) / off, (y - centres[best, 1]) / off
-            count = _clipped(cell, 4, a, b, radius - off, first)
+            count = _clip_polygon(cell, 4, a, b, radius - off, first)
             inked_area, ix, iy = _moments(first, count)
         else:
             inked_area, ix, iy = _dark_in_rectangles(cell, s, y, across, down, dark, first, second)

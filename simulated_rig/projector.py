@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from simulated_rig.light import LightTable, desktop_light, light_table, no_light
-from simulated_rig.options import Faults, ProjectorOptions
-from simulated_rig.staging import Staging
-from simulated_rig.world import NS_PER_S, Flicker, Lamp, nanoseconds
+from simulated_rig.light import LightTable, dark_table, desktop_table, light_table
+from simulated_rig.options import Faults, SimulatedProjectorOptions
+from simulated_rig.staging import SceneController
+from simulated_rig.world import NS_PER_S, Lamp, LightFlicker, nanoseconds
 from slrig.devices import COMPUTED, Clock, ProjectorInfo, ProjectorState, Shown
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Primary
@@ -22,7 +22,13 @@ class SimulatedProjector:
     """Implements `slrig.devices.Projector` on the rendered world. Tells `staging` of each capture and pattern."""
 
     def __init__(
-        self, options: ProjectorOptions, clock: Clock, *, faults: Faults, seed: int, staging: Staging | None = None
+        self,
+        options: SimulatedProjectorOptions,
+        clock: Clock,
+        *,
+        faults: Faults,
+        seed: int,
+        staging: SceneController | None = None,
     ) -> None:
         self._options = options
         self._clock = clock
@@ -30,7 +36,7 @@ class SimulatedProjector:
         self._staging = staging
         self._response = options.response()
         self._dark = self._table(np.zeros((1, 1), np.uint8))
-        swing = Flicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
+        swing = LightFlicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
         self.lamp = Lamp(self._dark, swing)
         self._rng = np.random.default_rng((seed, 0x70726F6A))
         self._state = ProjectorState("the rendered projector")
@@ -142,14 +148,14 @@ class SimulatedProjector:
 
     def _table(self, profile: np.ndarray[tuple[int, ...], np.dtype[np.unsignedinteger]]) -> LightTable:
         if self._faults.lamp_off:
-            return no_light(self._options.size)
+            return dark_table(self._options.size)
         if self._faults.picture in ("mirrored", "rotated"):
             profile = profile[:, ::-1]
         if self._faults.picture in ("upside_down", "rotated"):
             profile = profile[::-1]
         if self._faults.other_display:
             glow = self._faults.other_display_glow * float(self._response.light(profile).mean())
-            return replace(desktop_light(self._options.size, self._response), glow=glow)
+            return replace(desktop_table(self._options.size, self._response), glow=glow)
         return light_table(profile, self._options.size, self._response)
 
     def _require_usable(self) -> None:

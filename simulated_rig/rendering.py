@@ -10,37 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulated_rig import transport
-from simulated_rig.casting import Caster, caster
+from simulated_rig.casting import RayCaster, build_caster
 from simulated_rig.defocus import ALWAYS_SHARP, LEVELS_PX, Focus, level_weights
-from simulated_rig.light import Float32Array, LightTable, blurred, radiance
+from simulated_rig.light import Float32Array, LightTable, blur_image, radiance
 from simulated_rig.optics import lens_array, world_directions
 from simulated_rig.scene import SceneSurface
-from simulated_rig.transport import Paths
+from simulated_rig.transport import LightPaths
 from slrig.model import CameraTruth, Pinhole
 
 Weights = dict[int, Float32Array]
 """(H, W) by the index of a level of `defocus.LEVELS_PX`: how much of its image each pixel takes."""
 
 
-class Setting:
+class SceneSnapshot:
     """A surface before a projector, for as long as both stand still, and the caster that finds the surface."""
 
     def __init__(self, surface: SceneSurface, projector: Pinhole) -> None:
         self.surface = surface
         self.projector = projector
-        self._rays: Caster | None = None
+        self._rays: RayCaster | None = None
         self._lock = threading.Lock()
 
     @property
-    def rays(self) -> Caster:
+    def rays(self) -> RayCaster:
         """The caster of the surface. Built once, when first needed."""
         with self._lock:
             if self._rays is None:
-                self._rays = caster(self.surface.vertices_mm, self.surface.faces)
+                self._rays = build_caster(self.surface.vertices_mm, self.surface.faces)
             return self._rays
 
 
-class Stage:
+class SceneState:
     """What stands before the cameras now, and the projector: exchanged as a whole when something moves."""
 
     def __init__(
@@ -51,7 +51,7 @@ class Stage:
         working_distance_mm: float,
         fall_off: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        self.setting = Setting(surface, projector)
+        self.setting = SceneSnapshot(surface, projector)
         self.fall_off = fall_off
         self.working_distance_mm = working_distance_mm
 
@@ -66,41 +66,41 @@ class Stage:
         return self.setting.projector
 
     @property
-    def rays(self) -> Caster:
+    def rays(self) -> RayCaster:
         """The caster of the surface."""
         return self.setting.rays
 
     def change(self, *, surface: SceneSurface | None = None, projector: Pinhole | None = None) -> None:
         """Put another surface there, or move the projector. Nothing happens if the projector stands there already."""
         now = self.setting
-        if surface is not None or (projector is not None and not same_pose(projector, now.projector)):
-            self.setting = Setting(surface or now.surface, projector or now.projector)
+        if surface is not None or (projector is not None and not is_same_pose(projector, now.projector)):
+            self.setting = SceneSnapshot(surface or now.surface, projector or now.projector)
 
 
-class _Seen:
+class _ViewCache:
     """What was traced of one setting by a camera in one place.
 
     room : its image under the room's light alone; last : under the projector's light that was asked for last.
     softness : how much of each level of defocus every pixel takes, of the projector's and of the camera's.
     """
 
-    def __init__(self, setting: Setting, camera: Pinhole) -> None:
+    def __init__(self, setting: SceneSnapshot, camera: Pinhole) -> None:
         self.setting = setting
         self.camera = camera
-        self.paths: Paths | None = None
+        self.paths: LightPaths | None = None
         self.room: Float32Array | None = None
         self.last: tuple[LightTable, Float32Array] | None = None
         self.softness: tuple[Weights, Weights] | None = None
         self.truth: CameraTruth | None = None
 
 
-class View:
+class CameraView:
     """One camera's view of a stage. Its light paths are traced once for each setting, by `prepare` or an image."""
 
     def __init__(
         self,
         camera: Pinhole,
-        stage: Stage,
+        stage: SceneState,
         *,
         blur_px: float,
         focus: tuple[Focus, Focus] = (ALWAYS_SHARP, ALWAYS_SHARP),
@@ -119,7 +119,7 @@ class View:
         self._jitter = jitter
         self._seed = seed
         self._workers = workers
-        self._newest = _Seen(stage.setting, camera)
+        self._newest = _ViewCache(stage.setting, camera)
 
     @property
     def camera(self) -> Pinhole:
@@ -128,24 +128,24 @@ class View:
 
     def move(self, camera: Pinhole) -> None:
         """Put the camera elsewhere. Nothing happens if it stands there already."""
-        if not same_pose(camera, self._camera):
+        if not is_same_pose(camera, self._camera):
             self._camera = camera
 
     @property
-    def _seen(self) -> _Seen:
+    def _seen(self) -> _ViewCache:
         """What is known of the present setting: a fresh start when something has moved."""
         setting, camera = self._stage.setting, self._camera
         if self._newest.setting is not setting or self._newest.camera is not camera:
-            self._newest = _Seen(setting, camera)
+            self._newest = _ViewCache(setting, camera)
         return self._newest
 
-    def prepare(self, *, told: Callable[[float], None] = lambda _: None) -> Paths:
+    def prepare(self, *, told: Callable[[float], None] = lambda _: None) -> LightPaths:
         """Trace the light paths, unless that is done, and return them. `told` hears the share that is done."""
         return self._traced_paths(self._seen, told)
 
-    def _traced_paths(self, seen: _Seen, told: Callable[[float], None] = lambda _: None) -> Paths:
+    def _traced_paths(self, seen: _ViewCache, told: Callable[[float], None] = lambda _: None) -> LightPaths:
         if seen.paths is None:
-            seen.paths = transport.paths(
+            seen.paths = transport.trace_paths(
                 seen.camera,
                 seen.setting.projector,
                 seen.setting.surface,
@@ -161,7 +161,7 @@ class View:
                 self._let_fall_off(seen.paths, seen.setting.projector)
         return seen.paths
 
-    def _let_fall_off(self, paths: Paths, projector: Pinhole) -> None:
+    def _let_fall_off(self, paths: LightPaths, projector: Pinhole) -> None:
         """Take from the light what the projector's lens takes: see `ProjectorOptions.fall_off`."""
         power, corner = self._stage.fall_off
         (fx, _, cx), (_, fy, cy), _ = projector.matrix
@@ -182,7 +182,7 @@ class View:
         seen = self._seen
         paths = self._traced_paths(seen)
         if seen.room is None:
-            seen.room = blurred(paths.albedo * np.float32(self._ambient), self._blur_px)
+            seen.room = blur_image(paths.albedo * np.float32(self._ambient), self._blur_px)
         total = seen.room.copy() if ambient is None else seen.room * ambient
         for fraction, light in lights:
             total += np.asarray(fraction, np.float32) * self._under(seen, paths, light)
@@ -196,7 +196,7 @@ class View:
 
         def channel(number: int) -> Float32Array:
             paths = self._traced_paths(seen).in_light(number)
-            total = blurred(paths.albedo * np.float32(self._ambient), self._blur_px) * (
+            total = blur_image(paths.albedo * np.float32(self._ambient), self._blur_px) * (
                 1 if ambient is None else ambient
             )
             for fraction, light in lights:
@@ -214,21 +214,21 @@ class View:
         for _, light in lights:
             self._under(seen, paths, light)
 
-    def _under(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
+    def _under(self, seen: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
         # A free-running camera sees the same light many times over: keep the last image.
         if seen.last is None or seen.last[0] is not light:
             seen.last = (light, self._lit(seen, paths, light))
         return seen.last[1]
 
-    def _lit(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
+    def _lit(self, seen: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
         if light.channel is not None:
             paths = paths.in_light(light.channel)
         image = self._defocused(seen, paths, light) * np.float32(light.power)
         if light.glow > 0:
-            image += blurred(paths.albedo * np.float32(light.glow), self._blur_px)
+            image += blur_image(paths.albedo * np.float32(light.glow), self._blur_px)
         return image
 
-    def _defocused(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
+    def _defocused(self, seen: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
         """The light of the projector on each pixel, blended from images at several levels of defocus."""
         if not any(focus.far_px for focus in self._focus):
             return radiance(paths, light, blur_px=self._blur_px)
@@ -245,7 +245,7 @@ class View:
                     image += taken * radiance(paths, tables[min(of_light, len(tables) - 1)], blur_px=blur_px)
         return image
 
-    def _softness(self, seen: _Seen) -> tuple[Weights, Weights]:
+    def _softness(self, seen: _ViewCache) -> tuple[Weights, Weights]:
         """The levels of the projector and of the camera at each pixel, by the distance of what its centre sees."""
         if seen.truth is None:
             seen.truth = self._traced_truth(seen)
@@ -266,14 +266,14 @@ class View:
             seen.truth = self._traced_truth(seen)
         return seen.truth
 
-    def _traced_truth(self, seen: _Seen) -> CameraTruth:
+    def _traced_truth(self, seen: _ViewCache) -> CameraTruth:
         camera, setting = seen.camera, seen.setting
         shape = camera.size.shape
         depth = np.full(shape, np.nan)
         projector_px = np.full((*shape, 2), np.nan)
         visible: list[NDArray[np.float64]] = []
         for rows, u, v in transport.pixel_centres(camera):
-            hits = transport.trace(
+            hits = transport.trace_rays(
                 u,
                 v,
                 camera,
@@ -291,6 +291,6 @@ class View:
         return CameraTruth(depth, projector_px, np.concatenate(visible))
 
 
-def same_pose(one: Pinhole, other: Pinhole) -> bool:
+def is_same_pose(one: Pinhole, other: Pinhole) -> bool:
     """Whether two devices stand alike, to the last bit."""
     return np.array_equal(one.rotation, other.rotation) and np.array_equal(one.translation_mm, other.translation_mm)

@@ -17,40 +17,40 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from simulated_rig import shapes
-from simulated_rig.boards import Board, Print
-from simulated_rig.placed import Colour, Placed, turned_by
-from simulated_rig.shapes import Part
-from simulated_rig.tables import NotNegative, Pair, Positive, at_least_one
+from simulated_rig.boards import BoardPrint, PrintedBoard
+from simulated_rig.placed import Colour, TexturedObject, rotation_matrix
+from simulated_rig.shapes import MeshPart
+from simulated_rig.tables import NotNegative, Pair, Positive, require_one
 from slrig.bundle.validation import Strict, checked, read_toml
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, IntArray
 
-_MOST_BYTES = 1 << 24
+_MAX_FILE_BYTES = 1 << 24
 
 
-class Plane(Placed):
+class PlaneObject(TexturedObject):
     """A rectangle in the object's x-y plane."""
 
     shape: Literal["plane"]
     size_mm: Annotated[tuple[Positive, Positive], Field(strict=False)]
 
-    def parts(self, _folder: Path) -> list[Part]:
+    def parts(self, _folder: Path) -> list[MeshPart]:
         """The rectangle."""
         return [shapes.rectangle(*self.size_mm)]
 
 
-class Sphere(Placed):
+class Sphere(TexturedObject):
     """A ball about the object's origin. Light and truth use the exact sphere, not its facets."""
 
     shape: Literal["sphere"]
     radius_mm: Positive
 
-    def parts(self, _folder: Path) -> list[Part]:
+    def parts(self, _folder: Path) -> list[MeshPart]:
         """The ball."""
         return [shapes.ball(self.radius_mm)]
 
 
-class BallBar(Placed):
+class BallBar(TexturedObject):
     """Two equal balls, `distance_mm` between their centres along x, and the bar that joins them."""
 
     shape: Literal["ball_bar"]
@@ -67,7 +67,7 @@ class BallBar(Placed):
             raise ValueError(message)
         return self
 
-    def parts(self, _folder: Path) -> list[Part]:
+    def parts(self, _folder: Path) -> list[MeshPart]:
         """Two balls and a rod."""
         half = self.distance_mm / 2
         left = shapes.ball(self.radius_mm, centre_mm=(-half, 0.0, 0.0))
@@ -75,7 +75,7 @@ class BallBar(Placed):
         return [left, right, shapes.rod(self.bar_radius_mm, self.distance_mm)]
 
 
-class Stairs(Placed):
+class Stairs(TexturedObject):
     """Steps along x, each `rise_mm` nearer to the devices than the one on its left, `height_mm` long in y."""
 
     shape: Literal["stairs"]
@@ -84,7 +84,7 @@ class Stairs(Placed):
     rise_mm: Positive
     height_mm: Positive
 
-    def parts(self, _folder: Path) -> list[Part]:
+    def parts(self, _folder: Path) -> list[MeshPart]:
         """Treads and risers, flat."""
         return [shapes.staircase(self.steps, self.tread_mm, self.rise_mm, self.height_mm)]
 
@@ -98,7 +98,7 @@ class Wave(Strict):
     phase_deg: float = 0.0
 
 
-class Bump(Strict):
+class ReliefBump(Strict):
     """One Gaussian hill (or hollow, with a negative height) of a relief."""
 
     centre_mm: Pair
@@ -106,14 +106,14 @@ class Bump(Strict):
     sigma_mm: Positive
 
 
-class Relief(Placed):
+class Relief(TexturedObject):
     """A height field over a rectangle: a sum of waves and bumps, sampled every `step_mm`."""
 
     shape: Literal["relief"]
     size_mm: Annotated[tuple[Positive, Positive], Field(strict=False)]
     step_mm: Positive = 0.5
     wave: Annotated[tuple[Wave, ...], Field(strict=False)] = ()
-    bump: Annotated[tuple[Bump, ...], Field(strict=False)] = ()
+    bump: Annotated[tuple[ReliefBump, ...], Field(strict=False)] = ()
 
     @model_validator(mode="after")
     def _bounded(self) -> Relief:
@@ -135,12 +135,12 @@ class Relief(Placed):
             total += bump.height_mm * np.exp(-square / (2 * bump.sigma_mm**2))
         return total
 
-    def parts(self, _folder: Path) -> list[Part]:
+    def parts(self, _folder: Path) -> list[MeshPart]:
         """The height field."""
         return [shapes.height_field(self.size_mm, self.step_mm, self.height_mm)]
 
 
-class Turned(Placed):
+class Vessel(TexturedObject):
     """A vessel turned on a lathe about y: a smooth curve through (radius, height) points, fluted if asked.
 
     `flutes` grooves run along the axis and change the radius by ± `flute_depth_mm`, twisted by `twist_deg` over
@@ -155,7 +155,7 @@ class Turned(Placed):
     step_mm: Positive = 0.5
 
     @model_validator(mode="after")
-    def _turnable(self) -> Turned:
+    def _turnable(self) -> Vessel:
         if len(self.profile_mm) < 3:
             message = f"profile_mm needs at least 3 points, found {len(self.profile_mm)}"
             raise ValueError(message)
@@ -165,13 +165,13 @@ class Turned(Placed):
             raise ValueError(message)
         return self
 
-    def parts(self, _folder: Path) -> list[Part]:
+    def parts(self, _folder: Path) -> list[MeshPart]:
         """The open vessel's outer wall."""
         profile = np.array(self.profile_mm)
-        return [shapes.turned(profile, self.flutes, self.flute_depth_mm, np.deg2rad(self.twist_deg), self.step_mm)]
+        return [shapes.vessel(profile, self.flutes, self.flute_depth_mm, np.deg2rad(self.twist_deg), self.step_mm)]
 
 
-class MeshFile(Placed):
+class MeshFile(TexturedObject):
     """A triangle mesh from a file (STL, PLY, OBJ, GLB), in units of `unit_mm`, in its own frame.
 
     A GLB's frame is glTF's: metres, y up. unit_mm = 1000 and rotation_deg = [180, 0, 0] bring a scan's mesh.glb back.
@@ -183,13 +183,13 @@ class MeshFile(Placed):
     unit_mm: Positive = 1.0
     crease_deg: Annotated[float, Field(ge=0, le=180)] = 30.0
 
-    def parts(self, folder: Path) -> list[Part]:
+    def parts(self, folder: Path) -> list[MeshPart]:
         """The mesh. Raises ConfigError when the file cannot be read or holds no triangle."""
         return [shapes.mesh_file(folder / self.file, self.unit_mm, crease_rad=np.deg2rad(self.crease_deg))]
 
 
-Thing = Annotated[
-    Plane | Sphere | BallBar | Stairs | Relief | Turned | MeshFile | Board,
+AnyObject = Annotated[
+    PlaneObject | Sphere | BallBar | Stairs | Relief | Vessel | MeshFile | PrintedBoard,
     Field(discriminator="shape"),
 ]
 
@@ -198,7 +198,7 @@ class Scene(Strict):
     """A scene file: a name and one or more objects."""
 
     name: str = ""
-    object: Annotated[tuple[Thing, ...], Field(strict=False), AfterValidator(at_least_one)]
+    object: Annotated[tuple[AnyObject, ...], Field(strict=False), AfterValidator(require_one)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,32 +221,32 @@ class SceneSurface:
     to_object: FloatArray
     material: FloatArray
     colours: FloatArray
-    prints: Mapping[int, Print] = field(default_factory=dict)
+    prints: Mapping[int, BoardPrint] = field(default_factory=dict)
 
 
 def read_scene(path: Path) -> Scene:
     """Return the scene of a TOML file. Raises ConfigError that lists all faults."""
-    return checked(Scene, read_toml(path, _MOST_BYTES), f"the scene file {path}")
+    return checked(Scene, read_toml(path, _MAX_FILE_BYTES), f"the scene file {path}")
 
 
-def surface_of(scene: Scene, folder: Path) -> SceneSurface:
+def build_surface(scene: Scene, folder: Path) -> SceneSurface:
     """Return the triangles of a scene; mesh files are looked for from `folder`. Raises ConfigError."""
     vertices, faces, normals, owners = [], [], [], []
     spheres: list[tuple[float, ...]] = []
     inverses: list[FloatArray] = []
     materials: list[tuple[float, ...]] = []
     colours: list[tuple[Colour, Colour]] = []
-    prints: dict[int, Print] = {}
+    prints: dict[int, BoardPrint] = {}
     faults, first = [], 0
     for thing in scene.object:
-        rotation = turned_by(thing.rotation_deg)
+        rotation = rotation_matrix(thing.rotation_deg)
         shift = np.array(thing.position_mm)
         try:
             parts = thing.parts(folder)
         except ConfigError as error:
             faults.append(str(error))
             continue
-        if isinstance(thing, Board):
+        if isinstance(thing, PrintedBoard):
             prints[len(spheres)] = thing.printed()
         for part in parts:
             vertices.append(part.vertices_mm @ rotation.T + shift)

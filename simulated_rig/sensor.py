@@ -12,7 +12,7 @@ from slrig.model import Pixels
 
 
 @dataclass(frozen=True, slots=True)
-class Sensor:
+class SensorModel:
     """A linear sensor, and the camera's own processing behind it, if there is any.
 
     value = pedestal_dn + gain * electrons * (full scale - pedestal_dn) / full_well_e, clipped; then

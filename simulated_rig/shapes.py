@@ -24,7 +24,7 @@ and rods; reliefs and turned shapes are as fine as their `step_mm`, and are them
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class MeshPart:
     """One primitive in its object's frame.
 
     vertices_mm : (V, 3) float64; faces : (F, 3) int32; corner_normals : (F, 3, 3) float64, unit.
@@ -37,20 +37,20 @@ class Part:
     sphere_mm: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
-def rectangle(width_mm: float, height_mm: float) -> Part:
+def rectangle(width_mm: float, height_mm: float) -> MeshPart:
     """A flat rectangle in x and y that faces -z."""
     reach = np.array([width_mm, height_mm]) / 2
     return rectangle_between(-reach, reach)
 
 
-def rectangle_between(least_mm: FloatArray, most_mm: FloatArray) -> Part:
+def rectangle_between(least_mm: FloatArray, most_mm: FloatArray) -> MeshPart:
     """A flat rectangle that faces -z between two corners (x, y)."""
     (left, top), (right, bottom) = least_mm, most_mm
     vertices = np.array([(left, top, 0), (right, top, 0), (right, bottom, 0), (left, bottom, 0)], np.float64)
-    return _flat(vertices, np.array([(0, 2, 1), (0, 3, 2)], np.int32))
+    return _flat_part(vertices, np.array([(0, 2, 1), (0, 3, 2)], np.int32))
 
 
-def bent_sheet(across_mm: tuple[float, float], down_mm: tuple[float, float], curvature_per_mm: float) -> Part:
+def bent_sheet(across_mm: tuple[float, float], down_mm: tuple[float, float], curvature_per_mm: float) -> MeshPart:
     """The sheet z = curvature x² that faces -z, in strips narrow enough for FACET_ERROR_MM / 30."""
     # A chord of a parabola over a strip of width w sags by curvature w² / 4.
     width = np.sqrt(4 * FACET_ERROR_MM / 30 / abs(curvature_per_mm))
@@ -58,10 +58,10 @@ def bent_sheet(across_mm: tuple[float, float], down_mm: tuple[float, float], cur
     x = np.linspace(*across_mm, count)
     z = curvature_per_mm * x**2
     vertices = np.concatenate([np.column_stack([x, np.full(count, y), z]) for y in down_mm])
-    return _smooth(vertices, _grid_faces(2, count, closed=False), crease_rad=np.pi)
+    return _smooth_part(vertices, _grid_faces(2, count, closed=False), crease_rad=np.pi)
 
 
-def ball(radius_mm: float, *, centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:
+def ball(radius_mm: float, *, centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> MeshPart:
     """An icosphere whose facets' mid points lie at most FACET_ERROR_MM inside the sphere."""
     # The icosahedron's edge is 1.05 radii and halves with each subdivision, though the longest stay up to 1.24 times
     # that; the middle of an equilateral triangle of edge e (circumradius e/√3) sags by e²/(6 r).
@@ -70,10 +70,10 @@ def ball(radius_mm: float, *, centre_mm: tuple[float, float, float] = (0.0, 0.0,
     vertices = np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces, np.int32)
     normals = vertices[faces] / np.linalg.norm(vertices[faces], axis=2, keepdims=True)
-    return Part(vertices + np.array(centre_mm), faces, normals, (*centre_mm, radius_mm))
+    return MeshPart(vertices + np.array(centre_mm), faces, normals, (*centre_mm, radius_mm))
 
 
-def rod(radius_mm: float, length_mm: float) -> Part:
+def rod(radius_mm: float, length_mm: float) -> MeshPart:
     """The wall of a cylinder along x, open at both ends."""
     count = int(np.ceil(np.pi / np.arccos(max(1 - FACET_ERROR_MM / radius_mm, 0.0)))) + 3
     turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
@@ -86,10 +86,10 @@ def rod(radius_mm: float, length_mm: float) -> Part:
         [np.column_stack([here, after, after + count]), np.column_stack([here, after + count, here + count])]
     ).astype(np.int32)
     radial = np.concatenate([ring, ring]) / radius_mm
-    return Part(vertices, faces, radial[faces])
+    return MeshPart(vertices, faces, radial[faces])
 
 
-def staircase(steps: int, tread_mm: float, rise_mm: float, height_mm: float) -> Part:
+def staircase(steps: int, tread_mm: float, rise_mm: float, height_mm: float) -> MeshPart:
     """Treads facing -z and risers facing -x, centred on the origin; each step is nearer than the one on its left."""
     x = (np.repeat(np.arange(steps + 1), 2)[1:-1] - steps / 2) * tread_mm
     z = -(np.repeat(np.arange(steps), 2) - (steps - 1) / 2) * rise_mm
@@ -103,22 +103,22 @@ def staircase(steps: int, tread_mm: float, rise_mm: float, height_mm: float) -> 
             np.column_stack([here, here + count, here + 1 + count]),
         ]
     ).astype(np.int32)
-    return _flat(vertices, faces)
+    return _flat_part(vertices, faces)
 
 
 def height_field(
     size_mm: tuple[float, float], step_mm: float, height_mm: Callable[[FloatArray, FloatArray], FloatArray]
-) -> Part:
+) -> MeshPart:
     """A rectangle sampled every `step_mm` (or a little finer) and raised towards -z."""
     columns, rows = (max(int(np.ceil(extent / step_mm)), 1) + 1 for extent in size_mm)
     x, y = np.meshgrid(
         np.linspace(-size_mm[0] / 2, size_mm[0] / 2, columns), np.linspace(-size_mm[1] / 2, size_mm[1] / 2, rows)
     )
     vertices = np.stack([x, y, -height_mm(x, y)], axis=-1).reshape(-1, 3)
-    return _smooth(vertices, _grid_faces(rows, columns, closed=False), crease_rad=np.pi)
+    return _smooth_part(vertices, _grid_faces(rows, columns, closed=False), crease_rad=np.pi)
 
 
-def turned(profile_mm: FloatArray, flutes: int, flute_depth_mm: float, twist_rad: float, step_mm: float) -> Part:
+def vessel(profile_mm: FloatArray, flutes: int, flute_depth_mm: float, twist_rad: float, step_mm: float) -> MeshPart:
     """The wall of a vessel about the y axis: radius by a cubic spline through (radius, height), with flutes."""
     radius, height = profile_mm.T
     curve = CubicSpline(height, radius)
@@ -130,10 +130,10 @@ def turned(profile_mm: FloatArray, flutes: int, flute_depth_mm: float, twist_rad
     twist = twist_rad * (h - height[0]) / (height[-1] - height[0])
     r = curve(h) + flute_depth_mm * np.cos(flutes * (turn - twist))
     vertices = np.stack([r * np.sin(turn), -h, -r * np.cos(turn)], axis=-1).reshape(-1, 3)
-    return _smooth(vertices, _grid_faces(rows, columns, closed=True)[:, ::-1].copy(), crease_rad=np.pi)
+    return _smooth_part(vertices, _grid_faces(rows, columns, closed=True)[:, ::-1].copy(), crease_rad=np.pi)
 
 
-def mesh_file(path: Path, unit_mm: float, *, crease_rad: float) -> Part:
+def mesh_file(path: Path, unit_mm: float, *, crease_rad: float) -> MeshPart:
     """The triangles of an STL, PLY, OBJ or GLB file, times `unit_mm`. Raises ConfigError."""
     if not path.is_file():
         message = f"mesh file {path}: there is no such file; paths count from the folder of the scene file"
@@ -150,7 +150,7 @@ def mesh_file(path: Path, unit_mm: float, *, crease_rad: float) -> Part:
     if not np.isfinite(vertices).all():
         message = f"mesh file {path}: some vertices are not finite; repair the mesh"
         raise ConfigError(message)
-    return _smooth(vertices, np.asarray(mesh.faces, np.int32), crease_rad=crease_rad)
+    return _smooth_part(vertices, np.asarray(mesh.faces, np.int32), crease_rad=crease_rad)
 
 
 def _grid_faces(rows: int, columns: int, *, closed: bool) -> IntArray:
@@ -169,25 +169,30 @@ def _face_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
     return np.cross(b - a, c - a)
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _normalise(vectors: FloatArray) -> FloatArray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.where(length > 0, length, 1.0), dtype=np.float64)
 
 
-def _flat(vertices: FloatArray, faces: IntArray) -> Part:
-    normals = _unit(_face_normals(vertices, faces))
-    return Part(vertices, faces, np.repeat(normals[:, None], 3, axis=1))
+def _flat_part(vertices: FloatArray, faces: IntArray) -> MeshPart:
+    normals = _normalise(_face_normals(vertices, faces))
+    return MeshPart(vertices, faces, np.repeat(normals[:, None], 3, axis=1))
 
 
-def _smooth(vertices: FloatArray, faces: IntArray, *, crease_rad: float) -> Part:
+def _smooth_part(vertices: FloatArray, faces: IntArray, *, crease_rad: float) -> MeshPart:
     """Corner normals: the area-weighted mean of the faces at the vertex that bend less than a crease from this one."""
     weighted = _face_normals(vertices, faces)
     corners = np.argsort(faces, axis=None, kind="stable")
     first = np.searchsorted(faces.ravel()[corners], np.arange(len(vertices) + 1))
     normals = _corner_normals(
-        np.ascontiguousarray(faces), first, corners // 3, weighted, _unit(weighted), float(np.cos(crease_rad)) - 1e-12
+        np.ascontiguousarray(faces),
+        first,
+        corners // 3,
+        weighted,
+        _normalise(weighted),
+        float(np.cos(crease_rad)) - 1e-12,
     )
-    return Part(vertices, faces, normals)
+    return MeshPart(vertices, faces, normals)
 
 
 @kernel(in_every_scan=False)

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from simulated_rig.boards import Board
-from simulated_rig.disturbing import PROJECTOR, Moving, Push, pushed
+from simulated_rig.boards import PrintedBoard
+from simulated_rig.disturbing import PROJECTOR, ObjectMotion, PoseChange, apply_pose_change
 from simulated_rig.options import HeadOptions
-from simulated_rig.placed import Standing, put, turned_by
-from simulated_rig.poses import Pose, made_up
-from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import Scene, SceneSurface, surface_of
+from simulated_rig.placed import SceneObject, place_object, rotation_matrix
+from simulated_rig.poses import ScriptedPose, generate_poses
+from simulated_rig.rendering import CameraView, SceneState
+from simulated_rig.scene import Scene, SceneSurface, build_surface
 from simulated_rig.world import NS_PER_S
 from slrig.devices import Clock
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
@@ -23,24 +23,24 @@ from slrig.model import FloatArray, Pinhole
 _BACKDROP = "backdrop"
 
 
-class Script:
+class PoseScript:
     """The poses that a rig's options and scene give, and the surface at each. Raises ConfigError, with all faults."""
 
     def __init__(self, options: HeadOptions, scene: Scene, folder: Path) -> None:
         self._scene = scene
         self._folder = folder
-        self.poses: tuple[Pose, ...] = options.pose
-        boards = [thing for thing in scene.object if isinstance(thing, Board)]
-        self._mover: Standing = boards[0] if boards else scene.object[0]
+        self.poses: tuple[ScriptedPose, ...] = options.pose
+        boards = [thing for thing in scene.object if isinstance(thing, PrintedBoard)]
+        self._mover: SceneObject = boards[0] if boards else scene.object[0]
         faults: list[str] = []
         if options.poses is not None:
             if boards:
                 devices = [each.pinhole() for each in (*options.camera, options.projector)]
-                self.poses += made_up(options.poses, boards[0], devices)
+                self.poses += generate_poses(options.poses, boards[0], devices)
             else:
                 faults.append('[head.poses] moves a board, and the scene has none: add an object of shape = "board"')
         names = {thing.name: thing for thing in scene.object}
-        self._moved: list[Standing] = []
+        self._moved: list[SceneObject] = []
         for number, pose in enumerate(self.poses):
             if pose.object is None and not boards:
                 faults.append(
@@ -78,7 +78,7 @@ class Script:
         return tuple(pose.name or f"pose {number + 1}" for number, pose in enumerate(self.poses))
 
     def surface(
-        self, index: int, movings: Sequence[tuple[Moving, float]] = (), *, turn: FloatArray | None = None
+        self, index: int, movings: Sequence[tuple[ObjectMotion, float]] = (), *, turn: FloatArray | None = None
     ) -> SceneSurface:
         """The scene at a pose, after a share of each movement, and after the turntable's turn, (4, 4) in the world.
         Without poses: as the scene file has it.
@@ -88,25 +88,30 @@ class Script:
         things = self._scene.object
         if scripted is not None or movings:
             stand = scripted if scripted is not None else mover
-            position, rotation = np.array(stand.position_mm), turned_by(stand.rotation_deg)
+            position, rotation = np.array(stand.position_mm), rotation_matrix(stand.rotation_deg)
             for moving, share in movings:
                 position = position + share * np.array(moving.shift_mm)
                 rotation = Rotation.from_rotvec(share * np.deg2rad(moving.turn_deg)).as_matrix() @ rotation
             exact = {} if scripted is None or movings else {"rotation_deg": scripted.rotation_deg}
             things = tuple(
-                put(each, position, rotation).model_copy(update=exact) if each is mover else each for each in things
+                place_object(each, position, rotation).model_copy(update=exact) if each is mover else each
+                for each in things
             )
         if turn is not None:
             things = tuple(
-                put(each, turn[:3, :3] @ each.position_mm + turn[:3, 3], turn[:3, :3] @ turned_by(each.rotation_deg))
+                place_object(
+                    each,
+                    turn[:3, :3] @ each.position_mm + turn[:3, 3],
+                    turn[:3, :3] @ rotation_matrix(each.rotation_deg),
+                )
                 if on_table
                 else each
                 for each, on_table in zip(things, self._on_table, strict=True)
             )
-        return surface_of(self._scene.model_copy(update={"object": things}), self._folder)
+        return build_surface(self._scene.model_copy(update={"object": things}), self._folder)
 
 
-class Staging:
+class SceneController:
     """Puts the world into the state that the script wants: at a move, at a capture's beginning, between its patterns.
 
     Implements `slrig.devices.Positioner`. Devices and surface are exchanged on the stage and its views, which then
@@ -114,7 +119,7 @@ class Staging:
     """
 
     def __init__(
-        self, options: HeadOptions, script: Script, stage: Stage, views: Mapping[str, View], clock: Clock
+        self, options: HeadOptions, script: PoseScript, stage: SceneState, views: Mapping[str, CameraView], clock: Clock
     ) -> None:
         self._options = options
         self._script = script
@@ -188,7 +193,7 @@ class Staging:
         self._shows += 1
 
     @property
-    def _movings(self) -> list[Moving]:
+    def _movings(self) -> list[ObjectMotion]:
         return [each for each in self._options.faults.moving if each.pose in (None, self._index)]
 
     def _set_objects(self) -> None:
@@ -197,7 +202,7 @@ class Staging:
 
     def _set_devices(self) -> None:
         time_s = (self._clock.now_ns() - self._t_opened_ns) / NS_PER_S
-        pushes: list[tuple[Push, float]] = [
+        pushes: list[tuple[PoseChange, float]] = [
             *((bump, 1.0) for bump in self._options.faults.bump if bump.pose <= self._index),
             *((drift, drift.share(time_s, self._captures)) for drift in self._options.drift),
         ]
@@ -205,7 +210,7 @@ class Staging:
             now = stated
             for push, share in pushes:
                 if push.device == name:
-                    now = pushed(now, push, share=share)
+                    now = apply_pose_change(now, push, share=share)
             if name == PROJECTOR:
                 self._stage.change(projector=now)
             else:

@@ -17,7 +17,7 @@ Positive = Annotated[float, Field(gt=0)]
 Item = TypeVar("Item")
 
 
-def at_least_one(items: tuple[Item, ...]) -> tuple[Item, ...]:
+def require_one(items: tuple[Item, ...]) -> tuple[Item, ...]:
     """Return `items`, or raise ValueError. A length rule of pydantic's own would also count items with faults."""
     if not items:
         message = "at least one is needed"

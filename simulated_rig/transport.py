@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from simulated_rig.casting import Caster
-from simulated_rig.optics import LensArray, distorted, field_radius, lens_array, world_directions
-from simulated_rig.printing import pigment
+from simulated_rig.casting import RayCaster
+from simulated_rig.optics import LensArray, distort, field_radius, lens_array, world_directions
+from simulated_rig.printing import print_reflectance
 from simulated_rig.scene import SceneSurface
 from simulated_rig.textures import texture_value
 from slrig.kernels import kernel, kernel_part
@@ -53,7 +53,7 @@ class Hits:
 
 
 @dataclass(frozen=True, slots=True)
-class Paths:
+class LightPaths:
     """Every sub-pixel sample of one camera, S per pixel.
 
     column_px, row_px, weight : (H, W, S) float32, weight 0 where the sample is not lit.
@@ -67,7 +67,7 @@ class Paths:
     albedo: NDArray[np.float32]
     hue: NDArray[np.float32] | None = None
 
-    def in_light(self, channel: int) -> Paths:
+    def in_light(self, channel: int) -> LightPaths:
         """The paths of blue, green or red light alone: 0, 1, 2."""
         if self.hue is None:
             return self
@@ -76,13 +76,13 @@ class Paths:
         return replace(self, weight=self.weight * hue, albedo=self.albedo * hue.mean(axis=2), hue=None)
 
 
-def trace(
+def trace_rays(
     u: FloatArray,
     v: FloatArray,
     camera: Pinhole,
     projector: Pinhole,
     surface: SceneSurface,
-    rays: Caster,
+    rays: RayCaster,
     *,
     working_distance_mm: float,
     footprint_px: float = 0.0,
@@ -107,7 +107,7 @@ def trace(
         surface.part,
         surface.sphere_mm,
     )
-    pigments = pigment(points, normals, triangle, u, v, camera, surface, footprint_px=footprint_px)
+    pigments = print_reflectance(points, normals, triangle, u, v, camera, surface, footprint_px=footprint_px)
     seen = np.isfinite(points[:, 0])
     to_point = points - lamp
     distance = np.linalg.norm(to_point, axis=1)
@@ -149,11 +149,11 @@ def trace(
     return Hits(points, seen, inside & (weight > 0), column, row, weight, albedo, hue)
 
 
-def paths(
+def trace_paths(
     camera: Pinhole,
     projector: Pinhole,
     surface: SceneSurface,
-    rays: Caster,
+    rays: RayCaster,
     *,
     samples_per_axis: int,
     jitter: bool,
@@ -161,14 +161,14 @@ def paths(
     working_distance_mm: float,
     workers: int,
     told: Callable[[float], None] = lambda _: None,
-) -> Paths:
+) -> LightPaths:
     """Trace samples_per_axis² samples per pixel: at the middles of equal cells, or, jittered, anywhere in each cell.
 
     `told` hears the share that is done, block by block.
     """
     rows, columns = camera.size.shape
     count = samples_per_axis**2
-    out = Paths(
+    out = LightPaths(
         column_px=np.zeros((rows, columns, count), np.float32),
         row_px=np.zeros((rows, columns, count), np.float32),
         weight=np.zeros((rows, columns, count), np.float32),
@@ -182,7 +182,7 @@ def paths(
         u, v = _sample_positions(
             first, last, columns, samples_per_axis, np.random.default_rng((seed, first)) if jitter else None
         )
-        hits = trace(
+        hits = trace_rays(
             u,
             v,
             camera,
@@ -385,7 +385,7 @@ def _light_points(
         x, y = q0 / q2, q1 / q2
         if x * x + y * y > field * field:
             continue
-        xd, yd = distorted(x, y, lens)
+        xd, yd = distort(x, y, lens)
         column[i] = lens[0] * xd + lens[2]
         row[i] = lens[1] * yd + lens[3]
         strength = albedo[i] * cosine

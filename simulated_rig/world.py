@@ -11,7 +11,7 @@ from simulated_rig.light import LightTable
 
 NS_PER_S = 1_000_000_000
 
-_CHANGES_KEPT = 256
+_MAX_CHANGES = 256
 
 
 def nanoseconds(seconds: float) -> int:
@@ -39,7 +39,7 @@ class VirtualClock:
 
 
 @dataclass(frozen=True, slots=True)
-class Flicker:
+class LightFlicker:
     """Light that swings about its mean, 1 + depth · sin(2π f t): the mains' in a lamp, or a colour wheel's."""
 
     frequency_hz: float
@@ -56,10 +56,10 @@ class Flicker:
 class Lamp:
     """What the projector shows, and showed: a list of changes in time. Dark at first. Safe between threads."""
 
-    def __init__(self, dark: LightTable, flicker: Flicker | None = None) -> None:
+    def __init__(self, dark: LightTable, flicker: LightFlicker | None = None) -> None:
         self._dark = dark
         self.flicker = flicker
-        self._changes: deque[tuple[int, LightTable]] = deque([(0, dark)], maxlen=_CHANGES_KEPT)
+        self._changes: deque[tuple[int, LightTable]] = deque([(0, dark)], maxlen=_MAX_CHANGES)
         self._lock = threading.Lock()
 
     def show(self, table: LightTable, *, at_ns: int) -> int:

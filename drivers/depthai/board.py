@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
-from drivers.depthai.feed import Feed
-from drivers.depthai.library import library, nanoseconds
-from drivers.depthai.messages import delivery_of, fault_of, kind_of
-from drivers.depthai.options import Stream
-from drivers.depthai.presence import available
-from drivers.depthai.sensors import Sensor, sensors_of
+from drivers.depthai.feed import FrameQueue
+from drivers.depthai.library import load_depthai, nanoseconds
+from drivers.depthai.messages import find_frame_fault, frame_type, read_frame
+from drivers.depthai.options import OakStream
+from drivers.depthai.presence import find_available
+from drivers.depthai.sensors import OakSensor, read_sensors
 from slrig.errors import (
     CalibrationError,
     ConfigError,
@@ -38,23 +38,23 @@ STAMP_ERR_NS = {"USB": 600_000, "network": 1_500_000}
 _QUEUED_MESSAGES = 16
 _LISTEN = timedelta(milliseconds=200)
 _CLOSE_S = 10.0
-_MOST_CLOCK_OFFSET_NS = 5_000_000
+_MAX_CLOCK_OFFSET_NS = 5_000_000
 
-_BOARDS: dict[str, Board] = {}
-_BOARDS_LOCK = threading.Lock()
+_DEVICES: dict[str, OakDevice] = {}
+_DEVICES_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class CameraLink:
     """A camera that uses a board: what it is to deliver, and where its frames go. `start` : its first settings."""
 
-    stream: Stream
+    stream: OakStream
     start: Callable[[Any], None]
-    feed: Feed
+    feed: FrameQueue
 
 
-class Board:
-    """An open device. Made by `board_of`; its cameras `join` and `leave`, the last one closes it.
+class OakDevice:
+    """An open device. Made by `open_device`; its cameras `join` and `leave`, the last one closes it.
 
     Raises
     ------
@@ -67,14 +67,14 @@ class Board:
         self.device_id: str = info.deviceId or info.name
         self.address: str = info.name
         require_one_clock(vendor)
-        with _told(self.device_id, vendor):
+        with _translate_errors(self.device_id, vendor):
             self._device = vendor.Device(info)
         try:
-            with _told(self.device_id, vendor):
+            with _translate_errors(self.device_id, vendor):
                 # A device that comes back by itself comes back with other settings: gone is gone.
                 self._device.setMaxReconnectionAttempts(0)
                 self.model: str = self._device.getProductName() or self._device.getDeviceName() or "OAK"
-                self.sensors: Mapping[str, Sensor] = sensors_of(self._device.getConnectedCameraFeatures(), vendor)
+                self.sensors: Mapping[str, OakSensor] = read_sensors(self._device.getConnectedCameraFeatures(), vendor)
                 self._pipeline = vendor.Pipeline(self._device)
                 self._pipeline.setStopOnDeviceLoss(True)
             by_network = info.protocol == vendor.XLinkProtocol.X_LINK_TCP_IP
@@ -84,8 +84,8 @@ class Board:
                 self._device.close()
             raise
         self._lock = threading.Lock()
-        self._links: dict[str, Link] = {}
-        self._running: Mapping[str, Link] | None = None
+        self._links: dict[str, CameraLink] = {}
+        self._running: Mapping[str, CameraLink] | None = None
         self._controls: dict[str, Any] = {}
         self._users: set[str] = set()
         self._closing = threading.Event()
@@ -95,7 +95,7 @@ class Board:
 
     def factory_calibration(self) -> Any:
         """The library's handler of what was measured in the factory. Raises CalibrationError where there is none."""
-        with _told(self.device_id, self._vendor):
+        with _translate_errors(self.device_id, self._vendor):
             try:
                 return self._device.readCalibration2()
             except self._vendor.XLinkError:
@@ -107,7 +107,7 @@ class Board:
                 )
                 raise CalibrationError(message) from cause
 
-    def join(self, link: Link) -> Feed:
+    def join(self, link: CameraLink) -> FrameQueue:
         """Use one camera; return where its frames come.
 
         Raises
@@ -161,13 +161,13 @@ class Board:
 
     def close_unless_used(self) -> None:
         """Close the device if no camera uses it. Works after an unplug."""
-        with _BOARDS_LOCK, self._lock:
+        with _DEVICES_LOCK, self._lock:
             if not self._users:
                 self._close()
 
     def close(self) -> None:
         """Close the device, whoever uses it. Idempotent; works after an unplug."""
-        with _BOARDS_LOCK, self._lock:
+        with _DEVICES_LOCK, self._lock:
             self._close()
 
     def start(self) -> None:
@@ -232,7 +232,7 @@ class Board:
             link.start(camera.initialControl)
             outputs[socket] = camera.requestOutput(
                 (stream.size.width_px, stream.size.height_px),
-                kind_of(stream, vendor),
+                frame_type(stream, vendor),
                 resizeMode=vendor.ImgResizeMode.CROP,
                 fps=stream.fps,
                 enableUndistortion=False,
@@ -249,7 +249,7 @@ class Board:
 
     def _darken(self) -> None:
         """Switch the device's own light off: a dot pattern over ours would spoil every frame."""
-        with _told(self.device_id, self._vendor):
+        with _translate_errors(self.device_id, self._vendor):
             if not self._device.getIrDrivers():
                 return
             obeyed = [self._device.setIrLaserDotProjectorIntensity(0.0), self._device.setIrFloodLightIntensity(0.0)]
@@ -282,11 +282,11 @@ class Board:
     def _hand_out(self, message: Any, received_ns: int) -> None:
         for socket, link in (self._running or {}).items():
             frame = message[socket] if isinstance(message, self._vendor.MessageGroup) else message
-            fault = fault_of(frame, link.stream, received_ns, self.err_ns, self._vendor)
+            fault = find_frame_fault(frame, link.stream, received_ns, self.err_ns, self._vendor)
             if fault is not None:
                 link.feed.damaged(fault)
             else:
-                link.feed.put(delivery_of(frame, received_ns, self._vendor))
+                link.feed.put(read_frame(frame, received_ns, self._vendor))
 
     def _end(self, reason: str) -> None:
         self._gone = self._gone or reason
@@ -298,7 +298,7 @@ class Board:
             raise DeviceGoneError(self._gone)
 
     def _close(self) -> None:
-        _BOARDS.pop(self.device_id, None)
+        _DEVICES.pop(self.device_id, None)
         if self._closing.is_set():
             return
         self._closing.set()
@@ -326,7 +326,7 @@ class Board:
 
 
 @contextmanager
-def _told(device_id: str, vendor: Any) -> Iterator[None]:
+def _translate_errors(device_id: str, vendor: Any) -> Iterator[None]:
     """Say what the library's errors mean."""
     try:
         yield
@@ -347,7 +347,7 @@ def require_one_clock(vendor: Any) -> None:
     # On a busy machine this thread may rest between two readings: what lies between before and after is no offset.
     before_ns, now_ns, after_ns = time.monotonic_ns(), nanoseconds(vendor.Clock.now()), time.monotonic_ns()
     offset_ns = now_ns - min(max(now_ns, before_ns), after_ns)
-    if abs(offset_ns) > _MOST_CLOCK_OFFSET_NS:
+    if abs(offset_ns) > _MAX_CLOCK_OFFSET_NS:
         message = (
             f"the clock of depthai {vendor.__version__} is {offset_ns / 1e6:.0f} ms off CLOCK_MONOTONIC, in which "
             "frames are timed; report it, and use depthai 3.12"
@@ -355,7 +355,7 @@ def require_one_clock(vendor: Any) -> None:
         raise DeviceError(message)
 
 
-def board_of(device: str) -> Board:
+def open_device(device: str) -> OakDevice:
     """The board of a device, opened now unless this process has it open.
 
     Raises
@@ -365,24 +365,24 @@ def board_of(device: str) -> Board:
     DeviceBusyError, DeviceGoneError, DeviceError
         The device cannot be opened.
     """
-    vendor = library()
-    with _BOARDS_LOCK:
-        for known in _BOARDS.values():
+    vendor = load_depthai()
+    with _DEVICES_LOCK:
+        for known in _DEVICES.values():
             if device in (known.device_id, known.address):
                 return known
-        opened = Board(available(device, vendor), vendor)
-        _BOARDS[opened.device_id] = opened
+        opened = OakDevice(find_available(device, vendor), vendor)
+        _DEVICES[opened.device_id] = opened
         return opened
 
 
 @atexit.register
-def close_boards() -> None:
+def close_devices() -> None:
     """Close whatever a program left open: the library's threads would keep it from ending."""
-    for board in tuple(_BOARDS.values()):
+    for board in tuple(_DEVICES.values()):
         board.close()
 
 
-def held_devices() -> frozenset[str]:
+def open_device_ids() -> frozenset[str]:
     """The ids of the devices that this process holds."""
-    with _BOARDS_LOCK:
-        return frozenset(_BOARDS)
+    with _DEVICES_LOCK:
+        return frozenset(_DEVICES)

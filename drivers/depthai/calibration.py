@@ -15,12 +15,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drivers.depthai.board import board_of
-from drivers.depthai.library import library
+from drivers.depthai.board import open_device
+from drivers.depthai.library import load_depthai
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size
 
-MOST_RESIDUAL_PX = 0.1
+MAX_RESIDUAL_PX = 0.1
 
 _BROWN = 5
 _GRID = 25
@@ -72,10 +72,10 @@ def read_factory_calibration(device: str, cameras: Mapping[str, Lens] | None = N
     CalibrationError
         Nothing is stored for one of the cameras, or its lens cannot be written with five coefficients.
     LibraryMissingError, DeviceBusyError, DeviceGoneError, DeviceError
-        See `drivers.depthai.board.board_of`.
+        See `drivers.depthai.board.open_device`.
     """
-    vendor = library()
-    board = board_of(device)
+    vendor = load_depthai()
+    board = open_device(device)
     try:
         handler = board.factory_calibration()
         wanted = cameras or {
@@ -91,12 +91,12 @@ def read_factory_calibration(device: str, cameras: Mapping[str, Lens] | None = N
             for name, lens in wanted.items()
         }
         focusing = {socket for socket, sensor in board.sensors.items() if sensor.autofocus}
-        return calibration_of(handler, sized, focusing, vendor)
+        return convert_calibration(handler, sized, focusing, vendor)
     finally:
         board.close_unless_used()
 
 
-def calibration_of(
+def convert_calibration(
     handler: Any, cameras: Mapping[str, tuple[str, Size | None]], focusing: set[str], vendor: Any
 ) -> FactoryCalibration:
     """Translate the library's handler.
@@ -140,11 +140,11 @@ def calibration_of(
                 "read; calibrate the rig with a board"
             )
             raise CalibrationError(message)
-        matrix, distortion, residual_px[name] = brown_lens(matrix, stored, size, fisheye=fisheye)
-        if residual_px[name] > MOST_RESIDUAL_PX:
+        matrix, distortion, residual_px[name] = fit_brown_lens(matrix, stored, size, fisheye=fisheye)
+        if residual_px[name] > MAX_RESIDUAL_PX:
             message = (
                 f"camera '{name}': its lens is stored with {len(stored)} distortion coefficients, which five follow to "
-                f"{residual_px[name]:.2f} px only; {MOST_RESIDUAL_PX} px are allowed. Calibrate the rig with a board"
+                f"{residual_px[name]:.2f} px only; {MAX_RESIDUAL_PX} px are allowed. Calibrate the rig with a board"
             )
             raise CalibrationError(message)
         pose = np.eye(4)
@@ -168,7 +168,7 @@ def calibration_of(
     )
 
 
-def brown_lens(
+def fit_brown_lens(
     matrix: FloatArray, stored: FloatArray, size: Size, *, fisheye: bool = False
 ) -> tuple[FloatArray, FloatArray, float]:
     """Write a lens with five coefficients.
@@ -196,8 +196,8 @@ def brown_lens(
     rays = _rays(pixels, matrix, stored, fisheye=fisheye)
     if rays is None:
         return matrix, np.zeros(_BROWN), float("inf")
-    fitted, distortion = _fitted(rays, pixels, matrix)
-    off_px = np.linalg.norm(_projected(rays, fitted, distortion) - pixels, axis=1)
+    fitted, distortion = _fit_lens(rays, pixels, matrix)
+    off_px = np.linalg.norm(_project(rays, fitted, distortion) - pixels, axis=1)
     worst_px = float(off_px.max())
     return fitted, distortion, worst_px if np.isfinite(worst_px) else float("inf")
 
@@ -211,12 +211,12 @@ def _rays(pixels: FloatArray, matrix: FloatArray, stored: FloatArray, *, fisheye
         again = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), matrix, stored[:4]).reshape(-1, 2)
     else:
         rays = cv2.undistortPoints(given, matrix, stored, criteria=end).reshape(-1, 2)
-        again = _projected(rays, matrix, stored)
+        again = _project(rays, matrix, stored)
     off_px = np.linalg.norm(again - pixels, axis=1)
-    return rays if np.isfinite(rays).all() and float(off_px.max()) < MOST_RESIDUAL_PX / 100 else None
+    return rays if np.isfinite(rays).all() and float(off_px.max()) < MAX_RESIDUAL_PX / 100 else None
 
 
-def _fitted(rays: FloatArray, pixels: FloatArray, matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _fit_lens(rays: FloatArray, pixels: FloatArray, matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least squares of fx, fy, cx, cy, k1, k2, p1, p2, k3 by Gauss and Newton; OpenCV gives the derivatives."""
     matrix, distortion = matrix.copy(), np.zeros(_BROWN)
     points = np.column_stack([rays, np.ones(len(rays))])
@@ -232,7 +232,7 @@ def _fitted(rays: FloatArray, pixels: FloatArray, matrix: FloatArray) -> tuple[F
     return matrix, distortion
 
 
-def _projected(rays: FloatArray, matrix: FloatArray, distortion: FloatArray) -> FloatArray:
+def _project(rays: FloatArray, matrix: FloatArray, distortion: FloatArray) -> FloatArray:
     points = np.column_stack([rays, np.ones(len(rays))])
     seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
     return np.asarray(seen, dtype=np.float64).reshape(-1, 2)

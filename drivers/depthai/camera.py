@@ -14,28 +14,28 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from drivers.depthai.board import Board, Link, board_of
-from drivers.depthai.feed import KEPT_FRAMES, Feed
-from drivers.depthai.library import library
-from drivers.depthai.messages import Delivery, brightness, coloured
-from drivers.depthai.options import OakOptions, Stream
-from drivers.depthai.sensors import Sensor
+from drivers.depthai.board import CameraLink, OakDevice, open_device
+from drivers.depthai.feed import MAX_WAITING_FRAMES, FrameQueue
+from drivers.depthai.library import load_depthai
+from drivers.depthai.messages import OakFrame, colour_reader, read_luminance
+from drivers.depthai.options import OakOptions, OakStream
+from drivers.depthai.sensors import OakSensor
 from slrig.bundle.validation import checked
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import CalibrationError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Size
 
-LEAST_EXPOSURE_S = 100e-6
-LONGEST_SHARE = 0.95
+MIN_EXPOSURE_S = 100e-6
+MAX_EXPOSURE_FRACTION = 0.95
 """The longest exposure as a share of the frame period: the rest is the sensor's."""
 
 ISO_OF_GAIN_1 = 100
-MOST_GAIN = 16.0
+MAX_GAIN = 16.0
 """ISO 1600, the end of the range that the library calls usual."""
 
-USUAL_EXPOSURE_S = 1 / 60
+DEFAULT_EXPOSURE_S = 1 / 60
 
-_SAME = 0.01
+_TOLERANCE = 0.01
 _SETTLE_S = 2.0
 
 
@@ -52,7 +52,7 @@ class OakCamera:
     Raises
     ------
     LibraryMissingError, DeviceBusyError, DeviceGoneError, DeviceError
-        See `board_of`.
+        See `open_device`.
     ConfigError
         The device's other cameras run otherwise.
     UnsupportedByDeviceError
@@ -61,15 +61,15 @@ class OakCamera:
 
     def __init__(self, name: str, options: OakOptions) -> None:
         self._name = name
-        self._vendor = library()
-        self._board: Board = board_of(options.device)
+        self._vendor = load_depthai()
+        self._board: OakDevice = open_device(options.device)
         try:
             self._sensor = self._chosen(options)
             self._stream = self._planned(options)
             self._info = self._declared()
             low_s, high_s = self._info.exposure_range_s
-            self._asked = (round(min(max(USUAL_EXPOSURE_S, low_s), high_s) * 1e6), ISO_OF_GAIN_1)
-            self._feed: Feed = self._board.join(Link(self._stream, self._prepare, Feed()))
+            self._asked = (round(min(max(DEFAULT_EXPOSURE_S, low_s), high_s) * 1e6), ISO_OF_GAIN_1)
+            self._feed: FrameQueue = self._board.join(CameraLink(self._stream, self._prepare, FrameQueue()))
         except BaseException:
             self._board.close_unless_used()
             raise
@@ -101,7 +101,7 @@ class OakCamera:
         if self._stream.external_trigger:
             return AppliedSettings(self._asked[0] / 1e6, self._asked[1] / ISO_OF_GAIN_1, 1 / self._stream.fps)
         until_ns = time.monotonic_ns() + round((_SETTLE_S + 8 / self._stream.fps) * 1e9)
-        last: Delivery | None = None
+        last: OakFrame | None = None
         while (delivery := self._feed.take(until_ns)) is not None:
             if self._as_asked(delivery):
                 return AppliedSettings(delivery.exposure_us / 1e6, delivery.iso / ISO_OF_GAIN_1, 1 / self._stream.fps)
@@ -115,7 +115,7 @@ class OakCamera:
         self._state.check_arming(count, trigger, self._info, hint=self._how_to_wire(trigger))
         self._board.start()
         # Edges that come while nobody reads must not be lost; a camera that runs by itself has newer frames.
-        self._feed.begin(max(KEPT_FRAMES, 2 * count) if trigger is Trigger.HARDWARE else KEPT_FRAMES)
+        self._feed.begin(max(MAX_WAITING_FRAMES, 2 * count) if trigger is Trigger.HARDWARE else MAX_WAITING_FRAMES)
         self._armed_ns = time.monotonic_ns()
         self._state.armed = trigger
 
@@ -159,7 +159,7 @@ class OakCamera:
         if self._state.close():
             self._board.leave(self._stream.socket)
 
-    def _chosen(self, options: OakOptions) -> Sensor:
+    def _chosen(self, options: OakOptions) -> OakSensor:
         """The sensor at the socket, if it can do what is asked."""
         board = self._board
         sensor = board.sensors.get(options.socket)
@@ -184,7 +184,7 @@ class OakCamera:
             raise UnsupportedByDeviceError(message)
         return sensor
 
-    def _planned(self, options: OakOptions) -> Stream:
+    def _planned(self, options: OakOptions) -> OakStream:
         sensor = self._sensor
         size = sensor.size if options.size_px is None else Size(*options.size_px)
         if size.width_px > sensor.size.width_px or size.height_px > sensor.size.height_px:
@@ -201,7 +201,7 @@ class OakCamera:
                     "scan, and stores no lens position; write focus = 0 … 255 into its table"
                 )
                 raise UnsupportedByDeviceError(message)
-        return Stream(
+        return OakStream(
             socket=options.socket,
             size=size,
             fps=options.fps,
@@ -219,8 +219,8 @@ class OakCamera:
             serial=f"{self._board.device_id}-{self._stream.socket}",
             format=CameraFormat(self._stream.size, 8),
             triggers=frozenset({trigger}),
-            exposure_range_s=(LEAST_EXPOSURE_S, LONGEST_SHARE / self._stream.fps),
-            gain_range=(1.0, MOST_GAIN),
+            exposure_range_s=(MIN_EXPOSURE_S, MAX_EXPOSURE_FRACTION / self._stream.fps),
+            gain_range=(1.0, MAX_GAIN),
             colour=self._stream.colour,
         )
 
@@ -241,19 +241,19 @@ class OakCamera:
             control.setFrameSyncMode(vendor.CameraControl.FrameSyncMode.INPUT)
             control.setExternalTrigger(1, 0)
 
-    def _as_asked(self, delivery: Delivery) -> bool:
+    def _as_asked(self, delivery: OakFrame) -> bool:
         exposure_us, iso = self._asked
         return (
-            abs(delivery.exposure_us - exposure_us) <= max(_SAME * exposure_us, 1)
-            and abs(delivery.iso - iso) <= max(_SAME * iso, 1)
+            abs(delivery.exposure_us - exposure_us) <= max(_TOLERANCE * exposure_us, 1)
+            and abs(delivery.iso - iso) <= max(_TOLERANCE * iso, 1)
             and (self._stream.focus is None or abs(delivery.lens_position - self._stream.focus) <= 1)
         )
 
-    def _frame(self, delivery: Delivery) -> Frame:
+    def _frame(self, delivery: OakFrame) -> Frame:
         # The last row was read out by the time the frame was here.
         skew_ns = min(self._sensor.longest_skew_ns(self._stream.fps), delivery.received_ns - delivery.t_end_ns)
         skew_ns = max(skew_ns, 0)
-        image = brightness(delivery.message, self._stream)
+        image = read_luminance(delivery.message, self._stream)
         return Frame(
             camera=self._name,
             image=image,
@@ -265,10 +265,10 @@ class OakCamera:
             exposure_s=delivery.exposure_us / 1e6,
             gain=delivery.iso / ISO_OF_GAIN_1,
             shutter_skew_s=skew_ns / 1e9,
-            colour=coloured(delivery.message, image) if self._stream.colour else None,
+            colour=colour_reader(delivery.message, image) if self._stream.colour else None,
         )
 
-    def _not_settled(self, last: Delivery | None) -> Exception:
+    def _not_settled(self, last: OakFrame | None) -> Exception:
         exposure_us, iso = self._asked
         focus = "" if self._stream.focus is None else f", focus {self._stream.focus}"
         asked = f"exposure {exposure_us} µs, ISO {iso}{focus}"

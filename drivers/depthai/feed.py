@@ -6,19 +6,19 @@ import threading
 import time
 from collections import deque
 
-from drivers.depthai.messages import Delivery
+from drivers.depthai.messages import OakFrame
 from slrig.errors import DeviceGoneError
 
-KEPT_FRAMES = 4
+MAX_WAITING_FRAMES = 4
 """How many frames wait for a reader while a camera runs by itself; older ones are stale."""
 
 
-class Feed:
+class FrameQueue:
     """Safe between threads. Counts what was lost: gaps in the sequence numbers, which damaged frames leave, too."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._waiting: deque[Delivery] = deque(maxlen=KEPT_FRAMES)
+        self._waiting: deque[OakFrame] = deque(maxlen=MAX_WAITING_FRAMES)
         self._last_number = -1
         self._lost = 0
         self._why_lost = ""
@@ -30,13 +30,13 @@ class Feed:
         with self._changed:
             return self._lost, self._why_lost
 
-    def begin(self, kept: int = KEPT_FRAMES) -> None:
+    def begin(self, kept: int = MAX_WAITING_FRAMES) -> None:
         """Forget what is waiting, and count anew."""
         with self._changed:
             self._waiting = deque(maxlen=kept)
             self._lost, self._why_lost = 0, ""
 
-    def put(self, delivery: Delivery) -> None:
+    def put(self, delivery: OakFrame) -> None:
         """Take a frame. One that came before is dropped; a gap in the numbers before it counts as lost."""
         with self._changed:
             if delivery.number <= self._last_number:
@@ -57,7 +57,7 @@ class Feed:
         with self._changed:
             self._lost += 1
 
-    def take(self, until_ns: int) -> Delivery | None:
+    def take(self, until_ns: int) -> OakFrame | None:
         """Return the oldest frame that waits, or None if none came until then (CLOCK_MONOTONIC).
 
         Raises

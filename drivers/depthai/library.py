@@ -24,7 +24,7 @@ ENVIRONMENT = {
 _MICROSECOND = timedelta(microseconds=1)
 
 
-def library() -> Any:
+def load_depthai() -> Any:
     """Return the module `depthai`, version 3.12 or later.
 
     Raises

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from drivers.depthai.library import microseconds, nanoseconds
-from drivers.depthai.options import Stream
+from drivers.depthai.options import OakStream
 from drivers.v4l2.formats import from_luma
 from slrig.model import Pixels
 
 
 @dataclass(frozen=True, slots=True)
-class Delivery:
+class OakFrame:
     """A whole frame, as it came. `t_start_ns` and `t_end_ns` are those of the first row, CLOCK_MONOTONIC.
 
     message : the library's `ImgFrame`; its pixels are copied only if the frame is wanted.
@@ -36,13 +36,13 @@ class Delivery:
     lens_position: int
 
 
-def fault_of(message: Any, stream: Stream, received_ns: int, err_ns: int, vendor: Any) -> str | None:
+def find_frame_fault(message: Any, stream: OakStream, received_ns: int, err_ns: int, vendor: Any) -> str | None:
     """Say what makes a frame unusable; None if it is whole.
 
     A frame that was cut on its way has less data than its header announces; one whose header was damaged has another
     size or kind than was asked for. A frame that says it ends later than it came would pass for a fresh one.
     """
-    size, kind = stream.size, kind_of(stream, vendor)
+    size, kind = stream.size, frame_type(stream, vendor)
     if message.getType() != kind or (message.getWidth(), message.getHeight()) != (size.width_px, size.height_px):
         return f"{message.getWidth()} x {message.getHeight()} {message.getType()} where {size} {kind} was asked for"
     stride, rows = message.getStride(), size.height_px * (3 if stream.colour else 2) // 2
@@ -55,10 +55,10 @@ def fault_of(message: Any, stream: Stream, received_ns: int, err_ns: int, vendor
     return None
 
 
-def delivery_of(message: Any, received_ns: int, vendor: Any) -> Delivery:
+def read_frame(message: Any, received_ns: int, vendor: Any) -> OakFrame:
     """Read what a whole frame says of itself."""
     offsets = vendor.CameraExposureOffset
-    return Delivery(
+    return OakFrame(
         message=message,
         number=message.getSequenceNum(),
         t_start_ns=nanoseconds(message.getTimestamp(offsets.START)),
@@ -70,14 +70,14 @@ def delivery_of(message: Any, received_ns: int, vendor: Any) -> Delivery:
     )
 
 
-def brightness(message: Any, stream: Stream) -> Pixels:
+def read_luminance(message: Any, stream: OakStream) -> Pixels:
     """(H, W) uint8, a copy: the grey levels, or a colour frame's luminance, which NV12 begins with."""
     stride, size = message.getStride(), stream.size
     plane = np.asarray(message.getData(), dtype=np.uint8)[: stride * size.height_px]
     return plane.reshape(size.height_px, stride)[:, : size.width_px].copy()
 
 
-def coloured(message: Any, luma: Pixels) -> Callable[[], Pixels]:
+def colour_reader(message: Any, luma: Pixels) -> Callable[[], Pixels]:
     """What makes a colour frame of its brightness and of the differences of blue and red, copied, which follow it in
     NV12: in turn, half as many rows and columns.
     """
@@ -87,6 +87,6 @@ def coloured(message: Any, luma: Pixels) -> Callable[[], Pixels]:
     return lambda: from_luma(luma, differences[:, ::2], differences[:, 1::2])
 
 
-def kind_of(stream: Stream, vendor: Any) -> Any:
+def frame_type(stream: OakStream, vendor: Any) -> Any:
     """The library's name of the frames' layout."""
     return vendor.ImgFrame.Type.NV12 if stream.colour else vendor.ImgFrame.Type.GRAY8

@@ -10,7 +10,7 @@ from pydantic import Field
 from slrig.bundle.validation import Strict
 from slrig.model import Size
 
-USUAL_FPS = 20.0
+DEFAULT_FPS = 20.0
 
 Socket = Literal["CAM_A", "CAM_B", "CAM_C", "CAM_D", "CAM_E", "CAM_F", "CAM_G", "CAM_H"]
 PixelExtent = Annotated[int, Field(ge=16, le=16384)]
@@ -29,7 +29,7 @@ class OakOptions(Strict, use_attribute_docstrings=True):
     size_px: Annotated[tuple[PixelExtent, PixelExtent], Field(strict=False)] | None = None
     """[width, height] of the frames; else the sensor's own."""
 
-    fps: Annotated[float, Field(ge=1, le=240, json_schema_extra={"unit": "Hz"})] = USUAL_FPS
+    fps: Annotated[float, Field(ge=1, le=240, json_schema_extra={"unit": "Hz"})] = DEFAULT_FPS
     """How many frames the sensor makes per second; the longest exposure follows from it. One for all of a device."""
 
     focus: Annotated[int, Field(ge=0, le=255)] | None = None
@@ -44,7 +44,7 @@ class OakOptions(Strict, use_attribute_docstrings=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class OakStream:
     """What one camera of a device is to deliver: options, with what the device told filled in.
 
     focus : None for a camera without autofocus. colour : the frames are the luminance of NV12, else GRAY8.

@@ -18,7 +18,7 @@ SNAPSHOT = frozenset({"OV9282", "OV9782", "AR0234"})
 
 
 @dataclass(frozen=True, slots=True)
-class Sensor:
+class OakSensor:
     """One camera on a device. `name` is the chip's; `fastest_fps` is 0 where the device does not tell."""
 
     socket: str
@@ -48,7 +48,7 @@ class Sensor:
         return round(1e9 / max(self.fastest_fps, fps))
 
 
-def sensors_of(features: Iterable[Any], vendor: Any) -> Mapping[str, Sensor]:
+def read_sensors(features: Iterable[Any], vendor: Any) -> Mapping[str, OakSensor]:
     """The cameras that a device says it has, by socket; others than mono and colour are left out."""
     kinds = vendor.CameraSensorType
     found = {}
@@ -62,7 +62,7 @@ def sensors_of(features: Iterable[Any], vendor: Any) -> Mapping[str, Sensor]:
             for config in feature.configs
             if (config.width, config.height) == (feature.width, feature.height)
         ]
-        found[feature.socket.name] = Sensor(
+        found[feature.socket.name] = OakSensor(
             socket=feature.socket.name,
             name=feature.sensorName,
             size=Size(feature.width, feature.height),

@@ -50,7 +50,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     Parameters
     ----------
     options
-        `drivers.dlpc347x.options.EngineOptions`.
+        `drivers.dlpc347x.options.Dlpc347xEngineOptions`.
     folder
         The rig file's own.
 
@@ -70,13 +70,13 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
         It may not be opened, or failed.
     """
     from drivers.dlpc347x.bus import open_bus
-    from drivers.dlpc347x.options import EngineOptions
-    from drivers.dlpc347x.projector import LightEngine
+    from drivers.dlpc347x.options import Dlpc347xEngineOptions
+    from drivers.dlpc347x.projector import Dlpc347xProjector
     from drivers.linux import require_linux
 
     require_linux("dlpc347x", through="the kernel's /dev/i2c-*", instead="run slrig on Linux for it")
-    table = checked(EngineOptions, options, "the [projector] table of a light engine")
-    return LightEngine(open_bus(Path(table.device), table.address), table)
+    table = checked(Dlpc347xEngineOptions, options, "the [projector] table of a light engine")
+    return Dlpc347xProjector(open_bus(Path(table.device), table.address), table)
 
 
 __all__ = ["open_projector"]

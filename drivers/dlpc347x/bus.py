@@ -25,7 +25,7 @@ _GONE = {errno.ENXIO, errno.EREMOTEIO, errno.EIO, errno.ENODEV, errno.ESHUTDOWN}
 """ENXIO and EREMOTEIO: nobody answered at the address (kernel, Documentation/i2c/fault-codes.rst)."""
 
 
-class Port(Protocol):
+class I2cPort(Protocol):
     """One address of a bus. Every call is one transaction; raises OSError as the kernel does."""
 
     def write(self, data: bytes) -> None:
@@ -41,12 +41,12 @@ class Port(Protocol):
         ...
 
 
-class Bus:
+class I2cBus:
     """An open port. Threads may share it: each command and its answer are one step. name : for messages."""
 
-    def __init__(self, port: Port, name: str) -> None:
+    def __init__(self, port: I2cPort, name: str) -> None:
         self.name = name
-        self._port: Port | None = port
+        self._port: I2cPort | None = port
         self._lock = threading.Lock()
 
     def write(self, command: int, data: bytes = b"") -> None:
@@ -93,30 +93,30 @@ class Bus:
             raise DeviceError(message) from error
 
 
-class Node:
-    """Implements `Port` on a node of the kernel's i2c-dev."""
+class I2cNode:
+    """Implements `I2cPort` on a node of the kernel's i2c-dev."""
 
     def __init__(self, handle: int) -> None:
         self._handle = handle
 
     def write(self, data: bytes) -> None:
-        """See `Port`."""
+        """See `I2cPort`."""
         if os.write(self._handle, data) != len(data):
             raise OSError(errno.EIO, "it took a part of a command")
 
     def read(self, length: int) -> bytes:
-        """See `Port`."""
+        """See `I2cPort`."""
         data = os.read(self._handle, length)
         if len(data) != length:
             raise OSError(errno.EIO, "it gave a part of an answer")
         return data
 
     def close(self) -> None:
-        """See `Port`."""
+        """See `I2cPort`."""
         os.close(self._handle)
 
 
-def open_bus(path: Path, address: int) -> Bus:
+def open_bus(path: Path, address: int) -> I2cBus:
     """Open an address of a bus for this program alone.
 
     Raises
@@ -151,4 +151,4 @@ def open_bus(path: Path, address: int) -> Bus:
             raise DeviceBusyError(message) from error
         message = f"{name}: this is no I²C bus ({error.strerror}); name one of /dev/i2c-*"
         raise DeviceGoneError(message) from error
-    return Bus(Node(handle), name)
+    return I2cBus(I2cNode(handle), name)

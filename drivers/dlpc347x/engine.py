@@ -15,13 +15,13 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from enum import IntEnum
 
-from drivers.dlpc347x.bus import Bus
-from drivers.dlpc347x.flash import HEAD, Place, size_of
-from drivers.pattern_engine.options import Colour
+from drivers.dlpc347x.bus import I2cBus
+from drivers.dlpc347x.flash import HEAD_BYTES, FlashedLine, block_size
+from drivers.pattern_engine.options import LedColour
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 
 
-class Command(IntEnum):
+class Dlpc347xCommand(IntEnum):
     """Writes. That with the next number reads what was set."""
 
     MODE = 0x05  # 4: patterns from flash
@@ -38,7 +38,7 @@ class Command(IntEnum):
     FLASH_WRITE = 0xE1  # and E2h for what follows
 
 
-class Read(IntEnum):
+class Dlpc347xRead(IntEnum):
     """Reads of what is not set."""
 
     LED_MOST = 0x5D
@@ -78,7 +78,7 @@ FAULTS = {
     29: "its watchdog ran out",
 }
 """By bit of the system status' four bytes."""
-SEQUENCES = {
+SEQUENCE_FAULTS = {
     1: "it has no such light",
     2: "the dark before the light is too short or too long",
     3: "the dark after the light is too short or too long",
@@ -87,10 +87,10 @@ SEQUENCES = {
     6: "its order has fewer entries",
 }
 """By number in bits 19 to 23 of the system status."""
-READY_S, ERASED_S = 1.0, 20.0
-MOST_READ, MOST_WRITTEN = 256, 256
+READY_TIMEOUT_S, ERASE_TIMEOUT_S = 1.0, 20.0
+MAX_READ_BYTES, MAX_WRITE_BYTES = 256, 256
 """Bytes of flash at once: 256 are read at the most, 1024 written; adapters on USB take fewer."""
-PATTERNS = bytes([0xD0, 0, 0, 0])
+PATTERN_DATA = bytes([0xD0, 0, 0, 0])
 """The kind of flash data ("entire sensing pattern data", dlpc347x.h)."""
 _ENTRY = struct.Struct("<BBBQIIIB")
 _INTERNAL_MODE, _INTERNAL = 4, 1
@@ -98,7 +98,7 @@ _ASK_AGAIN_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class LightLimits:
     """What the engine says of a light, µs."""
 
     supported: bool
@@ -108,10 +108,10 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class OrderEntry:
     """An entry of the order: patterns of a set from one on, lit alike, none of them inverted. Times in µs."""
 
-    place: Place
+    place: FlashedLine
     count: int
     leds: int
     light_us: int
@@ -129,10 +129,10 @@ class Entry:
         return self.count * (self.before_us + self.light_us + self.after_us)
 
 
-class Engine:
+class Dlpc347xEngine:
     """The controller behind a bus. Every method raises DeviceError and DeviceGoneError as the bus does."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: I2cBus) -> None:
         self._bus = bus
         self._never = threading.Event()
         self._repeats = 0
@@ -153,14 +153,14 @@ class Engine:
         self._bus.write(command, data)
         short = self._short()
         if short & COMMUNICATION:
-            told = self._bus.read(Read.COMMUNICATION, 2, b"\2")[0]
+            told = self._bus.read(Dlpc347xRead.COMMUNICATION, 2, b"\2")[0]
             causes = "; ".join(words for bit, words in enumerate(REFUSALS) if told >> bit & 1) or f"{told:#04x}"
             message = f"{self.name} does not take the command {command:02x}h {data.hex(' ')}: {causes}"
             raise UnsupportedByDeviceError(message)
         if short & (SYSTEM | SEQUENCE | FLASH):
             raise self._fault(short)
 
-    def settle(self, command: Command, data: bytes, asked: bytes = b"", *, read: bytes | None = None) -> None:
+    def settle(self, command: Dlpc347xCommand, data: bytes, asked: bytes = b"", *, read: bytes | None = None) -> None:
         """Set something, and compare what is read back. asked : what the read is sent; read : what it should give.
         Raises UnsupportedByDeviceError if that is something else.
         """
@@ -176,28 +176,28 @@ class Engine:
         """Return when the main program takes commands. What was wrong before is forgotten."""
         self._wait(INITIALISED | MAIN, INITIALISED | MAIN, timeout_s, "finish its initialisation")
         # Errors are told once, by whoever reads them (DLPU075B, "Read System Status").
-        self._bus.read(Read.COMMUNICATION, 2, b"\2")
-        self._bus.read(Read.SYSTEM, 4)
+        self._bus.read(Dlpc347xRead.COMMUNICATION, 2, b"\2")
+        self._bus.read(Dlpc347xRead.SYSTEM, 4)
 
     def controller(self) -> int:
         """The number of its kind."""
-        return self._bus.read(Read.CONTROLLER, 1)[0]
+        return self._bus.read(Dlpc347xRead.CONTROLLER, 1)[0]
 
     def version(self) -> str:
         """Of its firmware."""
-        patch, minor, major = struct.unpack("<HBB", self._bus.read(Read.VERSION, 4))
+        patch, minor, major = struct.unpack("<HBB", self._bus.read(Dlpc347xRead.VERSION, 4))
         return f"{major}.{minor}.{patch}"
 
     def take_patterns_from_flash(self) -> None:
         """Choose the mode. Patterns wait for nobody."""
-        self.settle(Command.MODE, bytes([_INTERNAL_MODE]))
-        self.settle(Command.TRIGGER_IN, b"\0")
+        self.settle(Dlpc347xCommand.MODE, bytes([_INTERNAL_MODE]))
+        self.settle(Dlpc347xCommand.TRIGGER_IN, b"\0")
 
     def set_current(self, share: float) -> None:
         """Set the current of every LED, as a share of its most, which stands in the engine's flash."""
-        most = struct.unpack("<3H", self._bus.read(Read.LED_MOST, 6))
-        self.settle(Command.LED_CONTROL, b"\0")
-        self.settle(Command.LED_CURRENT, struct.pack("<3H", *(round(share * each) for each in most)))
+        most = struct.unpack("<3H", self._bus.read(Dlpc347xRead.LED_MOST, 6))
+        self.settle(Dlpc347xCommand.LED_CONTROL, b"\0")
+        self.settle(Dlpc347xCommand.LED_CURRENT, struct.pack("<3H", *(round(share * each) for each in most)))
 
     def set_trigger_out(self, *, active_low: bool, delay_us: int) -> None:
         """Set TRIG_OUT_2, which is on while a pattern is lit; TRIG_OUT_1, of whole sets, is off."""
@@ -206,26 +206,26 @@ class Engine:
             sent, got = (
                 struct.pack("<Bi", flags, late) for flags in (number | on << 1 | inverted << 2, on | inverted << 1)
             )
-            self.settle(Command.TRIGGER_OUT, sent, bytes([number]), read=got)
+            self.settle(Dlpc347xCommand.TRIGGER_OUT, sent, bytes([number]), read=got)
 
-    def light(self, leds: Colour, light_us: int) -> Light:
+    def light(self, leds: LedColour, light_us: int) -> LightLimits:
         """Ask whether a pattern of 1 bit can be lit for so long, and what dark that takes."""
-        depth = int(leds is Colour.WHITE)
-        told = self._bus.read(Read.LIGHT, 13, struct.pack("<BBI", _INTERNAL, depth, light_us))
-        return Light(bool(told[0] & 1), *struct.unpack_from("<3I", told, 1))
+        depth = int(leds is LedColour.WHITE)
+        told = self._bus.read(Dlpc347xRead.LIGHT, 13, struct.pack("<BBI", _INTERNAL, depth, light_us))
+        return LightLimits(bool(told[0] & 1), *struct.unpack_from("<3I", told, 1))
 
-    def order(self, entries: Sequence[Entry], repeats: int) -> None:
+    def order(self, entries: Sequence[OrderEntry], repeats: int) -> None:
         """Set what `start` shows: these, and so many times again. Whether "again" counts the first, nobody says."""
         for number, entry in enumerate(entries):
-            self.tell(Command.ORDER, bytes([number == 0]) + entry.packed)
+            self.tell(Dlpc347xCommand.ORDER, bytes([number == 0]) + entry.packed)
         for number, entry in enumerate(entries):
-            got = self._bus.read(Command.ORDER + 1, _ENTRY.size, bytes([number]))
+            got = self._bus.read(Dlpc347xCommand.ORDER + 1, _ENTRY.size, bytes([number]))
             if got != entry.packed:
                 message = f"{self.name}: entry {number} was {entry.packed.hex(' ')}, the engine gives {got.hex(' ')}"
                 raise UnsupportedByDeviceError(message + "; update its firmware to TI's latest")
         self._repeats = repeats
-        until = time.monotonic() + READY_S
-        while (told := self._bus.read(Read.STATE, 7))[0] != 1 or told[1] != len(entries):
+        until = time.monotonic() + READY_TIMEOUT_S
+        while (told := self._bus.read(Dlpc347xRead.STATE, 7))[0] != 1 or told[1] != len(entries):
             if time.monotonic() > until:
                 message = f"{self.name} is not ready for {len(entries)} entries, and says {told.hex(' ')}"
                 raise DeviceError(message + "; switch it off and on, and write its flash: slrig patterns RIG")
@@ -233,40 +233,40 @@ class Engine:
 
     def leds(self, *, by_sequence: bool) -> None:
         """Let the sequence switch the LEDs, or switch them all off; compare what is read back."""
-        self.settle(Command.LED_ENABLE, bytes([7 if by_sequence else 0]))
+        self.settle(Dlpc347xCommand.LED_ENABLE, bytes([7 if by_sequence else 0]))
 
     def start(self) -> None:
         """Start what was ordered."""
-        self.tell(Command.CONTROL, bytes([0, self._repeats]))
+        self.tell(Dlpc347xCommand.CONTROL, bytes([0, self._repeats]))
 
     def stop(self) -> None:
         """Stop it."""
-        self.tell(Command.CONTROL, b"\1\0")
+        self.tell(Dlpc347xCommand.CONTROL, b"\1\0")
 
     def flash(self) -> bytes:
         """Return the block of patterns in its flash; empty where there is none."""
-        self.tell(Command.FLASH_KIND, PATTERNS)
-        size = size_of(head) if len(head := self._read_flash(HEAD)) == HEAD else 0
-        if not HEAD < size < 1 << 20:
+        self.tell(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
+        size = block_size(head) if len(head := self._read_flash(HEAD_BYTES)) == HEAD_BYTES else 0
+        if not HEAD_BYTES < size < 1 << 20:
             return b""
-        self.tell(Command.FLASH_KIND, PATTERNS)
+        self.tell(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
         return self._read_flash(size)
 
     def write_flash(self, block: bytes) -> None:
         """Erase the patterns in its flash, write others, and compare what is read back (DLPU075B §3, "update internal
         pattern data": kind, check, erase, length, start, continue).
         """
-        self.tell(Command.FLASH_KIND, PATTERNS)
-        if told := self._bus.read(Read.FLASH_CHECK, 1, struct.pack("<I", len(block)))[0]:
+        self.tell(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
+        if told := self._bus.read(Dlpc347xRead.FLASH_CHECK, 1, struct.pack("<I", len(block)))[0]:
             message = f"{self.name}: asked for {len(block)} bytes of patterns, its flash has no room ({told:#04x}); "
             raise UnsupportedByDeviceError(message + "scan one axis only, or with a shorter line_shift_period_px")
-        self.tell(Command.FLASH_ERASE, bytes.fromhex("AABBCCDD"))
-        self._wait(ERASING, 0, ERASED_S, "erase its flash")
+        self.tell(Dlpc347xCommand.FLASH_ERASE, bytes.fromhex("AABBCCDD"))
+        self._wait(ERASING, 0, ERASE_TIMEOUT_S, "erase its flash")
         length = 0
-        for start in range(0, len(block), MOST_WRITTEN):
-            part = block[start : start + MOST_WRITTEN]
+        for start in range(0, len(block), MAX_WRITE_BYTES):
+            part = block[start : start + MAX_WRITE_BYTES]
             length = self._set_length(len(part), length)
-            self.tell(Command.FLASH_WRITE + (start > 0), part)
+            self.tell(Dlpc347xCommand.FLASH_WRITE + (start > 0), part)
         if self.flash() != block:
             message = f"{self.name}: its flash does not give back what was written; write it again: slrig patterns RIG"
             raise DeviceError(message)
@@ -274,17 +274,17 @@ class Engine:
     def _read_flash(self, size: int) -> bytes:
         data, length = b"", 0
         while len(data) < size:
-            length = self._set_length(min(size - len(data), MOST_READ), length)
-            data += self._bus.read(Read.FLASH + (len(data) > 0), length)
+            length = self._set_length(min(size - len(data), MAX_READ_BYTES), length)
+            data += self._bus.read(Dlpc347xRead.FLASH + (len(data) > 0), length)
         return data
 
     def _set_length(self, length: int, before: int) -> int:
         if length != before:
-            self.tell(Command.FLASH_LENGTH, struct.pack("<H", length))
+            self.tell(Dlpc347xCommand.FLASH_LENGTH, struct.pack("<H", length))
         return length
 
     def _short(self) -> int:
-        return self._bus.read(Read.SHORT, 1)[0]
+        return self._bus.read(Dlpc347xRead.SHORT, 1)[0]
 
     def _wait(self, mask: int, wanted: int, timeout_s: float, what: str) -> None:
         until = time.monotonic() + timeout_s
@@ -295,9 +295,9 @@ class Engine:
             self._never.wait(_ASK_AGAIN_S)
 
     def _fault(self, short: int) -> DeviceError:
-        system = int.from_bytes(self._bus.read(Read.SYSTEM, 4), "little")
+        system = int.from_bytes(self._bus.read(Dlpc347xRead.SYSTEM, 4), "little")
         if sequence := system >> 19 & 0x1F:
-            told = SEQUENCES.get(sequence, f"sequence error {sequence}")
+            told = SEQUENCE_FAULTS.get(sequence, f"sequence error {sequence}")
             return UnsupportedByDeviceError(f"{self.name} does not take the sequence: {told}")
         told = "; ".join(words for bit, words in FAULTS.items() if system >> bit & 1)
         told = told or ("its flash failed" if short & FLASH else f"status {short:#04x}, {system:#010x}")

@@ -25,24 +25,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.pattern_engine.planes import plane_of, words
+from drivers.pattern_engine.planes import describe_pattern, pattern_plane
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
-MOST_PATTERNS = 64
+MAX_PATTERNS = 64
 """Of a set of 1 bit: an entry of the order has as many bits that say which are inverted."""
 _BLOCK = struct.Struct("<4sIIII")
 _ENTRY = struct.Struct("<BBBxQIII")
 _SET = struct.Struct("<BBBxI")
-HEAD = _BLOCK.size
+HEAD_BYTES = _BLOCK.size
 _DARK_US = (1000, 1000, 1000)
 
-Line = tuple[int, bytes]
+PatternLine = tuple[int, bytes]
 """1 where a pattern is of columns, 0 where of rows, and its bits."""
 
 
 @dataclass(frozen=True, slots=True)
-class Mirrors:
+class Dlpc347xMirrors:
     """A mirror array. before, after : mirrors beyond the picture, of (rows, columns)."""
 
     name: str
@@ -52,7 +52,7 @@ class Mirrors:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class FlashedLine:
     """Where a pattern lies: the number of its set, and its own within it."""
 
     set: int
@@ -60,17 +60,17 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Lines:
+class LineEncoder:
     """How patterns become lines: of which mirrors, and which ways are turned round, of (rows, columns)."""
 
-    mirrors: Mirrors
+    mirrors: Dlpc347xMirrors
     turned: tuple[bool, bool]
 
-    def of(self, sequence: PatternSequence, index: int) -> tuple[Line, ...]:
+    def of(self, sequence: PatternSequence, index: int) -> tuple[PatternLine, ...]:
         """Return a pattern as a line of columns, or of rows, or, where it lights all mirrors or none, as both.
         Raises UnsupportedByDeviceError: it has shades of grey.
         """
-        plane = plane_of(sequence, index)
+        plane = pattern_plane(sequence, index)
         rows, columns = sequence.profiles[index].shape
         lines = [(1, plane[0])] * (rows == 1) + [(0, plane[:, 0])] * (columns == 1)
         return tuple((way, self._packed(line[::-1] if self.turned[way] else line, way)) for way, line in lines)
@@ -81,7 +81,7 @@ class Lines:
         return packed + bytes(-len(packed) % 4)
 
 
-def block_of(sequence: PatternSequence, lines: Lines) -> bytes:
+def build_block(sequence: PatternSequence, lines: LineEncoder) -> bytes:
     """Return the block that holds a sequence: columns, then rows, in sets with white and black; and an order that is
     dark.
     """
@@ -92,27 +92,27 @@ def block_of(sequence: PatternSequence, lines: Lines) -> bytes:
             list(dict.fromkeys(bits for line in found if len(line) == ways for each, bits in line if each == way))
             for ways in (2, 1)
         )
-        room = MOST_PATTERNS - len(both)
+        room = MAX_PATTERNS - len(both)
         for start in range(0, len(own) or way, room):
             held = both + own[start : start + room]
             if held:
                 sets.append(_SET.pack(len(held), way, 1, sum(map(len, held))) + b"".join(held))
     order = struct.pack("<I", 1) + _ENTRY.pack(0, 1, 0, 0, *_DARK_US)
-    begin = HEAD + len(order)
+    begin = HEAD_BYTES + len(order)
     starts = [begin + 4 + 4 * len(sets) + sum(map(len, sets[:number])) for number in range(len(sets))]
     content = struct.pack(f"<I{len(sets)}I", len(sets), *starts) + b"".join(sets)
-    return _BLOCK.pack(b"PATN", begin, len(content), HEAD, len(order)) + order + content
+    return _BLOCK.pack(b"PATN", begin, len(content), HEAD_BYTES, len(order)) + order + content
 
 
-def size_of(head: bytes) -> int:
+def block_size(head: bytes) -> int:
     """Return how many bytes a block has, by its first 20; 0 where there is none."""
     name, sets, size, _, _ = _BLOCK.unpack(head)
     return sets + size if name == b"PATN" else 0
 
 
-def places_in(block: bytes) -> dict[Line, tuple[Place, ...]]:
+def find_lines(block: bytes) -> dict[PatternLine, tuple[FlashedLine, ...]]:
     """Return where a block holds each line of 1 bit. Raises ValueError or struct.error: it is none."""
-    found: dict[Line, tuple[Place, ...]] = {}
+    found: dict[PatternLine, tuple[FlashedLine, ...]] = {}
     _, begin, _, _, _ = _BLOCK.unpack_from(block)
     (count,) = struct.unpack_from("<I", block, begin)
     for number, start in enumerate(struct.unpack_from(f"<{count}I", block, begin + 4)):
@@ -123,11 +123,13 @@ def places_in(block: bytes) -> dict[Line, tuple[Place, ...]]:
         for index in range(patterns):
             at = start + _SET.size + index * length
             key = columns, block[at : at + length]
-            found[key] = (*found.get(key, ()), Place(number, index))
+            found[key] = (*found.get(key, ()), FlashedLine(number, index))
     return found
 
 
-def places_of(sequence: PatternSequence, lines: Lines, held: Mapping[Line, tuple[Place, ...]]) -> tuple[Place, ...]:
+def locate_patterns(
+    sequence: PatternSequence, lines: LineEncoder, held: Mapping[PatternLine, tuple[FlashedLine, ...]]
+) -> tuple[FlashedLine, ...]:
     """Return where each pattern lies: all in one set where one holds them all.
     Raises UnsupportedByDeviceError: the flash lacks patterns; the message says what to do.
     """
@@ -135,7 +137,7 @@ def places_of(sequence: PatternSequence, lines: Lines, held: Mapping[Line, tuple
         {place.set: place for line in lines.of(sequence, index) for place in reversed(held.get(line, ()))}
         for index in range(len(sequence))
     ]
-    missing = [words(sequence.patterns[index]) for index, places in enumerate(found) if not places]
+    missing = [describe_pattern(sequence.patterns[index]) for index, places in enumerate(found) if not places]
     if missing:
         message = (
             f"the engine's flash lacks {len(missing)} of {len(found)} patterns ({', '.join(missing[:3])}); write all "

@@ -10,7 +10,7 @@ from drivers.dlpc347x.bus import ADDRESS
 from drivers.pattern_engine.options import LightOptions
 
 
-class EngineOptions(LightOptions, use_attribute_docstrings=True):
+class Dlpc347xEngineOptions(LightOptions, use_attribute_docstrings=True):
     """The keys of a `[projector]` table with `driver = "dlpc347x"`."""
 
     device: Annotated[str, Field(pattern="^/")]

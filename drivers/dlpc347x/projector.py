@@ -7,35 +7,43 @@ from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 
-from drivers.dlpc347x.bus import Bus
-from drivers.dlpc347x.engine import Engine, Entry, Light
-from drivers.dlpc347x.flash import Line, Lines, Mirrors, Place, block_of, places_in, places_of
-from drivers.dlpc347x.options import EngineOptions
-from drivers.pattern_engine.light import HeldLight
-from drivers.pattern_engine.options import Colour
-from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing, check_duty, light_us
+from drivers.dlpc347x.bus import I2cBus
+from drivers.dlpc347x.engine import Dlpc347xEngine, LightLimits, OrderEntry
+from drivers.dlpc347x.flash import (
+    Dlpc347xMirrors,
+    FlashedLine,
+    LineEncoder,
+    PatternLine,
+    build_block,
+    find_lines,
+    locate_patterns,
+)
+from drivers.dlpc347x.options import Dlpc347xEngineOptions
+from drivers.pattern_engine.light import EngineProjector
+from drivers.pattern_engine.options import LedColour
+from drivers.pattern_engine.timing import MAX_UNATTENDED_S, Timing, check_duty, light_duration_us
 from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
 MIRRORS = {
-    0x0F: ("DLPC3470", Mirrors("DLP2010", Size(854, 480), before=(32, 0), after=(0, 10))),
-    0x0B: ("DLPC3478", Mirrors("DLP3010", Size(1280, 720), before=(48, 0), after=(0, 0))),
+    0x0F: ("DLPC3470", Dlpc347xMirrors("DLP2010", Size(854, 480), before=(32, 0), after=(0, 10))),
+    0x0B: ("DLPC3478", Dlpc347xMirrors("DLP3010", Size(1280, 720), before=(48, 0), after=(0, 0))),
 }
 """By the number of the controller (dlpc347x.h, `ControllerDeviceId_e`): its name, and its mirrors (its data sheet,
 features). Mirrors beyond the picture: dlpc347x_internal_patterns.c, `SetDMDInfo`."""
-AWAKE_S = 10.0
+WAKE_TIMEOUT_S = 10.0
 COMMANDS_S = 0.06
 """What the commands of one `show` take, typically: 100 bits per ms, and some 600 bytes."""
-HELD_US = 7_600
+MAX_LIGHT_US = 7_600
 """The longest light of a pattern of 1 bit (release notes of DLPC3478 8.0.1, timings of internal patterns)."""
-END_US = 1_000_000
+END_DARK_US = 1_000_000
 """Dark at the end of a played sequence, in which this program stops the engine."""
-MOST_REPEATS = 254
+MAX_REPEATS = 254
 """255 is for ever, as TI's programs use it."""
 
 
-class LightEngine(HeldLight[Engine]):
+class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
     """Implements `slrig.devices.FlashedProjector` on a DLPC3470 or DLPC3478.
 
     Parameters
@@ -55,20 +63,20 @@ class LightEngine(HeldLight[Engine]):
         The engine failed.
     """
 
-    def __init__(self, bus: Bus, options: EngineOptions, *, clock: Clock | None = None) -> None:
-        super().__init__(Engine(bus), options, clock=clock)
+    def __init__(self, bus: I2cBus, options: Dlpc347xEngineOptions, *, clock: Clock | None = None) -> None:
+        super().__init__(Dlpc347xEngine(bus), options, clock=clock)
         self._options = options
-        self._lines: Lines
-        self._held: Mapping[Line, tuple[Place, ...]] = {}
-        self._places: tuple[Place, ...] = ()
-        self._colours: tuple[Colour, ...] = ()
-        self._lights: dict[tuple[Colour, int], Light] = {}
+        self._lines: LineEncoder
+        self._held: Mapping[PatternLine, tuple[FlashedLine, ...]] = {}
+        self._places: tuple[FlashedLine, ...] = ()
+        self._colours: tuple[LedColour, ...] = ()
+        self._lights: dict[tuple[LedColour, int], LightLimits] = {}
         self._take_over()
 
     def write_patterns(self, sequence: PatternSequence) -> str:
         """See `FlashedProjector`. Into the engine itself, if it lacks any; what its flash had before is gone then."""
         self._state.require_size(sequence, self._lines.mirrors.size)
-        block = block_of(sequence, self._lines)
+        block = build_block(sequence, self._lines)
         with self._lock:
             self._state.require_open()
             self._state.loaded = None
@@ -76,7 +84,7 @@ class LightEngine(HeldLight[Engine]):
             if self._engine.flash() == block:
                 return f"the flash of {self._engine.name} holds these {len(sequence)} patterns already"
             self._engine.write_flash(block)
-            self._held = places_in(block)
+            self._held = find_lines(block)
             self._engine.take_patterns_from_flash()
             self.blank()
         return (
@@ -89,23 +97,23 @@ class LightEngine(HeldLight[Engine]):
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, self._lines.mirrors.size)
-        self._places = places_of(sequence, self._lines, self._held)
+        self._places = locate_patterns(sequence, self._lines, self._held)
         self._colours = tuple(map(self._options.colour_of, sequence.patterns))
         self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
-        """See `Projector`. Light that pulses, 97 % of the time; dark again after `hold_s`, and `LEFT_ALONE_S` after the
+        """See `Projector`. Light that pulses, 97 % of the time; dark again after `hold_s`, and `MAX_UNATTENDED_S` after the
         end of this program.
         """
         self._state.require_pattern(index)
-        entry = self._entry(self._places[index], 1, self._colours[index], HELD_US)
+        entry = self._entry(self._places[index], 1, self._colours[index], MAX_LIGHT_US)
         # A repeat more or less than counted is within what it is left alone for.
-        repeats = min(round(LEFT_ALONE_S * 1e6) // entry.lasts_us - 1, MOST_REPEATS)
+        repeats = min(round(MAX_UNATTENDED_S * 1e6) // entry.lasts_us - 1, MAX_REPEATS)
         with self._lock:
             started_ns = self._run((entry,), repeats)
-            self._begin_holding(repeats * entry.lasts_us / 1e6, again_s=LEFT_ALONE_S / 2)
+            self._begin_holding(repeats * entry.lasts_us / 1e6, again_s=MAX_UNATTENDED_S / 2)
             # Whether LEDs stay dark after the last repeat is not documented.
-            self._dark_at_s = self._held_until_s + LEFT_ALONE_S
+            self._dark_at_s = self._held_until_s + MAX_UNATTENDED_S
         return self._shown(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
@@ -118,8 +126,8 @@ class LightEngine(HeldLight[Engine]):
             )
             raise UnsupportedByDeviceError(message)
         options = self._options
-        least = self._light_of(options.colour, HELD_US)
-        wanted_us = light_us(
+        least = self._light_of(options.colour, MAX_LIGHT_US)
+        wanted_us = light_duration_us(
             exposure_s,
             period_s,
             margin_s=options.light_margin_s,
@@ -127,41 +135,41 @@ class LightEngine(HeldLight[Engine]):
             dark_us=least.before_us + least.after_us,
         )
         check_duty(Timing(wanted_us, round(period_s * 1e6)), options.duty_limit)
-        entries: list[Entry] = []
+        entries: list[OrderEntry] = []
         # The last pattern has an entry of its own, and stays dark after it until this program stops the engine: it is
         # not documented whether a repeat of 0 is once or for ever, and 1 is once or twice.
         begins = [at for at in range(len(sequence)) if at in (0, len(sequence) - 1) or self._breaks(at)]
         for begin, end in pairwise([*begins, len(sequence)]):
             lit = self._entry(self._places[begin], end - begin, self._colours[begin], wanted_us)
-            dark_us = round(period_s * 1e6) - wanted_us - lit.before_us + (END_US if end == len(sequence) else 0)
+            dark_us = round(period_s * 1e6) - wanted_us - lit.before_us + (END_DARK_US if end == len(sequence) else 0)
             entries.append(replace(lit, after_us=dark_us))
         lasts_us = sum(entry.lasts_us for entry in entries)
         with self._lock:
             self._run(tuple(entries), 1)
-            self._dark_at_s = self._now_s() + options.start_s + (lasts_us - END_US / 2) / 1e6
+            self._dark_at_s = self._now_s() + options.start_s + (lasts_us - END_DARK_US / 2) / 1e6
 
     def _breaks(self, at: int) -> bool:
         """Whether pattern `at` needs an entry of its own: it is not the next one in the flash, or lit otherwise."""
         return self._places[at].index != self._places[at - 1].index + 1 or self._colours[at] != self._colours[at - 1]
 
-    def _entry(self, place: Place, count: int, colour: Colour, wanted_us: int) -> Entry:
+    def _entry(self, place: FlashedLine, count: int, colour: LedColour, wanted_us: int) -> OrderEntry:
         light = self._light_of(colour, wanted_us)
-        return Entry(place, count, colour, wanted_us, light.before_us, light.after_us)
+        return OrderEntry(place, count, colour, wanted_us, light.before_us, light.after_us)
 
-    def _light_of(self, colour: Colour, wanted_us: int) -> Light:
+    def _light_of(self, colour: LedColour, wanted_us: int) -> LightLimits:
         """What the engine says of a light; it is asked once. Raises UnsupportedByDeviceError: it has none such."""
         light = self._lights.get((colour, wanted_us)) or self._engine.light(colour, wanted_us)
         if not light.supported:
             message = (
                 f"asked for {wanted_us} µs of {colour.name.lower()} light, the engine has none; its shortest is "
-                f"{light.least_us} µs, the longest that TI states {HELD_US} µs; shorten exposure_s, or trigger the "
+                f"{light.least_us} µs, the longest that TI states {MAX_LIGHT_US} µs; shorten exposure_s, or trigger the "
                 "cameras by software, where exposures may be longer"
             )
             raise UnsupportedByDeviceError(message)
         self._lights[colour, wanted_us] = light
         return light
 
-    def _run(self, entries: tuple[Entry, ...], repeats: int) -> int:
+    def _run(self, entries: tuple[OrderEntry, ...], repeats: int) -> int:
         """Stop, set, start. Return when the command to start was sent."""
         with self._lock:
             self._state.require_open()
@@ -180,7 +188,7 @@ class LightEngine(HeldLight[Engine]):
         for fault in self._darken():
             if isinstance(fault, DeviceGoneError):
                 raise fault
-        self._engine.wait_until_initialised(AWAKE_S)
+        self._engine.wait_until_initialised(WAKE_TIMEOUT_S)
 
     def _prepare(self) -> ProjectorInfo:
         engine, options = self._engine, self._options
@@ -191,17 +199,17 @@ class LightEngine(HeldLight[Engine]):
             two = "; how the flash of a DLPC3479 is filled, TI's sources tell in two ways: it is not served"
             raise UnsupportedByDeviceError(message + (two if number == 0x0C else ""))
         name, mirrors = MIRRORS[number]
-        self._lines = Lines(mirrors, (options.mirror_rows, options.mirror_columns))
+        self._lines = LineEncoder(mirrors, (options.mirror_rows, options.mirror_columns))
         engine.take_patterns_from_flash()
         # Another mode may start what the engine shows by itself.
         self.blank()
         try:
-            self._held = places_in(block) if (block := engine.flash()) else {}
+            self._held = find_lines(block) if (block := engine.flash()) else {}
         except struct.error:
             self._held = {}
         engine.set_current(options.led_current)
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
-        light = self._light_of(options.colour, HELD_US)
+        light = self._light_of(options.colour, MAX_LIGHT_US)
         return ProjectorInfo(
             name="projector",
             model=f"{name} light engine, {mirrors.name}, firmware {engine.version()}",
@@ -211,5 +219,5 @@ class LightEngine(HeldLight[Engine]):
             latency_s=options.start_s + COMMANDS_S,
             gap_s=options.light_margin_s + (light.before_us + light.after_us) / 1e6,
             duty=options.duty_limit,
-            lights=options.colour is Colour.WHITE,
+            lights=options.colour is LedColour.WHITE,
         )

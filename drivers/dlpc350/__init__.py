@@ -50,7 +50,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     Parameters
     ----------
     options
-        `drivers.dlpc350.options.EngineOptions`.
+        `drivers.dlpc350.options.Dlpc350EngineOptions`.
     folder
         The rig file's own: the path of the flashed pictures' list counts from there.
 
@@ -69,17 +69,17 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceError
         It may not be opened, or failed.
     """
-    from drivers.dlpc350.flash import read_flash
-    from drivers.dlpc350.options import EngineOptions
-    from drivers.dlpc350.projector import DLPC350, LightEngine
-    from drivers.pattern_engine.finding import engines, require_hidraw, resolved
+    from drivers.dlpc350.flash import read_flash_list
+    from drivers.dlpc350.options import Dlpc350EngineOptions
+    from drivers.dlpc350.projector import DLPC350, Dlpc350Projector
+    from drivers.pattern_engine.finding import choose_engine, find_engines, require_hidraw
     from drivers.pattern_engine.link import open_link
 
     require_hidraw(DLPC350)
-    table = checked(EngineOptions, options, "the [projector] table of a light engine")
-    flash = read_flash(folder / table.patterns)
-    node = resolved(table.device, engines(DLPC350))
-    return LightEngine(open_link(node.path, DLPC350), table, flash, serial=node.name)
+    table = checked(Dlpc350EngineOptions, options, "the [projector] table of a light engine")
+    flash = read_flash_list(folder / table.patterns)
+    node = choose_engine(table.device, find_engines(DLPC350))
+    return Dlpc350Projector(open_link(node.path, DLPC350), table, flash, serial=node.name)
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
@@ -91,9 +91,9 @@ def find_devices() -> tuple[FoundDevice, ...]:
         This is not Linux.
     """
     from drivers.dlpc350.projector import DLPC350
-    from drivers.pattern_engine.finding import found_devices
+    from drivers.pattern_engine.finding import list_devices
 
-    return found_devices(DLPC350)
+    return list_devices(DLPC350)
 
 
 __all__ = ["find_devices", "open_projector"]

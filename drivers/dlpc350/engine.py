@@ -10,13 +10,13 @@ import struct
 import time
 from enum import IntEnum
 
-from drivers.dlpc350.tables import Tables
+from drivers.dlpc350.tables import PatternTables
 from drivers.pattern_engine import engine
 from drivers.pattern_engine.timing import Timing
 from slrig.errors import UnsupportedByDeviceError
 
 
-class Command(IntEnum):
+class Dlpc350Command(IntEnum):
     """USB commands."""
 
     VALIDATE = 0x1A1A
@@ -31,7 +31,7 @@ class Command(IntEnum):
     FIRMWARE_TAG = 0x1AFF
 
 
-INVALID = {
+VALIDATION_FAULTS = {
     1: "the exposure or the period is not one that it can do",
     2: "a pattern number in the table is not one that it has",
     4: "the trigger output would be held on through a dark between",
@@ -44,19 +44,19 @@ _EDGE_ZERO = 0xBB
 _EDGES = (0, 0xD5)
 
 
-class Engine(engine.Engine):
+class Dlpc350Engine(engine.UsbEngine):
     """A DLPC350 behind a link."""
 
     def set_trigger_out(self, *, active_low: bool, delay_us: float) -> None:
         """Set TRIG_OUT_1: its edges, later than the pattern's light by the delay, in steps of 107.2 ns."""
         edge = min(max(_EDGE_ZERO + round(delay_us * 1e3 / _EDGE_NS), _EDGES[0]), _EDGES[1])
-        self._link.write(engine.Command.TRIGGER_OUT_1, bytes([active_low, edge, edge]))
+        self._link.write(engine.UsbCommand.TRIGGER_OUT_1, bytes([active_low, edge, edge]))
 
     def set_timing(self, timing: Timing) -> None:
         """Set exposure and period of all patterns; compare what is read back."""
-        self.settle(Command.EXPOSURE_PERIOD, struct.pack("<II", timing.exposure_us, timing.period_us))
+        self.settle(Dlpc350Command.EXPOSURE_PERIOD, struct.pack("<II", timing.exposure_us, timing.period_us))
 
-    def set_tables(self, tables: Tables, before: Tables | None = None) -> None:
+    def set_tables(self, tables: PatternTables, before: PatternTables | None = None) -> None:
         """Send the tables of a sequence that is shown once. before : those that the engine has, if that is known; only
         what differs is sent.
         """
@@ -66,15 +66,15 @@ class Engine(engine.Engine):
             self._mail(1, tables.images)
         if before is None or (tables.length, len(tables.images)) != (before.length, len(before.images)):
             entries = tables.length - 1
-            self._link.write(Command.PATTERN_CONFIGURATION, bytes([entries, 0, entries, len(tables.images) - 1]))
+            self._link.write(Dlpc350Command.PATTERN_CONFIGURATION, bytes([entries, 0, entries, len(tables.images) - 1]))
 
     def _mail(self, mailbox: int, data: bytes) -> None:
-        self.set_byte(Command.MAILBOX, mailbox)
+        self.set_byte(Dlpc350Command.MAILBOX, mailbox)
         try:
-            self.set_byte(Command.MAILBOX_OFFSET, 0)
-            self._link.write(Command.MAILBOX_DATA, data)
+            self.set_byte(Dlpc350Command.MAILBOX_OFFSET, 0)
+            self._link.write(Dlpc350Command.MAILBOX_DATA, data)
         finally:
-            self.set_byte(Command.MAILBOX, 0)
+            self.set_byte(Dlpc350Command.MAILBOX, 0)
 
     def validate(self, timeout_s: float) -> None:
         """Let the engine check what it was told.
@@ -86,15 +86,19 @@ class Engine(engine.Engine):
         DeviceError
             It did not come to an end in time.
         """
-        self.set_byte(Command.VALIDATE, 0)
+        self.set_byte(Dlpc350Command.VALIDATE, 0)
         until = time.monotonic() + timeout_s
-        while (found := self.byte(Command.VALIDATE)) & _BUSY:
+        while (found := self.byte(Dlpc350Command.VALIDATE)) & _BUSY:
             self._wait(until, "come to an end with checking the sequence")
         if found:
-            causes = "; ".join(words for bit, words in INVALID.items() if found & bit) or f"status {found:#04x}"
+            causes = (
+                "; ".join(words for bit, words in VALIDATION_FAULTS.items() if found & bit) or f"status {found:#04x}"
+            )
             message = f"{self.name} refuses the sequence: {causes}; report this message to the driver's maintainer"
             raise UnsupportedByDeviceError(message)
 
     def firmware_tag(self) -> str:
         """The name that was given to what lies in the flash, at most 32 characters."""
-        return self._link.read(Command.FIRMWARE_TAG, 1)[:32].split(b"\0", 1)[0].decode("ascii", "replace").strip()
+        return (
+            self._link.read(Dlpc350Command.FIRMWARE_TAG, 1)[:32].split(b"\0", 1)[0].decode("ascii", "replace").strip()
+        )

@@ -25,34 +25,34 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from drivers.dlpc350.planes import PLANES, picture_of, planes_in
-from drivers.dlpc350.timing import MOST_IMAGES
-from drivers.pattern_engine.planes import Plane, keys_of_plane, plane_of, words
+from drivers.dlpc350.planes import PLANES, decode_planes, encode_picture
+from drivers.dlpc350.timing import MAX_IMAGES
+from drivers.pattern_engine.planes import Plane, describe_pattern, pattern_plane, plane_keys
 from slrig.bundle.validation import Strict, checked, read_json, read_text
 from slrig.errors import ConfigError, StorageError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
-LIST = "images.json"
-TO_FLASH = "to_flash"
-_MOST_BYTES = 1_000_000
+LIST_FILE = "images.json"
+EXPORT_FOLDER = "to_flash"
+_MAX_LIST_BYTES = 1_000_000
 
 
-class _Image(Strict):
+class _ImageEntry(Strict):
     flash_index: Annotated[int, Field(ge=0, lt=256)]
     file: Annotated[str, Field(min_length=1)]
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     planes: Annotated[list[str], Field(min_length=1, max_length=PLANES)]
 
 
-class _List(Strict):
+class _ImageList(Strict):
     format: Literal["slrig-dlpc350-images"]
     version: Literal[1]
     tag: Annotated[str, Field(min_length=1, max_length=31)] | None = None
-    images: Annotated[list[_Image], Field(max_length=MOST_IMAGES)]
+    images: Annotated[list[_ImageEntry], Field(max_length=MAX_IMAGES)]
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class FlashedPlane:
     """Where a pattern lies: the picture's index in the flash, the plane's number, and whether it is to be inverted."""
 
     image: int
@@ -61,7 +61,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class FlashedPicture:
     """One picture of the flash. numbers : by the key of a plane, its number; content : the BMP file."""
 
     flash_index: int
@@ -69,23 +69,23 @@ class Picture:
     numbers: Mapping[bytes, int]
     planes: tuple[str, ...]
 
-    def place(self, keys: tuple[bytes, bytes]) -> Place | None:
+    def place(self, keys: tuple[bytes, bytes]) -> FlashedPlane | None:
         """Return where a plane or its inverse, told by their keys, lies here, if it does."""
         for inverted, key in enumerate(keys):
             if key in self.numbers:
-                return Place(self.flash_index, self.numbers[key], bool(inverted))
+                return FlashedPlane(self.flash_index, self.numbers[key], bool(inverted))
         return None
 
 
 @dataclass(frozen=True, slots=True)
-class Flash:
+class FlashContents:
     """Everything that the list says of the flash. folder : where it lies, or would; tag : the firmware's, if known."""
 
     folder: Path
     tag: str | None = None
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[FlashedPicture, ...] = ()
 
-    def places(self, sequence: PatternSequence) -> tuple[Place, ...]:
+    def places(self, sequence: PatternSequence) -> tuple[FlashedPlane, ...]:
         """Return where each pattern lies, with as few changes of picture as possible.
 
         Raises
@@ -93,38 +93,38 @@ class Flash:
         UnsupportedByDeviceError
             The flash lacks patterns; the message says what to do.
         """
-        found = [self._candidates(plane_of(sequence, index)) for index in range(len(sequence))]
+        found = [self._candidates(pattern_plane(sequence, index)) for index in range(len(sequence))]
         missing = [index for index, candidates in enumerate(found) if not candidates]
         if missing:
             raise self._lacking(sequence, missing)
-        chosen: list[Place] = []
+        chosen: list[FlashedPlane] = []
         for index, candidates in enumerate(found):
             # Stay with the picture that is in the buffer; change to the one that lasts longest.
             image = chosen[-1].image if chosen else -1
             if image not in candidates:
-                image = max(candidates, key=lambda image: _lasts(found[index:], image))
+                image = max(candidates, key=lambda image: _run_length(found[index:], image))
             chosen.append(candidates[image])
         return tuple(chosen)
 
-    def _candidates(self, plane: Plane) -> dict[int, Place]:
-        keys = keys_of_plane(plane)
+    def _candidates(self, plane: Plane) -> dict[int, FlashedPlane]:
+        keys = plane_keys(plane)
         places = (picture.place(keys) for picture in self.pictures)
         return {place.image: place for place in places if place is not None}
 
     def _lacking(self, sequence: PatternSequence, missing: Sequence[int]) -> UnsupportedByDeviceError:
-        named = ", ".join(words(sequence.patterns[index]) for index in missing[:3])
+        named = ", ".join(describe_pattern(sequence.patterns[index]) for index in missing[:3])
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         return UnsupportedByDeviceError(
-            f"the engine's flash, as {self.folder / LIST} lists it, lacks {len(missing)} of {len(sequence)} patterns "
+            f"the engine's flash, as {self.folder / LIST_FILE} lists it, lacks {len(missing)} of {len(sequence)} patterns "
             f"({named}{more}); flash it once with all that this rig shows: slrig patterns RIG writes the pictures into "
-            f"{self.folder / TO_FLASH}"
+            f"{self.folder / EXPORT_FOLDER}"
         )
 
     def written(self, sequence: PatternSequence) -> str:
         """Write pictures that hold a sequence, beside those that are flashed, and say what to do with them.
         Raises as `write_pictures`.
         """
-        written = write_pictures(self.folder / TO_FLASH, sequence, self.pictures)
+        written = write_pictures(self.folder / EXPORT_FOLDER, sequence, self.pictures)
         return (
             f"the pictures to flash are in {written.folder}: add them to the firmware with TI's LightCrafter 4500 "
             f'program, in the order of their numbers, with the firmware tag "{written.tag}", upload it, and let '
@@ -132,12 +132,12 @@ class Flash:
         )
 
 
-def _lasts(found: Sequence[Mapping[int, Place]], image: int) -> int:
+def _run_length(found: Sequence[Mapping[int, FlashedPlane]], image: int) -> int:
     """How many patterns in a row lie in a picture."""
     return next((count for count, candidates in enumerate(found) if image not in candidates), len(found))
 
 
-def read_flash(folder: Path) -> Flash:
+def read_flash_list(folder: Path) -> FlashContents:
     """Return what the list in a folder says; an empty flash where there is no list yet.
 
     Raises
@@ -145,42 +145,42 @@ def read_flash(folder: Path) -> Flash:
     ConfigError
         The list has faults, or a picture is not the one that it names.
     """
-    path = folder / LIST
+    path = folder / LIST_FILE
     if not path.exists():
-        return Flash(folder)
-    data = read_json(read_text(path, _MOST_BYTES, ConfigError), path, ConfigError)
-    listed = checked(_List, data, f"{path}: the list of the flashed pictures")
+        return FlashContents(folder)
+    data = read_json(read_text(path, _MAX_LIST_BYTES, ConfigError), path, ConfigError)
+    listed = checked(_ImageList, data, f"{path}: the list of the flashed pictures")
     indices = [image.flash_index for image in listed.images]
     if len(set(indices)) != len(indices):
         message = f"{path}: expected each flash_index once, found {indices}; correct the list"
         raise ConfigError(message)
-    return Flash(folder, listed.tag, tuple(_read(folder, image) for image in listed.images))
+    return FlashContents(folder, listed.tag, tuple(_read_picture(folder, image) for image in listed.images))
 
 
-def _read(folder: Path, image: _Image) -> Picture:
+def _read_picture(folder: Path, image: _ImageEntry) -> FlashedPicture:
     path = folder / image.file
     try:
         content = path.read_bytes()
     except OSError as error:
-        message = f"{path}: {LIST} names this picture, found: {error.strerror}; copy it there"
+        message = f"{path}: {LIST_FILE} names this picture, found: {error.strerror}; copy it there"
         raise ConfigError(message) from error
     if hashlib.sha256(content).hexdigest() != image.sha256:
         message = (
-            f"{path}: this is not the picture that {LIST} lists (SHA-256 differs): what lies in the flash cannot be "
+            f"{path}: this is not the picture that {LIST_FILE} lists (SHA-256 differs): what lies in the flash cannot be "
             "told; copy the folder again, or write and flash new pictures"
         )
         raise ConfigError(message)
-    return _picture(image.flash_index, content, tuple(image.planes), str(path))
+    return _build_picture(image.flash_index, content, tuple(image.planes), str(path))
 
 
-def _picture(flash_index: int, content: bytes, planes: tuple[str, ...], name: str) -> Picture:
+def _build_picture(flash_index: int, content: bytes, planes: tuple[str, ...], name: str) -> FlashedPicture:
     numbers: dict[bytes, int] = {}
-    for number, plane in enumerate(planes_in(content, name)[: len(planes)]):
-        numbers.setdefault(keys_of_plane(plane)[0], number)
-    return Picture(flash_index, content, numbers, planes)
+    for number, plane in enumerate(decode_planes(content, name)[: len(planes)]):
+        numbers.setdefault(plane_keys(plane)[0], number)
+    return FlashedPicture(flash_index, content, numbers, planes)
 
 
-def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Picture] = ()) -> Flash:
+def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[FlashedPicture] = ()) -> FlashContents:
     """Write pictures that hold every pattern of a sequence, and the list of them, for TI's program.
 
     Parameters
@@ -201,13 +201,15 @@ def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Pic
     """
     first = max((picture.flash_index for picture in others), default=-1) + 1
     made = [
-        _picture(first + number, picture_of([plane for plane, _ in group]), tuple(word for _, word in group), "made")
-        for number, group in enumerate(_grouped(sequence))
+        _build_picture(
+            first + number, encode_picture([plane for plane, _ in group]), tuple(word for _, word in group), "made"
+        )
+        for number, group in enumerate(_group_planes(sequence))
     ]
     pictures = (*others, *made)
-    if len(pictures) > MOST_IMAGES:
+    if len(pictures) > MAX_IMAGES:
         message = (
-            f"asked for {len(made)} pictures beside the {len(others)} in the flash, it takes {MOST_IMAGES}; begin "
+            f"asked for {len(made)} pictures beside the {len(others)} in the flash, it takes {MAX_IMAGES}; begin "
             "anew: let patterns in the rig file name an empty folder"
         )
         raise UnsupportedByDeviceError(message)
@@ -224,25 +226,25 @@ def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Pic
                 {"flash_index": picture.flash_index, "file": file, "sha256": digest, "planes": list(picture.planes)}
             )
         listed = {"format": "slrig-dlpc350-images", "version": 1, "tag": tag, "images": entries}
-        (folder / LIST).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
+        (folder / LIST_FILE).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         message = f"{folder}: asked to write pictures for the engine's flash, found: {error.strerror}; make room there"
         raise StorageError(message) from error
-    return Flash(folder, tag, pictures)
+    return FlashContents(folder, tag, pictures)
 
 
-def _grouped(sequence: PatternSequence) -> list[list[tuple[Plane, str]]]:
+def _group_planes(sequence: PatternSequence) -> list[list[tuple[Plane, str]]]:
     """Planes picture by picture: each holds all patterns from its first to its last one in the order of play."""
     groups: list[list[tuple[Plane, str]]] = [[]]
     held: set[bytes] = set()
     for index, pattern in enumerate(sequence.patterns):
-        plane = plane_of(sequence, index)
-        keys = keys_of_plane(plane)
+        plane = pattern_plane(sequence, index)
+        keys = plane_keys(plane)
         if not held.isdisjoint(keys):
             continue
         if len(groups[-1]) == PLANES:
             groups.append([])
             held = set()
         held.update(keys)
-        groups[-1].append((plane, words(pattern)))
+        groups[-1].append((plane, describe_pattern(pattern)))
     return groups

@@ -9,7 +9,7 @@ from pydantic import Field
 from drivers.pattern_engine.options import UsbLightOptions
 
 
-class EngineOptions(UsbLightOptions, use_attribute_docstrings=True):
+class Dlpc350EngineOptions(UsbLightOptions, use_attribute_docstrings=True):
     """The keys of a `[projector]` table with `driver = "dlpc350"`."""
 
     patterns: Annotated[str, Field(min_length=1)]

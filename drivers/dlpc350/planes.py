@@ -29,7 +29,7 @@ _CHANNELS = (1, 2, 0)
 """Where green, red and blue lie in a BMP's pixel."""
 
 
-def picture_of(planes: Sequence[Plane]) -> bytes:
+def encode_picture(planes: Sequence[Plane]) -> bytes:
     """Return up to 24 planes as a BMP file of 24 bits per pixel; those that are left are dark."""
     pixels = np.zeros((*MIRRORS.shape, 3), np.uint8)
     for number, plane in enumerate(planes):
@@ -41,7 +41,7 @@ def picture_of(planes: Sequence[Plane]) -> bytes:
     return _FILE_HEADER.pack(b"BM", offset + len(data), 0, 0, offset) + header + data
 
 
-def planes_in(picture: bytes, name: str) -> tuple[Plane, ...]:
+def decode_planes(picture: bytes, name: str) -> tuple[Plane, ...]:
     """Return the 24 planes of a BMP file. Raises ConfigError, naming it, if it is none of 912 x 1140 with 24 bits."""
     least = _FILE_HEADER.size + _PICTURE_HEADER.size
     kind, offset, width, height, bits, packing = b"", 0, 0, 0, 0, 0

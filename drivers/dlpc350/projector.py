@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from drivers.dlpc350.engine import Command, Engine
-from drivers.dlpc350.flash import Flash, Place
-from drivers.dlpc350.options import EngineOptions
+from drivers.dlpc350.engine import Dlpc350Command, Dlpc350Engine
+from drivers.dlpc350.flash import FlashContents, FlashedPlane
+from drivers.dlpc350.options import Dlpc350EngineOptions
 from drivers.dlpc350.planes import MIRRORS
-from drivers.dlpc350.tables import Tables, tables_of
-from drivers.dlpc350.timing import DARK_US, MOST_PATTERNS, check_loading, check_timing, lit
-from drivers.pattern_engine.engine import Command as Shared
-from drivers.pattern_engine.link import Kind, Link
-from drivers.pattern_engine.options import Colour
-from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
-from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
+from drivers.dlpc350.tables import PatternTables, build_tables
+from drivers.dlpc350.timing import DARK_US, MAX_PATTERNS, check_loading, check_timing, play_timing
+from drivers.pattern_engine.engine import UsbCommand as Shared
+from drivers.pattern_engine.link import UsbController, UsbLink
+from drivers.pattern_engine.options import LedColour
+from drivers.pattern_engine.projector import COMMANDS_S, DIM_TIMING, START_TIMEOUT_S, UsbEngineProjector
+from drivers.pattern_engine.timing import MAX_UNATTENDED_S, Timing
 from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
-DLPC350 = Kind("dlpc350", 0x6401, "3.0")
-VALIDATED_S = 5.0
-_LONG_US = 1_000_000
+DLPC350 = UsbController("dlpc350", 0x6401, "3.0")
+VALIDATION_TIMEOUT_S = 5.0
+_POLLABLE_US = 1_000_000
 """A sequence of this length still runs when the engine is asked whether it does."""
 
 
-class LightEngine(PatternEngine[Engine]):
+class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
     """Implements `slrig.devices.Projector` on a DLPC350.
 
     Parameters
@@ -44,16 +44,22 @@ class LightEngine(PatternEngine[Engine]):
     """
 
     def __init__(
-        self, link: Link, options: EngineOptions, flash: Flash, *, serial: str = "", clock: Clock | None = None
+        self,
+        link: UsbLink,
+        options: Dlpc350EngineOptions,
+        flash: FlashContents,
+        *,
+        serial: str = "",
+        clock: Clock | None = None,
     ) -> None:
-        super().__init__(Engine(link), options, clock=clock)
+        super().__init__(Dlpc350Engine(link), options, clock=clock)
         self._options = options
         self._flash = flash
         self._serial = serial
-        self._places: tuple[Place, ...] = ()
-        self._colours: tuple[Colour, ...] = ()
+        self._places: tuple[FlashedPlane, ...] = ()
+        self._colours: tuple[LedColour, ...] = ()
         # What the engine was told last, and which picture it shows; None where that is not known.
-        self._told: tuple[Timing, Tables] | None = None
+        self._told: tuple[Timing, PatternTables] | None = None
         self._picture: int | None = None
         self._take_over()
 
@@ -68,9 +74,9 @@ class LightEngine(PatternEngine[Engine]):
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, MIRRORS)
-        if len(sequence) > MOST_PATTERNS:
+        if len(sequence) > MAX_PATTERNS:
             message = (
-                f"asked for a sequence of {len(sequence)} patterns, the engine's table takes {MOST_PATTERNS}; scan one "
+                f"asked for a sequence of {len(sequence)} patterns, the engine's table takes {MAX_PATTERNS}; scan one "
                 "axis only, or with a shorter line_shift_period_px"
             )
             raise UnsupportedByDeviceError(message)
@@ -79,7 +85,7 @@ class LightEngine(PatternEngine[Engine]):
         self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
-        """See `Projector`. Dark again after `hold_s`, and `LEFT_ALONE_S` after the end of this program.
+        """See `Projector`. Dark again after `hold_s`, and `MAX_UNATTENDED_S` after the end of this program.
 
         When light begins is not told by the engine: it is after the command to start was sent, and before its sequencer
         says that it runs and a picture has had its time from the flash to the mirrors. The error is half of that span.
@@ -88,15 +94,15 @@ class LightEngine(PatternEngine[Engine]):
         place = self._places[index]
         load_s = self._options.load_s(kept=self._picture == place.image)
         # The sequence ends by itself: until it began, a picture may have to be loaded.
-        alone_us = round((LEFT_ALONE_S - self._options.image_load_s) * 1e6)
+        alone_us = round((MAX_UNATTENDED_S - self._options.image_load_s) * 1e6)
         if self.unproven:
-            timing, count = DIM, min(alone_us // DIM.period_us, MOST_PATTERNS)
+            timing, count = DIM_TIMING, min(alone_us // DIM_TIMING.period_us, MAX_PATTERNS)
         else:
             timing, count = Timing(alone_us - DARK_US, alone_us), 1
         check_timing(timing)
         with self._lock:
             earliest_ns, running_ns = self._run((place,) * count, (self._colours[index],) * count, timing)
-            self._begin_holding(alone_us / 1e6, again_s=(LEFT_ALONE_S - self._options.image_load_s) / 2)
+            self._begin_holding(alone_us / 1e6, again_s=(MAX_UNATTENDED_S - self._options.image_load_s) / 2)
         return self._shown(index, earliest_ns, running_ns + round(load_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
@@ -104,14 +110,14 @@ class LightEngine(PatternEngine[Engine]):
         self._state.require_loaded("play")
         self._require_proven()
         options = self._options
-        timing = lit(exposure_s, period_s, margin_s=options.light_margin_s, duty_limit=options.duty_limit)
-        counts = tables_of(self._places, self._colours, dark_between=timing.dark_between).counts
+        timing = play_timing(exposure_s, period_s, margin_s=options.light_margin_s, duty_limit=options.duty_limit)
+        counts = build_tables(self._places, self._colours, dark_between=timing.dark_between).counts
         check_loading(counts, timing.period_us, options.image_load_s)
         self._run(self._places, self._colours, timing)
 
-    def _run(self, places: tuple[Place, ...], colours: tuple[Colour, ...], timing: Timing) -> tuple[int, int]:
+    def _run(self, places: tuple[FlashedPlane, ...], colours: tuple[LedColour, ...], timing: Timing) -> tuple[int, int]:
         """Stop, set, validate, start. Return when the command to start was sent, and when the engine said it runs."""
-        tables = tables_of(places, colours, dark_between=timing.dark_between)
+        tables = build_tables(places, colours, dark_between=timing.dark_between)
         engine = self._engine
         with self._lock:
             self._state.require_open()
@@ -121,13 +127,13 @@ class LightEngine(PatternEngine[Engine]):
                 if told is None or told[0] != timing:
                     engine.set_timing(timing)
                 engine.set_tables(tables, None if told is None else told[1])
-                engine.validate(VALIDATED_S)
+                engine.validate(VALIDATION_TIMEOUT_S)
                 started_ns = self._clock.now_ns()
                 engine.leds(by_sequence=True)
                 engine.start()
                 # A short sequence may be over before the engine could be asked.
-                if tables.length * timing.period_us >= _LONG_US:
-                    engine.wait_until_running(RUNNING_S)
+                if tables.length * timing.period_us >= _POLLABLE_US:
+                    engine.wait_until_running(START_TIMEOUT_S)
                 self._told, self._picture = (timing, tables), places[-1].image
                 return started_ns, self._clock.now_ns()
             except BaseException:
@@ -139,8 +145,8 @@ class LightEngine(PatternEngine[Engine]):
         engine, options = self._engine, self._options
         self._check_flash()
         engine.settle_byte(Shared.DISPLAY_MODE, 1)
-        engine.settle_byte(Command.PATTERN_SOURCE, 3)
-        engine.settle_byte(Command.TRIGGER_MODE, 1)
+        engine.settle_byte(Dlpc350Command.PATTERN_SOURCE, 3)
+        engine.settle_byte(Dlpc350Command.TRIGGER_MODE, 1)
         self._set_up_light()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
         # Changing the mode may start what the engine shows by itself.
@@ -154,14 +160,14 @@ class LightEngine(PatternEngine[Engine]):
             latency_s=options.load_s(kept=True) + COMMANDS_S,
             gap_s=options.light_margin_s,
             duty=options.duty_limit,
-            lights=options.colour is Colour.WHITE,
+            lights=options.colour is LedColour.WHITE,
         )
 
     def _check_flash(self) -> None:
         flash = self._flash
         if not flash.pictures:
             return
-        held = self._engine.byte(Command.IMAGES_IN_FLASH)
+        held = self._engine.byte(Dlpc350Command.IMAGES_IN_FLASH)
         wanted = max(picture.flash_index for picture in flash.pictures) + 1
         if held < wanted:
             message = (

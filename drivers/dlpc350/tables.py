@@ -21,15 +21,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
-from drivers.dlpc350.flash import Place
-from drivers.pattern_engine.options import Colour
+from drivers.dlpc350.flash import FlashedPlane
+from drivers.pattern_engine.options import LedColour
 
 INTERNAL = 0
 _BIT_DEPTH = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Tables:
+class PatternTables:
     """What the engine is sent. counts : patterns per picture, in the order in which the pictures are taken."""
 
     patterns: bytes
@@ -42,7 +42,7 @@ class Tables:
         return sum(self.counts)
 
 
-def tables_of(places: Sequence[Place], colours: Sequence[Colour], *, dark_between: bool) -> Tables:
+def build_tables(places: Sequence[FlashedPlane], colours: Sequence[LedColour], *, dark_between: bool) -> PatternTables:
     """Return the tables that show these places one after the other, each lit by LEDs of its own."""
     words: list[int] = []
     previous: int | None = None
@@ -61,6 +61,6 @@ def tables_of(places: Sequence[Place], colours: Sequence[Colour], *, dark_betwee
     images = [image for image, _ in runs]
     if len(images) == 2:
         images.reverse()
-    return Tables(
+    return PatternTables(
         b"".join(word.to_bytes(3, "little") for word in words), bytes(images), tuple(count for _, count in runs)
     )

@@ -9,28 +9,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.pattern_engine.timing import Timing, check_duty, light_us
+from drivers.pattern_engine.timing import Timing, check_duty, light_duration_us
 from slrig.errors import UnsupportedByDeviceError
 
-MINIMUM_US = {1: 235, 2: 700, 3: 1570, 4: 1700, 5: 2000, 6: 2500, 7: 4500, 8: 8333}
+MIN_EXPOSURE_US = {1: 235, 2: 700, 3: 1570, 4: 1700, 5: 2000, 6: 2500, 7: 4500, 8: 8333}
 """Shortest exposure by bit depth."""
-MAXIMUM_US = 200_000_000
+MAX_EXPOSURE_US = 200_000_000
 DARK_US = 230
 """A pattern that does not last its whole period is dark for so long at least: the mirrors are cleared."""
 BUFFERS = 2
 """Pictures of 24 bit planes that are loaded before a sequence starts; of more than that, only the first is."""
-MOST_PATTERNS = 128
+MAX_PATTERNS = 128
 """Entries of the pattern table (DLPU010, "Pattern Display LUT")."""
-MOST_IMAGES = 64
+MAX_IMAGES = 64
 """Entries of the image table."""
 
 
-def lit(exposure_s: float, period_s: float, *, margin_s: float, duty_limit: float) -> Timing:
-    """How long to light patterns of which cameras take `exposure_s`, one per period; see `light_us` and `check_duty`.
+def play_timing(exposure_s: float, period_s: float, *, margin_s: float, duty_limit: float) -> Timing:
+    """How long to light patterns of which cameras take `exposure_s`, one per period; see `light_duration_us` and `check_duty`.
     Raises UnsupportedByDeviceError: the engine does not have this timing, or the duty limit forbids it.
     """
     period_us = round(period_s * 1e6)
-    wanted_us = light_us(exposure_s, period_s, margin_s=margin_s, least_us=MINIMUM_US[1])
+    wanted_us = light_duration_us(exposure_s, period_s, margin_s=margin_s, least_us=MIN_EXPOSURE_US[1])
     # What the dark between does not fit into is lit to its end.
     timing = Timing(wanted_us if wanted_us <= period_us - DARK_US else period_us, period_us)
     check_timing(timing)
@@ -42,12 +42,12 @@ def check_timing(timing: Timing, *, bit_depth: int = 1) -> None:
     """Raise UnsupportedByDeviceError if the engine does not have this timing; the message names the rule."""
     exposure_us, period_us = timing.exposure_us, timing.period_us
     asked = f"asked for an exposure of {exposure_us} µs and a period of {period_us} µs"
-    least_us = MINIMUM_US[bit_depth]
+    least_us = MIN_EXPOSURE_US[bit_depth]
     if exposure_us < least_us:
         message = f"{asked}: the shortest exposure of a {bit_depth}-bit pattern is {least_us} µs; lengthen exposure_s"
         raise UnsupportedByDeviceError(message)
-    if max(exposure_us, period_us) > MAXIMUM_US:
-        message = f"{asked}: the longest is {MAXIMUM_US} µs ({MAXIMUM_US / 1e6:g} s); shorten exposure_s"
+    if max(exposure_us, period_us) > MAX_EXPOSURE_US:
+        message = f"{asked}: the longest is {MAX_EXPOSURE_US} µs ({MAX_EXPOSURE_US / 1e6:g} s); shorten exposure_s"
         raise UnsupportedByDeviceError(message)
     if exposure_us > period_us or 0 < period_us - exposure_us < DARK_US:
         message = (

@@ -44,7 +44,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     Parameters
     ----------
     options
-        `drivers.dlpc900.options.EngineOptions`.
+        `drivers.dlpc900.options.Dlpc900EngineOptions`.
     folder
         The rig file's own.
 
@@ -63,15 +63,15 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     DeviceError
         It may not be opened, or failed.
     """
-    from drivers.dlpc900.options import EngineOptions
-    from drivers.dlpc900.projector import DLPC900, LightEngine
-    from drivers.pattern_engine.finding import engines, require_hidraw, resolved
+    from drivers.dlpc900.options import Dlpc900EngineOptions
+    from drivers.dlpc900.projector import DLPC900, Dlpc900Projector
+    from drivers.pattern_engine.finding import choose_engine, find_engines, require_hidraw
     from drivers.pattern_engine.link import open_link
 
     require_hidraw(DLPC900)
-    table = checked(EngineOptions, options, "the [projector] table of a light engine")
-    node = resolved(table.device, engines(DLPC900))
-    return LightEngine(open_link(node.path, DLPC900), table, serial=node.name)
+    table = checked(Dlpc900EngineOptions, options, "the [projector] table of a light engine")
+    node = choose_engine(table.device, find_engines(DLPC900))
+    return Dlpc900Projector(open_link(node.path, DLPC900), table, serial=node.name)
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
@@ -83,9 +83,9 @@ def find_devices() -> tuple[FoundDevice, ...]:
         This is not Linux.
     """
     from drivers.dlpc900.projector import DLPC900
-    from drivers.pattern_engine.finding import found_devices
+    from drivers.pattern_engine.finding import list_devices
 
-    return found_devices(DLPC900)
+    return list_devices(DLPC900)
 
 
 __all__ = ["find_devices", "open_projector"]

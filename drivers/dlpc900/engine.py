@@ -21,14 +21,14 @@ import struct
 from collections.abc import Sequence
 from enum import IntEnum
 
-from drivers.dlpc900.pictures import Place
+from drivers.dlpc900.pictures import MemoryPlane
 from drivers.pattern_engine import engine
-from drivers.pattern_engine.link import RefusedError
+from drivers.pattern_engine.link import CommandRefusedError
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import Size
 
 
-class Command(IntEnum):
+class Dlpc900Command(IntEnum):
     """USB commands."""
 
     ERROR_CODE = 0x0100  # 2-11: of the last command
@@ -36,7 +36,7 @@ class Command(IntEnum):
     HARDWARE = 0x0206  # 2-9: which mirrors
     CONFIGURATION = 0x1A31  # 2-132: entries (2), patterns to show (4)
     ORDER = 0x1A32  # 2-134: entries (2), patterns to show (4), indices (2 each)
-    DEFINITION = 0x1A34  # 2-136: see `definition`
+    DEFINITION = 0x1A34  # 2-136: see `encode_definition`
     PICTURE_1 = 0x1A2A  # 2-138: index (2), bytes with the header (4); of the first controller
     DATA_1 = 0x1A2B  # 2-140: bytes (2), data
     PICTURE_2 = 0x1A2C  # of the second controller
@@ -46,11 +46,11 @@ class Command(IntEnum):
 _CLEARED = 1
 ON_THE_FLY = 3
 """Display mode: pictures come over USB (DLPU018 table 2-97)."""
-MODE_S = 0.6
+MODE_CHANGE_S = 0.6
 """How long a change of mode may take. The guide says of another one that it takes 0.3 s, and that what is read before
 may be the mode that was (table 2-97); of this one it says nothing, so it has twice that.
 """
-MOST_DATA = 504
+MAX_MESSAGE_BYTES = 504
 """Bytes of a picture in one message (DLPU018 table 5-3)."""
 SECOND_READY, INCOMPATIBLE = 16, 2
 """Bits of the hardware status (DLPU018 table 2-2)."""
@@ -77,7 +77,7 @@ ERRORS = {
 """DLPU018 table 2-12."""
 
 
-class Mirrors(IntEnum):
+class Dlpc900Mirrors(IntEnum):
     """Hardware by its number (DLPU018 table 2-10)."""
 
     DLP6500 = 1
@@ -93,7 +93,7 @@ class Mirrors(IntEnum):
     @property
     def controllers(self) -> int:
         """How many share the columns (DLPS037, features)."""
-        return 1 if self is Mirrors.DLP6500 else 2
+        return 1 if self is Dlpc900Mirrors.DLP6500 else 2
 
     @property
     def least_us(self) -> int:
@@ -101,7 +101,7 @@ class Mirrors(IntEnum):
         return {1: 105, 2: 105, 3: 100, 4: 62}[self]
 
 
-def definition(index: int, place: Place, *, exposure_us: int, dark_us: int, leds: int) -> bytes:
+def encode_definition(index: int, place: MemoryPlane, *, exposure_us: int, dark_us: int, leds: int) -> bytes:
     """Return an entry of the pattern table: number (2), exposure (3, µs), LEDs in bits 4 to 6 and that the mirrors are
     cleared in bit 0, dark time after it (3, µs), nothing, and picture (11 bits) and plane (5 bits). One bit deep, not
     triggered from outside.
@@ -116,56 +116,59 @@ def definition(index: int, place: Place, *, exposure_us: int, dark_us: int, leds
     )
 
 
-class Engine(engine.Engine):
+class Dlpc900Engine(engine.UsbEngine):
     """A DLPC900 behind a link."""
 
     def version(self) -> tuple[int, int]:
         """Major and minor number of its firmware."""
-        told = self._link.read(Command.VERSION, 4)
+        told = self._link.read(Dlpc900Command.VERSION, 4)
         return told[3], told[2]
 
-    def mirrors(self) -> Mirrors:
+    def mirrors(self) -> Dlpc900Mirrors:
         """Which mirrors it drives. Raises UnsupportedByDeviceError: none that this driver knows."""
-        number = self._link.read(Command.HARDWARE, 1)[0]
+        number = self._link.read(Dlpc900Command.HARDWARE, 1)[0]
         try:
-            return Mirrors(number)
+            return Dlpc900Mirrors(number)
         except ValueError as error:
-            known = ", ".join(mirrors.name for mirrors in Mirrors)
+            known = ", ".join(mirrors.name for mirrors in Dlpc900Mirrors)
             message = f"{self.name} has mirrors of type {number}, this driver knows {known}; use one of these"
             raise UnsupportedByDeviceError(message) from error
 
     def set_trigger_out(self, *, active_low: bool, delay_us: int) -> None:
         """Set TRIG_OUT_1 (DLPU018 table 2-112): polarity, and both edges later than the light's by the delay."""
-        self.settle(engine.Command.TRIGGER_OUT_1, struct.pack("<Bhh", active_low, delay_us, delay_us))
+        self.settle(engine.UsbCommand.TRIGGER_OUT_1, struct.pack("<Bhh", active_low, delay_us, delay_us))
 
     def define(self, entry: bytes) -> None:
         """Set an entry of the pattern table. It holds from the next `configure` on."""
-        self._tell(Command.DEFINITION, entry)
+        self._tell(Dlpc900Command.DEFINITION, entry)
 
     def configure(self, entries: int, shown: int) -> None:
         """Take the table's first entries in their order, and show as many patterns of them."""
-        self._tell(Command.CONFIGURATION, struct.pack("<HI", entries, shown))
+        self._tell(Dlpc900Command.CONFIGURATION, struct.pack("<HI", entries, shown))
 
     def order(self, indices: Sequence[int], shown: int) -> None:
         """Show as many patterns as asked of these entries, over and over."""
-        self._link.send(Command.ORDER, struct.pack(f"<HI{len(indices)}H", len(indices), shown, *indices))
+        self._link.send(Dlpc900Command.ORDER, struct.pack(f"<HI{len(indices)}H", len(indices), shown, *indices))
         self._require_done("take the order of the patterns")
 
     def upload(self, number: int, parts: Sequence[bytes]) -> None:
         """Send a picture, a part for each controller. Pictures are sent with the last one first (table 2-139)."""
         for part, begin, data in zip(
-            parts, (Command.PICTURE_1, Command.PICTURE_2), (Command.DATA_1, Command.DATA_2), strict=False
+            parts,
+            (Dlpc900Command.PICTURE_1, Dlpc900Command.PICTURE_2),
+            (Dlpc900Command.DATA_1, Dlpc900Command.DATA_2),
+            strict=False,
         ):
             self._tell(begin, struct.pack("<HI", number, len(part)))
-            for start in range(0, len(part), MOST_DATA):
-                piece = part[start : start + MOST_DATA]
+            for start in range(0, len(part), MAX_MESSAGE_BYTES):
+                piece = part[start : start + MAX_MESSAGE_BYTES]
                 self._link.send(data, struct.pack("<H", len(piece)) + piece)
                 self._require_done(f"take picture {number}")
 
     def faults(self) -> str:
         """What the hardware status complains of, in words; empty if of nothing."""
         told = [super().faults()]
-        if self.byte(engine.Command.HARDWARE_STATUS) & INCOMPATIBLE:
+        if self.byte(engine.UsbCommand.HARDWARE_STATUS) & INCOMPATIBLE:
             told.append(ERRORS[4])
         return "; ".join(filter(None, told))
 
@@ -175,19 +178,19 @@ class Engine(engine.Engine):
             message = f"{self.name} says: {faults}; switch it off and on"
             raise DeviceError(message)
 
-    def _tell(self, command: Command, data: bytes) -> None:
+    def _tell(self, command: Dlpc900Command, data: bytes) -> None:
         """Send a command. Raises UnsupportedByDeviceError if the engine refuses it, with what it says."""
         try:
             self._link.write(command, data)
-        except RefusedError as error:
+        except CommandRefusedError as error:
             raise self._refusal(f"take {command.name.lower().replace('_', ' ')} {data.hex(' ')}") from error
 
     def _require_done(self, doing: str) -> None:
-        if self.byte(Command.ERROR_CODE):
+        if self.byte(Dlpc900Command.ERROR_CODE):
             raise self._refusal(doing)
 
     def _refusal(self, doing: str) -> UnsupportedByDeviceError:
-        code = self.byte(Command.ERROR_CODE)
+        code = self.byte(Dlpc900Command.ERROR_CODE)
         told = ERRORS.get(code, f"error code {code}")
         return UnsupportedByDeviceError(
             f"{self.name} was asked to {doing}, and says: {told}; report this message to the driver's maintainer"

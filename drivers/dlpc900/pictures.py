@@ -27,20 +27,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.dlpc900.timing import MOST_ENTRIES
-from drivers.pattern_engine.planes import Plane, keys_of_plane, plane_of
+from drivers.dlpc900.timing import MAX_ENTRIES
+from drivers.pattern_engine.planes import Plane, pattern_plane, plane_keys
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
 PLANES = 24
-MOST_PICTURES = 18
+MAX_PICTURES = 18
 """Picture indices are 0 to 17 (DLPU018 table 2-139)."""
 _HEADER = struct.Struct("<4sHHI8sIBBB21x")
 _ENHANCED = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class MemoryPlane:
     """Where a pattern lies in the engine's memory."""
 
     picture: int
@@ -48,66 +48,66 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class PatternMemory:
     """What the engine is given. places : of each pattern, and at the end of one that is dark; pictures : (H, W) uint32,
     bit n of a pixel is plane n.
     """
 
-    places: tuple[Place, ...]
+    places: tuple[MemoryPlane, ...]
     pictures: tuple[NDArray[np.uint32], ...]
 
 
-def memory_of(sequence: PatternSequence) -> Memory:
+def pack_sequence(sequence: PatternSequence) -> PatternMemory:
     """Return the pictures that hold a sequence, each pattern once, and a dark one.
     Raises UnsupportedByDeviceError: a pattern has shades of grey, or there are too many.
     """
     dark = np.zeros(sequence.projector.shape, np.bool_)
-    planes = [*(plane_of(sequence, index) for index in range(len(sequence))), dark]
-    found: dict[bytes, Place] = {}
+    planes = [*(pattern_plane(sequence, index) for index in range(len(sequence))), dark]
+    found: dict[bytes, MemoryPlane] = {}
     groups: list[tuple[bool, list[Plane]]] = []
     places = []
     for plane in planes:
-        key, _ = keys_of_plane(plane)
+        key, _ = plane_keys(plane)
         if key not in found:
             by_rows = bool((plane[:, :1] == plane).all()) and not (plane == plane[0, 0]).all()
             at = next((at for at, (rows, held) in enumerate(groups) if rows == by_rows and len(held) < PLANES), None)
             if at is None:
                 at = len(groups)
                 groups.append((by_rows, []))
-            found[key] = Place(at, len(groups[at][1]))
+            found[key] = MemoryPlane(at, len(groups[at][1]))
             groups[at][1].append(plane)
         places.append(found[key])
-    if len(places) > MOST_ENTRIES or len(groups) > MOST_PICTURES:
+    if len(places) > MAX_ENTRIES or len(groups) > MAX_PICTURES:
         message = (
             f"asked for a sequence of {len(sequence)} patterns in {len(groups)} pictures, the engine takes "
-            f"{MOST_ENTRIES - 1} in {MOST_PICTURES}; scan one axis only, or with a shorter line_shift_period_px"
+            f"{MAX_ENTRIES - 1} in {MAX_PICTURES}; scan one axis only, or with a shorter line_shift_period_px"
         )
         raise UnsupportedByDeviceError(message)
-    return Memory(tuple(places), tuple(_picture(held, sequence.projector) for _, held in groups))
+    return PatternMemory(tuple(places), tuple(_merge_planes(held, sequence.projector) for _, held in groups))
 
 
-def _picture(planes: Sequence[Plane], size: Size) -> NDArray[np.uint32]:
+def _merge_planes(planes: Sequence[Plane], size: Size) -> NDArray[np.uint32]:
     pixels = np.zeros(size.shape, np.uint32)
     for number, plane in enumerate(planes):
         pixels |= plane.astype(np.uint32) << np.uint32(number)
     return pixels
 
 
-def packed(picture: NDArray[np.uint32]) -> bytes:
+def encode_picture(picture: NDArray[np.uint32]) -> bytes:
     """Return a picture, or one half of it, with its header, as it is sent."""
     rows, columns = picture.shape
     lines = []
     before: NDArray[np.uint32] | None = None
     for line in picture:
         same = before is not None and np.array_equal(line, before)
-        lines.append(b"\0\1" + _number(columns) if same else _line(line))
+        lines.append(b"\0\1" + _encode_count(columns) if same else _encode_line(line))
         before = line
     data = b"".join(lines) + b"\0\1\0"
     data += bytes(-len(data) % 4)
     return _HEADER.pack(b"Spld", columns, rows, len(data), b"\xff" * 8, 0, 0, _ENHANCED, 1) + data
 
 
-def _line(line: NDArray[np.uint32]) -> bytes:
+def _encode_line(line: NDArray[np.uint32]) -> bytes:
     """Runs of two pixels and more, and what is between them as it is."""
     starts = np.flatnonzero(np.diff(line, prepend=~line[:1]))
     lengths = np.diff(starts, append=line.size)
@@ -117,22 +117,22 @@ def _line(line: NDArray[np.uint32]) -> bytes:
         if length == 1:
             single.append(start)
             continue
-        out += _raw(line[single]) + _number(length) + _bytes(line[start])
+        out += _encode_raw(line[single]) + _encode_count(length) + _encode_pixel(line[start])
         single = []
-    return bytes(out + _raw(line[single]))
+    return bytes(out + _encode_raw(line[single]))
 
 
-def _raw(pixels: NDArray[np.uint32]) -> bytes:
+def _encode_raw(pixels: NDArray[np.uint32]) -> bytes:
     if pixels.size == 0:
         return b""
     # One alone is a run of one: "0 1" means something else.
-    head = b"\1" if pixels.size == 1 else b"\0" + _number(pixels.size)
-    return head + b"".join(_bytes(pixel) for pixel in pixels)
+    head = b"\1" if pixels.size == 1 else b"\0" + _encode_count(pixels.size)
+    return head + b"".join(_encode_pixel(pixel) for pixel in pixels)
 
 
-def _bytes(pixel: np.uint32) -> bytes:
+def _encode_pixel(pixel: np.uint32) -> bytes:
     return int(pixel).to_bytes(3, "big")
 
 
-def _number(count: int) -> bytes:
+def _encode_count(count: int) -> bytes:
     return bytes([count]) if count < 128 else bytes([0x80 | count & 0x7F, count >> 7])

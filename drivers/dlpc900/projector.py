@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
-from drivers.dlpc900.engine import MODE_S, ON_THE_FLY, SECOND_READY, Engine, Mirrors, definition
-from drivers.dlpc900.options import EngineOptions
-from drivers.dlpc900.pictures import Place, memory_of, packed
-from drivers.dlpc900.timing import lit
-from drivers.pattern_engine.engine import Command
-from drivers.pattern_engine.link import Kind, Link
-from drivers.pattern_engine.options import Colour
-from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
-from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
+from drivers.dlpc900.engine import (
+    MODE_CHANGE_S,
+    ON_THE_FLY,
+    SECOND_READY,
+    Dlpc900Engine,
+    Dlpc900Mirrors,
+    encode_definition,
+)
+from drivers.dlpc900.options import Dlpc900EngineOptions
+from drivers.dlpc900.pictures import MemoryPlane, encode_picture, pack_sequence
+from drivers.dlpc900.timing import play_timing
+from drivers.pattern_engine.engine import UsbCommand
+from drivers.pattern_engine.link import UsbController, UsbLink
+from drivers.pattern_engine.options import LedColour
+from drivers.pattern_engine.projector import COMMANDS_S, DIM_TIMING, START_TIMEOUT_S, UsbEngineProjector
+from drivers.pattern_engine.timing import MAX_UNATTENDED_S, Timing
 from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
-DLPC900 = Kind("dlpc900", 0xC900, "6.0")
-OLDEST = (6, 0)
+DLPC900 = UsbController("dlpc900", 0xC900, "6.0")
+OLDEST_FIRMWARE = (6, 0)
 """Before 5.0 patterns cannot be put into another order (DLPU101, "Edit LUT"); up to 5.0.0 blocks of mirrors may lock
 after a change of mode (DLPT028)."""
 _DARK_END_US = 10_000
-_ALONE_US = round(LEFT_ALONE_S * 1e6) - _DARK_END_US
+_ALONE_US = round(MAX_UNATTENDED_S * 1e6) - _DARK_END_US
 
 
-class LightEngine(PatternEngine[Engine]):
+class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
     """Implements `slrig.devices.Projector` on a DLPC900.
 
     Parameters
@@ -43,12 +50,14 @@ class LightEngine(PatternEngine[Engine]):
         The engine failed.
     """
 
-    def __init__(self, link: Link, options: EngineOptions, *, serial: str = "", clock: Clock | None = None) -> None:
-        super().__init__(Engine(link), options, clock=clock)
+    def __init__(
+        self, link: UsbLink, options: Dlpc900EngineOptions, *, serial: str = "", clock: Clock | None = None
+    ) -> None:
+        super().__init__(Dlpc900Engine(link), options, clock=clock)
         self._options = options
         self._serial = serial
-        self._mirrors: Mirrors
-        self._places: tuple[Place, ...] = ()
+        self._mirrors: Dlpc900Mirrors
+        self._places: tuple[MemoryPlane, ...] = ()
         self._leds: tuple[int, ...] = ()
         # The pattern table, as far as the engine has it.
         self._table: dict[int, bytes] = {}
@@ -60,7 +69,7 @@ class LightEngine(PatternEngine[Engine]):
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, self._mirrors.size)
-        memory = memory_of(sequence)
+        memory = pack_sequence(sequence)
         columns = self._mirrors.size.width_px // self._mirrors.controllers
         with self._lock:
             self._state.require_open()
@@ -69,23 +78,23 @@ class LightEngine(PatternEngine[Engine]):
             self._leds = (*map(self._options.colour_of, sequence.patterns), 0)
             # The table first: pictures are lost when its length changes (DLPU018 section 2.4.4.4.2).
             for index in range(len(memory.places)):
-                self._define(index, DIM)
+                self._define(index, DIM_TIMING)
             self._engine.configure(len(memory.places), len(sequence))
             for number in reversed(range(len(memory.pictures))):
                 picture = memory.pictures[number]
                 halves = [picture[:, at : at + columns] for at in range(0, picture.shape[1], columns)]
-                self._engine.upload(number, [packed(half) for half in halves])
+                self._engine.upload(number, [encode_picture(half) for half in halves])
         self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
-        """See `Projector`. Dark again after `hold_s`, and `LEFT_ALONE_S` after the end of this program.
+        """See `Projector`. Dark again after `hold_s`, and `MAX_UNATTENDED_S` after the end of this program.
 
         A pattern without any LED ends what is shown: it is dark, whatever the mirrors do after a sequence.
         """
         self._state.require_pattern(index)
         if self.unproven:
-            exposure_us, dark_us = DIM.exposure_us, DIM.period_us - DIM.exposure_us
-            times = _ALONE_US // DIM.period_us
+            exposure_us, dark_us = DIM_TIMING.exposure_us, DIM_TIMING.period_us - DIM_TIMING.exposure_us
+            times = _ALONE_US // DIM_TIMING.period_us
         else:
             exposure_us, dark_us, times = _ALONE_US, _DARK_END_US, 1
         with self._lock:
@@ -98,12 +107,12 @@ class LightEngine(PatternEngine[Engine]):
                 self._engine.configure(len(self._places), len(self._places))
                 self._engine.order((index, last), 2 * times)
                 started_ns = self._start()
-                self._engine.wait_until_running(RUNNING_S)
+                self._engine.wait_until_running(START_TIMEOUT_S)
                 self._engine.require_well()
             except BaseException:
                 self._darken()
                 raise
-            self._begin_holding(LEFT_ALONE_S, again_s=LEFT_ALONE_S / 2)
+            self._begin_holding(MAX_UNATTENDED_S, again_s=MAX_UNATTENDED_S / 2)
         return self._shown(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
@@ -111,7 +120,7 @@ class LightEngine(PatternEngine[Engine]):
         self._state.require_loaded("play")
         self._require_proven()
         options = self._options
-        timing = lit(
+        timing = play_timing(
             exposure_s,
             period_s,
             margin_s=options.light_margin_s,
@@ -135,7 +144,7 @@ class LightEngine(PatternEngine[Engine]):
     def _define(self, index: int, timing: Timing) -> None:
         """Set an entry of the pattern table, unless the engine has it."""
         dark_us = timing.period_us - timing.exposure_us
-        entry = definition(
+        entry = encode_definition(
             index, self._places[index], exposure_us=timing.exposure_us, dark_us=dark_us, leds=self._leds[index]
         )
         if self._table.get(index) != entry:
@@ -153,16 +162,16 @@ class LightEngine(PatternEngine[Engine]):
     def _prepare(self) -> ProjectorInfo:
         engine, options = self._engine, self._options
         version = engine.version()
-        if version < OLDEST:
-            found, wanted = (".".join(map(str, each)) for each in (version, OLDEST))
+        if version < OLDEST_FIRMWARE:
+            found, wanted = (".".join(map(str, each)) for each in (version, OLDEST_FIRMWARE))
             message = f"{engine.name} has firmware {found}, this driver needs {wanted}; update it with TI's program"
             raise UnsupportedByDeviceError(message)
         self._mirrors = mirrors = engine.mirrors()
-        if mirrors.controllers > 1 and not engine.byte(Command.HARDWARE_STATUS) & SECOND_READY:
+        if mirrors.controllers > 1 and not engine.byte(UsbCommand.HARDWARE_STATUS) & SECOND_READY:
             message = f"{engine.name}: a {mirrors.name} has two controllers, the second one does not answer; "
             message += "switch it off and on"
             raise DeviceError(message)
-        engine.settle_byte(Command.DISPLAY_MODE, ON_THE_FLY, within_s=MODE_S)
+        engine.settle_byte(UsbCommand.DISPLAY_MODE, ON_THE_FLY, within_s=MODE_CHANGE_S)
         # A new mode may start what the engine shows by itself.
         self.blank()
         self._set_up_light()
@@ -176,5 +185,5 @@ class LightEngine(PatternEngine[Engine]):
             latency_s=options.start_s + COMMANDS_S,
             gap_s=options.light_margin_s + mirrors.least_us / 1e6,
             duty=options.duty_limit,
-            lights=options.colour is Colour.WHITE,
+            lights=options.colour is LedColour.WHITE,
         )

@@ -7,8 +7,8 @@ import time
 from contextlib import AbstractContextManager, suppress
 from typing import Any
 
-from drivers.genicam.connection import Connection, Delivery, Memory, Stream
-from drivers.genicam.library import library, told
+from drivers.genicam.connection import GenICamConnection, GenICamStream, RawFrame, RawImage
+from drivers.genicam.library import load_aravis, translate_aravis_errors
 from drivers.genicam.options import GenicamOptions
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
@@ -25,7 +25,7 @@ _CLOCK_TRIES = 5
 _CLOCK_TIGHT_NS = 20_000
 
 
-class AravisConnection(Connection):
+class AravisConnection(GenICamConnection):
     """An open device. Aravis' own thread tells when control is lost.
 
     Parameters
@@ -47,9 +47,9 @@ class AravisConnection(Connection):
 
     def __init__(self, name: str, options: GenicamOptions) -> None:
         super().__init__(name)
-        aravis = library().aravis
+        aravis = load_aravis().aravis
         self._options = options
-        self._camera = _opened(aravis, name, options.device)
+        self._camera = _open_device(aravis, name, options.device)
         self._device = self._camera.get_device()
         self._is_gige = bool(self._camera.is_gv_device())
         self._device.set_register_cache_policy(aravis.RegisterCachePolicy.DISABLE)
@@ -65,12 +65,12 @@ class AravisConnection(Connection):
             raise
 
     def told(self, doing: str) -> AbstractContextManager[None]:
-        """See `Connection`."""
-        return told(self.name, doing)
+        """See `GenICamConnection`."""
+        return translate_aravis_errors(self.name, doing)
 
     def kind(self, feature: str) -> str:
-        """See `Connection`."""
-        aravis = library().aravis
+        """See `GenICamConnection`."""
+        aravis = load_aravis().aravis
         with self.asking(f"feature {feature}"):
             node = self._device.get_feature(feature)
         for kind in ("Boolean", "Enumeration", "String", "Integer", "Float"):
@@ -78,9 +78,9 @@ class AravisConnection(Connection):
                 return kind
         return type(node).__name__.removeprefix("Gc").removesuffix("Node")
 
-    def start(self, buffers: int) -> Stream:
-        """See `Connection`. A new `Aravis.Stream`: no buffer of an earlier one can come out of it."""
-        aravis = library().aravis
+    def start(self, buffers: int) -> GenICamStream:
+        """See `GenICamConnection`. A new `Aravis.GenICamStream`: no buffer of an earlier one can come out of it."""
+        aravis = load_aravis().aravis
         with self.asking("opening a stream") as camera:
             stream = camera.create_stream(None, None)
         if stream is None:
@@ -98,7 +98,7 @@ class AravisConnection(Connection):
         return AravisStream(self, stream)
 
     def latch(self) -> tuple[int, int, int] | None:
-        """See `Connection`. GigE Vision has it in registers that every device shares, USB3 Vision in features."""
+        """See `GenICamConnection`. GigE Vision has it in registers that every device shares, USB3 Vision in features."""
         if not self._is_gige:
             return super().latch()
         try:
@@ -108,7 +108,7 @@ class AravisConnection(Connection):
 
     @property
     def has_stamps(self) -> bool:
-        """See `Connection`."""
+        """See `GenICamConnection`."""
         return not self._is_gige or self._device.get_timestamp_tick_frequency() > 0
 
     def close(self) -> None:
@@ -169,14 +169,14 @@ class AravisConnection(Connection):
 
 
 class AravisStream:
-    """Implements `Stream` on an `Aravis.Stream` that runs."""
+    """Implements `GenICamStream` on an `Aravis.GenICamStream` that runs."""
 
     def __init__(self, connection: AravisConnection, stream: Any) -> None:
         self._connection = connection
         self._stream = stream
 
-    def take(self, most_s: float) -> Delivery | None:
-        """See `Stream`."""
+    def take(self, most_s: float) -> RawFrame | None:
+        """See `GenICamStream`."""
         if most_s > 0:
             buffer = self._stream.timeout_pop_buffer(round(most_s * 1e6) + 1)
         else:
@@ -186,15 +186,15 @@ class AravisStream:
         try:
             arrived_ns = _arrived_ns(buffer)
             image = None
-            if buffer.get_status() == library().aravis.BufferStatus.SUCCESS:
+            if buffer.get_status() == load_aravis().aravis.BufferStatus.SUCCESS:
                 size = Size(buffer.get_image_width(), buffer.get_image_height())
-                image = Memory(buffer.get_data(), size, buffer.get_image_padding()[0])
-            return Delivery(int(buffer.get_frame_id()), arrived_ns, int(buffer.get_timestamp()), image)
+                image = RawImage(buffer.get_data(), size, buffer.get_image_padding()[0])
+            return RawFrame(int(buffer.get_frame_id()), arrived_ns, int(buffer.get_timestamp()), image)
         finally:
             self._stream.push_buffer(buffer)
 
     def end(self) -> None:
-        """See `Stream`."""
+        """See `GenICamStream`."""
         connection = self._connection
         if not connection.is_lost:
             # A camera that is lost only now is told of by the next call that needs it.
@@ -204,12 +204,12 @@ class AravisStream:
         connection.let_go(held)
 
 
-def _opened(aravis: Any, name: str, device: str) -> Any:
+def _open_device(aravis: Any, name: str, device: str) -> Any:
     try:
-        with told(name, f"opening {device}"):
+        with translate_aravis_errors(name, f"opening {device}"):
             return aravis.Camera.new(device)
     except DeviceGoneError as error:
-        known = ", ".join(label for _, label in listed()) or "none"
+        known = ", ".join(label for _, label in list_aravis_cameras()) or "none"
         message = (
             f"camera '{name}': no GenICam camera '{device}' answers; found: {known}. Check cable, power, and that its "
             "IP address lies in the network of this machine's card"
@@ -217,9 +217,9 @@ def _opened(aravis: Any, name: str, device: str) -> Any:
         raise DeviceGoneError(message) from error
 
 
-def listed() -> tuple[tuple[str, str], ...]:
+def list_aravis_cameras() -> tuple[tuple[str, str], ...]:
     """Id and label of every camera that answers. Opens nothing; takes Aravis about one second."""
-    aravis = library().aravis
+    aravis = load_aravis().aravis
     aravis.update_device_list()
     found = []
     for index in range(aravis.get_n_devices()):

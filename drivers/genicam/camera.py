@@ -18,13 +18,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from drivers.genicam.aravis import AravisConnection
-from drivers.genicam.connection import Connection
-from drivers.genicam.features import differ
+from drivers.genicam.connection import GenICamConnection
+from drivers.genicam.features import differs
 from drivers.genicam.gentl import GentlConnection
-from drivers.genicam.options import CameraOptions, GenicamOptions, GentlOptions
+from drivers.genicam.options import GenICamCameraOptions, GenicamOptions, GentlOptions
 from drivers.genicam.pixels import FORMATS
-from drivers.genicam.session import Session
-from drivers.genicam.setup import line_of, prepare, set_trigger
+from drivers.genicam.session import Acquisition
+from drivers.genicam.setup import choose_trigger_line, set_trigger, set_up_camera
 from slrig.bundle.validation import checked
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
 from slrig.errors import UnsupportedByDeviceError
@@ -32,10 +32,10 @@ from slrig.model import CameraFormat, Frame
 
 _RESENT_AFTER_NS = 400_000_000
 _LATE_S = 0.2
-_MOST_BUFFER_BYTES = 1 << 30
-_FEWEST_BUFFERS = 8
+_MAX_BUFFER_BYTES = 1 << 30
+_MIN_BUFFERS = 8
 
-_RATES = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
+_FRAME_RATE_FEATURES = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
 """What tells the fastest rate that exposure, read-out and link allow: SFNC has no name for it, makers have theirs."""
 
 
@@ -55,18 +55,18 @@ class GenicamCamera:
         The device does not take an option, or takes it otherwise.
     """
 
-    def __init__(self, connection: Connection, options: CameraOptions) -> None:
+    def __init__(self, connection: GenICamConnection, options: GenICamCameraOptions) -> None:
         self._name = connection.name
         self._options = options
         self._connection = connection
         self._state = self._connection.state
-        self._session: Session
+        self._session: Acquisition
         self._owes = False
         try:
-            self._size = prepare(self._connection, options)
-            self._line = line_of(self._connection, options)
+            self._size = set_up_camera(self._connection, options)
+            self._line = choose_trigger_line(self._connection, options)
             self._info = self._declared()
-            self._rate = next((each for each in _RATES if self._connection.features.has(each)), None)
+            self._rate = next((each for each in _FRAME_RATE_FEATURES if self._connection.features.has(each)), None)
             self._applied = self._in_use()
         except BaseException:
             self._connection.close()
@@ -90,7 +90,7 @@ class GenicamCamera:
             ("exposure_s", settings.exposure_s, self._applied.exposure_s),
             ("gain", settings.gain, self._applied.gain),
         ):
-            if differ(got, asked):
+            if differs(got, asked):
                 message = (
                     f"camera '{self._name}': asked for {what} {asked:g}, it gives {got:g}; ask for that, or for what "
                     "its other settings allow (frame rate, pixel format)"
@@ -105,8 +105,8 @@ class GenicamCamera:
         source = {Trigger.FREE: None, Trigger.SOFTWARE: "Software", Trigger.HARDWARE: self._line}[trigger]
         set_trigger(self._connection, source, self._options)
         self._applied = self._in_use()
-        session = Session(self._connection, self._options, FORMATS[self._options.pixel_format], self._size)
-        session.begin(trigger, self._applied, _FEWEST_BUFFERS if trigger is Trigger.FREE else self._buffers(count))
+        session = Acquisition(self._connection, self._options, FORMATS[self._options.pixel_format], self._size)
+        session.begin(trigger, self._applied, _MIN_BUFFERS if trigger is Trigger.FREE else self._buffers(count))
         self._session = session
         self._state.armed = trigger
         if self._owes and trigger is not Trigger.FREE:
@@ -179,7 +179,7 @@ class GenicamCamera:
         """As many as frames are asked for, so that none is lost while nobody reads; fewer if memory forbids."""
         with self._connection.asking("asking for the size of a frame") as camera:
             payload = int(camera.get_payload())
-        return max(_FEWEST_BUFFERS, min(count + 2, _MOST_BUFFER_BYTES // max(payload, 1)))
+        return max(_MIN_BUFFERS, min(count + 2, _MAX_BUFFER_BYTES // max(payload, 1)))
 
     def _require_there(self) -> None:
         self._state.require_open()

@@ -17,7 +17,7 @@ from slrig.model import Size
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class RawImage:
     """An image as it lies in memory; so many bytes follow each row."""
 
     data: bytes
@@ -26,7 +26,7 @@ class Memory:
 
 
 @dataclass(frozen=True, slots=True)
-class Delivery:
+class RawFrame:
     """What a library delivered of a frame.
 
     block_id : the camera's number of it. arrived_ns : when it came, CLOCK_MONOTONIC; not before it did. stamp_ns : the
@@ -36,13 +36,13 @@ class Delivery:
     block_id: int
     arrived_ns: int
     stamp_ns: int
-    image: Memory | None
+    image: RawImage | None
 
 
-class Stream(Protocol):
+class GenICamStream(Protocol):
     """A running acquisition."""
 
-    def take(self, most_s: float) -> Delivery | None:
+    def take(self, most_s: float) -> RawFrame | None:
         """Return the next frame, waiting for it no longer than that; None if none came."""
         ...
 
@@ -51,7 +51,7 @@ class Stream(Protocol):
         ...
 
 
-class Connection(ABC):
+class GenICamConnection(ABC):
     """An open device. One thread uses it; one of the library may tell that it is lost.
 
     Parameters
@@ -129,7 +129,7 @@ class Connection(ABC):
         """Boolean, Enumeration, String, Integer, Float, or what else the library calls a feature that it has."""
 
     @abstractmethod
-    def start(self, buffers: int) -> Stream:
+    def start(self, buffers: int) -> GenICamStream:
         """Start the acquisition, with room for so many frames. No frame of an earlier one comes out of it."""
 
     @abstractmethod

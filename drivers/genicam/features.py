@@ -130,7 +130,7 @@ class Features:
         with self._asking(feature) as camera:
             camera.set_float(feature, value)
             got = float(camera.get_float(feature))
-        if differ(got, value):
+        if differs(got, value):
             raise self._refused(feature, value, f"it gives {got:g}", "ask for a value that it can give")
 
     def _compare(self, feature: str, asked: object, got: object) -> None:
@@ -144,7 +144,7 @@ class Features:
         return self._ask(f"feature {feature}")
 
 
-def differ(got: float, asked: float) -> bool:
+def differs(got: float, asked: float) -> bool:
     """Whether a number that was read back is not the one that was asked for.
 
     >>> differ(0.01001, 0.01), differ(0.0, 0.0), differ(2.0, 1.5)

@@ -14,7 +14,7 @@ def find_devices() -> tuple[FoundDevice, ...]:
     LibraryMissingError
         Aravis or PyGObject is not installed.
     """
-    return tuple(FoundDevice("genicam", identity, label) for identity, label in aravis.listed())
+    return tuple(FoundDevice("genicam", identity, label) for identity, label in aravis.list_aravis_cameras())
 
 
 def find_gentl_devices() -> tuple[FoundDevice, ...]:
@@ -25,4 +25,4 @@ def find_gentl_devices() -> tuple[FoundDevice, ...]:
     LibraryMissingError
         harvesters is not installed.
     """
-    return tuple(FoundDevice("gentl", identity, label) for identity, label in producers.listed())
+    return tuple(FoundDevice("gentl", identity, label) for identity, label in producers.list_gentl_cameras())

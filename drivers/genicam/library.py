@@ -20,7 +20,7 @@ _BUILDS = "libcairo2-dev gcc pkg-config python3-dev"
 
 
 @dataclass(frozen=True, slots=True)
-class Library:
+class AravisLibrary:
     """The loaded library: the `Aravis` namespace, and the class of the errors that come out of it."""
 
     aravis: Any
@@ -28,7 +28,7 @@ class Library:
 
 
 @lru_cache(maxsize=1)
-def library() -> Library:
+def load_aravis() -> AravisLibrary:
     """Load Aravis once.
 
     Raises
@@ -50,7 +50,7 @@ def library() -> Library:
             "extra)"
         )
         raise LibraryMissingError(message, install=install) from cause
-    return Library(aravis, error)
+    return AravisLibrary(aravis, error)
 
 
 def install_command(python: tuple[int, int] = sys.version_info[:2], system: str = sys.platform) -> str:
@@ -71,7 +71,7 @@ def install_command(python: tuple[int, int] = sys.version_info[:2], system: str 
 
 
 @contextmanager
-def told(name: str, doing: str) -> Iterator[None]:
+def translate_aravis_errors(name: str, doing: str) -> Iterator[None]:
     """Turn Aravis' errors within the block into ours, with the camera's name and what was being done.
 
     Raises
@@ -85,14 +85,14 @@ def told(name: str, doing: str) -> Iterator[None]:
     DeviceError
         Anything else.
     """
-    loaded = library()
+    loaded = load_aravis()
     try:
         yield
     except loaded.error as cause:
-        raise _ours(loaded.aravis, name, doing, cause) from cause
+        raise _slrig_error(loaded.aravis, name, doing, cause) from cause
 
 
-def _ours(aravis: Any, name: str, doing: str, cause: Any) -> DeviceError:
+def _slrig_error(aravis: Any, name: str, doing: str, cause: Any) -> DeviceError:
     what = f"camera '{name}', {doing}: {cause.message}"
     if cause.domain == "arv-gc-error-quark":
         return UnsupportedByDeviceError(f"{what}; look up what the camera offers in its manual, and ask for that")

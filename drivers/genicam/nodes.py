@@ -14,7 +14,7 @@ GAIN = ("Gain", "GainAbs", "GainRaw")
 _KINDS = ("Boolean", "Enumeration", "String", "Integer", "Float", "Command", "Register", "Category")
 
 
-def kind_of(node: Any) -> str:
+def feature_type(node: Any) -> str:
     """Boolean, Enumeration, String, Integer, Float, or another kind of GenApi's interfaces."""
     genapi = importlib.import_module("genicam.genapi")
     principal = node.node.principal_interface_type
@@ -154,7 +154,7 @@ class NodeMapCamera:
 
     def _set_number(self, feature: str, value: float) -> None:
         node = self.node(feature)
-        node.value = round(value) if kind_of(node) == "Integer" else value
+        node.value = round(value) if feature_type(node) == "Integer" else value
 
     def _first(self, features: tuple[str, ...]) -> str:
         """The first feature that the camera offers; the first of all if it offers none."""

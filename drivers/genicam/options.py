@@ -9,13 +9,13 @@ from pydantic import Field, model_validator
 
 from slrig.bundle.validation import Strict
 
-Stamp = Literal["exposure", "exposure_start", "exposure_end", "none"]
+StampMeaning = Literal["exposure", "exposure_start", "exposure_end", "none"]
 
-_LEAST_PACKET_BYTES = 576
-_MOST_PACKET_BYTES = 16_000
+_MIN_PACKET_BYTES = 576
+_MAX_PACKET_BYTES = 16_000
 
 
-class Region(Strict, use_attribute_docstrings=True):
+class SensorRegion(Strict, use_attribute_docstrings=True):
     """Part of the sensor, px. The calibration holds for the region it was made with."""
 
     x_px: int = Field(default=0, ge=0)
@@ -31,7 +31,7 @@ class Region(Strict, use_attribute_docstrings=True):
     """How many rows."""
 
 
-class CameraOptions(Strict, use_attribute_docstrings=True):
+class GenICamCameraOptions(Strict, use_attribute_docstrings=True):
     """What a rig file says about a GenICam camera, whichever library opens it."""
 
     device: str = Field(min_length=1)
@@ -40,7 +40,7 @@ class CameraOptions(Strict, use_attribute_docstrings=True):
     pixel_format: str = Field(default="Mono8", min_length=1)
     """PFNC name: Mono8, Mono10, Mono12, Mono16, their packed kinds, Bayer…, RGB8, BGR8."""
 
-    region: Region | None = None
+    region: SensorRegion | None = None
     """Part of the sensor; else all of it."""
 
     trigger_line: str | None = Field(default=None, min_length=1)
@@ -52,7 +52,7 @@ class CameraOptions(Strict, use_attribute_docstrings=True):
     features: Mapping[str, bool | int | float | str] = Field(default_factory=dict)
     """Further GenICam features, set in this order when the camera is opened, and read back."""
 
-    time_stamp: Stamp = "exposure"
+    time_stamp: StampMeaning = "exposure"
     """Which instant the camera's time stamps mean: "exposure" is some instant within it, "none" distrusts them (cameras
     that stamp a frame when it is sent)."""
 
@@ -77,13 +77,13 @@ class CameraOptions(Strict, use_attribute_docstrings=True):
         return self
 
 
-class GenicamOptions(CameraOptions, use_attribute_docstrings=True):
+class GenicamOptions(GenICamCameraOptions, use_attribute_docstrings=True):
     """The keys of a `[[camera]]` table with `driver = "genicam"` (beside name, exposure_s and gain)."""
 
     device: str = Field(min_length=1)
     """Aravis' id (vendor-model-serial, as `slrig devices` lists it), or the IP address of a GigE camera."""
 
-    packet_size_bytes: int | None = Field(default=None, ge=_LEAST_PACKET_BYTES, le=_MOST_PACKET_BYTES)
+    packet_size_bytes: int | None = Field(default=None, ge=_MIN_PACKET_BYTES, le=_MAX_PACKET_BYTES)
     """GigE: the size of packets; else the largest that arrives whole is found out."""
 
     packet_delay_ns: int | None = Field(default=None, ge=0)
@@ -97,7 +97,7 @@ class GenicamOptions(CameraOptions, use_attribute_docstrings=True):
     interface)."""
 
 
-class GentlOptions(CameraOptions, use_attribute_docstrings=True):
+class GentlOptions(GenICamCameraOptions, use_attribute_docstrings=True):
     """The keys of a `[[camera]]` table with `driver = "gentl"` (beside name, exposure_s and gain)."""
 
     device: str = Field(min_length=1)

@@ -28,7 +28,7 @@ _REFUSED = ("AccessException", "InvalidArgumentException", "LogicalErrorExceptio
 
 
 @lru_cache(maxsize=1)
-def core() -> Any:
+def load_harvesters() -> Any:
     """The only module of harvesters.
 
     Raises
@@ -44,7 +44,7 @@ def core() -> Any:
 
 
 @contextmanager
-def told(name: str, doing: str) -> Iterator[None]:
+def translate_gentl_errors(name: str, doing: str) -> Iterator[None]:
     """Turn the errors of producers and node maps within the block into ours.
 
     Raises
@@ -58,7 +58,7 @@ def told(name: str, doing: str) -> Iterator[None]:
     DeviceError
         Anything else.
     """
-    core()
+    load_harvesters()
     gentl, genapi = importlib.import_module("genicam.gentl"), importlib.import_module("genicam.genapi")
     errors: tuple[type[Exception], ...] = (gentl.GenericException, genapi.GenericException)
     try:
@@ -82,12 +82,12 @@ def producer_files() -> tuple[Path, ...]:
     return tuple(sorted({file.resolve() for folder in folders for file in folder.glob("*.cti")}))
 
 
-class Producer:
-    """A producer in use. Get one by `using`."""
+class GentlProducer:
+    """A producer in use. Get one by `use_producer`."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
-        self._harvester = core().Harvester()
+        self._harvester = load_harvesters().Harvester()
         self._harvester.add_file(str(file))
         self._harvester.update()
         self.users = 0
@@ -99,23 +99,23 @@ class Producer:
 
     def acquirer(self, device: Any) -> Any:
         """Open a device, as harvesters' `ImageAcquirer`. Raises what GenTL does."""
-        key = core().ParameterKey
+        key = load_harvesters().ParameterKey
         # A wait of the wheel keeps every other thread waiting, too: it must not wait. Chunks are not read.
         settings = {key.TIMEOUT_PERIOD_ON_UPDATE_EVENT_DATA_CALL: 0, key.ENABLE_AUTO_CHUNK_DATA_UPDATE: False}
-        with _interrupts_kept():
-            return self._harvester.create(device, config=core().ParameterSet(settings))
+        with _preserve_interrupt_handler():
+            return self._harvester.create(device, config=load_harvesters().ParameterSet(settings))
 
     def close(self) -> None:
         """Let the producer go, with all that it opened."""
         self._harvester.reset()
 
 
-_loaded: dict[Path, Producer] = {}
+_loaded: dict[Path, GentlProducer] = {}
 _lock = threading.Lock()
 
 
-def take(file: Path) -> Producer:
-    """Return the producer of a file, loaded if it is not yet; `release` it after use.
+def acquire_producer(file: Path) -> GentlProducer:
+    """Return the producer of a file, loaded if it is not yet; `release_producer` it after use.
 
     Raises
     ------
@@ -126,13 +126,13 @@ def take(file: Path) -> Producer:
         message = f"there is no GenTL producer {file}; install the one that comes with the camera, and write its path"
         raise LibraryMissingError(message, install=f"the camera maker's GenTL producer, as {file}")
     with _lock:
-        producer = _loaded.get(file) or Producer(file)
+        producer = _loaded.get(file) or GentlProducer(file)
         _loaded[file] = producer
         producer.users += 1
         return producer
 
 
-def release(file: Path) -> None:
+def release_producer(file: Path) -> None:
     """Give a producer back; the last one closes it."""
     with _lock:
         producer = _loaded[file]
@@ -143,16 +143,16 @@ def release(file: Path) -> None:
 
 
 @contextmanager
-def using(file: Path) -> Iterator[Producer]:
+def use_producer(file: Path) -> Iterator[GentlProducer]:
     """A producer, for the block."""
-    producer = take(file)
+    producer = acquire_producer(file)
     try:
         yield producer
     finally:
-        release(file)
+        release_producer(file)
 
 
-def listed() -> tuple[tuple[str, str], ...]:
+def list_gentl_cameras() -> tuple[tuple[str, str], ...]:
     """Id and label of every camera behind the producers that are installed. Opens none.
 
     Raises
@@ -160,17 +160,17 @@ def listed() -> tuple[tuple[str, str], ...]:
     LibraryMissingError
         harvesters is not installed.
     """
-    core()
+    load_harvesters()
     found = []
     for file in producer_files():
-        with using(file) as producer:
+        with use_producer(file) as producer:
             for device in producer.devices:
-                parts = filter(None, (told_by(device, each) for each in ("vendor", "model", "serial_number")))
-                found.append((device.id_, f"{' '.join(parts)} ({told_by(device, 'tl_type')}, {file.name})"))
+                parts = filter(None, (device_field(device, each) for each in ("vendor", "model", "serial_number")))
+                found.append((device.id_, f"{' '.join(parts)} ({device_field(device, 'tl_type')}, {file.name})"))
     return tuple(sorted(found))
 
 
-def told_by(device: Any, what: str) -> str:
+def device_field(device: Any, what: str) -> str:
     """What a producer tells of a device, "" if it does not."""
     with suppress(importlib.import_module("genicam.gentl").GenericException):
         return str(getattr(device, what) or "")
@@ -178,7 +178,7 @@ def told_by(device: Any, what: str) -> str:
 
 
 @contextmanager
-def _interrupts_kept() -> Iterator[None]:
+def _preserve_interrupt_handler() -> Iterator[None]:
     """Keep the handler of Ctrl-C, which harvesters sets to its own."""
     kept = signal.getsignal(signal.SIGINT)
     try:

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-from drivers.genicam.connection import Connection, Delivery, Stream
-from drivers.genicam.options import CameraOptions
-from drivers.genicam.pixels import PixelFormat, grey
+from drivers.genicam.connection import GenICamConnection, GenICamStream, RawFrame
+from drivers.genicam.options import GenICamCameraOptions
+from drivers.genicam.pixels import PfncFormat, decode_pixels
 from drivers.genicam.timing import (
     Arrival,
     FrameNumbers,
@@ -29,7 +29,7 @@ _TIE_AGAIN_NS = 5_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class _Exposed:
+class _TimedFrame:
     """A sound frame, in colour too where there is any, and when its exposure began."""
 
     image: Pixels
@@ -38,7 +38,7 @@ class _Exposed:
     start: Interval
 
 
-class Session:
+class Acquisition:
     """An armed camera. One thread uses it.
 
     Parameters
@@ -49,16 +49,18 @@ class Session:
         What was set.
     """
 
-    def __init__(self, connection: Connection, options: CameraOptions, form: PixelFormat, size: Size) -> None:
+    def __init__(
+        self, connection: GenICamConnection, options: GenICamCameraOptions, form: PfncFormat, size: Size
+    ) -> None:
         self._connection = connection
         self._options = options
         self._form = form
         self._size = size
-        self._stream: Stream | None = None
+        self._stream: GenICamStream | None = None
         self._numbers = FrameNumbers()
         self._good = 0
         self._last_end_ns = 0
-        self._waiting: deque[_Exposed] = deque()
+        self._waiting: deque[_TimedFrame] = deque()
         self._passed = dict.fromkeys(("stale", "corrupt", "repeated", "unasked"), 0)
         self.trigger = Trigger.FREE
         self._applied = AppliedSettings(0.0, 0.0)
@@ -140,7 +142,7 @@ class Session:
             self._judge(delivery)
         return delivery is not None
 
-    def _judge(self, delivery: Delivery) -> None:
+    def _judge(self, delivery: RawFrame) -> None:
         number = self._numbers.next(delivery.block_id)
         pictures = self._pictures(delivery)
         if pictures is None:
@@ -156,9 +158,9 @@ class Session:
         if start is None:
             self._passed["unasked"] += 1
             return
-        self._waiting.append(_Exposed(*pictures, number, start))
+        self._waiting.append(_TimedFrame(*pictures, number, start))
 
-    def _frame(self, exposed: _Exposed) -> Frame:
+    def _frame(self, exposed: _TimedFrame) -> Frame:
         start = exposed.start
         t_start_ns = (start.least_ns + start.most_ns) // 2
         # What a camera began it ended before it began anew.
@@ -177,12 +179,12 @@ class Session:
             colour=exposed.colour,
         )
 
-    def _pictures(self, delivery: Delivery) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
+    def _pictures(self, delivery: RawFrame) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
         """The image, and what makes it in colour, or None if packets are missing or it is not what was set."""
         image = delivery.image
         if image is None or image.size != self._size:
             return None
-        made = partial(grey, image.data, self._form, self._size, padding_bytes=image.padding_bytes)
+        made = partial(decode_pixels, image.data, self._form, self._size, padding_bytes=image.padding_bytes)
         try:
             return made(), partial(made, in_colour=True) if self._form.mosaic else None
         except ValueError:

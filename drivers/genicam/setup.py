@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.genicam.connection import Connection
-from drivers.genicam.options import CameraOptions, Region
+from drivers.genicam.connection import GenICamConnection
+from drivers.genicam.options import GenICamCameraOptions, SensorRegion
 from drivers.genicam.pixels import FORMATS
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Size
@@ -15,7 +15,7 @@ _STARTS = ("FrameStart", "ExposureStart")
 _AUTOMATIC = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto", "GammaAuto")
 
 
-def prepare(connection: Connection, options: CameraOptions) -> Size:
+def set_up_camera(connection: GenICamConnection, options: GenICamCameraOptions) -> Size:
     """Stop what runs, switch off what is automatic, set format, region and features. Return the image's extent.
 
     Raises
@@ -47,7 +47,7 @@ def prepare(connection: Connection, options: CameraOptions) -> Size:
     return _set_region(connection, options)
 
 
-def _set_region(connection: Connection, options: CameraOptions) -> Size:
+def _set_region(connection: GenICamConnection, options: GenICamCameraOptions) -> Size:
     features = connection.features
     # Extents are bounded by the offsets in use, so those go first, and come back last.
     for offset in ("OffsetX", "OffsetY"):
@@ -57,7 +57,7 @@ def _set_region(connection: Connection, options: CameraOptions) -> Size:
         width_px, height_px = int(camera.get_width_bounds()[1]), int(camera.get_height_bounds()[1])
     region = options.region
     if region is None:
-        region = Region(width_px=width_px, height_px=height_px)
+        region = SensorRegion(width_px=width_px, height_px=height_px)
     if region.x_px + region.width_px > width_px or region.y_px + region.height_px > height_px:
         message = (
             f"camera '{connection.name}': asked for a region of {region.width_px} x {region.height_px} px at column "
@@ -72,7 +72,7 @@ def _set_region(connection: Connection, options: CameraOptions) -> Size:
     return Size(region.width_px, region.height_px)
 
 
-def line_of(connection: Connection, options: CameraOptions) -> str | None:
+def choose_trigger_line(connection: GenICamConnection, options: GenICamCameraOptions) -> str | None:
     """Return the input that a hardware trigger comes by; None if the camera has none.
 
     Raises
@@ -82,7 +82,7 @@ def line_of(connection: Connection, options: CameraOptions) -> str | None:
     """
     features = connection.features
     if features.has(_SELECTOR):
-        features.choose(_SELECTOR, _start_of(features.choices(_SELECTOR)))
+        features.choose(_SELECTOR, _start_selector(features.choices(_SELECTOR)))
     lines = (
         tuple(source for source in features.choices("TriggerSource") if source.startswith("Line"))
         if (features.has("TriggerSource"))
@@ -99,7 +99,7 @@ def line_of(connection: Connection, options: CameraOptions) -> str | None:
     return options.trigger_line
 
 
-def set_trigger(connection: Connection, source: str | None, options: CameraOptions) -> None:
+def set_trigger(connection: GenICamConnection, source: str | None, options: GenICamCameraOptions) -> None:
     """Let `source` start every exposure; None lets the camera run by itself.
 
     Raises
@@ -109,7 +109,7 @@ def set_trigger(connection: Connection, source: str | None, options: CameraOptio
     """
     features = connection.features
     selectors = features.choices(_SELECTOR) if features.has(_SELECTOR) else ()
-    start = _start_of(selectors)
+    start = _start_selector(selectors)
     for selector in selectors:
         if selector != start:
             features.choose(_SELECTOR, selector)
@@ -127,6 +127,6 @@ def set_trigger(connection: Connection, source: str | None, options: CameraOptio
         features.choose("TriggerActivation", options.trigger_activation)
 
 
-def _start_of(selectors: tuple[str, ...]) -> str:
+def _start_selector(selectors: tuple[str, ...]) -> str:
     """The selector of what starts a frame; the usual one, which is then refused, where there is none of them."""
     return next((each for each in _STARTS if each in selectors), _STARTS[0])

@@ -12,11 +12,11 @@ import threading
 import time
 from enum import IntEnum, IntFlag
 
-from drivers.pattern_engine.link import Link
+from drivers.pattern_engine.link import UsbLink
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 
 
-class Command(IntEnum):
+class UsbCommand(IntEnum):
     """USB commands of both."""
 
     POWER = 0x0200  # 1 standby, 0 normal
@@ -33,14 +33,14 @@ class Command(IntEnum):
     INVERT_DATA = 0x1A30
 
 
-class Main(IntFlag):
+class MainStatus(IntFlag):
     """Main status."""
 
     PARKED = 1
     RUNNING = 2
 
 
-class Hardware(IntFlag):
+class HardwareStatus(IntFlag):
     """Hardware status. INITIALISED is well when set, the others when not."""
 
     INITIALISED = 1
@@ -51,18 +51,18 @@ class Hardware(IntFlag):
 
 
 FAULTS = {
-    Hardware.RESET_CONTROLLER: "the mirrors' reset controller failed (several resets at once)",
-    Hardware.FORCED_SWAP: "a picture was taken before it was loaded",
-    Hardware.ABORTED: "the sequence was aborted",
-    Hardware.SEQUENCER: "the sequencer failed",
+    HardwareStatus.RESET_CONTROLLER: "the mirrors' reset controller failed (several resets at once)",
+    HardwareStatus.FORCED_SWAP: "a picture was taken before it was loaded",
+    HardwareStatus.ABORTED: "the sequence was aborted",
+    HardwareStatus.SEQUENCER: "the sequencer failed",
 }
 _ASK_AGAIN_S = 0.005
 
 
-class Engine:
+class UsbEngine:
     """The controller behind a link. Every method raises DeviceError and DeviceGoneError as the link does."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: UsbLink) -> None:
         self._link = link
         self._never = threading.Event()
 
@@ -103,7 +103,7 @@ class Engine:
 
     def leds(self, *, by_sequence: bool) -> None:
         """Let the sequence switch the LEDs, or switch them all off."""
-        self.set_byte(Command.LED_ENABLE, 8 if by_sequence else 0)
+        self.set_byte(UsbCommand.LED_ENABLE, 8 if by_sequence else 0)
 
     def set_led_current(self, colours: int, current: int, *, inverted: bool) -> None:
         """Set the current of the LEDs in `colours` (0 to 255), and none of the others; compare what is read back."""
@@ -116,35 +116,35 @@ class Engine:
     @property
     def led_polarity_turned(self) -> bool:
         """Whether the register of the polarity is set."""
-        return bool(self.byte(Command.LED_POLARITY) & 1)
+        return bool(self.byte(UsbCommand.LED_POLARITY) & 1)
 
     def set_led_registers(self, values: bytes) -> None:
         """Set the registers of red, green and blue, whatever their values mean; compare what is read back."""
-        self.settle(Command.LED_CURRENT, values)
+        self.settle(UsbCommand.LED_CURRENT, values)
 
     def start(self) -> None:
         """Start the sequence that was set."""
-        self.set_byte(Command.START_STOP, 2)
+        self.set_byte(UsbCommand.START_STOP, 2)
 
     def stop(self) -> None:
         """Stop the sequence; the next start begins it anew."""
-        self.set_byte(Command.START_STOP, 0)
+        self.set_byte(UsbCommand.START_STOP, 0)
 
     def wait_until_running(self, timeout_s: float) -> None:
         """Return when the sequencer says that it runs. Raises DeviceError if it does not in time."""
         until = time.monotonic() + timeout_s
-        while not self.byte(Command.MAIN_STATUS) & Main.RUNNING:
+        while not self.byte(UsbCommand.MAIN_STATUS) & MainStatus.RUNNING:
             self._wait(until, "start the sequence")
 
     def wait_until_initialised(self, timeout_s: float) -> None:
         """Return when the engine is ready for commands. Raises DeviceError if it is not in time."""
         until = time.monotonic() + timeout_s
-        while not self.byte(Command.HARDWARE_STATUS) & Hardware.INITIALISED:
+        while not self.byte(UsbCommand.HARDWARE_STATUS) & HardwareStatus.INITIALISED:
             self._wait(until, "finish its initialisation")
 
     def faults(self) -> str:
         """What the hardware status complains of, in words; empty if of nothing."""
-        status = self.byte(Command.HARDWARE_STATUS)
+        status = self.byte(UsbCommand.HARDWARE_STATUS)
         return "; ".join(words for bit, words in FAULTS.items() if status & bit)
 
     def _wait(self, until: float, what: str) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.linux import require_linux
-from drivers.pattern_engine.link import TI, Kind
+from drivers.pattern_engine.link import TI, UsbController
 from slrig.devices import FoundDevice
 from slrig.errors import ConfigError, DeviceGoneError
 
@@ -23,7 +23,7 @@ DEV = Path("/dev")
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class EngineNode:
     """An engine's node. name : the serial number where that is the engine's alone, else its port, else the path."""
 
     path: Path
@@ -31,36 +31,38 @@ class Node:
     label: str
 
 
-def engines(kind: Kind, sysfs: Path = SYSFS, dev: Path = DEV) -> tuple[Node, ...]:
+def find_engines(kind: UsbController, sysfs: Path = SYSFS, dev: Path = DEV) -> tuple[EngineNode, ...]:
     """Return the engines that are plugged in, each under a name that no other has."""
     try:
         names = sorted((entry.name for entry in sysfs.iterdir()), key=_number)
     except OSError:
         return ()
     wanted = f"{TI:08X}:{kind.product:08X}"
-    listed = ((dev / name, _facts(sysfs / name)) for name in names)
+    listed = ((dev / name, _read_facts(sysfs / name)) for name in names)
     found = [(path, facts) for path, facts in listed if wanted in facts.get("HID_ID", "") and _is_first(facts)]
     for_key = {key: Counter(facts.get(key, "") for _, facts in found) for key in ("HID_UNIQ", "HID_PHYS")}
     nodes = []
     for path, facts in found:
         own = [facts[key] for key, often in for_key.items() if facts.get(key) and often[facts[key]] == 1]
-        nodes.append(Node(path, (own or [str(path)])[0], facts.get("HID_NAME", "light engine")))
+        nodes.append(EngineNode(path, (own or [str(path)])[0], facts.get("HID_NAME", "light engine")))
     return tuple(nodes)
 
 
-def require_hidraw(kind: Kind) -> None:
+def require_hidraw(kind: UsbController) -> None:
     """Raise WrongSystemError unless this is Linux."""
     require_linux(kind.driver, through="the kernel's /dev/hidraw*", instead="run slrig on Linux for it")
 
 
-def found_devices(kind: Kind, sysfs: Path = SYSFS) -> tuple[FoundDevice, ...]:
+def list_devices(kind: UsbController, sysfs: Path = SYSFS) -> tuple[FoundDevice, ...]:
     """The engines in the words of `slrig devices`. Raises WrongSystemError: this is not Linux."""
     require_hidraw(kind)
-    return tuple(FoundDevice(kind.driver, node.name, f"{node.label} ({node.path})") for node in engines(kind, sysfs))
+    return tuple(
+        FoundDevice(kind.driver, node.name, f"{node.label} ({node.path})") for node in find_engines(kind, sysfs)
+    )
 
 
-def resolved(device: str | None, found: tuple[Node, ...]) -> Node:
-    """Return the engine that a rig file means: a name that `engines` gives, a path, or the only one there is.
+def choose_engine(device: str | None, found: tuple[EngineNode, ...]) -> EngineNode:
+    """Return the engine that a rig file means: a name that `find_engines` gives, a path, or the only one there is.
 
     Raises
     ------
@@ -87,7 +89,7 @@ def _is_first(facts: dict[str, str]) -> bool:
     return number is None or int(number[1]) == 0
 
 
-def _facts(entry: Path) -> dict[str, str]:
+def _read_facts(entry: Path) -> dict[str, str]:
     try:
         lines = (entry / "device" / "uevent").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

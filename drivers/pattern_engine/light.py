@@ -10,7 +10,7 @@ from functools import partial
 from typing import Generic, Protocol, TypeVar
 
 from drivers.pattern_engine.options import LightOptions
-from drivers.pattern_engine.timing import LEFT_ALONE_S
+from drivers.pattern_engine.timing import MAX_UNATTENDED_S
 from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.errors import SlrigError
 
@@ -38,7 +38,7 @@ class LightSource(Protocol):
 SourceT = TypeVar("SourceT", bound=LightSource)
 
 
-class HeldLight(ABC, Generic[SourceT]):
+class EngineProjector(ABC, Generic[SourceT]):
     """What implements `slrig.devices.Projector` on any engine, as far as engines are alike.
 
     A kind of engine calls `_take_over` when it is constructed, and `_begin_holding` when it has begun what it shows.
@@ -119,7 +119,7 @@ class HeldLight(ABC, Generic[SourceT]):
         end by itself, from `_dark_at_s` on. Runs until `close`.
         """
         while True:
-            self._clock.wait_until(self._clock.now_ns() + round(LEFT_ALONE_S * 1e9 / 20), self._state.closed)
+            self._clock.wait_until(self._clock.now_ns() + round(MAX_UNATTENDED_S * 1e9 / 20), self._state.closed)
             if self._state.closed.is_set():
                 return
             with self._lock:

@@ -28,10 +28,10 @@ from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceSt
 REPORT = 64
 HEADER = 4
 READ, ANSWER, FAILED = 0x80, 0x40, 0x20
-MOST_DATA = 512 - HEADER
+MAX_DATA = 512 - HEADER
 """The engine's buffer holds 512 bytes of a message (DLPU018 §1.2)."""
 
-ANSWER_S = 1.0
+ANSWER_TIMEOUT_S = 1.0
 _RAW_INFO = 0x8008_4803
 """HIDIOCGRAWINFO: bus type, vendor, product (include/uapi/linux/hidraw.h)."""
 
@@ -39,7 +39,7 @@ TI = 0x0451
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class UsbController:
     """A controller on USB. driver : slrig's; product : its id under TI's; firmware : the oldest that serves."""
 
     driver: str
@@ -55,14 +55,14 @@ class Kind:
         )
 
 
-class RefusedError(DeviceError):
+class CommandRefusedError(DeviceError):
     """The controller said that it does not take a command."""
 
 
 _GONE = {errno.EIO, errno.ENODEV, errno.ENXIO, errno.EPIPE, errno.ESHUTDOWN, errno.ECONNRESET}
 
 
-class Link:
+class UsbLink:
     """An open engine. Threads may share it: each command and its answer are one step.
 
     Parameters
@@ -77,7 +77,7 @@ class Link:
         How long an answer may take.
     """
 
-    def __init__(self, handle: int, name: str, kind: Kind, *, answer_s: float = ANSWER_S) -> None:
+    def __init__(self, handle: int, name: str, kind: UsbController, *, answer_s: float = ANSWER_TIMEOUT_S) -> None:
         self.name = name
         self.kind = kind
         self._handle: int | None = handle
@@ -126,8 +126,8 @@ class Link:
                 os.close(handle)
 
     def _exchange(self, command: int, data: bytes, flags: int) -> bytes:
-        if len(data) > MOST_DATA - 2:
-            message = f"{self.name}: asked to send {len(data)} bytes at once, it takes {MOST_DATA - 2}; send fewer"
+        if len(data) > MAX_DATA - 2:
+            message = f"{self.name}: asked to send {len(data)} bytes at once, it takes {MAX_DATA - 2}; send fewer"
             raise DeviceError(message)
         with self._lock:
             self._open_handle()
@@ -154,7 +154,7 @@ class Link:
                     f"{self.name} refused the command {command:#06x}; switch it off and on, and update its firmware "
                     f"to {self.kind.firmware} or later if it goes on"
                 )
-                raise RefusedError(message)
+                raise CommandRefusedError(message)
             return data[:length]
 
     def _send(self, report: bytes) -> None:
@@ -205,7 +205,7 @@ class Link:
         return DeviceError(message)
 
 
-def open_link(path: Path, kind: Kind, *, answer_s: float = ANSWER_S) -> Link:
+def open_link(path: Path, kind: UsbController, *, answer_s: float = ANSWER_TIMEOUT_S) -> UsbLink:
     """Open a hidraw node for this program alone.
 
     Raises
@@ -230,7 +230,7 @@ def open_link(path: Path, kind: Kind, *, answer_s: float = ANSWER_S) -> Link:
             )
             raise DeviceError(message) from error
         if error.errno == errno.EBUSY:
-            raise _busy(path) from error
+            raise _busy_error(path) from error
         message = f"{path}: asked to open the light engine, found: {error.strerror}; plug it in, and power it"
         raise DeviceGoneError(message) from error
     try:
@@ -238,14 +238,14 @@ def open_link(path: Path, kind: Kind, *, answer_s: float = ANSWER_S) -> Link:
         _require_engine(handle, path, kind)
     except BlockingIOError as error:
         os.close(handle)
-        raise _busy(path) from error
+        raise _busy_error(path) from error
     except BaseException:
         os.close(handle)
         raise
-    return Link(handle, f"light engine {path}", kind, answer_s=answer_s)
+    return UsbLink(handle, f"light engine {path}", kind, answer_s=answer_s)
 
 
-def _require_engine(handle: int, path: Path, kind: Kind) -> None:
+def _require_engine(handle: int, path: Path, kind: UsbController) -> None:
     """Compare vendor and product of an open node: numbers of nodes are given again after an unplug."""
     import fcntl
 
@@ -262,6 +262,6 @@ def _require_engine(handle: int, path: Path, kind: Kind) -> None:
         raise DeviceGoneError(message)
 
 
-def _busy(path: Path) -> DeviceBusyError:
+def _busy_error(path: Path) -> DeviceBusyError:
     message = f"{path}: asked for the light engine, another program holds it; end that one (see: fuser -v {path})"
     return DeviceBusyError(message)

@@ -13,7 +13,7 @@ from slrig.model import Pattern, Primary
 Share = Annotated[float, Field(gt=0, le=1)]
 
 
-class Colour(IntEnum):
+class LedColour(IntEnum):
     """LEDs of a pattern, as the pattern table has them: bit 0 red, 1 green, 2 blue."""
 
     RED = 1
@@ -63,13 +63,13 @@ class LightOptions(Strict, use_attribute_docstrings=True):
         return self
 
     @property
-    def colour(self) -> Colour:
+    def colour(self) -> LedColour:
         """The LEDs that patterns are lit with."""
-        return Colour[self.led.upper()]
+        return LedColour[self.led.upper()]
 
-    def colour_of(self, pattern: Pattern) -> Colour:
+    def colour_of(self, pattern: Pattern) -> LedColour:
         """The LEDs that a pattern is lit with."""
-        return Colour[pattern.colour.upper()] if isinstance(pattern, Primary) else self.colour
+        return LedColour[pattern.colour.upper()] if isinstance(pattern, Primary) else self.colour
 
 
 class UsbLightOptions(LightOptions, use_attribute_docstrings=True):

@@ -14,7 +14,7 @@ Plane = NDArray[np.bool_]
 """(H, W) bool: which mirrors send light."""
 
 
-def plane_of(sequence: PatternSequence, index: int) -> Plane:
+def pattern_plane(sequence: PatternSequence, index: int) -> Plane:
     """Return the mirrors of pattern `index`. Raises UnsupportedByDeviceError unless it is black and white only."""
     profile = sequence.profiles[index]
     lit: NDArray[np.bool_] = profile == np.iinfo(profile.dtype).max
@@ -27,13 +27,13 @@ def plane_of(sequence: PatternSequence, index: int) -> Plane:
     return np.broadcast_to(lit, sequence.projector.shape)
 
 
-def keys_of_plane(plane: Plane) -> tuple[bytes, bytes]:
+def plane_keys(plane: Plane) -> tuple[bytes, bytes]:
     """Return what tells a plane and its inverse from all others: SHA-256 of their bits."""
     bits = np.packbits(plane)
     return hashlib.sha256(bits.tobytes()).digest(), hashlib.sha256((~bits).tobytes()).digest()
 
 
-def words(pattern: Pattern) -> str:
+def describe_pattern(pattern: Pattern) -> str:
     """Words for a pattern."""
     match pattern:
         case White() | Black():

@@ -5,27 +5,27 @@ from __future__ import annotations
 from abc import ABC
 from typing import TypeVar
 
-from drivers.pattern_engine.engine import Command, Engine
-from drivers.pattern_engine.light import HeldLight
+from drivers.pattern_engine.engine import UsbCommand, UsbEngine
+from drivers.pattern_engine.light import EngineProjector
 from drivers.pattern_engine.options import UsbLightOptions
 from drivers.pattern_engine.timing import Timing
 from slrig.devices import Clock
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 
-AWAKE_S = 10.0
+WAKE_TIMEOUT_S = 10.0
 """How long an engine may take to wake up."""
-RUNNING_S = 2.0
+START_TIMEOUT_S = 2.0
 COMMANDS_S = 0.04
 """What the commands of one `show` take, typically: a dozen, of about 3 ms each."""
-DIM = Timing(1_250, 15_000)
+DIM_TIMING = Timing(1_250, 15_000)
 """Light for a twelfth of the time: at half current that is 4.2 % of the most, and never above 5 % at 60 %."""
-_HALF = 128
+_HALF_CURRENT = 128
 """A current that is half of the most, whichever way the register counts."""
 
-EngineT = TypeVar("EngineT", bound=Engine)
+EngineT = TypeVar("EngineT", bound=UsbEngine)
 
 
-class PatternEngine(HeldLight[EngineT], ABC):
+class UsbEngineProjector(EngineProjector[EngineT], ABC):
     """What implements `slrig.devices.Projector` and `UnprovenLight` on an engine with a USB port."""
 
     def __init__(self, engine: EngineT, options: UsbLightOptions, *, clock: Clock | None = None) -> None:
@@ -40,7 +40,7 @@ class PatternEngine(HeldLight[EngineT], ABC):
     @property
     def light_period_s(self) -> float:
         """See `UnprovenLight`."""
-        return DIM.period_us / 1e6
+        return DIM_TIMING.period_us / 1e6
 
     def try_current(self, share: float) -> None:
         """See `UnprovenLight`."""
@@ -59,22 +59,22 @@ class PatternEngine(HeldLight[EngineT], ABC):
 
     def _wake(self) -> None:
         # An engine in standby is dark, and takes no other command.
-        if self._engine.byte(Command.POWER) & 1:
-            self._engine.set_byte(Command.POWER, 0)
+        if self._engine.byte(UsbCommand.POWER) & 1:
+            self._engine.set_byte(UsbCommand.POWER, 0)
         else:
             for fault in self._darken():
                 if isinstance(fault, DeviceGoneError):
                     raise fault
-        self._engine.wait_until_initialised(AWAKE_S)
+        self._engine.wait_until_initialised(WAKE_TIMEOUT_S)
         self.blank()
 
     def _set_up_light(self) -> None:
         """No mirroring, no inversion, and the current of the LEDs: half of it where its sense is not known."""
         engine, light = self._engine, self._light
-        for unchanged in (Command.FLIP_LONG, Command.FLIP_SHORT, Command.INVERT_DATA):
+        for unchanged in (UsbCommand.FLIP_LONG, UsbCommand.FLIP_SHORT, UsbCommand.INVERT_DATA):
             engine.settle_byte(unchanged, 0)
         if light.led_current_inverted is None:
-            engine.set_led_registers(bytes([_HALF] * 3))
+            engine.set_led_registers(bytes([_HALF_CURRENT] * 3))
         else:
             engine.set_led_current(light.colour, light.current_byte, inverted=light.led_current_inverted)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from slrig.errors import UnsupportedByDeviceError
 
-LEFT_ALONE_S = 2.0
+MAX_UNATTENDED_S = 2.0
 """So long after its host has died a shown pattern is dark."""
 
 
@@ -23,7 +23,7 @@ class Timing:
         return self.exposure_us < self.period_us
 
 
-def light_us(exposure_s: float, period_s: float, *, margin_s: float, least_us: int, dark_us: int = 0) -> int:
+def light_duration_us(exposure_s: float, period_s: float, *, margin_s: float, least_us: int, dark_us: int = 0) -> int:
     """How long to light patterns of which cameras take `exposure_s`, whole microseconds.
 
     Parameters

@@ -13,7 +13,7 @@ from pathlib import Path
 import structlog
 from pydantic import Field, field_validator
 
-from drivers.replay.camera import ReplayCamera, Stage
+from drivers.replay.camera import ReplayCamera, ReplayState
 from drivers.replay.clock import ReplayClock
 from drivers.replay.projector import ReplayProjector
 from slrig.bundle import Bundle, read_bundle
@@ -56,7 +56,7 @@ class ReplayHead:
 
     def __init__(self, bundle: Bundle, clock: ReplayClock | None = None) -> None:
         self.clock = clock = ReplayClock() if clock is None else clock
-        stage = Stage()
+        stage = ReplayState()
         self._calibration = bundle.calibration
         self._cameras = {name: ReplayCamera(name, bundle, clock, stage) for name in bundle.capture.cameras}
         self._projector = ReplayProjector(bundle, self._cameras, clock, stage)

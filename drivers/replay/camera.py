@@ -12,11 +12,11 @@ from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings,
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Black, Frame, Pattern, Shot
 
-_SAME_EXPOSURE = 0.01
+_EXPOSURE_TOLERANCE = 0.01
 
 
 @dataclass(slots=True)
-class Stage:
+class ReplayState:
     """What lies before the cameras: the pattern shown, and how often it was shown before in the sequence."""
 
     shown: tuple[Pattern, int] | None = None
@@ -25,7 +25,7 @@ class Stage:
 class ReplayCamera:
     """Implements `slrig.devices.Camera` on one camera's recorded frames."""
 
-    def __init__(self, name: str, bundle: Bundle, clock: ReplayClock, stage: Stage) -> None:
+    def __init__(self, name: str, bundle: Bundle, clock: ReplayClock, stage: ReplayState) -> None:
         capture = bundle.capture
         self._recorded: dict[Pattern, list[Shot]] = defaultdict(list)
         for shot in capture.shots:
@@ -66,7 +66,7 @@ class ReplayCamera:
         if nearest_s is None:
             fits, had = low_s <= settings.exposure_s <= high_s, f"{low_s:g} to {high_s:g} s"
         else:
-            fits = abs(nearest_s - settings.exposure_s) <= _SAME_EXPOSURE * nearest_s
+            fits = abs(nearest_s - settings.exposure_s) <= _EXPOSURE_TOLERANCE * nearest_s
             had = ", ".join(f"{exposure_s:.6g} s" for exposure_s in self._exposures_s)
         if not fits:
             message = (
@@ -74,7 +74,7 @@ class ReplayCamera:
                 f"made with {had}; write that as exposure_s into the rig file, or leave exposure_s out"
             )
             raise UnsupportedByDeviceError(message)
-        if abs(settings.gain - 1) > _SAME_EXPOSURE:
+        if abs(settings.gain - 1) > _EXPOSURE_TOLERANCE:
             message = (
                 f"camera '{self._info.name}': asked for gain {settings.gain:g}, a recording cannot be amplified; use 1"
             )
@@ -148,7 +148,9 @@ class ReplayCamera:
         shots = self._recorded.get(pattern, [])
         in_use_s = self._applied.exposure_s
         alike = [
-            s for s in shots if s.exposure_s is not None and abs(s.exposure_s - in_use_s) <= _SAME_EXPOSURE * in_use_s
+            s
+            for s in shots
+            if s.exposure_s is not None and abs(s.exposure_s - in_use_s) <= _EXPOSURE_TOLERANCE * in_use_s
         ]
         return alike or shots
 

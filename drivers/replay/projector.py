@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.replay.camera import ReplayCamera, Stage
+from drivers.replay.camera import ReplayCamera, ReplayState
 from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
 from slrig.devices import COMPUTED, ProjectorInfo, ProjectorState, Shown
@@ -15,7 +15,9 @@ from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, Primar
 class ReplayProjector:
     """Implements `slrig.devices.Projector` on the patterns of a recording."""
 
-    def __init__(self, bundle: Bundle, cameras: Mapping[str, ReplayCamera], clock: ReplayClock, stage: Stage) -> None:
+    def __init__(
+        self, bundle: Bundle, cameras: Mapping[str, ReplayCamera], clock: ReplayClock, stage: ReplayState
+    ) -> None:
         self._info = ProjectorInfo(
             name="projector",
             model="recorded projector",
@@ -49,9 +51,9 @@ class ReplayProjector:
         for pattern in sequence.patterns:
             lacking = [name for name, camera in self._cameras.items() if not camera.frames_of(pattern)]
             if lacking:
-                recorded = "; ".join(dict.fromkeys(map(_family, self._recorded)))
+                recorded = "; ".join(dict.fromkeys(map(_describe_family, self._recorded)))
                 message = (
-                    f"the recording '{self._info.serial}' has no frame of {_member(pattern)} from camera "
+                    f"the recording '{self._info.serial}' has no frame of {_describe_pattern(pattern)} from camera "
                     f"{', '.join(lacking)}; it has {recorded}. Leave the patterns out of the "
                     "request and of the rig file's [scan], and all that was recorded is played; or ask for some of it: "
                     f"{setting('gray_cell_px')}, {setting('line_shift_period_px')} and their like"
@@ -95,18 +97,18 @@ class ReplayProjector:
         self._state.closed.set()
 
 
-def _member(pattern: Pattern) -> str:
+def _describe_pattern(pattern: Pattern) -> str:
     """Which pattern of its family."""
     match pattern:
         case Gray():
-            return f"bit {pattern.bit} of {_family(pattern)}"
+            return f"bit {pattern.bit} of {_describe_family(pattern)}"
         case LineShift():
-            return f"shift {pattern.shift} of {_family(pattern)}"
+            return f"shift {pattern.shift} of {_describe_family(pattern)}"
         case _:
-            return _family(pattern)
+            return _describe_family(pattern)
 
 
-def _family(pattern: Pattern) -> str:
+def _describe_family(pattern: Pattern) -> str:
     """What a pattern is one of, in the words of a request."""
     match pattern:
         case White() | Black():

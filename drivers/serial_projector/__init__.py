@@ -207,9 +207,9 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
 
 def find_devices() -> tuple[FoundDevice, ...]:
     """Return the USB serial ports; opens none of them. Raises LibraryMissingError."""
-    from drivers.serial_projector.finding import found_ports
+    from drivers.serial_projector.finding import find_ports
 
-    return found_ports()
+    return find_ports()
 
 
 __all__ = ["find_devices", "open_projector"]

@@ -8,26 +8,26 @@ from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, TypeVar
 
-from drivers.serial_port import Port
-from drivers.serial_projector.clock import DeviceClock
-from drivers.serial_projector.frames import Event, Mode, Refused
-from drivers.serial_projector.link import Link, RefusedError, Reply, SilentError
-from drivers.serial_projector.pattern_set import crc32_of_all
+from drivers.serial_port import BytePort
+from drivers.serial_projector.clock import BoxClock
+from drivers.serial_projector.frames import BoxEvent, RefusalCode, SequenceMode
+from drivers.serial_projector.link import BoxLink, BoxRefusedError, NoAnswerError, Reply
+from drivers.serial_projector.pattern_set import sequence_checksum
 from slrig.errors import DeviceBusyError, DeviceError, SlrigError, UnsupportedByDeviceError
 
 PROTOCOL = 1
-PICKED_AT_ONCE = 16
+MAX_PICKS_PER_LINE = 16
 """Checksums in one line: a line has 240 bytes."""
 _PINGS = 8
 _FAREWELL_S = 0.6
-_AGAIN_S = 0.1
-_MANY = 10**6
+_GREET_RETRY_S = 0.1
+_UNLIMITED_TRIES = 10**6
 
-_Values = TypeVar("_Values", "Box", "Status")
+_Values = TypeVar("_Values", "BoxInfo", "BoxStatus")
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class BoxLimits:
     """What the host asks a box to keep to, as HELLO says it."""
 
     watchdog_ms: int
@@ -37,7 +37,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class BoxInfo:
     """What a box says of itself in HELLO: the fields of the protocol, under their names there. pick : 0 for a box that
     holds runs of its flash only.
     """
@@ -67,7 +67,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class BoxStatus:
     """What a box does now. index : the pattern that was lit last, None before the first."""
 
     state: str
@@ -80,7 +80,7 @@ class Status:
     index: int | None = None
 
 
-class Client:
+class BoxClient:
     """A session with one box.
 
     Raises
@@ -95,19 +95,19 @@ class Client:
         The port is gone.
     """
 
-    def __init__(self, link: Link, limits: Limits, *, label: str, open_s: float) -> None:
+    def __init__(self, link: BoxLink, limits: BoxLimits, *, label: str, open_s: float) -> None:
         self._link = link
         self._limits = limits
         self._label = label
         self._open_s = open_s
         self._lock = threading.RLock()
-        self._clock = DeviceClock()
+        self._clock = BoxClock()
         self._abandoned = threading.Event()
         self._box = self._greeted()
         self._gap_us = self._box.gap_us
 
     @property
-    def box(self) -> Box:
+    def box(self) -> BoxInfo:
         """What the box said of itself when it was last greeted."""
         return self._box
 
@@ -117,18 +117,18 @@ class Client:
         return self._gap_us
 
     @property
-    def link(self) -> Link:
+    def link(self) -> BoxLink:
         """What the session runs over."""
         return self._link
 
-    def greet(self) -> Box:
+    def greet(self) -> BoxInfo:
         """Begin the session again, after the box restarted: it is dark, and holds nothing. Raises as opening does."""
         with self._lock:
-            self._clock = DeviceClock()
+            self._clock = BoxClock()
             self._box = self._greeted()
             return self._box
 
-    def reconnect(self, open_port: Callable[[], Port]) -> None:
+    def reconnect(self, open_port: Callable[[], BytePort]) -> None:
         """Open the port again, after the box was unplugged and plugged in. Greets nobody. Raises as opening does."""
         with self._lock:
             # The system gives the old name to a new device only once nobody holds the old one.
@@ -145,7 +145,7 @@ class Client:
         if self._abandoned.is_set() or not self._lock.acquire(blocking=False):
             return
         try:
-            with suppress(SilentError, RefusedError):
+            with suppress(NoAnswerError, BoxRefusedError):
                 self._pinged(self._link.ask("PING", tries=1))
         finally:
             self._lock.release()
@@ -158,8 +158,8 @@ class Client:
         with self._lock:
             try:
                 self._load(each)
-            except RefusedError as refusal:
-                if refusal.number not in {Refused.PATTERNS, Refused.RANGE} or len(each) > self._box.pick:
+            except BoxRefusedError as refusal:
+                if refusal.number not in {RefusalCode.PATTERNS, RefusalCode.RANGE} or len(each) > self._box.pick:
                     raise
                 lacking = self._picked(each)
                 if lacking:
@@ -169,15 +169,15 @@ class Client:
             return ()
 
     def _load(self, each: Sequence[int]) -> None:
-        reply = self._ask("LOAD", len(each), f"{crc32_of_all(each):08X}")
-        self._gap_us = _whole(reply, 2) if len(reply.words) > 2 else self._box.gap_us
+        reply = self._ask("LOAD", len(each), f"{sequence_checksum(each):08X}")
+        self._gap_us = _integer(reply, 2) if len(reply.words) > 2 else self._box.gap_us
 
     def _picked(self, each: Sequence[int]) -> tuple[int, ...]:
         """Pick patterns; return the indices of those that the box lacks."""
         lacking: list[int] = []
-        for at in range(0, len(each), PICKED_AT_ONCE):
-            reply = self._ask("PICK", at, *(f"{crc32:08X}" for crc32 in each[at : at + PICKED_AT_ONCE]))
-            lacking += (_whole(reply, index) for index in range(1, len(reply.words)))
+        for at in range(0, len(each), MAX_PICKS_PER_LINE):
+            reply = self._ask("PICK", at, *(f"{crc32:08X}" for crc32 in each[at : at + MAX_PICKS_PER_LINE]))
+            lacking += (_integer(reply, index) for index in range(1, len(reply.words)))
         return tuple(lacking)
 
     def show(self, index: int) -> tuple[int, int]:
@@ -186,7 +186,7 @@ class Client:
             reply = self._ask("SHOW", index, takes_s=self._box.light_s)
             return self._lit(reply, index)
 
-    def sequence(self, first: int, count: int, exposure_us: int, period_us: int, mode: Mode) -> None:
+    def sequence(self, first: int, count: int, exposure_us: int, period_us: int, mode: SequenceMode) -> None:
         """Begin a sequence. Its events are collected from now on."""
         with self._lock:
             self._link.events.clear()
@@ -199,15 +199,15 @@ class Client:
 
     def stop(self) -> int:
         """End a sequence, dark; return how many of its patterns were lit."""
-        return _whole(self._ask("STOP"), 0)
+        return _integer(self._ask("STOP"), 0)
 
     def blank(self) -> None:
         """Go dark."""
         self._ask("BLANK")
 
-    def status(self) -> Status:
+    def status(self) -> BoxStatus:
         """What the box does now."""
-        return _keyed(Status, self._ask("STATUS").words)
+        return _parse_fields(BoxStatus, self._ask("STATUS").words)
 
     def frames(self) -> tuple[tuple[int, int, int], ...]:
         """(index, t_visible_ns, t_err_ns) of the patterns of the last sequence, as far as their events came in."""
@@ -215,7 +215,7 @@ class Client:
             found = []
             for event in self._link.events:
                 match event:
-                    case Event("FRAME", (index, t_us)) if index.isdigit() and t_us.isdigit():
+                    case BoxEvent("FRAME", (index, t_us)) if index.isdigit() and t_us.isdigit():
                         t_ns, error_ns = self._clock.host_ns(int(t_us))
                         found.append((int(index), t_ns, error_ns + self._box.error_us * 1000))
             return tuple(found)
@@ -239,21 +239,21 @@ class Client:
             return self._link.ask(verb, *numbers, takes_s=takes_s)
 
     def _pinged(self, reply: Reply) -> tuple[str, int]:
-        self._clock.note(_whole(reply, 0), reply.sent_ns, reply.received_ns)
-        return reply.words[1] if len(reply.words) > 1 else "", _whole(reply, 2)
+        self._clock.note(_integer(reply, 0), reply.sent_ns, reply.received_ns)
+        return reply.words[1] if len(reply.words) > 1 else "", _integer(reply, 2)
 
     def _lit(self, reply: Reply, index: int) -> tuple[int, int]:
-        if _whole(reply, 0) != index:
+        if _integer(reply, 0) != index:
             message = (
                 f"asked the trigger box on {self._label} for pattern {index}, found {reply.words}; its firmware errs"
             )
             raise DeviceError(message)
-        t_us = _whole(reply, 1)
+        t_us = _integer(reply, 1)
         self._clock.note(t_us, reply.sent_ns, reply.received_ns)
         t_ns, error_ns = self._clock.host_ns(t_us)
         return t_ns, error_ns + self._box.error_us * 1000
 
-    def _greeted(self) -> Box:
+    def _greeted(self) -> BoxInfo:
         """Say HELLO until the box has started; many boards restart when their port is opened."""
         link = self._link
         until_ns = link.after(self._open_s)
@@ -263,35 +263,35 @@ class Client:
                 box = self._checked(self._said_hello(max(left_s, link.reply_s)))
                 for _ in range(_PINGS):
                     self._pinged(link.ask("PING"))
-            except RefusedError as refusal:
-                if refusal.number == Refused.RANGE:
+            except BoxRefusedError as refusal:
+                if refusal.number == RefusalCode.RANGE:
                     raise UnsupportedByDeviceError(self._beyond(refusal)) from refusal
-                if refusal.number not in {Refused.BUSY, Refused.SESSION}:
+                if refusal.number not in {RefusalCode.BUSY, RefusalCode.SESSION}:
                     raise
                 # Another host's session may be about to end; and a box that restarts just now has forgotten ours.
                 if left_s > 0:
-                    link.clock.wait_until(link.after(_AGAIN_S), link.closing)
+                    link.clock.wait_until(link.after(_GREET_RETRY_S), link.closing)
                     if not link.closing.is_set():
                         continue
                 raise DeviceBusyError(self._held(" ".join(refusal.words))) from refusal
             return box
 
-    def _said_hello(self, deadline_s: float) -> Box:
+    def _said_hello(self, deadline_s: float) -> BoxInfo:
         limits = self._limits
         asked = (PROTOCOL, limits.watchdog_ms, limits.on_ms, limits.duty, limits.bright)
         try:
-            reply = self._link.ask("HELLO", *asked, tries=_MANY, deadline_s=deadline_s)
-        except SilentError as silence:
+            reply = self._link.ask("HELLO", *asked, tries=_UNLIMITED_TRIES, deadline_s=deadline_s)
+        except NoAnswerError as silence:
             if self._link.tally.others:
                 raise DeviceBusyError(self._held("somebody else's answers came in")) from silence
             raise DeviceError(self._unspoken(silence)) from silence
-        return _keyed(Box, reply.words)
+        return _parse_fields(BoxInfo, reply.words)
 
-    def _checked(self, box: Box) -> Box:
+    def _checked(self, box: BoxInfo) -> BoxInfo:
         """What the box says of itself. Raises DeviceError, UnsupportedByDeviceError."""
         beyond = [
             f"{field.name} {getattr(box, field.name)} instead of {getattr(self._limits, field.name)}"
-            for field in fields(Limits)
+            for field in fields(BoxLimits)
             if getattr(box, field.name) > getattr(self._limits, field.name)
         ]
         if min(box.w, box.h, box.watchdog_ms, box.on_ms) < 1:
@@ -311,20 +311,20 @@ class Client:
             "watchdog if it has died"
         )
 
-    def _beyond(self, refusal: RefusedError) -> str:
+    def _beyond(self, refusal: BoxRefusedError) -> str:
         return (
             f"the trigger box on {self._label} does not grant {self._limits}: {' '.join(refusal.words)}; a box that "
             "cannot dim takes brightness 1 only, else see watchdog_s, max_on_s and max_duty"
         )
 
-    def _unspoken(self, silence: SilentError) -> str:
+    def _unspoken(self, silence: NoAnswerError) -> str:
         return (
             f"nothing on {self._label} answered as a trigger box that speaks SLTP/{PROTOCOL}: {silence}. Is it the "
             "right port (slrig devices), and is the firmware on the box?"
         )
 
 
-def _whole(reply: Reply, index: int) -> int:
+def _integer(reply: Reply, index: int) -> int:
     """Word `index` of an answer as a number. Raises DeviceError."""
     try:
         return int(reply.words[index])
@@ -333,7 +333,7 @@ def _whole(reply: Reply, index: int) -> int:
         raise DeviceError(message) from error
 
 
-def _keyed(model: type[_Values], words: tuple[str, ...]) -> _Values:
+def _parse_fields(model: type[_Values], words: tuple[str, ...]) -> _Values:
     """Make a value of `key=value` words; keys that newer firmware adds are passed over. Raises DeviceError."""
     given = dict(word.split("=", 1) for word in words if "=" in word)
     values: dict[str, Any] = {}

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MOST_DRIFT = 1e-3
+MAX_DRIFT = 1e-3
 """How fast or slow a box's clock may be; a ceramic resonator is within this, a crystal by far."""
 
 _SLOT_NS = 4 * 10**9
@@ -35,13 +35,13 @@ class _Exchange:
         return self.after_ns - self.before_ns
 
 
-class DeviceClock:
+class BoxClock:
     """Turns instants of a box into instants of CLOCK_MONOTONIC. Not safe between threads."""
 
     def __init__(self) -> None:
         self._latest: _Exchange | None = None
         self._best: dict[int, _Exchange] = {}
-        self._rate = (1 - MOST_DRIFT, 1 + MOST_DRIFT)
+        self._rate = (1 - MAX_DRIFT, 1 + MAX_DRIFT)
 
     @property
     def rate(self) -> tuple[float, float]:
@@ -54,7 +54,7 @@ class DeviceClock:
         if self._latest is not None and not self._agree(new):
             # Its clock jumped, or drifts more than a clock may: what was known is of no use.
             self._best.clear()
-            self._rate = (1 - MOST_DRIFT, 1 + MOST_DRIFT)
+            self._rate = (1 - MAX_DRIFT, 1 + MAX_DRIFT)
         self._latest = new
         slot = before_ns // _SLOT_NS
         kept = self._best.get(slot)
@@ -94,11 +94,11 @@ class DeviceClock:
 
     def _learn_rate(self) -> None:
         exchanges = sorted(self._exchanges(), key=lambda each: each.device_us)
-        slow, fast = 1 - MOST_DRIFT, 1 + MOST_DRIFT
+        slow, fast = 1 - MAX_DRIFT, 1 + MAX_DRIFT
         for index, first in enumerate(exchanges):
             for second in exchanges[index + 1 :]:
                 apart_ns = (second.device_us - first.device_us) * 1000
                 if apart_ns > 0:
                     slow = max(slow, (second.before_ns - first.after_ns) / apart_ns - _WANDER)
                     fast = min(fast, (second.after_ns - first.before_ns) / apart_ns + _WANDER)
-        self._rate = (slow, fast) if slow <= fast else (1 - MOST_DRIFT, 1 + MOST_DRIFT)
+        self._rate = (slow, fast) if slow <= fast else (1 - MAX_DRIFT, 1 + MAX_DRIFT)

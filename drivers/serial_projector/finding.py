@@ -19,7 +19,7 @@ MICROPYTHON_RP2 = (0x2E8A, 0x0005)
 """USB ids of an RP2040 that runs MicroPython."""
 
 
-def found_ports(by_id: Path = BY_ID) -> tuple[FoundDevice, ...]:
+def find_ports(by_id: Path = BY_ID) -> tuple[FoundDevice, ...]:
     """Return the USB serial ports, each by a name that stays the same where it has one. Raises LibraryMissingError."""
     try:
         list_ports = importlib.import_module("serial.tools.list_ports")
@@ -27,7 +27,7 @@ def found_ports(by_id: Path = BY_ID) -> tuple[FoundDevice, ...]:
         install = "pip install pyserial"
         message = f"driver 'serial_projector' needs pyserial, which is not installed ({missing}); {install}"
         raise LibraryMissingError(message, install=install) from missing
-    lasting = _links(by_id)
+    lasting = _links_by_target(by_id)
     ports = sorted(list_ports.comports(), key=lambda port: str(port.device))
     return tuple(
         FoundDevice("serial_projector", lasting.get(os.path.realpath(port.device), port.device), _label(port))
@@ -44,7 +44,7 @@ def _label(port: Any) -> str:
     return f"{likely}{name} ({port.device}, {port.vid:04X}:{port.pid or 0:04X}{serial}), not asked whether it is a box"
 
 
-def _links(folder: Path) -> dict[str, str]:
+def _links_by_target(folder: Path) -> dict[str, str]:
     try:
         return {os.path.realpath(link): str(link) for link in sorted(folder.iterdir(), reverse=True)}
     except OSError:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 NUMBERS = 10_000
-MOST_LINE_BYTES = 240
+MAX_LINE_BYTES = 240
 
 
-class Refused(IntEnum):
+class RefusalCode(IntEnum):
     """Why a box does not obey, the code of an ERR line."""
 
     FRAMING = 1
@@ -25,7 +25,7 @@ class Refused(IntEnum):
     LIMIT = 10
 
 
-class Fault(IntEnum):
+class BoxFault(IntEnum):
     """Why a box went dark by itself, the code of a FAULT event."""
 
     WATCHDOG = 1
@@ -34,7 +34,7 @@ class Fault(IntEnum):
     LIGHT = 4
 
 
-class Mode(IntEnum):
+class SequenceMode(IntEnum):
     """What starts each pattern of a sequence: the box's own clock, or a TRIG from the host."""
 
     FREE = 0
@@ -42,8 +42,8 @@ class Mode(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """A line that answers a command of ours. code : None for OK, else what `Refused` lists (or a number beyond it)."""
+class BoxAnswer:
+    """A line that answers a command of ours. code : None for OK, else what `RefusalCode` lists (or a number beyond it)."""
 
     session: str
     number: int
@@ -52,7 +52,7 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class BoxEvent:
     """A line that answers nothing: `! FRAME 3 123456`."""
 
     name: str
@@ -60,14 +60,14 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
-class Unread:
+class UnreadableLine:
     """The box says that it could not read a line."""
 
 
-Line = Answer | Event | Unread
+BoxLine = BoxAnswer | BoxEvent | UnreadableLine
 
 
-def framed(text: str) -> bytes:
+def encode_line(text: str) -> bytes:
     """Return a line as it goes over the wire.
 
     >>> framed("1A2B 7 SHOW 3").rstrip()
@@ -77,10 +77,10 @@ def framed(text: str) -> bytes:
     return b"%s*%04X\n" % (body, binascii.crc_hqx(body, 0xFFFF))
 
 
-def parsed(line: bytes) -> Line | None:
+def parse_line(line: bytes) -> BoxLine | None:
     """Return what a line that came in says; None where it is damaged, or no SLTP at all."""
     body, star, crc = line.rstrip(b"\r\n").rpartition(b"*")
-    if not star or len(line) > MOST_LINE_BYTES + 2 or b"%04X" % binascii.crc_hqx(body, 0xFFFF) != crc:
+    if not star or len(line) > MAX_LINE_BYTES + 2 or b"%04X" % binascii.crc_hqx(body, 0xFFFF) != crc:
         return None
     try:
         words = body.decode("ascii").split(" ")
@@ -88,19 +88,19 @@ def parsed(line: bytes) -> Line | None:
         return None
     match words:
         case ["!", name, *rest]:
-            return Event(name, tuple(rest))
+            return BoxEvent(name, tuple(rest))
         case ["?", *_]:
-            return Unread()
+            return UnreadableLine()
         case [session, number, "OK", *rest] if number.isdigit():
-            return Answer(session, int(number), None, tuple(rest))
+            return BoxAnswer(session, int(number), None, tuple(rest))
         case [session, number, "ERR", code, *rest] if number.isdigit() and code.isdigit():
-            return Answer(session, int(number), int(code), tuple(rest))
+            return BoxAnswer(session, int(number), int(code), tuple(rest))
         case _:
             return None
 
 
 @dataclass(slots=True)
-class Splitter:
+class LineSplitter:
     """Cuts what comes in, in pieces of any size, into lines."""
 
     _rest: bytes = field(default=b"")
@@ -109,5 +109,5 @@ class Splitter:
         """Return the lines that are complete now, without their ends; empty ones are left out."""
         *whole, self._rest = (self._rest + data).split(b"\n")
         # A line that is too long is damaged in any case.
-        self._rest = self._rest[-2 * MOST_LINE_BYTES :]
+        self._rest = self._rest[-2 * MAX_LINE_BYTES :]
         return [line for line in whole if line.strip(b"\r")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from drivers.serial_projector.client import Client
+from drivers.serial_projector.client import BoxClient
 from slrig.devices import Clock
 from slrig.errors import DeviceError
 
@@ -19,7 +19,7 @@ class KeepAlive:
     by the box after `max_on_s`. clock : by which it waits.
     """
 
-    def __init__(self, client: Client, *, watchdog_s: float, clock: Clock) -> None:
+    def __init__(self, client: BoxClient, *, watchdog_s: float, clock: Clock) -> None:
         self._client, self._clock = client, clock
         self._period_ns = round(watchdog_s * 1e9 / BEATS_PER_WATCHDOG)
         self._stop = threading.Event()

@@ -11,26 +11,35 @@ import threading
 from collections import deque
 from dataclasses import dataclass, field
 
-from drivers.serial_port import SLICE_S, Port
-from drivers.serial_projector.frames import NUMBERS, Answer, Event, Refused, Splitter, Unread, framed, parsed
+from drivers.serial_port import SLICE_S, BytePort
+from drivers.serial_projector.frames import (
+    NUMBERS,
+    BoxAnswer,
+    BoxEvent,
+    LineSplitter,
+    RefusalCode,
+    UnreadableLine,
+    encode_line,
+    parse_line,
+)
 from slrig.devices import Clock, SystemClock
 from slrig.errors import DeviceError, DeviceStateError
 
-MOST_TRIES = 12
+MAX_TRIES = 12
 _NS_PER_S = 1_000_000_000
 _EVENTS = 4096
 
 
-class RefusedError(DeviceError):
-    """The box answered, and does not obey. `number` is one of `Refused` (or a number that newer firmware knows)."""
+class BoxRefusedError(DeviceError):
+    """The box answered, and does not obey. `number` is one of `RefusalCode` (or a number that newer firmware knows)."""
 
     def __init__(self, verb: str, number: int, words: tuple[str, ...]) -> None:
         self.verb, self.number, self.words = verb, number, words
-        name = Refused(number).name.lower() if number in set(Refused) else "unknown"
+        name = RefusalCode(number).name.lower() if number in set(RefusalCode) else "unknown"
         super().__init__(f"the trigger box refused {verb}: error {number} ({name}) {' '.join(words)}".rstrip())
 
 
-class SilentError(DeviceError):
+class NoAnswerError(DeviceError):
     """No answer came, however often the command was sent: the box may have obeyed, or never heard of it."""
 
 
@@ -44,7 +53,7 @@ class Reply:
 
 
 @dataclass(slots=True)
-class Tally:
+class LinkCounters:
     """What the line did: commands, sent again, damaged lines that came in, answers to somebody else."""
 
     commands: int = 0
@@ -54,29 +63,29 @@ class Tally:
 
 
 @dataclass(slots=True)
-class Link:
+class BoxLink:
     """Commands to one box. One thread at a time uses it; `closing` ends a wait from another one.
 
     reply_s : how long an answer may take, beyond what the command itself takes. deadline_s : after which a command is
     not sent again. clock : of both, and of the answers' instants.
     """
 
-    port: Port
+    port: BytePort
     reply_s: float
     deadline_s: float
     # So many that two hosts hardly share one; never the number of a session before.
     session: str = field(default_factory=lambda: secrets.token_hex(2).upper())
     closing: threading.Event = field(default_factory=threading.Event)
-    events: deque[Event] = field(default_factory=lambda: deque(maxlen=_EVENTS))
-    tally: Tally = field(default_factory=Tally)
+    events: deque[BoxEvent] = field(default_factory=lambda: deque(maxlen=_EVENTS))
+    tally: LinkCounters = field(default_factory=LinkCounters)
     clock: Clock = field(default_factory=SystemClock)
     _number: int = 0
-    _splitter: Splitter = field(default_factory=Splitter)
+    _splitter: LineSplitter = field(default_factory=LineSplitter)
     _waiting: deque[bytes] = field(default_factory=deque)
 
-    def replace_port(self, port: Port) -> None:
+    def replace_port(self, port: BytePort) -> None:
         """Go on over another port. What was under way on the old one is lost."""
-        self.port, self._splitter = port, Splitter()
+        self.port, self._splitter = port, LineSplitter()
         self._waiting.clear()
 
     def ask(
@@ -84,7 +93,7 @@ class Link:
         verb: str,
         *numbers: int | str,
         takes_s: float = 0.0,
-        tries: int = MOST_TRIES,
+        tries: int = MAX_TRIES,
         deadline_s: float | None = None,
         while_closing: bool = False,
     ) -> Reply:
@@ -109,7 +118,7 @@ class Link:
             `closing` was set meanwhile.
         """
         self._number = (self._number + 1) % NUMBERS
-        line = framed(" ".join(map(str, (self.session, self._number, verb, *numbers))))
+        line = encode_line(" ".join(map(str, (self.session, self._number, verb, *numbers))))
         until_ns = self.after(self.deadline_s if deadline_s is None else deadline_s)
         self.tally.commands += 1
         first_ns = self.clock.now_ns()
@@ -121,32 +130,32 @@ class Link:
             answer = self._answer(self.after(self.reply_s + takes_s), while_closing)
             if answer is not None:
                 if answer.code is not None:
-                    raise RefusedError(verb, answer.code, answer.words)
+                    raise BoxRefusedError(verb, answer.code, answer.words)
                 return Reply(answer.words, first_ns, self.clock.now_ns())
         took_s = (self.clock.now_ns() - first_ns) / _NS_PER_S
         message = (
             f"asked the trigger box for {verb} {sent} times in {took_s:.2f} s, found no answer "
             f"({self.tally.damaged} damaged lines so far); check its cable, its power and the baud rate"
         )
-        raise SilentError(message)
+        raise NoAnswerError(message)
 
     def after(self, seconds: float) -> int:
         """The time in so many seconds, ns."""
         return self.clock.now_ns() + round(seconds * _NS_PER_S)
 
-    def _answer(self, until_ns: int, while_closing: bool) -> Answer | None:
+    def _answer(self, until_ns: int, while_closing: bool) -> BoxAnswer | None:
         """The answer to the command that was sent last; None when it is time to send it again."""
         while True:
             while self._waiting:
                 raw = self._waiting.popleft()
-                match parsed(raw):
-                    case Answer() as answer if answer.session != self.session:
+                match parse_line(raw):
+                    case BoxAnswer() as answer if answer.session != self.session:
                         self.tally.others += 1
-                    case Answer() as answer if answer.number == self._number:
+                    case BoxAnswer() as answer if answer.number == self._number:
                         return answer
-                    case Event() as event:
+                    case BoxEvent() as event:
                         self.events.append(event)
-                    case Unread():
+                    case UnreadableLine():
                         return None
                     case None:
                         self.tally.damaged += 1

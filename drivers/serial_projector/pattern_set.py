@@ -22,7 +22,7 @@ from slrig.model import PatternSequence, Pixels
 DESCRIPTION = "patterns.json"
 
 
-def pattern_crc32(image: Pixels) -> int:
+def pattern_checksum(image: Pixels) -> int:
     """CRC-32 of one pattern's image, (H, W) uint8.
 
     >>> hex(pattern_crc32(np.array([[0, 255], [255, 0]], np.uint8)))
@@ -31,7 +31,7 @@ def pattern_crc32(image: Pixels) -> int:
     return zlib.crc32(image.tobytes())
 
 
-def crc32_of_each(sequence: PatternSequence) -> tuple[int, ...]:
+def pattern_checksums(sequence: PatternSequence) -> tuple[int, ...]:
     """CRC-32 of every pattern of a sequence.
 
     Raises
@@ -43,10 +43,10 @@ def crc32_of_each(sequence: PatternSequence) -> tuple[int, ...]:
     if deep:
         message = f"patterns {deep} have more than 8 bits, a pattern set for a trigger box has 8; encode them with 8"
         raise UnsupportedByDeviceError(message)
-    return tuple(pattern_crc32(sequence.image(index)) for index in range(len(sequence)))
+    return tuple(pattern_checksum(sequence.image(index)) for index in range(len(sequence)))
 
 
-def crc32_of_all(each: Sequence[int]) -> int:
+def sequence_checksum(each: Sequence[int]) -> int:
     """CRC-32 of a sequence, from those of its patterns.
 
     >>> f"{crc32_of_all([0x0CF81683, 0x00000000]):08X}"
@@ -55,7 +55,7 @@ def crc32_of_all(each: Sequence[int]) -> int:
     return zlib.crc32(b"".join(crc32.to_bytes(4, "big") for crc32 in each))
 
 
-def export(sequence: PatternSequence, folder: Path) -> None:
+def export_patterns(sequence: PatternSequence, folder: Path) -> None:
     """Write the images for the light engine's flash, `000.png` …, and `patterns.json` for the box.
 
     Raises
@@ -66,11 +66,11 @@ def export(sequence: PatternSequence, folder: Path) -> None:
         A pattern has more than 8 bits.
     """
     size = sequence.projector
-    each = crc32_of_each(sequence)
+    each = pattern_checksums(sequence)
     description = {
         "size_px": [size.width_px, size.height_px],
         "crc32": [f"{crc32:08X}" for crc32 in each],
-        "crc32_of_all": f"{crc32_of_all(each):08X}",
+        "crc32_of_all": f"{sequence_checksum(each):08X}",
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)

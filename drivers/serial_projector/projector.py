@@ -7,24 +7,24 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from drivers.serial_port import Port
-from drivers.serial_projector.client import Client, Limits
-from drivers.serial_projector.frames import Fault, Mode, Refused
+from drivers.serial_port import BytePort
+from drivers.serial_projector.client import BoxClient, BoxLimits
+from drivers.serial_projector.frames import BoxFault, RefusalCode, SequenceMode
 from drivers.serial_projector.keeping import KeepAlive
-from drivers.serial_projector.link import Link, RefusedError
+from drivers.serial_projector.link import BoxLink, BoxRefusedError
 from drivers.serial_projector.options import SerialProjectorOptions
-from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each, export
+from drivers.serial_projector.pattern_set import export_patterns, pattern_checksums, sequence_checksum
 from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
 _FAULTS = {
-    Fault.WATCHDOG: "it heard nothing from this host for watchdog_s: the host was too busy or the cable is bad; raise "
+    BoxFault.WATCHDOG: "it heard nothing from this host for watchdog_s: the host was too busy or the cable is bad; raise "
     "watchdog_s in the rig file, or give the host less to do",
-    Fault.ON_TIME: "a pattern was lit for max_on_s without another one being asked for; raise max_on_s in the rig file "
+    BoxFault.ON_TIME: "a pattern was lit for max_on_s without another one being asked for; raise max_on_s in the rig file "
     "if the light may be on for longer",
-    Fault.DUTY: "there was light for max_duty of 10 s; raise max_duty in the rig file if it may, or wait between scans",
-    Fault.LIGHT: "its light engine failed; see to its cables and power",
+    BoxFault.DUTY: "there was light for max_duty of 10 s; raise max_duty in the rig file if it may, or wait between scans",
+    BoxFault.LIGHT: "its light engine failed; see to its cables and power",
 }
 _Value = TypeVar("_Value")
 
@@ -49,7 +49,7 @@ class SerialProjector:
 
     def __init__(
         self,
-        open_port: Callable[[], Port],
+        open_port: Callable[[], BytePort],
         options: SerialProjectorOptions,
         *,
         export_folder: Path,
@@ -59,16 +59,16 @@ class SerialProjector:
         self._clock = clock or SystemClock()
         self._options = options
         self._export_folder = export_folder
-        limits = Limits(
+        limits = BoxLimits(
             watchdog_ms=round(options.watchdog_s * 1000),
             on_ms=round(options.max_on_s * 1000),
             duty=round(options.max_duty * 1000),
             bright=round(options.brightness * 1000),
         )
         port = open_port()
-        link = Link(port, options.reply_s, options.deadline_s, clock=self._clock)
+        link = BoxLink(port, options.reply_s, options.deadline_s, clock=self._clock)
         try:
-            self._client = Client(link, limits, label=options.port, open_s=options.open_s)
+            self._client = BoxClient(link, limits, label=options.port, open_s=options.open_s)
         except BaseException:
             port.close()
             raise
@@ -96,7 +96,7 @@ class SerialProjector:
         return self._info
 
     @property
-    def client(self) -> Client:
+    def client(self) -> BoxClient:
         """The session with the box, for what `Projector` has no word for."""
         return self._client
 
@@ -117,7 +117,7 @@ class SerialProjector:
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, self._size)
-        self._wanted = crc32_of_each(sequence)
+        self._wanted = pattern_checksums(sequence)
         try:
             lacking = self._sent(lambda: self._client.load(self._wanted))
         except UnsupportedByDeviceError as error:
@@ -136,9 +136,9 @@ class SerialProjector:
     def write_patterns(self, sequence: PatternSequence) -> str:
         """See `FlashedProjector`. Into a folder of its own: no other set is written over."""
         self._state.require_size(sequence, self._size)
-        crc32 = crc32_of_all(crc32_of_each(sequence))
+        crc32 = sequence_checksum(pattern_checksums(sequence))
         folder = self._export_folder / f"{crc32:08X}"
-        export(sequence, folder)
+        export_patterns(sequence, folder)
         return (
             f"{len(sequence)} images and patterns.json are in {folder}: put the images into the light engine's memory, "
             "in the order of their numbers, and patterns.json onto the box"
@@ -162,7 +162,7 @@ class SerialProjector:
             # A box that restarted since is found here: below, it could have begun to play before it did.
             self._sent(self._client.ping)
             self._lit = "a sequence played"
-            self._sent(lambda: self._client.sequence(0, count, exposure_us, period_us, Mode.FREE))
+            self._sent(lambda: self._client.sequence(0, count, exposure_us, period_us, SequenceMode.FREE))
 
     def stop(self) -> None:
         """See `Projector`."""
@@ -233,21 +233,21 @@ class SerialProjector:
         """Send a command; what the box refuses becomes an error of slrig's."""
         try:
             return command()
-        except RefusedError as refusal:
+        except BoxRefusedError as refusal:
             match refusal.number:
-                case Refused.SESSION:
+                case RefusalCode.SESSION:
                     raise _RestartedError from refusal
-                case Refused.STATE:
+                case RefusalCode.STATE:
                     raise DeviceStateError(f"{refusal}; stop what it does first") from refusal
-                case Refused.RANGE | Refused.LIMIT | Refused.PATTERNS:
+                case RefusalCode.RANGE | RefusalCode.LIMIT | RefusalCode.PATTERNS:
                     raise UnsupportedByDeviceError(str(refusal)) from refusal
-                case Refused.BUSY:
+                case RefusalCode.BUSY:
                     message = (
                         f"another host took the trigger box on {self._options.port} over ({refusal}); end that one"
                     )
                     raise DeviceBusyError(message) from refusal
-                case Refused.FAULT:
-                    raise DeviceError(_went_dark(self._options.port, refusal.words)) from refusal
+                case RefusalCode.FAULT:
+                    raise DeviceError(_fault_message(self._options.port, refusal.words)) from refusal
                 case _:
                     raise
 
@@ -301,7 +301,7 @@ class _RestartedError(DeviceError):
     """The box does not know the session any more."""
 
 
-def _went_dark(port: str, words: tuple[str, ...]) -> str:
+def _fault_message(port: str, words: tuple[str, ...]) -> str:
     known = {str(fault.value): why for fault, why in _FAULTS.items()}
     why = known.get(words[0] if words else "", f"fault {' '.join(words)}, which is unknown here")
     return f"the trigger box on {port} had gone dark by itself: {why}. Frames since then may be dark; scan again"

@@ -59,13 +59,13 @@ def open_turntable(options: Mapping[str, object], folder: Path, *, clock: Clock 
     """
     from drivers.serial_port import SerialPort
     from drivers.serial_turntable.options import LineOptions
-    from drivers.serial_turntable.simple import SimpleController
+    from drivers.serial_turntable.simple import LineController
     from drivers.serial_turntable.turntable import SerialTurntable
 
     del folder
     table = checked(LineOptions, options, "the [positioner] table of a serial turntable")
     port = SerialPort(table.port, baud=table.baud, device="turntable", driver="serial_turntable")
-    return SerialTurntable(port, table, lambda lines: SimpleController(lines, table), clock or SystemClock())
+    return SerialTurntable(port, table, lambda lines: LineController(lines, table), clock or SystemClock())
 
 
 def open_grbl(options: Mapping[str, object], folder: Path, *, clock: Clock | None = None) -> Turntable:
@@ -74,14 +74,14 @@ def open_grbl(options: Mapping[str, object], folder: Path, *, clock: Clock | Non
     Parameters and errors are those of `open_turntable`.
     """
     from drivers.serial_port import SerialPort
-    from drivers.serial_turntable.grbl import Grbl
+    from drivers.serial_turntable.grbl import GrblController
     from drivers.serial_turntable.options import GrblOptions
     from drivers.serial_turntable.turntable import SerialTurntable
 
     del folder
     table = checked(GrblOptions, options, "the [positioner] table of a turntable behind GRBL")
     port = SerialPort(table.port, baud=table.baud, device="turntable", driver="grbl_turntable")
-    return SerialTurntable(port, table, lambda lines: Grbl(lines, table), clock or SystemClock())
+    return SerialTurntable(port, table, lambda lines: GrblController(lines, table), clock or SystemClock())
 
 
 __all__ = ["open_grbl", "open_turntable"]

@@ -11,12 +11,12 @@ import re
 from dataclasses import dataclass
 from typing import NoReturn
 
-from drivers.serial_turntable.lines import Lines
+from drivers.serial_turntable.lines import ControllerLink
 from drivers.serial_turntable.options import AXES, GrblOptions
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 
-_RESET, _STATUS, _HOLD = b"\x18", b"?", b"!"
-_AGAIN_S = 0.5
+_RESET, _STATUS_REQUEST, _HOLD = b"\x18", b"?", b"!"
+_RETRY_S = 0.5
 """After this a byte or a line that nothing answered is sent again: far longer than any answer takes."""
 _REPLY_S = 2.0
 """GRBL answers a line at once, unless its look-ahead is full, which one move never does."""
@@ -24,9 +24,9 @@ _POLL_S = 0.1
 """GRBL's documentation asks for 5 Hz at the least and 10 Hz at the most."""
 _STILL_S = 1.0
 """A controller that is Idle elsewhere for so long does not begin to move any more."""
-_PRINTED = 0.001
+_PRINT_STEP = 0.001
 """Places are printed with three decimals."""
-_LOOKS_FOR_HOLD = 10
+_HOLD_POLLS = 10
 _BANNER = re.compile(r"grbl(hal)? ?v?\d", re.IGNORECASE)
 _REPORT = re.compile(r"<([A-Za-z]+(?::\d+)?)\|(.*)>")
 _SETTING = re.compile(r"\$(\d+)=(\d+(?:\.\d+)?)")
@@ -62,12 +62,12 @@ _ALARMS = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Status:
+class _GrblStatus:
     state: str
     place: float
 
 
-class Grbl:
+class GrblController:
     """Implements `Controller` on GRBL 1.1 and what takes the same (grblHAL, FluidNC).
 
     Raises
@@ -80,7 +80,7 @@ class Grbl:
         Nothing answers.
     """
 
-    def __init__(self, lines: Lines, options: GrblOptions) -> None:
+    def __init__(self, lines: ControllerLink, options: GrblOptions) -> None:
         self._lines = lines
         self._axis = options.axis
         self._index = AXES.index(options.axis)
@@ -115,7 +115,7 @@ class Grbl:
             now_ns = self._lines.clock.now_ns()
             if found.state == "Idle":
                 still_ns = self._lines.after(_STILL_S) if still_ns is None else still_ns
-                if abs(found.place - place) <= self.step / 2 + _PRINTED or now_ns >= still_ns:
+                if abs(found.place - place) <= self.step / 2 + _PRINT_STEP or now_ns >= still_ns:
                     return found.place
             elif found.state in {"Alarm", "Check", "Sleep"}:
                 message = f"{self._lines.label} is in the state {found.state} and does not turn; reset it"
@@ -134,8 +134,8 @@ class Grbl:
     def halt(self) -> None:
         """See `Controller`. Held first, which slows down, then reset, which forgets what was left of the turn."""
         self._lines.send_byte(_HOLD)
-        for _ in range(_LOOKS_FOR_HOLD):
-            self._lines.send_byte(_STATUS)
+        for _ in range(_HOLD_POLLS):
+            self._lines.send_byte(_STATUS_REQUEST)
             held = re.search(rb"<(Hold:0|Idle|Alarm)\b", self._lines.port.read(_POLL_S))
             if held is not None:
                 break
@@ -146,7 +146,7 @@ class Grbl:
         heard: list[str] = []
         while self._lines.clock.now_ns() < until_ns:
             self._lines.send_byte(_RESET)
-            again_ns = self._lines.after(_AGAIN_S)
+            again_ns = self._lines.after(_RETRY_S)
             while (line := self._lines.next(again_ns)) is not None:
                 heard.append(line)
                 if _BANNER.match(line):
@@ -178,18 +178,18 @@ class Grbl:
         )
         raise DeviceError(message)
 
-    def _status(self, until_ns: int) -> _Status:
+    def _status(self, until_ns: int) -> _GrblStatus:
         """Where it is, asked again while nothing that can be read comes."""
         # At least once, and past the deadline of a turn as well, which is to tell where it was.
         until_ns = max(until_ns, self._lines.after(_REPLY_S))
         while self._lines.clock.now_ns() < until_ns:
-            self._lines.send_byte(_STATUS)
-            again_ns = self._lines.after(_AGAIN_S)
+            self._lines.send_byte(_STATUS_REQUEST)
+            again_ns = self._lines.after(_RETRY_S)
             while (line := self._lines.next(again_ns)) is not None:
                 self._heed(line, "?")
                 report = _REPORT.fullmatch(line)
                 if report is not None:
-                    return _Status(report[1], self._place_in(report[2]))
+                    return _GrblStatus(report[1], self._place_in(report[2]))
         message = f"{self._lines.label} does not tell where it is any more; see to its power and cable"
         raise DeviceError(message)
 

@@ -6,20 +6,20 @@ import threading
 from collections import deque
 from dataclasses import dataclass, field
 
-from drivers.serial_port import SLICE_S, Port
+from drivers.serial_port import SLICE_S, BytePort
 from slrig.devices import Clock
 from slrig.errors import DeviceStateError
 
 NS_PER_S = 1_000_000_000
-_LONGEST = 1024
+_MAX_LINE_BYTES = 1024
 """Bytes without an end of line that are kept: no controller sends so long a line."""
 
 
 @dataclass(slots=True)
-class Lines:
+class ControllerLink:
     """A controller's port, line by line. `closing` ends a wait from another thread. label : what errors call it."""
 
-    port: Port
+    port: BytePort
     clock: Clock
     label: str
     closing: threading.Event = field(default_factory=threading.Event)
@@ -63,7 +63,7 @@ class Lines:
 
     def _take(self, data: bytes) -> None:
         *whole, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
-        self._rest = rest[-_LONGEST:]
+        self._rest = rest[-_MAX_LINE_BYTES:]
         for raw in whole:
             line = raw.decode("ascii", "replace").strip()
             if line and line.isascii() and line.isprintable():

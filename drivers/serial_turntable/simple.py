@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from drivers.serial_turntable.lines import Lines
+from drivers.serial_turntable.lines import ControllerLink
 from drivers.serial_turntable.options import LineOptions
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 
@@ -13,10 +13,10 @@ _AGAIN_S = 0.5
 _REPLY_S = 2.0
 """A board answers at once whatever it need not turn for."""
 _IDENTITY = re.compile(r"slrig-turntable (\d+) (\d+)")
-_REACHED = re.compile(r"OK (-?\d+(?:\.\d+)?)")
+_ANGLE = re.compile(r"OK (-?\d+(?:\.\d+)?)")
 
 
-class SimpleController:
+class LineController:
     """Implements `Controller`. Its unit is a degree.
 
     Raises
@@ -29,7 +29,7 @@ class SimpleController:
         Nothing that speaks this protocol answers.
     """
 
-    def __init__(self, lines: Lines, options: LineOptions) -> None:
+    def __init__(self, lines: ControllerLink, options: LineOptions) -> None:
         self._lines = lines
         self.step = 360 / self._steps_per_turn(lines.after(options.open_s))
 
@@ -53,7 +53,7 @@ class SimpleController:
             again_ns = self._lines.after(_AGAIN_S)
             while (line := self._lines.next(again_ns)) is not None:
                 heard = line
-                if _REACHED.fullmatch(line):
+                if _ANGLE.fullmatch(line):
                     break
             self._lines.send("ID?")
             again_ns = self._lines.after(_AGAIN_S)
@@ -79,7 +79,7 @@ class SimpleController:
         self._lines.send(command)
         while (line := self._lines.next(until_ns)) is not None:
             self._heed(line, command)
-            reached = _REACHED.fullmatch(line)
+            reached = _ANGLE.fullmatch(line)
             if reached is not None:
                 return float(reached[1])
         self.halt()

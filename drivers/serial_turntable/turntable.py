@@ -7,15 +7,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Protocol
 
-from drivers.serial_port import Port
-from drivers.serial_turntable.lines import Lines
+from drivers.serial_port import BytePort
+from drivers.serial_turntable.lines import ControllerLink
 from drivers.serial_turntable.options import LineOptions
 from slrig.devices import AnyAngle, Clock
 from slrig.errors import DeviceError, DeviceStateError, SlrigError, UnsupportedByDeviceError
 from slrig.model import StageAxis
 
 
-class Controller(Protocol):
+class TurntableController(Protocol):
     """What moves the motor. Places are in its own units."""
 
     step: float
@@ -53,12 +53,16 @@ class SerialTurntable(AnyAngle):
     """
 
     def __init__(
-        self, port: Port, options: LineOptions, controlled: Callable[[Lines], Controller], clock: Clock
+        self,
+        port: BytePort,
+        options: LineOptions,
+        controlled: Callable[[ControllerLink], TurntableController],
+        clock: Clock,
     ) -> None:
         super().__init__(options.poses)
         self._options = options
         self._units_per_deg = -options.units_per_deg if options.reversed else options.units_per_deg
-        self._lines = Lines(port, clock, f"the turntable on {options.port}")
+        self._lines = ControllerLink(port, clock, f"the turntable on {options.port}")
         try:
             self._controller = controlled(self._lines)
             self._origin = self._place = self._controller.place()

@@ -7,5 +7,5 @@ They are copied to the box as they are, with the `patterns.json` that the driver
     mpremote reset
 
 `python -c "import drivers.serial_projector.device as box; print(*box.__path__)"` prints the folder they are in. For
-another engine, write another `main.py`: what it must offer is `box.Hardware`.
+another engine, write another `main.py`: what it must offer is `box.BoxHardware`.
 """

@@ -14,10 +14,10 @@ DUTY_SLACK = 20
 
 
 class HardwareError(Exception):
-    """The light engine did not do what it was told. Raised by the methods of a `Hardware`."""
+    """The light engine did not do what it was told. Raised by the methods of a `BoxHardware`."""
 
 
-class Hardware:
+class BoxHardware:
     """What the core asks of a box. Every method may raise `HardwareError`; then the box goes dark."""
 
     def time_us(self) -> int:
@@ -45,7 +45,7 @@ class Hardware:
         raise NotImplementedError
 
 
-class Description:
+class BoxDescription:
     """What a box is, as it says in HELLO, and the CRC-32 of every pattern in its flash.
 
     light_us : longest time from a command to its light. error_us : error of its time stamps. gap_us : least time from

@@ -19,12 +19,11 @@ to change its files, start the box with SERVICE (GP15) on ground, and it ends at
 # mypy: disable-error-code="call-overload, redundant-expr, import-not-found"
 
 try:
-    from drivers.serial_projector.device.box import Description, Hardware, HardwareError
-    from drivers.serial_projector.device.protocol import Device
+    from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError
+    from drivers.serial_projector.device.protocol import TriggerBox
 except ImportError:
     # On a box the files lie side by side.
-    from box import Description, Hardware, HardwareError  # type: ignore[no-redef]
-    from protocol import Device  # type: ignore[no-redef]
+    from box import HardwareError  # type: ignore[no-redef]
 
 MODEL, FIRMWARE = "slrig-pico", "1.1.0"
 WIDTH_PX, HEIGHT_PX = 912, 1140
@@ -55,19 +54,19 @@ PULSE_US = 100
 HOLD_US = 500
 """How long a pattern of a sequence stays lit beyond its exposure: longer than this program is ever late."""
 
-LEAST_US = 200
+MIN_EXPOSURE_US = 200
 ERROR_US = 50
 DIM_HZ = 100000
 RESTART_MS = 1000
-MOST_DUTY, MOST_ON_MS = 1000, 3600000
+MAX_DUTY, MAX_ON_MS = 1000, 3600000
 TIDY_AFTER = 64
 
 
-def described(patterns: dict) -> Description:
+def describe_box(patterns: dict) -> BoxDescription:
     """What HELLO says, from the patterns.json that was written with the engine's images."""
     fits = patterns.get("size_px") == [WIDTH_PX, HEIGHT_PX]
     crc32 = [int(each, 16) for each in patterns["crc32"]] if fits else []
-    return Description(
+    return BoxDescription(
         MODEL,
         FIRMWARE,
         WIDTH_PX,
@@ -77,14 +76,14 @@ def described(patterns: dict) -> Description:
         error_us=ERROR_US,
         gap_us=HOLD_US + 2 * STEP_US + SETTLE_US + 1000,
         hold_us=HOLD_US,
-        least_us=LEAST_US,
+        least_us=MIN_EXPOSURE_US,
         step_us=2 * STEP_US,
-        duty=MOST_DUTY,
-        on_ms=MOST_ON_MS,
+        duty=MAX_DUTY,
+        on_ms=MAX_ON_MS,
     )
 
 
-class Board(Hardware):
+class PicoBoard(BoxHardware):
     """The pins. machine, rp2, time : MicroPython's modules."""
 
     def __init__(self, machine, rp2, time) -> None:
@@ -100,14 +99,14 @@ class Board(Hardware):
         self._us = 0
 
     def time_us(self) -> int:
-        """See `Hardware`. The board's own counter wraps after 18 minutes."""
+        """See `BoxHardware`. The board's own counter wraps after 18 minutes."""
         ticks = self._time.ticks_us()
         self._us += self._time.ticks_diff(ticks, self._ticks)
         self._ticks = ticks
         return self._us
 
     def select(self, pattern: int) -> None:
-        """See `Hardware`."""
+        """See `BoxHardware`."""
         if self._position < 0 or pattern < self._position:
             self._send(self._home, HOME_LEVEL)
             for _ in range(STEPS_TO_FIRST):
@@ -127,21 +126,21 @@ class Board(Hardware):
                 raise HardwareError("the engine is not READY")
 
     def light(self) -> None:
-        """See `Hardware`."""
+        """See `BoxHardware`."""
         self._lamp.duty_u16(self._level)
         self._time.sleep_us(LAMP_US)
 
     def dark(self) -> None:
-        """See `Hardware`."""
+        """See `BoxHardware`."""
         self._lamp.duty_u16(0)
         self._time.sleep_us(LAMP_US)
 
     def pulse(self) -> None:
-        """See `Hardware`. The state machine ends it, so nobody waits."""
+        """See `BoxHardware`. The state machine ends it, so nobody waits."""
         self._camera.put(PULSE_US)
 
     def dim(self, permille: int) -> int:
-        """See `Hardware`."""
+        """See `BoxHardware`."""
         self._level = 65535 * permille // 1000
         return permille
 
@@ -189,7 +188,7 @@ class UsbPort:
         self._out.write(data)
 
 
-def serve(device: Device, port: UsbPort, alive, tidy) -> None:
+def serve(device: TriggerBox, port: UsbPort, alive, tidy) -> None:
     """Run a box without end. alive : feeds the watchdog timer. tidy : collects garbage, where that disturbs least."""
     sent = 0
     while True:
@@ -222,13 +221,13 @@ def run() -> None:
         return
     # Bytes from the host are never a keyboard interrupt.
     micropython.kbd_intr(-1)
-    board = Board(machine, rp2, time)
+    board = PicoBoard(machine, rp2, time)
     try:
         with open("patterns.json") as file:  # noqa: PTH123 - MicroPython has no pathlib
             patterns = json.load(file)
     except (OSError, ValueError):
         patterns = {}
-    device = Device(board, described(patterns), int.from_bytes(os.urandom(4), "big"))
+    device = TriggerBox(board, describe_box(patterns), int.from_bytes(os.urandom(4), "big"))
     watchdog = machine.WDT(timeout=RESTART_MS)
     try:
         serve(device, UsbPort(select, sys), watchdog.feed, gc.collect)

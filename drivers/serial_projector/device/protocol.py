@@ -1,4 +1,4 @@
-"""SLTP/1 as a trigger box speaks it: bytes in, bytes out, and a `Hardware` between them and the light.
+"""SLTP/1 as a trigger box speaks it: bytes in, bytes out, and a `BoxHardware` between them and the light.
 
 Pure: no pin, no port, no clock of its own. Runs unchanged in MicroPython (1.20 or newer) and in CPython. What the
 verbs, fields and codes mean is in the docstring of `drivers.serial_projector`.
@@ -10,19 +10,19 @@ import binascii
 
 try:
     from drivers.serial_projector.device import wire
-    from drivers.serial_projector.device.box import Description, Hardware, HardwareError, LightTime
+    from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError, LightTime
 except ImportError:
     # On a box the files lie side by side.
     import wire  # type: ignore[import-not-found, no-redef]
-    from box import Description, Hardware, HardwareError, LightTime  # type: ignore[import-not-found, no-redef]
+    from box import HardwareError, LightTime  # type: ignore[import-not-found, no-redef]
 
-LEAST_WATCHDOG_MS = 50
-MOST_PICKED = 512
+MIN_WATCHDOG_MS = 50
+MAX_PICKED = 512
 """Patterns of one sequence; PICK takes no more."""
 _UNDER_LIGHT = ("lit", "playing", "waiting")
 
 
-class Refusal(Exception):  # noqa: N818 - an answer, not a failure of the box
+class BoxRefusal(Exception):  # noqa: N818 - an answer, not a failure of the box
     """The answer to a command that is not obeyed."""
 
     def __init__(self, code: int, words: str) -> None:
@@ -30,12 +30,12 @@ class Refusal(Exception):  # noqa: N818 - an answer, not a failure of the box
         self.code, self.words = code, words
 
 
-class Device:
+class TriggerBox:
     """A box. Give it every byte that comes in (`feed`), let it look at its clock as often as possible (`poll`), and
     send what both return.
     """
 
-    def __init__(self, hardware: Hardware, description: Description, boot_id: int) -> None:
+    def __init__(self, hardware: BoxHardware, description: BoxDescription, boot_id: int) -> None:
         self._hardware, self._about, self._boot = hardware, description, boot_id
         self._buffer = b""
         self._out: list[bytes] = []
@@ -44,7 +44,7 @@ class Device:
         self._number = -1
         self._reply = b""
         self._heard_us = 0
-        self._watchdog_us, self._on_us, self._duty = LEAST_WATCHDOG_MS * 1000, 0, 0
+        self._watchdog_us, self._on_us, self._duty = MIN_WATCHDOG_MS * 1000, 0, 0
         self._order: list[int] = []
         self._picked: list[int] = []
         self._gap_us = description.gap_us
@@ -72,7 +72,7 @@ class Device:
             line, self._buffer = self._buffer[:end], self._buffer[end + 1 :]
             if line:
                 self._out.append(self._answer(line))
-        if len(self._buffer) > wire.MOST_LINE_BYTES:
+        if len(self._buffer) > wire.MAX_LINE_BYTES:
             self._buffer = b""
         return self._sent()
 
@@ -102,7 +102,7 @@ class Device:
         return b"".join(out)
 
     def _event(self, text: str) -> None:
-        self._out.append(wire.framed("! " + text))
+        self._out.append(wire.encode_line("! " + text))
 
     # What happens by itself.
 
@@ -179,10 +179,10 @@ class Device:
     # What the host asks for.
 
     def _answer(self, line: bytes) -> bytes:
-        text = wire.unframed(line)
+        text = wire.decode_line(line)
         words = text.split(" ") if text is not None else []
         if len(words) < 3 or len(words[0]) != 4 or not words[1].isdigit() or int(words[1]) >= wire.NUMBERS:
-            return wire.framed(f"? ERR {wire.FRAMING} bad frame")
+            return wire.encode_line(f"? ERR {wire.FRAMING} bad frame")
         session, number, verb = words[0], int(words[1]), words[2]
         now_us = self._hardware.time_us()
         if session == self._session:
@@ -192,29 +192,29 @@ class Device:
             if ahead == 0:
                 return self._reply
             if ahead >= wire.NUMBERS // 2:
-                return wire.framed(f"{session} {number} ERR {wire.STATE} number {number} after {self._number}")
+                return wire.encode_line(f"{session} {number} ERR {wire.STATE} number {number} after {self._number}")
         if session != self._session or not self._open:
             silent_us = now_us - self._heard_us
             if self._open and silent_us <= self._watchdog_us:
-                return wire.framed(f"{session} {number} ERR {wire.BUSY} held by {self._session}")
+                return wire.encode_line(f"{session} {number} ERR {wire.BUSY} held by {self._session}")
             if verb != "HELLO":
-                return wire.framed(f"{session} {number} ERR {wire.SESSION} say HELLO")
+                return wire.encode_line(f"{session} {number} ERR {wire.SESSION} say HELLO")
             self._session, self._open, self._heard_us = session, False, now_us
         self._number = number
         try:
             done = self._act(verb, words[3:])
             answer = f"{session} {number} OK {done}" if done else f"{session} {number} OK"
-        except Refusal as refusal:
+        except BoxRefusal as refusal:
             answer = f"{session} {number} ERR {refusal.code} {refusal.words}"
         except HardwareError as error:
             self._trip(wire.LIGHT)
             answer = f"{session} {number} ERR {wire.HARDWARE} {error}"
-        self._reply = wire.framed(answer)
+        self._reply = wire.encode_line(answer)
         return self._reply
 
     def _act(self, verb: str, words: list[str]) -> str:
         if verb not in ("HELLO", "PING", "PICK", "LOAD", "SHOW", "SEQ", "TRIG", "STOP", "BLANK", "STATUS", "BYE"):
-            raise Refusal(wire.VERB, verb)
+            raise BoxRefusal(wire.VERB, verb)
         wanted = {"HELLO": 5, "LOAD": 2, "SHOW": 1, "SEQ": 5, "PICK": max(len(words), 2)}.get(verb, 0)
         checksums = verb in ("PICK", "LOAD")
         try:
@@ -222,7 +222,7 @@ class Device:
         except ValueError:
             numbers = []
         if len(numbers) != len(words) or len(words) != wanted or (numbers and min(numbers) < 0):
-            raise Refusal(wire.RANGE, f"{verb} takes {wanted} numbers")
+            raise BoxRefusal(wire.RANGE, f"{verb} takes {wanted} numbers")
         answer: str = getattr(self, "_" + verb.lower())(*numbers)
         return answer
 
@@ -232,12 +232,12 @@ class Device:
         self._darken("idle")
         self._open = False
         if version != wire.VERSION:
-            raise Refusal(wire.RANGE, f"speaks SLTP/{wire.VERSION}")
-        if watchdog_ms < LEAST_WATCHDOG_MS or on_ms < 1 or not 1 <= duty <= 1000 or not 1 <= bright <= 1000:
-            raise Refusal(wire.RANGE, "limits")
+            raise BoxRefusal(wire.RANGE, f"speaks SLTP/{wire.VERSION}")
+        if watchdog_ms < MIN_WATCHDOG_MS or on_ms < 1 or not 1 <= duty <= 1000 or not 1 <= bright <= 1000:
+            raise BoxRefusal(wire.RANGE, "limits")
         granted = self._hardware.dim(bright)
         if granted > bright:
-            raise Refusal(wire.RANGE, f"bright {granted}")
+            raise BoxRefusal(wire.RANGE, f"bright {granted}")
         watchdog_ms, on_ms, duty = min(watchdog_ms, about.watchdog_ms), min(on_ms, about.on_ms), min(duty, about.duty)
         self._watchdog_us, self._on_us, self._duty = watchdog_ms * 1000, on_ms * 1000, duty
         self._open = True
@@ -245,7 +245,7 @@ class Device:
             f"sltp={wire.VERSION} model={about.model} fw={about.firmware} w={about.width_px} h={about.height_px} "
             f"max={about.count} boot={self._boot:08X} watchdog_ms={watchdog_ms} on_ms={on_ms} duty={duty} "
             f"bright={granted} light_us={about.light_us} error_us={about.error_us} gap_us={about.gap_us} "
-            f"hold_us={about.hold_us} least_us={about.least_us} pick={MOST_PICKED}"
+            f"hold_us={about.hold_us} least_us={about.least_us} pick={MAX_PICKED}"
         )
 
     def _ping(self) -> str:
@@ -255,8 +255,8 @@ class Device:
         self._darken("idle")
         if at == 0:
             self._picked = []
-        if at != len(self._picked) or at + len(crc32) > MOST_PICKED or max(crc32) > 0xFFFFFFFF:
-            raise Refusal(wire.RANGE, f"{at} after {len(self._picked)}, most {MOST_PICKED}")
+        if at != len(self._picked) or at + len(crc32) > MAX_PICKED or max(crc32) > 0xFFFFFFFF:
+            raise BoxRefusal(wire.RANGE, f"{at} after {len(self._picked)}, most {MAX_PICKED}")
         self._picked += [self._about.found(each) for each in crc32]
         return " ".join(
             [f"{len(self._picked)}"] + [f"{i}" for i, each in enumerate(self._picked) if each < 0 and i >= at]
@@ -275,11 +275,11 @@ class Device:
         """So many patterns of the flash, one after another, that have this checksum."""
         about = self._about
         if not 1 <= count <= about.count:
-            raise Refusal(wire.RANGE, f"{count} of {about.count}")
+            raise BoxRefusal(wire.RANGE, f"{count} of {about.count}")
         for first in range(about.count - count + 1):
             if binascii.crc32(about.crc32[4 * first : 4 * (first + count)]) == crc32:
                 return list(range(first, first + count))
-        raise Refusal(wire.PATTERNS, f"{about.count} {binascii.crc32(about.crc32):08X}")
+        raise BoxRefusal(wire.PATTERNS, f"{about.count} {binascii.crc32(about.crc32):08X}")
 
     def _show(self, index: int) -> str:
         self._require_light(index)
@@ -295,11 +295,11 @@ class Device:
         about = self._about
         self._require_light(first)
         if not 1 <= count <= len(self._order) - first or mode not in (wire.FREE, wire.STEP):
-            raise Refusal(wire.RANGE, f"{count} patterns from {first}, mode {mode}")
+            raise BoxRefusal(wire.RANGE, f"{count} patterns from {first}, mode {mode}")
         if not about.least_us <= exposure_us <= self._on_us - about.hold_us or period_us < exposure_us + self._gap_us:
-            raise Refusal(wire.RANGE, f"exposure {exposure_us} period {period_us}")
+            raise BoxRefusal(wire.RANGE, f"exposure {exposure_us} period {period_us}")
         if mode == wire.FREE and (exposure_us + about.hold_us) * 1000 > self._duty * period_us:
-            raise Refusal(wire.LIMIT, f"duty {self._duty}")
+            raise BoxRefusal(wire.LIMIT, f"duty {self._duty}")
         self._darken("ready")
         self._hardware.select(self._order[first])
         self._sequence, self._frames = (first, count, exposure_us, period_us), 0
@@ -310,7 +310,7 @@ class Device:
     def _trig(self) -> str:
         self._require_no_fault()
         if self._state != "waiting" or self._lit:
-            raise Refusal(wire.STATE, "nothing waits" if self._state != "waiting" else "still lit")
+            raise BoxRefusal(wire.STATE, "nothing waits" if self._state != "waiting" else "still lit")
         self._require_duty()
         t_us = self._light_frame()
         return f"{self._index} {t_us}"
@@ -340,18 +340,18 @@ class Device:
     def _require_light(self, index: int) -> None:
         self._require_no_fault()
         if not self._order or self._state in ("playing", "waiting"):
-            raise Refusal(wire.STATE, self._state)
+            raise BoxRefusal(wire.STATE, self._state)
         if not 0 <= index < len(self._order):
-            raise Refusal(wire.RANGE, f"{index} of {len(self._order)}")
+            raise BoxRefusal(wire.RANGE, f"{index} of {len(self._order)}")
         self._require_duty()
 
     def _require_no_fault(self) -> None:
         if self._fault:
-            raise Refusal(wire.FAULT, f"{self._fault}")
+            raise BoxRefusal(wire.FAULT, f"{self._fault}")
 
     def _require_duty(self) -> None:
         if self._light_used_up():
-            raise Refusal(wire.LIMIT, f"duty {self._duty}")
+            raise BoxRefusal(wire.LIMIT, f"duty {self._duty}")
 
     def _light_used_up(self) -> bool:
         return self._duty < 1000 and self._light_time.left_us(self._duty) <= 0

@@ -6,7 +6,7 @@ Runs unchanged in MicroPython and in CPython.
 # MicroPython has no `__future__`.
 
 VERSION = 1
-MOST_LINE_BYTES = 240
+MAX_LINE_BYTES = 240
 NUMBERS = 10000
 
 # Errors, as in `<session> <number> ERR <code> <words>`.
@@ -40,17 +40,17 @@ def crc16(data: bytes) -> int:
     return value
 
 
-def framed(text: str) -> bytes:
+def encode_line(text: str) -> bytes:
     """A line as it goes over the wire."""
     body = text.encode("ascii")
     return body + b"*" + f"{crc16(body):04X}".encode("ascii") + b"\n"
 
 
-def unframed(line: bytes) -> "str | None":
+def decode_line(line: bytes) -> "str | None":
     """The text of a line that came over the wire (without its end); None where it is damaged."""
     line = line.rstrip(b"\r")
     body, star, crc = line[:-5], line[-5:-4], line[-4:]
-    if star != b"*" or len(line) > MOST_LINE_BYTES or f"{crc16(body):04X}".encode("ascii") != crc:
+    if star != b"*" or len(line) > MAX_LINE_BYTES or f"{crc16(body):04X}".encode("ascii") != crc:
         return None
     for byte in body:
         if not 32 <= byte < 127:

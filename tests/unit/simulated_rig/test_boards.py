@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from simulated_rig.boards import Board, Print, across_of, along_of
+from simulated_rig.boards import BoardPrint, PrintedBoard, arc_length_mm, x_at_arc_length_mm
 from slrig.calibration.board import Board as Designed
 from slrig.calibration.board import BoardKind
 from slrig.model import FloatArray
@@ -23,11 +23,11 @@ SIZES: dict[str, dict[str, Any]] = {
 }
 
 
-def board(kind: str = "chessboard", **options: Any) -> Board:
-    return Board.model_validate({"shape": "board", "kind": kind, **SIZES[kind], **options})
+def board(kind: str = "chessboard", **options: Any) -> PrintedBoard:
+    return PrintedBoard.model_validate({"shape": "board", "kind": kind, **SIZES[kind], **options})
 
 
-def dark_at(shown: Print, points_mm: FloatArray) -> NDArray[np.bool_]:
+def dark_at(shown: BoardPrint, points_mm: FloatArray) -> NDArray[np.bool_]:
     """Whether the print is dark at points (n, 2) that lie on no line of it."""
     if len(shown.centres_mm):
         apart = np.linalg.norm(points_mm[:, None] - shown.centres_mm, axis=2)
@@ -39,7 +39,7 @@ def dark_at(shown: Print, points_mm: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(inside & dark)
 
 
-def on_print(each: Board, columns: int, rows: int, *, per_mm: int) -> FloatArray:
+def on_print(each: PrintedBoard, columns: int, rows: int, *, per_mm: int) -> FloatArray:
     """(n, 2): centres of the pixels of a drawing of so many squares, in the board's frame."""
     y, x = np.mgrid[: rows * 9 * per_mm, : columns * 9 * per_mm]
     at = (np.column_stack([x.ravel(), y.ravel()]) + 0.5) / per_mm - each.square_mm
@@ -109,7 +109,7 @@ def test_a_bent_board_keeps_its_length_along_the_bend(bow_mm: float) -> None:
     fine = each.on_sheet_mm(np.column_stack([np.linspace(-half, half, 20001), np.zeros(20001)]))
     assert np.linalg.norm(np.diff(fine, axis=0), axis=1).sum() == pytest.approx(2 * half, rel=1e-8)
     x = np.linspace(-half, half, 7)
-    np.testing.assert_allclose(across_of(along_of(x, 0.004), 0.004), x, atol=1e-10)
+    np.testing.assert_allclose(x_at_arc_length_mm(arc_length_mm(x, 0.004), 0.004), x, atol=1e-10)
     (part,) = each.parts(None)  # type: ignore[arg-type]  # a board reads no file
     vertices = part.vertices_mm
     np.testing.assert_allclose(vertices[:, 2], each.curvature_per_mm * vertices[:, 0] ** 2, atol=1e-12)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulated_rig.device import open_head, simulated_head
+from simulated_rig.device import open_head, open_simulated_head
 from slrig.errors import ConfigError
 from tests.unit.simulated_rig.building import FACING_PLATE, coarser, head_options, small_head
 
@@ -29,7 +29,7 @@ RENDERED = [path for path in RIGS if tomllib.loads(path.read_text()).get("head",
 def test_every_rendered_rig_we_ship_sees_a_lit_surface(path: Path) -> None:
     table = tomllib.loads(path.read_text())["head"]
     table.pop("driver")
-    head = simulated_head(coarser(table, 8), path.parent)
+    head = open_simulated_head(coarser(table, 8), path.parent)
     assert (head.calibration is None) is ("calibration" in path.stem)
     truth = head.truth()
     assert list(truth.cameras) == list(head.exact_calibration.cameras) == list(head.cameras)

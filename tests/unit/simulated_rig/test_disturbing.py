@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.device import SimulatedHead
-from simulated_rig.disturbing import Drift, Push, pushed
+from simulated_rig.disturbing import PoseChange, PoseDrift, apply_pose_change
 from simulated_rig.light import Float32Array
 from slrig.devices import Trigger
 from slrig.errors import ConfigError
@@ -40,16 +40,16 @@ def frames(head: SimulatedHead, count: int = 10) -> list[Float32Array]:
 
 def test_a_push_turns_and_shifts_a_device_in_its_own_frame(tmp_path: Path) -> None:
     device = small_head(tmp_path).exact_calibration.cameras["eye"]
-    push = Push(device="eye", turn_deg=(0.0, 0.0, 90.0), shift_mm=(1.0, 2.0, 3.0))
-    now = pushed(device, push)
+    push = PoseChange(device="eye", turn_deg=(0.0, 0.0, 90.0), shift_mm=(1.0, 2.0, 3.0))
+    now = apply_pose_change(device, push)
     point = np.array([4.0, 5.0, 6.0])
     seen = device.rotation @ point + device.translation_mm
     moved = now.rotation @ point + now.translation_mm
     np.testing.assert_allclose(moved, [-(seen[1] + 2), seen[0] + 1, seen[2] + 3], atol=1e-12)
-    half = pushed(device, push, share=0.5)
+    half = apply_pose_change(device, push, share=0.5)
     angle = Rotation.from_matrix(half.rotation @ device.rotation.T).magnitude()
     assert np.rad2deg(angle) == pytest.approx(45.0)
-    np.testing.assert_allclose(pushed(device, push, share=0.0).translation_mm, device.translation_mm)
+    np.testing.assert_allclose(apply_pose_change(device, push, share=0.0).translation_mm, device.translation_mm)
 
 
 def test_a_bumped_camera_sees_otherwise_than_its_calibration_says(tmp_path: Path) -> None:
@@ -65,7 +65,9 @@ def test_a_bumped_camera_sees_otherwise_than_its_calibration_says(tmp_path: Path
     stated, again = bumped.exact_calibration.cameras["left"], steady.exact_calibration.cameras["left"]
     np.testing.assert_array_equal(stated.rotation, again.rotation)
     # What it sees at pose 1 is what a rig sees whose camera stands there from the beginning.
-    there = pushed(stated, Push.model_validate({k: v for k, v in BUMP.items() if k != "pose"} | {"device": "left"}))
+    there = apply_pose_change(
+        stated, PoseChange.model_validate({k: v for k, v in BUMP.items() if k != "pose"} | {"device": "left"})
+    )
     options = coarser(board_options(poses=None, pose=POSES), 2)
     posed = {key: options["camera"][0][key] for key in options["camera"][0] if key not in ("position_mm", "target_mm")}
     posed |= {"rotation": there.rotation.tolist(), "translation_mm": there.translation_mm.tolist()}
@@ -93,14 +95,14 @@ def test_a_bumped_projector_lights_otherwise_and_moves_no_depth(tmp_path: Path) 
 
 
 def test_drift_settles() -> None:
-    drift = Drift(device="left", turn_deg=(0.0, 0.1, 0.0), settle_s=100.0)
+    drift = PoseDrift(device="left", turn_deg=(0.0, 0.1, 0.0), settle_s=100.0)
     shares = [drift.share(time_s, 0) for time_s in (0.0, 100.0, 1e6)]
     np.testing.assert_allclose(shares, [0.0, 1 - np.exp(-1), 1.0])
-    counted = Drift(device="left", settle_captures=2.0)
+    counted = PoseDrift(device="left", settle_captures=2.0)
     np.testing.assert_allclose([counted.share(99.0, n) for n in (0, 2)], [0.0, 1 - np.exp(-1)])
     for table in ({}, {"settle_s": 1.0, "settle_captures": 1.0}):
         with pytest.raises(ValueError, match="not both"):
-            Drift.model_validate({"device": "left", **table})
+            PoseDrift.model_validate({"device": "left", **table})
 
 
 def test_a_device_drifts_from_capture_to_capture_and_stands_still_within_one(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from simulated_rig import transport
-from simulated_rig.casting import EMBREE, Caster, EmbreeCaster, TreeCaster
+from simulated_rig.casting import EMBREE, EmbreeCaster, RayCaster, TreeCaster
 from simulated_rig.optics import lens_array, world_directions
 from simulated_rig.textures import texture_value
 from simulated_rig.transport import Hits
@@ -23,7 +23,7 @@ EYE = np.array([-60.0, 0, -500])
 def traced(folder: Path, scene: str, u: FloatArray, v: FloatArray) -> Hits:
     view = small_head(folder, scene)._views["eye"]
     stage = view._stage
-    return transport.trace(
+    return transport.trace_rays(
         u, v, view._camera, stage.projector, stage.surface, stage.rays, working_distance_mm=stage.working_distance_mm
     )
 
@@ -148,7 +148,7 @@ def test_threads_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(one.weight, many.weight)
 
 
-def first_hits(rays: Caster) -> IntArray:
+def first_hits(rays: RayCaster) -> IntArray:
     target = np.random.default_rng(3).uniform(-14, 14, (300, 3))
     towards = target - np.array([0.0, 0, -100])
     return rays.first_hit(np.array([0.0, 0, -100]), towards / np.linalg.norm(towards, axis=1, keepdims=True))

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from drivers.depthai import find_devices, open_camera
-from drivers.depthai.board import Board, require_one_clock
+from drivers.depthai.board import OakDevice, require_one_clock
 from slrig.devices import Camera, CameraSettings, FoundDevice, Trigger
 from slrig.errors import (
     ConfigError,
@@ -147,14 +147,14 @@ def test_a_program_that_leaves_a_camera_open_ends() -> None:
 def test_closing_waits_for_the_thread_that_listens(monkeypatch: pytest.MonkeyPatch) -> None:
     # One that comes back from the library after the interpreter has ended aborts the program.
     ended = threading.Event()
-    end = Board._end
+    end = OakDevice._end
 
-    def slowly(board: Board, reason: str) -> None:
+    def slowly(board: OakDevice, reason: str) -> None:
         threading.Event().wait(0.05)
         end(board, reason)
         ended.set()
 
-    monkeypatch.setattr(Board, "_end", slowly)
+    monkeypatch.setattr(OakDevice, "_end", slowly)
     oak = FakeOak(small_stage())
     with oak.connected():
         camera = open_camera("left", {"device": DEVICE, "socket": "CAM_B"}, Path())

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from drivers.dlpc347x import open_projector
-from drivers.dlpc347x.bus import Bus, Node, open_bus
-from drivers.dlpc347x.flash import Lines, block_of, places_in, places_of, size_of
+from drivers.dlpc347x.bus import I2cBus, I2cNode, open_bus
+from drivers.dlpc347x.flash import LineEncoder, block_size, build_block, find_lines, locate_patterns
 from drivers.dlpc347x.projector import MIRRORS as CONTROLLERS
 from slrig.devices import FlashedProjector, UnprovenLight
 from slrig.errors import (
@@ -176,7 +176,7 @@ def test_what_the_engine_does_not_take_or_gives_back_otherwise_is_reported_and_i
     told: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("drivers.dlpc347x.engine.READY_S", 0.02)
+    monkeypatch.setattr("drivers.dlpc347x.engine.READY_TIMEOUT_S", 0.02)
     bench = Bench(**engine)
     bench.engine.bent = bent
     with pytest.raises(error, match=told):
@@ -209,7 +209,7 @@ def test_what_is_no_bus_is_reported(tmp_path: Path) -> None:
 def test_each_command_and_each_answer_is_a_transaction_of_its_own() -> None:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with far:
-        bus = Bus(Node(near.detach()), "light engine")
+        bus = I2cBus(I2cNode(near.detach()), "light engine")
         far.send(b"\x0b")
         assert bus.read(0xD3, 1, b"\2") == b"\x0b"
         bus.write(0x9E, b"\1\0")
@@ -250,21 +250,21 @@ def test_a_block_is_what_tis_own_source_makes_of_the_same_patterns(controller: i
     found = scanned(mirrors.size)
     ordered = sorted(zip(found.patterns, found.profiles, strict=True), key=lambda each: as_compiled(each[0]))
     patterns, profiles = zip(*ordered, strict=True)
-    block = block_of(PatternSequence(found.projector, patterns, profiles), Lines(mirrors, (False, False)))
+    block = build_block(PatternSequence(found.projector, patterns, profiles), LineEncoder(mirrors, (False, False)))
     assert (len(block), hashlib.sha256(block).hexdigest()) == (length, digest)
-    assert size_of(block[:20]) == length
+    assert block_size(block[:20]) == length
 
 
 def test_more_patterns_than_a_set_holds_go_into_further_ones_with_white_and_black() -> None:
     _, mirrors = CONTROLLERS[0x0B]
-    lines = Lines(mirrors, (False, False))
+    lines = LineEncoder(mirrors, (False, False))
     sequence = scanned(mirrors.size, period_px=80)
-    held = places_in(block_of(sequence, lines))
-    places = places_of(sequence, lines, held)
+    held = find_lines(build_block(sequence, lines))
+    places = locate_patterns(sequence, lines, held)
     assert len(held) > 2 * 80
     assert {place.set for place in places} == {0, 1, 2, 3}
     assert max(place.index for found in held.values() for place in found) == 63
     columns = encode(sequence.patterns[60:90], mirrors.size)
-    assert {place.set for place in places_of(columns, lines, held)} == {0, 1}
+    assert {place.set for place in locate_patterns(columns, lines, held)} == {0, 1}
     white_and_one = encode((sequence.patterns[0], sequence.patterns[90]), mirrors.size)
-    assert {place.set for place in places_of(white_and_one, lines, held)} == {1}
+    assert {place.set for place in locate_patterns(white_and_one, lines, held)} == {1}

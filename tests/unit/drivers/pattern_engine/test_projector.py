@@ -251,7 +251,7 @@ def test_the_trigger_output_is_set(usb_bench: UsbBench, options: dict[str, Any],
 def test_a_setting_that_the_engine_bends_is_refused_and_it_is_dark(
     usb_bench: UsbBench, command: int, got: bytes, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers.dlpc900.projector.MODE_S", 0.02)
+    monkeypatch.setattr("drivers.dlpc900.projector.MODE_CHANGE_S", 0.02)
     usb_bench.engine.registers[0x0B01] = b"\1\1\1"
     usb_bench.engine.faults.bent = {command: got}
     with pytest.raises(UnsupportedByDeviceError, match=words):

@@ -114,7 +114,7 @@ class Line(ABC):
 
 
 class MemoryLine(Line):
-    """A line in memory, on a clock of tests. Implements `drivers.serial_port.Port`.
+    """A line in memory, on a clock of tests. Implements `drivers.serial_port.BytePort`.
 
     The box catches up with the clock whenever anybody looks: what was due meanwhile is done at the time when it was.
     """
@@ -168,7 +168,7 @@ class MemoryLine(Line):
             self._take(data)
 
     def close(self) -> None:
-        """See `Port`."""
+        """See `BytePort`."""
 
     def _due_ns(self) -> int | None:
         wait_s, at_ns = self.engine.wait_s(), self.engine.scene.at_ns

@@ -15,11 +15,11 @@ import pytest
 
 from drivers.serial_port import SerialPort
 from drivers.serial_projector import open_projector
-from drivers.serial_projector.client import Client, Limits
+from drivers.serial_projector.client import BoxClient, BoxLimits
 from drivers.serial_projector.device import protocol
-from drivers.serial_projector.frames import Mode
-from drivers.serial_projector.link import Link
-from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each
+from drivers.serial_projector.frames import SequenceMode
+from drivers.serial_projector.link import BoxLink
+from drivers.serial_projector.pattern_set import pattern_checksums, sequence_checksum
 from drivers.serial_projector.projector import SerialProjector
 from slrig.devices import FlashedProjector
 from slrig.errors import (
@@ -111,7 +111,7 @@ def test_a_play_lights_every_pattern_once_and_pulses_the_cameras(bench: Bench) -
 def test_patterns_can_be_stepped_by_trigger(bench: Bench) -> None:
     client = bench.open().client
     assert client.load(CRC32[8:11]) == ()
-    client.sequence(0, 3, 4_000, 8_000, Mode.STEP)
+    client.sequence(0, 3, 4_000, 8_000, SequenceMode.STEP)
     for index in range(3):
         t_ns, error_ns = client.trigger(index)
         assert abs(t_ns - bench.scene.changes[-1].t_ns) <= error_ns + 1_000
@@ -141,7 +141,7 @@ def test_what_is_flashed_is_shown_in_any_order_and_as_often_as_wanted(
 
 
 def test_a_box_of_old_firmware_takes_runs_and_nothing_else(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(protocol, "MOST_PICKED", 0)
+    monkeypatch.setattr(protocol, "MAX_PICKED", 0)
     projector = bench.open()
     assert projector.client.box.pick == 0
     projector.load(part(2, 14))
@@ -168,13 +168,13 @@ def test_each_set_of_patterns_is_written_into_a_folder_of_its_own(bench: Bench, 
     projector = bench.open(tmp_path)
     assert isinstance(projector, FlashedProjector)
     told = [projector.write_patterns(each) for each in (SEQUENCE, BACKWARDS, SEQUENCE)]
-    first, second = (crc32_of_all(crc32_of_each(each)) for each in (SEQUENCE, BACKWARDS))
+    first, second = (sequence_checksum(pattern_checksums(each)) for each in (SEQUENCE, BACKWARDS))
     assert {folder.name for folder in (tmp_path / "patterns").iterdir()} == {f"{first:08X}", f"{second:08X}"}
     folder = tmp_path / "patterns" / f"{second:08X}"
     assert str(folder) in told[1]
     listed = json.loads((folder / "patterns.json").read_text())
     assert listed["size_px"] == [400, 300]
-    assert [int(each, 16) for each in listed["crc32"]] == list(crc32_of_each(BACKWARDS))
+    assert [int(each, 16) for each in listed["crc32"]] == list(pattern_checksums(BACKWARDS))
     for index in (0, 7, 25):
         image = cv2.imread(str(folder / f"{index:03d}.png"), cv2.IMREAD_UNCHANGED)
         assert image is not None
@@ -399,10 +399,10 @@ def test_close_from_another_thread_ends_a_wait(bench: Bench) -> None:
 def test_a_second_host_that_gets_in_anyway_is_turned_away(bench: Bench) -> None:
     projector = bench.loaded()
     projector.show(0)
-    second = Link(bench.line, 0.05, 1.0, clock=bench.clock)
+    second = BoxLink(bench.line, 0.05, 1.0, clock=bench.clock)
     begun_ns = bench.clock.now_ns()
     with pytest.raises(DeviceBusyError, match="in a session with another host"):
-        Client(second, Limits(1000, 1000, 1000, 1000), label="x", open_s=0.5)
+        BoxClient(second, BoxLimits(1000, 1000, 1000, 1000), label="x", open_s=0.5)
     assert 0.5e9 <= bench.clock.now_ns() - begun_ns <= 0.7e9
     projector.show(1)
     assert bench.patterns == [0, 1]
