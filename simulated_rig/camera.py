@@ -9,10 +9,9 @@ from functools import partial
 
 import numpy as np
 
-from simulated_rig.light import Float32Array, LightTable
+from simulated_rig.light import Float32Array, Lamp, LightFlicker, LightTable, nanoseconds
 from simulated_rig.options import Faults, SimulatedCameraOptions
 from simulated_rig.rendering import CameraView
-from simulated_rig.world import Lamp, LightFlicker, nanoseconds
 from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings, CameraState, Clock, Trigger
 from slrig.errors import DeviceGoneError, FrameTimeoutError
 from slrig.model import CameraFormat, Frame, Pixels

@@ -3,23 +3,195 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from simulated_rig.camera import SimulatedCamera
-from simulated_rig.options import HeadOptions
-from simulated_rig.projector import SimulatedProjector
+from simulated_rig.light import (
+    NS_PER_S,
+    Lamp,
+    LightFlicker,
+    LightTable,
+    VirtualClock,
+    dark_table,
+    desktop_table,
+    light_table,
+    nanoseconds,
+)
+from simulated_rig.movements import RenderedTurntable
+from simulated_rig.options import Faults, HeadOptions, SimulatedProjectorOptions
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import read_scene
 from simulated_rig.staging import PoseScript, SceneController
-from simulated_rig.turning import RenderedTurntable
-from simulated_rig.world import LightFlicker, VirtualClock
 from slrig.bundle.validation import checked
-from slrig.devices import Camera, Clock, Head, Positioner, SystemClock, progress_reporter
+from slrig.devices import (
+    COMPUTED,
+    Camera,
+    Clock,
+    Head,
+    Positioner,
+    ProjectorInfo,
+    ProjectorState,
+    Shown,
+    SystemClock,
+    progress_reporter,
+)
+from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.kernels import compilations_told
-from slrig.model import Calibration, Surface, Truth
+from slrig.model import Calibration, PatternSequence, Primary, Surface, Truth
+
+NAME = "projector"
+CHANNELS = ("blue", "green", "red")
+
+
+class SimulatedProjector:
+    """Implements `slrig.devices.Projector` on the rendered world. Tells `staging` of each capture and pattern."""
+
+    def __init__(
+        self,
+        options: SimulatedProjectorOptions,
+        clock: Clock,
+        *,
+        faults: Faults,
+        seed: int,
+        staging: SceneController | None = None,
+    ) -> None:
+        self._options = options
+        self._clock = clock
+        self._faults = faults
+        self._staging = staging
+        self._response = options.response()
+        self._dark = self._table(np.zeros((1, 1), np.uint8))
+        swing = LightFlicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
+        self.lamp = Lamp(self._dark, swing)
+        self._rng = np.random.default_rng((seed, 0x70726F6A))
+        self._state = ProjectorState("the rendered projector")
+        self._tables: dict[int, LightTable] = {}
+        self._shows = 0
+        self._showing: int | None = None
+        self._gone = False
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        return ProjectorInfo(
+            name=NAME,
+            model="rendered projector",
+            serial="simulated",
+            size=self._options.size,
+            plays=False,
+            latency_s=self._options.latency_s,
+            refresh_s=None if self._options.refresh_hz is None else 1 / self._options.refresh_hz,
+            limits=COMPUTED,
+            lights=self._options.lights is not None,
+        )
+
+    @property
+    def showing(self) -> int | None:
+        """The pattern that the projector was last told to show, None when it was told to be dark."""
+        return self._showing
+
+    @property
+    def lit(self) -> bool:
+        """Whether more light than the dark projector's leak is on the scene now."""
+        return self.lamp.light_at(self._clock.now_ns()).peak > self._dark.peak * (1 + 1e-6)
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`. What was shown before goes dark."""
+        self._require_usable()
+        self._state.require_size(sequence, self._options.size)
+        if len(sequence) > self._options.max_patterns:
+            message = (
+                f"the projector holds {self._options.max_patterns} patterns, the sequence has {len(sequence)}; "
+                "shorten it or raise max_patterns"
+            )
+            raise UnsupportedByDeviceError(message)
+        for index, profile in enumerate(sequence.profiles):
+            if min(profile.shape) > 1:
+                message = (
+                    f"pattern {index} varies along both axes ({profile.shape}), the rendered projector shows patterns "
+                    "that vary along one"
+                )
+                raise UnsupportedByDeviceError(message)
+        self.blank()
+        self._state.loaded, self._tables = sequence, {}
+        if self._staging is not None:
+            self._staging.begun(len(sequence))
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`."""
+        self._require_usable()
+        sequence = self._state.require_pattern(index)
+        if self._faults.unplug_projector_at_show is not None and self._shows >= self._faults.unplug_projector_at_show:
+            self._gone, self._showing = True, None
+            self.lamp.darken(at_ns=self._clock.now_ns())
+            self._require_usable()
+        self._shows += 1
+        if self._staging is not None:
+            self._staging.shown()
+        if index not in self._tables:
+            table, pattern = self._table(sequence.profiles[index]), sequence.patterns[index]
+            if isinstance(pattern, Primary) and self._options.lights is not None:
+                channel = CHANNELS.index(pattern.colour)
+                table = replace(table, channel=channel, power=self._options.lights[channel])
+            self._tables[index] = table
+        error_s = self._options.visible_error_s
+        t_visible_ns = self._at_refresh(self._clock.now_ns() + nanoseconds(self._options.latency_s))
+        off_s = float(self._rng.uniform(-error_s, error_s)) + self._faults.light_delay_s
+        self.lamp.show(self._tables[index], at_ns=t_visible_ns + nanoseconds(off_s))
+        self._showing = index
+        self._clock.wait_until(t_visible_ns + nanoseconds(error_s), self._state.closed)
+        return Shown(index, t_visible_ns, nanoseconds(error_s))
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. This one does not play."""
+        self._require_usable()
+        self._state.refuse_to_play(exposure_s, period_s)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self.blank()
+
+    def blank(self) -> None:
+        """See `Projector`. Raises DeviceGoneError after an unplug: nobody can say what it shows."""
+        if self._state.closed.is_set():
+            return
+        if self._gone:
+            self._require_usable()
+        self._showing = None
+        self.lamp.darken(at_ns=self._clock.now_ns())
+
+    def close(self) -> None:
+        """See `Projector`."""
+        if not self._gone:
+            self.blank()
+        self._showing, self._state.loaded, self._tables = None, None, {}
+        self._state.closed.set()
+
+    def _at_refresh(self, t_ns: int) -> int:
+        refresh_hz = self._options.refresh_hz
+        return t_ns if refresh_hz is None else round(-(-t_ns * refresh_hz // NS_PER_S) / refresh_hz * NS_PER_S)
+
+    def _table(self, profile: np.ndarray[tuple[int, ...], np.dtype[np.unsignedinteger]]) -> LightTable:
+        if self._faults.lamp_off:
+            return dark_table(self._options.size)
+        if self._faults.picture in ("mirrored", "rotated"):
+            profile = profile[:, ::-1]
+        if self._faults.picture in ("upside_down", "rotated"):
+            profile = profile[::-1]
+        if self._faults.other_display:
+            glow = self._faults.other_display_glow * float(self._response.light(profile).mean())
+            return replace(desktop_table(self._options.size, self._response), glow=glow)
+        return light_table(profile, self._options.size, self._response)
+
+    def _require_usable(self) -> None:
+        self._state.require_open()
+        if self._gone:
+            message = "the projector is gone (unplugged or powered off); plug it in and open the rig again"
+            raise DeviceGoneError(message)
 
 
 class SimulatedHead:

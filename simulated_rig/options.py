@@ -7,14 +7,19 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from simulated_rig.defocus import Focus
-from simulated_rig.disturbing import PROJECTOR, BumpFault, ObjectMotion, PoseDrift
 from simulated_rig.light import Response
-from simulated_rig.optics import look_at
-from simulated_rig.poses import PoseSeries, ScriptedPose
-from simulated_rig.sensor import SensorModel
-from simulated_rig.tables import Fraction, Names, NotNegative, Pair, Positive, Triple, require_one
-from simulated_rig.turning import TurntableOptions
+from simulated_rig.movements import (
+    PROJECTOR,
+    BumpFault,
+    ObjectMotion,
+    PoseDrift,
+    PoseSeries,
+    ScriptedPose,
+    TurntableOptions,
+)
+from simulated_rig.optics import Focus, look_at
+from simulated_rig.rendering import SensorModel
+from simulated_rig.scene import Fraction, Names, NotNegative, Pair, Positive, Triple, require_one
 from slrig.bundle.validation import Strict
 from slrig.errors import CalibrationError
 from slrig.model import Pinhole, Size

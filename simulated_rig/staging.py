@@ -8,14 +8,19 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from simulated_rig.boards import PrintedBoard
-from simulated_rig.disturbing import PROJECTOR, ObjectMotion, PoseChange, apply_pose_change
+from simulated_rig.light import NS_PER_S
+from simulated_rig.movements import PROJECTOR, ObjectMotion, PoseChange, ScriptedPose, apply_pose_change, generate_poses
 from simulated_rig.options import HeadOptions
-from simulated_rig.placed import SceneObject, place_object, rotation_matrix
-from simulated_rig.poses import ScriptedPose, generate_poses
 from simulated_rig.rendering import CameraView, SceneState
-from simulated_rig.scene import Scene, SceneSurface, build_surface
-from simulated_rig.world import NS_PER_S
+from simulated_rig.scene import (
+    PrintedBoard,
+    Scene,
+    SceneObject,
+    SceneSurface,
+    build_surface,
+    place_object,
+    rotation_matrix,
+)
 from slrig.devices import Clock
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Pinhole

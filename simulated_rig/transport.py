@@ -9,26 +9,367 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
-from simulated_rig.casting import RayCaster
-from simulated_rig.optics import LensArray, distort, field_radius, lens_array, world_directions
-from simulated_rig.printing import print_reflectance
-from simulated_rig.scene import SceneSurface
-from simulated_rig.textures import texture_value
+from simulated_rig.optics import LensArray, distort, field_radius, lens_array, undistort, world_directions
+from simulated_rig.scene import BoardPrint, SceneSurface
+from slrig.errors import ConfigError
 from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, IntArray, Pinhole
 
+try:
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    EMBREE = True
+except ImportError:  # no wheel for this processor
+    EMBREE = False
+
+
+_REACH = 0.9
+"""Of a cell's side: more than half its diagonal, with room for the lens's stretch. Farther edges need no clipping."""
+_MAX_CORNERS = 12
 SHADOW_BIAS_MM = 0.05
 """A surface shades a point only if it lies nearer to the projector by more than this: facets must not shade
 the curved surface that they stand for."""
-
 LUMA = (0.114, 0.587, 0.299)
 """What blue, green and red light are of grey (Rec. 601)."""
-
 _BLOCK_RAYS = 120_000
+
+
+class RayCaster(Protocol):
+    """A surface that rays can be cast at."""
+
+    def first_hit(self, origin_mm: FloatArray, directions: FloatArray) -> IntArray:
+        """(n,) int32: index of the first triangle along each ray, -1 where there is none.
+
+        origin_mm : (3,) float64; directions : (n, 3) float64, unit.
+        """
+        ...
+
+
+class EmbreeCaster:
+    """Embree, in single precision about the middle of the scene.
+
+    It only names the triangle; the caller computes the point in double precision, so its rounding moves no surface.
+    """
+
+    def __init__(self, vertices_mm: FloatArray, faces: IntArray) -> None:
+        self._middle = (vertices_mm.min(axis=0) + vertices_mm.max(axis=0)) / 2
+        self._scene = EmbreeScene()
+        # embreex reads the buffers as they lie in memory: by rows.
+        vertices = np.ascontiguousarray(vertices_mm - self._middle, np.float32)
+        TriangleMesh(scene=self._scene, vertices=vertices, indices=np.ascontiguousarray(faces, np.int32))
+
+    def first_hit(self, origin_mm: FloatArray, directions: FloatArray) -> IntArray:
+        """See `RayCaster`. Runs without the interpreter's lock."""
+        origins = np.broadcast_to((origin_mm - self._middle).astype(np.float32), directions.shape)
+        found: NDArray[np.int32] = self._scene.run(
+            np.ascontiguousarray(origins), np.ascontiguousarray(directions, np.float32)
+        )
+        return found
+
+
+class TreeCaster:
+    """trimesh's R-tree caster: a hundred times slower, and everywhere."""
+
+    def __init__(self, vertices_mm: FloatArray, faces: IntArray) -> None:
+        mesh = trimesh.Trimesh(vertices_mm, faces, process=False)
+        self._mesh = trimesh.ray.ray_triangle.RayMeshIntersector(mesh)
+
+    def first_hit(self, origin_mm: FloatArray, directions: FloatArray) -> IntArray:
+        """See `RayCaster`."""
+        origins = np.broadcast_to(origin_mm, directions.shape)
+        return np.asarray(self._mesh.intersects_first(origins, directions), np.int32)
+
+
+def build_caster(vertices_mm: FloatArray, faces: IntArray) -> RayCaster:
+    """Return the fastest caster that this machine has. Raises ConfigError when it has none."""
+    if EMBREE:
+        return EmbreeCaster(vertices_mm, faces)
+    try:
+        return TreeCaster(vertices_mm, faces)
+    except ImportError as error:
+        message = "the rendered rig needs a ray caster: found neither embreex nor rtree; install one of them with pip"
+        raise ConfigError(message) from error
+
+
+def print_reflectance(
+    points: FloatArray,
+    normals: FloatArray,
+    triangle: IntArray,
+    u: FloatArray,
+    v: FloatArray,
+    camera: Pinhole,
+    surface: SceneSurface,
+    *,
+    footprint_px: float,
+) -> FloatArray:
+    """(n,) float64: what prints leave of the albedo at the points that a camera's rays through u, v met; else 1.
+
+    Each point of a print is moved, in place, to the middle of the light that its cell sends back: a cell half in the
+    dark is lit where its light half lies. footprint_px : side of a sample's cell; 0 takes the print at the point.
+    """
+    out = np.ones(len(u))
+    for part, shown in surface.prints.items():
+        _fill_reflectance(
+            out,
+            points,
+            normals,
+            triangle,
+            u,
+            v,
+            surface.part,
+            part,
+            surface.to_object[part],
+            camera.centre_mm,
+            lens_array(camera),
+            camera.rotation,
+            footprint_px,
+            *_numbers(shown),
+        )
+    return out
+
+
+def _numbers(
+    shown: BoardPrint,
+) -> tuple[FloatArray, FloatArray, NDArray[np.uint8], FloatArray, float, float, float]:
+    return (
+        shown.across_mm,
+        shown.down_mm,
+        shown.dark,
+        shown.centres_mm,
+        shown.radius_mm,
+        shown.dark_share,
+        shown.curvature_per_mm,
+    )
+
+
+@kernel_part
+def _arc_length(x: float, curvature: float) -> float:
+    """Length along the sheet z = c x² from 0 to x."""
+    if curvature == 0.0:
+        return x
+    steep = 2.0 * curvature * x
+    return float(x * np.sqrt(1.0 + steep * steep) / 2.0 + np.arcsinh(steep) / (4.0 * curvature))
+
+
+@kernel_part
+def _clip_polygon(polygon: FloatArray, count: int, a: float, b: float, limit: float, out: FloatArray) -> int:
+    """Keep of a convex polygon what has a x + b y <= limit (Sutherland and Hodgman 1974). Returns its corner count."""
+    kept = 0
+    for i in range(count):
+        j = i + 1 if i + 1 < count else 0
+        here = a * polygon[i, 0] + b * polygon[i, 1] - limit
+        there = a * polygon[j, 0] + b * polygon[j, 1] - limit
+        if here <= 0.0:
+            out[kept, 0], out[kept, 1] = polygon[i, 0], polygon[i, 1]
+            kept += 1
+        if (here < 0.0 < there) or (there < 0.0 < here):
+            share = here / (here - there)
+            out[kept, 0] = polygon[i, 0] + share * (polygon[j, 0] - polygon[i, 0])
+            out[kept, 1] = polygon[i, 1] + share * (polygon[j, 1] - polygon[i, 1])
+            kept += 1
+    return kept
+
+
+@kernel_part
+def _moments(polygon: FloatArray, count: int) -> tuple[float, float, float]:
+    """Area of a polygon and its first moments in x and y; the area's sign is that of the way round."""
+    area, mx, my = 0.0, 0.0, 0.0
+    for i in range(count):
+        j = i + 1 if i + 1 < count else 0
+        cross = polygon[i, 0] * polygon[j, 1] - polygon[j, 0] * polygon[i, 1]
+        area += cross
+        mx += cross * (polygon[i, 0] + polygon[j, 0])
+        my += cross * (polygon[i, 1] + polygon[j, 1])
+    return area / 2.0, mx / 6.0, my / 6.0
+
+
+@kernel_part
+def _dark_in_rectangles(
+    cell: FloatArray,
+    x0: float,
+    y0: float,
+    across: FloatArray,
+    down: FloatArray,
+    dark: NDArray[np.uint8],
+    first: FloatArray,
+    second: FloatArray,
+) -> tuple[float, float, float]:
+    """Dark area of a cell, its corners about (x0, y0), and that area's first moments."""
+    area, mx, my = 0.0, 0.0, 0.0
+    left, right = cell[:, 0].min() + x0, cell[:, 0].max() + x0
+    top, bottom = cell[:, 1].min() + y0, cell[:, 1].max() + y0
+    i0 = max(np.searchsorted(down, top, "right") - 1, 0)
+    j0 = max(np.searchsorted(across, left, "right") - 1, 0)
+    for i in range(i0, len(down) - 1):
+        if down[i] >= bottom:
+            break
+        for j in range(j0, len(across) - 1):
+            if across[j] >= right:
+                break
+            if dark[i, j] == 0:
+                continue
+            count = _clip_polygon(cell, 4, -1.0, 0.0, -(across[j] - x0), first)
+            count = _clip_polygon(first, count, 1.0, 0.0, across[j + 1] - x0, second)
+            count = _clip_polygon(second, count, 0.0, -1.0, -(down[i] - y0), first)
+            count = _clip_polygon(first, count, 0.0, 1.0, down[i + 1] - y0, second)
+            a, x, y = _moments(second, count)
+            area, mx, my = area + a, mx + x, my + y
+    return area, mx, my
+
+
+@kernel_part
+def _nearest_disc(x: float, y: float, centres: FloatArray) -> tuple[int, float]:
+    best, least = 0, np.inf
+    for k in range(len(centres)):
+        square = (centres[k, 0] - x) ** 2 + (centres[k, 1] - y) ** 2
+        if square < least:
+            best, least = k, square
+    return best, np.sqrt(least)
+
+
+@kernel_part
+def _print_at_point(
+    x: float,
+    y: float,
+    reach: float,
+    across: FloatArray,
+    down: FloatArray,
+    dark: NDArray[np.uint8],
+    centres: FloatArray,
+    radius: float,
+) -> tuple[bool, bool]:
+    """Whether the print is dark at a point, and whether it is the same everywhere within `reach` of it."""
+    if len(centres) > 0:
+        _best, distance = _nearest_disc(x, y, centres)
+        return distance < radius, abs(distance - radius) > reach
+    j, i = np.searchsorted(across, x, "right") - 1, np.searchsorted(down, y, "right") - 1
+    if i < 0 or j < 0 or i >= len(down) - 1 or j >= len(across) - 1:
+        outside = x < across[0] - reach or x > across[-1] + reach or y < down[0] - reach or y > down[-1] + reach
+        return False, outside
+    same = x - across[j] > reach and across[j + 1] - x > reach and y - down[i] > reach and down[i + 1] - y > reach
+    return dark[i, j] == 1, same
+
+
+@kernel(in_every_scan=False)
+def _fill_reflectance(
+    out: FloatArray,
+    points: FloatArray,
+    normals: FloatArray,
+    triangle: IntArray,
+    u: FloatArray,
+    v: FloatArray,
+    part: IntArray,
+    own: int,
+    frame: FloatArray,
+    eye: FloatArray,
+    lens: LensArray,
+    rotation: FloatArray,
+    footprint: float,
+    across: FloatArray,
+    down: FloatArray,
+    dark: NDArray[np.uint8],
+    centres: FloatArray,
+    radius: float,
+    dark_share: float,
+    curvature: float,
+) -> None:
+    """Fill `out` at the hits of part `own`, and move their points. See `print_reflectance`."""
+    cell = np.zeros((4, 2))
+    first, second = np.zeros((_MAX_CORNERS, 2)), np.zeros((_MAX_CORNERS, 2))
+    ray = np.zeros(3)
+    narrow = min(lens[0], lens[1])
+    for k in range(len(u)):
+        if triangle[k] < 0 or part[triangle[k]] != own or not np.isfinite(points[k, 0]):
+            continue
+        p, n = points[k], normals[k]
+        x = frame[0, 0] * p[0] + frame[0, 1] * p[1] + frame[0, 2] * p[2] + frame[0, 3]
+        y = frame[1, 0] * p[0] + frame[1, 1] * p[1] + frame[1, 2] * p[2] + frame[1, 3]
+        s = _arc_length(x, curvature)
+        d0, d1, d2 = p[0] - eye[0], p[1] - eye[1], p[2] - eye[2]
+        distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+        # Distance to the sheet's plane; over the distance along the ray, the cosine at which it is met.
+        height = -(n[0] * d0 + n[1] * d1 + n[2] * d2)
+        reach = _REACH * footprint * distance / narrow * distance / max(height, 1e-9)
+        inked, same = _print_at_point(s, y, reach, across, down, dark, centres, radius)
+        if same or footprint == 0.0:
+            if inked:
+                out[k] = dark_share
+            continue
+        # The cell's four corners on the plane that touches the sheet here, along the sheet and about this point.
+        cu = (np.floor((u[k] + 0.5) / footprint) + 0.5) * footprint - 0.5
+        cv = (np.floor((v[k] + 0.5) / footprint) + 0.5) * footprint - 0.5
+        for corner in range(4):
+            du = -0.5 if corner == 0 or corner == 3 else 0.5
+            dv = -0.5 if corner < 2 else 0.5
+            a, b = undistort((cu + du * footprint - lens[2]) / lens[0], (cv + dv * footprint - lens[3]) / lens[1], lens)
+            for axis in range(3):
+                ray[axis] = rotation[0, axis] * a + rotation[1, axis] * b + rotation[2, axis]
+            t = -height / (n[0] * ray[0] + n[1] * ray[1] + n[2] * ray[2])
+            q0, q1, q2 = eye[0] + t * ray[0], eye[1] + t * ray[1], eye[2] + t * ray[2]
+            qx = frame[0, 0] * q0 + frame[0, 1] * q1 + frame[0, 2] * q2 + frame[0, 3]
+            qy = frame[1, 0] * q0 + frame[1, 1] * q1 + frame[1, 2] * q2 + frame[1, 3]
+            cell[corner, 0], cell[corner, 1] = _arc_length(qx, curvature) - s, qy - y
+        area, mx, my = _moments(cell, 4)
+        if len(centres) > 0:
+            # So near its rim a disc of many cells is a half-plane.
+            best, off = _nearest_disc(s, y, centres)
+            a, b = (s - centres[best, 0]) / off, (y - centres[best, 1]) / off
+            count = _clip_polygon(cell, 4, a, b, radius - off, first)
+            inked_area, ix, iy = _moments(first, count)
+        else:
+            inked_area, ix, iy = _dark_in_rectangles(cell, s, y, across, down, dark, first, second)
+        lost = (1.0 - dark_share) * inked_area / area
+        out[k] = 1.0 - lost
+        # From the cell's middle to the middle of what it sends back, in the sheet's plane.
+        move_x = (mx - (1.0 - dark_share) * ix) / (area * out[k]) - mx / area
+        move_y = (my - (1.0 - dark_share) * iy) / (area * out[k]) - my / area
+        rise, slope = 0.0, 0.0
+        for axis in range(3):
+            rise -= n[axis] * (move_x * frame[0, axis] + move_y * frame[1, axis])
+            slope += n[axis] * frame[2, axis]
+        for axis in range(3):
+            points[k, axis] += move_x * frame[0, axis] + move_y * frame[1, axis] + rise / slope * frame[2, axis]
+
+
+@kernel_part
+def _hash01(x: int, y: int, z: int) -> float:
+    """A number in 0..1 that looks random, the same for the same lattice point."""
+    # 64-bit arithmetic cut to 32 bits after each product: the same under numba and in plain Python.
+    h = ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & 0xFFFFFFFF
+    h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
+    h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
+    return float(h ^ (h >> 16)) / 4294967295.0
+
+
+@kernel_part
+def texture_value(kind: int, x: float, y: float, z: float) -> float:
+    """Darkness 0..1 of a texture at (x, y, z), in grains. 0 uniform, 1 checker, 2 smooth value noise, two octaves."""
+    if kind == 1:
+        return float((int(np.floor(x)) + int(np.floor(y))) % 2)
+    if kind != 2:
+        return 0.0
+    total = 0.0
+    for octave in range(2):
+        scale = 1.0 + octave
+        xs, ys, zs = x * scale, y * scale, z * scale
+        i, j, k = int(np.floor(xs)), int(np.floor(ys)), int(np.floor(zs))
+        fx, fy, fz = xs - i, ys - j, zs - k
+        # Smoothstep, so that the shading has no creases at the lattice.
+        fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
+        value = 0.0
+        for corner in range(8):
+            a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
+            share = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if c else 1 - fz)
+            value += share * _hash01(i + a, j + b, k + c)
+        total += value * (2.0 / 3.0 if octave == 0 else 1.0 / 3.0)
+    return total
 
 
 @dataclass(frozen=True, slots=True)

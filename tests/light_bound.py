@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulated_rig.light import NODES_PER_PX, Float32Array, LightTable, Response, light_table
-from simulated_rig.rendering import CameraView
-from simulated_rig.sensor import SensorModel
+from simulated_rig.rendering import CameraView, SensorModel
 from slrig.model import FloatArray, IntArray, Pixels, Size
 
 _STEP_PX = 1.0 / NODES_PER_PX

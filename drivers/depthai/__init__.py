@@ -2,7 +2,7 @@
 
 from drivers.depthai.calibration import FactoryCalibration, Lens, read_calibration, read_factory_calibration
 from drivers.depthai.camera import OakCamera, open_camera
-from drivers.depthai.finder import find_devices
+from drivers.depthai.device import find_devices
 from drivers.depthai.options import OakOptions
 
 __all__ = [

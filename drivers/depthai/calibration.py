@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drivers.depthai.board import open_device
+from drivers.depthai.device import open_device
 from drivers.depthai.library import load_depthai
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size
@@ -72,7 +72,7 @@ def read_factory_calibration(device: str, cameras: Mapping[str, Lens] | None = N
     CalibrationError
         Nothing is stored for one of the cameras, or its lens cannot be written with five coefficients.
     LibraryMissingError, DeviceBusyError, DeviceGoneError, DeviceError
-        See `drivers.depthai.board.open_device`.
+        See `drivers.depthai.device.open_device`.
     """
     vendor = load_depthai()
     board = open_device(device)

@@ -14,12 +14,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from drivers.depthai.board import CameraLink, OakDevice, open_device
-from drivers.depthai.feed import MAX_WAITING_FRAMES, FrameQueue
-from drivers.depthai.library import load_depthai
-from drivers.depthai.messages import OakFrame, colour_reader, read_luminance
+from drivers.depthai.device import (
+    MAX_WAITING_FRAMES,
+    CameraLink,
+    FrameQueue,
+    OakDevice,
+    OakFrame,
+    colour_reader,
+    open_device,
+    read_luminance,
+)
+from drivers.depthai.library import OakSensor, load_depthai
 from drivers.depthai.options import OakOptions, OakStream
-from drivers.depthai.sensors import OakSensor
 from slrig.bundle.validation import checked
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import CalibrationError, FrameTimeoutError, UnsupportedByDeviceError

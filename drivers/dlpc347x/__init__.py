@@ -43,6 +43,8 @@ from pathlib import Path
 from slrig.bundle.validation import checked
 from slrig.devices import Projector
 
+__all__ = ["open_projector"]
+
 
 def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  # noqa: ARG001 - no path is in them
     """Open a light engine from a rig file's `[projector]` table (without its `driver`). It is dark afterwards.
@@ -77,6 +79,3 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     require_linux("dlpc347x", through="the kernel's /dev/i2c-*", instead="run slrig on Linux for it")
     table = checked(Dlpc347xEngineOptions, options, "the [projector] table of a light engine")
     return Dlpc347xProjector(open_bus(Path(table.device), table.address), table)
-
-
-__all__ = ["open_projector"]

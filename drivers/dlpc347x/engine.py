@@ -20,39 +20,6 @@ from drivers.dlpc347x.flash import HEAD_BYTES, FlashedLine, block_size
 from drivers.pattern_engine.options import LedColour
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 
-
-class Dlpc347xCommand(IntEnum):
-    """Writes. That with the next number reads what was set."""
-
-    MODE = 0x05  # 4: patterns from flash
-    LED_CONTROL = 0x50  # 0: by the currents that are set
-    LED_ENABLE = 0x52  # bits 0-2 red, green, blue
-    LED_CURRENT = 0x54  # red, green, blue: 2 bytes each; more is more current ("directly controls the LED current")
-    TRIGGER_IN = 0x90  # bit 0: patterns wait for it
-    TRIGGER_OUT = 0x92  # bit 0: 2, not 1; bit 1 on; bit 2 inverted; delay (4, µs)
-    ORDER = 0x98
-    CONTROL = 0x9E  # 0 start, 1 stop; how often it is repeated
-    FLASH_KIND = 0xDE
-    FLASH_LENGTH = 0xDF
-    FLASH_ERASE = 0xE0
-    FLASH_WRITE = 0xE1  # and E2h for what follows
-
-
-class Dlpc347xRead(IntEnum):
-    """Reads of what is not set."""
-
-    LED_MOST = 0x5D
-    LIGHT = 0x9D  # mode, depth, light (4, µs): bit 0 supported; least light, dark before, dark after (4 each, µs)
-    STATE = 0x9F  # ready, entries of the order, and five more
-    SHORT = 0xD0
-    SYSTEM = 0xD1
-    VERSION = 0xD2  # patch (2), minor, major
-    COMMUNICATION = 0xD3  # 2: of this bus
-    CONTROLLER = 0xD4
-    FLASH_CHECK = 0xDD  # bytes (4): 0 is well
-    FLASH = 0xE3  # and E4h for what follows
-
-
 INITIALISED, COMMUNICATION, SYSTEM, ERASING, FLASH, SEQUENCE, MAIN = (1 << bit for bit in (0, 1, 3, 4, 5, 6, 7))
 """Bits of the short status."""
 REFUSALS = (
@@ -95,6 +62,38 @@ PATTERN_DATA = bytes([0xD0, 0, 0, 0])
 _ENTRY = struct.Struct("<BBBQIIIB")
 _INTERNAL_MODE, _INTERNAL = 4, 1
 _ASK_AGAIN_S = 0.005
+
+
+class Dlpc347xCommand(IntEnum):
+    """Writes. That with the next number reads what was set."""
+
+    MODE = 0x05  # 4: patterns from flash
+    LED_CONTROL = 0x50  # 0: by the currents that are set
+    LED_ENABLE = 0x52  # bits 0-2 red, green, blue
+    LED_CURRENT = 0x54  # red, green, blue: 2 bytes each; more is more current ("directly controls the LED current")
+    TRIGGER_IN = 0x90  # bit 0: patterns wait for it
+    TRIGGER_OUT = 0x92  # bit 0: 2, not 1; bit 1 on; bit 2 inverted; delay (4, µs)
+    ORDER = 0x98
+    CONTROL = 0x9E  # 0 start, 1 stop; how often it is repeated
+    FLASH_KIND = 0xDE
+    FLASH_LENGTH = 0xDF
+    FLASH_ERASE = 0xE0
+    FLASH_WRITE = 0xE1  # and E2h for what follows
+
+
+class Dlpc347xRead(IntEnum):
+    """Reads of what is not set."""
+
+    LED_MOST = 0x5D
+    LIGHT = 0x9D  # mode, depth, light (4, µs): bit 0 supported; least light, dark before, dark after (4 each, µs)
+    STATE = 0x9F  # ready, entries of the order, and five more
+    SHORT = 0xD0
+    SYSTEM = 0xD1
+    VERSION = 0xD2  # patch (2), minor, major
+    COMMUNICATION = 0xD3  # 2: of this bus
+    CONTROLLER = 0xD4
+    FLASH_CHECK = 0xDD  # bytes (4): 0 is well
+    FLASH = 0xE3  # and E4h for what follows
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,9 +19,9 @@ from drivers.dlpc347x.flash import (
     locate_patterns,
 )
 from drivers.dlpc347x.options import Dlpc347xEngineOptions
-from drivers.pattern_engine.light import EngineProjector
 from drivers.pattern_engine.options import LedColour
-from drivers.pattern_engine.timing import MAX_UNATTENDED_S, Timing, check_duty, light_duration_us
+from drivers.pattern_engine.patterns import MAX_UNATTENDED_S, Timing, check_duty, light_duration_us
+from drivers.pattern_engine.projector import EngineProjector
 from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size

@@ -43,6 +43,8 @@ from pathlib import Path
 from slrig.bundle.validation import checked
 from slrig.devices import FoundDevice, Projector
 
+__all__ = ["find_devices", "open_projector"]
+
 
 def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     """Open a light engine from a rig file's `[projector]` table (without its `driver`). It is dark afterwards.
@@ -72,8 +74,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     from drivers.dlpc350.flash import read_flash_list
     from drivers.dlpc350.options import Dlpc350EngineOptions
     from drivers.dlpc350.projector import DLPC350, Dlpc350Projector
-    from drivers.pattern_engine.finding import choose_engine, find_engines, require_hidraw
-    from drivers.pattern_engine.link import open_link
+    from drivers.pattern_engine.usb import choose_engine, find_engines, open_link, require_hidraw
 
     require_hidraw(DLPC350)
     table = checked(Dlpc350EngineOptions, options, "the [projector] table of a light engine")
@@ -91,9 +92,6 @@ def find_devices() -> tuple[FoundDevice, ...]:
         This is not Linux.
     """
     from drivers.dlpc350.projector import DLPC350
-    from drivers.pattern_engine.finding import list_devices
+    from drivers.pattern_engine.usb import list_devices
 
     return list_devices(DLPC350)
-
-
-__all__ = ["find_devices", "open_projector"]

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from drivers.dlpc350.engine import Dlpc350Command, Dlpc350Engine
-from drivers.dlpc350.flash import FlashContents, FlashedPlane
+from drivers.dlpc350.engine import (
+    DARK_US,
+    MAX_PATTERNS,
+    Dlpc350Command,
+    Dlpc350Engine,
+    PatternTables,
+    build_tables,
+    check_loading,
+    check_timing,
+    play_timing,
+)
+from drivers.dlpc350.flash import MIRRORS, FlashContents, FlashedPlane
 from drivers.dlpc350.options import Dlpc350EngineOptions
-from drivers.dlpc350.planes import MIRRORS
-from drivers.dlpc350.tables import PatternTables, build_tables
-from drivers.dlpc350.timing import DARK_US, MAX_PATTERNS, check_loading, check_timing, play_timing
-from drivers.pattern_engine.engine import UsbCommand as Shared
-from drivers.pattern_engine.link import UsbController, UsbLink
 from drivers.pattern_engine.options import LedColour
+from drivers.pattern_engine.patterns import MAX_UNATTENDED_S, Timing
 from drivers.pattern_engine.projector import COMMANDS_S, DIM_TIMING, START_TIMEOUT_S, UsbEngineProjector
-from drivers.pattern_engine.timing import MAX_UNATTENDED_S, Timing
+from drivers.pattern_engine.usb import UsbCommand, UsbController, UsbLink
 from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence
@@ -144,7 +150,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
     def _prepare(self) -> ProjectorInfo:
         engine, options = self._engine, self._options
         self._check_flash()
-        engine.settle_byte(Shared.DISPLAY_MODE, 1)
+        engine.settle_byte(UsbCommand.DISPLAY_MODE, 1)
         engine.settle_byte(Dlpc350Command.PATTERN_SOURCE, 3)
         engine.settle_byte(Dlpc350Command.TRIGGER_MODE, 1)
         self._set_up_light()
@@ -186,4 +192,4 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
 
     def _rest(self) -> None:
         if self._options.standby:
-            self._engine.set_byte(Shared.POWER, 1)
+            self._engine.set_byte(UsbCommand.POWER, 1)

@@ -37,6 +37,8 @@ from pathlib import Path
 from slrig.bundle.validation import checked
 from slrig.devices import FoundDevice, Projector
 
+__all__ = ["find_devices", "open_projector"]
+
 
 def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  # noqa: ARG001 - no path is in them
     """Open a light engine from a rig file's `[projector]` table (without its `driver`). It is dark afterwards.
@@ -65,8 +67,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     """
     from drivers.dlpc900.options import Dlpc900EngineOptions
     from drivers.dlpc900.projector import DLPC900, Dlpc900Projector
-    from drivers.pattern_engine.finding import choose_engine, find_engines, require_hidraw
-    from drivers.pattern_engine.link import open_link
+    from drivers.pattern_engine.usb import choose_engine, find_engines, open_link, require_hidraw
 
     require_hidraw(DLPC900)
     table = checked(Dlpc900EngineOptions, options, "the [projector] table of a light engine")
@@ -83,9 +84,6 @@ def find_devices() -> tuple[FoundDevice, ...]:
         This is not Linux.
     """
     from drivers.dlpc900.projector import DLPC900
-    from drivers.pattern_engine.finding import list_devices
+    from drivers.pattern_engine.usb import list_devices
 
     return list_devices(DLPC900)
-
-
-__all__ = ["find_devices", "open_projector"]

@@ -1,4 +1,4 @@
-"""What the DLPC900 understands beside `drivers.pattern_engine.engine`: its pattern table, and pictures over USB.
+"""What the DLPC900 understands beside `drivers.pattern_engine.usb`: its pattern table, and pictures over USB.
 
 Each command is in the guide (DLPU018 revisions F and J, the number of its table is beside it) and in TI's own program
 (API.c, `CmdList`, in github.com/RhojAnn/DLPC900_CLI under lib). Where they contradict each other, the driver does not
@@ -22,25 +22,14 @@ from collections.abc import Sequence
 from enum import IntEnum
 
 from drivers.dlpc900.pictures import MemoryPlane
-from drivers.pattern_engine import engine
-from drivers.pattern_engine.link import CommandRefusedError
+from drivers.pattern_engine.patterns import Timing, check_duty, light_duration_us
+from drivers.pattern_engine.usb import CommandRefusedError, UsbCommand, UsbEngine
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import Size
 
-
-class Dlpc900Command(IntEnum):
-    """USB commands."""
-
-    ERROR_CODE = 0x0100  # 2-11: of the last command
-    VERSION = 0x0205  # 2-7: four bytes are the application's: patch (2), minor, major
-    HARDWARE = 0x0206  # 2-9: which mirrors
-    CONFIGURATION = 0x1A31  # 2-132: entries (2), patterns to show (4)
-    ORDER = 0x1A32  # 2-134: entries (2), patterns to show (4), indices (2 each)
-    DEFINITION = 0x1A34  # 2-136: see `encode_definition`
-    PICTURE_1 = 0x1A2A  # 2-138: index (2), bytes with the header (4); of the first controller
-    DATA_1 = 0x1A2B  # 2-140: bytes (2), data
-    PICTURE_2 = 0x1A2C  # of the second controller
-    DATA_2 = 0x1A2D
+MAX_US = 2**24 - 1
+"""Exposure and dark time have 24 bits each."""
+TRIGGER_DELAY_RANGE_US = (-20, 20_000)
 
 
 _CLEARED = 1
@@ -54,7 +43,6 @@ MAX_MESSAGE_BYTES = 504
 """Bytes of a picture in one message (DLPU018 table 5-3)."""
 SECOND_READY, INCOMPATIBLE = 16, 2
 """Bits of the hardware status (DLPU018 table 2-2)."""
-
 ERRORS = {
     2: "a device failed",
     3: "it does not know the command",
@@ -75,6 +63,38 @@ ERRORS = {
     255: "it failed inside",
 }
 """DLPU018 table 2-12."""
+
+
+def play_timing(exposure_s: float, period_s: float, *, margin_s: float, duty_limit: float, least_us: int) -> Timing:
+    """How long to light patterns of which cameras take `exposure_s`, one per period; see `light_duration_us` and `check_duty`.
+    Raises UnsupportedByDeviceError: the engine does not have this timing, or the duty limit forbids it.
+    """
+    wanted_us = light_duration_us(exposure_s, period_s, margin_s=margin_s, least_us=least_us, dark_us=least_us)
+    timing = Timing(wanted_us, round(period_s * 1e6))
+    dark_us = timing.period_us - timing.exposure_us
+    if max(timing.exposure_us, dark_us) > MAX_US:
+        message = (
+            f"asked for {timing.exposure_us} µs of light and {dark_us} µs of dark after it: the longest is {MAX_US} "
+            "µs each; shorten exposure_s, or the period"
+        )
+        raise UnsupportedByDeviceError(message)
+    check_duty(timing, duty_limit)
+    return timing
+
+
+class Dlpc900Command(IntEnum):
+    """USB commands."""
+
+    ERROR_CODE = 0x0100  # 2-11: of the last command
+    VERSION = 0x0205  # 2-7: four bytes are the application's: patch (2), minor, major
+    HARDWARE = 0x0206  # 2-9: which mirrors
+    CONFIGURATION = 0x1A31  # 2-132: entries (2), patterns to show (4)
+    ORDER = 0x1A32  # 2-134: entries (2), patterns to show (4), indices (2 each)
+    DEFINITION = 0x1A34  # 2-136: see `encode_definition`
+    PICTURE_1 = 0x1A2A  # 2-138: index (2), bytes with the header (4); of the first controller
+    DATA_1 = 0x1A2B  # 2-140: bytes (2), data
+    PICTURE_2 = 0x1A2C  # of the second controller
+    DATA_2 = 0x1A2D
 
 
 class Dlpc900Mirrors(IntEnum):
@@ -116,7 +136,7 @@ def encode_definition(index: int, place: MemoryPlane, *, exposure_us: int, dark_
     )
 
 
-class Dlpc900Engine(engine.UsbEngine):
+class Dlpc900Engine(UsbEngine):
     """A DLPC900 behind a link."""
 
     def version(self) -> tuple[int, int]:
@@ -136,7 +156,7 @@ class Dlpc900Engine(engine.UsbEngine):
 
     def set_trigger_out(self, *, active_low: bool, delay_us: int) -> None:
         """Set TRIG_OUT_1 (DLPU018 table 2-112): polarity, and both edges later than the light's by the delay."""
-        self.settle(engine.UsbCommand.TRIGGER_OUT_1, struct.pack("<Bhh", active_low, delay_us, delay_us))
+        self.settle(UsbCommand.TRIGGER_OUT_1, struct.pack("<Bhh", active_low, delay_us, delay_us))
 
     def define(self, entry: bytes) -> None:
         """Set an entry of the pattern table. It holds from the next `configure` on."""
@@ -168,7 +188,7 @@ class Dlpc900Engine(engine.UsbEngine):
     def faults(self) -> str:
         """What the hardware status complains of, in words; empty if of nothing."""
         told = [super().faults()]
-        if self.byte(engine.UsbCommand.HARDWARE_STATUS) & INCOMPATIBLE:
+        if self.byte(UsbCommand.HARDWARE_STATUS) & INCOMPATIBLE:
             told.append(ERRORS[4])
         return "; ".join(filter(None, told))
 

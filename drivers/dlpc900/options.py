@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from drivers.dlpc900.timing import TRIGGER_DELAY_RANGE_US
+from drivers.dlpc900.engine import TRIGGER_DELAY_RANGE_US
 from drivers.pattern_engine.options import UsbLightOptions
 
 

@@ -27,12 +27,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.dlpc900.timing import MAX_ENTRIES
-from drivers.pattern_engine.planes import Plane, pattern_plane, plane_keys
+from drivers.pattern_engine.patterns import Plane, pattern_plane, plane_keys
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
 PLANES = 24
+MAX_ENTRIES = 400
+"""Entries of the pattern table (DLPU018 revision J, table 2-139)."""
 MAX_PICTURES = 18
 """Picture indices are 0 to 17 (DLPU018 table 2-139)."""
 _HEADER = struct.Struct("<4sHHI8sIBBB21x")

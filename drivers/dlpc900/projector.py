@@ -9,15 +9,14 @@ from drivers.dlpc900.engine import (
     Dlpc900Engine,
     Dlpc900Mirrors,
     encode_definition,
+    play_timing,
 )
 from drivers.dlpc900.options import Dlpc900EngineOptions
 from drivers.dlpc900.pictures import MemoryPlane, encode_picture, pack_sequence
-from drivers.dlpc900.timing import play_timing
-from drivers.pattern_engine.engine import UsbCommand
-from drivers.pattern_engine.link import UsbController, UsbLink
 from drivers.pattern_engine.options import LedColour
+from drivers.pattern_engine.patterns import MAX_UNATTENDED_S, Timing
 from drivers.pattern_engine.projector import COMMANDS_S, DIM_TIMING, START_TIMEOUT_S, UsbEngineProjector
-from drivers.pattern_engine.timing import MAX_UNATTENDED_S, Timing
+from drivers.pattern_engine.usb import UsbCommand, UsbController, UsbLink
 from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence

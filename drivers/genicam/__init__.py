@@ -7,8 +7,9 @@ USB3 Vision goes the same way through Aravis, and was not tried.
 harvesters; extra `gentl`. Tried on a producer of our own.
 """
 
+from drivers.genicam.aravis import find_devices
 from drivers.genicam.camera import GenicamCamera, open_camera, open_gentl_camera
-from drivers.genicam.finder import find_devices, find_gentl_devices
+from drivers.genicam.gentl import find_gentl_devices
 from drivers.genicam.options import GenicamOptions, GentlOptions
 
 __all__ = [

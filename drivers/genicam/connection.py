@@ -5,15 +5,158 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from drivers.genicam.features import Features
 from slrig.devices import CameraState
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
+
+TOLERANCE = 0.01
+"""How far a number may be from what was asked, as a fraction: cameras round to their steps."""
+
+
+class Features:
+    """The features of a device. Every call may raise what `Connection.asking` raises.
+
+    Parameters
+    ----------
+    name
+        The camera's, for messages.
+    asking
+        Gives the `Aravis.Camera` for one question; its registers must not be cached, so that what is read back comes
+        from the camera.
+    kind
+        Of a feature: see `Connection`.
+    """
+
+    def __init__(
+        self, name: str, asking: Callable[[str], AbstractContextManager[Any]], kind: Callable[[str], str]
+    ) -> None:
+        self._name = name
+        self._ask = asking
+        self._kind = kind
+
+    def has(self, feature: str) -> bool:
+        """Whether the device has the feature, and offers it as it is set now."""
+        with self._asking(feature) as camera:
+            return bool(camera.is_feature_available(feature))
+
+    def choices(self, feature: str) -> tuple[str, ...]:
+        """The entries of an enumeration that can be chosen now."""
+        with self._asking(feature) as camera:
+            return tuple(camera.dup_available_enumerations_as_strings(feature) or ())
+
+    def text(self, feature: str) -> str:
+        """The value of an enumeration or a string."""
+        with self._asking(feature) as camera:
+            return str(camera.get_string(feature))
+
+    def whole(self, feature: str) -> int:
+        """The value of an integer."""
+        with self._asking(feature) as camera:
+            return int(camera.get_integer(feature))
+
+    def number(self, feature: str) -> float:
+        """The value of a number with decimals."""
+        with self._asking(feature) as camera:
+            return float(camera.get_float(feature))
+
+    def execute(self, feature: str) -> None:
+        """Execute a command."""
+        with self._asking(feature) as camera:
+            camera.execute_command(feature)
+
+    def choose(self, feature: str, entry: str) -> None:
+        """Set an enumeration.
+
+        Raises
+        ------
+        UnsupportedByDeviceError
+            It has no such entry, or reads back another.
+        """
+        offered = self.choices(feature)
+        if entry not in offered:
+            raise self._refused(
+                feature, entry, f"it offers {', '.join(offered) or 'nothing now'}", "choose one of these"
+            )
+        if self.text(feature) == entry:
+            # Some cameras offer one entry only, and do not let it be written.
+            return
+        with self._asking(feature) as camera:
+            camera.set_string(feature, entry)
+        self._compare(feature, entry, self.text(feature))
+
+    def set_whole(self, feature: str, value: int) -> None:
+        """Set an integer. Raises UnsupportedByDeviceError: out of range, between steps, or it reads back another."""
+        with self._asking(feature) as camera:
+            least, most = camera.get_integer_bounds(feature)
+            step = camera.get_integer_increment(feature)
+        if not least <= value <= most or (step > 1 and (value - least) % step):
+            steps = f" in steps of {step}" if step > 1 else ""
+            raise self._refused(feature, value, f"it takes {least} to {most}{steps}", "ask for such a value")
+        with self._asking(feature) as camera:
+            camera.set_integer(feature, value)
+        self._compare(feature, value, self.whole(feature))
+
+    def set_any(self, feature: str, value: bool | int | float | str) -> None:
+        """Set a feature of whatever kind it is. Raises UnsupportedByDeviceError: missing, another kind, not taken."""
+        if not self.has(feature):
+            message = (
+                f"camera '{self._name}' has no feature {feature}, or does not offer it as it is set now; remove it "
+                "from features, or set what enables it before"
+            )
+            raise UnsupportedByDeviceError(message)
+        match value, self._kind(feature):
+            case bool(), "Boolean":
+                with self._asking(feature) as camera:
+                    camera.set_boolean(feature, value)
+                    got = bool(camera.get_boolean(feature))
+                self._compare(feature, value, got)
+            case str(), "Enumeration":
+                self.choose(feature, value)
+            case str(), "String":
+                with self._asking(feature) as camera:
+                    camera.set_string(feature, value)
+                self._compare(feature, value, self.text(feature))
+            case int(), "Integer" if not isinstance(value, bool):
+                self.set_whole(feature, value)
+            case int() | float(), "Float" if not isinstance(value, bool):
+                self._set_number(feature, float(value))
+            case _, kind:
+                raise self._refused(feature, value, f"it is a feature of the kind {kind}", "write a value of that kind")
+
+    def _set_number(self, feature: str, value: float) -> None:
+        with self._asking(feature) as camera:
+            least, most = camera.get_float_bounds(feature)
+        if not least <= value <= most:
+            raise self._refused(feature, value, f"it takes {least:g} to {most:g}", "ask for such a value")
+        with self._asking(feature) as camera:
+            camera.set_float(feature, value)
+            got = float(camera.get_float(feature))
+        if differs(got, value):
+            raise self._refused(feature, value, f"it gives {got:g}", "ask for a value that it can give")
+
+    def _compare(self, feature: str, asked: object, got: object) -> None:
+        if got != asked:
+            raise self._refused(feature, asked, f"it gives {got}", "ask for a value that it can give")
+
+    def _refused(self, feature: str, asked: object, found: str, remedy: str) -> UnsupportedByDeviceError:
+        return UnsupportedByDeviceError(f"camera '{self._name}': asked for {feature} {asked}, {found}; {remedy}")
+
+    def _asking(self, feature: str) -> AbstractContextManager[Any]:
+        return self._ask(f"feature {feature}")
+
+
+def differs(got: float, asked: float) -> bool:
+    """Whether a number that was read back is not the one that was asked for.
+
+    >>> differ(0.01001, 0.01), differ(0.0, 0.0), differ(2.0, 1.5)
+    (False, False, True)
+    """
+    return abs(got - asked) > TOLERANCE * abs(asked) + 1e-12
 
 
 @dataclass(frozen=True, slots=True)

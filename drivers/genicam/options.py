@@ -15,6 +15,31 @@ _MIN_PACKET_BYTES = 576
 _MAX_PACKET_BYTES = 16_000
 
 
+OWN_FEATURES = frozenset(
+    {
+        "AcquisitionMode",
+        "AcquisitionStart",
+        "AcquisitionStop",
+        "ExposureAuto",
+        "ExposureMode",
+        "ExposureTime",
+        "ExposureTimeAbs",
+        "Gain",
+        "GainAuto",
+        "GainRaw",
+        "Height",
+        "OffsetX",
+        "OffsetY",
+        "PixelFormat",
+        "TriggerMode",
+        "TriggerSelector",
+        "TriggerSoftware",
+        "TriggerSource",
+        "Width",
+    }
+)
+
+
 class SensorRegion(Strict, use_attribute_docstrings=True):
     """Part of the sensor, px. The calibration holds for the region it was made with."""
 
@@ -106,28 +131,3 @@ class GentlOptions(GenICamCameraOptions, use_attribute_docstrings=True):
     producer: str | None = Field(default=None, min_length=1)
     """The vendor's GenTL producer, a .cti file, from the rig file's folder; else all in the folders that the variable
     GENICAM_GENTL64_PATH names."""
-
-
-OWN_FEATURES = frozenset(
-    {
-        "AcquisitionMode",
-        "AcquisitionStart",
-        "AcquisitionStop",
-        "ExposureAuto",
-        "ExposureMode",
-        "ExposureTime",
-        "ExposureTimeAbs",
-        "Gain",
-        "GainAuto",
-        "GainRaw",
-        "Height",
-        "OffsetX",
-        "OffsetY",
-        "PixelFormat",
-        "TriggerMode",
-        "TriggerSelector",
-        "TriggerSoftware",
-        "TriggerSource",
-        "Width",
-    }
-)

@@ -15,6 +15,16 @@ from slrig.model import Pixels, Size
 Bytes = NDArray[np.uint8]
 
 
+_GREY_CONVERSIONS = {
+    "RGGB": cv2.COLOR_BayerRGGB2GRAY,
+    "GRBG": cv2.COLOR_BayerGRBG2GRAY,
+    "GBRG": cv2.COLOR_BayerGBRG2GRAY,
+    "BGGR": cv2.COLOR_BayerBGGR2GRAY,
+    "RGB": cv2.COLOR_RGB2GRAY,
+    "BGR": cv2.COLOR_BGR2GRAY,
+}
+
+
 class SamplePacking(Enum):
     """How samples lie in memory: each in 8 or 16 bits (little endian, right aligned), or packed.
 
@@ -68,15 +78,6 @@ def _build_formats() -> Mapping[str, PfncFormat]:
 
 FORMATS: Mapping[str, PfncFormat] = _build_formats()
 """Every format that the driver reads, by its PFNC name."""
-
-_GREY_CONVERSIONS = {
-    "RGGB": cv2.COLOR_BayerRGGB2GRAY,
-    "GRBG": cv2.COLOR_BayerGRBG2GRAY,
-    "GBRG": cv2.COLOR_BayerGBRG2GRAY,
-    "BGGR": cv2.COLOR_BayerBGGR2GRAY,
-    "RGB": cv2.COLOR_RGB2GRAY,
-    "BGR": cv2.COLOR_BGR2GRAY,
-}
 
 
 def decode_pixels(

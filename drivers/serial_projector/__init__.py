@@ -167,6 +167,8 @@ from pathlib import Path
 from slrig.bundle.validation import checked
 from slrig.devices import FoundDevice, Projector
 
+__all__ = ["find_devices", "open_projector"]
+
 
 def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     """Open a trigger box from a rig file's `[projector]` table (without its `driver`).
@@ -207,9 +209,6 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
 
 def find_devices() -> tuple[FoundDevice, ...]:
     """Return the USB serial ports; opens none of them. Raises LibraryMissingError."""
-    from drivers.serial_projector.finding import find_ports
+    from drivers.serial_projector.link import find_ports
 
     return find_ports()
-
-
-__all__ = ["find_devices", "open_projector"]

@@ -3,18 +3,34 @@
 from __future__ import annotations
 
 import threading
+import zlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, TypeVar
 
-from drivers.serial_port import BytePort
-from drivers.serial_projector.clock import BoxClock
-from drivers.serial_projector.frames import BoxEvent, RefusalCode, SequenceMode
-from drivers.serial_projector.link import BoxLink, BoxRefusedError, NoAnswerError, Reply
-from drivers.serial_projector.pattern_set import sequence_checksum
-from slrig.errors import DeviceBusyError, DeviceError, SlrigError, UnsupportedByDeviceError
+import numpy as np
 
+from drivers.serial_port import BytePort
+from drivers.serial_projector.link import (
+    BoxEvent,
+    BoxLink,
+    BoxRefusedError,
+    NoAnswerError,
+    RefusalCode,
+    Reply,
+    SequenceMode,
+)
+from slrig.devices import Clock
+from slrig.errors import DeviceBusyError, DeviceError, SlrigError, UnsupportedByDeviceError
+from slrig.model import PatternSequence, Pixels
+
+MAX_DRIFT = 1e-3
+"""How fast or slow a box's clock may be; a ceramic resonator is within this, a crystal by far."""
+_SLOT_NS = 4 * 10**9
+_SLOTS = 16
+_WANDER = 2e-6
+"""By how much the rate of a clock may change within the time that is looked back on: its temperature does."""
 PROTOCOL = 1
 MAX_PICKS_PER_LINE = 16
 """Checksums in one line: a line has 240 bytes."""
@@ -22,8 +38,122 @@ _PINGS = 8
 _FAREWELL_S = 0.6
 _GREET_RETRY_S = 0.1
 _UNLIMITED_TRIES = 10**6
-
 _Values = TypeVar("_Values", "BoxInfo", "BoxStatus")
+BEATS_PER_WATCHDOG = 5
+"""So many that a few lost ones, or a busy host, do not put the light out."""
+
+
+def pattern_checksum(image: Pixels) -> int:
+    """CRC-32 of one pattern's image, (H, W) uint8.
+
+    >>> hex(pattern_crc32(np.array([[0, 255], [255, 0]], np.uint8)))
+    '0xcf81683'
+    """
+    return zlib.crc32(image.tobytes())
+
+
+def pattern_checksums(sequence: PatternSequence) -> tuple[int, ...]:
+    """CRC-32 of every pattern of a sequence.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        A pattern has more than 8 bits.
+    """
+    deep = [index for index, profile in enumerate(sequence.profiles) if profile.dtype != np.uint8]
+    if deep:
+        message = f"patterns {deep} have more than 8 bits, a pattern set for a trigger box has 8; encode them with 8"
+        raise UnsupportedByDeviceError(message)
+    return tuple(pattern_checksum(sequence.image(index)) for index in range(len(sequence)))
+
+
+def sequence_checksum(each: Sequence[int]) -> int:
+    """CRC-32 of a sequence, from those of its patterns.
+
+    >>> f"{crc32_of_all([0x0CF81683, 0x00000000]):08X}"
+    '46D5955C'
+    """
+    return zlib.crc32(b"".join(crc32.to_bytes(4, "big") for crc32 in each))
+
+
+@dataclass(frozen=True, slots=True)
+class _Exchange:
+    device_us: int
+    before_ns: int
+    after_ns: int
+
+    @property
+    def width_ns(self) -> int:
+        return self.after_ns - self.before_ns
+
+
+class BoxClock:
+    """Turns instants of a box into instants of CLOCK_MONOTONIC. Not safe between threads."""
+
+    def __init__(self) -> None:
+        self._latest: _Exchange | None = None
+        self._best: dict[int, _Exchange] = {}
+        self._rate = (1 - MAX_DRIFT, 1 + MAX_DRIFT)
+
+    @property
+    def rate(self) -> tuple[float, float]:
+        """Bounds of how many ns of the host pass in 1000 · (1 µs of the box)."""
+        return self._rate
+
+    def note(self, device_us: int, before_ns: int, after_ns: int) -> None:
+        """The box stamped something with `device_us` between two instants of the host."""
+        new = _Exchange(device_us, before_ns, after_ns)
+        if self._latest is not None and not self._agree(new):
+            # Its clock jumped, or drifts more than a clock may: what was known is of no use.
+            self._best.clear()
+            self._rate = (1 - MAX_DRIFT, 1 + MAX_DRIFT)
+        self._latest = new
+        slot = before_ns // _SLOT_NS
+        kept = self._best.get(slot)
+        if kept is None or new.width_ns <= kept.width_ns:
+            self._best[slot] = new
+        for old in sorted(self._best)[:-_SLOTS]:
+            del self._best[old]
+        self._learn_rate()
+
+    def host_ns(self, device_us: int) -> tuple[int, int]:
+        """(instant, error) in ns, of an instant of the box. Raises ValueError before anything was noted."""
+        bounds = self._bounds(device_us)
+        if bounds is None:
+            message = "no exchange with the box was noted yet"
+            raise ValueError(message)
+        low_ns, high_ns = bounds
+        return (low_ns + high_ns) // 2, (high_ns - low_ns + 1) // 2
+
+    def _exchanges(self) -> list[_Exchange]:
+        kept = list(self._best.values())
+        return kept if self._latest is None or self._latest in kept else [*kept, self._latest]
+
+    def _bounds(self, device_us: int) -> tuple[int, int] | None:
+        """(earliest, latest) instant that all exchanges allow; earliest after latest where they contradict."""
+        slow, fast = self._rate
+        lows, highs = [], []
+        for each in self._exchanges():
+            since_ns = (device_us - each.device_us) * 1000
+            least, most = sorted((since_ns * slow, since_ns * fast))
+            lows.append(each.before_ns + round(least))
+            highs.append(each.after_ns + round(most))
+        return (max(lows), min(highs)) if lows else None
+
+    def _agree(self, new: _Exchange) -> bool:
+        bounds = self._bounds(new.device_us)
+        return bounds is None or max(bounds[0], new.before_ns) <= min(bounds[1], new.after_ns)
+
+    def _learn_rate(self) -> None:
+        exchanges = sorted(self._exchanges(), key=lambda each: each.device_us)
+        slow, fast = 1 - MAX_DRIFT, 1 + MAX_DRIFT
+        for index, first in enumerate(exchanges):
+            for second in exchanges[index + 1 :]:
+                apart_ns = (second.device_us - first.device_us) * 1000
+                if apart_ns > 0:
+                    slow = max(slow, (second.before_ns - first.after_ns) / apart_ns - _WANDER)
+                    fast = min(fast, (second.after_ns - first.before_ns) / apart_ns + _WANDER)
+        self._rate = (slow, fast) if slow <= fast else (1 - MAX_DRIFT, 1 + MAX_DRIFT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,3 +487,35 @@ def _parse_fields(model: type[_Values], words: tuple[str, ...]) -> _Values:
         message = f"the trigger box answered {' '.join(words)!r}: {', '.join(faults)}; its firmware errs"
         raise DeviceError(message)
     return model(**values)
+
+
+class KeepAlive:
+    """A thread that beats until it is stopped, except while the box is abandoned.
+
+    It says that the process lives, not that its owner thread does: a pattern that a stuck owner leaves lit is put out
+    by the box after `max_on_s`. clock : by which it waits.
+    """
+
+    def __init__(self, client: BoxClient, *, watchdog_s: float, clock: Clock) -> None:
+        self._client, self._clock = client, clock
+        self._period_ns = round(watchdog_s * 1e9 / BEATS_PER_WATCHDOG)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="serial projector", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End it. Idempotent; from any thread."""
+        self._stop.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            self._clock.wait_until(self._clock.now_ns() + self._period_ns, self._stop)
+            if self._stop.is_set():
+                return
+            try:
+                self._client.beat()
+            except DeviceError:
+                # What the box answers, and that it is gone, is the owner's business: its next command finds out.
+                continue

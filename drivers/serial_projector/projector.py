@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
+import cv2
+import numpy as np
+
 from drivers.serial_port import BytePort
-from drivers.serial_projector.client import BoxClient, BoxLimits
-from drivers.serial_projector.frames import BoxFault, RefusalCode, SequenceMode
-from drivers.serial_projector.keeping import KeepAlive
-from drivers.serial_projector.link import BoxLink, BoxRefusedError
+from drivers.serial_projector.client import BoxClient, BoxLimits, KeepAlive, pattern_checksums, sequence_checksum
+from drivers.serial_projector.link import BoxFault, BoxLink, BoxRefusedError, RefusalCode, SequenceMode
 from drivers.serial_projector.options import SerialProjectorOptions
-from drivers.serial_projector.pattern_set import export_patterns, pattern_checksums, sequence_checksum
 from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
+
+DESCRIPTION = "patterns.json"
+"""File that describes a pattern set to the box."""
 
 _FAULTS = {
     BoxFault.WATCHDOG: "it heard nothing from this host for watchdog_s: the host was too busy or the cable is bad; raise "
@@ -305,3 +309,34 @@ def _fault_message(port: str, words: tuple[str, ...]) -> str:
     known = {str(fault.value): why for fault, why in _FAULTS.items()}
     why = known.get(words[0] if words else "", f"fault {' '.join(words)}, which is unknown here")
     return f"the trigger box on {port} had gone dark by itself: {why}. Frames since then may be dark; scan again"
+
+
+def export_patterns(sequence: PatternSequence, folder: Path) -> None:
+    """Write the images for the light engine's flash, `000.png` …, and `patterns.json` for the box.
+
+    Raises
+    ------
+    DeviceError
+        The folder cannot be written.
+    UnsupportedByDeviceError
+        A pattern has more than 8 bits.
+    """
+    size = sequence.projector
+    each = pattern_checksums(sequence)
+    description = {
+        "size_px": [size.width_px, size.height_px],
+        "crc32": [f"{crc32:08X}" for crc32 in each],
+        "crc32_of_all": f"{sequence_checksum(each):08X}",
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for index in range(len(sequence)):
+            encoded, png = cv2.imencode(".png", np.ascontiguousarray(sequence.image(index)))
+            if not encoded:
+                message = f"pattern {index} could not be encoded as PNG; report it"
+                raise DeviceError(message)
+            (folder / f"{index:03d}.png").write_bytes(png.tobytes())
+        (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        message = f"export_folder: {folder} cannot be written ({error}); name another folder"
+        raise DeviceError(message) from error

@@ -41,6 +41,8 @@ from pathlib import Path
 from slrig.bundle.validation import checked
 from slrig.devices import Clock, SystemClock, Turntable
 
+__all__ = ["open_grbl", "open_turntable"]
+
 
 def open_turntable(options: Mapping[str, object], folder: Path, *, clock: Clock | None = None) -> Turntable:
     """Open a turntable that speaks the protocol of lines, from a rig file's `[positioner]` table without its `driver`.
@@ -58,8 +60,8 @@ def open_turntable(options: Mapping[str, object], folder: Path, *, clock: Clock 
     UnsupportedByDeviceError or DeviceError where what answers is another controller, or none.
     """
     from drivers.serial_port import SerialPort
+    from drivers.serial_turntable.controllers import LineController
     from drivers.serial_turntable.options import LineOptions
-    from drivers.serial_turntable.simple import LineController
     from drivers.serial_turntable.turntable import SerialTurntable
 
     del folder
@@ -74,7 +76,7 @@ def open_grbl(options: Mapping[str, object], folder: Path, *, clock: Clock | Non
     Parameters and errors are those of `open_turntable`.
     """
     from drivers.serial_port import SerialPort
-    from drivers.serial_turntable.grbl import GrblController
+    from drivers.serial_turntable.controllers import GrblController
     from drivers.serial_turntable.options import GrblOptions
     from drivers.serial_turntable.turntable import SerialTurntable
 
@@ -82,6 +84,3 @@ def open_grbl(options: Mapping[str, object], folder: Path, *, clock: Clock | Non
     table = checked(GrblOptions, options, "the [positioner] table of a turntable behind GRBL")
     port = SerialPort(table.port, baud=table.baud, device="turntable", driver="grbl_turntable")
     return SerialTurntable(port, table, lambda lines: GrblController(lines, table), clock or SystemClock())
-
-
-__all__ = ["open_grbl", "open_turntable"]

@@ -19,12 +19,10 @@ from typing import Any
 import pytest
 
 from drivers import dlpc350, dlpc900
-from drivers.dlpc350.flash import read_flash_list, write_pictures
+from drivers.dlpc350.flash import MIRRORS, read_flash_list, write_pictures
 from drivers.dlpc350.options import Dlpc350EngineOptions
-from drivers.dlpc350.planes import MIRRORS
 from drivers.dlpc350.projector import DLPC350, Dlpc350Projector
-from drivers.pattern_engine.finding import find_engines
-from drivers.pattern_engine.link import UsbLink
+from drivers.pattern_engine.usb import UsbLink, find_engines
 from slrig.capture.sequencer import capture
 from slrig.capture.verifier import Evidence
 from slrig.conformance import run

@@ -8,7 +8,7 @@ from typing import Any
 from drivers import dlpc900
 from drivers.dlpc900.options import Dlpc900EngineOptions
 from drivers.dlpc900.projector import DLPC900, Dlpc900Projector
-from drivers.pattern_engine.link import UsbLink
+from drivers.pattern_engine.usb import UsbLink
 from slrig.model import Size
 from tests.contract.dlpc350_device import Cable
 from tests.contract.dlpc900_device import Fake900

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers.serial_projector import open_projector
-from drivers.serial_projector.pattern_set import pattern_checksums
+from drivers.serial_projector.client import pattern_checksums
 from slrig.devices import Projector
 from slrig.model import PatternSequence
 from tests.contract.stage import Stage

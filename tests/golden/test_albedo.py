@@ -18,10 +18,9 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from simulated_rig.casting import build_caster
 from simulated_rig.options import HeadOptions
 from simulated_rig.scene import build_surface, read_scene
-from simulated_rig.transport import trace_rays
+from simulated_rig.transport import build_caster, trace_rays
 from slrig.bundle import read_bundle, read_calibration, write_calibration
 from slrig.capture.verifier import check_capture
 from slrig.cli.commands import app

@@ -15,9 +15,8 @@ import pytest
 
 from simulated_rig.light import Response
 from simulated_rig.options import SimulatedCameraOptions, SimulatedProjectorOptions
-from simulated_rig.rendering import CameraView, SceneState
+from simulated_rig.rendering import CameraView, SceneState, SensorModel
 from simulated_rig.scene import Scene, build_surface
-from simulated_rig.sensor import SensorModel
 from slrig.model import FloatArray, Pixels
 from tests.light_bound import ExposedView, StripeBound, pixel_bound, stripe_bound
 from tests.unit.simulated_rig.building import line_profile

@@ -14,9 +14,9 @@ import pytest
 
 from drivers import depthai, genicam, picamera2
 from drivers.depthai.library import ENVIRONMENT, load_depthai
-from drivers.genicam.library import install_command
-from drivers.genicam.library import load_aravis as aravis
-from drivers.genicam.producers import load_harvesters
+from drivers.genicam.aravis import install_command
+from drivers.genicam.aravis import load_aravis as aravis
+from drivers.genicam.gentl import load_harvesters
 from slrig.bundle.validation import checked
 from slrig.errors import ConfigError, LibraryMissingError
 from slrig.option_models import described_drivers, kinds_of, option_model

@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from simulated_rig.boards import PrintedBoard
 from simulated_rig.device import SimulatedHead, open_simulated_head
-from simulated_rig.placed import rotation_matrix
-from simulated_rig.tables import Triple
+from simulated_rig.scene import PrintedBoard, Triple, rotation_matrix
 from slrig.devices import Trigger
 from slrig.model import Axis, Black, FloatArray, Frame, LineShift, Pattern, PatternSequence, Pixels, Size, White
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from simulated_rig.boards import BoardPrint, PrintedBoard, arc_length_mm, x_at_arc_length_mm
+from simulated_rig.scene import BoardPrint, PrintedBoard, arc_length_mm, x_at_arc_length_mm
 from slrig.calibration.board import Board as Designed
 from slrig.calibration.board import BoardKind
 from slrig.model import FloatArray

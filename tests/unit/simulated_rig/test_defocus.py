@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_rig.defocus import LEVELS_PX, Focus, level_weights
 from simulated_rig.light import Float32Array, Response, light_table
+from simulated_rig.optics import LEVELS_PX, Focus, level_weights
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import Scene, build_surface
 from slrig.model import FloatArray, Pinhole, Size

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_rig.device import SimulatedHead
-from simulated_rig.projector import SimulatedProjector
+from simulated_rig.device import SimulatedHead, SimulatedProjector
 from slrig.devices import Camera, CameraSettings, Trigger
 from slrig.errors import (
     DeviceGoneError,

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.device import SimulatedHead
-from simulated_rig.disturbing import PoseChange, PoseDrift, apply_pose_change
 from simulated_rig.light import Float32Array
+from simulated_rig.movements import PoseChange, PoseDrift, apply_pose_change
 from slrig.devices import Trigger
 from slrig.errors import ConfigError
 from tests.rendered_boards import board_head, board_options

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from simulated_rig.device import SimulatedHead
-from simulated_rig.world import LightFlicker
+from simulated_rig.light import LightFlicker
 from slrig.devices import CameraSettings
 from slrig.model import Axis, Black, FloatArray, LineShift, PatternSequence, Pixels, Size, White
 from tests.unit.simulated_rig.building import frames_of, small_head, white_black_lines

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_rig.boards import PrintedBoard
 from simulated_rig.device import SimulatedHead
+from simulated_rig.movements import PoseSeries, generate_poses
 from simulated_rig.optics import image_positions
 from simulated_rig.options import HeadOptions
-from simulated_rig.placed import rotation_matrix
-from simulated_rig.poses import PoseSeries, generate_poses
+from simulated_rig.scene import PrintedBoard, rotation_matrix
 from slrig.calibration.board import Board as Designed
 from slrig.calibration.board import BoardKind
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError

@@ -11,13 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulated_rig.boards import PrintedBoard
-from simulated_rig.casting import build_caster
 from simulated_rig.options import SimulatedCameraOptions
-from simulated_rig.placed import rotation_matrix
 from simulated_rig.rendering import CameraView, SceneState
-from simulated_rig.scene import Scene, SceneSurface, build_surface
-from simulated_rig.transport import Hits, trace_rays
+from simulated_rig.scene import PrintedBoard, Scene, SceneSurface, build_surface, rotation_matrix
+from simulated_rig.transport import Hits, build_caster, trace_rays
 from slrig.model import FloatArray, Pinhole, Size
 from tests.unit.reconstruction.builders import opencv_pixels, opencv_rays
 from tests.unit.simulated_rig.building import corners_in_world_mm

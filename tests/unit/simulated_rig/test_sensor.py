@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simulated_rig import sensor as sensor_module
-from simulated_rig.sensor import SensorModel
+from simulated_rig import rendering as sensor_module
+from simulated_rig.rendering import SensorModel
 
 
 def sensor(**changes: float) -> SensorModel:

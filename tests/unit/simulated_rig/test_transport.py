@@ -9,10 +9,8 @@ import pytest
 import trimesh
 
 from simulated_rig import transport
-from simulated_rig.casting import EMBREE, EmbreeCaster, RayCaster, TreeCaster
 from simulated_rig.optics import lens_array, world_directions
-from simulated_rig.textures import texture_value
-from simulated_rig.transport import Hits
+from simulated_rig.transport import EMBREE, EmbreeCaster, Hits, RayCaster, TreeCaster, texture_value
 from slrig.model import FloatArray, IntArray
 from tests.unit.simulated_rig.building import FACING_PLATE, small_head
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.device import SimulatedHead
-from simulated_rig.turning import TurntableOptions
+from simulated_rig.movements import TurntableOptions
 from slrig.devices import Turntable
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray

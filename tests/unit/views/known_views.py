@@ -13,7 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from simulated_rig.casting import build_caster
+from simulated_rig.transport import build_caster
 from slrig.meshing.surface import vertex_normals
 from slrig.meshing.topology import used_vertices
 from slrig.model import FloatArray, Mesh

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from drivers.depthai import find_devices, open_camera
-from drivers.depthai.board import OakDevice, require_one_clock
+from drivers.depthai.device import OakDevice, require_one_clock
 from slrig.devices import Camera, CameraSettings, FoundDevice, Trigger
 from slrig.errors import (
     ConfigError,
@@ -117,7 +117,7 @@ class SlowClock:
 
 def test_a_clock_of_another_kind_is_refused_however_slow_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = VirtualClock()
-    monkeypatch.setattr("drivers.depthai.board.time", SimpleNamespace(monotonic_ns=clock.now_ns))
+    monkeypatch.setattr("drivers.depthai.device.time", SimpleNamespace(monotonic_ns=clock.now_ns))
     require_one_clock(SlowClock(clock, 0.0))
     for offset_s in (-1.0, 1.0):
         with pytest.raises(DeviceError, match=r"is -?980 ms off CLOCK_MONOTONIC"):

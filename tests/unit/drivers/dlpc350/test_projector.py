@@ -11,16 +11,23 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.dlpc350.flash import EXPORT_FOLDER, LIST_FILE, FlashContents, FlashedPlane, read_flash_list, write_pictures
+from drivers.dlpc350.engine import MIN_EXPOSURE_US, build_tables, check_loading, check_timing, play_timing
+from drivers.dlpc350.flash import (
+    EXPORT_FOLDER,
+    LIST_FILE,
+    MIRRORS,
+    FlashContents,
+    FlashedPlane,
+    decode_planes,
+    encode_picture,
+    read_flash_list,
+    write_pictures,
+)
 from drivers.dlpc350.options import Dlpc350EngineOptions
-from drivers.dlpc350.planes import MIRRORS, decode_planes, encode_picture
 from drivers.dlpc350.projector import DLPC350, Dlpc350Projector
-from drivers.dlpc350.tables import build_tables
-from drivers.dlpc350.timing import MIN_EXPOSURE_US, check_loading, check_timing, play_timing
-from drivers.pattern_engine.link import UsbLink
 from drivers.pattern_engine.options import LedColour
-from drivers.pattern_engine.planes import pattern_plane
-from drivers.pattern_engine.timing import Timing
+from drivers.pattern_engine.patterns import Timing, pattern_plane
+from drivers.pattern_engine.usb import UsbLink
 from slrig.bundle.validation import checked
 from slrig.devices import FlashedProjector
 from slrig.errors import (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.dlpc900.pictures import MAX_PICTURES, encode_picture, pack_sequence
-from drivers.pattern_engine.planes import pattern_plane
+from drivers.pattern_engine.patterns import pattern_plane
 from slrig.devices import FlashedProjector
 from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, PatternSequence, Size, White

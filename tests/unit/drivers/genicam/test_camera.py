@@ -18,7 +18,7 @@ from drivers.genicam import (
     open_camera,
     open_gentl_camera,
 )
-from drivers.genicam.library import install_command
+from drivers.genicam.aravis import install_command
 from slrig.devices import CameraSettings, Trigger
 from slrig.errors import (
     ConfigError,

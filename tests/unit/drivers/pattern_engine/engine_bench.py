@@ -15,15 +15,14 @@ import numpy as np
 from drivers.dlpc347x.bus import I2cBus
 from drivers.dlpc347x.options import Dlpc347xEngineOptions as Options347x
 from drivers.dlpc347x.projector import Dlpc347xProjector as LightEngine347x
-from drivers.dlpc350 import planes
-from drivers.dlpc350.flash import FlashContents, write_pictures
+from drivers.dlpc350.flash import MIRRORS, FlashContents, write_pictures
 from drivers.dlpc350.options import Dlpc350EngineOptions as Options350
 from drivers.dlpc350.projector import DLPC350
 from drivers.dlpc350.projector import Dlpc350Projector as LightEngine350
 from drivers.dlpc900.options import Dlpc900EngineOptions as Options900
 from drivers.dlpc900.projector import DLPC900
 from drivers.dlpc900.projector import Dlpc900Projector as LightEngine900
-from drivers.pattern_engine.link import UsbLink
+from drivers.pattern_engine.usb import UsbLink
 from slrig.model import Axis, Black, LineShift, PatternSequence, Pixels, White
 from slrig.patterns.sequence import encode
 from tests.contract import dlpc347x_bench, dlpc900_bench
@@ -35,7 +34,7 @@ from tests.virtual_clock import VirtualClock
 
 LINES = LineShift(Axis.COLUMN, 1, 8)
 PATTERNS = (White(), Black(), LINES)
-SEQUENCE_350 = encode(PATTERNS, planes.MIRRORS)
+SEQUENCE_350 = encode(PATTERNS, MIRRORS)
 SEQUENCE_900 = encode(PATTERNS, dlpc900_bench.MIRRORS)
 SEQUENCE_347X = encode(PATTERNS, dlpc347x_bench.MIRRORS)
 LEDS, START_STOP = 0x1A07, 0x1A24

@@ -19,8 +19,7 @@ import pytest
 from drivers import dlpc350, dlpc900
 from drivers.dlpc350.projector import DLPC350
 from drivers.dlpc900.projector import DLPC900
-from drivers.pattern_engine.finding import choose_engine, find_engines, list_devices
-from drivers.pattern_engine.link import UsbController, UsbLink, open_link
+from drivers.pattern_engine.usb import UsbController, UsbLink, choose_engine, find_engines, list_devices, open_link
 from slrig.errors import ConfigError, DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, WrongSystemError
 from tests.contract.dlpc350_device import Cable, FakeEngine
 from tests.contract.dlpc900_device import Fake900
@@ -252,8 +251,8 @@ def test_a_rig_opens_the_engine_that_it_means(
         opened.append(path)
         return UsbLink(Cable(engine).host, "light engine", kind)
 
-    monkeypatch.setattr("drivers.pattern_engine.finding.find_engines", partial(find_engines, sysfs=tmp_path))
-    monkeypatch.setattr("drivers.pattern_engine.link.open_link", open_link)
+    monkeypatch.setattr("drivers.pattern_engine.usb.find_engines", partial(find_engines, sysfs=tmp_path))
+    monkeypatch.setattr("drivers.pattern_engine.usb.open_link", open_link)
     projector = driver.open_projector({"device": "B", **options}, tmp_path)
     assert (projector.info.serial, opened) == ("B", [Path("/dev/hidraw1")])
     projector.close()

@@ -15,7 +15,7 @@ import pytest
 from drivers.serial_projector.device import main
 from drivers.serial_projector.device.box import HardwareError
 from drivers.serial_projector.device.protocol import TriggerBox
-from drivers.serial_projector.frames import encode_line
+from drivers.serial_projector.link import encode_line
 
 
 class Pico:

@@ -13,23 +13,27 @@ from types import SimpleNamespace
 import pytest
 
 from drivers.serial_port import resolve_port
-from drivers.serial_projector import find_devices, finding, open_projector
-from drivers.serial_projector.clock import MAX_DRIFT, BoxClock
+from drivers.serial_projector import find_devices, open_projector
+from drivers.serial_projector.client import MAX_DRIFT, BoxClock
 from drivers.serial_projector.device import wire
-from drivers.serial_projector.frames import (
+from drivers.serial_projector.link import (
     MAX_LINE_BYTES,
+    MAX_TRIES,
     NUMBERS,
     BoxAnswer,
     BoxEvent,
     BoxFault,
+    BoxLink,
+    BoxRefusedError,
     LineSplitter,
+    NoAnswerError,
     RefusalCode,
     SequenceMode,
     UnreadableLine,
     encode_line,
+    find_ports,
     parse_line,
 )
-from drivers.serial_projector.link import MAX_TRIES, BoxLink, BoxRefusedError, NoAnswerError
 from slrig.errors import DeviceGoneError, DeviceStateError, LibraryMissingError
 from tests.unit.drivers.serial_projector.line import Noise
 from tests.virtual_clock import VirtualClock
@@ -330,7 +334,7 @@ def ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def test_usb_ports_are_found_by_lasting_names_and_not_opened(ports: Path) -> None:
-    pico, bridge = finding.find_ports(ports / "by-id")
+    pico, bridge = find_ports(ports / "by-id")
     assert pico.driver == bridge.driver == "serial_projector"
     assert pico.device == str(ports / "by-id" / "usb-MicroPython_Board_in_FS_mode_e66-if00")
     assert pico.label.startswith("MicroPython on an RP2040: MicroPython Board (")
@@ -339,7 +343,7 @@ def test_usb_ports_are_found_by_lasting_names_and_not_opened(ports: Path) -> Non
     assert "USB Serial" in bridge.label
     assert "not asked" in bridge.label
     # Without lasting names, the ports' own are used.
-    assert [each.device for each in finding.find_ports(ports / "none")] == [
+    assert [each.device for each in find_ports(ports / "none")] == [
         str(ports / "dev" / "ttyACM0"),
         str(ports / "dev" / "ttyUSB1"),
     ]

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 import tests.unit.drivers.serial_projector
+from drivers.serial_projector.client import sequence_checksum
 from drivers.serial_projector.device import box, main, protocol, wire
-from drivers.serial_projector.frames import encode_line
-from drivers.serial_projector.pattern_set import sequence_checksum
+from drivers.serial_projector.link import encode_line
 from tests.npm import npm_package
 
 pytestmark = pytest.mark.slow

@@ -15,11 +15,9 @@ import pytest
 
 from drivers.serial_port import SerialPort
 from drivers.serial_projector import open_projector
-from drivers.serial_projector.client import BoxClient, BoxLimits
+from drivers.serial_projector.client import BoxClient, BoxLimits, pattern_checksums, sequence_checksum
 from drivers.serial_projector.device import protocol
-from drivers.serial_projector.frames import SequenceMode
-from drivers.serial_projector.link import BoxLink
-from drivers.serial_projector.pattern_set import pattern_checksums, sequence_checksum
+from drivers.serial_projector.link import BoxLink, SequenceMode
 from drivers.serial_projector.projector import SerialProjector
 from slrig.devices import FlashedProjector
 from slrig.errors import (

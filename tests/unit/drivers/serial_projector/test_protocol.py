@@ -11,11 +11,11 @@ from itertools import pairwise
 import pytest
 
 import drivers.serial_projector
-from drivers.serial_projector.client import BoxInfo, BoxStatus
+from drivers.serial_projector.client import BoxInfo, BoxStatus, sequence_checksum
 from drivers.serial_projector.device import wire
 from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError, LightTime
 from drivers.serial_projector.device.protocol import TriggerBox
-from drivers.serial_projector.frames import (
+from drivers.serial_projector.link import (
     BoxAnswer,
     BoxEvent,
     BoxFault,
@@ -25,7 +25,6 @@ from drivers.serial_projector.frames import (
     encode_line,
     parse_line,
 )
-from drivers.serial_projector.pattern_set import sequence_checksum
 
 CRC32 = [zlib.crc32(bytes([number])) for number in range(26)]
 WATCHDOG_US, ON_US = 1_000_000, 5_000_000

@@ -10,18 +10,28 @@ from __future__ import annotations
 import atexit
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
-from drivers.depthai.feed import FrameQueue
-from drivers.depthai.library import load_depthai, nanoseconds
-from drivers.depthai.messages import find_frame_fault, frame_type, read_frame
+import numpy as np
+
+from drivers.depthai.library import (
+    UDEV_RULE,
+    OakSensor,
+    find_available,
+    is_permitted,
+    load_depthai,
+    microseconds,
+    nanoseconds,
+    read_sensors,
+)
 from drivers.depthai.options import OakStream
-from drivers.depthai.presence import find_available
-from drivers.depthai.sensors import OakSensor, read_sensors
+from drivers.v4l2.formats import from_luma
+from slrig.devices import FoundDevice
 from slrig.errors import (
     CalibrationError,
     ConfigError,
@@ -30,18 +40,164 @@ from slrig.errors import (
     DeviceGoneError,
     UnsupportedByDeviceError,
 )
+from slrig.model import Pixels
 
+MAX_WAITING_FRAMES = 4
+"""How many frames wait for a reader while a camera runs by itself; older ones are stale."""
 STAMP_ERR_NS = {"USB": 600_000, "network": 1_500_000}
 """How well the library knows when a device's clock ticks: three times the standard deviations that Luxonis states
 (200 µs by USB, 500 µs by Ethernet; docs.luxonis.com, Device, host clock syncing)."""
-
 _QUEUED_MESSAGES = 16
 _LISTEN = timedelta(milliseconds=200)
 _CLOSE_S = 10.0
 _MAX_CLOCK_OFFSET_NS = 5_000_000
-
 _DEVICES: dict[str, OakDevice] = {}
 _DEVICES_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class OakFrame:
+    """A whole frame, as it came. `t_start_ns` and `t_end_ns` are those of the first row, CLOCK_MONOTONIC.
+
+    message : the library's `ImgFrame`; its pixels are copied only if the frame is wanted.
+    """
+
+    message: Any
+    number: int
+    t_start_ns: int
+    t_end_ns: int
+    received_ns: int
+    exposure_us: int
+    iso: int
+    lens_position: int
+
+
+def find_frame_fault(message: Any, stream: OakStream, received_ns: int, err_ns: int, vendor: Any) -> str | None:
+    """Say what makes a frame unusable; None if it is whole.
+
+    A frame that was cut on its way has less data than its header announces; one whose header was damaged has another
+    size or kind than was asked for. A frame that says it ends later than it came would pass for a fresh one.
+    """
+    size, kind = stream.size, frame_type(stream, vendor)
+    if message.getType() != kind or (message.getWidth(), message.getHeight()) != (size.width_px, size.height_px):
+        return f"{message.getWidth()} x {message.getHeight()} {message.getType()} where {size} {kind} was asked for"
+    stride, rows = message.getStride(), size.height_px * (3 if stream.colour else 2) // 2
+    if stride < size.width_px or len(message.getData()) < stride * rows:
+        return f"{len(message.getData())} bytes where {stride} x {rows} were announced"
+    if microseconds(message.getExposureTime()) <= 0:
+        return "no exposure told"
+    if nanoseconds(message.getTimestamp()) - err_ns > received_ns:
+        return "stamped later than it came"
+    return None
+
+
+def read_frame(message: Any, received_ns: int, vendor: Any) -> OakFrame:
+    """Read what a whole frame says of itself."""
+    offsets = vendor.CameraExposureOffset
+    return OakFrame(
+        message=message,
+        number=message.getSequenceNum(),
+        t_start_ns=nanoseconds(message.getTimestamp(offsets.START)),
+        t_end_ns=nanoseconds(message.getTimestamp(offsets.END)),
+        received_ns=received_ns,
+        exposure_us=microseconds(message.getExposureTime()),
+        iso=message.getSensitivity(),
+        lens_position=message.getLensPosition(),
+    )
+
+
+def read_luminance(message: Any, stream: OakStream) -> Pixels:
+    """(H, W) uint8, a copy: the grey levels, or a colour frame's luminance, which NV12 begins with."""
+    stride, size = message.getStride(), stream.size
+    plane = np.asarray(message.getData(), dtype=np.uint8)[: stride * size.height_px]
+    return plane.reshape(size.height_px, stride)[:, : size.width_px].copy()
+
+
+def colour_reader(message: Any, luma: Pixels) -> Callable[[], Pixels]:
+    """What makes a colour frame of its brightness and of the differences of blue and red, copied, which follow it in
+    NV12: in turn, half as many rows and columns.
+    """
+    stride, (rows, columns) = message.getStride(), luma.shape
+    planes = np.asarray(message.getData(), dtype=np.uint8)[stride * rows :][: stride * (rows // 2)]
+    differences = planes.reshape(-1, stride)[:, :columns].copy()
+    return lambda: from_luma(luma, differences[:, ::2], differences[:, 1::2])
+
+
+def frame_type(stream: OakStream, vendor: Any) -> Any:
+    """The library's name of the frames' layout."""
+    return vendor.ImgFrame.Type.NV12 if stream.colour else vendor.ImgFrame.Type.GRAY8
+
+
+class FrameQueue:
+    """Safe between threads. Counts what was lost: gaps in the sequence numbers, which damaged frames leave, too."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._waiting: deque[OakFrame] = deque(maxlen=MAX_WAITING_FRAMES)
+        self._last_number = -1
+        self._lost = 0
+        self._why_lost = ""
+        self._ended: str | None = None
+
+    @property
+    def lost(self) -> tuple[int, str]:
+        """How many frames were lost since `begin`, and what was wrong with the last damaged one."""
+        with self._changed:
+            return self._lost, self._why_lost
+
+    def begin(self, kept: int = MAX_WAITING_FRAMES) -> None:
+        """Forget what is waiting, and count anew."""
+        with self._changed:
+            self._waiting = deque(maxlen=kept)
+            self._lost, self._why_lost = 0, ""
+
+    def put(self, delivery: OakFrame) -> None:
+        """Take a frame. One that came before is dropped; a gap in the numbers before it counts as lost."""
+        with self._changed:
+            if delivery.number <= self._last_number:
+                return
+            if self._last_number >= 0:
+                self._lost += delivery.number - self._last_number - 1
+            self._last_number = delivery.number
+            self._waiting.append(delivery)
+            self._changed.notify_all()
+
+    def damaged(self, fault: str) -> None:
+        """Note what was wrong with a frame. The gap that it leaves counts it: its own number may be damaged, too."""
+        with self._changed:
+            self._why_lost = fault
+
+    def lose(self) -> None:
+        """Count one more frame that the reader had to pass over."""
+        with self._changed:
+            self._lost += 1
+
+    def take(self, until_ns: int) -> OakFrame | None:
+        """Return the oldest frame that waits, or None if none came until then (CLOCK_MONOTONIC).
+
+        Raises
+        ------
+        DeviceGoneError
+            No frame will come any more.
+        """
+        with self._changed:
+            while True:
+                if self._ended is not None:
+                    raise DeviceGoneError(self._ended)
+                if self._waiting:
+                    return self._waiting.popleft()
+                left_ns = until_ns - time.monotonic_ns()
+                if left_ns <= 0:
+                    return None
+                self._changed.wait(left_ns / 1e9)
+
+    def end(self, reason: str) -> None:
+        """No frame will come any more. The first reason stays."""
+        with self._changed:
+            if self._ended is None:
+                self._ended = reason
+            self._waiting.clear()
+            self._changed.notify_all()
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,3 +542,32 @@ def open_device_ids() -> frozenset[str]:
     """The ids of the devices that this process holds."""
     with _DEVICES_LOCK:
         return frozenset(_DEVICES)
+
+
+def find_devices() -> tuple[FoundDevice, ...]:
+    """Every OAK device that the library sees on USB and on the network, in half a second.
+
+    Raises
+    ------
+    LibraryMissingError
+        The library is not installed.
+    """
+    vendor = load_depthai()
+    found = {info.deviceId or info.name: info for info in vendor.Device.getAllConnectedDevices()}
+    held = open_device_ids()
+    return tuple(
+        FoundDevice("depthai", device, _label(info, device in held, vendor)) for device, info in sorted(found.items())
+    ) + tuple(
+        FoundDevice("depthai", device, "OAK device, in use by this process") for device in sorted(held - set(found))
+    )
+
+
+def _label(info: Any, held: bool, vendor: Any) -> str:
+    where = f"OAK device at {info.name}" if info.name else "OAK device"
+    if held:
+        return f"{where}, in use by this process"
+    if not is_permitted(info, vendor):
+        return f"{where}, not permitted: it needs the udev rule {UDEV_RULE}"
+    if info.state == vendor.XLinkDeviceState.X_LINK_BOOTED:
+        return f"{where}, in use by another program"
+    return where
