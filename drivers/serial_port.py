@@ -80,7 +80,7 @@ class SerialPort:
     def read(self, timeout_s: float) -> bytes:
         """See `BytePort`."""
         until_s = time.monotonic() + timeout_s
-        with self._told("read from"):
+        with self._translate_errors("read from"):
             while True:
                 left_s = max(until_s - time.monotonic(), 0.0)
                 self._serial.timeout = min(left_s, SLICE_S)
@@ -90,7 +90,7 @@ class SerialPort:
 
     def write(self, data: bytes) -> None:
         """See `BytePort`."""
-        with self._told("write to"):
+        with self._translate_errors("write to"):
             self._serial.write(data)
 
     def close(self) -> None:
@@ -103,12 +103,12 @@ class SerialPort:
             data: bytes = self._serial.read(max(1, self._serial.in_waiting))
         except _library(self._driver).SerialException:
             # Raised alike when another program read first what this one was told of, and when the port is gone.
-            if not self._alive():
+            if not self._is_alive():
                 raise
             return b""
         return data
 
-    def _alive(self) -> bool:
+    def _is_alive(self) -> bool:
         """Whether the system still has a line here: one that was hung up answers with EIO."""
         try:
             import termios
@@ -119,7 +119,7 @@ class SerialPort:
         return True
 
     @contextmanager
-    def _told(self, what: str) -> Iterator[None]:
+    def _translate_errors(self, what: str) -> Iterator[None]:
         try:
             if not self._serial.is_open:
                 raise _library(self._driver).PortNotOpenError

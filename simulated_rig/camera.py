@@ -107,7 +107,7 @@ class SimulatedCamera:
         self._state.require_armed(Trigger.SOFTWARE)
         latency_s = self._options.trigger_latency_s + self._jitter_s(_START, self._made)
         start_ns = max(self._clock.now_ns() + nanoseconds(latency_s), self._t_busy_ns)
-        exposure = self._exposure(self._made, start_ns)
+        exposure = self._schedule_exposure(self._made, start_ns)
         self._made += 1
         self._t_busy_ns = exposure.t_end_ns
         self._pending.append(exposure)
@@ -116,14 +116,14 @@ class SimulatedCamera:
         """See `Camera`."""
         self._require_usable()
         self._state.require_armed()
-        asked_ns = self._clock.now_ns()
-        deadline_ns = asked_ns + nanoseconds(timeout_s)
+        started_ns = self._clock.now_ns()
+        deadline_ns = started_ns + nanoseconds(timeout_s)
         while True:
-            exposure = self._upcoming(after_ns, deadline_ns)
+            exposure = self._next_exposure(after_ns, deadline_ns)
             ready = exposure is not None and exposure.t_ready_ns <= deadline_ns
             if exposure is not None and ready and not self._is_dropped(exposure.number):
                 # Tracing its light takes a while of real time: better while it shines than after its read-out.
-                self._view.rehearse(self._lights(exposure))
+                self._view.rehearse(self._lights_during(exposure))
             self._clock.wait_until(
                 exposure.t_ready_ns if exposure is not None and ready else deadline_ns, self._state.closed
             )
@@ -138,7 +138,7 @@ class SimulatedCamera:
             if self._is_dropped(exposure.number):
                 self._dropped += 1
                 continue
-            return self._frame(exposure)
+            return self._make_frame(exposure)
 
     def disarm(self) -> None:
         """See `Camera`."""
@@ -163,13 +163,13 @@ class SimulatedCamera:
         """From the first row's start to the last row's end."""
         return nanoseconds(self._settings.exposure_s) + nanoseconds(self._options.shutter_skew_s)
 
-    def _exposure(self, number: int, start_ns: int) -> _ExposureTimes:
+    def _schedule_exposure(self, number: int, start_ns: int) -> _ExposureTimes:
         end_ns = start_ns + self._span_ns
-        late_s = self._faults.late_s if self._befalls(self._faults.late_frames, number) else 0.0
+        late_s = self._faults.late_s if self._is_affected(self._faults.late_frames, number) else 0.0
         late_s += self._jitter_s(_DELIVERY, number)
         return _ExposureTimes(number, start_ns, end_ns, end_ns + nanoseconds(self._options.readout_s + late_s))
 
-    def _upcoming(self, after_ns: int, deadline_ns: int) -> _ExposureTimes | None:
+    def _next_exposure(self, after_ns: int, deadline_ns: int) -> _ExposureTimes | None:
         """Return the first exposure that lies wholly after `after_ns`, passing over earlier ones, or None."""
         earliest_ns = after_ns + nanoseconds(self._options.stamp_error_s)
         while True:
@@ -192,38 +192,38 @@ class SimulatedCamera:
 
         Frames that finished before it are passed over, or were overwritten while nobody read.
         """
-        overwritten = max(self._finished(self._clock.now_ns()) - self._options.buffers - self._free_index, 0)
+        overwritten = max(self._count_read_out(self._clock.now_ns()) - self._options.buffers - self._free_index, 0)
         self._dropped += overwritten
         self._free_index += overwritten
         wanted = -((self._t_armed_ns - earliest_ns) // self._period_ns)
-        by_deadline = self._finished(deadline_ns)
+        by_deadline = self._count_read_out(deadline_ns)
         index = max(self._free_index, wanted)
         if index < by_deadline:
             start_ns = self._t_armed_ns + index * self._period_ns
-            self._pending.append(self._exposure(self._made + index, start_ns))
+            self._pending.append(self._schedule_exposure(self._made + index, start_ns))
             self._free_index = index + 1
         else:
             self._free_index = max(self._free_index, min(wanted, by_deadline))
 
-    def _finished(self, t_ns: int) -> int:
+    def _count_read_out(self, t_ns: int) -> int:
         """How many free-running exposures were read out by `t_ns`."""
         first_ns = self._t_armed_ns + self._span_ns + nanoseconds(self._options.readout_s)
         return max((t_ns - first_ns) // self._period_ns + 1, 0)
 
-    def _frame(self, exposure: _ExposureTimes) -> Frame:
-        stale = self._befalls(self._faults.stale_frames, exposure.number) or self._chance(
+    def _make_frame(self, exposure: _ExposureTimes) -> Frame:
+        stale = self._is_affected(self._faults.stale_frames, exposure.number) or self._draw_fault(
             self._faults.stale_probability, _STALE, exposure.number
         )
         repeated = self._last_image if stale else None
-        image = repeated if repeated is not None else self._rendered(exposure)
+        image = repeated if repeated is not None else self._render(exposure)
         self._last_image = image
         if repeated is None and self._options.colour is not None:
-            mean = self._view.colour(self._lights(exposure), ambient=self._ambient(exposure))
-            self._last_colour = partial(self._coloured, mean, exposure.number, self._settings)
-        if self._befalls(self._faults.corrupt_frames, exposure.number) or self._chance(
+            mean = self._view.colour(self._lights_during(exposure), ambient=self._ambient(exposure))
+            self._last_colour = partial(self._render_colour, mean, exposure.number, self._settings)
+        if self._is_affected(self._faults.corrupt_frames, exposure.number) or self._draw_fault(
             self._faults.corrupt_probability, _CORRUPT, exposure.number
         ):
-            image = self._garbled(image, exposure.number)
+            image = self._garble(image, exposure.number)
         return Frame(
             camera=self._options.name,
             image=image,
@@ -238,26 +238,26 @@ class SimulatedCamera:
             colour=self._last_colour,
         )
 
-    def _rendered(self, exposure: _ExposureTimes) -> Pixels:
-        mean = self._view.image(self._lights(exposure), ambient=self._ambient(exposure))
-        exposure_s = self._settings.exposure_s * self._crept(exposure.number)
+    def _render(self, exposure: _ExposureTimes) -> Pixels:
+        mean = self._view.image(self._lights_during(exposure), ambient=self._ambient(exposure))
+        exposure_s = self._settings.exposure_s * self._light_factor(exposure.number)
         electrons = self._sensor.electrons(mean, exposure_s)
         return self._sensor.read_out(electrons, gain=self._settings.gain, rng=self._rng(_NOISE, exposure.number))
 
-    def _coloured(self, mean: Callable[[], Float32Array], number: int, settings: AppliedSettings) -> Pixels:
+    def _render_colour(self, mean: Callable[[], Float32Array], number: int, settings: AppliedSettings) -> Pixels:
         """A frame in colour, with a noise of its own."""
         light = mean() * np.array(self._options.colour, np.float32)
-        electrons = self._sensor.electrons(light, settings.exposure_s * self._crept(number))
+        electrons = self._sensor.electrons(light, settings.exposure_s * self._light_factor(number))
         flat = electrons.reshape(len(electrons), -1)
         return self._sensor.read_out(flat, gain=settings.gain, rng=self._rng(_COLOUR, number)).reshape(light.shape)
 
-    def _crept(self, number: int) -> float:
+    def _light_factor(self, number: int) -> float:
         """How much more light a frame has than the settings say."""
         steps = sum(number >= first for first in self._faults.exposure_step_frames) if self._is_faulty else 0
         drift = (1 + self._options.exposure_drift) ** max(number - self._armed_at, 0)
         return float(drift * self._faults.exposure_step**steps)
 
-    def _lights(self, exposure: _ExposureTimes) -> Sequence[tuple[float | Float32Array, LightTable]]:
+    def _lights_during(self, exposure: _ExposureTimes) -> Sequence[tuple[float | Float32Array, LightTable]]:
         """Each light that an exposure saw, with its fraction: one number, or (H, 1) when each row saw its own."""
         together = self._lamp.light_between(exposure.t_start_ns, exposure.t_end_ns)
         if self._options.line_time_s == 0 or (len(together) == 1 and self._lamp.flicker is None):
@@ -282,7 +282,7 @@ class SimulatedCamera:
         means = [self._ambient_flicker.mean(*self._row_times_ns(exposure, row)) for row in range(rows)]
         return np.array(means, np.float32)[:, None]
 
-    def _garbled(self, image: Pixels, number: int) -> Pixels:
+    def _garble(self, image: Pixels, number: int) -> Pixels:
         rng = self._rng(_GARBLE, number)
         rows = len(image)
         band = slice(rows // 3, rows // 3 + max(rows // 3, 1))
@@ -297,15 +297,15 @@ class SimulatedCamera:
     def _is_faulty(self) -> bool:
         return self._faults.cameras is None or self._options.name in self._faults.cameras
 
-    def _befalls(self, frames: tuple[int, ...], number: int) -> bool:
+    def _is_affected(self, frames: tuple[int, ...], number: int) -> bool:
         return self._is_faulty and number in frames
 
     def _is_dropped(self, number: int) -> bool:
-        return self._befalls(self._faults.drop_frames, number) or self._chance(
+        return self._is_affected(self._faults.drop_frames, number) or self._draw_fault(
             self._faults.drop_probability, _FATE, number
         )
 
-    def _chance(self, probability: float, purpose: int, number: int) -> bool:
+    def _draw_fault(self, probability: float, purpose: int, number: int) -> bool:
         return self._is_faulty and probability > 0 and bool(self._rng(purpose, number).random() < probability)
 
     def _jitter_s(self, purpose: int, number: int) -> float:

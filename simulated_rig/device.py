@@ -71,7 +71,7 @@ class SimulatedProjector:
         self._state = ProjectorState("the rendered projector")
         self._tables: dict[int, LightTable] = {}
         self._shows = 0
-        self._showing: int | None = None
+        self._shown_pattern: int | None = None
         self._gone = False
 
     @property
@@ -90,12 +90,12 @@ class SimulatedProjector:
         )
 
     @property
-    def showing(self) -> int | None:
+    def shown_pattern(self) -> int | None:
         """The pattern that the projector was last told to show, None when it was told to be dark."""
-        return self._showing
+        return self._shown_pattern
 
     @property
-    def lit(self) -> bool:
+    def is_lit(self) -> bool:
         """Whether more light than the dark projector's leak is on the scene now."""
         return self.lamp.light_at(self._clock.now_ns()).peak > self._dark.peak * (1 + 1e-6)
 
@@ -119,19 +119,19 @@ class SimulatedProjector:
         self.blank()
         self._state.loaded, self._tables = sequence, {}
         if self._staging is not None:
-            self._staging.begun(len(sequence))
+            self._staging.start_capture(len(sequence))
 
     def show(self, index: int) -> Shown:
         """See `Projector`."""
         self._require_usable()
         sequence = self._state.require_pattern(index)
         if self._faults.unplug_projector_at_show is not None and self._shows >= self._faults.unplug_projector_at_show:
-            self._gone, self._showing = True, None
+            self._gone, self._shown_pattern = True, None
             self.lamp.darken(at_ns=self._clock.now_ns())
             self._require_usable()
         self._shows += 1
         if self._staging is not None:
-            self._staging.shown()
+            self._staging.advance_pattern()
         if index not in self._tables:
             table, pattern = self._table(sequence.profiles[index]), sequence.patterns[index]
             if isinstance(pattern, Primary) and self._options.lights is not None:
@@ -142,7 +142,7 @@ class SimulatedProjector:
         t_visible_ns = self._at_refresh(self._clock.now_ns() + nanoseconds(self._options.latency_s))
         off_s = float(self._rng.uniform(-error_s, error_s)) + self._faults.light_delay_s
         self.lamp.show(self._tables[index], at_ns=t_visible_ns + nanoseconds(off_s))
-        self._showing = index
+        self._shown_pattern = index
         self._clock.wait_until(t_visible_ns + nanoseconds(error_s), self._state.closed)
         return Shown(index, t_visible_ns, nanoseconds(error_s))
 
@@ -161,14 +161,14 @@ class SimulatedProjector:
             return
         if self._gone:
             self._require_usable()
-        self._showing = None
+        self._shown_pattern = None
         self.lamp.darken(at_ns=self._clock.now_ns())
 
     def close(self) -> None:
         """See `Projector`."""
         if not self._gone:
             self.blank()
-        self._showing, self._state.loaded, self._tables = None, None, {}
+        self._shown_pattern, self._state.loaded, self._tables = None, None, {}
         self._state.closed.set()
 
     def _at_refresh(self, t_ns: int) -> int:
@@ -275,7 +275,7 @@ class SimulatedHead:
         tell = progress_reporter()
         with compilations_told(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")):
             for name, view in self._views.items():
-                view.prepare(told=partial(_report_tracing, tell, name))
+                view.prepare(report_progress=partial(_report_tracing, tell, name))
 
     @property
     def positioner(self) -> Positioner | None:
@@ -285,7 +285,7 @@ class SimulatedHead:
     def truth(self) -> Truth:
         """See `Head`. Of what stands there now. Works in every state, also after close."""
         cameras = {name: view.truth() for name, view in self._views.items()}
-        shape = self._stage.setting.surface
+        shape = self._stage.snapshot.surface
         known = self._truth
         if (
             known is None

@@ -37,7 +37,7 @@ _SIDES = (1, 5, 3, 7, 0, 4, 2, 6)
 """Eighths of a turn: corners are odd."""
 
 
-class PoseChange(Strict, use_attribute_docstrings=True):
+class PoseOffset(Strict, use_attribute_docstrings=True):
     """A device's change of pose, in its own frame: X' = turn (X + shift). The stated calibration does not follow."""
 
     device: Annotated[str, Field(min_length=1)]
@@ -50,7 +50,7 @@ class PoseChange(Strict, use_attribute_docstrings=True):
     """Along its x, y and z axis."""
 
 
-class BumpFault(PoseChange):
+class BumpFault(PoseOffset):
     """A device is bumped when a pose is taken, and stays so: `[[head.faults.bump]]`.
 
     Whoever goes back to an earlier pose finds it as it was before the bump.
@@ -60,7 +60,7 @@ class BumpFault(PoseChange):
     """Number of the pose, from 0."""
 
 
-class PoseDrift(PoseChange):
+class PoseDrift(PoseOffset):
     """A device drifts towards a change of pose as 1 - exp(-t / settling): `[[head.drift]]`.
 
     t counts from the opening of the rig in the world's time for settle_s, or in captures for settle_captures. During
@@ -74,13 +74,13 @@ class PoseDrift(PoseChange):
     """How many captures settling takes, of a drift by captures."""
 
     @model_validator(mode="after")
-    def _one_clock(self) -> PoseDrift:
+    def _check_settling(self) -> PoseDrift:
         if (self.settle_s is None) == (self.settle_captures is None):
             message = "a drift needs settle_s or settle_captures, and not both"
             raise ValueError(message)
         return self
 
-    def share(self, time_s: float, captures: int) -> float:
+    def progress(self, time_s: float, captures: int) -> float:
         """How much of the drift is there, 0 to 1, after a time and so many captures."""
         if self.settle_s is not None:
             return 1 - math.exp(-time_s / self.settle_s)
@@ -103,7 +103,7 @@ class ObjectMotion(Strict, use_attribute_docstrings=True):
     """In how many equal steps."""
 
 
-def apply_pose_change(device: Pinhole, push: PoseChange, *, share: float = 1.0) -> Pinhole:
+def apply_pose_offset(device: Pinhole, push: PoseOffset, *, share: float = 1.0) -> Pinhole:
     """Return a device after a share of a push."""
     turn = Rotation.from_rotvec(share * np.deg2rad(push.turn_deg)).as_matrix()
     translation = turn @ (device.translation_mm + share * np.array(push.shift_mm))
@@ -140,7 +140,7 @@ class TurntableOptions(Strict, use_attribute_docstrings=True):
 
     @field_validator("direction")
     @classmethod
-    def _a_direction(cls, direction: Triple) -> Triple:
+    def _check_direction(cls, direction: Triple) -> Triple:
         if not np.linalg.norm(direction) > 0:
             message = "expected a direction, found [0, 0, 0]; upwards is [0, -1, 0]"
             raise ValueError(message)
@@ -177,7 +177,7 @@ class RenderedTurntable(AnyAngle):
         self._options = options
         self._turn_objects = turn_objects
         self._rng = np.random.default_rng((seed, _SEED))
-        self._asked_deg = 0.0
+        self._angle_deg = 0.0
         self._closed = False
 
     @property
@@ -198,11 +198,11 @@ class RenderedTurntable(AnyAngle):
         if not np.isfinite(angle_deg):
             message = f"asked the turntable for {angle_deg}°; ask for a number of degrees"
             raise UnsupportedByDeviceError(message)
-        if angle_deg == self._asked_deg:
+        if angle_deg == self._angle_deg:
             return
         error_deg = self._options.scale_error * angle_deg + self._rng.normal(0.0, self._options.angle_sigma_deg)
         self._turn_objects(self._options.motion(angle_deg + error_deg))
-        self._asked_deg = angle_deg
+        self._angle_deg = angle_deg
 
     def close(self) -> None:
         """See `Positioner`."""
@@ -251,7 +251,7 @@ class PoseSeries(Strict, use_attribute_docstrings=True):
     """The paper stays so far inside every image, the projector's too."""
 
     @model_validator(mode="after")
-    def _rising(self) -> PoseSeries:
+    def _check_bounds(self) -> PoseSeries:
         if not 0 <= self.tilt_deg[0] <= self.tilt_deg[1] <= 70 or self.depth_mm[0] > self.depth_mm[1]:
             message = "tilt_deg needs 0 <= least <= most <= 70, depth_mm least <= most"
             raise ValueError(message)

@@ -74,7 +74,7 @@ class DeviceOptions(Strict, use_attribute_docstrings=True):
     """Standard deviation of the further spread of a point far away; at a distance d it is that times |1 - focus/d|."""
 
     @model_validator(mode="after")
-    def _posed(self) -> DeviceOptions:
+    def _check_pose(self) -> DeviceOptions:
         look = (self.position_mm is not None, self.target_mm is not None)
         matrix = (self.rotation is not None, self.translation_mm is not None)
         if not ((all(look) and not any(matrix)) or (all(matrix) and not any(look))):
@@ -223,7 +223,7 @@ class SimulatedCameraOptions(DeviceOptions):
         return (self.size.height_px - 1) * self.line_time_s
 
     @model_validator(mode="after")
-    def _consistent(self) -> SimulatedCameraOptions:
+    def _check_limits(self) -> SimulatedCameraOptions:
         if not self.exposure_min_s <= self.exposure_s <= self.exposure_max_s:
             message = (
                 f"exposure_s must lie between exposure_min_s and exposure_max_s ({self.exposure_min_s} to "
@@ -373,7 +373,7 @@ class HeadOptions(Strict, use_attribute_docstrings=True):
 
     @field_validator("camera")
     @classmethod
-    def _different_names(cls, cameras: tuple[SimulatedCameraOptions, ...]) -> tuple[SimulatedCameraOptions, ...]:
+    def _check_camera_names(cls, cameras: tuple[SimulatedCameraOptions, ...]) -> tuple[SimulatedCameraOptions, ...]:
         names = [camera.name for camera in cameras]
         if len(set(names)) != len(names):
             message = f"each camera needs a name of its own, found {names}"
@@ -381,7 +381,7 @@ class HeadOptions(Strict, use_attribute_docstrings=True):
         return cameras
 
     @model_validator(mode="after")
-    def _faulty_cameras_exist(self) -> HeadOptions:
+    def _check_faulty_cameras(self) -> HeadOptions:
         names = {camera.name for camera in self.camera}
         unknown = sorted(set(self.faults.cameras or ()) - names)
         if unknown:
@@ -390,7 +390,7 @@ class HeadOptions(Strict, use_attribute_docstrings=True):
         return self
 
     @model_validator(mode="after")
-    def _pushed_devices_exist(self) -> HeadOptions:
+    def _check_moved_devices(self) -> HeadOptions:
         names = {PROJECTOR, *(camera.name for camera in self.camera)}
         unknown = sorted({push.device for push in (*self.faults.bump, *self.drift)} - names)
         if unknown:

@@ -128,46 +128,46 @@ class SceneState:
         working_distance_mm: float,
         fall_off: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        self.setting = SceneSnapshot(surface, projector)
+        self.snapshot = SceneSnapshot(surface, projector)
         self.fall_off = fall_off
         self.working_distance_mm = working_distance_mm
 
     @property
     def surface(self) -> SceneSurface:
         """What stands there now."""
-        return self.setting.surface
+        return self.snapshot.surface
 
     @property
     def projector(self) -> Pinhole:
         """The projector where it is now."""
-        return self.setting.projector
+        return self.snapshot.projector
 
     @property
     def rays(self) -> RayCaster:
         """The caster of the surface."""
-        return self.setting.rays
+        return self.snapshot.rays
 
     def change(self, *, surface: SceneSurface | None = None, projector: Pinhole | None = None) -> None:
         """Put another surface there, or move the projector. Nothing happens if the projector stands there already."""
-        now = self.setting
+        now = self.snapshot
         if surface is not None or (projector is not None and not is_same_pose(projector, now.projector)):
-            self.setting = SceneSnapshot(surface or now.surface, projector or now.projector)
+            self.snapshot = SceneSnapshot(surface or now.surface, projector or now.projector)
 
 
 class _ViewCache:
     """What was traced of one setting by a camera in one place.
 
     room : its image under the room's light alone; last : under the projector's light that was asked for last.
-    softness : how much of each level of defocus every pixel takes, of the projector's and of the camera's.
+    defocus_weights : how much of each level of defocus every pixel takes, of the projector's and of the camera's.
     """
 
     def __init__(self, setting: SceneSnapshot, camera: Pinhole) -> None:
-        self.setting = setting
+        self.snapshot = setting
         self.camera = camera
         self.paths: LightPaths | None = None
         self.room: Float32Array | None = None
         self.last: tuple[LightTable, Float32Array] | None = None
-        self.softness: tuple[Weights, Weights] | None = None
+        self.defocus_weights: tuple[Weights, Weights] | None = None
         self.truth: CameraTruth | None = None
 
 
@@ -196,7 +196,7 @@ class CameraView:
         self._jitter = jitter
         self._seed = seed
         self._workers = workers
-        self._newest = _ViewCache(stage.setting, camera)
+        self._cache = _ViewCache(stage.snapshot, camera)
 
     @property
     def camera(self) -> Pinhole:
@@ -209,36 +209,36 @@ class CameraView:
             self._camera = camera
 
     @property
-    def _seen(self) -> _ViewCache:
+    def _current_cache(self) -> _ViewCache:
         """What is known of the present setting: a fresh start when something has moved."""
-        setting, camera = self._stage.setting, self._camera
-        if self._newest.setting is not setting or self._newest.camera is not camera:
-            self._newest = _ViewCache(setting, camera)
-        return self._newest
+        setting, camera = self._stage.snapshot, self._camera
+        if self._cache.snapshot is not setting or self._cache.camera is not camera:
+            self._cache = _ViewCache(setting, camera)
+        return self._cache
 
-    def prepare(self, *, told: Callable[[float], None] = lambda _: None) -> LightPaths:
-        """Trace the light paths, unless that is done, and return them. `told` hears the share that is done."""
-        return self._traced_paths(self._seen, told)
+    def prepare(self, *, report_progress: Callable[[float], None] = lambda _: None) -> LightPaths:
+        """Trace the light paths, unless that is done, and return them. `report_progress` receives the fraction done."""
+        return self._trace_paths(self._current_cache, report_progress)
 
-    def _traced_paths(self, seen: _ViewCache, told: Callable[[float], None] = lambda _: None) -> LightPaths:
-        if seen.paths is None:
-            seen.paths = transport.trace_paths(
-                seen.camera,
-                seen.setting.projector,
-                seen.setting.surface,
-                seen.setting.rays,
+    def _trace_paths(self, cache: _ViewCache, report_progress: Callable[[float], None] = lambda _: None) -> LightPaths:
+        if cache.paths is None:
+            cache.paths = transport.trace_paths(
+                cache.camera,
+                cache.snapshot.projector,
+                cache.snapshot.surface,
+                cache.snapshot.rays,
                 samples_per_axis=self._samples_per_axis,
                 jitter=self._jitter,
                 seed=self._seed,
                 working_distance_mm=self._stage.working_distance_mm,
                 workers=self._workers,
-                told=told,
+                report_progress=report_progress,
             )
             if any(self._stage.fall_off):
-                self._let_fall_off(seen.paths, seen.setting.projector)
-        return seen.paths
+                self._apply_fall_off(cache.paths, cache.snapshot.projector)
+        return cache.paths
 
-    def _let_fall_off(self, paths: LightPaths, projector: Pinhole) -> None:
+    def _apply_fall_off(self, paths: LightPaths, projector: Pinhole) -> None:
         """Take from the light what the projector's lens takes: see `ProjectorOptions.fall_off`."""
         power, corner = self._stage.fall_off
         (fx, _, cx), (_, fy, cy), _ = projector.matrix
@@ -256,65 +256,65 @@ class CameraView:
         this exposure over its mean, (H, 1) or (1, 1); absent, the mean.
         1 is a white diffuser, at the working distance and facing the projector, under full white.
         """
-        seen = self._seen
-        paths = self._traced_paths(seen)
-        if seen.room is None:
-            seen.room = blur_image(paths.albedo * np.float32(self._ambient), self._blur_px)
-        total = seen.room.copy() if ambient is None else seen.room * ambient
+        cache = self._current_cache
+        paths = self._trace_paths(cache)
+        if cache.room is None:
+            cache.room = blur_image(paths.albedo * np.float32(self._ambient), self._blur_px)
+        total = cache.room.copy() if ambient is None else cache.room * ambient
         for fraction, light in lights:
-            total += np.asarray(fraction, np.float32) * self._under(seen, paths, light)
+            total += np.asarray(fraction, np.float32) * self._cached_light(cache, paths, light)
         return total
 
     def colour(
         self, lights: Sequence[tuple[float | Float32Array, LightTable]], *, ambient: Float32Array | None = None
     ) -> Callable[[], Float32Array]:
         """What makes `image` in blue, green and red, (H, W, 3) float32, of what stands there now."""
-        seen = self._seen
+        cache = self._current_cache
 
         def channel(number: int) -> Float32Array:
-            paths = self._traced_paths(seen).in_light(number)
+            paths = self._trace_paths(cache).for_channel(number)
             total = blur_image(paths.albedo * np.float32(self._ambient), self._blur_px) * (
                 1 if ambient is None else ambient
             )
             for fraction, light in lights:
                 if light.channel not in (None, number):
                     continue
-                total = total + np.asarray(fraction, np.float32) * self._lit(seen, paths, light)
+                total = total + np.asarray(fraction, np.float32) * self._render_light(cache, paths, light)
             return total
 
         return lambda: np.stack([channel(number) for number in range(3)], axis=2)
 
     def rehearse(self, lights: Sequence[tuple[float | Float32Array, LightTable]]) -> None:
         """Do the work of `image` that does not depend on fractions, so that it is quick when time matters."""
-        seen = self._seen
-        paths = self._traced_paths(seen)
+        cache = self._current_cache
+        paths = self._trace_paths(cache)
         for _, light in lights:
-            self._under(seen, paths, light)
+            self._cached_light(cache, paths, light)
 
-    def _under(self, seen: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
+    def _cached_light(self, cache: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
         # A free-running camera sees the same light many times over: keep the last image.
-        if seen.last is None or seen.last[0] is not light:
-            seen.last = (light, self._lit(seen, paths, light))
-        return seen.last[1]
+        if cache.last is None or cache.last[0] is not light:
+            cache.last = (light, self._render_light(cache, paths, light))
+        return cache.last[1]
 
-    def _lit(self, seen: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
+    def _render_light(self, cache: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
         if light.channel is not None:
-            paths = paths.in_light(light.channel)
-        image = self._defocused(seen, paths, light) * np.float32(light.power)
+            paths = paths.for_channel(light.channel)
+        image = self._render_defocused(cache, paths, light) * np.float32(light.power)
         if light.glow > 0:
             image += blur_image(paths.albedo * np.float32(light.glow), self._blur_px)
         return image
 
-    def _defocused(self, seen: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
+    def _render_defocused(self, cache: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
         """The light of the projector on each pixel, blended from images at several levels of defocus."""
         if not any(focus.far_px for focus in self._focus):
             return radiance(paths, light, blur_px=self._blur_px)
-        if seen.softness is None:
-            seen.softness = self._softness(seen)
+        if cache.defocus_weights is None:
+            cache.defocus_weights = self._defocus_weights(cache)
         image = np.zeros(paths.albedo.shape, np.float32)
         tables = (light, *light.softer)
-        for of_light, weight in seen.softness[0].items():
-            for of_lens, share in seen.softness[1].items():
+        for of_light, weight in cache.defocus_weights[0].items():
+            for of_lens, share in cache.defocus_weights[1].items():
                 taken = weight * share
                 if taken.any():
                     blur_px = math.hypot(self._blur_px, LEVELS_PX[of_lens])
@@ -322,15 +322,15 @@ class CameraView:
                     image += taken * radiance(paths, tables[min(of_light, len(tables) - 1)], blur_px=blur_px)
         return image
 
-    def _softness(self, seen: _ViewCache) -> tuple[Weights, Weights]:
+    def _defocus_weights(self, cache: _ViewCache) -> tuple[Weights, Weights]:
         """The levels of the projector and of the camera at each pixel, by the distance of what its centre sees."""
-        if seen.truth is None:
-            seen.truth = self._traced_truth(seen)
-        camera, projector = seen.camera, seen.setting.projector
+        if cache.truth is None:
+            cache.truth = self._trace_truth(cache)
+        camera, projector = cache.camera, cache.snapshot.projector
         centres = [(u, v) for _, u, v in transport.pixel_centres(camera)]
         u, v = (np.concatenate(each) for each in zip(*centres, strict=True))
         towards = world_directions(u, v, lens_array(camera), camera.rotation)
-        from_eye = towards * (seen.truth.depth_mm.reshape(-1) / (towards @ camera.rotation[2]))[:, None]
+        from_eye = towards * (cache.truth.depth_mm.reshape(-1) / (towards @ camera.rotation[2]))[:, None]
         of_light, of_lens = self._focus
         light_mm = np.linalg.norm(from_eye + camera.centre_mm - projector.centre_mm, axis=1).reshape(camera.size.shape)
         lens_mm = np.linalg.norm(from_eye, axis=1).reshape(camera.size.shape)
@@ -338,13 +338,13 @@ class CameraView:
 
     def truth(self) -> CameraTruth:
         """Return depth, projector coordinates and visible points of what stands there, by rays at the pixel centres."""
-        seen = self._seen
-        if seen.truth is None:
-            seen.truth = self._traced_truth(seen)
-        return seen.truth
+        cache = self._current_cache
+        if cache.truth is None:
+            cache.truth = self._trace_truth(cache)
+        return cache.truth
 
-    def _traced_truth(self, seen: _ViewCache) -> CameraTruth:
-        camera, setting = seen.camera, seen.setting
+    def _trace_truth(self, cache: _ViewCache) -> CameraTruth:
+        camera, setting = cache.camera, cache.snapshot
         shape = camera.size.shape
         depth = np.full(shape, np.nan)
         projector_px = np.full((*shape, 2), np.nan)
@@ -361,10 +361,10 @@ class CameraView:
             )
             along = hits.points_mm @ camera.rotation[2] + camera.translation_mm[2]
             coordinates = np.column_stack([hits.column_px, hits.row_px])
-            coordinates[~hits.lit] = np.nan
+            coordinates[~hits.is_lit] = np.nan
             depth[rows] = along.reshape(depth[rows].shape)
             projector_px[rows] = coordinates.reshape(projector_px[rows].shape)
-            visible.append(hits.points_mm[hits.lit])
+            visible.append(hits.points_mm[hits.is_lit])
         return CameraTruth(depth, projector_px, np.concatenate(visible))
 
 

@@ -165,7 +165,7 @@ class PrintedBoard(SceneObject):
     bow_mm: float = 0.0
 
     @model_validator(mode="after")
-    def _printable(self) -> PrintedBoard:
+    def _check_print(self) -> PrintedBoard:
         if self.albedo_dark >= self.albedo_light:
             message = "albedo_dark must lie below albedo_light"
             raise ValueError(message)
@@ -261,7 +261,7 @@ class PrintedBoard(SceneObject):
         """See `Placed.material`: that of the light paper."""
         return (self.albedo_light, 0.0, 0.0, 1.0, self.specular.strength, self.specular.exponent)
 
-    def printed(self) -> BoardPrint:
+    def print_layout(self) -> BoardPrint:
         """What is printed."""
         ratio = self.albedo_dark / self.albedo_light
         if self.kind == "circles":
@@ -350,7 +350,7 @@ class BallBar(TexturedObject):
     bar_radius_mm: Positive
 
     @model_validator(mode="after")
-    def _apart(self) -> BallBar:
+    def _check_clearance(self) -> BallBar:
         if self.distance_mm <= 2 * self.radius_mm or self.bar_radius_mm >= self.radius_mm:
             message = (
                 f"the balls must lie apart (distance above {2 * self.radius_mm} mm) and the bar be thinner than them"
@@ -407,7 +407,7 @@ class Relief(TexturedObject):
     bump: Annotated[tuple[ReliefBump, ...], Field(strict=False)] = ()
 
     @model_validator(mode="after")
-    def _bounded(self) -> Relief:
+    def _check_cell_count(self) -> Relief:
         cells = self.size_mm[0] * self.size_mm[1] / self.step_mm**2
         if cells > 4e6:
             message = f"size_mm and step_mm ask for {cells:.0f} cells, at most 4000000 are made; use a larger step_mm"
@@ -446,7 +446,7 @@ class Vessel(TexturedObject):
     step_mm: Positive = 0.5
 
     @model_validator(mode="after")
-    def _turnable(self) -> Vessel:
+    def _check_profile(self) -> Vessel:
         if len(self.profile_mm) < 3:
             message = f"profile_mm needs at least 3 points, found {len(self.profile_mm)}"
             raise ValueError(message)
@@ -538,7 +538,7 @@ def build_surface(scene: Scene, folder: Path) -> SceneSurface:
             faults.append(str(error))
             continue
         if isinstance(thing, PrintedBoard):
-            prints[len(spheres)] = thing.printed()
+            prints[len(spheres)] = thing.print_layout()
         for part in parts:
             vertices.append(part.vertices_mm @ rotation.T + shift)
             faces.append(part.faces + first)

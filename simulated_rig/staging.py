@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.light import NS_PER_S
-from simulated_rig.movements import PROJECTOR, ObjectMotion, PoseChange, ScriptedPose, apply_pose_change, generate_poses
+from simulated_rig.movements import PROJECTOR, ObjectMotion, PoseOffset, ScriptedPose, apply_pose_offset, generate_poses
 from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import (
@@ -36,7 +36,7 @@ class PoseScript:
         self._folder = folder
         self.poses: tuple[ScriptedPose, ...] = options.pose
         boards = [thing for thing in scene.object if isinstance(thing, PrintedBoard)]
-        self._mover: SceneObject = boards[0] if boards else scene.object[0]
+        self._default_object: SceneObject = boards[0] if boards else scene.object[0]
         faults: list[str] = []
         if options.poses is not None:
             if boards:
@@ -45,7 +45,7 @@ class PoseScript:
             else:
                 faults.append('[head.poses] moves a board, and the scene has none: add an object of shape = "board"')
         names = {thing.name: thing for thing in scene.object}
-        self._moved: list[SceneObject] = []
+        self._moved_objects: list[SceneObject] = []
         for number, pose in enumerate(self.poses):
             if pose.object is None and not boards:
                 faults.append(
@@ -54,7 +54,7 @@ class PoseScript:
             elif pose.object is not None and pose.object not in names:
                 faults.append(f"pose {number + 1}: there is no object {pose.object!r}; the scene has {sorted(names)}")
             else:
-                self._moved.append(boards[0] if pose.object is None else names[pose.object])
+                self._moved_objects.append(boards[0] if pose.object is None else names[pose.object])
         table = options.turntable
         if table is not None and (options.pose or options.poses is not None):
             faults.append(
@@ -89,7 +89,7 @@ class PoseScript:
         Without poses: as the scene file has it.
         """
         scripted = self.poses[index] if self.poses else None
-        mover = self._moved[index] if self.poses else self._mover
+        mover = self._moved_objects[index] if self.poses else self._default_object
         things = self._scene.object
         if scripted is not None or movings:
             stand = scripted if scripted is not None else mover
@@ -131,8 +131,8 @@ class SceneController:
         self._stage = stage
         self._views = views
         self._clock = clock
-        self._stated: dict[str, Pinhole] = {each.name: each.pinhole() for each in options.camera}
-        self._stated[PROJECTOR] = options.projector.pinhole()
+        self._calibrated: dict[str, Pinhole] = {each.name: each.pinhole() for each in options.camera}
+        self._calibrated[PROJECTOR] = options.projector.pinhole()
         self._t_opened_ns = clock.now_ns()
         self._index = 0
         self._captures = 0
@@ -175,7 +175,7 @@ class SceneController:
         """See `Positioner`."""
         self._closed = True
 
-    def begun(self, pattern_count: int) -> None:
+    def start_capture(self, pattern_count: int) -> None:
         """A capture of so many patterns begins: what drifts does it now, what moves starts anew."""
         self._pattern_count, self._shows = max(pattern_count, 1), 0
         if self._options.drift:
@@ -184,7 +184,7 @@ class SceneController:
         if self._step:
             self._set_objects()
 
-    def shown(self) -> None:
+    def advance_pattern(self) -> None:
         """One more pattern is about to be shown: what moves has moved on."""
         movings = self._movings
         if movings:
@@ -207,15 +207,15 @@ class SceneController:
 
     def _set_devices(self) -> None:
         time_s = (self._clock.now_ns() - self._t_opened_ns) / NS_PER_S
-        pushes: list[tuple[PoseChange, float]] = [
+        pushes: list[tuple[PoseOffset, float]] = [
             *((bump, 1.0) for bump in self._options.faults.bump if bump.pose <= self._index),
-            *((drift, drift.share(time_s, self._captures)) for drift in self._options.drift),
+            *((drift, drift.progress(time_s, self._captures)) for drift in self._options.drift),
         ]
-        for name, stated in self._stated.items():
+        for name, stated in self._calibrated.items():
             now = stated
             for push, share in pushes:
                 if push.device == name:
-                    now = apply_pose_change(now, push, share=share)
+                    now = apply_pose_offset(now, push, share=share)
             if name == PROJECTOR:
                 self._stage.change(projector=now)
             else:

@@ -130,12 +130,12 @@ def print_reflectance(
             lens_array(camera),
             camera.rotation,
             footprint_px,
-            *_numbers(shown),
+            *_kernel_arguments(shown),
         )
     return out
 
 
-def _numbers(
+def _kernel_arguments(
     shown: BoardPrint,
 ) -> tuple[FloatArray, FloatArray, NDArray[np.uint8], FloatArray, float, float, float]:
     return (
@@ -384,8 +384,8 @@ class Hits:
     """
 
     points_mm: FloatArray
-    seen: NDArray[np.bool_]
-    lit: NDArray[np.bool_]
+    is_hit: NDArray[np.bool_]
+    is_lit: NDArray[np.bool_]
     column_px: FloatArray
     row_px: FloatArray
     weight: NDArray[np.float32]
@@ -408,7 +408,7 @@ class LightPaths:
     albedo: NDArray[np.float32]
     hue: NDArray[np.float32] | None = None
 
-    def in_light(self, channel: int) -> LightPaths:
+    def for_channel(self, channel: int) -> LightPaths:
         """The paths of blue, green or red light alone: 0, 1, 2."""
         if self.hue is None:
             return self
@@ -501,11 +501,11 @@ def trace_paths(
     seed: int,
     working_distance_mm: float,
     workers: int,
-    told: Callable[[float], None] = lambda _: None,
+    report_progress: Callable[[float], None] = lambda _: None,
 ) -> LightPaths:
     """Trace samples_per_axis² samples per pixel: at the middles of equal cells, or, jittered, anywhere in each cell.
 
-    `told` hears the share that is done, block by block.
+    `report_progress` receives the fraction done after each block.
     """
     rows, columns = camera.size.shape
     count = samples_per_axis**2
@@ -546,7 +546,7 @@ def trace_paths(
     with ThreadPoolExecutor(workers, thread_name_prefix="trace") as pool:
         # Each block writes rows of its own; going over them makes a failure in any of them surface here.
         for done, _ in enumerate(pool.map(fill, starts), start=1):
-            told(done / len(starts))
+            report_progress(done / len(starts))
     return out
 
 

@@ -68,16 +68,16 @@ class OakCamera:
     def __init__(self, name: str, options: OakOptions) -> None:
         self._name = name
         self._vendor = load_depthai()
-        self._board: OakDevice = open_device(options.device)
+        self._device: OakDevice = open_device(options.device)
         try:
-            self._sensor = self._chosen(options)
-            self._stream = self._planned(options)
-            self._info = self._declared()
+            self._sensor = self._choose_sensor(options)
+            self._stream = self._plan_stream(options)
+            self._info = self._build_info()
             low_s, high_s = self._info.exposure_range_s
             self._asked = (round(min(max(DEFAULT_EXPOSURE_S, low_s), high_s) * 1e6), ISO_OF_GAIN_1)
-            self._feed: FrameQueue = self._board.join(CameraLink(self._stream, self._prepare, FrameQueue()))
+            self._frames: FrameQueue = self._device.join(CameraLink(self._stream, self._prepare, FrameQueue()))
         except BaseException:
-            self._board.close_unless_used()
+            self._device.close_unless_used()
             raise
         self._state = CameraState(name)
         self._armed_ns = 0
@@ -98,30 +98,30 @@ class OakCamera:
         """
         hint = f"exposures are that long at fps = {self._stream.fps:g}"
         self._state.check_settings(settings, self._info, hint=hint)
-        self._board.start()
+        self._device.start()
         self._asked = (round(settings.exposure_s * 1e6), round(settings.gain * ISO_OF_GAIN_1))
         control = self._vendor.CameraControl()
         control.setManualExposure(*self._asked)
-        self._feed.begin()
-        self._board.send(self._stream.socket, control)
+        self._frames.begin()
+        self._device.send(self._stream.socket, control)
         if self._stream.external_trigger:
             return AppliedSettings(self._asked[0] / 1e6, self._asked[1] / ISO_OF_GAIN_1, 1 / self._stream.fps)
         until_ns = time.monotonic_ns() + round((_SETTLE_S + 8 / self._stream.fps) * 1e9)
         last: OakFrame | None = None
-        while (delivery := self._feed.take(until_ns)) is not None:
-            if self._as_asked(delivery):
+        while (delivery := self._frames.take(until_ns)) is not None:
+            if self._matches_settings(delivery):
                 return AppliedSettings(delivery.exposure_us / 1e6, delivery.iso / ISO_OF_GAIN_1, 1 / self._stream.fps)
             last = delivery
             if delivery.received_ns > until_ns:
                 break
-        raise self._not_settled(last)
+        raise self._settling_error(last)
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`. Frames beyond `count` can be had."""
-        self._state.check_arming(count, trigger, self._info, hint=self._how_to_wire(trigger))
-        self._board.start()
+        self._state.check_arming(count, trigger, self._info, hint=self._trigger_hint(trigger))
+        self._device.start()
         # Edges that come while nobody reads must not be lost; a camera that runs by itself has newer frames.
-        self._feed.begin(max(MAX_WAITING_FRAMES, 2 * count) if trigger is Trigger.HARDWARE else MAX_WAITING_FRAMES)
+        self._frames.begin(max(MAX_WAITING_FRAMES, 2 * count) if trigger is Trigger.HARDWARE else MAX_WAITING_FRAMES)
         self._armed_ns = time.monotonic_ns()
         self._state.armed = trigger
 
@@ -136,18 +136,18 @@ class OakCamera:
         self._state.require_armed()
         until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         stale = otherwise = 0
-        while (delivery := self._feed.take(until_ns)) is not None:
-            if delivery.t_start_ns - self._board.err_ns < after_ns or delivery.t_start_ns < self._armed_ns:
+        while (delivery := self._frames.take(until_ns)) is not None:
+            if delivery.t_start_ns - self._device.err_ns < after_ns or delivery.t_start_ns < self._armed_ns:
                 stale += 1
-            elif not self._as_asked(delivery):
+            elif not self._matches_settings(delivery):
                 otherwise += 1
-                self._feed.lose()
+                self._frames.count_loss()
             else:
                 return self._frame(delivery)
             # Frames that keep coming must not keep this from ending.
             if time.monotonic_ns() > until_ns:
                 break
-        lost, why = self._feed.lost
+        lost, why = self._frames.losses
         damage = f", the last damaged one: {why}" if why else ""
         message = (
             f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s; passed over: "
@@ -163,11 +163,11 @@ class OakCamera:
     def close(self) -> None:
         """See `Camera`. The device is closed with the last of its cameras."""
         if self._state.close():
-            self._board.leave(self._stream.socket)
+            self._device.leave(self._stream.socket)
 
-    def _chosen(self, options: OakOptions) -> OakSensor:
+    def _choose_sensor(self, options: OakOptions) -> OakSensor:
         """The sensor at the socket, if it can do what is asked."""
-        board = self._board
+        board = self._device
         sensor = board.sensors.get(options.socket)
         if sensor is None:
             has = ", ".join(f"{s.socket} ({s.name}, {s.size})" for s in board.sensors.values()) or "none"
@@ -190,7 +190,7 @@ class OakCamera:
             raise UnsupportedByDeviceError(message)
         return sensor
 
-    def _planned(self, options: OakOptions) -> OakStream:
+    def _plan_stream(self, options: OakOptions) -> OakStream:
         sensor = self._sensor
         size = sensor.size if options.size_px is None else Size(*options.size_px)
         if size.width_px > sensor.size.width_px or size.height_px > sensor.size.height_px:
@@ -199,7 +199,7 @@ class OakCamera:
         focus = options.focus
         if sensor.autofocus and focus is None:
             with suppress(CalibrationError):
-                handler = self._board.factory_calibration()
+                handler = self._device.factory_calibration()
                 focus = handler.getLensPosition(getattr(self._vendor.CameraBoardSocket, sensor.socket))
             if not focus:
                 message = (
@@ -217,12 +217,12 @@ class OakCamera:
             external_trigger=options.external_trigger,
         )
 
-    def _declared(self) -> CameraInfo:
+    def _build_info(self) -> CameraInfo:
         trigger = Trigger.HARDWARE if self._stream.external_trigger else Trigger.FREE
         return CameraInfo(
             name=self._name,
-            model=f"{self._board.model} {self._sensor.name}",
-            serial=f"{self._board.device_id}-{self._stream.socket}",
+            model=f"{self._device.model} {self._sensor.name}",
+            serial=f"{self._device.device_id}-{self._stream.socket}",
             format=CameraFormat(self._stream.size, 8),
             triggers=frozenset({trigger}),
             exposure_range_s=(MIN_EXPOSURE_S, MAX_EXPOSURE_FRACTION / self._stream.fps),
@@ -247,7 +247,7 @@ class OakCamera:
             control.setFrameSyncMode(vendor.CameraControl.FrameSyncMode.INPUT)
             control.setExternalTrigger(1, 0)
 
-    def _as_asked(self, delivery: OakFrame) -> bool:
+    def _matches_settings(self, delivery: OakFrame) -> bool:
         exposure_us, iso = self._asked
         return (
             abs(delivery.exposure_us - exposure_us) <= max(_TOLERANCE * exposure_us, 1)
@@ -265,21 +265,21 @@ class OakCamera:
             image=image,
             t_start_ns=delivery.t_start_ns,
             t_end_ns=delivery.t_end_ns + skew_ns,
-            t_err_ns=self._board.err_ns,
+            t_err_ns=self._device.err_ns,
             sequence_number=delivery.number,
-            dropped_count=self._feed.lost[0],
+            dropped_count=self._frames.losses[0],
             exposure_s=delivery.exposure_us / 1e6,
             gain=delivery.iso / ISO_OF_GAIN_1,
             shutter_skew_s=skew_ns / 1e9,
             colour=colour_reader(delivery.message, image) if self._stream.colour else None,
         )
 
-    def _not_settled(self, last: OakFrame | None) -> Exception:
+    def _settling_error(self, last: OakFrame | None) -> Exception:
         exposure_us, iso = self._asked
         focus = "" if self._stream.focus is None else f", focus {self._stream.focus}"
         asked = f"exposure {exposure_us} µs, ISO {iso}{focus}"
         if last is None:
-            lost, why = self._feed.lost
+            lost, why = self._frames.losses
             message = (
                 f"camera '{self._name}' delivers no frame after {asked} was asked for ({lost} lost"
                 f"{f', the last one: {why}' if why else ''}); check cable and USB port, or lower fps or size_px"
@@ -292,7 +292,7 @@ class OakCamera:
         )
         return UnsupportedByDeviceError(message)
 
-    def _how_to_wire(self, trigger: Trigger) -> str:
+    def _trigger_hint(self, trigger: Trigger) -> str:
         if trigger is not Trigger.HARDWARE:
             return ""
         if self._sensor.snapshot:

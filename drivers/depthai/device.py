@@ -136,20 +136,20 @@ class FrameQueue:
         self._waiting: deque[OakFrame] = deque(maxlen=MAX_WAITING_FRAMES)
         self._last_number = -1
         self._lost = 0
-        self._why_lost = ""
+        self._damage = ""
         self._ended: str | None = None
 
     @property
-    def lost(self) -> tuple[int, str]:
+    def losses(self) -> tuple[int, str]:
         """How many frames were lost since `begin`, and what was wrong with the last damaged one."""
         with self._changed:
-            return self._lost, self._why_lost
+            return self._lost, self._damage
 
     def begin(self, kept: int = MAX_WAITING_FRAMES) -> None:
         """Forget what is waiting, and count anew."""
         with self._changed:
             self._waiting = deque(maxlen=kept)
-            self._lost, self._why_lost = 0, ""
+            self._lost, self._damage = 0, ""
 
     def put(self, delivery: OakFrame) -> None:
         """Take a frame. One that came before is dropped; a gap in the numbers before it counts as lost."""
@@ -162,12 +162,12 @@ class FrameQueue:
             self._waiting.append(delivery)
             self._changed.notify_all()
 
-    def damaged(self, fault: str) -> None:
+    def note_damage(self, fault: str) -> None:
         """Note what was wrong with a frame. The gap that it leaves counts it: its own number may be damaged, too."""
         with self._changed:
-            self._why_lost = fault
+            self._damage = fault
 
-    def lose(self) -> None:
+    def count_loss(self) -> None:
         """Count one more frame that the reader had to pass over."""
         with self._changed:
             self._lost += 1
@@ -206,7 +206,7 @@ class CameraLink:
 
     stream: OakStream
     start: Callable[[Any], None]
-    feed: FrameQueue
+    frames: FrameQueue
 
 
 class OakDevice:
@@ -277,7 +277,7 @@ class OakDevice:
         """
         stream = link.stream
         with self._lock:
-            self._require_there()
+            self._require_connected()
             if stream.socket in self._users:
                 message = (
                     f"camera {stream.socket} of OAK device '{self.device_id}' is open already; close it first, or name "
@@ -305,7 +305,7 @@ class OakDevice:
                 )
                 raise DeviceBusyError(message)
             self._users.add(stream.socket)
-            return self._links[stream.socket].feed
+            return self._links[stream.socket].frames
 
     def leave(self, socket: str) -> None:
         """Stop using one camera; close the device after the last one. Works after an unplug."""
@@ -337,15 +337,15 @@ class OakDevice:
             It was unplugged.
         """
         with self._lock:
-            self._require_there()
+            self._require_connected()
             if self._running is not None:
                 return
             if self._refusal is None:
                 try:
-                    queue = self._built()
+                    queue = self._build_pipeline()
                     self._pipeline.start()
                 except Exception as cause:  # noqa: BLE001 - it raises errors of many kinds, its own and Python's
-                    self._refused(cause)
+                    self._note_refusal(cause)
             if self._refusal is not None:
                 raise UnsupportedByDeviceError(self._refusal)
             self._running = dict(self._links)
@@ -355,11 +355,11 @@ class OakDevice:
             self._listener.start()
             self._darken()
 
-    def _refused(self, cause: Exception) -> None:
+    def _note_refusal(self, cause: Exception) -> None:
         """Remember why the device does not stream: what was laid out half cannot be laid out again."""
         if self._device.isClosed():
             self._end(f"OAK device '{self.device_id}' is gone ({cause}); plug it in and open it again")
-            self._require_there()
+            self._require_connected()
         streams = ", ".join(f"{link.stream.size} from {socket}" for socket, link in self._links.items())
         self._refusal = (
             f"OAK device '{self.device_id}': asked for {streams}, the device refuses: {cause}; ask for another size_px "
@@ -369,14 +369,14 @@ class OakDevice:
     def send(self, socket: str, control: Any) -> None:
         """Send a camera its settings. Raises DeviceGoneError."""
         with self._lock:
-            self._require_there()
+            self._require_connected()
             try:
                 self._controls[socket].send(control)
             except (RuntimeError, self._vendor.MessageQueue.QueueException) as cause:
                 self._end(f"OAK device '{self.device_id}' is gone ({cause}); plug it in and open it again")
-                self._require_there()
+                self._require_connected()
 
-    def _built(self) -> Any:
+    def _build_pipeline(self) -> Any:
         """Lay out the pipeline; return the queue that it fills."""
         vendor, pipeline = self._vendor, self._pipeline
         outputs = {}
@@ -423,7 +423,7 @@ class OakDevice:
                 message = queue.get(_LISTEN)
                 received_ns = time.monotonic_ns()
                 if message is not None:
-                    self._hand_out(message, received_ns)
+                    self._distribute(message, received_ns)
                 elif not self._pipeline.isRunning():
                     break
             reason = "the pipeline has ended"
@@ -435,21 +435,21 @@ class OakDevice:
             else f"OAK device '{self.device_id}' is gone ({reason}); plug it in and open it again"
         )
 
-    def _hand_out(self, message: Any, received_ns: int) -> None:
+    def _distribute(self, message: Any, received_ns: int) -> None:
         for socket, link in (self._running or {}).items():
             frame = message[socket] if isinstance(message, self._vendor.MessageGroup) else message
             fault = find_frame_fault(frame, link.stream, received_ns, self.err_ns, self._vendor)
             if fault is not None:
-                link.feed.damaged(fault)
+                link.frames.note_damage(fault)
             else:
-                link.feed.put(read_frame(frame, received_ns, self._vendor))
+                link.frames.put(read_frame(frame, received_ns, self._vendor))
 
     def _end(self, reason: str) -> None:
         self._gone = self._gone or reason
         for link in (self._running or self._links).values():
-            link.feed.end(self._gone)
+            link.frames.end(self._gone)
 
-    def _require_there(self) -> None:
+    def _require_connected(self) -> None:
         if self._gone is not None:
             raise DeviceGoneError(self._gone)
 

@@ -118,12 +118,12 @@ class OrderEntry:
     after_us: int
 
     @property
-    def packed(self) -> bytes:
+    def encoded(self) -> bytes:
         """As it is read back; it is sent with one byte before it."""
         return _ENTRY.pack(self.place.set, self.count, self.leds, 0, *astuple(self)[3:], self.place.index)
 
     @property
-    def lasts_us(self) -> int:
+    def duration_us(self) -> int:
         """All its patterns together."""
         return self.count * (self.before_us + self.light_us + self.after_us)
 
@@ -145,26 +145,26 @@ class Dlpc347xEngine:
         """Let the bus go. Idempotent."""
         self._bus.close()
 
-    def tell(self, command: int, data: bytes = b"") -> None:
+    def send(self, command: int, data: bytes = b"") -> None:
         """Send a command, and ask whether it was taken.
         Raises UnsupportedByDeviceError, with what the engine says, if it was not; DeviceError if the engine failed.
         """
         self._bus.write(command, data)
-        short = self._short()
+        short = self._short_status()
         if short & COMMUNICATION:
             told = self._bus.read(Dlpc347xRead.COMMUNICATION, 2, b"\2")[0]
             causes = "; ".join(words for bit, words in enumerate(REFUSALS) if told >> bit & 1) or f"{told:#04x}"
             message = f"{self.name} does not take the command {command:02x}h {data.hex(' ')}: {causes}"
             raise UnsupportedByDeviceError(message)
         if short & (SYSTEM | SEQUENCE | FLASH):
-            raise self._fault(short)
+            raise self._system_fault(short)
 
     def settle(self, command: Dlpc347xCommand, data: bytes, asked: bytes = b"", *, read: bytes | None = None) -> None:
         """Set something, and compare what is read back. asked : what the read is sent; read : what it should give.
         Raises UnsupportedByDeviceError if that is something else.
         """
         wanted = data if read is None else read
-        self.tell(command, data)
+        self.send(command, data)
         got = self._bus.read(command + 1, len(wanted), asked)
         if got != wanted:
             name = command.name.lower().replace("_", " ")
@@ -207,7 +207,7 @@ class Dlpc347xEngine:
             )
             self.settle(Dlpc347xCommand.TRIGGER_OUT, sent, bytes([number]), read=got)
 
-    def light(self, leds: LedColour, light_us: int) -> LightLimits:
+    def light_limits(self, leds: LedColour, light_us: int) -> LightLimits:
         """Ask whether a pattern of 1 bit can be lit for so long, and what dark that takes."""
         depth = int(leds is LedColour.WHITE)
         told = self._bus.read(Dlpc347xRead.LIGHT, 13, struct.pack("<BBI", _INTERNAL, depth, light_us))
@@ -216,11 +216,11 @@ class Dlpc347xEngine:
     def order(self, entries: Sequence[OrderEntry], repeats: int) -> None:
         """Set what `start` shows: these, and so many times again. Whether "again" counts the first, nobody says."""
         for number, entry in enumerate(entries):
-            self.tell(Dlpc347xCommand.ORDER, bytes([number == 0]) + entry.packed)
+            self.send(Dlpc347xCommand.ORDER, bytes([number == 0]) + entry.encoded)
         for number, entry in enumerate(entries):
             got = self._bus.read(Dlpc347xCommand.ORDER + 1, _ENTRY.size, bytes([number]))
-            if got != entry.packed:
-                message = f"{self.name}: entry {number} was {entry.packed.hex(' ')}, the engine gives {got.hex(' ')}"
+            if got != entry.encoded:
+                message = f"{self.name}: entry {number} was {entry.encoded.hex(' ')}, the engine gives {got.hex(' ')}"
                 raise UnsupportedByDeviceError(message + "; update its firmware to TI's latest")
         self._repeats = repeats
         until = time.monotonic() + READY_TIMEOUT_S
@@ -230,42 +230,42 @@ class Dlpc347xEngine:
                 raise DeviceError(message + "; switch it off and on, and write its flash: slrig patterns RIG")
             self._never.wait(_ASK_AGAIN_S)
 
-    def leds(self, *, by_sequence: bool) -> None:
+    def switch_leds(self, *, by_sequence: bool) -> None:
         """Let the sequence switch the LEDs, or switch them all off; compare what is read back."""
         self.settle(Dlpc347xCommand.LED_ENABLE, bytes([7 if by_sequence else 0]))
 
     def start(self) -> None:
         """Start what was ordered."""
-        self.tell(Dlpc347xCommand.CONTROL, bytes([0, self._repeats]))
+        self.send(Dlpc347xCommand.CONTROL, bytes([0, self._repeats]))
 
     def stop(self) -> None:
         """Stop it."""
-        self.tell(Dlpc347xCommand.CONTROL, b"\1\0")
+        self.send(Dlpc347xCommand.CONTROL, b"\1\0")
 
     def flash(self) -> bytes:
         """Return the block of patterns in its flash; empty where there is none."""
-        self.tell(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
+        self.send(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
         size = block_size(head) if len(head := self._read_flash(HEAD_BYTES)) == HEAD_BYTES else 0
         if not HEAD_BYTES < size < 1 << 20:
             return b""
-        self.tell(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
+        self.send(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
         return self._read_flash(size)
 
     def write_flash(self, block: bytes) -> None:
         """Erase the patterns in its flash, write others, and compare what is read back (DLPU075B §3, "update internal
         pattern data": kind, check, erase, length, start, continue).
         """
-        self.tell(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
+        self.send(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
         if told := self._bus.read(Dlpc347xRead.FLASH_CHECK, 1, struct.pack("<I", len(block)))[0]:
             message = f"{self.name}: asked for {len(block)} bytes of patterns, its flash has no room ({told:#04x}); "
             raise UnsupportedByDeviceError(message + "scan one axis only, or with a shorter line_shift_period_px")
-        self.tell(Dlpc347xCommand.FLASH_ERASE, bytes.fromhex("AABBCCDD"))
+        self.send(Dlpc347xCommand.FLASH_ERASE, bytes.fromhex("AABBCCDD"))
         self._wait(ERASING, 0, ERASE_TIMEOUT_S, "erase its flash")
         length = 0
         for start in range(0, len(block), MAX_WRITE_BYTES):
             part = block[start : start + MAX_WRITE_BYTES]
             length = self._set_length(len(part), length)
-            self.tell(Dlpc347xCommand.FLASH_WRITE + (start > 0), part)
+            self.send(Dlpc347xCommand.FLASH_WRITE + (start > 0), part)
         if self.flash() != block:
             message = f"{self.name}: its flash does not give back what was written; write it again: slrig patterns RIG"
             raise DeviceError(message)
@@ -279,21 +279,21 @@ class Dlpc347xEngine:
 
     def _set_length(self, length: int, before: int) -> int:
         if length != before:
-            self.tell(Dlpc347xCommand.FLASH_LENGTH, struct.pack("<H", length))
+            self.send(Dlpc347xCommand.FLASH_LENGTH, struct.pack("<H", length))
         return length
 
-    def _short(self) -> int:
+    def _short_status(self) -> int:
         return self._bus.read(Dlpc347xRead.SHORT, 1)[0]
 
     def _wait(self, mask: int, wanted: int, timeout_s: float, what: str) -> None:
         until = time.monotonic() + timeout_s
-        while (short := self._short()) & mask != wanted:
+        while (short := self._short_status()) & mask != wanted:
             if time.monotonic() > until:
                 message = f"{self.name} did not {what} in {timeout_s:g} s (status {short:#04x}); switch it off and on"
                 raise DeviceError(message)
             self._never.wait(_ASK_AGAIN_S)
 
-    def _fault(self, short: int) -> DeviceError:
+    def _system_fault(self, short: int) -> DeviceError:
         system = int.from_bytes(self._bus.read(Dlpc347xRead.SYSTEM, 4), "little")
         if sequence := system >> 19 & 0x1F:
             told = SEQUENCE_FAULTS.get(sequence, f"sequence error {sequence}")

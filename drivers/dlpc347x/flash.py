@@ -66,16 +66,16 @@ class LineEncoder:
     mirrors: Dlpc347xMirrors
     turned: tuple[bool, bool]
 
-    def of(self, sequence: PatternSequence, index: int) -> tuple[PatternLine, ...]:
+    def encode(self, sequence: PatternSequence, index: int) -> tuple[PatternLine, ...]:
         """Return a pattern as a line of columns, or of rows, or, where it lights all mirrors or none, as both.
         Raises UnsupportedByDeviceError: it has shades of grey.
         """
         plane = pattern_plane(sequence, index)
         rows, columns = sequence.profiles[index].shape
         lines = [(1, plane[0])] * (rows == 1) + [(0, plane[:, 0])] * (columns == 1)
-        return tuple((way, self._packed(line[::-1] if self.turned[way] else line, way)) for way, line in lines)
+        return tuple((way, self._pack(line[::-1] if self.turned[way] else line, way)) for way, line in lines)
 
-    def _packed(self, line: NDArray[np.bool_], columns: int) -> bytes:
+    def _pack(self, line: NDArray[np.bool_], columns: int) -> bytes:
         bits = np.pad(line, (self.mirrors.before[columns], self.mirrors.after[columns]))
         packed = np.packbits(bits, bitorder="little").tobytes()
         return packed + bytes(-len(packed) % 4)
@@ -85,7 +85,7 @@ def build_block(sequence: PatternSequence, lines: LineEncoder) -> bytes:
     """Return the block that holds a sequence: columns, then rows, in sets with white and black; and an order that is
     dark.
     """
-    found = [lines.of(sequence, index) for index in range(len(sequence))]
+    found = [lines.encode(sequence, index) for index in range(len(sequence))]
     sets: list[bytes] = []
     for way in (1, 0):
         both, own = (
@@ -134,7 +134,7 @@ def locate_patterns(
     Raises UnsupportedByDeviceError: the flash lacks patterns; the message says what to do.
     """
     found = [
-        {place.set: place for line in lines.of(sequence, index) for place in reversed(held.get(line, ()))}
+        {place.set: place for line in lines.encode(sequence, index) for place in reversed(held.get(line, ()))}
         for index in range(len(sequence))
     ]
     missing = [describe_pattern(sequence.patterns[index]) for index, places in enumerate(found) if not places]

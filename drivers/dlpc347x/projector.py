@@ -71,7 +71,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
         self._places: tuple[FlashedLine, ...] = ()
         self._colours: tuple[LedColour, ...] = ()
         self._lights: dict[tuple[LedColour, int], LightLimits] = {}
-        self._take_over()
+        self._initialise()
 
     def write_patterns(self, sequence: PatternSequence) -> str:
         """See `FlashedProjector`. Into the engine itself, if it lacks any; what its flash had before is gone then."""
@@ -98,7 +98,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
         self.blank()
         self._state.require_size(sequence, self._lines.mirrors.size)
         self._places = locate_patterns(sequence, self._lines, self._held)
-        self._colours = tuple(map(self._options.colour_of, sequence.patterns))
+        self._colours = tuple(map(self._options.led_colour, sequence.patterns))
         self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
@@ -108,13 +108,13 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
         self._state.require_pattern(index)
         entry = self._entry(self._places[index], 1, self._colours[index], MAX_LIGHT_US)
         # A repeat more or less than counted is within what it is left alone for.
-        repeats = min(round(MAX_UNATTENDED_S * 1e6) // entry.lasts_us - 1, MAX_REPEATS)
+        repeats = min(round(MAX_UNATTENDED_S * 1e6) // entry.duration_us - 1, MAX_REPEATS)
         with self._lock:
-            started_ns = self._run((entry,), repeats)
-            self._begin_holding(repeats * entry.lasts_us / 1e6, again_s=MAX_UNATTENDED_S / 2)
+            started_ns = self._start_sequence((entry,), repeats)
+            self._hold_pattern(repeats * entry.duration_us / 1e6, again_s=MAX_UNATTENDED_S / 2)
             # Whether LEDs stay dark after the last repeat is not documented.
             self._dark_at_s = self._held_until_s + MAX_UNATTENDED_S
-        return self._shown(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
+        return self._wait_for_light(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
@@ -126,7 +126,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
             )
             raise UnsupportedByDeviceError(message)
         options = self._options
-        least = self._light_of(options.colour, MAX_LIGHT_US)
+        least = self._light_limits(options.colour, MAX_LIGHT_US)
         wanted_us = light_duration_us(
             exposure_s,
             period_s,
@@ -138,27 +138,27 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
         entries: list[OrderEntry] = []
         # The last pattern has an entry of its own, and stays dark after it until this program stops the engine: it is
         # not documented whether a repeat of 0 is once or for ever, and 1 is once or twice.
-        begins = [at for at in range(len(sequence)) if at in (0, len(sequence) - 1) or self._breaks(at)]
+        begins = [at for at in range(len(sequence)) if at in (0, len(sequence) - 1) or self._needs_own_entry(at)]
         for begin, end in pairwise([*begins, len(sequence)]):
             lit = self._entry(self._places[begin], end - begin, self._colours[begin], wanted_us)
             dark_us = round(period_s * 1e6) - wanted_us - lit.before_us + (END_DARK_US if end == len(sequence) else 0)
             entries.append(replace(lit, after_us=dark_us))
-        lasts_us = sum(entry.lasts_us for entry in entries)
+        duration_us = sum(entry.duration_us for entry in entries)
         with self._lock:
-            self._run(tuple(entries), 1)
-            self._dark_at_s = self._now_s() + options.start_s + (lasts_us - END_DARK_US / 2) / 1e6
+            self._start_sequence(tuple(entries), 1)
+            self._dark_at_s = self._now_s() + options.start_s + (duration_us - END_DARK_US / 2) / 1e6
 
-    def _breaks(self, at: int) -> bool:
+    def _needs_own_entry(self, at: int) -> bool:
         """Whether pattern `at` needs an entry of its own: it is not the next one in the flash, or lit otherwise."""
         return self._places[at].index != self._places[at - 1].index + 1 or self._colours[at] != self._colours[at - 1]
 
     def _entry(self, place: FlashedLine, count: int, colour: LedColour, wanted_us: int) -> OrderEntry:
-        light = self._light_of(colour, wanted_us)
+        light = self._light_limits(colour, wanted_us)
         return OrderEntry(place, count, colour, wanted_us, light.before_us, light.after_us)
 
-    def _light_of(self, colour: LedColour, wanted_us: int) -> LightLimits:
+    def _light_limits(self, colour: LedColour, wanted_us: int) -> LightLimits:
         """What the engine says of a light; it is asked once. Raises UnsupportedByDeviceError: it has none such."""
-        light = self._lights.get((colour, wanted_us)) or self._engine.light(colour, wanted_us)
+        light = self._lights.get((colour, wanted_us)) or self._engine.light_limits(colour, wanted_us)
         if not light.supported:
             message = (
                 f"asked for {wanted_us} µs of {colour.name.lower()} light, the engine has none; its shortest is "
@@ -169,7 +169,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
         self._lights[colour, wanted_us] = light
         return light
 
-    def _run(self, entries: tuple[OrderEntry, ...], repeats: int) -> int:
+    def _start_sequence(self, entries: tuple[OrderEntry, ...], repeats: int) -> int:
         """Stop, set, start. Return when the command to start was sent."""
         with self._lock:
             self._state.require_open()
@@ -177,7 +177,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
                 self.blank()
                 self._engine.order(entries, repeats)
                 started_ns = self._clock.now_ns()
-                self._engine.leds(by_sequence=True)
+                self._engine.switch_leds(by_sequence=True)
                 self._engine.start()
             except BaseException:
                 self._darken()
@@ -192,7 +192,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
 
     def _prepare(self) -> ProjectorInfo:
         engine, options = self._engine, self._options
-        engine.leds(by_sequence=False)
+        engine.switch_leds(by_sequence=False)
         number = engine.controller()
         if number not in MIRRORS:
             message = f"{engine.name} is controller {number:#04x}, this driver knows the DLPC3470 and the DLPC3478"
@@ -209,7 +209,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
             self._held = {}
         engine.set_current(options.led_current)
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
-        light = self._light_of(options.colour, MAX_LIGHT_US)
+        light = self._light_limits(options.colour, MAX_LIGHT_US)
         return ProjectorInfo(
             name="projector",
             model=f"{name} light engine, {mirrors.name}, firmware {engine.version()}",

@@ -175,14 +175,14 @@ class Dlpc350Engine(UsbEngine):
         what differs is sent.
         """
         if before is None or tables.patterns != before.patterns:
-            self._mail(2, tables.patterns)
+            self._send_mailbox(2, tables.patterns)
         if before is None or tables.images != before.images:
-            self._mail(1, tables.images)
+            self._send_mailbox(1, tables.images)
         if before is None or (tables.length, len(tables.images)) != (before.length, len(before.images)):
             entries = tables.length - 1
             self._link.write(Dlpc350Command.PATTERN_CONFIGURATION, bytes([entries, 0, entries, len(tables.images) - 1]))
 
-    def _mail(self, mailbox: int, data: bytes) -> None:
+    def _send_mailbox(self, mailbox: int, data: bytes) -> None:
         self.set_byte(Dlpc350Command.MAILBOX, mailbox)
         try:
             self.set_byte(Dlpc350Command.MAILBOX_OFFSET, 0)

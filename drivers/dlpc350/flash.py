@@ -143,7 +143,7 @@ class FlashContents:
         found = [self._candidates(pattern_plane(sequence, index)) for index in range(len(sequence))]
         missing = [index for index, candidates in enumerate(found) if not candidates]
         if missing:
-            raise self._lacking(sequence, missing)
+            raise self._missing_error(sequence, missing)
         chosen: list[FlashedPlane] = []
         for index, candidates in enumerate(found):
             # Stay with the picture that is in the buffer; change to the one that lasts longest.
@@ -158,7 +158,7 @@ class FlashContents:
         places = (picture.place(keys) for picture in self.pictures)
         return {place.image: place for place in places if place is not None}
 
-    def _lacking(self, sequence: PatternSequence, missing: Sequence[int]) -> UnsupportedByDeviceError:
+    def _missing_error(self, sequence: PatternSequence, missing: Sequence[int]) -> UnsupportedByDeviceError:
         named = ", ".join(describe_pattern(sequence.patterns[index]) for index in missing[:3])
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         return UnsupportedByDeviceError(
@@ -167,7 +167,7 @@ class FlashContents:
             f"{self.folder / EXPORT_FOLDER}"
         )
 
-    def written(self, sequence: PatternSequence) -> str:
+    def write_patterns(self, sequence: PatternSequence) -> str:
         """Write pictures that hold a sequence, beside those that are flashed, and say what to do with them.
         Raises as `write_pictures`.
         """

@@ -65,14 +65,14 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         self._places: tuple[FlashedPlane, ...] = ()
         self._colours: tuple[LedColour, ...] = ()
         # What the engine was told last, and which picture it shows; None where that is not known.
-        self._told: tuple[Timing, PatternTables] | None = None
-        self._picture: int | None = None
-        self._take_over()
+        self._last_sent: tuple[Timing, PatternTables] | None = None
+        self._shown_picture: int | None = None
+        self._initialise()
 
     def write_patterns(self, sequence: PatternSequence) -> str:
         """See `FlashedProjector`. What is flashed already keeps its place."""
         self._state.require_size(sequence, MIRRORS)
-        return self._flash.written(sequence)
+        return self._flash.write_patterns(sequence)
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`. Refuses patterns that the flash lacks, and writes the pictures that hold them."""
@@ -87,7 +87,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
             )
             raise UnsupportedByDeviceError(message)
         self._places = self._flash.places(sequence)
-        self._colours = tuple(map(self._options.colour_of, sequence.patterns))
+        self._colours = tuple(map(self._options.led_colour, sequence.patterns))
         self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
@@ -98,7 +98,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         """
         self._state.require_pattern(index)
         place = self._places[index]
-        load_s = self._options.load_s(kept=self._picture == place.image)
+        load_s = self._options.load_s(kept=self._shown_picture == place.image)
         # The sequence ends by itself: until it began, a picture may have to be loaded.
         alone_us = round((MAX_UNATTENDED_S - self._options.image_load_s) * 1e6)
         if self.unproven:
@@ -107,21 +107,23 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
             timing, count = Timing(alone_us - DARK_US, alone_us), 1
         check_timing(timing)
         with self._lock:
-            earliest_ns, running_ns = self._run((place,) * count, (self._colours[index],) * count, timing)
-            self._begin_holding(alone_us / 1e6, again_s=(MAX_UNATTENDED_S - self._options.image_load_s) / 2)
-        return self._shown(index, earliest_ns, running_ns + round(load_s * 1e9))
+            earliest_ns, running_ns = self._start_sequence((place,) * count, (self._colours[index],) * count, timing)
+            self._hold_pattern(alone_us / 1e6, again_s=(MAX_UNATTENDED_S - self._options.image_load_s) / 2)
+        return self._wait_for_light(index, earliest_ns, running_ns + round(load_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
         self._state.require_loaded("play")
-        self._require_proven()
+        self._require_known_polarity()
         options = self._options
         timing = play_timing(exposure_s, period_s, margin_s=options.light_margin_s, duty_limit=options.duty_limit)
         counts = build_tables(self._places, self._colours, dark_between=timing.dark_between).counts
         check_loading(counts, timing.period_us, options.image_load_s)
-        self._run(self._places, self._colours, timing)
+        self._start_sequence(self._places, self._colours, timing)
 
-    def _run(self, places: tuple[FlashedPlane, ...], colours: tuple[LedColour, ...], timing: Timing) -> tuple[int, int]:
+    def _start_sequence(
+        self, places: tuple[FlashedPlane, ...], colours: tuple[LedColour, ...], timing: Timing
+    ) -> tuple[int, int]:
         """Stop, set, validate, start. Return when the command to start was sent, and when the engine said it runs."""
         tables = build_tables(places, colours, dark_between=timing.dark_between)
         engine = self._engine
@@ -129,21 +131,21 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
             self._state.require_open()
             try:
                 self.blank()
-                told, self._told = self._told, None
+                told, self._last_sent = self._last_sent, None
                 if told is None or told[0] != timing:
                     engine.set_timing(timing)
                 engine.set_tables(tables, None if told is None else told[1])
                 engine.validate(VALIDATION_TIMEOUT_S)
                 started_ns = self._clock.now_ns()
-                engine.leds(by_sequence=True)
+                engine.switch_leds(by_sequence=True)
                 engine.start()
                 # A short sequence may be over before the engine could be asked.
                 if tables.length * timing.period_us >= _POLLABLE_US:
                     engine.wait_until_running(START_TIMEOUT_S)
-                self._told, self._picture = (timing, tables), places[-1].image
+                self._last_sent, self._shown_picture = (timing, tables), places[-1].image
                 return started_ns, self._clock.now_ns()
             except BaseException:
-                self._picture = None
+                self._shown_picture = None
                 self._darken()
                 raise
 
@@ -153,7 +155,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         engine.settle_byte(UsbCommand.DISPLAY_MODE, 1)
         engine.settle_byte(Dlpc350Command.PATTERN_SOURCE, 3)
         engine.settle_byte(Dlpc350Command.TRIGGER_MODE, 1)
-        self._set_up_light()
+        self._configure_leds()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
         # Changing the mode may start what the engine shows by itself.
         self.blank()
@@ -190,6 +192,6 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
             )
             raise UnsupportedByDeviceError(message)
 
-    def _rest(self) -> None:
+    def _before_close(self) -> None:
         if self._options.standby:
             self._engine.set_byte(UsbCommand.POWER, 1)

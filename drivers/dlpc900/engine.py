@@ -160,16 +160,16 @@ class Dlpc900Engine(UsbEngine):
 
     def define(self, entry: bytes) -> None:
         """Set an entry of the pattern table. It holds from the next `configure` on."""
-        self._tell(Dlpc900Command.DEFINITION, entry)
+        self._send(Dlpc900Command.DEFINITION, entry)
 
     def configure(self, entries: int, shown: int) -> None:
         """Take the table's first entries in their order, and show as many patterns of them."""
-        self._tell(Dlpc900Command.CONFIGURATION, struct.pack("<HI", entries, shown))
+        self._send(Dlpc900Command.CONFIGURATION, struct.pack("<HI", entries, shown))
 
     def order(self, indices: Sequence[int], shown: int) -> None:
         """Show as many patterns as asked of these entries, over and over."""
         self._link.send(Dlpc900Command.ORDER, struct.pack(f"<HI{len(indices)}H", len(indices), shown, *indices))
-        self._require_done("take the order of the patterns")
+        self._check_error_code("take the order of the patterns")
 
     def upload(self, number: int, parts: Sequence[bytes]) -> None:
         """Send a picture, a part for each controller. Pictures are sent with the last one first (table 2-139)."""
@@ -179,11 +179,11 @@ class Dlpc900Engine(UsbEngine):
             (Dlpc900Command.DATA_1, Dlpc900Command.DATA_2),
             strict=False,
         ):
-            self._tell(begin, struct.pack("<HI", number, len(part)))
+            self._send(begin, struct.pack("<HI", number, len(part)))
             for start in range(0, len(part), MAX_MESSAGE_BYTES):
                 piece = part[start : start + MAX_MESSAGE_BYTES]
                 self._link.send(data, struct.pack("<H", len(piece)) + piece)
-                self._require_done(f"take picture {number}")
+                self._check_error_code(f"take picture {number}")
 
     def faults(self) -> str:
         """What the hardware status complains of, in words; empty if of nothing."""
@@ -192,24 +192,24 @@ class Dlpc900Engine(UsbEngine):
             told.append(ERRORS[4])
         return "; ".join(filter(None, told))
 
-    def require_well(self) -> None:
+    def require_healthy(self) -> None:
         """Raise DeviceError, with its cause, if the hardware status complains."""
         if faults := self.faults():
             message = f"{self.name} says: {faults}; switch it off and on"
             raise DeviceError(message)
 
-    def _tell(self, command: Dlpc900Command, data: bytes) -> None:
+    def _send(self, command: Dlpc900Command, data: bytes) -> None:
         """Send a command. Raises UnsupportedByDeviceError if the engine refuses it, with what it says."""
         try:
             self._link.write(command, data)
         except CommandRefusedError as error:
-            raise self._refusal(f"take {command.name.lower().replace('_', ' ')} {data.hex(' ')}") from error
+            raise self._refusal_error(f"take {command.name.lower().replace('_', ' ')} {data.hex(' ')}") from error
 
-    def _require_done(self, doing: str) -> None:
+    def _check_error_code(self, doing: str) -> None:
         if self.byte(Dlpc900Command.ERROR_CODE):
-            raise self._refusal(doing)
+            raise self._refusal_error(doing)
 
-    def _refusal(self, doing: str) -> UnsupportedByDeviceError:
+    def _refusal_error(self, doing: str) -> UnsupportedByDeviceError:
         code = self.byte(Dlpc900Command.ERROR_CODE)
         told = ERRORS.get(code, f"error code {code}")
         return UnsupportedByDeviceError(

@@ -60,7 +60,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
         self._leds: tuple[int, ...] = ()
         # The pattern table, as far as the engine has it.
         self._table: dict[int, bytes] = {}
-        self._take_over()
+        self._initialise()
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`. Sends the patterns, of some 10 kB for 24 of them, at 64 kB a second at the most."""
@@ -74,7 +74,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
             self._state.require_open()
             self._table.clear()
             self._places = memory.places
-            self._leds = (*map(self._options.colour_of, sequence.patterns), 0)
+            self._leds = (*map(self._options.led_colour, sequence.patterns), 0)
             # The table first: pictures are lost when its length changes (DLPU018 section 2.4.4.4.2).
             for index in range(len(memory.places)):
                 self._define(index, DIM_TIMING)
@@ -107,17 +107,17 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
                 self._engine.order((index, last), 2 * times)
                 started_ns = self._start()
                 self._engine.wait_until_running(START_TIMEOUT_S)
-                self._engine.require_well()
+                self._engine.require_healthy()
             except BaseException:
                 self._darken()
                 raise
-            self._begin_holding(MAX_UNATTENDED_S, again_s=MAX_UNATTENDED_S / 2)
-        return self._shown(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
+            self._hold_pattern(MAX_UNATTENDED_S, again_s=MAX_UNATTENDED_S / 2)
+        return self._wait_for_light(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
         self._state.require_loaded("play")
-        self._require_proven()
+        self._require_known_polarity()
         options = self._options
         timing = play_timing(
             exposure_s,
@@ -135,7 +135,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
                     self._define(index, timing)
                 self._engine.configure(len(self._places), patterns)
                 self._start()
-                self._engine.require_well()
+                self._engine.require_healthy()
             except BaseException:
                 self._darken()
                 raise
@@ -154,7 +154,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
     def _start(self) -> int:
         """Start the sequence; return when that was begun."""
         started_ns = self._clock.now_ns()
-        self._engine.leds(by_sequence=True)
+        self._engine.switch_leds(by_sequence=True)
         self._engine.start()
         return started_ns
 
@@ -173,7 +173,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
         engine.settle_byte(UsbCommand.DISPLAY_MODE, ON_THE_FLY, within_s=MODE_CHANGE_S)
         # A new mode may start what the engine shows by itself.
         self.blank()
-        self._set_up_light()
+        self._configure_leds()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
         return ProjectorInfo(
             name="projector",

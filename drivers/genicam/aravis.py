@@ -159,14 +159,14 @@ class AravisConnection(GenICamConnection):
             self.close()
             raise
 
-    def told(self, doing: str) -> AbstractContextManager[None]:
+    def translate_errors(self, doing: str) -> AbstractContextManager[None]:
         """See `GenICamConnection`."""
         return translate_aravis_errors(self.name, doing)
 
-    def kind(self, feature: str) -> str:
+    def feature_type(self, feature: str) -> str:
         """See `GenICamConnection`."""
         aravis = load_aravis().aravis
-        with self.asking(f"feature {feature}"):
+        with self.access(f"feature {feature}"):
             node = self._device.get_feature(feature)
         for kind in ("Boolean", "Enumeration", "String", "Integer", "Float"):
             if isinstance(node, getattr(aravis, f"Gc{kind}")):
@@ -176,7 +176,7 @@ class AravisConnection(GenICamConnection):
     def start(self, buffers: int) -> GenICamStream:
         """See `GenICamConnection`. A new `Aravis.GenICamStream`: no buffer of an earlier one can come out of it."""
         aravis = load_aravis().aravis
-        with self.asking("opening a stream") as camera:
+        with self.access("opening a stream") as camera:
             stream = camera.create_stream(None, None)
         if stream is None:
             message = f"camera '{self.name}' gave no stream; close other programs that read from it, and try again"
@@ -185,7 +185,7 @@ class AravisConnection(GenICamConnection):
             resend = aravis.GvStreamPacketResend
             stream.set_property("packet-resend", resend.ALWAYS if self._options.packet_resend else resend.NEVER)
             stream.set_property("socket-buffer", aravis.GvStreamSocketBuffer.AUTO)
-        with self.asking("starting") as camera:
+        with self.access("starting") as camera:
             payload = camera.get_payload()
             for _ in range(buffers):
                 stream.push_buffer(aravis.Buffer.new_allocate(payload))
@@ -197,7 +197,7 @@ class AravisConnection(GenICamConnection):
         if not self._is_gige:
             return super().latch()
         try:
-            return self._latched_gige()
+            return self._latch_gige()
         except UnsupportedByDeviceError:
             return None
 
@@ -213,9 +213,9 @@ class AravisConnection(GenICamConnection):
         with suppress(Exception):
             self._device.disconnect(self._handler)
         held, self._device, self._camera = [self._camera, self._device], None, None
-        self.let_go(held)
+        self.release(held)
 
-    def let_go(self, held: list[Any]) -> None:
+    def release(self, held: list[Any]) -> None:
         """Drop Aravis' objects, the only references to which are in the list."""
         if self._lost.is_set():
             # Each of them says goodbye to the device first, and waits 5 s for an answer that will not come.
@@ -223,11 +223,11 @@ class AravisConnection(GenICamConnection):
         else:
             held.clear()
 
-    def _latched_gige(self) -> tuple[int, int, int] | None:
+    def _latch_gige(self) -> tuple[int, int, int] | None:
         frequency_hz = self._device.get_timestamp_tick_frequency()
         if not frequency_hz:
             return None
-        with self.asking("looking at its clock"):
+        with self.access("looking at its clock"):
             before_ns = time.monotonic_ns()
             self._device.write_register(_LATCH, _LATCH_BIT)
             after_ns = time.monotonic_ns()
@@ -245,7 +245,7 @@ class AravisConnection(GenICamConnection):
 
     def _prepare_network(self, aravis: Any, options: GenicamOptions) -> None:
         kind = aravis.GvStreamOption
-        with self.asking("setting up the network") as camera:
+        with self.access("setting up the network") as camera:
             camera.gv_set_stream_options(kind.NONE if options.packet_socket else kind.PACKET_SOCKET_DISABLED)
             if options.packet_delay_ns is not None:
                 camera.gv_set_packet_delay(options.packet_delay_ns)
@@ -270,16 +270,16 @@ class AravisStream:
         self._connection = connection
         self._stream = stream
 
-    def take(self, most_s: float) -> RawFrame | None:
+    def take(self, max_s: float) -> RawFrame | None:
         """See `GenICamStream`."""
-        if most_s > 0:
-            buffer = self._stream.timeout_pop_buffer(round(most_s * 1e6) + 1)
+        if max_s > 0:
+            buffer = self._stream.timeout_pop_buffer(round(max_s * 1e6) + 1)
         else:
             buffer = self._stream.try_pop_buffer()
         if buffer is None:
             return None
         try:
-            arrived_ns = _arrived_ns(buffer)
+            arrived_ns = _arrival_ns(buffer)
             image = None
             if buffer.get_status() == load_aravis().aravis.BufferStatus.SUCCESS:
                 size = Size(buffer.get_image_width(), buffer.get_image_height())
@@ -293,10 +293,10 @@ class AravisStream:
         connection = self._connection
         if not connection.is_lost:
             # A camera that is lost only now is told of by the next call that needs it.
-            with suppress(DeviceError), connection.asking("stopping") as camera:
+            with suppress(DeviceError), connection.access("stopping") as camera:
                 camera.stop_acquisition()
         held, self._stream = [self._stream], None
-        connection.let_go(held)
+        connection.release(held)
 
 
 def _open_device(aravis: Any, name: str, device: str) -> Any:
@@ -331,15 +331,15 @@ def list_aravis_cameras() -> tuple[tuple[str, str], ...]:
     return tuple(sorted(found))
 
 
-def _arrived_ns(buffer: Any) -> int:
+def _arrival_ns(buffer: Any) -> int:
     """When the frame's first packet arrived, CLOCK_MONOTONIC: Aravis notes it on the wall clock."""
-    now_ns, wall_ns = _both_clocks()
+    now_ns, wall_ns = _read_clocks()
     ago_ns = wall_ns - int(buffer.get_system_timestamp())
     # A wall clock that was set meanwhile tells nothing; the frame has arrived by now in any case.
     return now_ns - ago_ns if 0 <= ago_ns < _OLDEST_NS else now_ns
 
 
-def _both_clocks() -> tuple[int, int]:
+def _read_clocks() -> tuple[int, int]:
     """CLOCK_MONOTONIC and the wall clock at one instant, as near as a few tries bring them."""
     best_ns, found = _OLDEST_NS, (0, 0)
     for _ in range(_CLOCK_TRIES):

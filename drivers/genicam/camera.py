@@ -37,11 +37,11 @@ _TIE_AGAIN_NS = 5_000_000_000
 
 
 _SELECTOR = "TriggerSelector"
-_STARTS = ("FrameStart", "ExposureStart")
+_START_SELECTORS = ("FrameStart", "ExposureStart")
 """What starts one frame; IDS' cameras (uEye+) have the latter only. For one exposure per frame they are the same."""
 _AUTOMATIC = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto", "GammaAuto")
-_RESENT_AFTER_NS = 400_000_000
-_LATE_S = 0.2
+_RESEND_AFTER_NS = 400_000_000
+_DRAIN_MARGIN_S = 0.2
 _MAX_BUFFER_BYTES = 1 << 30
 _MIN_BUFFERS = 8
 _FRAME_RATE_FEATURES = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
@@ -81,7 +81,7 @@ class Acquisition:
         self._good = 0
         self._last_end_ns = 0
         self._waiting: deque[_TimedFrame] = deque()
-        self._passed = dict.fromkeys(("stale", "corrupt", "repeated", "unasked"), 0)
+        self._skipped = dict.fromkeys(("stale", "corrupt", "repeated", "unasked"), 0)
         self.trigger = Trigger.FREE
         self._applied = AppliedSettings(0.0, 0.0)
         self._exposure_ns = 0
@@ -92,10 +92,10 @@ class Acquisition:
         self._applied = applied
         self._exposure_ns = round(applied.exposure_s * 1e9)
         self._clock = StartClock(self._lag_ns())
-        self._count_from_here()
+        self._reset_counting()
         self._stamped = self._options.time_stamp != "none" and self._connection.has_stamps
         self._tied_ns = 0
-        self._tie(_LATCHES)
+        self._tie_clock(_LATCHES)
         self._stream = self._connection.start(buffers)
 
     def end(self) -> None:
@@ -104,102 +104,102 @@ class Acquisition:
             stream, self._stream = self._stream, None
             stream.end()
 
-    def triggered(self, begun_ns: int, ended_ns: int, *, times: int) -> None:
+    def note_trigger(self, begun_ns: int, ended_ns: int, *, times: int) -> None:
         """Note a software trigger, and how often it may have been sent."""
-        self._asked.triggered(begun_ns, ended_ns, times=times)
+        self._triggered.note_trigger(begun_ns, ended_ns, times=times)
 
-    def owed(self) -> bool:
+    def is_answer_due(self) -> bool:
         """Whether the answer to a software trigger may still come."""
-        return self._asked.owed_ns(time.monotonic_ns()) > 0
+        return self._triggered.answer_due_ns(time.monotonic_ns()) > 0
 
     def settle(self) -> None:
         """Wait until no answer to a software trigger is due: a camera that exposes ignores the next trigger."""
-        while (left_ns := self._asked.owed_ns(time.monotonic_ns())) > 0 and not self._connection.is_lost:
-            self._take(left_ns / 1e9)
+        while (left_ns := self._triggered.answer_due_ns(time.monotonic_ns())) > 0 and not self._connection.is_lost:
+            self._take_frame(left_ns / 1e9)
 
     def drain(self, seconds: float) -> None:
         """Pass over what comes without being asked for, for so long."""
         end_s = time.monotonic() + seconds
         while (left_s := end_s - time.monotonic()) > 0 and not self._connection.is_lost:
-            self._take(left_s)
-        self._count_from_here()
+            self._take_frame(left_s)
+        self._reset_counting()
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `slrig.devices.Camera`."""
         if self.trigger is not Trigger.SOFTWARE and time.monotonic_ns() - self._tied_ns > _TIE_AGAIN_NS:
-            self._tie(2)
+            self._tie_clock(2)
         deadline_s = time.monotonic() + timeout_s
-        self._passed = dict.fromkeys(self._passed, 0)
+        self._skipped = dict.fromkeys(self._skipped, 0)
         while True:
             while self._waiting:
-                exposed = self._waiting.popleft()
+                frame = self._waiting.popleft()
                 # Wire-triggered frames are told apart by their order.
                 follows = self.trigger is Trigger.HARDWARE and after_ns <= self._last_end_ns
-                if exposed.start.least_ns >= after_ns or follows:
-                    return self._frame(exposed)
-                self._passed["stale"] += 1
+                if frame.start.min_ns >= after_ns or follows:
+                    return self._frame(frame)
+                self._skipped["stale"] += 1
             left_s = deadline_s - time.monotonic()
-            if self._take(left_s):
+            if self._take_frame(left_s):
                 continue
             if self._connection.is_lost:
-                raise self._connection.gone("waiting for a frame")
+                raise self._connection.gone_error("waiting for a frame")
             if left_s <= 0:
-                raise self._late(after_ns, timeout_s)
+                raise self._timeout_error(after_ns, timeout_s)
 
-    def _count_from_here(self) -> None:
+    def _reset_counting(self) -> None:
         """The next frame is number 0, and nothing has been asked for."""
         answer_ns, transfer_ns = round(self._options.answer_s * 1e9), round(self._options.transfer_s * 1e9)
-        self._asked = TriggeredStarts(self._exposure_ns, answer_ns, self._clock)
-        self._unasked = UntriggeredStarts(self._exposure_ns, transfer_ns, self._clock)
+        self._triggered = TriggeredStarts(self._exposure_ns, answer_ns, self._clock)
+        self._untriggered = UntriggeredStarts(self._exposure_ns, transfer_ns, self._clock)
         self._numbers = FrameNumbers()
         self._good = 0
         self._waiting.clear()
 
-    def _take(self, most_s: float) -> bool:
+    def _take_frame(self, max_s: float) -> bool:
         """Take one frame from the stream and judge it, waiting for it no longer than a slice; False: none came."""
-        delivery = None if self._stream is None else self._stream.take(min(most_s, _SLICE_S))
+        delivery = None if self._stream is None else self._stream.take(min(max_s, _SLICE_S))
         if delivery is not None:
-            self._judge(delivery)
+            self._process(delivery)
         return delivery is not None
 
-    def _judge(self, delivery: RawFrame) -> None:
+    def _process(self, delivery: RawFrame) -> None:
         number = self._numbers.next(delivery.block_id)
-        pictures = self._pictures(delivery)
+        pictures = self._decode(delivery)
         if pictures is None:
-            self._passed["corrupt"] += 1
+            self._skipped["corrupt"] += 1
             return
         if number is None:
-            self._passed["repeated"] += 1
+            self._skipped["repeated"] += 1
             return
         self._good += 1
         stamp_ns = delivery.stamp_ns if self._stamped else 0
         arrival = Arrival(number, stamp_ns or None, delivery.arrived_ns)
-        start = self._asked.start(arrival) if self.trigger is Trigger.SOFTWARE else self._unasked.start(arrival)
+        start = self._triggered.start(arrival) if self.trigger is Trigger.SOFTWARE else self._untriggered.start(arrival)
         if start is None:
-            self._passed["unasked"] += 1
+            self._skipped["unasked"] += 1
             return
         self._waiting.append(_TimedFrame(*pictures, number, start))
 
-    def _frame(self, exposed: _TimedFrame) -> Frame:
-        start = exposed.start
-        t_start_ns = (start.least_ns + start.most_ns) // 2
+    def _frame(self, frame: _TimedFrame) -> Frame:
+        start = frame.start
+        t_start_ns = (start.min_ns + start.max_ns) // 2
         # What a camera began it ended before it began anew.
-        t_start_ns = min(max(t_start_ns, self._last_end_ns), start.most_ns)
+        t_start_ns = min(max(t_start_ns, self._last_end_ns), start.max_ns)
         self._last_end_ns = t_start_ns + self._exposure_ns
         return Frame(
             camera=self._connection.name,
-            image=exposed.image,
+            image=frame.image,
             t_start_ns=t_start_ns,
             t_end_ns=self._last_end_ns,
-            t_err_ns=max(start.most_ns - t_start_ns, t_start_ns - start.least_ns),
-            sequence_number=exposed.number,
-            dropped_count=self._numbers.made - self._good,
+            t_err_ns=max(start.max_ns - t_start_ns, t_start_ns - start.min_ns),
+            sequence_number=frame.number,
+            dropped_count=self._numbers.frame_count - self._good,
             exposure_s=self._applied.exposure_s,
             gain=self._applied.gain,
-            colour=exposed.colour,
+            colour=frame.colour,
         )
 
-    def _pictures(self, delivery: RawFrame) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
+    def _decode(self, delivery: RawFrame) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
         """The image, and what makes it in colour, or None if packets are missing or it is not what was set."""
         image = delivery.image
         if image is None or image.size != self._size:
@@ -210,11 +210,11 @@ class Acquisition:
         except ValueError:
             return None
 
-    def _late(self, after_ns: int, timeout_s: float) -> FrameTimeoutError:
+    def _timeout_error(self, after_ns: int, timeout_s: float) -> FrameTimeoutError:
         # A camera that is gone and has not been missed yet does not answer: that is another error.
-        with self._connection.asking("asking whether it is there") as camera:
+        with self._connection.access("asking whether it is there") as camera:
             camera.get_exposure_time()
-        passed = ", ".join(f"{count} {kind}" for kind, count in self._passed.items() if count) or "none"
+        passed = ", ".join(f"{count} {kind}" for kind, count in self._skipped.items() if count) or "none"
         remedy = {
             Trigger.FREE: "check the frame rate and the network's load",
             Trigger.SOFTWARE: "trigger after the pattern is shown, and wait for the exposure",
@@ -228,10 +228,10 @@ class Acquisition:
 
     def _lag_ns(self) -> Interval:
         """By how much a time stamp is later than the start of its exposure."""
-        least_ns = self._exposure_ns if self._options.time_stamp == "exposure_end" else 0
-        return Interval(least_ns, 0 if self._options.time_stamp == "exposure_start" else self._exposure_ns)
+        min_ns = self._exposure_ns if self._options.time_stamp == "exposure_end" else 0
+        return Interval(min_ns, 0 if self._options.time_stamp == "exposure_start" else self._exposure_ns)
 
-    def _tie(self, looks: int) -> None:
+    def _tie_clock(self, looks: int) -> None:
         """Latch the camera's clock, if it has one that can be."""
         self._tied_ns = time.monotonic_ns()
         if not self._stamped:
@@ -250,7 +250,7 @@ def set_up_camera(connection: GenICamConnection, options: GenICamCameraOptions) 
         The camera does not take a value, or takes it otherwise.
     """
     features = connection.features
-    with connection.asking("stopping it") as camera:
+    with connection.access("stopping it") as camera:
         # Another program may have left it running; settings are locked then.
         camera.stop_acquisition()
     if options.pixel_format not in FORMATS:
@@ -278,8 +278,8 @@ def _set_region(connection: GenICamConnection, options: GenICamCameraOptions) ->
     # Extents are bounded by the offsets in use, so those go first, and come back last.
     for offset in ("OffsetX", "OffsetY"):
         if features.has(offset):
-            features.set_whole(offset, 0)
-    with connection.asking("asking for its extent") as camera:
+            features.set_integer(offset, 0)
+    with connection.access("asking for its extent") as camera:
         width_px, height_px = int(camera.get_width_bounds()[1]), int(camera.get_height_bounds()[1])
     region = options.region
     if region is None:
@@ -290,11 +290,11 @@ def _set_region(connection: GenICamConnection, options: GenICamCameraOptions) ->
             f"{region.x_px}, row {region.y_px}; its image is {width_px} x {height_px} px; ask for what lies on it"
         )
         raise UnsupportedByDeviceError(message)
-    features.set_whole("Width", region.width_px)
-    features.set_whole("Height", region.height_px)
+    features.set_integer("Width", region.width_px)
+    features.set_integer("Height", region.height_px)
     for offset, value in (("OffsetX", region.x_px), ("OffsetY", region.y_px)):
         if value:
-            features.set_whole(offset, value)
+            features.set_integer(offset, value)
     return Size(region.width_px, region.height_px)
 
 
@@ -355,7 +355,7 @@ def set_trigger(connection: GenICamConnection, source: str | None, options: GenI
 
 def _start_selector(selectors: tuple[str, ...]) -> str:
     """The selector of what starts a frame; the usual one, which is then refused, where there is none of them."""
-    return next((each for each in _STARTS if each in selectors), _STARTS[0])
+    return next((each for each in _START_SELECTORS if each in selectors), _START_SELECTORS[0])
 
 
 class GenicamCamera:
@@ -380,13 +380,15 @@ class GenicamCamera:
         self._connection = connection
         self._state = self._connection.state
         self._session: Acquisition
-        self._owes = False
+        self._answer_pending = False
         try:
             self._size = set_up_camera(self._connection, options)
             self._line = choose_trigger_line(self._connection, options)
-            self._info = self._declared()
-            self._rate = next((each for each in _FRAME_RATE_FEATURES if self._connection.features.has(each)), None)
-            self._applied = self._in_use()
+            self._info = self._read_info()
+            self._rate_feature = next(
+                (each for each in _FRAME_RATE_FEATURES if self._connection.features.has(each)), None
+            )
+            self._applied = self._read_settings()
         except BaseException:
             self._connection.close()
             raise
@@ -398,13 +400,13 @@ class GenicamCamera:
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         """See `Camera`. A value that the camera rounds by more than 1 % is refused, with what it would use."""
-        self._require_there()
+        self._require_connected()
         self._state.check_settings(settings, self._info)
-        with self._connection.asking("setting exposure and gain") as camera:
+        with self._connection.access("setting exposure and gain") as camera:
             camera.set_exposure_time(settings.exposure_s * 1e6)
             if camera.is_gain_available():
                 camera.set_gain(settings.gain)
-        self._applied = self._in_use()
+        self._applied = self._read_settings()
         for what, asked, got in (
             ("exposure_s", settings.exposure_s, self._applied.exposure_s),
             ("gain", settings.gain, self._applied.gain),
@@ -419,35 +421,35 @@ class GenicamCamera:
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`. Opens a stream of its own, so no frame of an earlier arming can come."""
-        self._require_there()
+        self._require_connected()
         self._state.check_arming(count, trigger, self._info)
         source = {Trigger.FREE: None, Trigger.SOFTWARE: "Software", Trigger.HARDWARE: self._line}[trigger]
         set_trigger(self._connection, source, self._options)
-        self._applied = self._in_use()
+        self._applied = self._read_settings()
         session = Acquisition(self._connection, self._options, FORMATS[self._options.pixel_format], self._size)
         session.begin(trigger, self._applied, _MIN_BUFFERS if trigger is Trigger.FREE else self._buffers(count))
         self._session = session
         self._state.armed = trigger
-        if self._owes and trigger is not Trigger.FREE:
+        if self._answer_pending and trigger is not Trigger.FREE:
             # A camera may keep a trigger that came while it was stopped, and expose now.
-            session.drain(self._applied.exposure_s + _LATE_S)
-            self._owes = False
+            session.drain(self._applied.exposure_s + _DRAIN_MARGIN_S)
+            self._answer_pending = False
 
     def trigger(self) -> None:
         """See `Camera`. While the frame of an earlier trigger is due, waits for that first."""
-        self._require_there()
+        self._require_connected()
         self._state.require_armed(Trigger.SOFTWARE)
         self._session.settle()
-        with self._connection.asking("triggering") as camera:
+        with self._connection.access("triggering") as camera:
             begun_ns = time.monotonic_ns()
             camera.software_trigger()
             ended_ns = time.monotonic_ns()
-        # A command whose answer was lost is sent again: the camera may have exposed twice.
-        self._session.triggered(begun_ns, ended_ns, times=2 if ended_ns - begun_ns > _RESENT_AFTER_NS else 1)
+        # A command whose answer was lost is sent again: the camera may have frame twice.
+        self._session.note_trigger(begun_ns, ended_ns, times=2 if ended_ns - begun_ns > _RESEND_AFTER_NS else 1)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `Camera`, and the head of this module. Exposure and gain are those read back when it was armed."""
-        self._require_there()
+        self._require_connected()
         self._state.require_armed()
         return self._session.read(after_ns, timeout_s)
 
@@ -455,7 +457,9 @@ class GenicamCamera:
         """See `Camera`."""
         if self._state.armed is not None:
             # One that runs free is in the middle of an exposure, and may send it later than it is told to stop.
-            self._owes = self._owes or self._state.armed is Trigger.FREE or self._session.owed()
+            self._answer_pending = (
+                self._answer_pending or self._state.armed is Trigger.FREE or self._session.is_answer_due()
+            )
             self._state.armed = None
             self._session.end()
 
@@ -464,8 +468,8 @@ class GenicamCamera:
         self.disarm()
         self._connection.close()
 
-    def _declared(self) -> CameraInfo:
-        with self._connection.asking("asking what it is") as camera:
+    def _read_info(self) -> CameraInfo:
+        with self._connection.access("asking what it is") as camera:
             model = f"{camera.get_vendor_name()} {camera.get_model_name()}"
             serial = str(camera.get_device_serial_number() or camera.get_device_id())
             least_us, most_us = camera.get_exposure_time_bounds()
@@ -487,23 +491,23 @@ class GenicamCamera:
             colour=bool(FORMATS[self._options.pixel_format].mosaic),
         )
 
-    def _in_use(self) -> AppliedSettings:
-        with self._connection.asking("reading exposure and gain") as camera:
+    def _read_settings(self) -> AppliedSettings:
+        with self._connection.access("reading exposure and gain") as camera:
             gain = float(camera.get_gain()) if camera.is_gain_available() else 1.0
             exposure_s = camera.get_exposure_time() / 1e6
-        rate_hz = self._connection.features.number(self._rate) if self._rate is not None else 0.0
+        rate_hz = self._connection.features.number(self._rate_feature) if self._rate_feature is not None else 0.0
         return AppliedSettings(exposure_s, gain, 1 / rate_hz if rate_hz > 0 else None)
 
     def _buffers(self, count: int) -> int:
         """As many as frames are asked for, so that none is lost while nobody reads; fewer if memory forbids."""
-        with self._connection.asking("asking for the size of a frame") as camera:
+        with self._connection.access("asking for the size of a frame") as camera:
             payload = int(camera.get_payload())
         return max(_MIN_BUFFERS, min(count + 2, _MAX_BUFFER_BYTES // max(payload, 1)))
 
-    def _require_there(self) -> None:
+    def _require_connected(self) -> None:
         self._state.require_open()
         if self._connection.is_lost:
-            raise self._connection.gone("noticed before")
+            raise self._connection.gone_error("noticed before")
 
 
 def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:

@@ -19,7 +19,7 @@ TOLERANCE = 0.01
 
 
 class Features:
-    """The features of a device. Every call may raise what `Connection.asking` raises.
+    """The features of a device. Every call may raise what `GenICamConnection.access` raises.
 
     Parameters
     ----------
@@ -33,40 +33,40 @@ class Features:
     """
 
     def __init__(
-        self, name: str, asking: Callable[[str], AbstractContextManager[Any]], kind: Callable[[str], str]
+        self, name: str, access: Callable[[str], AbstractContextManager[Any]], kind: Callable[[str], str]
     ) -> None:
         self._name = name
-        self._ask = asking
+        self._access_camera = access
         self._kind = kind
 
     def has(self, feature: str) -> bool:
         """Whether the device has the feature, and offers it as it is set now."""
-        with self._asking(feature) as camera:
+        with self._access(feature) as camera:
             return bool(camera.is_feature_available(feature))
 
     def choices(self, feature: str) -> tuple[str, ...]:
         """The entries of an enumeration that can be chosen now."""
-        with self._asking(feature) as camera:
+        with self._access(feature) as camera:
             return tuple(camera.dup_available_enumerations_as_strings(feature) or ())
 
     def text(self, feature: str) -> str:
         """The value of an enumeration or a string."""
-        with self._asking(feature) as camera:
+        with self._access(feature) as camera:
             return str(camera.get_string(feature))
 
-    def whole(self, feature: str) -> int:
+    def integer(self, feature: str) -> int:
         """The value of an integer."""
-        with self._asking(feature) as camera:
+        with self._access(feature) as camera:
             return int(camera.get_integer(feature))
 
     def number(self, feature: str) -> float:
         """The value of a number with decimals."""
-        with self._asking(feature) as camera:
+        with self._access(feature) as camera:
             return float(camera.get_float(feature))
 
     def execute(self, feature: str) -> None:
         """Execute a command."""
-        with self._asking(feature) as camera:
+        with self._access(feature) as camera:
             camera.execute_command(feature)
 
     def choose(self, feature: str, entry: str) -> None:
@@ -79,27 +79,27 @@ class Features:
         """
         offered = self.choices(feature)
         if entry not in offered:
-            raise self._refused(
+            raise self._refusal(
                 feature, entry, f"it offers {', '.join(offered) or 'nothing now'}", "choose one of these"
             )
         if self.text(feature) == entry:
             # Some cameras offer one entry only, and do not let it be written.
             return
-        with self._asking(feature) as camera:
+        with self._access(feature) as camera:
             camera.set_string(feature, entry)
-        self._compare(feature, entry, self.text(feature))
+        self._require_equal(feature, entry, self.text(feature))
 
-    def set_whole(self, feature: str, value: int) -> None:
+    def set_integer(self, feature: str, value: int) -> None:
         """Set an integer. Raises UnsupportedByDeviceError: out of range, between steps, or it reads back another."""
-        with self._asking(feature) as camera:
+        with self._access(feature) as camera:
             least, most = camera.get_integer_bounds(feature)
             step = camera.get_integer_increment(feature)
         if not least <= value <= most or (step > 1 and (value - least) % step):
             steps = f" in steps of {step}" if step > 1 else ""
-            raise self._refused(feature, value, f"it takes {least} to {most}{steps}", "ask for such a value")
-        with self._asking(feature) as camera:
+            raise self._refusal(feature, value, f"it takes {least} to {most}{steps}", "ask for such a value")
+        with self._access(feature) as camera:
             camera.set_integer(feature, value)
-        self._compare(feature, value, self.whole(feature))
+        self._require_equal(feature, value, self.integer(feature))
 
     def set_any(self, feature: str, value: bool | int | float | str) -> None:
         """Set a feature of whatever kind it is. Raises UnsupportedByDeviceError: missing, another kind, not taken."""
@@ -111,43 +111,43 @@ class Features:
             raise UnsupportedByDeviceError(message)
         match value, self._kind(feature):
             case bool(), "Boolean":
-                with self._asking(feature) as camera:
+                with self._access(feature) as camera:
                     camera.set_boolean(feature, value)
                     got = bool(camera.get_boolean(feature))
-                self._compare(feature, value, got)
+                self._require_equal(feature, value, got)
             case str(), "Enumeration":
                 self.choose(feature, value)
             case str(), "String":
-                with self._asking(feature) as camera:
+                with self._access(feature) as camera:
                     camera.set_string(feature, value)
-                self._compare(feature, value, self.text(feature))
+                self._require_equal(feature, value, self.text(feature))
             case int(), "Integer" if not isinstance(value, bool):
-                self.set_whole(feature, value)
+                self.set_integer(feature, value)
             case int() | float(), "Float" if not isinstance(value, bool):
                 self._set_number(feature, float(value))
             case _, kind:
-                raise self._refused(feature, value, f"it is a feature of the kind {kind}", "write a value of that kind")
+                raise self._refusal(feature, value, f"it is a feature of the kind {kind}", "write a value of that kind")
 
     def _set_number(self, feature: str, value: float) -> None:
-        with self._asking(feature) as camera:
+        with self._access(feature) as camera:
             least, most = camera.get_float_bounds(feature)
         if not least <= value <= most:
-            raise self._refused(feature, value, f"it takes {least:g} to {most:g}", "ask for such a value")
-        with self._asking(feature) as camera:
+            raise self._refusal(feature, value, f"it takes {least:g} to {most:g}", "ask for such a value")
+        with self._access(feature) as camera:
             camera.set_float(feature, value)
             got = float(camera.get_float(feature))
         if differs(got, value):
-            raise self._refused(feature, value, f"it gives {got:g}", "ask for a value that it can give")
+            raise self._refusal(feature, value, f"it gives {got:g}", "ask for a value that it can give")
 
-    def _compare(self, feature: str, asked: object, got: object) -> None:
+    def _require_equal(self, feature: str, asked: object, got: object) -> None:
         if got != asked:
-            raise self._refused(feature, asked, f"it gives {got}", "ask for a value that it can give")
+            raise self._refusal(feature, asked, f"it gives {got}", "ask for a value that it can give")
 
-    def _refused(self, feature: str, asked: object, found: str, remedy: str) -> UnsupportedByDeviceError:
+    def _refusal(self, feature: str, asked: object, found: str, remedy: str) -> UnsupportedByDeviceError:
         return UnsupportedByDeviceError(f"camera '{self._name}': asked for {feature} {asked}, {found}; {remedy}")
 
-    def _asking(self, feature: str) -> AbstractContextManager[Any]:
-        return self._ask(f"feature {feature}")
+    def _access(self, feature: str) -> AbstractContextManager[Any]:
+        return self._access_camera(f"feature {feature}")
 
 
 def differs(got: float, asked: float) -> bool:
@@ -185,7 +185,7 @@ class RawFrame:
 class GenICamStream(Protocol):
     """A running acquisition."""
 
-    def take(self, most_s: float) -> RawFrame | None:
+    def take(self, max_s: float) -> RawFrame | None:
         """Return the next frame, waiting for it no longer than that; None if none came."""
         ...
 
@@ -210,7 +210,7 @@ class GenICamConnection(ABC):
         self.name = name
         self.state = CameraState(name)
         self._lost = threading.Event()
-        self.features = Features(name, self.asking, self.kind)
+        self.features = Features(name, self.access, self.feature_type)
 
     @property
     def is_lost(self) -> bool:
@@ -218,7 +218,7 @@ class GenICamConnection(ABC):
         return self._lost.is_set()
 
     @contextmanager
-    def asking(self, doing: str) -> Iterator[Any]:
+    def access(self, doing: str) -> Iterator[Any]:
         """The camera as `Aravis.Camera` presents it, for the block.
 
         Raises
@@ -228,19 +228,19 @@ class GenICamConnection(ABC):
         DeviceGoneError
             It is lost, before or by what the block asked.
         DeviceError
-            What `told` makes of the library's errors.
+            What `translate_errors` makes of the library's errors.
         """
         self.state.require_open()
         if self._lost.is_set():
-            raise self.gone(doing)
+            raise self.gone_error(doing)
         try:
-            with self.told(doing):
+            with self.translate_errors(doing):
                 yield self._camera
         except DeviceGoneError:
             self._lost.set()
             raise
 
-    def gone(self, doing: str) -> DeviceGoneError:
+    def gone_error(self, doing: str) -> DeviceGoneError:
         """The error of a device that is lost."""
         message = f"camera '{self.name}' is gone ({doing}); check its cable and power, and open the rig again"
         return DeviceGoneError(message)
@@ -254,7 +254,7 @@ class GenICamConnection(ABC):
             before_ns = time.monotonic_ns()
             self.features.execute(command)
             after_ns = time.monotonic_ns()
-            return before_ns, self.features.whole(value), after_ns
+            return before_ns, self.features.integer(value), after_ns
         except UnsupportedByDeviceError:
             return None
 
@@ -264,11 +264,11 @@ class GenICamConnection(ABC):
         return True
 
     @abstractmethod
-    def told(self, doing: str) -> AbstractContextManager[None]:
+    def translate_errors(self, doing: str) -> AbstractContextManager[None]:
         """Turn the library's errors within the block into slrig's."""
 
     @abstractmethod
-    def kind(self, feature: str) -> str:
+    def feature_type(self, feature: str) -> str:
         """Boolean, Enumeration, String, Integer, Float, or what else the library calls a feature that it has."""
 
     @abstractmethod

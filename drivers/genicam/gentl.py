@@ -237,10 +237,10 @@ class NodeMapCamera:
         return self._nodes.get_node(feature)
 
     def is_feature_available(self, feature: str) -> bool:
-        return self._nodes.has_node(feature) and self._offered(self.node(feature))
+        return self._nodes.has_node(feature) and self._is_offered(self.node(feature))
 
     def dup_available_enumerations_as_strings(self, feature: str) -> list[str]:
-        return [entry.symbolic for entry in self.node(feature).entries if self._offered(entry)]
+        return [entry.symbolic for entry in self.node(feature).entries if self._is_offered(entry)]
 
     def get_string(self, feature: str) -> str:
         return str(self._read(feature))
@@ -347,7 +347,7 @@ class NodeMapCamera:
         """The first feature that the camera offers; the first of all if it offers none."""
         return next(filter(self.is_feature_available, features), features[0])
 
-    def _offered(self, node: Any) -> bool:
+    def _is_offered(self, node: Any) -> bool:
         return node.get_access_mode() in {self._access.WO, self._access.RO, self._access.RW}
 
 
@@ -383,21 +383,21 @@ class GentlConnection(GenICamConnection):
                 f"the path of its .cti file as producer, or set {PATHS} to its folder"
             )
             raise LibraryMissingError(message, install="the camera maker's GenTL producer (a .cti file)")
-        self._file, self._acquirer = self._opened(files, options.device)
+        self._file, self._acquirer = self._find_device(files, options.device)
         self._camera = NodeMapCamera(name, self._acquirer.remote_device.node_map, self._acquirer.device)
 
-    def told(self, doing: str) -> AbstractContextManager[None]:
+    def translate_errors(self, doing: str) -> AbstractContextManager[None]:
         """See `GenICamConnection`."""
         return translate_gentl_errors(self.name, doing)
 
-    def kind(self, feature: str) -> str:
+    def feature_type(self, feature: str) -> str:
         """See `GenICamConnection`."""
-        with self.asking(f"feature {feature}") as camera:
+        with self.access(f"feature {feature}") as camera:
             return feature_type(camera.node(feature))
 
     def start(self, buffers: int) -> GenICamStream:
         """See `GenICamConnection`. The producer's queue is emptied when an acquisition ends."""
-        with self.asking("starting"):
+        with self.access("starting"):
             self._acquirer.num_buffers = max(buffers, self._acquirer.min_num_buffers)
             self._acquirer.start()
         return GentlStream(self, self._acquirer, self._lost)
@@ -411,7 +411,7 @@ class GentlConnection(GenICamConnection):
             acquirer.destroy()
         release_producer(self._file)
 
-    def _opened(self, files: tuple[Path, ...], device: str) -> tuple[Path, Any]:
+    def _find_device(self, files: tuple[Path, ...], device: str) -> tuple[Path, Any]:
         """The producer that has the device, which is then in use, and the device's acquirer."""
         known = []
         for file in files:
@@ -419,7 +419,7 @@ class GentlConnection(GenICamConnection):
             try:
                 for found in producer.devices:
                     if device in {found.id_, device_field(found, "serial_number")}:
-                        with self.told(f"opening {device}"):
+                        with self.translate_errors(f"opening {device}"):
                             return file, producer.acquirer(found)
                     known.append(found.id_)
             except BaseException:
@@ -449,16 +449,16 @@ class GentlStream:
     def __init__(self, connection: GentlConnection, acquirer: Any, lost: threading.Event) -> None:
         self._acquirer = acquirer
         self._lost = lost
-        self._told = connection.told
+        self._translate_errors = connection.translate_errors
         self._came: queue.SimpleQueue[RawFrame] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._pump, name=f"frames of {connection.name}", daemon=True)
         self._thread.start()
 
-    def take(self, most_s: float) -> RawFrame | None:
+    def take(self, max_s: float) -> RawFrame | None:
         """See `GenICamStream`."""
         try:
-            return self._came.get(timeout=most_s) if most_s > 0 else self._came.get_nowait()
+            return self._came.get(timeout=max_s) if max_s > 0 else self._came.get_nowait()
         except queue.Empty:
             return None
 
@@ -467,13 +467,13 @@ class GentlStream:
         self._ending.set()
         self._thread.join()
         # A camera that is lost only now is told of by the next call that needs it.
-        with suppress(DeviceError), self._told("stopping"):
+        with suppress(DeviceError), self._translate_errors("stopping"):
             self._acquirer.stop()
 
     def _pump(self) -> None:
         while not self._ending.is_set():
             try:
-                with self._told("taking a frame"):
+                with self._translate_errors("taking a frame"):
                     # Frames that are not whole do not come; they are counted by the gap that they leave.
                     buffer = self._acquirer.try_fetch(timeout=_ASK_S, is_raw=True)
                     if buffer is not None:

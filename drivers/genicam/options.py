@@ -90,7 +90,7 @@ class GenICamCameraOptions(Strict, use_attribute_docstrings=True):
     trigger waits for it."""
 
     @model_validator(mode="after")
-    def _set_once(self) -> Self:
+    def _check_features(self) -> Self:
         """Refuse features that the driver sets itself: two masters for one register."""
         own = sorted(set(self.features) & OWN_FEATURES)
         if own:

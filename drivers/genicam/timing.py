@@ -18,26 +18,26 @@ from dataclasses import dataclass
 DRIFT = 1e-4
 """How far a camera's clock may run from the host's: crystals are good to 50 parts per million each."""
 
-_EVER_NS = 1 << 62
-_FORGOTTEN = 4
+_FOREVER_NS = 1 << 62
+_EXPIRY_FACTOR = 4
 _HALF = 1 << 15
 _GIGE_IDS = (1 << 16) - 1
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """From `least_ns` to `most_ns`; empty if that is backwards."""
+    """From `min_ns` to `max_ns`; empty if that is backwards."""
 
-    least_ns: int
-    most_ns: int
+    min_ns: int
+    max_ns: int
 
     def __and__(self, other: Interval) -> Interval:
-        return Interval(max(self.least_ns, other.least_ns), min(self.most_ns, other.most_ns))
+        return Interval(max(self.min_ns, other.min_ns), min(self.max_ns, other.max_ns))
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether no instant lies in it."""
-        return self.least_ns > self.most_ns
+        return self.min_ns > self.max_ns
 
 
 class FrameNumbers:
@@ -49,7 +49,7 @@ class FrameNumbers:
     def __init__(self) -> None:
         self._last: int | None = None
         self._number = 0
-        self.made = 0
+        self.frame_count = 0
 
     def next(self, block_id: int) -> int | None:
         """Return the number of a frame; None for one that repeats or precedes the last."""
@@ -65,7 +65,7 @@ class FrameNumbers:
             self._last = last
             return None
         self._number += step
-        self.made = self._number + 1
+        self.frame_count = self._number + 1
         return self._number
 
 
@@ -84,7 +84,7 @@ class StartClock:
         self._offset: tuple[int, Interval] | None = None
 
     @property
-    def tied(self) -> bool:
+    def is_tied(self) -> bool:
         """Whether the clock was latched: its word then counts more than that of the network."""
         return self._latched is not None
 
@@ -93,28 +93,28 @@ class StartClock:
 
         Return whether they agree; if not (a clock that stands, a stamp in other units) they are not used.
         """
-        offset, at_ns = Interval(-_EVER_NS, _EVER_NS), 0
+        offset, at_ns = Interval(-_FOREVER_NS, _FOREVER_NS), 0
         for before_ns, stamp_ns, after_ns in looks:
             at_ns = max(at_ns, stamp_ns)
             seen = Interval(before_ns - stamp_ns, after_ns - stamp_ns)
-            offset &= Interval(seen.least_ns - self._lag_ns.most_ns, seen.most_ns - self._lag_ns.least_ns)
+            offset &= Interval(seen.min_ns - self._lag_ns.max_ns, seen.max_ns - self._lag_ns.min_ns)
         # Without the play of the lag: two looks at a clock that stands are farther apart than each is long.
         bare = Interval(
             max(before_ns - stamp_ns for before_ns, stamp_ns, _ in looks),
             min(after_ns - stamp_ns for _, stamp_ns, after_ns in looks),
         )
         moved = len({stamp_ns for _, stamp_ns, _ in looks}) == len(looks) > 1
-        if bare.empty or not moved:
+        if bare.is_empty or not moved:
             return False
         self._latched = self._offset = (at_ns, offset)
         return True
 
     def learn(self, stamp_ns: int, start: Interval) -> None:
         """Tie the clock closer by a frame whose start is known otherwise; do not learn from a contradiction."""
-        offset = Interval(start.least_ns - stamp_ns, start.most_ns - stamp_ns)
+        offset = Interval(start.min_ns - stamp_ns, start.max_ns - stamp_ns)
         if self._offset is not None:
-            offset &= self._drifted(stamp_ns, self._offset)
-        if not offset.empty:
+            offset &= self._with_drift(stamp_ns, self._offset)
+        if not offset.is_empty:
             self._offset = (stamp_ns, offset)
 
     def forget(self) -> None:
@@ -124,14 +124,14 @@ class StartClock:
     def start(self, stamp_ns: int) -> Interval:
         """When the exposure with this stamp began, as far as the clock can tell."""
         if self._offset is None:
-            return Interval(-_EVER_NS, _EVER_NS)
-        offset = self._drifted(stamp_ns, self._offset)
-        return Interval(offset.least_ns + stamp_ns, offset.most_ns + stamp_ns)
+            return Interval(-_FOREVER_NS, _FOREVER_NS)
+        offset = self._with_drift(stamp_ns, self._offset)
+        return Interval(offset.min_ns + stamp_ns, offset.max_ns + stamp_ns)
 
-    def _drifted(self, stamp_ns: int, offset: tuple[int, Interval]) -> Interval:
+    def _with_drift(self, stamp_ns: int, offset: tuple[int, Interval]) -> Interval:
         at_ns, known = offset
         play_ns = round(DRIFT * abs(stamp_ns - at_ns))
-        return Interval(known.least_ns - play_ns, known.most_ns + play_ns)
+        return Interval(known.min_ns - play_ns, known.max_ns + play_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,11 +157,11 @@ class UntriggeredStarts:
         if frame.stamp_ns is None:
             return Interval(latest_ns - self._transfer_ns, latest_ns)
         # A frame may come late and never early, so the quickest ones tie the clock from above.
-        self._clock.learn(frame.stamp_ns, Interval(-_EVER_NS, latest_ns))
-        start = self._clock.start(frame.stamp_ns) & Interval(-_EVER_NS, latest_ns)
-        if not self._clock.tied:
-            start &= Interval(start.most_ns - self._transfer_ns, _EVER_NS)
-        return None if start.empty else start
+        self._clock.learn(frame.stamp_ns, Interval(-_FOREVER_NS, latest_ns))
+        start = self._clock.start(frame.stamp_ns) & Interval(-_FOREVER_NS, latest_ns)
+        if not self._clock.is_tied:
+            start &= Interval(start.max_ns - self._transfer_ns, _FOREVER_NS)
+        return None if start.is_empty else start
 
 
 class TriggeredStarts:
@@ -184,16 +184,16 @@ class TriggeredStarts:
         self._closed = -1
         self._number = -1
 
-    def triggered(self, begun_ns: int, ended_ns: int, *, times: int = 1) -> None:
+    def note_trigger(self, begun_ns: int, ended_ns: int, *, times: int = 1) -> None:
         """Note a trigger, and how often it may have been sent."""
-        if self.owed_ns(begun_ns) <= 0:
+        if self.answer_due_ns(begun_ns) <= 0:
             self._closed = self._heard
         self._triggers += [Interval(begun_ns, ended_ns)] * times
 
-    def owed_ns(self, now_ns: int) -> int:
+    def answer_due_ns(self, now_ns: int) -> int:
         """For how long the answer to a trigger may still come; 0 or less if none is due."""
         unanswered = self._triggers[max(self._answered, self._closed) + 1 :]
-        last_ns = max((trigger.most_ns for trigger in unanswered), default=-_EVER_NS)
+        last_ns = max((trigger.max_ns for trigger in unanswered), default=-_FOREVER_NS)
         return last_ns + self._exposure_ns + self._answer_ns - now_ns
 
     def start(self, frame: Arrival) -> Interval | None:
@@ -204,12 +204,12 @@ class TriggeredStarts:
         latest_ns = frame.arrived_ns - self._exposure_ns
         for index in range(first, len(self._triggers)):
             trigger = self._triggers[index]
-            if trigger.most_ns < latest_ns - _FORGOTTEN * self._answer_ns:
+            if trigger.max_ns < latest_ns - _EXPIRY_FACTOR * self._answer_ns:
                 continue
-            start = Interval(trigger.least_ns, latest_ns)
+            start = Interval(trigger.min_ns, latest_ns)
             if frame.stamp_ns is not None:
                 start &= self._clock.start(frame.stamp_ns)
-            if not start.empty:
+            if not start.is_empty:
                 if frame.stamp_ns is not None:
                     self._clock.learn(frame.stamp_ns, start)
                 self._answered = index

@@ -53,7 +53,7 @@ class LightOptions(Strict, use_attribute_docstrings=True):
     """Which way the trigger output goes as the pattern's light begins: high, it rises; low, it falls."""
 
     @model_validator(mode="after")
-    def _within_limits(self) -> Self:
+    def _check_current(self) -> Self:
         if self.led_current > self.led_current_limit:
             message = (
                 f"led_current is {self.led_current:g}, led_current_limit allows {self.led_current_limit:g}; lower the "
@@ -67,7 +67,7 @@ class LightOptions(Strict, use_attribute_docstrings=True):
         """The LEDs that patterns are lit with."""
         return LedColour[self.led.upper()]
 
-    def colour_of(self, pattern: Pattern) -> LedColour:
+    def led_colour(self, pattern: Pattern) -> LedColour:
         """The LEDs that a pattern is lit with."""
         return LedColour[pattern.colour.upper()] if isinstance(pattern, Primary) else self.colour
 

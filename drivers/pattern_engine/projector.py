@@ -30,7 +30,7 @@ EngineT = TypeVar("EngineT", bound=UsbEngine)
 class LightSource(Protocol):
     """An engine, as far as light goes. `start` begins anew what was told last."""
 
-    def leds(self, *, by_sequence: bool) -> None:
+    def switch_leds(self, *, by_sequence: bool) -> None:
         """Let the sequence switch the LEDs, or switch them all off."""
         ...
 
@@ -53,7 +53,7 @@ SourceT = TypeVar("SourceT", bound=LightSource)
 class EngineProjector(ABC, Generic[SourceT]):
     """What implements `slrig.devices.Projector` on any engine, as far as engines are alike.
 
-    A kind of engine calls `_take_over` when it is constructed, and `_begin_holding` when it has begun what it shows.
+    A kind of engine calls `_initialise` when it is constructed, and `_hold_pattern` when it has begun what it shows.
     `_lock` keeps the engine's commands together. clock : the rig's; else the system's.
     """
 
@@ -63,7 +63,7 @@ class EngineProjector(ABC, Generic[SourceT]):
         self._light = options
         self._state = ProjectorState("the light engine")
         self._lock = threading.RLock()
-        self._held_until_s = self._restart_at_s = self._restart_each_s = 0.0
+        self._held_until_s = self._next_restart_s = self._restart_interval_s = 0.0
         self._dark_at_s = math.inf
         self._info: ProjectorInfo
 
@@ -99,25 +99,25 @@ class EngineProjector(ABC, Generic[SourceT]):
         self._state.closed.set()
         with self._lock:
             if not already:
-                self._leave()
+                self._shut_down()
 
-    def _take_over(self) -> None:
+    def _initialise(self) -> None:
         """Wake the engine, darken it first of all, and prepare it; close it if that fails."""
         try:
             self._wake()
             self._info = self._prepare()
         except BaseException:
-            self._leave()
+            self._shut_down()
             raise
-        threading.Thread(target=self._hold, name="light engine", daemon=True).start()
+        threading.Thread(target=self._hold_loop, name="light engine", daemon=True).start()
 
-    def _begin_holding(self, alone_s: float, *, again_s: float) -> None:
+    def _hold_pattern(self, alone_s: float, *, again_s: float) -> None:
         """Hold what was begun now, and ends by itself `alone_s` later; then each `again_s`."""
         now_s = self._now_s()
         self._held_until_s = now_s + self._light.hold_s
-        self._restart_at_s, self._restart_each_s = now_s + alone_s / 2, again_s
+        self._next_restart_s, self._restart_interval_s = now_s + alone_s / 2, again_s
 
-    def _shown(self, index: int, earliest_ns: int, latest_ns: int) -> Shown:
+    def _wait_for_light(self, index: int, earliest_ns: int, latest_ns: int) -> Shown:
         """Wait until the latest instant at which light can begin."""
         self._clock.wait_until(latest_ns, self._state.closed)
         self._state.require_open()
@@ -126,7 +126,7 @@ class EngineProjector(ABC, Generic[SourceT]):
     def _now_s(self) -> float:
         return self._clock.now_ns() / 1e9
 
-    def _hold(self) -> None:
+    def _hold_loop(self) -> None:
         """Start what is shown anew, before the engine ends it: it says that this program lives. End what does not
         end by itself, from `_dark_at_s` on. Runs until `close`.
         """
@@ -138,9 +138,9 @@ class EngineProjector(ABC, Generic[SourceT]):
                 now_s = self._now_s()
                 if now_s >= self._dark_at_s:
                     self._darken()
-                if not self._restart_at_s <= now_s < self._held_until_s:
+                if not self._next_restart_s <= now_s < self._held_until_s:
                     continue
-                self._restart_at_s = now_s + self._restart_each_s
+                self._next_restart_s = now_s + self._restart_interval_s
                 try:
                     self._engine.stop()
                     self._engine.start()
@@ -152,21 +152,21 @@ class EngineProjector(ABC, Generic[SourceT]):
         """LEDs off, then stop, each tried whatever becomes of the other. Return what the engine said against it."""
         self._held_until_s, self._dark_at_s = 0.0, math.inf
         faults: list[SlrigError] = []
-        for darken in (partial(self._engine.leds, by_sequence=False), self._engine.stop):
+        for darken in (partial(self._engine.switch_leds, by_sequence=False), self._engine.stop):
             try:
                 darken()
             except SlrigError as error:
                 faults.append(error)
         return faults
 
-    def _rest(self) -> None:
+    def _before_close(self) -> None:
         """What else is done before the engine is let go. It is dark."""
 
-    def _leave(self) -> None:
+    def _shut_down(self) -> None:
         """Darken as far as the engine lets, and let it go."""
         self._darken()
         with suppress(SlrigError):
-            self._rest()
+            self._before_close()
         self._state.loaded = None
         self._state.closed.set()
         self._engine.close()
@@ -201,7 +201,7 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
 
     def option_for(self, *, rises: bool) -> str:
         """See `UnprovenLight`."""
-        inverted = rises == self._engine.led_polarity_turned
+        inverted = rises == self._engine.is_led_polarity_inverted
         return f"led_current_inverted = {str(inverted).lower()}"
 
     def _wake(self) -> None:
@@ -215,7 +215,7 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
         self._engine.wait_until_initialised(WAKE_TIMEOUT_S)
         self.blank()
 
-    def _set_up_light(self) -> None:
+    def _configure_leds(self) -> None:
         """No mirroring, no inversion, and the current of the LEDs: half of it where its sense is not known."""
         engine, light = self._engine, self._light
         for unchanged in (UsbCommand.FLIP_LONG, UsbCommand.FLIP_SHORT, UsbCommand.INVERT_DATA):
@@ -225,7 +225,7 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
         else:
             engine.set_led_current(light.colour, light.current_byte, inverted=light.led_current_inverted)
 
-    def _require_proven(self) -> None:
+    def _require_known_polarity(self) -> None:
         if self.unproven:
             message = (
                 "asked to play, but it is not known which way the LEDs' current goes, and light is dim until it is: "

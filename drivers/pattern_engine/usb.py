@@ -435,7 +435,7 @@ class UsbEngine:
             message += f"switch it off and on, and update its firmware to {self._link.kind.firmware} or later"
             raise UnsupportedByDeviceError(message)
 
-    def leds(self, *, by_sequence: bool) -> None:
+    def switch_leds(self, *, by_sequence: bool) -> None:
         """Let the sequence switch the LEDs, or switch them all off."""
         self.set_byte(UsbCommand.LED_ENABLE, 8 if by_sequence else 0)
 
@@ -443,12 +443,12 @@ class UsbEngine:
         """Set the current of the LEDs in `colours` (0 to 255), and none of the others; compare what is read back."""
         wanted = [current if colours & bit else 0 for bit in (1, 2, 4)]
         # The register's polarity turns the sense of the values around once more.
-        if inverted != self.led_polarity_turned:
+        if inverted != self.is_led_polarity_inverted:
             wanted = [255 - value for value in wanted]
         self.set_led_registers(bytes(wanted))
 
     @property
-    def led_polarity_turned(self) -> bool:
+    def is_led_polarity_inverted(self) -> bool:
         """Whether the register of the polarity is set."""
         return bool(self.byte(UsbCommand.LED_POLARITY) & 1)
 

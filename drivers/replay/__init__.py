@@ -40,7 +40,7 @@ class ReplayOptions(Strict, use_attribute_docstrings=True):
 
     @field_validator("speed")
     @classmethod
-    def _possible(cls, speed: float) -> float:
+    def _check_speed(cls, speed: float) -> float:
         least, most = _SPEEDS
         if speed != 0 and not least <= speed <= most:
             message = f"expected 0, or {least:g} to {most:g} times the recording's own speed, found {speed:g}"

@@ -90,7 +90,7 @@ class ReplayCamera:
     def trigger(self) -> None:
         """See `Camera`. Takes the recorded frame of what is shown now; in the dark, that of the black pattern."""
         self._state.require_armed()
-        shot = self._shot()
+        shot = self._recorded_shot()
         exposure_s = self._applied.exposure_s if shot.exposure_s is None else shot.exposure_s
         colour = shot.colour
         start_ns = max(self._clock.now_ns(), self._busy_ns, self._clock.recorded_ns(shot.time_s))
@@ -119,12 +119,12 @@ class ReplayCamera:
         while self._pending:
             frame = self._pending[0]
             if frame.t_start_ns >= after_ns:
-                if not self._clock.reached(frame.t_end_ns, timeout_s):
+                if not self._clock.wait_until_reached(frame.t_end_ns, timeout_s):
                     break
                 self._state.require_armed()
                 return self._pending.popleft()
             self._pending.popleft()
-        self._clock.idle(timeout_s)
+        self._clock.pass_time(timeout_s)
         message = (
             f"camera '{self._info.name}': no frame that began after {after_ns} ns was triggered and exposed within "
             f"{timeout_s} s; trigger after show"
@@ -143,7 +143,7 @@ class ReplayCamera:
         self._state.close()
         self._clock.release()
 
-    def frames_of(self, pattern: Pattern) -> Sequence[Shot]:
+    def recorded_frames(self, pattern: Pattern) -> Sequence[Shot]:
         """Return the recorded frames of a pattern at the exposure in use; at any exposure where there is none such."""
         shots = self._recorded.get(pattern, [])
         in_use_s = self._applied.exposure_s
@@ -154,9 +154,9 @@ class ReplayCamera:
         ]
         return alike or shots
 
-    def _shot(self) -> Shot:
+    def _recorded_shot(self) -> Shot:
         pattern, showing = self._stage.shown if self._stage.shown is not None else (Black(), 0)
-        shots = self.frames_of(pattern)
+        shots = self.recorded_frames(pattern)
         if not shots:
             message = (
                 f"camera '{self._info.name}': triggered while the projector is dark, and the recording has no black "

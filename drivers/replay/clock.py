@@ -81,14 +81,14 @@ class ReplayClock:
         self._pace(self._now_ns)
         return self._now_ns
 
-    def reached(self, at_ns: int, within_s: float) -> bool:
+    def wait_until_reached(self, at_ns: int, within_s: float) -> bool:
         """Wait until the clock may stand at `at_ns`; False, at once, if that would take longer than `within_s`."""
         if self._left_s(at_ns) > within_s:
             return False
         self._pace(at_ns)
         return True
 
-    def idle(self, seconds: float) -> None:
+    def pass_time(self, seconds: float) -> None:
         """Let so much time pass, of the pace's clock where there is a pace."""
         passed_ns = round(seconds * 1e9 * (self._speed or 1))
         self._now_ns = self._held_ns = max(self._now_ns + passed_ns, self._held_ns)

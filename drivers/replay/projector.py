@@ -29,7 +29,7 @@ class ReplayProjector:
             recorded=tuple(
                 pattern
                 for pattern in bundle.capture.patterns
-                if all(camera.frames_of(pattern) for camera in cameras.values())
+                if all(camera.recorded_frames(pattern) for camera in cameras.values())
             ),
             lights=any(isinstance(pattern, Primary) for pattern in bundle.capture.patterns),
         )
@@ -49,7 +49,7 @@ class ReplayProjector:
         self._state.require_open()
         self._state.require_size(sequence, self._info.size)
         for pattern in sequence.patterns:
-            lacking = [name for name, camera in self._cameras.items() if not camera.frames_of(pattern)]
+            lacking = [name for name, camera in self._cameras.items() if not camera.recorded_frames(pattern)]
             if lacking:
                 recorded = "; ".join(dict.fromkeys(map(_describe_family, self._recorded)))
                 message = (
@@ -71,7 +71,7 @@ class ReplayProjector:
         self._stage.shown = (pattern, showing)
         times_s = [
             shots[min(showing, len(shots) - 1)].time_s
-            for shots in (camera.frames_of(pattern) for camera in self._cameras.values())
+            for shots in (camera.recorded_frames(pattern) for camera in self._cameras.values())
         ]
         first_s = min((time_s for time_s in times_s if time_s is not None), default=0.0)
         return Shown(index, self._clock.change_light(first_s), 0)

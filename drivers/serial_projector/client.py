@@ -233,7 +233,7 @@ class BoxClient:
         self._lock = threading.RLock()
         self._clock = BoxClock()
         self._abandoned = threading.Event()
-        self._box = self._greeted()
+        self._box = self._greet_box()
         self._gap_us = self._box.gap_us
 
     @property
@@ -255,7 +255,7 @@ class BoxClient:
         """Begin the session again, after the box restarted: it is dark, and holds nothing. Raises as opening does."""
         with self._lock:
             self._clock = BoxClock()
-            self._box = self._greeted()
+            self._box = self._greet_box()
             return self._box
 
     def reconnect(self, open_port: Callable[[], BytePort]) -> None:
@@ -268,7 +268,7 @@ class BoxClient:
     def ping(self) -> tuple[str, int]:
         """What the box does, and the fault that it went dark for (0: none)."""
         with self._lock:
-            return self._pinged(self._link.ask("PING"))
+            return self._note_ping(self._link.ask("PING"))
 
     def beat(self) -> None:
         """Tell the box that its host lives, unless a command is under way, which tells it, too. Tried once."""
@@ -276,7 +276,7 @@ class BoxClient:
             return
         try:
             with suppress(NoAnswerError, BoxRefusedError):
-                self._pinged(self._link.ask("PING", tries=1))
+                self._note_ping(self._link.ask("PING", tries=1))
         finally:
             self._lock.release()
 
@@ -291,7 +291,7 @@ class BoxClient:
             except BoxRefusedError as refusal:
                 if refusal.number not in {RefusalCode.PATTERNS, RefusalCode.RANGE} or len(each) > self._box.pick:
                     raise
-                lacking = self._picked(each)
+                lacking = self._pick(each)
                 if lacking:
                     return lacking
                 self._load(each)
@@ -302,7 +302,7 @@ class BoxClient:
         reply = self._ask("LOAD", len(each), f"{sequence_checksum(each):08X}")
         self._gap_us = _integer(reply, 2) if len(reply.words) > 2 else self._box.gap_us
 
-    def _picked(self, each: Sequence[int]) -> tuple[int, ...]:
+    def _pick(self, each: Sequence[int]) -> tuple[int, ...]:
         """Pick patterns; return the indices of those that the box lacks."""
         lacking: list[int] = []
         for at in range(0, len(each), MAX_PICKS_PER_LINE):
@@ -314,7 +314,7 @@ class BoxClient:
         """Light a pattern; return (t_visible_ns, t_err_ns), on the link's clock."""
         with self._lock:
             reply = self._ask("SHOW", index, takes_s=self._box.light_s)
-            return self._lit(reply, index)
+            return self._read_light_time(reply, index)
 
     def sequence(self, first: int, count: int, exposure_us: int, period_us: int, mode: SequenceMode) -> None:
         """Begin a sequence. Its events are collected from now on."""
@@ -325,7 +325,7 @@ class BoxClient:
     def trigger(self, index: int) -> tuple[int, int]:
         """Light the next pattern of a sequence that waits for it, which is `index`; return as `show` does."""
         with self._lock:
-            return self._lit(self._ask("TRIG", takes_s=self._box.light_s), index)
+            return self._read_light_time(self._ask("TRIG", takes_s=self._box.light_s), index)
 
     def stop(self) -> int:
         """End a sequence, dark; return how many of its patterns were lit."""
@@ -368,11 +368,11 @@ class BoxClient:
         with self._lock:
             return self._link.ask(verb, *numbers, takes_s=takes_s)
 
-    def _pinged(self, reply: Reply) -> tuple[str, int]:
+    def _note_ping(self, reply: Reply) -> tuple[str, int]:
         self._clock.note(_integer(reply, 0), reply.sent_ns, reply.received_ns)
         return reply.words[1] if len(reply.words) > 1 else "", _integer(reply, 2)
 
-    def _lit(self, reply: Reply, index: int) -> tuple[int, int]:
+    def _read_light_time(self, reply: Reply, index: int) -> tuple[int, int]:
         if _integer(reply, 0) != index:
             message = (
                 f"asked the trigger box on {self._label} for pattern {index}, found {reply.words}; its firmware errs"
@@ -383,19 +383,19 @@ class BoxClient:
         t_ns, error_ns = self._clock.host_ns(t_us)
         return t_ns, error_ns + self._box.error_us * 1000
 
-    def _greeted(self) -> BoxInfo:
+    def _greet_box(self) -> BoxInfo:
         """Say HELLO until the box has started; many boards restart when their port is opened."""
         link = self._link
         until_ns = link.after(self._open_s)
         while True:
             left_s = (until_ns - link.clock.now_ns()) / 1e9
             try:
-                box = self._checked(self._said_hello(max(left_s, link.reply_s)))
+                box = self._check_box(self._send_hello(max(left_s, link.reply_s)))
                 for _ in range(_PINGS):
-                    self._pinged(link.ask("PING"))
+                    self._note_ping(link.ask("PING"))
             except BoxRefusedError as refusal:
                 if refusal.number == RefusalCode.RANGE:
-                    raise UnsupportedByDeviceError(self._beyond(refusal)) from refusal
+                    raise UnsupportedByDeviceError(self._limits_message(refusal)) from refusal
                 if refusal.number not in {RefusalCode.BUSY, RefusalCode.SESSION}:
                     raise
                 # Another host's session may be about to end; and a box that restarts just now has forgotten ours.
@@ -403,21 +403,21 @@ class BoxClient:
                     link.clock.wait_until(link.after(_GREET_RETRY_S), link.closing)
                     if not link.closing.is_set():
                         continue
-                raise DeviceBusyError(self._held(" ".join(refusal.words))) from refusal
+                raise DeviceBusyError(self._busy_message(" ".join(refusal.words))) from refusal
             return box
 
-    def _said_hello(self, deadline_s: float) -> BoxInfo:
+    def _send_hello(self, deadline_s: float) -> BoxInfo:
         limits = self._limits
         asked = (PROTOCOL, limits.watchdog_ms, limits.on_ms, limits.duty, limits.bright)
         try:
             reply = self._link.ask("HELLO", *asked, tries=_UNLIMITED_TRIES, deadline_s=deadline_s)
         except NoAnswerError as silence:
             if self._link.tally.others:
-                raise DeviceBusyError(self._held("somebody else's answers came in")) from silence
-            raise DeviceError(self._unspoken(silence)) from silence
+                raise DeviceBusyError(self._busy_message("somebody else's answers came in")) from silence
+            raise DeviceError(self._silence_message(silence)) from silence
         return _parse_fields(BoxInfo, reply.words)
 
-    def _checked(self, box: BoxInfo) -> BoxInfo:
+    def _check_box(self, box: BoxInfo) -> BoxInfo:
         """What the box says of itself. Raises DeviceError, UnsupportedByDeviceError."""
         beyond = [
             f"{field.name} {getattr(box, field.name)} instead of {getattr(self._limits, field.name)}"
@@ -435,19 +435,19 @@ class BoxClient:
             raise UnsupportedByDeviceError(message)
         return box
 
-    def _held(self, by: str) -> str:
+    def _busy_message(self, by: str) -> str:
         return (
             f"the trigger box on {self._label} is in a session with another host ({by}); end that one, or wait for its "
             "watchdog if it has died"
         )
 
-    def _beyond(self, refusal: BoxRefusedError) -> str:
+    def _limits_message(self, refusal: BoxRefusedError) -> str:
         return (
             f"the trigger box on {self._label} does not grant {self._limits}: {' '.join(refusal.words)}; a box that "
             "cannot dim takes brightness 1 only, else see watchdog_s, max_on_s and max_duty"
         )
 
-    def _unspoken(self, silence: NoAnswerError) -> str:
+    def _silence_message(self, silence: NoAnswerError) -> str:
         return (
             f"nothing on {self._label} answered as a trigger box that speaks SLTP/{PROTOCOL}: {silence}. Is it the "
             "right port (slrig devices), and is the firmware on the box?"

@@ -90,9 +90,9 @@ class SerialProjector:
         )
         self._boot = box.boot
         self._state = ProjectorState(f"the trigger box on {options.port}")
-        self._wanted: tuple[int, ...] = ()
+        self._checksums: tuple[int, ...] = ()
         self._lit: str | None = None
-        self._keeping = KeepAlive(self._client, watchdog_s=box.watchdog_ms / 1000, clock=self._clock)
+        self._keep_alive = KeepAlive(self._client, watchdog_s=box.watchdog_ms / 1000, clock=self._clock)
 
     @property
     def info(self) -> ProjectorInfo:
@@ -105,7 +105,7 @@ class SerialProjector:
         return self._client
 
     @property
-    def played(self) -> tuple[Shown, ...]:
+    def played_patterns(self) -> tuple[Shown, ...]:
         """When each pattern of the last `play` became visible, as far as the box's events came through."""
         return tuple(Shown(*frame) for frame in self._client.frames())
 
@@ -121,9 +121,9 @@ class SerialProjector:
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, self._size)
-        self._wanted = pattern_checksums(sequence)
+        self._checksums = pattern_checksums(sequence)
         try:
-            lacking = self._sent(lambda: self._client.load(self._wanted))
+            lacking = self._send(lambda: self._client.load(self._checksums))
         except UnsupportedByDeviceError as error:
             lacking, why = tuple(range(len(sequence))), f"it takes runs of its flash only, and this is none ({error})"
         else:
@@ -151,8 +151,8 @@ class SerialProjector:
     def show(self, index: int) -> Shown:
         """See `Projector`. The instant is the box's own stamp; its error comes from the exchanges with its clock."""
         self._state.require_pattern(index)
-        with self._dark_if_it_fails():
-            t_visible_ns, t_err_ns = self._sent(lambda: self._client.show(index))
+        with self._darken_on_error():
+            t_visible_ns, t_err_ns = self._send(lambda: self._client.show(index))
             self._lit = f"pattern {index} was lit"
             self._clock.wait_until(t_visible_ns + t_err_ns, self._state.closed)
         return Shown(index, t_visible_ns, t_err_ns)
@@ -162,11 +162,11 @@ class SerialProjector:
         count = len(self._state.require_loaded("play"))
         exposure_us, period_us = round(exposure_s * 1e6), round(period_s * 1e6)
         self._check_timing(exposure_us, period_us)
-        with self._dark_if_it_fails():
+        with self._darken_on_error():
             # A box that restarted since is found here: below, it could have begun to play before it did.
-            self._sent(self._client.ping)
+            self._send(self._client.ping)
             self._lit = "a sequence played"
-            self._sent(lambda: self._client.sequence(0, count, exposure_us, period_us, SequenceMode.FREE))
+            self._send(lambda: self._client.sequence(0, count, exposure_us, period_us, SequenceMode.FREE))
 
     def stop(self) -> None:
         """See `Projector`."""
@@ -180,14 +180,14 @@ class SerialProjector:
         """See `Projector`."""
         self._state.closed.set()
         self._client.close()
-        self._keeping.stop()
+        self._keep_alive.stop()
         self._state.loaded = self._lit = None
 
     def _darken(self, command: Callable[[], object]) -> None:
         if self._state.closed.is_set():
             return
         try:
-            self._sent(command)
+            self._send(command)
         except BaseException as error:
             self._abandon()
             if self._state.closed.is_set() and isinstance(error, DeviceStateError):
@@ -198,7 +198,7 @@ class SerialProjector:
             self._lit = None
 
     @contextmanager
-    def _dark_if_it_fails(self) -> Iterator[None]:
+    def _darken_on_error(self) -> Iterator[None]:
         try:
             yield
         except BaseException:
@@ -214,10 +214,10 @@ class SerialProjector:
         self._state.loaded = None
         self._client.abandon()
 
-    def _sent(self, command: Callable[[], _Value]) -> _Value:
+    def _send(self, command: Callable[[], _Value]) -> _Value:
         """Send a command; to a box that restarted in the dark, once more after it was greeted and loaded again."""
         try:
-            return self._obeyed(command)
+            return self._run_command(command)
         except _RestartedError:
             # Told below, if it does not go better.
             pass
@@ -227,13 +227,13 @@ class SerialProjector:
                 raise
             self._client.reconnect(self._open_port)
         try:
-            self._meet_again()
-            return self._obeyed(command)
+            self._resume_session()
+            return self._run_command(command)
         except _RestartedError as error:
             message = f"the trigger box on {self._options.port} restarts again and again; see to its power supply"
             raise DeviceGoneError(message) from error
 
-    def _obeyed(self, command: Callable[[], _Value]) -> _Value:
+    def _run_command(self, command: Callable[[], _Value]) -> _Value:
         """Send a command; what the box refuses becomes an error of slrig's."""
         try:
             return command()
@@ -255,7 +255,7 @@ class SerialProjector:
                 case _:
                     raise
 
-    def _meet_again(self) -> None:
+    def _resume_session(self) -> None:
         """Greet and load a box that does not know its session any more. Raises DeviceGoneError where it was lit."""
         lit, self._lit = self._lit, None
         box = self._client.greet()
@@ -274,7 +274,7 @@ class SerialProjector:
             )
             raise DeviceGoneError(message)
         self._boot = box.boot
-        if self._state.loaded is not None and self._obeyed(lambda: self._client.load(self._wanted)):
+        if self._state.loaded is not None and self._run_command(lambda: self._client.load(self._checksums)):
             message = f"the trigger box on {self._options.port} {how} and holds other patterns; load them again"
             raise DeviceGoneError(message)
 

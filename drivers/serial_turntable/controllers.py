@@ -82,13 +82,13 @@ class LineController:
         self._lines = lines
         self.step = 360 / self._steps_per_turn(lines.after(options.open_s))
 
-    def place(self) -> float:
+    def position(self) -> float:
         """See `Controller`."""
-        return self._reached("STOP", self._lines.after(_REPLY_S))
+        return self._send_command("STOP", self._lines.after(_REPLY_S))
 
-    def go(self, place: float, until_ns: int) -> float:
+    def move_to(self, place: float, until_ns: int) -> float:
         """See `Controller`."""
-        return self._reached(f"TURN {place:.3f}", until_ns)
+        return self._send_command(f"TURN {place:.3f}", until_ns)
 
     def halt(self) -> None:
         """See `Controller`."""
@@ -100,13 +100,13 @@ class LineController:
             # A host that was killed may have left the board turning, and then it heeds nothing but STOP.
             self._lines.send("STOP")
             again_ns = self._lines.after(_RETRY_S)
-            while (line := self._lines.next(again_ns)) is not None:
+            while (line := self._lines.next_line(again_ns)) is not None:
                 heard = line
                 if _ANGLE.fullmatch(line):
                     break
             self._lines.send("ID?")
             again_ns = self._lines.after(_RETRY_S)
-            while (line := self._lines.next(again_ns)) is not None:
+            while (line := self._lines.next_line(again_ns)) is not None:
                 heard, found = line, _IDENTITY.fullmatch(line)
                 if found is None or not int(found[2]):
                     continue
@@ -121,13 +121,13 @@ class LineController:
         )
         raise DeviceError(message)
 
-    def _reached(self, command: str, until_ns: int) -> float:
+    def _send_command(self, command: str, until_ns: int) -> float:
         """Send a command; return the angle that its answer tells."""
-        for early in self._lines.come():
-            self._heed(early, command)
+        for early in self._lines.read_waiting():
+            self._check_line(early, command)
         self._lines.send(command)
-        while (line := self._lines.next(until_ns)) is not None:
-            self._heed(line, command)
+        while (line := self._lines.next_line(until_ns)) is not None:
+            self._check_line(line, command)
             reached = _ANGLE.fullmatch(line)
             if reached is not None:
                 return float(reached[1])
@@ -138,7 +138,7 @@ class LineController:
         )
         raise DeviceError(message)
 
-    def _heed(self, line: str, command: str) -> None:
+    def _check_line(self, line: str, command: str) -> None:
         """Raise DeviceError if a line says that something is wrong."""
         if line == "START":
             message = f"{self._lines.label} restarted, and no longer knows where it stands; see to its power"
@@ -173,11 +173,11 @@ class GrblController:
         self._axis = options.axis
         self._index = AXES.index(options.axis)
         self._feed = None if options.speed_deg_s is None else options.speed_deg_s * 60 * options.units_per_deg
-        self._wake(lines.after(options.open_s))
+        self._reset(lines.after(options.open_s))
         if self._status(lines.after(_REPLY_S)).state == "Alarm":
             # Locked at its start where homing is on; a table has nowhere to run into.
-            self._asked("$X")
-        told = filter(None, map(_SETTING.match, self._asked("$$")))
+            self._send_command("$X")
+        told = filter(None, map(_SETTING.match, self._send_command("$$")))
         settings = {int(each[1]): float(each[2]) for each in told}
         for key, wanted in ((13, "to report mm"), (20, "without soft limits, for a table turns round")):
             if settings.get(key):
@@ -186,17 +186,17 @@ class GrblController:
         steps = settings.get(100 + self._index)
         self.step = 1 / steps if steps else 0.0
 
-    def place(self) -> float:
+    def position(self) -> float:
         """See `Controller`. Raises DeviceError, also where it has restarted or told an alarm meanwhile."""
-        for line in self._lines.come():
-            self._heed(line, "before a turn")
+        for line in self._lines.read_waiting():
+            self._check_line(line, "before a turn")
         return self._status(self._lines.after(_REPLY_S)).place
 
-    def go(self, place: float, until_ns: int) -> float:
+    def move_to(self, place: float, until_ns: int) -> float:
         """See `Controller`."""
         # G53: places of the machine itself, as status reports have them, whatever offsets somebody has set.
         motion = "G0" if self._feed is None else f"G1 F{self._feed:.3f}"
-        self._asked(f"G21 G90 G53 {motion} {self._axis}{place:.4f}")
+        self._send_command(f"G21 G90 G53 {motion} {self._axis}{place:.4f}")
         still_ns: int | None = None
         while True:
             found = self._status(until_ns)
@@ -229,13 +229,13 @@ class GrblController:
                 break
         self._lines.send_byte(_RESET)
 
-    def _wake(self, until_ns: int) -> None:
+    def _reset(self, until_ns: int) -> None:
         """Reset it, which keeps its place while it stands, until it greets; a board that just restarts is deaf."""
         heard: list[str] = []
         while self._lines.clock.now_ns() < until_ns:
             self._lines.send_byte(_RESET)
             again_ns = self._lines.after(_RETRY_S)
-            while (line := self._lines.next(again_ns)) is not None:
+            while (line := self._lines.next_line(again_ns)) is not None:
                 heard.append(line)
                 if _BANNER.match(line):
                     # What was sent to a deaf board may still be greeted, and is so before this is answered.
@@ -249,17 +249,17 @@ class GrblController:
         )
         raise UnsupportedByDeviceError(message) if heard else DeviceError(message)
 
-    def _asked(self, text: str) -> list[str]:
+    def _send_command(self, text: str) -> list[str]:
         """Send a line; return what came before its `ok`."""
-        for early in self._lines.come():
-            self._heed(early, text)
+        for early in self._lines.read_waiting():
+            self._check_line(early, text)
         self._lines.send(text)
         until_ns = self._lines.after(_REPLY_S)
         told: list[str] = []
-        while (line := self._lines.next(until_ns)) is not None:
+        while (line := self._lines.next_line(until_ns)) is not None:
             if line == "ok":
                 return told
-            self._heed(line, text)
+            self._check_line(line, text)
             told.append(line)
         message = (
             f"{self._lines.label} did not answer {text!r} in {_REPLY_S:g} s; see to its power, cable and baud rate"
@@ -273,15 +273,15 @@ class GrblController:
         while self._lines.clock.now_ns() < until_ns:
             self._lines.send_byte(_STATUS_REQUEST)
             again_ns = self._lines.after(_RETRY_S)
-            while (line := self._lines.next(again_ns)) is not None:
-                self._heed(line, "?")
+            while (line := self._lines.next_line(again_ns)) is not None:
+                self._check_line(line, "?")
                 report = _REPORT.fullmatch(line)
                 if report is not None:
-                    return _GrblStatus(report[1], self._place_in(report[2]))
+                    return _GrblStatus(report[1], self._parse_position(report[2]))
         message = f"{self._lines.label} does not tell where it is any more; see to its power and cable"
         raise DeviceError(message)
 
-    def _place_in(self, fields: str) -> float:
+    def _parse_position(self, fields: str) -> float:
         told = dict(field.partition(":")[::2] for field in fields.split("|"))
         if "MPos" not in told:
             message = f"{self._lines.label} does not report places of the machine (MPos): set $10=1"
@@ -299,7 +299,7 @@ class GrblController:
             message = f"{self._lines.label} reported {fields!r}, which holds no place; see to its cable"
             raise DeviceError(message) from error
 
-    def _heed(self, line: str, asked: str) -> None:
+    def _check_line(self, line: str, asked: str) -> None:
         """Raise DeviceError if a line says that something is wrong."""
         if _BANNER.match(line):
             message = (
@@ -309,9 +309,9 @@ class GrblController:
             raise DeviceError(message)
         numbered = _NUMBERED.fullmatch(line)
         if numbered is not None:
-            self._refused(numbered[1], int(numbered[2]), asked)
+            self._raise_refusal(numbered[1], int(numbered[2]), asked)
 
-    def _refused(self, kind: str, number: int, asked: str) -> NoReturn:
+    def _raise_refusal(self, kind: str, number: int, asked: str) -> NoReturn:
         words = (_ERRORS if kind == "error" else _ALARMS).get(number, "see GRBL's list of its numbers")
         message = f"{self._lines.label} answered {kind}:{number} to {asked!r}: {words}"
         raise DeviceError(message)

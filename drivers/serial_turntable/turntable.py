@@ -30,7 +30,7 @@ class ControllerLink:
     label: str
     closing: threading.Event = field(default_factory=threading.Event)
     _rest: bytes = b""
-    _come: deque[str] = field(default_factory=deque)
+    _waiting: deque[str] = field(default_factory=deque)
 
     def send(self, text: str) -> None:
         """Send a line. Raises DeviceGoneError."""
@@ -49,31 +49,31 @@ class ControllerLink:
         self.clock.wait_until(self.after(seconds), self.closing)
         self._require_open()
 
-    def next(self, until_ns: int) -> str | None:
+    def next_line(self, until_ns: int) -> str | None:
         """The next line, or None when it is time. Raises DeviceGoneError; DeviceStateError: it was closed meanwhile."""
         while True:
             self._require_open()
-            if self._come:
-                return self._come.popleft()
+            if self._waiting:
+                return self._waiting.popleft()
             left_s = (until_ns - self.clock.now_ns()) / NS_PER_S
-            self._take(self.port.read(min(max(left_s, 0.0), SLICE_S)))
-            if left_s <= 0 and not self._come:
+            self._split_lines(self.port.read(min(max(left_s, 0.0), SLICE_S)))
+            if left_s <= 0 and not self._waiting:
                 return None
 
-    def come(self) -> list[str]:
+    def read_waiting(self) -> list[str]:
         """What has come in already. Raises DeviceGoneError."""
         lines: list[str] = []
-        while (line := self.next(0)) is not None:
+        while (line := self.next_line(0)) is not None:
             lines.append(line)
         return lines
 
-    def _take(self, data: bytes) -> None:
+    def _split_lines(self, data: bytes) -> None:
         *whole, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         self._rest = rest[-_MAX_LINE_BYTES:]
         for raw in whole:
             line = raw.decode("ascii", "replace").strip()
             if line and line.isascii() and line.isprintable():
-                self._come.append(line)
+                self._waiting.append(line)
 
     def _require_open(self) -> None:
         if self.closing.is_set():
@@ -87,11 +87,11 @@ class TurntableController(Protocol):
     step: float
     """Its smallest move; 0 where it tells none."""
 
-    def place(self) -> float:
+    def position(self) -> float:
         """Where it stands. Raises DeviceError."""
         ...
 
-    def go(self, place: float, until_ns: int) -> float:
+    def move_to(self, place: float, until_ns: int) -> float:
         """Go there, and return where it stands when it stands still. Raises DeviceError: it did not, or not in time."""
         ...
 
@@ -112,7 +112,7 @@ class SerialTurntable(AnyAngle):
         Open; the turntable closes it, also when it cannot be opened.
     options
         Checked.
-    controlled
+    open_controller
         Returns the controller at the other end of the line.
     clock
         By which it settles and gives up.
@@ -122,7 +122,7 @@ class SerialTurntable(AnyAngle):
         self,
         port: BytePort,
         options: LineOptions,
-        controlled: Callable[[ControllerLink], TurntableController],
+        open_controller: Callable[[ControllerLink], TurntableController],
         clock: Clock,
     ) -> None:
         super().__init__(options.poses)
@@ -130,12 +130,12 @@ class SerialTurntable(AnyAngle):
         self._units_per_deg = -options.units_per_deg if options.reversed else options.units_per_deg
         self._lines = ControllerLink(port, clock, f"the turntable on {options.port}")
         try:
-            self._controller = controlled(self._lines)
-            self._origin = self._place = self._controller.place()
+            self._controller = open_controller(self._lines)
+            self._origin = self._position = self._controller.position()
         except BaseException:
             port.close()
             raise
-        self._approached_deg: float | None = None
+        self._last_angle_deg: float | None = None
         self._turning = False
         self._lost: str | None = None
 
@@ -163,16 +163,16 @@ class SerialTurntable(AnyAngle):
         until_ns = self._lines.after(self._options.turn_s)
         self._turning = True
         try:
-            self._require_in_place()
-            for stop_deg in self._stops_deg(angle_deg):
-                self._go(stop_deg, until_ns)
+            self._require_unmoved()
+            for stop_deg in self._waypoints_deg(angle_deg):
+                self._move_to(stop_deg, until_ns)
             self._lines.wait(self._options.settle_s)
         except BaseException as error:
             self._lost = str(error) or type(error).__name__
             raise
         finally:
             self._turning = self._lost is not None
-        self._approached_deg = angle_deg
+        self._last_angle_deg = angle_deg
 
     def close(self) -> None:
         """See `Positioner`. From any thread; a turn that is under way is stopped."""
@@ -184,16 +184,16 @@ class SerialTurntable(AnyAngle):
                 self._controller.halt()
         self._lines.port.close()
 
-    def _stops_deg(self, angle_deg: float) -> tuple[float, ...]:
+    def _waypoints_deg(self, angle_deg: float) -> tuple[float, ...]:
         """The way to an angle: there, or by way of the side from which angles are approached."""
         approach_deg = self._options.approach_deg
-        here_deg = (self._place - self._origin) / self._units_per_deg
-        straight = approach_deg == 0 or angle_deg == self._approached_deg or (angle_deg - here_deg) / approach_deg >= 1
+        here_deg = (self._position - self._origin) / self._units_per_deg
+        straight = approach_deg == 0 or angle_deg == self._last_angle_deg or (angle_deg - here_deg) / approach_deg >= 1
         return (angle_deg,) if straight else (angle_deg - approach_deg, angle_deg)
 
-    def _go(self, angle_deg: float, until_ns: int) -> None:
-        self._place = self._controller.go(self._origin + angle_deg * self._units_per_deg, until_ns)
-        reached_deg = (self._place - self._origin) / self._units_per_deg
+    def _move_to(self, angle_deg: float, until_ns: int) -> None:
+        self._position = self._controller.move_to(self._origin + angle_deg * self._units_per_deg, until_ns)
+        reached_deg = (self._position - self._origin) / self._units_per_deg
         if abs(reached_deg - angle_deg) > self._options.tolerance_deg:
             step_deg = self._controller.step / self._options.units_per_deg
             steps = f", whose steps are {step_deg:.3g}°," if step_deg else ""
@@ -204,12 +204,12 @@ class SerialTurntable(AnyAngle):
             )
             raise DeviceError(message)
 
-    def _require_in_place(self) -> None:
+    def _require_unmoved(self) -> None:
         """Raise DeviceError unless it stands where it was left."""
-        place = self._controller.place()
-        if abs(place - self._place) > self._options.tolerance_deg * self._options.units_per_deg:
+        place = self._controller.position()
+        if abs(place - self._position) > self._options.tolerance_deg * self._options.units_per_deg:
             message = (
-                f"{self._lines.label} was left at {self._place:.3f} of its controller's units and now says "
+                f"{self._lines.label} was left at {self._position:.3f} of its controller's units and now says "
                 f"{place:.3f}: it was moved by somebody else, or restarted and counts anew; see to its power and cable"
             )
             raise DeviceError(message)

@@ -32,7 +32,7 @@ class BoxHardware:
         """Light the current pattern, and return once it is on the scene."""
         raise NotImplementedError
 
-    def dark(self) -> None:
+    def switch_off(self) -> None:
         """Put the light out, and return once it is."""
         raise NotImplementedError
 
@@ -40,7 +40,7 @@ class BoxHardware:
         """Begin one trigger pulse to the cameras."""
         raise NotImplementedError
 
-    def dim(self, permille: int) -> int:
+    def set_brightness(self, permille: int) -> int:
         """Set the brightness; return what it is now. A box that cannot dim returns 1000."""
         raise NotImplementedError
 
@@ -80,7 +80,7 @@ class BoxDescription:
         self.gap_us, self.hold_us, self.least_us, self.step_us = gap_us, hold_us, least_us, step_us
         self.watchdog_ms, self.on_ms, self.duty = watchdog_ms, on_ms, duty
 
-    def found(self, crc32: int) -> int:
+    def find(self, crc32: int) -> int:
         """Where a pattern lies in the flash, the first place if there are several; -1 if it does not."""
         wanted, at = crc32.to_bytes(4, "big"), -1
         while True:
@@ -88,11 +88,11 @@ class BoxDescription:
             if at < 0 or at % 4 == 0:
                 return at // 4
 
-    def crc32_of(self, order: list[int]) -> int:
+    def checksum(self, order: list[int]) -> int:
         """The checksum of a sequence of the flash's patterns."""
         return binascii.crc32(b"".join([self.crc32[4 * at : 4 * at + 4] for at in order]))
 
-    def gap_of(self, order: list[int]) -> int:
+    def gap_for(self, order: list[int]) -> int:
         """Least time between exposures of a sequence of the flash's patterns, µs."""
         most = 0
         for before, after in zip(order, order[1:]):  # noqa: B905, RUF007 - MicroPython has neither

@@ -130,7 +130,7 @@ class PicoBoard(BoxHardware):
         self._lamp.duty_u16(self._level)
         self._time.sleep_us(LAMP_US)
 
-    def dark(self) -> None:
+    def switch_off(self) -> None:
         """See `BoxHardware`."""
         self._lamp.duty_u16(0)
         self._time.sleep_us(LAMP_US)
@@ -139,7 +139,7 @@ class PicoBoard(BoxHardware):
         """See `BoxHardware`. The state machine ends it, so nobody waits."""
         self._camera.put(PULSE_US)
 
-    def dim(self, permille: int) -> int:
+    def set_brightness(self, permille: int) -> int:
         """See `BoxHardware`."""
         self._level = 65535 * permille // 1000
         return permille
@@ -232,7 +232,7 @@ def run() -> None:
     try:
         serve(device, UsbPort(select, sys), watchdog.feed, gc.collect)
     finally:
-        board.dark()
+        board.switch_off()
 
 
 if __name__ == "__main__":

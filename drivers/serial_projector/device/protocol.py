@@ -36,7 +36,7 @@ class TriggerBox:
     """
 
     def __init__(self, hardware: BoxHardware, description: BoxDescription, boot_id: int) -> None:
-        self._hardware, self._about, self._boot = hardware, description, boot_id
+        self._hardware, self._description, self._boot = hardware, description, boot_id
         self._buffer = b""
         self._out: list[bytes] = []
         self._session = ""
@@ -53,17 +53,17 @@ class TriggerBox:
         self._light_time = LightTime()
         self._lit = False
         self._lit_us = 0
-        self._owes_dark = False
+        self._must_darken = False
         self._index = -1
         self._shows = 0
         self._sequence = (0, 0, 0, 0)
         self._next_us = self._off_us = 0
         self._frames = 0
-        self._dark()
+        self._switch_off()
 
     def feed(self, data: bytes) -> bytes:
         """Take what came from the host; return what is to be sent."""
-        self._look()
+        self._check_time()
         self._buffer += data
         while True:
             end = self._buffer.find(b"\n")
@@ -74,18 +74,18 @@ class TriggerBox:
                 self._out.append(self._answer(line))
         if len(self._buffer) > wire.MAX_LINE_BYTES:
             self._buffer = b""
-        return self._sent()
+        return self._flush()
 
     def poll(self) -> bytes:
         """Do what is due by now; return what is to be sent."""
-        self._look()
-        return self._sent()
+        self._check_time()
+        return self._flush()
 
     def wait_us(self) -> int:
         """How long until `poll` has something to do, at the latest; -1 if only a command can change that."""
         now_us = self._hardware.time_us()
         due = []
-        if self._owes_dark:
+        if self._must_darken:
             due.append(now_us + 1000)
         if self._lit:
             due.append(self._lit_us + self._on_us)
@@ -97,7 +97,7 @@ class TriggerBox:
             due.append(self._off_us if self._lit else self._next_us)
         return max(min(due) - now_us, 0) if due else -1
 
-    def _sent(self) -> bytes:
+    def _flush(self) -> bytes:
         out, self._out = self._out, []
         return b"".join(out)
 
@@ -106,28 +106,28 @@ class TriggerBox:
 
     # What happens by itself.
 
-    def _look(self) -> None:
+    def _check_time(self) -> None:
         now_us = self._hardware.time_us()
         self._light_time.note(now_us, self._lit)
-        if self._owes_dark:
-            self._dark()
+        if self._must_darken:
+            self._switch_off()
         if self._state in _UNDER_LIGHT and now_us - self._heard_us > self._watchdog_us:
-            self._trip(wire.WATCHDOG)
+            self._raise_fault(wire.WATCHDOG)
         elif self._lit and now_us - self._lit_us > self._on_us:
-            self._trip(wire.ON_TIME)
+            self._raise_fault(wire.ON_TIME)
         elif self._lit and self._light_used_up():
-            self._trip(wire.DUTY)
+            self._raise_fault(wire.DUTY)
         elif self._state in ("playing", "waiting"):
             try:
-                self._go_on(now_us)
+                self._advance_sequence(now_us)
             except HardwareError:
-                self._trip(wire.LIGHT)
+                self._raise_fault(wire.LIGHT)
 
-    def _go_on(self, now_us: int) -> None:
+    def _advance_sequence(self, now_us: int) -> None:
         """A sequence's next step, if it is due."""
         first, count, _, period_us = self._sequence
         if self._lit and now_us >= self._off_us:
-            self._dark()
+            self._switch_off()
             if self._frames == count:
                 self._state = "ready"
                 self._event(f"DONE {count}")
@@ -142,7 +142,7 @@ class TriggerBox:
         first, _, exposure_us, _ = self._sequence
         t_us = self._light()
         self._hardware.pulse()
-        self._off_us = self._hardware.time_us() + exposure_us + self._about.hold_us
+        self._off_us = self._hardware.time_us() + exposure_us + self._description.hold_us
         self._index = first + self._frames
         self._frames += 1
         self._event(f"FRAME {self._index} {t_us}")
@@ -156,22 +156,22 @@ class TriggerBox:
         self._shows += 1
         return now_us
 
-    def _dark(self) -> None:
-        self._owes_dark = True
+    def _switch_off(self) -> None:
+        self._must_darken = True
         try:
-            self._hardware.dark()
+            self._hardware.switch_off()
         except HardwareError:
             # Tried again at every look, until it obeys.
             if self._fault != wire.LIGHT:
                 self._fault = wire.LIGHT
                 self._event(f"FAULT {wire.LIGHT}")
             return
-        self._owes_dark = False
+        self._must_darken = False
         self._light_time.note(self._hardware.time_us(), self._lit)
         self._lit = False
 
-    def _trip(self, code: int) -> None:
-        self._dark()
+    def _raise_fault(self, code: int) -> None:
+        self._switch_off()
         self._state = "ready" if self._order else "idle"
         self._fault = code
         self._event(f"FAULT {code}")
@@ -202,17 +202,17 @@ class TriggerBox:
             self._session, self._open, self._heard_us = session, False, now_us
         self._number = number
         try:
-            done = self._act(verb, words[3:])
+            done = self._execute(verb, words[3:])
             answer = f"{session} {number} OK {done}" if done else f"{session} {number} OK"
         except BoxRefusal as refusal:
             answer = f"{session} {number} ERR {refusal.code} {refusal.words}"
         except HardwareError as error:
-            self._trip(wire.LIGHT)
+            self._raise_fault(wire.LIGHT)
             answer = f"{session} {number} ERR {wire.HARDWARE} {error}"
         self._reply = wire.encode_line(answer)
         return self._reply
 
-    def _act(self, verb: str, words: list[str]) -> str:
+    def _execute(self, verb: str, words: list[str]) -> str:
         if verb not in ("HELLO", "PING", "PICK", "LOAD", "SHOW", "SEQ", "TRIG", "STOP", "BLANK", "STATUS", "BYE"):
             raise BoxRefusal(wire.VERB, verb)
         wanted = {"HELLO": 5, "LOAD": 2, "SHOW": 1, "SEQ": 5, "PICK": max(len(words), 2)}.get(verb, 0)
@@ -227,7 +227,7 @@ class TriggerBox:
         return answer
 
     def _hello(self, version: int, watchdog_ms: int, on_ms: int, duty: int, bright: int) -> str:
-        about = self._about
+        about = self._description
         self._picked = []
         self._darken("idle")
         self._open = False
@@ -235,7 +235,7 @@ class TriggerBox:
             raise BoxRefusal(wire.RANGE, f"speaks SLTP/{wire.VERSION}")
         if watchdog_ms < MIN_WATCHDOG_MS or on_ms < 1 or not 1 <= duty <= 1000 or not 1 <= bright <= 1000:
             raise BoxRefusal(wire.RANGE, "limits")
-        granted = self._hardware.dim(bright)
+        granted = self._hardware.set_brightness(bright)
         if granted > bright:
             raise BoxRefusal(wire.RANGE, f"bright {granted}")
         watchdog_ms, on_ms, duty = min(watchdog_ms, about.watchdog_ms), min(on_ms, about.on_ms), min(duty, about.duty)
@@ -257,23 +257,23 @@ class TriggerBox:
             self._picked = []
         if at != len(self._picked) or at + len(crc32) > MAX_PICKED or max(crc32) > 0xFFFFFFFF:
             raise BoxRefusal(wire.RANGE, f"{at} after {len(self._picked)}, most {MAX_PICKED}")
-        self._picked += [self._about.found(each) for each in crc32]
+        self._picked += [self._description.find(each) for each in crc32]
         return " ".join(
             [f"{len(self._picked)}"] + [f"{i}" for i, each in enumerate(self._picked) if each < 0 and i >= at]
         )
 
     def _load(self, count: int, crc32: int) -> str:
         self._darken("idle")
-        about, order = self._about, self._picked
+        about, order = self._description, self._picked
         self._picked = []
-        if not order or len(order) != count or -1 in order or about.crc32_of(order) != crc32:
-            order = self._run_of(count, crc32)
-        self._order, self._gap_us, self._state = order, about.gap_of(order), "ready"
+        if not order or len(order) != count or -1 in order or about.checksum(order) != crc32:
+            order = self._find_run(count, crc32)
+        self._order, self._gap_us, self._state = order, about.gap_for(order), "ready"
         return f"{count} {order[0]} {self._gap_us}"
 
-    def _run_of(self, count: int, crc32: int) -> list[int]:
+    def _find_run(self, count: int, crc32: int) -> list[int]:
         """So many patterns of the flash, one after another, that have this checksum."""
-        about = self._about
+        about = self._description
         if not 1 <= count <= about.count:
             raise BoxRefusal(wire.RANGE, f"{count} of {about.count}")
         for first in range(about.count - count + 1):
@@ -284,7 +284,7 @@ class TriggerBox:
     def _show(self, index: int) -> str:
         self._require_light(index)
         self._index = index
-        self._dark()
+        self._switch_off()
         self._state = "ready"
         self._hardware.select(self._order[index])
         t_us = self._light()
@@ -292,7 +292,7 @@ class TriggerBox:
         return f"{index} {t_us}"
 
     def _seq(self, first: int, count: int, exposure_us: int, period_us: int, mode: int) -> str:
-        about = self._about
+        about = self._description
         self._require_light(first)
         if not 1 <= count <= len(self._order) - first or mode not in (wire.FREE, wire.STEP):
             raise BoxRefusal(wire.RANGE, f"{count} patterns from {first}, mode {mode}")
@@ -362,6 +362,6 @@ class TriggerBox:
         if state == "idle":
             self._order = []
         self._fault = 0
-        self._dark()
-        if self._owes_dark:
+        self._switch_off()
+        if self._must_darken:
             raise HardwareError("the light does not go out")

@@ -113,7 +113,7 @@ def small_rig(
     settings = {"eye": CameraSettings(exposure_s)}
     with Rig("small", dict(head.cameras), head.projector, settings, head.calibration, head, clock=head.clock) as opened:
         yield opened
-        assert not head.projector.lit
+        assert not head.projector.is_lit
 
 
 @pytest.fixture

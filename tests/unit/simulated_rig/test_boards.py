@@ -50,13 +50,13 @@ def test_a_charuco_board_is_the_one_that_opencv_draws() -> None:
     each, per_mm = board("charuco"), 4
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
     drawn = cv2.aruco.CharucoBoard((6, 5), 9.0, 7.0, dictionary).generateImage((6 * 9 * per_mm, 5 * 9 * per_mm))
-    found = dark_at(each.printed(), on_print(each, 6, 5, per_mm=per_mm)).reshape(drawn.shape)
+    found = dark_at(each.print_layout(), on_print(each, 6, 5, per_mm=per_mm)).reshape(drawn.shape)
     np.testing.assert_array_equal(found, drawn < 128)
 
 
 def test_a_chessboard_begins_with_a_dark_square() -> None:
     each = board()
-    shown, s = each.printed(), each.square_mm
+    shown, s = each.print_layout(), each.square_mm
     corner = each.corners_mm[0, :2]
     around = corner + np.array([(-s, -s), (s, -s), (-s, s), (s, s)]) / 2
     assert dark_at(shown, around).tolist() == [True, False, False, True]
@@ -77,7 +77,7 @@ def test_corners_lie_where_the_calibration_expects_them(kind: BoardKind) -> None
 
 def test_circles_are_dark_discs_about_their_centres() -> None:
     each = board("circles", circle_mm=6.0)
-    shown = each.printed()
+    shown = each.print_layout()
     np.testing.assert_allclose(shown.centres_mm, each.corners_mm[:, :2])
     assert dark_at(shown, shown.centres_mm + np.array([2.9, 0.0])).all()
     assert not dark_at(shown, shown.centres_mm + np.array([3.1, 0.0])).any()
@@ -87,14 +87,18 @@ def test_circles_are_dark_discs_about_their_centres() -> None:
 def test_a_mirrored_print_is_the_print_seen_from_behind(kind: str) -> None:
     plain, mirrored = board(kind), board(kind, mirrored=True)
     points = np.random.default_rng(3).uniform(-40, 40, (5000, 2))
-    np.testing.assert_array_equal(dark_at(mirrored.printed(), points), dark_at(plain.printed(), points * [-1.0, 1.0]))
+    np.testing.assert_array_equal(
+        dark_at(mirrored.print_layout(), points), dark_at(plain.print_layout(), points * [-1.0, 1.0])
+    )
     np.testing.assert_allclose(mirrored.corners_mm, plain.corners_mm * [-1.0, 1.0, 1.0])
 
 
 def test_a_printer_that_scales_moves_corners_and_print_alike() -> None:
     plain, scaled = board(), board(scale=(1.05, 0.98))
     points = np.random.default_rng(4).uniform(-30, 30, (5000, 2))
-    np.testing.assert_array_equal(dark_at(scaled.printed(), points * [1.05, 0.98]), dark_at(plain.printed(), points))
+    np.testing.assert_array_equal(
+        dark_at(scaled.print_layout(), points * [1.05, 0.98]), dark_at(plain.print_layout(), points)
+    )
     np.testing.assert_allclose(scaled.corners_mm, plain.corners_mm * [1.05, 0.98, 1.0])
 
 

@@ -90,7 +90,7 @@ def test_another_display_leaves_a_desktop_on_the_scene(tmp_path: Path) -> None:
     assert black.mean() > 20
     assert np.abs(white - black).mean() < 3
     assert np.ptp(np.median(black, axis=0)) > 20
-    assert not head.projector.lit
+    assert not head.projector.is_lit
     glowing = small_head(tmp_path, faults={"other_display": True, "other_display_glow": 0.1})
     white, black = (taken(glowing, index, sequence) for index in (0, 1))
     difference = white - black

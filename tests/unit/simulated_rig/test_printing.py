@@ -100,7 +100,7 @@ def test_a_cell_has_the_mean_albedo_of_what_it_sees(kind: str) -> None:
     worst, farthest = 0.0, 0.0
     for k in mixed:
         at = on_board(u[k] + du, v[k] + dv)
-        albedo = np.where(dark_at(each.printed(), at), each.albedo_dark, each.albedo_light)
+        albedo = np.where(dark_at(each.print_layout(), at), each.albedo_dark, each.albedo_light)
         worst = max(worst, abs(float(albedo.mean()) - float(hits.albedo[k])))
         middle = (at * albedo[:, None]).sum(axis=0) / albedo.sum()
         found = (hits.points_mm[k] - POSITION) @ turn
@@ -118,7 +118,7 @@ def test_without_a_footprint_the_print_is_taken_at_the_point() -> None:
     u, v = rng.uniform(200, 440, 4000), rng.uniform(150, 350, 4000)
     hits = traced(each, u, v, 0.0)
     at = on_board(u, v)
-    expected = np.where(dark_at(each.printed(), at), each.albedo_dark, each.albedo_light)
+    expected = np.where(dark_at(each.print_layout(), at), each.albedo_dark, each.albedo_light)
     assert (np.abs(hits.albedo - expected) < 1e-6).mean() > 0.999
     np.testing.assert_allclose((hits.points_mm - POSITION) @ rotation_matrix(ROTATION)[:, :2], at, atol=1e-6)
 

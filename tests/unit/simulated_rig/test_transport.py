@@ -58,7 +58,7 @@ def test_a_surface_turned_away_from_the_lamp_is_dark(tmp_path: Path) -> None:
     hits = traced(tmp_path, scene, np.array([31.5]), np.array([23.5]))
     facing_eye = small_head(tmp_path, scene).truth().cameras["eye"].depth_mm
     assert np.isfinite(facing_eye).any()
-    assert hits.seen.all() != hits.lit.any()
+    assert hits.is_hit.all() != hits.is_lit.any()
 
 
 def test_a_checker_alternates_squares_in_the_object_own_frame(tmp_path: Path) -> None:

@@ -263,7 +263,7 @@ def test_pictures_beyond_the_buffers_need_time() -> None:
         (
             [(0, 1, False)] * 3,
             [
-                Dlpc350EngineOptions(patterns="p").colour_of(pattern)
+                Dlpc350EngineOptions(patterns="p").led_colour(pattern)
                 for pattern in (White(), Primary("green"), Primary("blue"))
             ],
             False,
@@ -395,7 +395,7 @@ def test_what_is_missing_is_reported_and_written_on_request(tmp_path: Path) -> N
     text = str(refused.value)
     assert "lacks 28 of 28 patterns (white, black, column Gray bit 0 of 8, cell 4 px and 25 more)" in text
     assert list(tmp_path.iterdir()) == []
-    text = read_flash_list(tmp_path).written(scan())
+    text = read_flash_list(tmp_path).write_patterns(scan())
     flash = read_flash_list(tmp_path / EXPORT_FOLDER)
     assert str(tmp_path / EXPORT_FOLDER) in text
     assert f'"{flash.tag}"' in text
@@ -410,7 +410,7 @@ def test_what_is_flashed_already_keeps_its_place(tmp_path: Path) -> None:
     before = read_flash_list(tmp_path)
     with pytest.raises(UnsupportedByDeviceError, match="lacks 1 of 3 patterns"):
         before.places(second)
-    before.written(second)
+    before.write_patterns(second)
     after = read_flash_list(tmp_path / EXPORT_FOLDER)
     assert [picture.flash_index for picture in after.pictures] == [0, 1]
     assert after.places(first) == before.places(first)

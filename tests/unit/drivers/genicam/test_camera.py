@@ -61,7 +61,7 @@ def one_frame(device: Device, camera: GenicamCamera) -> Frame:
 
 def asked(camera: GenicamCamera, call: str, *arguments: object) -> Any:
     """What Aravis answers. Nothing keeps its camera, which it lets go with the last reference."""
-    with camera._connection.asking("reading") as device:
+    with camera._connection.access("reading") as device:
         return getattr(device, call)(*arguments)
 
 

@@ -83,7 +83,7 @@ class FakeLight(BoxHardware):
         self._maybe("light")
         self._scene.change(self._selected, self._boot)
 
-    def dark(self) -> None:
+    def switch_off(self) -> None:
         self._maybe("dark")
         self._scene.change(None, self._boot)
 
@@ -91,7 +91,7 @@ class FakeLight(BoxHardware):
         self._maybe("pulse")
         self._scene.pulse()
 
-    def dim(self, permille: int) -> int:
+    def set_brightness(self, permille: int) -> int:
         self.bright = permille if self.dims else 1000
         return self.bright
 

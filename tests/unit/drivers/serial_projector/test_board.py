@@ -192,9 +192,9 @@ def test_an_engine_that_is_not_ready_is_a_failure_and_homed_next_time(pico: Pico
 def test_light_follows_the_lamp_and_its_brightness(pico: Pico, board: main.PicoBoard) -> None:
     board.light()
     assert pico.levels[main.LAMP_PIN] == FULL
-    board.dark()
+    board.switch_off()
     assert pico.levels[main.LAMP_PIN] == 0
-    assert board.dim(250) == 250
+    assert board.set_brightness(250) == 250
     assert pico.levels[main.LAMP_PIN] == 0
     board.light()
     assert pico.levels[main.LAMP_PIN] == FULL // 4

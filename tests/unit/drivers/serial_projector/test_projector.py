@@ -91,8 +91,8 @@ def test_a_play_lights_every_pattern_once_and_pulses_the_cameras(bench: Bench) -
     assert np.diff([on.t_ns for on in lights]) == pytest.approx(8_000_000, abs=10_000)
     assert (projector.client.status().state, projector.client.status().index) == ("ready", 25)
     projector.stop()
-    assert [each.index for each in projector.played] == ALL
-    for each, on in zip(projector.played, lights, strict=True):
+    assert [each.index for each in projector.played_patterns] == ALL
+    for each, on in zip(projector.played_patterns, lights, strict=True):
         assert abs(each.t_visible_ns - on.t_ns) <= each.t_err_ns + 1_000
     # Another one that is stopped, and one more, which begins at the beginning.
     projector.play(0.004, 0.04)
@@ -219,7 +219,7 @@ def test_the_light_stays_for_as_long_as_the_host_gives_signs_of_life(bench: Benc
     bench.advance(30)
     assert [change.pattern for change in bench.scene.changes] == [1]
     # The host is too busy: its thread does not come to it.
-    projector._keeping.stop()
+    projector._keep_alive.stop()
     stopped_ns = bench.clock.now_ns()
     bench.advance(1)
     _, dark = bench.scene.changes
@@ -410,7 +410,7 @@ def test_the_session_of_a_host_that_died_is_taken_over(bench: Bench) -> None:
     dead = bench.loaded(watchdog_s=0.3)
     dead.show(1)
     # Killed: no farewell.
-    dead._keeping.stop()
+    dead._keep_alive.stop()
     begun_ns = bench.clock.now_ns()
     projector = bench.open()
     assert 0.1e9 <= bench.clock.now_ns() - begun_ns <= 0.5e9

@@ -52,13 +52,13 @@ class Light(BoxHardware):
         self._do("light")
         self.now_us += self.takes_us
 
-    def dark(self) -> None:
+    def switch_off(self) -> None:
         self._do("dark")
 
     def pulse(self) -> None:
         self._do("pulse")
 
-    def dim(self, permille: int) -> int:
+    def set_brightness(self, permille: int) -> int:
         return permille if self.dims else 1000
 
     def _do(self, *what: str) -> None:
