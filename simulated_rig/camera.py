@@ -1,4 +1,4 @@
-"""A camera of the rendered rig: triggers, timing, frames and their faults."""
+"""A camera of the simulated rig: triggers, timing, frames and their faults."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NOISE, _FATE, _GARBLE, _STALE, _CORRUPT, _START, _DELIVERY, _COLOUR = range(8)
 
 @dataclass(frozen=True, slots=True)
 class _ExposureTimes:
-    """One exposure of the sensor; `t_ready_ns` is when its frame can be read."""
+    """Times of one exposure of the sensor; `t_ready_ns` is when its frame can be read."""
 
     number: int
     t_start_ns: int
@@ -30,9 +30,9 @@ class _ExposureTimes:
 
 
 class SimulatedCamera:
-    """Implements `slrig.devices.Camera` on the rendered world.
+    """Implements `slrig.devices.Camera` in the simulated world.
 
-    Noise depends on the seed and the frame's sequence number only: runs repeat, and no two frames are alike.
+    Noise depends only on the seed and the frame's sequence number: runs are reproducible, and frames differ.
     """
 
     def __init__(
@@ -90,10 +90,10 @@ class SimulatedCamera:
         return self._settings
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`. Frames beyond `count` can be had: a caller may take one again."""
+        """See `Camera`. More than `count` frames are available: a caller may repeat one."""
         self._require_usable()
         self._state.check_arming(count, trigger, self.info)
-        # Tracing takes seconds of real time; done here, it delays no frame.
+        # Tracing takes seconds; done here, it delays no frame.
         self._view.prepare()
         self._pending.clear()
         self._dropped = self._free_index = 0
@@ -120,17 +120,17 @@ class SimulatedCamera:
         deadline_ns = started_ns + nanoseconds(timeout_s)
         while True:
             exposure = self._next_exposure(after_ns, deadline_ns)
-            ready = exposure is not None and exposure.t_ready_ns <= deadline_ns
-            if exposure is not None and ready and not self._is_dropped(exposure.number):
-                # Tracing its light takes a while of real time: better while it shines than after its read-out.
+            is_ready = exposure is not None and exposure.t_ready_ns <= deadline_ns
+            if exposure is not None and is_ready and not self._is_dropped(exposure.number):
+                # Rendering takes real time: do it during the exposure, not after the read-out.
                 self._view.rehearse(self._lights_during(exposure))
             self._clock.wait_until(
-                exposure.t_ready_ns if exposure is not None and ready else deadline_ns, self._state.closed
+                exposure.t_ready_ns if exposure is not None and is_ready else deadline_ns, self._state.closed
             )
             self._require_usable()
-            if exposure is None or not ready:
+            if exposure is None or not is_ready:
                 message = (
-                    f"camera '{self._options.name}': no frame that began after {after_ns} ns came within {timeout_s} s "
+                    f"camera '{self._options.name}': no frame that began after {after_ns} ns arrived in {timeout_s} s "
                     f"({self._dropped} lost since it was armed); trigger again, or allow more time"
                 )
                 raise FrameTimeoutError(message)
@@ -160,7 +160,7 @@ class SimulatedCamera:
 
     @property
     def _span_ns(self) -> int:
-        """From the first row's start to the last row's end."""
+        """Time from the first row's start to the last row's end."""
         return nanoseconds(self._settings.exposure_s) + nanoseconds(self._options.shutter_skew_s)
 
     def _schedule_exposure(self, number: int, start_ns: int) -> _ExposureTimes:
@@ -170,7 +170,7 @@ class SimulatedCamera:
         return _ExposureTimes(number, start_ns, end_ns, end_ns + nanoseconds(self._options.readout_s + late_s))
 
     def _next_exposure(self, after_ns: int, deadline_ns: int) -> _ExposureTimes | None:
-        """Return the first exposure that lies wholly after `after_ns`, passing over earlier ones, or None."""
+        """Return the first exposure that begins after `after_ns`, skipping earlier ones, or None."""
         earliest_ns = after_ns + nanoseconds(self._options.stamp_error_s)
         while True:
             if not self._pending and self._state.armed is Trigger.FREE:
@@ -190,7 +190,7 @@ class SimulatedCamera:
     def _run_free(self, earliest_ns: int, deadline_ns: int) -> None:
         """Append the next free-running exposure that began late enough, if its time comes before the deadline.
 
-        Frames that finished before it are passed over, or were overwritten while nobody read.
+        Frames that finished before it are skipped, or were overwritten before they were read.
         """
         overwritten = max(self._count_read_out(self._clock.now_ns()) - self._options.buffers - self._free_index, 0)
         self._dropped += overwritten
@@ -206,15 +206,15 @@ class SimulatedCamera:
             self._free_index = max(self._free_index, min(wanted, by_deadline))
 
     def _count_read_out(self, t_ns: int) -> int:
-        """How many free-running exposures were read out by `t_ns`."""
+        """Number of free-running exposures read out by `t_ns`."""
         first_ns = self._t_armed_ns + self._span_ns + nanoseconds(self._options.readout_s)
         return max((t_ns - first_ns) // self._period_ns + 1, 0)
 
     def _make_frame(self, exposure: _ExposureTimes) -> Frame:
-        stale = self._is_affected(self._faults.stale_frames, exposure.number) or self._draw_fault(
+        is_stale = self._is_affected(self._faults.stale_frames, exposure.number) or self._draw_fault(
             self._faults.stale_probability, _STALE, exposure.number
         )
-        repeated = self._last_image if stale else None
+        repeated = self._last_image if is_stale else None
         image = repeated if repeated is not None else self._render(exposure)
         self._last_image = image
         if repeated is None and self._options.colour is not None:
@@ -245,20 +245,20 @@ class SimulatedCamera:
         return self._sensor.read_out(electrons, gain=self._settings.gain, rng=self._rng(_NOISE, exposure.number))
 
     def _render_colour(self, mean: Callable[[], Float32Array], number: int, settings: AppliedSettings) -> Pixels:
-        """A frame in colour, with a noise of its own."""
+        """Render a colour frame, with its own noise."""
         light = mean() * np.array(self._options.colour, np.float32)
         electrons = self._sensor.electrons(light, settings.exposure_s * self._light_factor(number))
         flat = electrons.reshape(len(electrons), -1)
         return self._sensor.read_out(flat, gain=settings.gain, rng=self._rng(_COLOUR, number)).reshape(light.shape)
 
     def _light_factor(self, number: int) -> float:
-        """How much more light a frame has than the settings say."""
+        """Return the frame's light relative to the settings."""
         steps = sum(number >= first for first in self._faults.exposure_step_frames) if self._is_faulty else 0
         drift = (1 + self._options.exposure_drift) ** max(number - self._armed_at, 0)
         return float(drift * self._faults.exposure_step**steps)
 
     def _lights_during(self, exposure: _ExposureTimes) -> Sequence[tuple[float | Float32Array, LightTable]]:
-        """Each light that an exposure saw, with its fraction: one number, or (H, 1) when each row saw its own."""
+        """Return each light during an exposure with its fraction: a number, or (H, 1) if it differs between rows."""
         together = self._lamp.light_between(exposure.t_start_ns, exposure.t_end_ns)
         if self._options.line_time_s == 0 or (len(together) == 1 and self._lamp.flicker is None):
             return together
@@ -275,7 +275,7 @@ class SimulatedCamera:
         return begin_ns, begin_ns + nanoseconds(self._settings.exposure_s)
 
     def _ambient(self, exposure: _ExposureTimes) -> Float32Array | None:
-        """The room's light over its mean: (1, 1), or (H, 1) when each row saw its own; None if it does not flicker."""
+        """Ambient light over its mean: (1, 1), or (H, 1) if it differs between rows; None without flicker."""
         if self._ambient_flicker is None:
             return None
         rows = self._options.size.height_px if self._options.line_time_s > 0 else 1
@@ -309,8 +309,8 @@ class SimulatedCamera:
         return self._is_faulty and probability > 0 and bool(self._rng(purpose, number).random() < probability)
 
     def _jitter_s(self, purpose: int, number: int) -> float:
-        most_s = self._faults.jitter_s if self._is_faulty else 0.0
-        return float(self._rng(purpose, number).uniform(0, most_s)) if most_s else 0.0
+        max_s = self._faults.jitter_s if self._is_faulty else 0.0
+        return float(self._rng(purpose, number).uniform(0, max_s)) if max_s else 0.0
 
     def _require_usable(self) -> None:
         self._state.require_open()

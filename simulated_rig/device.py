@@ -1,4 +1,4 @@
-"""The rendered rig as an instrument: cameras and a projector on one world, opened from a rig file's `[head]` table."""
+"""The simulated rig as a device: its projector, and cameras and projector opened from a rig file's `[head]` table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from simulated_rig.light import (
     light_table,
     nanoseconds,
 )
-from simulated_rig.movements import RenderedTurntable
+from simulated_rig.movements import SimulatedTurntable
 from simulated_rig.options import Faults, HeadOptions, SimulatedProjectorOptions
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import read_scene
@@ -48,7 +48,9 @@ CHANNELS = ("blue", "green", "red")
 
 
 class SimulatedProjector:
-    """Implements `slrig.devices.Projector` on the rendered world. Tells `staging` of each capture and pattern."""
+    """Implements `slrig.devices.Projector` in the simulated world. Notifies the scene controller of captures and
+    patterns.
+    """
 
     def __init__(
         self,
@@ -57,18 +59,18 @@ class SimulatedProjector:
         *,
         faults: Faults,
         seed: int,
-        staging: SceneController | None = None,
+        scene_controller: SceneController | None = None,
     ) -> None:
         self._options = options
         self._clock = clock
         self._faults = faults
-        self._staging = staging
+        self._scene_controller = scene_controller
         self._response = options.response()
         self._dark = self._table(np.zeros((1, 1), np.uint8))
         swing = LightFlicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
         self.lamp = Lamp(self._dark, swing)
         self._rng = np.random.default_rng((seed, 0x70726F6A))
-        self._state = ProjectorState("the rendered projector")
+        self._state = ProjectorState("the simulated projector")
         self._tables: dict[int, LightTable] = {}
         self._shows = 0
         self._shown_pattern: int | None = None
@@ -91,35 +93,35 @@ class SimulatedProjector:
 
     @property
     def shown_pattern(self) -> int | None:
-        """The pattern that the projector was last told to show, None when it was told to be dark."""
+        """Index of the requested pattern, None if dark."""
         return self._shown_pattern
 
     @property
     def is_lit(self) -> bool:
-        """Whether more light than the dark projector's leak is on the scene now."""
+        """True if the scene receives more light than the dark projector's leak."""
         return self.lamp.light_at(self._clock.now_ns()).peak > self._dark.peak * (1 + 1e-6)
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`. What was shown before goes dark."""
+        """See `Projector`. Goes dark."""
         self._require_usable()
         self._state.require_size(sequence, self._options.size)
         if len(sequence) > self._options.max_patterns:
             message = (
-                f"the projector holds {self._options.max_patterns} patterns, the sequence has {len(sequence)}; "
+                f"the sequence has {len(sequence)} patterns, the projector holds {self._options.max_patterns}; "
                 "shorten it or raise max_patterns"
             )
             raise UnsupportedByDeviceError(message)
         for index, profile in enumerate(sequence.profiles):
             if min(profile.shape) > 1:
                 message = (
-                    f"pattern {index} varies along both axes ({profile.shape}), the rendered projector shows patterns "
-                    "that vary along one"
+                    f"pattern {index} varies along both axes ({profile.shape}); the simulated projector shows patterns "
+                    "that vary along one axis only"
                 )
                 raise UnsupportedByDeviceError(message)
         self.blank()
         self._state.loaded, self._tables = sequence, {}
-        if self._staging is not None:
-            self._staging.start_capture(len(sequence))
+        if self._scene_controller is not None:
+            self._scene_controller.start_capture(len(sequence))
 
     def show(self, index: int) -> Shown:
         """See `Projector`."""
@@ -130,8 +132,8 @@ class SimulatedProjector:
             self.lamp.darken(at_ns=self._clock.now_ns())
             self._require_usable()
         self._shows += 1
-        if self._staging is not None:
-            self._staging.advance_pattern()
+        if self._scene_controller is not None:
+            self._scene_controller.advance_pattern()
         if index not in self._tables:
             table, pattern = self._table(sequence.profiles[index]), sequence.patterns[index]
             if isinstance(pattern, Primary) and self._options.lights is not None:
@@ -147,7 +149,7 @@ class SimulatedProjector:
         return Shown(index, t_visible_ns, nanoseconds(error_s))
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. This one does not play."""
+        """See `Projector`. Not supported."""
         self._require_usable()
         self._state.refuse_to_play(exposure_s, period_s)
 
@@ -156,7 +158,7 @@ class SimulatedProjector:
         self.blank()
 
     def blank(self) -> None:
-        """See `Projector`. Raises DeviceGoneError after an unplug: nobody can say what it shows."""
+        """See `Projector`. Raises DeviceGoneError after an unplug, since the state of the light is unknown."""
         if self._state.closed.is_set():
             return
         if self._gone:
@@ -195,16 +197,16 @@ class SimulatedProjector:
 
 
 class SimulatedHead:
-    """Implements `slrig.devices.Head` on the rendered world.
+    """Implements `slrig.devices.Head` on the simulated world.
 
-    The calibration it carries is exact. `clock` is the world's time; all time stamps count in it. `script` says what
-    stands where.
+    Its calibration is exact. `clock` is the world's time, in which all time stamps count. `script` gives the object
+    poses.
     """
 
     def __init__(self, options: HeadOptions, script: PoseScript) -> None:
         self.clock: Clock = SystemClock() if options.realtime else VirtualClock()
         lens = options.projector.pinhole()
-        self._stage = SceneState(
+        self._scene_state = SceneState(
             script.surface(0),
             lens,
             working_distance_mm=options.projector.working_distance_mm or float(np.linalg.norm(lens.centre_mm)),
@@ -216,7 +218,7 @@ class SimulatedHead:
         self._views = {
             camera.name: CameraView(
                 camera.pinhole(),
-                self._stage,
+                self._scene_state,
                 blur_px=camera.blur_px,
                 focus=(options.projector.focus, camera.focus),
                 ambient=options.ambient,
@@ -227,12 +229,18 @@ class SimulatedHead:
             )
             for camera in options.camera
         }
-        self._staging = SceneController(options, script, self._stage, self._views, self.clock)
-        self._positioner: Positioner | None = self._staging if self._staging.poses else None
+        self._scene_controller = SceneController(options, script, self._scene_state, self._views, self.clock)
+        self._positioner: Positioner | None = self._scene_controller if self._scene_controller.poses else None
         if options.turntable is not None:
-            self._positioner = RenderedTurntable(options.turntable, self._staging.turn_table, seed=options.seed)
+            self._positioner = SimulatedTurntable(
+                options.turntable, self._scene_controller.turn_table, seed=options.seed
+            )
         self._projector = SimulatedProjector(
-            options.projector, self.clock, faults=options.faults, seed=options.seed, staging=self._staging
+            options.projector,
+            self.clock,
+            faults=options.faults,
+            seed=options.seed,
+            scene_controller=self._scene_controller,
         )
         self._cameras = {
             camera.name: SimulatedCamera(
@@ -257,7 +265,7 @@ class SimulatedHead:
 
     @property
     def projector(self) -> SimulatedProjector:
-        """See `Head`. Also says what it shows: `showing`, `lit`."""
+        """See `Head`. Also has `shown_pattern` and `is_lit`."""
         return self._projector
 
     @property
@@ -267,11 +275,11 @@ class SimulatedHead:
 
     @property
     def exact_calibration(self) -> Calibration:
-        """What the options say of the devices, whether or not the head carries it."""
+        """Calibration of the options, regardless of `carries_calibration`."""
         return self._calibration
 
     def prepare(self) -> None:
-        """Do what takes long the first time, telling of it: compile kernels, trace the light of what stands there."""
+        """Compile kernels and trace the light of the current scene, reporting progress."""
         tell = progress_reporter()
         with compilations_told(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")):
             for name, view in self._views.items():
@@ -279,13 +287,13 @@ class SimulatedHead:
 
     @property
     def positioner(self) -> Positioner | None:
-        """See `slrig.devices.Positions`. None where the options have neither poses nor a turntable."""
+        """See `slrig.devices.Positions`. None without poses or turntable."""
         return self._positioner
 
     def truth(self) -> Truth:
-        """See `Head`. Of what stands there now. Works in every state, also after close."""
+        """See `Head`. Ground truth of the current scene. Works in every state, also after close."""
         cameras = {name: view.truth() for name, view in self._views.items()}
-        shape = self._stage.snapshot.surface
+        shape = self._scene_state.snapshot.surface
         known = self._truth
         if (
             known is None
@@ -301,9 +309,9 @@ def _report_tracing(tell: Callable[[str], None], camera: str, share: float) -> N
 
 
 def open_head(options: Mapping[str, object], folder: Path) -> Head:
-    """Open the rendered rig described by a rig file's `[head]` table (without its `driver`).
+    """Open the simulated rig described by a rig file's `[head]` table (without its `driver`).
 
-    `folder` is the rig file's own: the scene's path counts from there.
+    `folder` is that of the rig file: the scene's path is relative to it.
 
     Raises
     ------
@@ -316,7 +324,7 @@ def open_head(options: Mapping[str, object], folder: Path) -> Head:
 
 
 def open_simulated_head(options: Mapping[str, object], folder: Path) -> SimulatedHead:
-    """Return `open_head`'s instrument under its own type."""
-    table = checked(HeadOptions, options, "the [head] table of the rendered rig")
+    """Open the rig as `open_head` does, typed as `SimulatedHead` and without preparing it."""
+    table = checked(HeadOptions, options, "the [head] table of the simulated rig")
     path = folder / table.scene
     return SimulatedHead(table, PoseScript(table, read_scene(path), path.parent))

@@ -1,7 +1,7 @@
-"""The script of a rendered rig: the poses that an object takes one after the other, listed or made up.
+"""Movements of the simulated rig: object poses, turntable, bumped and drifting devices.
 
-A made-up series is what a careful person does with a calibration board: tilted every way, near and far, turned in its
-plane, and brought to the middle, the corners and the sides of the images.
+A generated series of poses follows good practice with a calibration board: tilted about all axes, near and far, rotated
+in its plane, and placed in the centre, the corners and at the sides of the images.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ _HALVINGS = 20
 _FARTHEST_MM = 1000.0
 _NEAR_MIDDLE = 0.15
 _SIDES = (1, 5, 3, 7, 0, 4, 2, 6)
-"""Eighths of a turn: corners are odd."""
+"""Directions in eighths of a turn; corners are odd."""
 
 
 class PoseOffset(Strict, use_attribute_docstrings=True):
-    """A device's change of pose, in its own frame: X' = turn (X + shift). The stated calibration does not follow."""
+    """Change of a device's pose in its own frame: X' = turn (X + shift). The calibration does not follow it."""
 
     device: Annotated[str, Field(min_length=1)]
-    """A camera's name, or "projector"."""
+    """Name of a camera, or "projector"."""
 
     turn_deg: Triple = (0.0, 0.0, 0.0)
-    """About its x, y and z axis."""
+    """Rotation about the x, y and z axis."""
 
     shift_mm: Triple = (0.0, 0.0, 0.0)
-    """Along its x, y and z axis."""
+    """Shift along the x, y and z axis."""
 
 
 class BumpFault(PoseOffset):
-    """A device is bumped when a pose is taken, and stays so: `[[head.faults.bump]]`.
+    """Device that is bumped when a pose is taken: `[[head.faults.bump]]`.
 
-    Whoever goes back to an earlier pose finds it as it was before the bump.
+    The bump stays for all later poses; earlier poses are without it.
     """
 
     pose: Index
@@ -61,82 +61,82 @@ class BumpFault(PoseOffset):
 
 
 class PoseDrift(PoseOffset):
-    """A device drifts towards a change of pose as 1 - exp(-t / settling): `[[head.drift]]`.
+    """Device that drifts towards a change of pose as 1 - exp(-t / settling): `[[head.drift]]`.
 
-    t counts from the opening of the rig in the world's time for settle_s, or in captures for settle_captures. During
-    one capture the device stands still.
+    t counts from the opening of the rig, in seconds for settle_s or in captures for settle_captures. The device does
+    not move during a capture.
     """
 
     settle_s: Positive | None = None
-    """Settling time of a drift by time."""
+    """Settling time of a drift over time."""
 
     settle_captures: Positive | None = None
-    """How many captures settling takes, of a drift by captures."""
+    """Number of captures in which a drift over captures settles."""
 
     @model_validator(mode="after")
     def _check_settling(self) -> PoseDrift:
         if (self.settle_s is None) == (self.settle_captures is None):
-            message = "a drift needs settle_s or settle_captures, and not both"
+            message = "a drift needs either settle_s or settle_captures"
             raise ValueError(message)
         return self
 
     def progress(self, time_s: float, captures: int) -> float:
-        """How much of the drift is there, 0 to 1, after a time and so many captures."""
+        """Return the fraction of the drift, 0 to 1, after a time and a number of captures."""
         if self.settle_s is not None:
             return 1 - math.exp(-time_s / self.settle_s)
         return 1 - math.exp(-captures / (self.settle_captures or 1.0))
 
 
 class ObjectMotion(Strict, use_attribute_docstrings=True):
-    """What is moved does not stand still while a pose is captured: `[[head.faults.moving]]`."""
+    """Motion of the object while a pose is captured: `[[head.faults.moving]]`."""
 
     pose: Index | None = None
-    """Number of the pose, from 0; else every one."""
+    """Number of the pose, from 0; default: every pose."""
 
     shift_mm: Triple = (0.0, 0.0, 0.0)
-    """From the capture's first pattern to its last one."""
+    """Shift from the first to the last pattern of the capture."""
 
     turn_deg: Triple = (0.0, 0.0, 0.0)
-    """The same, about the world's axes at the object's own origin."""
+    """Rotation over the capture, about the world's axes at the object's own origin."""
 
     steps: Annotated[int, Field(ge=2, le=200)] = 6
-    """In how many equal steps."""
+    """Number of equal steps."""
 
 
 def apply_pose_offset(device: Pinhole, push: PoseOffset, *, share: float = 1.0) -> Pinhole:
-    """Return a device after a share of a push."""
+    """Return a device after a fraction of a pose offset."""
     turn = Rotation.from_rotvec(share * np.deg2rad(push.turn_deg)).as_matrix()
     translation = turn @ (device.translation_mm + share * np.array(push.shift_mm))
     return replace(device, rotation=turn @ device.rotation, translation_mm=translation)
 
 
 class TurntableOptions(Strict, use_attribute_docstrings=True):
-    """What turns objects: `[head.turntable]`. At 0° they stand as the scene file has them."""
+    """Options of the turntable: `[head.turntable]`. At 0° the objects are placed as in the scene file."""
 
     point_mm: Triple
-    """A point of the axis."""
+    """A point on the axis."""
 
     direction: Triple = (0.0, -1.0, 0.0)
-    """Of the axis; angles count right-handed about it. Upwards by default, since y points down."""
+    """Direction of the axis; angles count right-handed about it. Default: upwards, since y points down."""
 
     objects: Names | None = None
-    """Names of what stands on it; else all objects but those called "backdrop"."""
+    """Names of the objects on it; default: all except those called "backdrop"."""
 
     poses: Annotated[int, Field(ge=1, le=360)] = 8
-    """How many even poses it offers."""
+    """Number of equally spaced poses."""
 
     knows_axis: bool = False
-    """Whether it tells its axis; else that has to be found, as on metal."""
+    """Report the axis; otherwise it must be determined, as with a real turntable."""
 
     scale_error: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
-    """By what share of the angle that was asked for it goes too far."""
+    """Relative error of each angle."""
 
     angle_sigma_deg: NotNegative = 0.0
-    """Standard deviation of the angle that it stops at, drawn anew by the seed for each turn."""
+    """Standard deviation of the angle, drawn again for each turn."""
 
     wobble_deg: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """How far its axis leans, twice to either side in a turn, as on a bearing that is not flat: this times
-    sin(2 · angle), about a direction across it."""
+    """Tilt of the axis twice per turn, as from an uneven bearing: this times sin(2 · angle), about a direction
+    perpendicular to the axis."""
 
     @field_validator("direction")
     @classmethod
@@ -148,13 +148,13 @@ class TurntableOptions(Strict, use_attribute_docstrings=True):
 
     @property
     def axis(self) -> StageAxis:
-        """The axis, in the world."""
+        """The axis in the world."""
         return StageAxis(np.array(self.point_mm), np.array(self.direction) / np.linalg.norm(self.direction))
 
     def motion(self, angle_deg: float) -> FloatArray:
-        """(4, 4): how what stands on it has moved, from 0° to an angle at which it stands exactly."""
+        """(4, 4): motion of the objects from 0° to the exact angle."""
         axis = self.axis
-        # Across the axis: the world's direction that lies farthest from it, made orthogonal to it.
+        # Perpendicular to the axis: the world axis farthest from it, orthogonalised.
         farthest = np.eye(3)[np.argmin(np.abs(axis.direction))]
         across = np.cross(axis.direction, farthest)
         across /= np.linalg.norm(across)
@@ -166,10 +166,10 @@ class TurntableOptions(Strict, use_attribute_docstrings=True):
         return motion
 
 
-class RenderedTurntable(AnyAngle):
-    """Implements `slrig.devices.Turntable` on the rendered world.
+class SimulatedTurntable(AnyAngle):
+    """Implements `slrig.devices.Turntable` in the simulated world.
 
-    turn_objects : has what stands on the table stand turned, by a motion (4, 4) from where the scene file has it.
+    turn_objects : moves the objects on the table by a motion (4, 4) from their places in the scene file.
     """
 
     def __init__(self, options: TurntableOptions, turn_objects: Callable[[FloatArray], None], *, seed: int) -> None:
@@ -187,16 +187,16 @@ class RenderedTurntable(AnyAngle):
 
     @property
     def opened_at_deg(self) -> float | None:
-        """See `Turntable`. Its objects stand as the scene file has them, each time."""
+        """See `Turntable`. Objects start as placed in the scene file."""
         return None
 
     def turn(self, angle_deg: float) -> None:
-        """See `Turntable`. It is there at once, and stays where it is when it is there already."""
+        """See `Turntable`. Reaches the angle at once; does nothing if the angle is unchanged."""
         if self._closed:
-            message = "the rendered rig's turntable is closed; open the rig again"
+            message = "the simulated turntable is closed; open the rig again"
             raise DeviceStateError(message)
         if not np.isfinite(angle_deg):
-            message = f"asked the turntable for {angle_deg}°; ask for a number of degrees"
+            message = f"the turntable cannot turn to {angle_deg}°; request a finite angle"
             raise UnsupportedByDeviceError(message)
         if angle_deg == self._angle_deg:
             return
@@ -213,47 +213,47 @@ class ScriptedPose(Strict, use_attribute_docstrings=True):
     """One pose: `[[head.pose]]`. Position and rotation are as of an object of a scene."""
 
     name: str = ""
-    """What it is called; else "pose N" counted from 1."""
+    """Name of the pose; default: "pose N" counted from 1."""
 
     object: str | None = None
-    """The name of what is moved; else the scene's board."""
+    """Name of the moved object; default: the scene's board."""
 
     position_mm: Triple
-    """Where its origin is."""
+    """Position of the object's origin."""
 
     rotation_deg: Triple = (0.0, 0.0, 0.0)
-    """How it is turned."""
+    """Rotation of the object."""
 
 
 class PoseSeries(Strict, use_attribute_docstrings=True):
-    """Poses of the scene's board, made up from a seed: `[head.poses]`."""
+    """Generated poses of the scene's board: `[head.poses]`."""
 
     count: Annotated[int, Field(ge=1, le=200)] = 20
-    """How many."""
+    """Number of poses."""
 
     seed: Annotated[int, Field(ge=0)] = 1
-    """What they are made up from."""
+    """Seed of the random numbers."""
 
     tilt_deg: Pair = (15.0, 40.0)
-    """Least and most angle between the board and the plane across the line from it to the devices, about axes all
-    round."""
+    """Minimum and maximum angle between the board and the plane perpendicular to the viewing direction, about axes in
+    all directions."""
 
     roll_deg: NotNegative = 25.0
-    """Most turn in its own plane to either side."""
+    """Maximum rotation in its own plane to either side."""
 
     centre_mm: Triple = (0.0, 0.0, 0.0)
-    """About what point the board is held."""
+    """Point about which the board is held."""
 
     depth_mm: Pair = (-60.0, 60.0)
-    """Least and most distance from there along the line away from the devices."""
+    """Minimum and maximum distance from centre_mm along the line away from the devices."""
 
     edge_px: NotNegative = 6.0
-    """The paper stays so far inside every image, the projector's too."""
+    """Minimum distance of the paper from the border of every image, including the projector's."""
 
     @model_validator(mode="after")
     def _check_bounds(self) -> PoseSeries:
         if not 0 <= self.tilt_deg[0] <= self.tilt_deg[1] <= 70 or self.depth_mm[0] > self.depth_mm[1]:
-            message = "tilt_deg needs 0 <= least <= most <= 70, depth_mm least <= most"
+            message = "tilt_deg needs 0 <= minimum <= maximum <= 70, depth_mm minimum <= maximum"
             raise ValueError(message)
         return self
 
@@ -261,13 +261,13 @@ class PoseSeries(Strict, use_attribute_docstrings=True):
 def generate_poses(series: PoseSeries, board: PrintedBoard, devices: Sequence[Pinhole]) -> tuple[ScriptedPose, ...]:
     """Return the poses of a series.
 
-    Tilt axes go round by the golden angle, so that any few of them lie well apart. The board is slid from the middle
-    towards a side or a corner until its paper touches the borders of some device's image.
+    Successive tilt axes differ by the golden angle, so that any few of them are well distributed. The board is moved
+    from the centre towards a side or a corner until its paper touches the border of some device's image.
 
     Raises
     ------
     ConfigError
-        The board does not fit into every image, however it is held.
+        The board does not fit into every image in any pose.
     """
     rng = np.random.default_rng((series.seed, 0x706F7365))
     fields = [(device, field_radius(device)) for device in devices]
@@ -278,33 +278,33 @@ def generate_poses(series: PoseSeries, board: PrintedBoard, devices: Sequence[Pi
     rim = np.array([(x, y) for x in np.linspace(least[0], most[0], 5) for y in np.linspace(least[1], most[1], 5)])
     paper = board.on_sheet_mm(rim)
     poses: list[ScriptedPose] = []
-    slid = 0
+    moved_count = 0
     for number in range(series.count):
-        # Two in nine stay near the middle; the others go to each corner, then to each side, and so on.
+        # Two in nine stay near the centre; the others go to each corner, then to each side, and so on.
         share = _NEAR_MIDDLE if number % 9 in (0, 4) else 1.0
-        side = _SIDES[slid % len(_SIDES)]
+        side = _SIDES[moved_count % len(_SIDES)]
         in_corner = share == 1.0 and side % 2 == 1
-        slid += share == 1.0
+        moved_count += share == 1.0
         for _try in range(_TRIES):
-            # Depth and tilt are spread evenly, each in an order of its own, and jittered.
+            # Depth and tilt are stratified, each in a different order, and jittered.
             depth = _stratified(series.depth_mm, (number * 7 + 3) % series.count, series.count, rng)
             tilt = np.deg2rad(_stratified(series.tilt_deg, (number * 3 + 1) % series.count, series.count, rng))
             about = number * _GOLDEN_TURN + rng.uniform(-0.2, 0.2)
             towards = side * np.pi / 4 + rng.uniform(-0.15, 0.15)
-            # A board that is turned much leaves the corner free into which it is slid.
+            # A strongly rotated board would not fill the corner.
             most_roll = series.roll_deg * (0.4 if in_corner else 1.0)
             roll = np.deg2rad(rng.uniform(-most_roll, most_roll))
             leaning = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0]))
             rotation = facing @ (leaning * Rotation.from_rotvec([0.0, 0.0, roll])).as_matrix()
             middle = centre + depth * facing[:, 2]
-            held = paper @ rotation.T + middle
-            if not _is_visible_to_all(held, fields, series.edge_px):
+            corners = paper @ rotation.T + middle
+            if not _is_visible_to_all(corners, fields, series.edge_px):
                 continue
             across, down = np.cos(towards) * facing[:, 0], 0.75 * np.sin(towards) * facing[:, 1]
             slide = np.zeros(3)
-            # Together until the first border, then each alone: so corners are reached.
+            # First along both axes together, then along each, so that corners are reached.
             for sideways in (across + down, across, down):
-                slide += _free_distance(held + slide, sideways, fields, series.edge_px) * sideways
+                slide += _free_distance(corners + slide, sideways, fields, series.edge_px) * sideways
             poses.append(_rounded_pose(number, middle + share * slide, rotation))
             break
         else:
@@ -322,14 +322,14 @@ def _stratified(bounds: tuple[float, float], step: int, count: int, rng: np.rand
 
 
 def _facing_rotation(away: FloatArray) -> FloatArray:
-    """(3, 3): board to world of a board across `away`, its x as near the world's as that allows."""
+    """(3, 3): board to world of a board perpendicular to `away`, its x as near the world's x as possible."""
     right = np.array([1.0, 0.0, 0.0]) - away[0] * away
     right /= np.linalg.norm(right)
     return np.column_stack([right, np.cross(away, right), away])
 
 
 def _rounded_pose(number: int, middle: FloatArray, rotation: FloatArray) -> ScriptedPose:
-    # Rounded, so that what a log or a listing says of a pose is the pose.
+    # Rounded, so that printed poses are exact.
     turn = Rotation.from_matrix(rotation).as_euler("xyz", degrees=True)
     x, y, z = (round(float(each), 4) for each in middle)
     a, b, c = (round(float(each), 4) for each in turn)
@@ -339,7 +339,7 @@ def _rounded_pose(number: int, middle: FloatArray, rotation: FloatArray) -> Scri
 def _free_distance(
     held: FloatArray, sideways: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float
 ) -> float:
-    """How many times `sideways`, mm, a board can be slid until it touches a border."""
+    """How many times `sideways`, mm, a board can be moved until it touches a border."""
     low, high = 0.0, _FARTHEST_MM
     for _ in range(_HALVINGS):
         half = (low + high) / 2
@@ -351,7 +351,7 @@ def _free_distance(
 
 
 def _is_visible_to_all(points: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float) -> bool:
-    """Whether every device images all points; a field is a device and the radius that its lens images."""
+    """True if every device images all points; a field is a device and the radius that its lens images."""
     return all(_is_in_image(points, device, radius, edge_px) for device, radius in fields)
 
 

@@ -1,4 +1,4 @@
-"""What one camera of the rendered rig sees: its expected image under any light, and its truth."""
+"""Rendering for one camera: its expected image under any light, its ground truth, and the sensor that reads it out."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ from slrig.kernels import kernel
 from slrig.model import CameraTruth, Pinhole, Pixels
 
 Weights = dict[int, Float32Array]
-"""(H, W) by the index of a level of `defocus.LEVELS_PX`: how much of its image each pixel takes."""
+"""Weights (H, W) by the index of a level of `optics.LEVELS_PX`: contribution of its image to each pixel."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorModel:
-    """A linear sensor, and the camera's own processing behind it, if there is any.
+    """Linear sensor, optionally followed by a nonlinear camera response.
 
-    value = pedestal_dn + gain * electrons * (full scale - pedestal_dn) / full_well_e, clipped; then
-    full scale * (value / full scale) ^ response, rounded. response : 1 of machine vision cameras, about 0.45 of
-    webcams, whose pictures are made for displays.
+    value = pedestal_dn + gain * electrons * (full scale - pedestal_dn) / full_well_e, clipped; then full scale * (value
+    / full scale) ^ response, rounded. response : 1 for machine vision cameras, about 0.45 for webcams.
 
-    saturation_s : the exposure at which a white diffuser, at the working distance and facing the projector, fills
-    the well under a white pattern.
+    saturation_s : exposure at which a white diffuser at the working distance, facing the projector, saturates under a
+    white pattern.
     """
 
     bit_depth: int
@@ -43,7 +42,7 @@ class SensorModel:
 
     @property
     def full_scale(self) -> int:
-        """The value of a saturated sample."""
+        """Value of a saturated sample."""
         return int(2**self.bit_depth - 1)
 
     def dn_per_electron(self, gain: float) -> float:
@@ -51,13 +50,13 @@ class SensorModel:
         return gain * (self.full_scale - self.pedestal_dn) / self.full_well_e
 
     def electrons(self, radiance: NDArray[np.float32], exposure_s: float) -> NDArray[np.float32]:
-        """Expected electrons, same shape as `radiance` (a white diffuser gives 1). Not clipped at the full well."""
+        """Expected electrons, same shape as `radiance` (a white diffuser gives 1), not clipped at the full well."""
         return np.asarray(radiance * np.float32(self.full_well_e * exposure_s / self.saturation_s), np.float32)
 
     def read_out(self, electrons: NDArray[np.float32], *, gain: float, rng: np.random.Generator) -> Pixels:
-        """(H, W) uint8 or uint16: one noisy reading of expected electrons (H, W) float32.
+        """Read expected electrons (H, W) float32 once, with noise: (H, W) uint8 or uint16.
 
-        Shot noise is a Gaussian of the Poisson law's variance: read noise hides the difference at few electrons.
+        Shot noise is Gaussian with the variance of the Poisson law; read noise hides the difference at low light.
         """
         draws = rng.standard_normal(electrons.shape, dtype=np.float32)
         out = np.zeros(electrons.shape, np.uint8 if self.bit_depth <= 8 else np.uint16)
@@ -100,7 +99,7 @@ def _digitise(
 
 
 class SceneSnapshot:
-    """A surface before a projector, for as long as both stand still, and the caster that finds the surface."""
+    """A surface and a projector at fixed poses, and the ray caster of the surface."""
 
     def __init__(self, surface: SceneSurface, projector: Pinhole) -> None:
         self.surface = surface
@@ -110,7 +109,7 @@ class SceneSnapshot:
 
     @property
     def rays(self) -> RayCaster:
-        """The caster of the surface. Built once, when first needed."""
+        """Ray caster of the surface, built on first use."""
         with self._lock:
             if self._rays is None:
                 self._rays = build_caster(self.surface.vertices_mm, self.surface.faces)
@@ -118,7 +117,7 @@ class SceneSnapshot:
 
 
 class SceneState:
-    """What stands before the cameras now, and the projector: exchanged as a whole when something moves."""
+    """Current surface and projector pose; replaced as a whole when something moves."""
 
     def __init__(
         self,
@@ -134,35 +133,35 @@ class SceneState:
 
     @property
     def surface(self) -> SceneSurface:
-        """What stands there now."""
+        """Current surface."""
         return self.snapshot.surface
 
     @property
     def projector(self) -> Pinhole:
-        """The projector where it is now."""
+        """Current pose of the projector."""
         return self.snapshot.projector
 
     @property
     def rays(self) -> RayCaster:
-        """The caster of the surface."""
+        """Ray caster of the surface."""
         return self.snapshot.rays
 
     def change(self, *, surface: SceneSurface | None = None, projector: Pinhole | None = None) -> None:
-        """Put another surface there, or move the projector. Nothing happens if the projector stands there already."""
+        """Replace the surface or move the projector. Does nothing if the projector's pose is unchanged."""
         now = self.snapshot
         if surface is not None or (projector is not None and not is_same_pose(projector, now.projector)):
             self.snapshot = SceneSnapshot(surface or now.surface, projector or now.projector)
 
 
 class _ViewCache:
-    """What was traced of one setting by a camera in one place.
+    """Traced results for one scene snapshot and one camera pose.
 
-    room : its image under the room's light alone; last : under the projector's light that was asked for last.
-    defocus_weights : how much of each level of defocus every pixel takes, of the projector's and of the camera's.
+    room : image under ambient light alone; last : image under the last requested projector light.
+    defocus_weights : weight of each level of defocus at every pixel, for the projector and for the camera.
     """
 
-    def __init__(self, setting: SceneSnapshot, camera: Pinhole) -> None:
-        self.snapshot = setting
+    def __init__(self, snapshot: SceneSnapshot, camera: Pinhole) -> None:
+        self.snapshot = snapshot
         self.camera = camera
         self.paths: LightPaths | None = None
         self.room: Float32Array | None = None
@@ -172,12 +171,12 @@ class _ViewCache:
 
 
 class CameraView:
-    """One camera's view of a stage. Its light paths are traced once for each setting, by `prepare` or an image."""
+    """View of one camera of the scene. Light paths are traced once per scene snapshot, by `prepare` or for an image."""
 
     def __init__(
         self,
         camera: Pinhole,
-        stage: SceneState,
+        scene: SceneState,
         *,
         blur_px: float,
         focus: tuple[Focus, Focus] = (ALWAYS_SHARP, ALWAYS_SHARP),
@@ -188,7 +187,7 @@ class CameraView:
         workers: int,
     ) -> None:
         self._camera = camera
-        self._stage = stage
+        self._scene = scene
         self._blur_px = blur_px
         self._focus = focus
         self._ambient = ambient
@@ -196,28 +195,28 @@ class CameraView:
         self._jitter = jitter
         self._seed = seed
         self._workers = workers
-        self._cache = _ViewCache(stage.snapshot, camera)
+        self._cache = _ViewCache(scene.snapshot, camera)
 
     @property
     def camera(self) -> Pinhole:
-        """The camera where it is now."""
+        """Current pose of the camera."""
         return self._camera
 
     def move(self, camera: Pinhole) -> None:
-        """Put the camera elsewhere. Nothing happens if it stands there already."""
+        """Move the camera. Does nothing if the pose is unchanged."""
         if not is_same_pose(camera, self._camera):
             self._camera = camera
 
     @property
     def _current_cache(self) -> _ViewCache:
-        """What is known of the present setting: a fresh start when something has moved."""
-        setting, camera = self._stage.snapshot, self._camera
-        if self._cache.snapshot is not setting or self._cache.camera is not camera:
-            self._cache = _ViewCache(setting, camera)
+        """The cache for the current snapshot; empty if something has moved."""
+        snapshot, camera = self._scene.snapshot, self._camera
+        if self._cache.snapshot is not snapshot or self._cache.camera is not camera:
+            self._cache = _ViewCache(snapshot, camera)
         return self._cache
 
     def prepare(self, *, report_progress: Callable[[float], None] = lambda _: None) -> LightPaths:
-        """Trace the light paths, unless that is done, and return them. `report_progress` receives the fraction done."""
+        """Trace the light paths, if not yet done, and return them. `report_progress` receives the fraction done."""
         return self._trace_paths(self._current_cache, report_progress)
 
     def _trace_paths(self, cache: _ViewCache, report_progress: Callable[[float], None] = lambda _: None) -> LightPaths:
@@ -230,17 +229,17 @@ class CameraView:
                 samples_per_axis=self._samples_per_axis,
                 jitter=self._jitter,
                 seed=self._seed,
-                working_distance_mm=self._stage.working_distance_mm,
+                working_distance_mm=self._scene.working_distance_mm,
                 workers=self._workers,
                 report_progress=report_progress,
             )
-            if any(self._stage.fall_off):
+            if any(self._scene.fall_off):
                 self._apply_fall_off(cache.paths, cache.snapshot.projector)
         return cache.paths
 
     def _apply_fall_off(self, paths: LightPaths, projector: Pinhole) -> None:
-        """Take from the light what the projector's lens takes: see `ProjectorOptions.fall_off`."""
-        power, corner = self._stage.fall_off
+        """Apply the vignetting of the projector's lens: see `SimulatedProjectorOptions.fall_off`."""
+        power, corner = self._scene.fall_off
         (fx, _, cx), (_, fy, cy), _ = projector.matrix
         square = ((paths.column_px - cx) / fx) ** 2 + ((paths.row_px - cy) / fy) ** 2
         width, height = projector.size.width_px, projector.size.height_px
@@ -250,11 +249,11 @@ class CameraView:
     def image(
         self, lights: Sequence[tuple[float | Float32Array, LightTable]], *, ambient: Float32Array | None = None
     ) -> Float32Array:
-        """(H, W) float32: the mean light on each pixel when each light was on for its fraction of the exposure.
+        """Mean light on each pixel, (H, W) float32, when each light was on for its fraction of the exposure.
 
-        A fraction is one number for the whole image, or (H, 1): one for each row. `ambient` is the room's light in
-        this exposure over its mean, (H, 1) or (1, 1); absent, the mean.
-        1 is a white diffuser, at the working distance and facing the projector, under full white.
+        A fraction is one number for the whole image, or (H, 1): one for each row. `ambient` is the ambient light of
+        this exposure relative to its mean, (H, 1) or (1, 1); None for the mean. 1 is a white diffuser, at the working
+        distance and facing the projector, under full white.
         """
         cache = self._current_cache
         paths = self._trace_paths(cache)
@@ -268,7 +267,7 @@ class CameraView:
     def colour(
         self, lights: Sequence[tuple[float | Float32Array, LightTable]], *, ambient: Float32Array | None = None
     ) -> Callable[[], Float32Array]:
-        """What makes `image` in blue, green and red, (H, W, 3) float32, of what stands there now."""
+        """Return a function that renders `image` in blue, green and red, (H, W, 3) float32, of the current scene."""
         cache = self._current_cache
 
         def channel(number: int) -> Float32Array:
@@ -285,14 +284,14 @@ class CameraView:
         return lambda: np.stack([channel(number) for number in range(3)], axis=2)
 
     def rehearse(self, lights: Sequence[tuple[float | Float32Array, LightTable]]) -> None:
-        """Do the work of `image` that does not depend on fractions, so that it is quick when time matters."""
+        """Do the part of `image` that does not depend on fractions in advance, so that `image` is fast."""
         cache = self._current_cache
         paths = self._trace_paths(cache)
         for _, light in lights:
             self._cached_light(cache, paths, light)
 
     def _cached_light(self, cache: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
-        # A free-running camera sees the same light many times over: keep the last image.
+        # A free-running camera sees the same light repeatedly.
         if cache.last is None or cache.last[0] is not light:
             cache.last = (light, self._render_light(cache, paths, light))
         return cache.last[1]
@@ -306,24 +305,24 @@ class CameraView:
         return image
 
     def _render_defocused(self, cache: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
-        """The light of the projector on each pixel, blended from images at several levels of defocus."""
+        """Projector light on each pixel, blended from images at several levels of defocus."""
         if not any(focus.far_px for focus in self._focus):
             return radiance(paths, light, blur_px=self._blur_px)
         if cache.defocus_weights is None:
             cache.defocus_weights = self._defocus_weights(cache)
         image = np.zeros(paths.albedo.shape, np.float32)
         tables = (light, *light.softer)
-        for of_light, weight in cache.defocus_weights[0].items():
-            for of_lens, share in cache.defocus_weights[1].items():
-                taken = weight * share
-                if taken.any():
-                    blur_px = math.hypot(self._blur_px, LEVELS_PX[of_lens])
+        for light_level, weight in cache.defocus_weights[0].items():
+            for lens_level, share in cache.defocus_weights[1].items():
+                combined = weight * share
+                if combined.any():
+                    blur_px = math.hypot(self._blur_px, LEVELS_PX[lens_level])
                     # A lamp that is off has no levels.
-                    image += taken * radiance(paths, tables[min(of_light, len(tables) - 1)], blur_px=blur_px)
+                    image += combined * radiance(paths, tables[min(light_level, len(tables) - 1)], blur_px=blur_px)
         return image
 
     def _defocus_weights(self, cache: _ViewCache) -> tuple[Weights, Weights]:
-        """The levels of the projector and of the camera at each pixel, by the distance of what its centre sees."""
+        """Level weights of projector and camera at each pixel, by the distance of the point at its centre."""
         if cache.truth is None:
             cache.truth = self._trace_truth(cache)
         camera, projector = cache.camera, cache.snapshot.projector
@@ -331,20 +330,20 @@ class CameraView:
         u, v = (np.concatenate(each) for each in zip(*centres, strict=True))
         towards = world_directions(u, v, lens_array(camera), camera.rotation)
         from_eye = towards * (cache.truth.depth_mm.reshape(-1) / (towards @ camera.rotation[2]))[:, None]
-        of_light, of_lens = self._focus
+        projector_focus, camera_focus = self._focus
         light_mm = np.linalg.norm(from_eye + camera.centre_mm - projector.centre_mm, axis=1).reshape(camera.size.shape)
         lens_mm = np.linalg.norm(from_eye, axis=1).reshape(camera.size.shape)
-        return level_weights(of_light.spread_px(light_mm)), level_weights(of_lens.spread_px(lens_mm))
+        return level_weights(projector_focus.spread_px(light_mm)), level_weights(camera_focus.spread_px(lens_mm))
 
     def truth(self) -> CameraTruth:
-        """Return depth, projector coordinates and visible points of what stands there, by rays at the pixel centres."""
+        """Return depth, projector coordinates and visible points of the current scene, by rays at the pixel centres."""
         cache = self._current_cache
         if cache.truth is None:
             cache.truth = self._trace_truth(cache)
         return cache.truth
 
     def _trace_truth(self, cache: _ViewCache) -> CameraTruth:
-        camera, setting = cache.camera, cache.snapshot
+        camera, snapshot = cache.camera, cache.snapshot
         shape = camera.size.shape
         depth = np.full(shape, np.nan)
         projector_px = np.full((*shape, 2), np.nan)
@@ -354,10 +353,10 @@ class CameraView:
                 u,
                 v,
                 camera,
-                setting.projector,
-                setting.surface,
-                setting.rays,
-                working_distance_mm=self._stage.working_distance_mm,
+                snapshot.projector,
+                snapshot.surface,
+                snapshot.rays,
+                working_distance_mm=self._scene.working_distance_mm,
             )
             along = hits.points_mm @ camera.rotation[2] + camera.translation_mm[2]
             coordinates = np.column_stack([hits.column_px, hits.row_px])
@@ -369,5 +368,5 @@ class CameraView:
 
 
 def is_same_pose(one: Pinhole, other: Pinhole) -> bool:
-    """Whether two devices stand alike, to the last bit."""
+    """True if two devices have bitwise identical poses."""
     return np.array_equal(one.rotation, other.rotation) and np.array_equal(one.translation_mm, other.translation_mm)

@@ -1,7 +1,10 @@
-"""Scenes: what stands before the rig, described in TOML, and its one triangle surface.
+"""Scenes of the simulated rig: objects described in TOML, and their combined triangle surface.
 
-The world and each object's own frame look like a camera image: x to the right, y down, z away from the devices.
-An object's front therefore faces -z, and a relief of positive height comes towards the devices.
+The world and each object's own frame are oriented like a camera image: x to the right, y down, z away from the devices.
+The front of an object faces -z, and a relief of positive height extends towards the devices.
+
+A board's origin is the centre of its corners. Its print is piecewise constant: dark and light rectangles between two
+sets of lines, or dark discs on a light ground.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ Item = TypeVar("Item")
 
 TEXTURES = ("uniform", "checker", "noise")
 Colour = Annotated[tuple[Fraction, Fraction, Fraction], Field(strict=False)]
-"""Albedo for blue, green and red light, as a share of the albedo."""
+"""Albedo for blue, green and red light, as a fraction of the albedo."""
 WHITE: Colour = (1.0, 1.0, 1.0)
 Albedo = Annotated[float, Field(gt=0, le=1)]
 Corners = Annotated[int, Field(ge=2, le=60)]
@@ -45,7 +48,7 @@ _MAX_FILE_BYTES = 1 << 24
 
 
 def require_one(items: tuple[Item, ...]) -> tuple[Item, ...]:
-    """Return `items`, or raise ValueError. A length rule of pydantic's own would also count items with faults."""
+    """Return `items`; raise ValueError if there are none. A length rule of pydantic would also count invalid items."""
     if not items:
         message = "at least one is needed"
         raise ValueError(message)
@@ -53,10 +56,10 @@ def require_one(items: tuple[Item, ...]) -> tuple[Item, ...]:
 
 
 class Texture(Strict):
-    """Albedo that varies: times 1 - contrast * t, t in 0..1 over the object's own coordinates.
+    """Texture of an object: the albedo times 1 - contrast * t, with t in 0..1 over the object's own coordinates.
 
     `checker` alternates squares of `scale_mm` over x and y; `noise` is smooth random shading with grains of that size.
-    colour : the object's where t is 1, if it is another one there.
+    colour : colour where t is 1; the object's colour if None.
     """
 
     kind: Literal["uniform", "checker", "noise"] = "uniform"
@@ -66,14 +69,14 @@ class Texture(Strict):
 
 
 class Specular(Strict):
-    """A Phong lobe added to the Lambertian light: strength * cos(angle to the mirror direction) ^ exponent."""
+    """Phong lobe added to the Lambertian light: strength * cos(angle to the mirror direction) ^ exponent."""
 
     strength: NotNegative = 0.0
     exponent: Annotated[float, Field(ge=1)] = 20.0
 
 
 class SceneObject(Strict):
-    """An object in a pose (rotation about its own x, then y, then z axis as fixed axes), with a gloss."""
+    """Object with a pose (rotation about its own x, then y, then z axis as fixed axes) and a gloss."""
 
     name: str = ""
     position_mm: Triple = (0.0, 0.0, 0.0)
@@ -81,19 +84,19 @@ class SceneObject(Strict):
     specular: Specular = Specular()
 
     def colours(self) -> tuple[Colour, Colour]:
-        """The colour where a texture is light, and where it is dark."""
+        """Return the colours where a texture is light and where it is dark."""
         return WHITE, WHITE
 
 
 class TexturedObject(SceneObject):
-    """An object of one albedo and colour, or of those that a texture varies."""
+    """Object of uniform or textured albedo and colour."""
 
     albedo: Annotated[float, Field(gt=0, le=1)] = 0.8
     colour: Colour = WHITE
     texture: Texture = Texture()
 
     def material(self) -> tuple[float, ...]:
-        """(6,): albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent."""
+        """Return (6,): albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent."""
         texture, lobe = self.texture, self.specular
         kind = float(TEXTURES.index(texture.kind))
         return (self.albedo, kind, texture.contrast, texture.scale_mm, lobe.strength, lobe.exponent)
@@ -107,23 +110,23 @@ ObjectT = TypeVar("ObjectT", bound=SceneObject)
 
 
 def place_object(thing: ObjectT, position_mm: FloatArray, rotation: FloatArray) -> ObjectT:
-    """The same object in another pose. rotation : (3, 3), object to world."""
+    """Return the object in another pose. rotation : (3, 3), object to world."""
     x, y, z = (float(each) for each in position_mm)
     a, b, c = (float(each) for each in Rotation.from_matrix(rotation).as_euler("xyz", degrees=True))
     return thing.model_copy(update={"position_mm": (x, y, z), "rotation_deg": (a, b, c)})
 
 
 def rotation_matrix(rotation_deg: Triple) -> FloatArray:
-    """(3, 3) float64: object to world, of a pose's rotation."""
+    """Return (3, 3) float64: object to world, from the rotation angles of a pose."""
     return np.asarray(Rotation.from_euler("xyz", rotation_deg, degrees=True).as_matrix(), np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class BoardPrint:
-    """What is printed on a flat or bent sheet, in coordinates along it, mm, from its frame's origin.
+    """Print on a flat or bent sheet, in coordinates along it, mm, from the origin of its frame.
 
-    across_mm, down_mm : (n,), (m,) float64, ascending lines; dark : (m - 1, n - 1) uint8, 1 where the rectangle
-    between them is dark. centres_mm : (k, 2) float64, of dark discs of radius_mm instead. Elsewhere it is light.
+    across_mm, down_mm : (n,), (m,) float64, ascending lines; dark : (m - 1, n - 1) uint8, 1 where the rectangle between
+    them is dark. centres_mm : (k, 2) float64, of dark discs of radius_mm instead. Everything else is light.
     dark_share : albedo of the dark over that of the light. curvature_per_mm : the sheet is z = curvature x²; 0 is flat.
     """
 
@@ -137,16 +140,16 @@ class BoardPrint:
 
 
 class PrintedBoard(SceneObject):
-    """A calibration board: `shape = "board"`.
+    """Calibration board: `shape = "board"`.
 
-    kind, columns, rows : "chessboard" or "charuco" with so many inner corners, or "circles": rows of so many circles,
-    every other row moved by half their distance. square_mm : side of a square; of circles, the distance of two rows.
-    marker_mm, dictionary : of a ChArUco board; absent, 0.75 of the square. circle_mm : diameter; absent, square_mm.
-    margin_mm : of light paper around the print. The pose is that of the middle of the corners.
+    kind, columns, rows : "chessboard" or "charuco" with this number of inner corners, or "circles": rows of circles,
+    every other row shifted by half their distance. square_mm : side of a square, or distance of two rows of circles.
+    marker_mm, dictionary : of a ChArUco board; default 0.75 of the square. circle_mm : diameter; default square_mm.
+    margin_mm : light paper around the print. The pose is that of the centre of the corners.
 
-    mirrored : printed the wrong way round. scale : the printer's, in x and y; 1.05 makes 12 mm squares 12.6 mm wide.
-    bow_mm : the sheet is bent about y, its middle so much nearer to the devices than its left and right ends
-    (negative: farther); its length along the bend stays.
+    mirrored : the print is mirrored. scale : of the printer, in x and y; 1.05 makes 12 mm squares 12.6 mm wide.
+    bow_mm : the sheet is bent about y; its middle is this much nearer to the devices than its left and right ends
+    (negative: farther). The length along the bend is unchanged.
     """
 
     shape: Literal["board"]
@@ -167,22 +170,24 @@ class PrintedBoard(SceneObject):
     @model_validator(mode="after")
     def _check_print(self) -> PrintedBoard:
         if self.albedo_dark >= self.albedo_light:
-            message = "albedo_dark must lie below albedo_light"
+            message = "albedo_dark must be below albedo_light"
             raise ValueError(message)
         if self.kind == "charuco":
             if not self._marker_mm < self.square_mm:
-                message = f"marker_mm must lie below square_mm, {self.square_mm} mm"
+                message = f"marker_mm must be below square_mm, {self.square_mm} mm"
                 raise ValueError(message)
-            held, needed = len(self._markers().bytesList), (self.columns + 1) * (self.rows + 1) // 2
-            if held < needed:
-                message = f"the board needs {needed} markers, {self.dictionary} has {held}; choose a larger dictionary"
+            available, needed = len(self._markers().bytesList), (self.columns + 1) * (self.rows + 1) // 2
+            if available < needed:
+                message = (
+                    f"the board needs {needed} markers, {self.dictionary} has {available}; choose a larger dictionary"
+                )
                 raise ValueError(message)
         elif self.marker_mm is not None:
-            message = "marker_mm belongs to a ChArUco board"
+            message = "marker_mm applies to ChArUco boards only; remove it"
             raise ValueError(message)
         half_mm = self.print_mm[:, 0] @ (-0.5, 0.5) + self.margin_mm
         if abs(self.bow_mm) > half_mm / 4:
-            message = f"bow_mm must lie within a quarter of half the board's width, {half_mm / 4:.1f} mm"
+            message = f"bow_mm must be at most a quarter of half the board's width, {half_mm / 4:.1f} mm"
             raise ValueError(message)
         return self
 
@@ -197,21 +202,21 @@ class PrintedBoard(SceneObject):
     def _markers(self) -> cv2.aruco.Dictionary:
         number: int | None = getattr(cv2.aruco, self.dictionary, None) if self.dictionary[:5] == "DICT_" else None
         if number is None:
-            message = f"there is no dictionary {self.dictionary!r}; OpenCV's are called DICT_4X4_50, DICT_5X5_250, …"
+            message = f"unknown dictionary {self.dictionary!r}; use one of OpenCV's: DICT_4X4_50, DICT_5X5_250, …"
             raise ValueError(message)
         return cv2.aruco.getPredefinedDictionary(number)
 
     @property
     def middle_mm(self) -> tuple[float, float]:
-        """The middle of the corners from corner 0, as designed."""
+        """Centre of the corners measured from corner 0, as designed."""
         across = 2 * self.columns - 1 if self.kind == "circles" else self.columns - 1
         return across * self.square_mm / 2, (self.rows - 1) * self.square_mm / 2
 
     @property
     def corners_mm(self) -> FloatArray:
-        """(n, 3) float64: where the print's corners (its circles' centres) truly lie, in the board's own frame.
+        """True positions of the corners (or circle centres) in the board's own frame, (n, 3) float64.
 
-        With the printer's scale and the bend. A mirrored print has its corner 0 at the right.
+        They include the printer's scale and the bend. Corner 0 of a mirrored print is at the right.
         """
         row, column = (each.ravel() for each in np.mgrid[: self.rows, : self.columns])
         across = 2 * column + row % 2 if self.kind == "circles" else column
@@ -221,22 +226,22 @@ class PrintedBoard(SceneObject):
 
     @property
     def print_mm(self) -> FloatArray:
-        """(2, 2) float64: least and greatest (x, y) of the paper without its margin, along the sheet."""
+        """Smallest and largest (x, y) of the print along the sheet, without margin, (2, 2) float64."""
         border = self.square_mm if self.kind != "circles" else self.square_mm / 2 + self._circle_mm / 2
         reach = (np.array(self.middle_mm) + border) * self.scale
         return np.stack([-reach, reach])
 
     @property
     def paper_mm(self) -> FloatArray:
-        """(2, 2) float64: least and greatest (x, y) of the paper, along the sheet."""
+        """Smallest and largest (x, y) of the paper along the sheet, (2, 2) float64."""
         outwards = np.array([[-1.0], [1.0]])
         return self.print_mm + self.margin_mm * outwards
 
     @property
     def curvature_per_mm(self) -> float:
-        """How the sheet is bent: z = curvature x²."""
+        """Curvature of the bent sheet: z = curvature x²."""
         half_mm = float(self.paper_mm[1, 0])
-        # The ends' x follows from their length along the bend; to first order it is that length, then corrected.
+        # Fixed-point iteration: x of the ends depends on the curvature, which depends on x.
         reach = half_mm
         for _ in range(20):
             curvature = self.bow_mm / reach**2
@@ -244,13 +249,13 @@ class PrintedBoard(SceneObject):
         return self.bow_mm / reach**2
 
     def on_sheet_mm(self, along_mm: FloatArray) -> FloatArray:
-        """(n, 3) float64: points of the sheet in the board's own frame, from (n, 2) coordinates along it."""
+        """Convert (n, 2) coordinates along the sheet into points of the board's own frame, (n, 3) float64."""
         curvature = self.curvature_per_mm
         x = x_at_arc_length_mm(along_mm[:, 0], curvature)
         return np.column_stack([x, along_mm[:, 1], curvature * x**2])
 
     def parts(self, _folder: Path) -> list[MeshPart]:
-        """The paper: a rectangle, or a bent sheet."""
+        """Return the paper: a rectangle or a bent sheet."""
         least, most = self.paper_mm
         if self.bow_mm == 0:
             return [rectangle_between(least, most)]
@@ -258,18 +263,18 @@ class PrintedBoard(SceneObject):
         return [bent_sheet((-reach, reach), (least[1], most[1]), self.curvature_per_mm)]
 
     def material(self) -> tuple[float, ...]:
-        """See `Placed.material`: that of the light paper."""
+        """Return the material of the light paper, see `TexturedObject.material`."""
         return (self.albedo_light, 0.0, 0.0, 1.0, self.specular.strength, self.specular.exponent)
 
     def print_layout(self) -> BoardPrint:
-        """What is printed."""
+        """Return the layout of the print."""
         ratio = self.albedo_dark / self.albedo_light
         if self.kind == "circles":
             row, column = (each.ravel() for each in np.mgrid[: self.rows, : self.columns])
             designed = np.column_stack([2 * column + row % 2, row]) * self.square_mm - self.middle_mm
             centres = designed * self.scale * (-1.0 if self.mirrored else 1.0, 1.0)
             none = np.zeros(2)
-            # A printer that stretches unequally makes ellipses: discs of the mean radius stand for them.
+            # A printer that stretches unequally makes ellipses; they are approximated by discs of the mean radius.
             radius = self._circle_mm / 2 * float(np.sqrt(self.scale[0] * self.scale[1]))
             return BoardPrint(none, none, np.zeros((1, 1), np.uint8), centres, radius, ratio, self.curvature_per_mm)
         across, down, dark = self._rectangles()
@@ -280,7 +285,7 @@ class PrintedBoard(SceneObject):
         return BoardPrint(across, down, dark, np.zeros((0, 2)), 0.0, ratio, self.curvature_per_mm)
 
     def _rectangles(self) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
-        """Lines across and down from corner 0, mm, and which rectangles between them are dark, as designed."""
+        """Return the designed lines across and down from corner 0, mm, and which rectangles between them are dark."""
         squares = (np.indices((self.rows + 1, self.columns + 1)).sum(axis=0) + 1) % 2  # top left is dark
         if self.kind == "chessboard":
             across, down = (np.arange(-1.0, n + 1) * self.square_mm for n in (self.columns, self.rows))
@@ -295,7 +300,7 @@ class PrintedBoard(SceneObject):
         )
         size = modules + 2
         dark = np.kron(squares, np.ones((size, size), np.int64)).astype(np.uint8)
-        # Markers stand in the light squares, numbered by rows.
+        # Markers fill the light squares, numbered row by row.
         for number, (row, column) in enumerate(np.argwhere(squares == 0)):
             drawn = markers.generateImageMarker(number, modules)
             top, left = row * size + 1, column * size + 1
@@ -312,7 +317,7 @@ def arc_length_mm(x_mm: FloatArray, curvature_per_mm: float) -> FloatArray:
 
 
 def x_at_arc_length_mm(along_mm: FloatArray, curvature_per_mm: float) -> FloatArray:
-    """The x of the points so far along z = c x², mm: the inverse of `arc_length_mm`, by Newton's method."""
+    """Invert `arc_length_mm` by Newton's method: x of the points at these lengths along z = c x², mm."""
     x = np.array(along_mm, np.float64)
     for _ in range(8):
         x = x - (arc_length_mm(x, curvature_per_mm) - along_mm) / np.sqrt(1 + (2 * curvature_per_mm * x) ** 2)
@@ -320,29 +325,29 @@ def x_at_arc_length_mm(along_mm: FloatArray, curvature_per_mm: float) -> FloatAr
 
 
 class PlaneObject(TexturedObject):
-    """A rectangle in the object's x-y plane."""
+    """Rectangle in the object's x-y plane."""
 
     shape: Literal["plane"]
     size_mm: Annotated[tuple[Positive, Positive], Field(strict=False)]
 
     def parts(self, _folder: Path) -> list[MeshPart]:
-        """The rectangle."""
+        """Return the rectangle."""
         return [shapes.rectangle(*self.size_mm)]
 
 
 class Sphere(TexturedObject):
-    """A ball about the object's origin. Light and truth use the exact sphere, not its facets."""
+    """Ball about the object's origin. Rendering and truth use the exact sphere, not its facets."""
 
     shape: Literal["sphere"]
     radius_mm: Positive
 
     def parts(self, _folder: Path) -> list[MeshPart]:
-        """The ball."""
+        """Return the ball."""
         return [shapes.ball(self.radius_mm)]
 
 
 class BallBar(TexturedObject):
-    """Two equal balls, `distance_mm` between their centres along x, and the bar that joins them."""
+    """Two equal balls, with `distance_mm` between their centres along x, and the bar that joins them."""
 
     shape: Literal["ball_bar"]
     radius_mm: Positive
@@ -353,13 +358,14 @@ class BallBar(TexturedObject):
     def _check_clearance(self) -> BallBar:
         if self.distance_mm <= 2 * self.radius_mm or self.bar_radius_mm >= self.radius_mm:
             message = (
-                f"the balls must lie apart (distance above {2 * self.radius_mm} mm) and the bar be thinner than them"
+                f"the balls must not touch (distance_mm above {2 * self.radius_mm}), and the bar must be thinner than "
+                "the balls"
             )
             raise ValueError(message)
         return self
 
     def parts(self, _folder: Path) -> list[MeshPart]:
-        """Two balls and a rod."""
+        """Return two balls and a rod."""
         half = self.distance_mm / 2
         left = shapes.ball(self.radius_mm, centre_mm=(-half, 0.0, 0.0))
         right = shapes.ball(self.radius_mm, centre_mm=(half, 0.0, 0.0))
@@ -367,7 +373,7 @@ class BallBar(TexturedObject):
 
 
 class Stairs(TexturedObject):
-    """Steps along x, each `rise_mm` nearer to the devices than the one on its left, `height_mm` long in y."""
+    """Steps along x, each `rise_mm` nearer to the devices than its left neighbour, `height_mm` long in y."""
 
     shape: Literal["stairs"]
     steps: Annotated[int, Field(ge=1, le=1000)]
@@ -376,12 +382,12 @@ class Stairs(TexturedObject):
     height_mm: Positive
 
     def parts(self, _folder: Path) -> list[MeshPart]:
-        """Treads and risers, flat."""
+        """Return flat treads and risers."""
         return [shapes.staircase(self.steps, self.tread_mm, self.rise_mm, self.height_mm)]
 
 
 class Wave(Strict):
-    """One sine of a relief: amplitude_mm * sin(2 pi s / wavelength_mm + phase), s along `direction_deg` from x."""
+    """Sine wave of a relief: amplitude_mm * sin(2 pi s / wavelength_mm + phase), s along `direction_deg` from x."""
 
     amplitude_mm: float
     wavelength_mm: Positive
@@ -390,7 +396,7 @@ class Wave(Strict):
 
 
 class ReliefBump(Strict):
-    """One Gaussian hill (or hollow, with a negative height) of a relief."""
+    """Gaussian hill of a relief; a hollow if the height is negative."""
 
     centre_mm: Pair
     height_mm: float
@@ -398,7 +404,7 @@ class ReliefBump(Strict):
 
 
 class Relief(TexturedObject):
-    """A height field over a rectangle: a sum of waves and bumps, sampled every `step_mm`."""
+    """Height field over a rectangle: a sum of waves and bumps, sampled every `step_mm`."""
 
     shape: Literal["relief"]
     size_mm: Annotated[tuple[Positive, Positive], Field(strict=False)]
@@ -410,7 +416,7 @@ class Relief(TexturedObject):
     def _check_cell_count(self) -> Relief:
         cells = self.size_mm[0] * self.size_mm[1] / self.step_mm**2
         if cells > 4e6:
-            message = f"size_mm and step_mm ask for {cells:.0f} cells, at most 4000000 are made; use a larger step_mm"
+            message = f"size_mm and step_mm give {cells:.0f} cells, the limit is 4000000; use a larger step_mm"
             raise ValueError(message)
         return self
 
@@ -427,15 +433,15 @@ class Relief(TexturedObject):
         return total
 
     def parts(self, _folder: Path) -> list[MeshPart]:
-        """The height field."""
+        """Return the height field."""
         return [shapes.height_field(self.size_mm, self.step_mm, self.height_mm)]
 
 
 class Vessel(TexturedObject):
-    """A vessel turned on a lathe about y: a smooth curve through (radius, height) points, fluted if asked.
+    """Vessel of revolution about y: a smooth curve through (radius, height) points, optionally fluted.
 
-    `flutes` grooves run along the axis and change the radius by ± `flute_depth_mm`, twisted by `twist_deg` over
-    the height. Heights count upwards, against y.
+    `flutes` grooves run along the axis and change the radius by ± `flute_depth_mm`, twisted by `twist_deg` over the
+    height. Heights count upwards, against y.
     """
 
     shape: Literal["turned"]
@@ -457,16 +463,16 @@ class Vessel(TexturedObject):
         return self
 
     def parts(self, _folder: Path) -> list[MeshPart]:
-        """The open vessel's outer wall."""
+        """Return the outer wall of the open vessel."""
         profile = np.array(self.profile_mm)
         return [shapes.vessel(profile, self.flutes, self.flute_depth_mm, np.deg2rad(self.twist_deg), self.step_mm)]
 
 
 class MeshFile(TexturedObject):
-    """A triangle mesh from a file (STL, PLY, OBJ, GLB), in units of `unit_mm`, in its own frame.
+    """Triangle mesh from a file (STL, PLY, OBJ, GLB), in units of `unit_mm`, in its own frame.
 
-    A GLB's frame is glTF's: metres, y up. unit_mm = 1000 and rotation_deg = [180, 0, 0] bring a scan's mesh.glb back.
-    Edges sharper than `crease_deg` stay sharp in the shading.
+    The frame of a GLB file is that of glTF: metres, y up. Use unit_mm = 1000 and rotation_deg = [180, 0, 0] for the
+    mesh.glb of a scan. Edges sharper than `crease_deg` stay sharp in the shading.
     """
 
     shape: Literal["mesh"]
@@ -475,7 +481,7 @@ class MeshFile(TexturedObject):
     crease_deg: Annotated[float, Field(ge=0, le=180)] = 30.0
 
     def parts(self, folder: Path) -> list[MeshPart]:
-        """The mesh. Raises ConfigError when the file cannot be read or holds no triangle."""
+        """Return the mesh. Raises ConfigError when the file cannot be read or contains no triangle."""
         return [shapes.mesh_file(folder / self.file, self.unit_mm, crease_rad=np.deg2rad(self.crease_deg))]
 
 
@@ -486,7 +492,7 @@ AnyObject = Annotated[
 
 
 class Scene(Strict):
-    """A scene file: a name and one or more objects."""
+    """Scene file: a name and one or more objects."""
 
     name: str = ""
     object: Annotated[tuple[AnyObject, ...], Field(strict=False), AfterValidator(require_one)]
@@ -497,11 +503,11 @@ class SceneSurface:
     """The whole scene as triangles in the world, with materials by part.
 
     vertices_mm : (V, 3) float64; faces : (F, 3) int32; corner_normals : (F, 3, 3) float32, unit; part : (F,) int32.
-    sphere_mm : (P, 4) float64, centre and radius of a part that is a ball, radius 0 for the others.
+    sphere_mm : (P, 4) float64, centre and radius of a ball; radius 0 for other parts.
     to_object : (P, 3, 4) float64, world to the object's own frame.
     material : (P, 6) float64: albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent.
     colours : (P, 2, 3) float64, blue, green and red where a texture is light, and where it is dark.
-    prints : what is printed on the parts that are boards.
+    prints : print of each part that is a board.
     """
 
     vertices_mm: FloatArray
@@ -516,12 +522,12 @@ class SceneSurface:
 
 
 def read_scene(path: Path) -> Scene:
-    """Return the scene of a TOML file. Raises ConfigError that lists all faults."""
+    """Read a scene from a TOML file. Raises ConfigError that lists all faults."""
     return checked(Scene, read_toml(path, _MAX_FILE_BYTES), f"the scene file {path}")
 
 
 def build_surface(scene: Scene, folder: Path) -> SceneSurface:
-    """Return the triangles of a scene; mesh files are looked for from `folder`. Raises ConfigError."""
+    """Build the triangles of a scene; paths of mesh files are relative to `folder`. Raises ConfigError."""
     vertices, faces, normals, owners = [], [], [], []
     spheres: list[tuple[float, ...]] = []
     inverses: list[FloatArray] = []

@@ -1,7 +1,11 @@
-"""Ray-traced paths projector -> surface -> camera: where each camera sample is lit from, and how strongly.
+"""Ray-traced light paths projector -> surface -> camera: where each camera sample is lit from, and how strongly.
 
-One pose of the world is traced once; each pattern is then a table look-up (`simulated_rig.light`).
-Only direct light is traced: no light from one surface to another.
+Each state of the world is traced once; each pattern is then a table look-up (`simulated_rig.light`). Only direct light
+is traced: no light from one surface to another.
+
+Prints are averaged exactly over each sample. A sample stands for a cell of its pixel; the cell's rays meet the sheet in
+a small quadrilateral, whose dark part follows from clipping it at the lines of the print. Edges are therefore
+independent of the sample positions.
 """
 
 from __future__ import annotations
@@ -31,21 +35,22 @@ except ImportError:  # no wheel for this processor
 
 
 _REACH = 0.9
-"""Of a cell's side: more than half its diagonal, with room for the lens's stretch. Farther edges need no clipping."""
+"""Fraction of a cell's side: more than half its diagonal, with a margin for the lens distortion. Cells farther from
+every edge need no clipping."""
 _MAX_CORNERS = 12
 SHADOW_BIAS_MM = 0.05
-"""A surface shades a point only if it lies nearer to the projector by more than this: facets must not shade
-the curved surface that they stand for."""
+"""A surface shades a point only if it is nearer to the projector by more than this, so that facets do not shade the
+curved surface that they approximate."""
 LUMA = (0.114, 0.587, 0.299)
-"""What blue, green and red light are of grey (Rec. 601)."""
+"""Weights of blue, green and red light in grey (Rec. 601)."""
 _BLOCK_RAYS = 120_000
 
 
 class RayCaster(Protocol):
-    """A surface that rays can be cast at."""
+    """Casts rays at a surface."""
 
     def first_hit(self, origin_mm: FloatArray, directions: FloatArray) -> IntArray:
-        """(n,) int32: index of the first triangle along each ray, -1 where there is none.
+        """Return (n,) int32: index of the first triangle along each ray, -1 if none.
 
         origin_mm : (3,) float64; directions : (n, 3) float64, unit.
         """
@@ -53,15 +58,16 @@ class RayCaster(Protocol):
 
 
 class EmbreeCaster:
-    """Embree, in single precision about the middle of the scene.
+    """Embree, in single precision relative to the centre of the scene.
 
-    It only names the triangle; the caller computes the point in double precision, so its rounding moves no surface.
+    It only identifies the triangle; the caller computes the point in double precision, so rounding does not move
+    surfaces.
     """
 
     def __init__(self, vertices_mm: FloatArray, faces: IntArray) -> None:
         self._middle = (vertices_mm.min(axis=0) + vertices_mm.max(axis=0)) / 2
         self._scene = EmbreeScene()
-        # embreex reads the buffers as they lie in memory: by rows.
+        # embreex reads the buffers in memory order: by rows.
         vertices = np.ascontiguousarray(vertices_mm - self._middle, np.float32)
         TriangleMesh(scene=self._scene, vertices=vertices, indices=np.ascontiguousarray(faces, np.int32))
 
@@ -75,7 +81,7 @@ class EmbreeCaster:
 
 
 class TreeCaster:
-    """trimesh's R-tree caster: a hundred times slower, and everywhere."""
+    """The R-tree caster of trimesh: a hundred times slower, available everywhere."""
 
     def __init__(self, vertices_mm: FloatArray, faces: IntArray) -> None:
         mesh = trimesh.Trimesh(vertices_mm, faces, process=False)
@@ -88,13 +94,13 @@ class TreeCaster:
 
 
 def build_caster(vertices_mm: FloatArray, faces: IntArray) -> RayCaster:
-    """Return the fastest caster that this machine has. Raises ConfigError when it has none."""
+    """Return the fastest available caster. Raises ConfigError if there is none."""
     if EMBREE:
         return EmbreeCaster(vertices_mm, faces)
     try:
         return TreeCaster(vertices_mm, faces)
     except ImportError as error:
-        message = "the rendered rig needs a ray caster: found neither embreex nor rtree; install one of them with pip"
+        message = "the simulated rig needs a ray caster: found neither embreex nor rtree; install one of them with pip"
         raise ConfigError(message) from error
 
 
@@ -109,13 +115,14 @@ def print_reflectance(
     *,
     footprint_px: float,
 ) -> FloatArray:
-    """(n,) float64: what prints leave of the albedo at the points that a camera's rays through u, v met; else 1.
+    """Factor of the prints on the albedo, (n,) float64, where a camera's rays through u, v hit the surface; 1
+    elsewhere.
 
-    Each point of a print is moved, in place, to the middle of the light that its cell sends back: a cell half in the
-    dark is lit where its light half lies. footprint_px : side of a sample's cell; 0 takes the print at the point.
+    Each point of a print is moved, in place, to the centroid of the light that its cell reflects, so that a partly dark
+    cell counts at its light part. footprint_px : side of a sample's cell; 0 evaluates the print at the point.
     """
     out = np.ones(len(u))
-    for part, shown in surface.prints.items():
+    for part, board_print in surface.prints.items():
         _fill_reflectance(
             out,
             points,
@@ -130,7 +137,7 @@ def print_reflectance(
             lens_array(camera),
             camera.rotation,
             footprint_px,
-            *_kernel_arguments(shown),
+            *_kernel_arguments(board_print),
         )
     return out
 
@@ -160,7 +167,7 @@ def _arc_length(x: float, curvature: float) -> float:
 
 @kernel_part
 def _clip_polygon(polygon: FloatArray, count: int, a: float, b: float, limit: float, out: FloatArray) -> int:
-    """Keep of a convex polygon what has a x + b y <= limit (Sutherland and Hodgman 1974). Returns its corner count."""
+    """Clip a convex polygon to a x + b y <= limit (Sutherland and Hodgman 1974). Return its number of corners."""
     kept = 0
     for i in range(count):
         j = i + 1 if i + 1 < count else 0
@@ -179,7 +186,7 @@ def _clip_polygon(polygon: FloatArray, count: int, a: float, b: float, limit: fl
 
 @kernel_part
 def _moments(polygon: FloatArray, count: int) -> tuple[float, float, float]:
-    """Area of a polygon and its first moments in x and y; the area's sign is that of the way round."""
+    """Signed area of a polygon and its first moments in x and y."""
     area, mx, my = 0.0, 0.0, 0.0
     for i in range(count):
         j = i + 1 if i + 1 < count else 0
@@ -201,7 +208,7 @@ def _dark_in_rectangles(
     first: FloatArray,
     second: FloatArray,
 ) -> tuple[float, float, float]:
-    """Dark area of a cell, its corners about (x0, y0), and that area's first moments."""
+    """Dark area of a cell, its corners relative to (x0, y0), and the first moments of that area."""
     area, mx, my = 0.0, 0.0, 0.0
     left, right = cell[:, 0].min() + x0, cell[:, 0].max() + x0
     top, bottom = cell[:, 1].min() + y0, cell[:, 1].max() + y0
@@ -245,7 +252,7 @@ def _print_at_point(
     centres: FloatArray,
     radius: float,
 ) -> tuple[bool, bool]:
-    """Whether the print is dark at a point, and whether it is the same everywhere within `reach` of it."""
+    """Return if the print is dark at a point, and if it is uniform within `reach` of it."""
     if len(centres) > 0:
         _best, distance = _nearest_disc(x, y, centres)
         return distance < radius, abs(distance - radius) > reach
@@ -294,7 +301,7 @@ def _fill_reflectance(
         s = _arc_length(x, curvature)
         d0, d1, d2 = p[0] - eye[0], p[1] - eye[1], p[2] - eye[2]
         distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-        # Distance to the sheet's plane; over the distance along the ray, the cosine at which it is met.
+        # Distance to the sheet's plane; divided by the distance along the ray it is the cosine of incidence.
         height = -(n[0] * d0 + n[1] * d1 + n[2] * d2)
         reach = _REACH * footprint * distance / narrow * distance / max(height, 1e-9)
         inked, same = _print_at_point(s, y, reach, across, down, dark, centres, radius)
@@ -302,7 +309,7 @@ def _fill_reflectance(
             if inked:
                 out[k] = dark_share
             continue
-        # The cell's four corners on the plane that touches the sheet here, along the sheet and about this point.
+        # The cell's four corners on the tangent plane of the sheet, in sheet coordinates relative to this point.
         cu = (np.floor((u[k] + 0.5) / footprint) + 0.5) * footprint - 0.5
         cv = (np.floor((v[k] + 0.5) / footprint) + 0.5) * footprint - 0.5
         for corner in range(4):
@@ -318,7 +325,7 @@ def _fill_reflectance(
             cell[corner, 0], cell[corner, 1] = _arc_length(qx, curvature) - s, qy - y
         area, mx, my = _moments(cell, 4)
         if len(centres) > 0:
-            # So near its rim a disc of many cells is a half-plane.
+            # Near its rim a large disc is approximated by a half-plane.
             best, off = _nearest_disc(s, y, centres)
             a, b = (s - centres[best, 0]) / off, (y - centres[best, 1]) / off
             count = _clip_polygon(cell, 4, a, b, radius - off, first)
@@ -327,7 +334,7 @@ def _fill_reflectance(
             inked_area, ix, iy = _dark_in_rectangles(cell, s, y, across, down, dark, first, second)
         lost = (1.0 - dark_share) * inked_area / area
         out[k] = 1.0 - lost
-        # From the cell's middle to the middle of what it sends back, in the sheet's plane.
+        # From the cell's centre to the centroid of its reflected light, in the sheet's plane.
         move_x = (mx - (1.0 - dark_share) * ix) / (area * out[k]) - mx / area
         move_y = (my - (1.0 - dark_share) * iy) / (area * out[k]) - my / area
         rise, slope = 0.0, 0.0
@@ -340,8 +347,8 @@ def _fill_reflectance(
 
 @kernel_part
 def _hash01(x: int, y: int, z: int) -> float:
-    """A number in 0..1 that looks random, the same for the same lattice point."""
-    # 64-bit arithmetic cut to 32 bits after each product: the same under numba and in plain Python.
+    """Pseudo-random number in 0..1 of a lattice point, always the same for the same point."""
+    # Masked to 32 bits after each product: the same result under numba and in plain Python.
     h = ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
@@ -374,13 +381,12 @@ def texture_value(kind: int, x: float, y: float, z: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """What n rays from one camera met.
+    """Surface points hit by n rays of one camera.
 
-    points_mm : (n, 3) float64, world, NaN where nothing was met; seen, lit : (n,) bool, lit by the projector's image.
-    column_px, row_px : (n,) float64, where the projector's lens images the point (perhaps beside its image), NaN in
-    shadow.
+    points_mm : (n, 3) float64, world, NaN for a miss; is_hit, is_lit : (n,) bool, is_lit by the projector's image.
+    column_px, row_px : (n,) float64, projector image position of the point (may be outside the image), NaN in shadow.
     weight : (n,) float32, light sent to the camera per unit of projector light; albedo : (n,) float32.
-    hue : (n, 3) float32, what a part of blue, green and red light makes of both, over what all light does.
+    hue : (n, 3) float32, factor on both for blue, green and red light relative to white light.
     """
 
     points_mm: FloatArray
@@ -395,11 +401,11 @@ class Hits:
 
 @dataclass(frozen=True, slots=True)
 class LightPaths:
-    """Every sub-pixel sample of one camera, S per pixel.
+    """Light paths of every sub-pixel sample of one camera, S per pixel.
 
     column_px, row_px, weight : (H, W, S) float32, weight 0 where the sample is not lit.
-    albedo : (H, W) float32, mean over the pixel's samples, 0 where they meet nothing.
-    hue : (H, W, S, 3) float32 as of `Hits`; None where nothing is coloured.
+    albedo : (H, W) float32, mean over the pixel's samples, 0 for misses.
+    hue : (H, W, S, 3) float32 as in `Hits`; None if nothing is coloured.
     """
 
     column_px: NDArray[np.float32]
@@ -409,11 +415,11 @@ class LightPaths:
     hue: NDArray[np.float32] | None = None
 
     def for_channel(self, channel: int) -> LightPaths:
-        """The paths of blue, green or red light alone: 0, 1, 2."""
+        """Return the paths of blue, green or red light alone: 0, 1, 2."""
         if self.hue is None:
             return self
         hue = self.hue[..., channel]
-        # Samples of one pixel have nearly one albedo, and only the room's light takes the mean of both.
+        # An approximation: samples of one pixel have nearly the same albedo, and only ambient light uses the mean.
         return replace(self, weight=self.weight * hue, albedo=self.albedo * hue.mean(axis=2), hue=None)
 
 
@@ -428,12 +434,11 @@ def trace_rays(
     working_distance_mm: float,
     footprint_px: float = 0.0,
 ) -> Hits:
-    """Follow the camera's rays through pixel positions u, v ((n,) float64) to the surface and on to the projector.
+    """Trace the camera's rays through pixel positions u, v ((n,) float64) to the surface and on to the projector.
 
-    The weight is the Lambert and Phong light times (working distance / distance to the projector)², so that a white
-    diffuser at the working distance that faces the projector has weight 1. footprint_px : side of the square of the
-    image that each ray stands for: prints are averaged over it, and their points lie in the middle of what it sends
-    back. 0 takes them at the point.
+    The weight is the Lambert and Phong light times (working distance / distance to the projector)²: 1 for a white
+    diffuser at the working distance that faces the projector. footprint_px : side of the square of the image that each
+    ray stands for, over which prints are averaged; 0 evaluates prints at the point.
     """
     eye, lamp = camera.centre_mm, projector.centre_mm
     directions = world_directions(u, v, lens_array(camera), camera.rotation)
@@ -449,11 +454,11 @@ def trace_rays(
         surface.sphere_mm,
     )
     pigments = print_reflectance(points, normals, triangle, u, v, camera, surface, footprint_px=footprint_px)
-    seen = np.isfinite(points[:, 0])
+    is_hit = np.isfinite(points[:, 0])
     to_point = points - lamp
     distance = np.linalg.norm(to_point, axis=1)
-    # Rays that met nothing are cast along x, and ignored.
-    towards = np.where(seen[:, None], to_point / np.where(distance > 0, distance, 1.0)[:, None], (1.0, 0.0, 0.0))
+    # Rays that missed are cast along x, and ignored.
+    towards = np.where(is_hit[:, None], to_point / np.where(distance > 0, distance, 1.0)[:, None], (1.0, 0.0, 0.0))
     blocker = rays.first_hit(lamp, towards)
     column, row = np.full(len(u), np.nan), np.full(len(u), np.nan)
     weight, albedo = np.zeros(len(u), np.float32), np.zeros(len(u), np.float32)
@@ -487,7 +492,7 @@ def trace_rays(
     )
     width, height = projector.size.width_px, projector.size.height_px
     inside = (column >= -0.5) & (column <= width - 0.5) & (row >= -0.5) & (row <= height - 0.5)
-    return Hits(points, seen, inside & (weight > 0), column, row, weight, albedo, hue)
+    return Hits(points, is_hit, inside & (weight > 0), column, row, weight, albedo, hue)
 
 
 def trace_paths(
@@ -503,7 +508,7 @@ def trace_paths(
     workers: int,
     report_progress: Callable[[float], None] = lambda _: None,
 ) -> LightPaths:
-    """Trace samples_per_axis² samples per pixel: at the middles of equal cells, or, jittered, anywhere in each cell.
+    """Trace samples_per_axis² samples per pixel, at the centres of equal cells or, jittered, anywhere in each cell.
 
     `report_progress` receives the fraction done after each block.
     """
@@ -544,14 +549,14 @@ def trace_paths(
 
     starts = range(0, rows, block_rows)
     with ThreadPoolExecutor(workers, thread_name_prefix="trace") as pool:
-        # Each block writes rows of its own; going over them makes a failure in any of them surface here.
+        # Each block writes its own rows; iterating over the results raises the error of a failed block here.
         for done, _ in enumerate(pool.map(fill, starts), start=1):
             report_progress(done / len(starts))
     return out
 
 
 def pixel_centres(camera: Pinhole) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
-    """Yield blocks of whole rows: (rows, u, v) with the centres of their pixels, row by row."""
+    """Yield blocks of whole rows: (rows, u, v) with the pixel centres, row by row."""
     rows, columns = camera.size.shape
     block_rows = max(_BLOCK_RAYS // columns, 1)
     for first in range(0, rows, block_rows):
@@ -564,7 +569,7 @@ def _sample_positions(
     first: int, last: int, columns: int, per_axis: int, jitter: np.random.Generator | None
 ) -> tuple[FloatArray, FloatArray]:
     shape = (last - first, columns, per_axis, per_axis)
-    row, column, below, beside = np.meshgrid(
+    row, column, cell_row, cell_column = np.meshgrid(
         np.arange(first, last, dtype=np.float64),
         np.arange(columns, dtype=np.float64),
         np.arange(per_axis, dtype=np.float64),
@@ -573,8 +578,8 @@ def _sample_positions(
     )
     across: FloatArray | float = 0.5 if jitter is None else jitter.random(shape)
     down: FloatArray | float = 0.5 if jitter is None else jitter.random(shape)
-    u = column + (beside + across) / per_axis - 0.5
-    v = row + (below + down) / per_axis - 0.5
+    u = column + (cell_column + across) / per_axis - 0.5
+    v = row + (cell_row + down) / per_axis - 0.5
     return u.ravel(), v.ravel()
 
 
@@ -582,7 +587,7 @@ def _sample_positions(
 def _plane_distance(
     origin: FloatArray, direction: FloatArray, face: IntArray, vertices: FloatArray
 ) -> tuple[float, float, float, float]:
-    """Distance along a ray to a triangle's plane, and the plane's normal (not unit). NaN when they are parallel."""
+    """Distance along a ray to a triangle's plane, and the plane's normal (not unit). NaN if they are parallel."""
     a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
     e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     f0, f1, f2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
@@ -605,9 +610,9 @@ def _hit_points(
     part: IntArray,
     spheres: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """(points, normals), both (n, 3) float64, NaN where nothing was met; normals are unit and face the origin.
+    """Return (points, normals), both (n, 3) float64, NaN for misses; normals are unit and face the origin.
 
-    The point is where the ray meets the triangle's plane, or the exact ball that the triangle stands for.
+    The point is the intersection with the triangle's plane, or with the exact ball that the triangle approximates.
     """
     count = len(triangle)
     points, normals = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
@@ -688,7 +693,7 @@ def _light_points(
     albedo: NDArray[np.float32],
     hue: NDArray[np.float32],
 ) -> None:
-    """Fill column, row, weight, albedo and hue (see `Hits`) for points met by camera rays `view`."""
+    """Fill column, row, weight, albedo and hue (see `Hits`) for points hit by camera rays `view`."""
     for i in range(len(triangle)):
         if not np.isfinite(points[i, 0]):
             continue
@@ -703,7 +708,7 @@ def _light_points(
             z = (f[2, 0] * p[0] + f[2, 1] * p[1] + f[2, 2] * p[2] + f[2, 3]) / grain
             darkness = texture_value(int(m[1]), x, y, z)
         light_tint, dark_tint = colours[owner, 0], colours[owner, 1]
-        # Written so that white makes exactly 1.
+        # Written so that white gives exactly 1.
         luma = 1.0
         for channel in range(3):
             hue[i, channel] = light_tint[channel] + darkness * (dark_tint[channel] - light_tint[channel])

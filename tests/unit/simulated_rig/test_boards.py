@@ -133,11 +133,11 @@ def test_corners_in_the_world_turn_about_the_middle() -> None:
     ("kind", "options", "words"),
     [
         ("charuco", {"marker_mm": 9.0}, "below square_mm"),
-        ("charuco", {"dictionary": "DICT_9X9"}, "no dictionary"),
+        ("charuco", {"dictionary": "DICT_9X9"}, "unknown dictionary"),
         ("charuco", {"dictionary": "DICT_5X5_50", "columns": 12, "rows": 9}, "needs 65 markers"),
-        ("chessboard", {"marker_mm": 5.0}, "belongs to a ChArUco"),
+        ("chessboard", {"marker_mm": 5.0}, "applies to ChArUco"),
         ("chessboard", {"albedo_dark": 0.9}, "below albedo_light"),
-        ("chessboard", {"bow_mm": 30.0}, "bow_mm must lie within"),
+        ("chessboard", {"bow_mm": 30.0}, "bow_mm must be at most"),
         ("chessboard", {"albedo": 0.5}, "albedo"),
     ],
 )

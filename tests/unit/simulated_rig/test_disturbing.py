@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from simulated_rig.device import SimulatedHead
 from simulated_rig.light import Float32Array
-from simulated_rig.movements import PoseOffset, PoseDrift, apply_pose_offset
+from simulated_rig.movements import PoseDrift, PoseOffset, apply_pose_offset
 from slrig.devices import Trigger
 from slrig.errors import ConfigError
 from tests.rendered_boards import board_head, board_options
@@ -101,7 +101,7 @@ def test_drift_settles() -> None:
     counted = PoseDrift(device="left", settle_captures=2.0)
     np.testing.assert_allclose([counted.progress(99.0, n) for n in (0, 2)], [0.0, 1 - np.exp(-1)])
     for table in ({}, {"settle_s": 1.0, "settle_captures": 1.0}):
-        with pytest.raises(ValueError, match="not both"):
+        with pytest.raises(ValueError, match="either settle_s"):
             PoseDrift.model_validate({"device": "left", **table})
 
 
@@ -132,7 +132,7 @@ def test_a_device_drifts_with_the_time_of_the_world(tmp_path: Path) -> None:
         eye.read(0, 10.0)
     assert head.clock.now_ns() - begun == 10 * 10**9
     head.projector.load(sequence)
-    now, stated = head._stage.projector, head.exact_calibration.projector
+    now, stated = head._scene_state.projector, head.exact_calibration.projector
     assert stated is not None
     np.testing.assert_allclose(now.translation_mm - stated.translation_mm, [0.0, 1 - np.exp(-1), 0.0], atol=1e-9)
 
@@ -173,8 +173,8 @@ def test_an_object_moves_without_a_script_too(tmp_path: Path) -> None:
     [
         ({"faults": {"bump": [BUMP | {"device": "third"}]}}, "third.*the rig has.*left.*projector"),
         ({"drift": [{"device": "third", "settle_s": 1.0}]}, "third"),
-        ({"faults": {"bump": [BUMP | {"device": "left", "pose": 9}]}}, "there is no pose 9, the script has 3"),
-        ({"faults": {"moving": [{"pose": 3}]}}, "there is no pose 3"),
+        ({"faults": {"bump": [BUMP | {"device": "left", "pose": 9}]}}, "pose 9 does not exist; the script has 3"),
+        ({"faults": {"moving": [{"pose": 3}]}}, "pose 3 does not exist"),
         ({"faults": {"moving": [{"steps": 1}]}}, "steps"),
     ],
 )
@@ -185,8 +185,8 @@ def test_faults_of_what_is_not_there_are_refused(tmp_path: Path, options: dict[s
 
 def test_nothing_is_disturbed_by_default(tmp_path: Path) -> None:
     head = small_head(tmp_path)
-    stage, eye = head._stage.snapshot, head._views["eye"].camera
+    stage, eye = head._scene_state.snapshot, head._views["eye"].camera
     frames(head)
-    assert head._stage.snapshot is stage
+    assert head._scene_state.snapshot is stage
     assert head._views["eye"].camera is eye
     assert head_options().keys().isdisjoint({"drift", "pose", "poses", "faults"})

@@ -191,7 +191,7 @@ def test_triangles_run_counter_clockwise_seen_from_the_devices(tmp_path: Path, s
     normal = np.cross(b - a, c - a)
     assert (np.linalg.norm(normal, axis=1) > 0).all()
     view = head._views["eye"]
-    hit = view._stage.rays.first_hit(np.array([0.0, 0, -500]), _directions_to(a + (b - a + c - a) / 3))
+    hit = view._scene.rays.first_hit(np.array([0.0, 0, -500]), _directions_to(a + (b - a + c - a) / 3))
     first = hit == np.arange(len(hit))
     assert first.sum() >= 2
     assert (normal[first] @ np.array([0.0, 0, 1]) < 1e-9).mean() > 0.97

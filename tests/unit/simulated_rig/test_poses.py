@@ -99,7 +99,7 @@ def test_a_board_that_does_not_fit_is_refused() -> None:
 
 @pytest.mark.parametrize("table", [{"tilt_deg": [30.0, 10.0]}, {"tilt_deg": [10.0, 80.0]}, {"depth_mm": [5.0, 4.0]}])
 def test_a_series_with_crossed_bounds_is_refused(tmp_path: Path, table: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match="least <= most"):
+    with pytest.raises(ConfigError, match="minimum <= maximum"):
         head_of(tmp_path, poses=table)
 
 
@@ -175,8 +175,8 @@ def test_the_positioner_refuses_what_it_cannot_do(tmp_path: Path) -> None:
     ("scene", "options", "words"),
     [
         (FACING_PLATE, {}, "the scene has none"),
-        (FACING_PLATE, {"poses": None, "pose": [ONE]}, "pose 1: expected `object`"),
-        (None, {"pose": [ONE, TWO | {"object": "tablet"}]}, "pose 2: there is no object 'tablet'.*board.*wall"),
+        (FACING_PLATE, {"poses": None, "pose": [ONE]}, "pose 1: .object. is missing"),
+        (None, {"pose": [ONE, TWO | {"object": "tablet"}]}, "pose 2: unknown object 'tablet'.*board.*wall"),
         (None, {"pose": [{"rotation_deg": [0.0, 0.0, 0.0]}]}, "position_mm"),
         (board_scene("chessboard", more="glitter = true"), {}, "glitter"),
     ],

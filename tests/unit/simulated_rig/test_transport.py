@@ -20,7 +20,7 @@ EYE = np.array([-60.0, 0, -500])
 
 def traced(folder: Path, scene: str, u: FloatArray, v: FloatArray) -> Hits:
     view = small_head(folder, scene)._views["eye"]
-    stage = view._stage
+    stage = view._scene
     return transport.trace_rays(
         u, v, view._camera, stage.projector, stage.surface, stage.rays, working_distance_mm=stage.working_distance_mm
     )
@@ -98,9 +98,9 @@ def test_hit_kernel_equals_plain_python(tmp_path: Path) -> None:
         "bump = [{ centre_mm = [0.0, 0.0], height_mm = 9.0, sigma_mm = 30.0 }]\n"
     )
     view = small_head(tmp_path, scene)._views["eye"]
-    surface = view._stage.surface
+    surface = view._scene.surface
     rays = world_directions(U, V, lens_array(view._camera), view._camera.rotation)
-    triangle = view._stage.rays.first_hit(EYE, rays)
+    triangle = view._scene.rays.first_hit(EYE, rays)
     triangle[0] = -1
     arguments = (
         EYE,
