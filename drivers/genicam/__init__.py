@@ -1,10 +1,10 @@
 """Cameras that speak GenICam, through one of two libraries.
 
-`genicam`: GigE Vision and USB3 Vision through Aravis; extra `genicam`. Tried on a GigE Vision camera over loopback;
-USB3 Vision goes the same way through Aravis, and was not tried.
+`genicam`: GigE Vision and USB3 Vision through Aravis; extra `genicam`. Tested with a GigE Vision camera over loopback;
+USB3 Vision takes the same path through Aravis and is untested.
 
-`gentl`: what a vendor's GenTL producer serves (GigE Vision, USB3 Vision, CoaXPress, Camera Link and others) through
-harvesters; extra `gentl`. Tried on a producer of our own.
+`gentl`: cameras behind a vendor's GenTL producer (GigE Vision, USB3 Vision, CoaXPress, Camera Link and others) through
+harvesters; extra `gentl`. Tested with our own producer.
 """
 
 from drivers.genicam.aravis import find_devices

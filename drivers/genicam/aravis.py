@@ -1,4 +1,8 @@
-"""A GigE Vision or USB3 Vision camera through Aravis: how it is got, how its frames come, and how it is let go."""
+"""GigE Vision and USB3 Vision cameras through Aravis: loading the library, connection, stream and device list.
+
+Aravis (LGPL) comes from the system's packages and is reached through GObject introspection: PyGObject and the
+`Aravis-0.8` typelib. Neither has wheels, so the error message names the packages to install.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,7 @@ _BUILDS = "libcairo2-dev gcc pkg-config python3-dev"
 
 
 PROTOCOLS = ("GigEVision", "USB3Vision")
-"""What this driver opens of the things that Aravis lists."""
+"""Protocols of the devices that this driver opens; Aravis lists others as well."""
 _LATCH = 0x0944
 _LATCH_BIT = 2
 _LATCHED_HIGH, _LATCHED_LOW = 0x0948, 0x094C
@@ -33,7 +37,7 @@ _CLOCK_TIGHT_NS = 20_000
 
 @dataclass(frozen=True, slots=True)
 class AravisLibrary:
-    """The loaded library: the `Aravis` namespace, and the class of the errors that come out of it."""
+    """The loaded library: the `Aravis` namespace, and the class of its errors."""
 
     aravis: Any
     error: type[Exception]
@@ -50,7 +54,7 @@ def load_aravis() -> AravisLibrary:
     """
     try:
         gi = importlib.import_module("gi")
-        # PyGObject says ValueError where the system has no typelib of that name.
+        # PyGObject raises ValueError if the system has no typelib of that name.
         gi.require_version("Aravis", "0.8")
         aravis = importlib.import_module("gi.repository.Aravis")
         error = importlib.import_module("gi.repository.GLib").Error
@@ -66,15 +70,15 @@ def load_aravis() -> AravisLibrary:
 
 
 def install_command(python: tuple[int, int] = sys.version_info[:2], system: str = sys.platform) -> str:
-    """Return the command that installs what is missing, for a version of Python and a system as `sys.platform` has it.
+    """Return the command that installs the missing libraries, for a version of Python and a system as in
+    `sys.platform`.
 
-    PyGObject from 3.51 on builds against girepository 2.0, which came after the systems with Python 3.11 and 3.12;
-    the extra asks for an older PyGObject there.
+    PyGObject from 3.51 on builds against girepository 2.0, which is newer than the systems with Python 3.11 and 3.12;
+    the extra requires an older PyGObject there.
 
     >>> "libgirepository1.0-dev" in install_command((3, 11)), "libgirepository-2.0-dev" in install_command((3, 13))
-    (True, True)
-    >>> install_command(system="win32")
-    "pip install 'slrig[genicam]' (Aravis with its introspection data first)"
+    (True, True) >>> install_command(system="win32") "pip install 'slrig[genicam]' (Aravis with its introspection data
+    first)"
     """
     if system != "linux":
         return "pip install 'slrig[genicam]' (Aravis with its introspection data first)"
@@ -84,12 +88,12 @@ def install_command(python: tuple[int, int] = sys.version_info[:2], system: str 
 
 @contextmanager
 def translate_aravis_errors(name: str, doing: str) -> Iterator[None]:
-    """Turn Aravis' errors within the block into ours, with the camera's name and what was being done.
+    """Translate Aravis errors within the block into slrig's; the message names the camera and the action.
 
     Raises
     ------
     DeviceGoneError
-        The device does not answer (Aravis asked it several times), or is not connected.
+        The device does not answer (after several attempts by Aravis), or is not connected.
     DeviceBusyError
         Another program controls it.
     UnsupportedByDeviceError
@@ -121,12 +125,12 @@ def _slrig_error(aravis: Any, name: str, doing: str, cause: Any) -> DeviceError:
 
 
 class AravisConnection(GenICamConnection):
-    """An open device. Aravis' own thread tells when control is lost.
+    """An open device. Aravis signals the loss of control on its own thread.
 
     Parameters
     ----------
     name
-        The camera's, for messages.
+        Name of the camera, for messages.
     options
         `GenicamOptions`.
 
@@ -148,7 +152,7 @@ class AravisConnection(GenICamConnection):
         self._device = self._camera.get_device()
         self._is_gige = bool(self._camera.is_gv_device())
         self._device.set_register_cache_policy(aravis.RegisterCachePolicy.DISABLE)
-        # Not a method of ours: the device would keep us, and we it.
+        # Not a bound method: that would create a reference cycle with the device.
         lost = self._lost
         self._handler = self._device.connect("control-lost", lambda *_: lost.set())
         try:
@@ -174,7 +178,7 @@ class AravisConnection(GenICamConnection):
         return type(node).__name__.removeprefix("Gc").removesuffix("Node")
 
     def start(self, buffers: int) -> GenICamStream:
-        """See `GenICamConnection`. A new `Aravis.GenICamStream`: no buffer of an earlier one can come out of it."""
+        """See `GenICamConnection`. Uses a new `Aravis.Stream`, which returns no buffer of an earlier one."""
         aravis = load_aravis().aravis
         with self.access("opening a stream") as camera:
             stream = camera.create_stream(None, None)
@@ -193,7 +197,7 @@ class AravisConnection(GenICamConnection):
         return AravisStream(self, stream)
 
     def latch(self) -> tuple[int, int, int] | None:
-        """See `GenICamConnection`. GigE Vision has it in registers that every device shares, USB3 Vision in features."""
+        """See `GenICamConnection`. GigE Vision has standard registers for it, USB3 Vision features."""
         if not self._is_gige:
             return super().latch()
         try:
@@ -207,27 +211,27 @@ class AravisConnection(GenICamConnection):
         return not self._is_gige or self._device.get_timestamp_tick_frequency() > 0
 
     def close(self) -> None:
-        """Let the device go. Idempotent; works after it is lost."""
+        """Close the device. Idempotent; works after it is lost."""
         if not self.state.close():
             return
         with suppress(Exception):
             self._device.disconnect(self._handler)
-        held, self._device, self._camera = [self._camera, self._device], None, None
-        self.release(held)
+        references, self._device, self._camera = [self._camera, self._device], None, None
+        self.release(references)
 
-    def release(self, held: list[Any]) -> None:
-        """Drop Aravis' objects, the only references to which are in the list."""
+    def release(self, references: list[Any]) -> None:
+        """Drop Aravis objects; the list has the only references to them."""
         if self._lost.is_set():
-            # Each of them says goodbye to the device first, and waits 5 s for an answer that will not come.
-            threading.Thread(target=held.clear, name=f"goodbye to {self.name}", daemon=True).start()
+            # Their destructors contact the lost device and wait 5 s for an answer.
+            threading.Thread(target=references.clear, name=f"releasing {self.name}", daemon=True).start()
         else:
-            held.clear()
+            references.clear()
 
     def _latch_gige(self) -> tuple[int, int, int] | None:
         frequency_hz = self._device.get_timestamp_tick_frequency()
         if not frequency_hz:
             return None
-        with self.access("looking at its clock"):
+        with self.access("reading its clock"):
             before_ns = time.monotonic_ns()
             self._device.write_register(_LATCH, _LATCH_BIT)
             after_ns = time.monotonic_ns()
@@ -257,14 +261,14 @@ class AravisConnection(GenICamConnection):
             got = camera.gv_get_packet_size()
         if got != options.packet_size_bytes:
             message = (
-                f"camera '{self.name}': asked for packet_size_bytes {options.packet_size_bytes}, it gives {got}; write "
-                "that, or leave it out"
+                f"camera '{self.name}': requested packet_size_bytes {options.packet_size_bytes}, it uses {got}; "
+                "write that, or leave it out"
             )
             raise DeviceError(message)
 
 
 class AravisStream:
-    """Implements `GenICamStream` on an `Aravis.GenICamStream` that runs."""
+    """Implements `GenICamStream` on a running `Aravis.Stream`."""
 
     def __init__(self, connection: AravisConnection, stream: Any) -> None:
         self._connection = connection
@@ -292,11 +296,11 @@ class AravisStream:
         """See `GenICamStream`."""
         connection = self._connection
         if not connection.is_lost:
-            # A camera that is lost only now is told of by the next call that needs it.
+            # If the camera is lost only now, the next call that needs it reports that.
             with suppress(DeviceError), connection.access("stopping") as camera:
                 camera.stop_acquisition()
-        held, self._stream = [self._stream], None
-        connection.release(held)
+        references, self._stream = [self._stream], None
+        connection.release(references)
 
 
 def _open_device(aravis: Any, name: str, device: str) -> Any:
@@ -313,7 +317,7 @@ def _open_device(aravis: Any, name: str, device: str) -> Any:
 
 
 def list_aravis_cameras() -> tuple[tuple[str, str], ...]:
-    """Id and label of every camera that answers. Opens nothing; takes Aravis about one second."""
+    """Return id and label of every camera that answers, without opening any. Aravis takes about one second."""
     aravis = load_aravis().aravis
     aravis.update_device_list()
     found = []
@@ -332,20 +336,20 @@ def list_aravis_cameras() -> tuple[tuple[str, str], ...]:
 
 
 def _arrival_ns(buffer: Any) -> int:
-    """When the frame's first packet arrived, CLOCK_MONOTONIC: Aravis notes it on the wall clock."""
+    """Arrival of the frame's first packet, CLOCK_MONOTONIC, from the wall-clock time that Aravis records."""
     now_ns, wall_ns = _read_clocks()
     ago_ns = wall_ns - int(buffer.get_system_timestamp())
-    # A wall clock that was set meanwhile tells nothing; the frame has arrived by now in any case.
+    # If the wall clock was set meanwhile, now is the only safe bound.
     return now_ns - ago_ns if 0 <= ago_ns < _OLDEST_NS else now_ns
 
 
 def _read_clocks() -> tuple[int, int]:
-    """CLOCK_MONOTONIC and the wall clock at one instant, as near as a few tries bring them."""
+    """Read CLOCK_MONOTONIC and the wall clock at nearly the same instant, the best of a few tries."""
     best_ns, found = _OLDEST_NS, (0, 0)
     for _ in range(_CLOCK_TRIES):
         before_ns, wall_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         if after_ns - before_ns < best_ns:
-            # The later of the two: a frame must not seem to have arrived before it did.
+            # The later reading: a frame must never be dated before its arrival.
             best_ns, found = after_ns - before_ns, (after_ns, wall_ns)
         if best_ns < _CLOCK_TIGHT_NS:
             break

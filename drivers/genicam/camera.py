@@ -1,14 +1,14 @@
-"""A GenICam camera: settings that are read back, and frames whose exposure is known to lie after an instant.
+"""A GenICam camera: settings that are read back, and frames whose exposure began after a given instant.
 
-What is known of an exposure's start, and from where, is in `drivers.genicam.timing`. `Frame.t_start_ns` is the middle
-of that interval and `t_err_ns` half of it; `read` returns a frame only if the whole interval lies after `after_ns`:
+`drivers.genicam.timing` bounds the start of each exposure. `Frame.t_start_ns` is the middle of that interval and
+`t_err_ns` half of it; `read` returns a frame only if the whole interval is after `after_ns`:
 
-- software trigger: the exposure began after the call of `trigger` did, so a pattern that was shown before is whole;
-- free-running: as the camera's clock says, tied to the host's by latching it; a camera without a latch is trusted to
-  send a frame within the option `transfer_s` after its exposure;
+- software trigger: the exposure began after the call of `trigger`, so a pattern shown before is complete;
+- free-running: by the camera's clock, related to the host's by latching it; a camera without a latch is assumed to send
+  a frame within the option `transfer_s` after its exposure;
 - hardware trigger: the same, and a frame that follows a delivered one began after that one's reported end.
 
-With a rolling shutter these are the times of the first row; the others follow it.
+With a rolling shutter these are the times of the first row.
 """
 
 from __future__ import annotations
@@ -38,19 +38,21 @@ _TIE_AGAIN_NS = 5_000_000_000
 
 _SELECTOR = "TriggerSelector"
 _START_SELECTORS = ("FrameStart", "ExposureStart")
-"""What starts one frame; IDS' cameras (uEye+) have the latter only. For one exposure per frame they are the same."""
+"""Selectors that start one frame; IDS cameras (uEye+) have the latter only. For one exposure per frame they are
+equivalent."""
 _AUTOMATIC = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto", "GammaAuto")
 _RESEND_AFTER_NS = 400_000_000
 _DRAIN_MARGIN_S = 0.2
 _MAX_BUFFER_BYTES = 1 << 30
 _MIN_BUFFERS = 8
 _FRAME_RATE_FEATURES = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
-"""What tells the fastest rate that exposure, read-out and link allow: SFNC has no name for it, makers have theirs."""
+"""Features that give the fastest rate that exposure, read-out and link allow: SFNC has no name for it, makers have
+their own."""
 
 
 @dataclass(frozen=True, slots=True)
 class _TimedFrame:
-    """A sound frame, in colour too where there is any, and when its exposure began."""
+    """A complete frame, also in colour if available, and the bounds of the start of its exposure."""
 
     image: Pixels
     colour: Callable[[], Pixels] | None
@@ -59,14 +61,14 @@ class _TimedFrame:
 
 
 class Acquisition:
-    """An armed camera. One thread uses it.
+    """Acquisition of an armed camera: its stream, and its frames in order. Used by one thread.
 
     Parameters
     ----------
     connection
         The open device, set up.
     options, form, size
-        What was set.
+        Current settings.
     """
 
     def __init__(
@@ -81,13 +83,13 @@ class Acquisition:
         self._good = 0
         self._last_end_ns = 0
         self._waiting: deque[_TimedFrame] = deque()
-        self._skipped = dict.fromkeys(("stale", "corrupt", "repeated", "unasked"), 0)
+        self._skipped = dict.fromkeys(("stale", "corrupt", "repeated", "untriggered"), 0)
         self.trigger = Trigger.FREE
         self._applied = AppliedSettings(0.0, 0.0)
         self._exposure_ns = 0
 
     def begin(self, trigger: Trigger, applied: AppliedSettings, buffers: int) -> None:
-        """Open the stream, give it `buffers` buffers, tie the camera's clock, and start."""
+        """Open the stream with `buffers` buffers, relate the camera's clock to the host's, and start."""
         self.trigger = trigger
         self._applied = applied
         self._exposure_ns = round(applied.exposure_s * 1e9)
@@ -99,26 +101,26 @@ class Acquisition:
         self._stream = self._connection.start(buffers)
 
     def end(self) -> None:
-        """Stop, whatever state the camera is in."""
+        """Stop, in any state of the camera."""
         if self._stream is not None:
             stream, self._stream = self._stream, None
             stream.end()
 
     def note_trigger(self, begun_ns: int, ended_ns: int, *, times: int) -> None:
-        """Note a software trigger, and how often it may have been sent."""
+        """Note a software trigger, and how many times it may have been sent."""
         self._triggered.note_trigger(begun_ns, ended_ns, times=times)
 
     def is_answer_due(self) -> bool:
-        """Whether the answer to a software trigger may still come."""
+        """True if the answer to a software trigger may still arrive."""
         return self._triggered.answer_due_ns(time.monotonic_ns()) > 0
 
     def settle(self) -> None:
-        """Wait until no answer to a software trigger is due: a camera that exposes ignores the next trigger."""
+        """Wait until no answer to a software trigger is due: a camera ignores a trigger during an exposure."""
         while (left_ns := self._triggered.answer_due_ns(time.monotonic_ns())) > 0 and not self._connection.is_lost:
             self._take_frame(left_ns / 1e9)
 
     def drain(self, seconds: float) -> None:
-        """Pass over what comes without being asked for, for so long."""
+        """Discard frames that arrive without a trigger, for this time."""
         end_s = time.monotonic() + seconds
         while (left_s := end_s - time.monotonic()) > 0 and not self._connection.is_lost:
             self._take_frame(left_s)
@@ -133,7 +135,7 @@ class Acquisition:
         while True:
             while self._waiting:
                 frame = self._waiting.popleft()
-                # Wire-triggered frames are told apart by their order.
+                # Wire-triggered frames are identified by their order.
                 follows = self.trigger is Trigger.HARDWARE and after_ns <= self._last_end_ns
                 if frame.start.min_ns >= after_ns or follows:
                     return self._frame(frame)
@@ -147,7 +149,7 @@ class Acquisition:
                 raise self._timeout_error(after_ns, timeout_s)
 
     def _reset_counting(self) -> None:
-        """The next frame is number 0, and nothing has been asked for."""
+        """Restart counting: the next frame is number 0, and no trigger is pending."""
         answer_ns, transfer_ns = round(self._options.answer_s * 1e9), round(self._options.transfer_s * 1e9)
         self._triggered = TriggeredStarts(self._exposure_ns, answer_ns, self._clock)
         self._untriggered = UntriggeredStarts(self._exposure_ns, transfer_ns, self._clock)
@@ -156,7 +158,7 @@ class Acquisition:
         self._waiting.clear()
 
     def _take_frame(self, max_s: float) -> bool:
-        """Take one frame from the stream and judge it, waiting for it no longer than a slice; False: none came."""
+        """Take and process one frame from the stream, waiting at most a slice; return False if none arrived."""
         delivery = None if self._stream is None else self._stream.take(min(max_s, _SLICE_S))
         if delivery is not None:
             self._process(delivery)
@@ -164,8 +166,8 @@ class Acquisition:
 
     def _process(self, delivery: RawFrame) -> None:
         number = self._numbers.next(delivery.block_id)
-        pictures = self._decode(delivery)
-        if pictures is None:
+        images = self._decode(delivery)
+        if images is None:
             self._skipped["corrupt"] += 1
             return
         if number is None:
@@ -176,14 +178,14 @@ class Acquisition:
         arrival = Arrival(number, stamp_ns or None, delivery.arrived_ns)
         start = self._triggered.start(arrival) if self.trigger is Trigger.SOFTWARE else self._untriggered.start(arrival)
         if start is None:
-            self._skipped["unasked"] += 1
+            self._skipped["untriggered"] += 1
             return
-        self._waiting.append(_TimedFrame(*pictures, number, start))
+        self._waiting.append(_TimedFrame(*images, number, start))
 
     def _frame(self, frame: _TimedFrame) -> Frame:
         start = frame.start
         t_start_ns = (start.min_ns + start.max_ns) // 2
-        # What a camera began it ended before it began anew.
+        # Exposures of a camera do not overlap.
         t_start_ns = min(max(t_start_ns, self._last_end_ns), start.max_ns)
         self._last_end_ns = t_start_ns + self._exposure_ns
         return Frame(
@@ -200,62 +202,62 @@ class Acquisition:
         )
 
     def _decode(self, delivery: RawFrame) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
-        """The image, and what makes it in colour, or None if packets are missing or it is not what was set."""
+        """Return the image and a function that makes it in colour; None if packets are missing or the size is wrong."""
         image = delivery.image
         if image is None or image.size != self._size:
             return None
-        made = partial(decode_pixels, image.data, self._form, self._size, padding_bytes=image.padding_bytes)
+        decode = partial(decode_pixels, image.data, self._form, self._size, padding_bytes=image.padding_bytes)
         try:
-            return made(), partial(made, in_colour=True) if self._form.mosaic else None
+            return decode(), partial(decode, in_colour=True) if self._form.mosaic else None
         except ValueError:
             return None
 
     def _timeout_error(self, after_ns: int, timeout_s: float) -> FrameTimeoutError:
-        # A camera that is gone and has not been missed yet does not answer: that is another error.
-        with self._connection.access("asking whether it is there") as camera:
+        # If the camera is gone, this raises DeviceGoneError instead.
+        with self._connection.access("checking the connection") as camera:
             camera.get_exposure_time()
-        passed = ", ".join(f"{count} {kind}" for kind, count in self._skipped.items() if count) or "none"
+        skipped = ", ".join(f"{count} {kind}" for kind, count in self._skipped.items() if count) or "none"
         remedy = {
             Trigger.FREE: "check the frame rate and the network's load",
             Trigger.SOFTWARE: "trigger after the pattern is shown, and wait for the exposure",
             Trigger.HARDWARE: "check the trigger's cable, level and edge",
         }[self.trigger]
         message = (
-            f"camera '{self._connection.name}': no frame that began after {after_ns} ns came in {timeout_s} s "
-            f"({self.trigger} trigger; passed over: {passed}); {remedy}"
+            f"camera '{self._connection.name}': no frame that began after {after_ns} ns arrived in {timeout_s} s "
+            f"({self.trigger} trigger; skipped: {skipped}); {remedy}"
         )
         return FrameTimeoutError(message)
 
     def _lag_ns(self) -> Interval:
-        """By how much a time stamp is later than the start of its exposure."""
+        """Bounds of the delay of a time stamp after the start of its exposure."""
         min_ns = self._exposure_ns if self._options.time_stamp == "exposure_end" else 0
         return Interval(min_ns, 0 if self._options.time_stamp == "exposure_start" else self._exposure_ns)
 
-    def _tie_clock(self, looks: int) -> None:
-        """Latch the camera's clock, if it has one that can be."""
+    def _tie_clock(self, count: int) -> None:
+        """Latch the camera's clock, if it supports that."""
         self._tied_ns = time.monotonic_ns()
         if not self._stamped:
             return
-        latches = [latch for latch in (self._connection.latch() for _ in range(looks)) if latch is not None]
-        if len(latches) == looks:
+        latches = [latch for latch in (self._connection.latch() for _ in range(count)) if latch is not None]
+        if len(latches) == count:
             self._clock.latch(latches)
 
 
 def set_up_camera(connection: GenICamConnection, options: GenICamCameraOptions) -> Size:
-    """Stop what runs, switch off what is automatic, set format, region and features. Return the image's extent.
+    """Stop the camera, switch automatic functions off, set format, region and features. Return the image size.
 
     Raises
     ------
     UnsupportedByDeviceError
-        The camera does not take a value, or takes it otherwise.
+        The camera does not accept a value, or changes it.
     """
     features = connection.features
     with connection.access("stopping it") as camera:
-        # Another program may have left it running; settings are locked then.
+        # Another program may have left it running, with locked settings.
         camera.stop_acquisition()
     if options.pixel_format not in FORMATS:
         message = (
-            f"camera '{connection.name}': asked for pixel_format {options.pixel_format}, the driver reads "
+            f"camera '{connection.name}': requested pixel_format {options.pixel_format}, the driver reads "
             f"{', '.join(FORMATS)}; choose one that the camera offers: {', '.join(features.choices('PixelFormat'))}"
         )
         raise UnsupportedByDeviceError(message)
@@ -267,7 +269,7 @@ def set_up_camera(connection: GenICamConnection, options: GenICamCameraOptions) 
         features.choose("ExposureMode", "Timed")
     if features.has("AcquisitionMode"):
         features.choose("AcquisitionMode", "Continuous")
-    # Binning is among these, and bounds the region.
+    # These may include binning, which limits the region.
     for feature, value in options.features.items():
         features.set_any(feature, value)
     return _set_region(connection, options)
@@ -275,19 +277,19 @@ def set_up_camera(connection: GenICamConnection, options: GenICamCameraOptions) 
 
 def _set_region(connection: GenICamConnection, options: GenICamCameraOptions) -> Size:
     features = connection.features
-    # Extents are bounded by the offsets in use, so those go first, and come back last.
+    # The offsets limit the size: reset them first, set them last.
     for offset in ("OffsetX", "OffsetY"):
         if features.has(offset):
             features.set_integer(offset, 0)
-    with connection.access("asking for its extent") as camera:
+    with connection.access("reading its size") as camera:
         width_px, height_px = int(camera.get_width_bounds()[1]), int(camera.get_height_bounds()[1])
     region = options.region
     if region is None:
         region = SensorRegion(width_px=width_px, height_px=height_px)
     if region.x_px + region.width_px > width_px or region.y_px + region.height_px > height_px:
         message = (
-            f"camera '{connection.name}': asked for a region of {region.width_px} x {region.height_px} px at column "
-            f"{region.x_px}, row {region.y_px}; its image is {width_px} x {height_px} px; ask for what lies on it"
+            f"camera '{connection.name}': requested a region of {region.width_px} x {region.height_px} px at "
+            f"column {region.x_px}, row {region.y_px}; its image is {width_px} x {height_px} px; choose a part of it"
         )
         raise UnsupportedByDeviceError(message)
     features.set_integer("Width", region.width_px)
@@ -299,12 +301,12 @@ def _set_region(connection: GenICamConnection, options: GenICamCameraOptions) ->
 
 
 def choose_trigger_line(connection: GenICamConnection, options: GenICamCameraOptions) -> str | None:
-    """Return the input that a hardware trigger comes by; None if the camera has none.
+    """Return the input of the hardware trigger; None if the camera has none.
 
     Raises
     ------
     UnsupportedByDeviceError
-        The line that was asked for is not among the camera's.
+        The camera does not have the requested line.
     """
     features = connection.features
     if features.has(_SELECTOR):
@@ -318,7 +320,7 @@ def choose_trigger_line(connection: GenICamConnection, options: GenICamCameraOpt
         return lines[0] if lines else None
     if options.trigger_line not in lines:
         message = (
-            f"camera '{connection.name}': asked for trigger_line {options.trigger_line}, it offers "
+            f"camera '{connection.name}': requested trigger_line {options.trigger_line}, it offers "
             f"{', '.join(lines) or 'none'}; choose one of these, or leave it out"
         )
         raise UnsupportedByDeviceError(message)
@@ -326,12 +328,12 @@ def choose_trigger_line(connection: GenICamConnection, options: GenICamCameraOpt
 
 
 def set_trigger(connection: GenICamConnection, source: str | None, options: GenICamCameraOptions) -> None:
-    """Let `source` start every exposure; None lets the camera run by itself.
+    """Let `source` start every exposure; None lets the camera run freely.
 
     Raises
     ------
     UnsupportedByDeviceError
-        The camera does not take it, or reads back otherwise.
+        The camera does not accept it, or another value is read back.
     """
     features = connection.features
     selectors = features.choices(_SELECTOR) if features.has(_SELECTOR) else ()
@@ -354,7 +356,7 @@ def set_trigger(connection: GenICamConnection, source: str | None, options: GenI
 
 
 def _start_selector(selectors: tuple[str, ...]) -> str:
-    """The selector of what starts a frame; the usual one, which is then refused, where there is none of them."""
+    """Return the selector that starts a frame; the standard one if none is available."""
     return next((each for each in _START_SELECTORS if each in selectors), _START_SELECTORS[0])
 
 
@@ -366,12 +368,12 @@ class GenicamCamera:
     connection
         The open device; this camera closes it.
     options
-        Checked already.
+        Validated options.
 
     Raises
     ------
     UnsupportedByDeviceError
-        The device does not take an option, or takes it otherwise.
+        The device does not accept an option, or changes it.
     """
 
     def __init__(self, connection: GenICamConnection, options: GenICamCameraOptions) -> None:
@@ -395,11 +397,11 @@ class GenicamCamera:
 
     @property
     def info(self) -> CameraInfo:
-        """See `Camera`. `gain` is in the camera's own unit, mostly dB."""
+        """See `Camera`. `gain` is in the camera's own unit, usually dB."""
         return self._info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. A value that the camera rounds by more than 1 % is refused, with what it would use."""
+        """See `Camera`. Refuses a value that the camera rounds by more than 1 %; the message has the rounded value."""
         self._require_connected()
         self._state.check_settings(settings, self._info)
         with self._connection.access("setting exposure and gain") as camera:
@@ -407,20 +409,20 @@ class GenicamCamera:
             if camera.is_gain_available():
                 camera.set_gain(settings.gain)
         self._applied = self._read_settings()
-        for what, asked, got in (
+        for what, requested, got in (
             ("exposure_s", settings.exposure_s, self._applied.exposure_s),
             ("gain", settings.gain, self._applied.gain),
         ):
-            if differs(got, asked):
+            if differs(got, requested):
                 message = (
-                    f"camera '{self._name}': asked for {what} {asked:g}, it gives {got:g}; ask for that, or for what "
-                    "its other settings allow (frame rate, pixel format)"
+                    f"camera '{self._name}': requested {what} {requested:g}, it gives {got:g}; request that, or a "
+                    "value that its other settings allow (frame rate, pixel format)"
                 )
                 raise UnsupportedByDeviceError(message)
         return self._applied
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`. Opens a stream of its own, so no frame of an earlier arming can come."""
+        """See `Camera`. Opens a new stream, so no frame of an earlier arming can arrive."""
         self._require_connected()
         self._state.check_arming(count, trigger, self._info)
         source = {Trigger.FREE: None, Trigger.SOFTWARE: "Software", Trigger.HARDWARE: self._line}[trigger]
@@ -431,12 +433,12 @@ class GenicamCamera:
         self._session = session
         self._state.armed = trigger
         if self._answer_pending and trigger is not Trigger.FREE:
-            # A camera may keep a trigger that came while it was stopped, and expose now.
+            # A camera may have stored a trigger while it was stopped, and expose now.
             session.drain(self._applied.exposure_s + _DRAIN_MARGIN_S)
             self._answer_pending = False
 
     def trigger(self) -> None:
-        """See `Camera`. While the frame of an earlier trigger is due, waits for that first."""
+        """See `Camera`. Waits first for the frame of an earlier trigger, if it is due."""
         self._require_connected()
         self._state.require_armed(Trigger.SOFTWARE)
         self._session.settle()
@@ -444,11 +446,11 @@ class GenicamCamera:
             begun_ns = time.monotonic_ns()
             camera.software_trigger()
             ended_ns = time.monotonic_ns()
-        # A command whose answer was lost is sent again: the camera may have frame twice.
+        # Aravis repeats a command whose answer was lost: the camera may have exposed twice.
         self._session.note_trigger(begun_ns, ended_ns, times=2 if ended_ns - begun_ns > _RESEND_AFTER_NS else 1)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`, and the head of this module. Exposure and gain are those read back when it was armed."""
+        """See `Camera` and the docstring of this module. Exposure and gain are those read back when it was armed."""
         self._require_connected()
         self._state.require_armed()
         return self._session.read(after_ns, timeout_s)
@@ -456,7 +458,7 @@ class GenicamCamera:
     def disarm(self) -> None:
         """See `Camera`."""
         if self._state.armed is not None:
-            # One that runs free is in the middle of an exposure, and may send it later than it is told to stop.
+            # A free-running camera may send the frame of its current exposure after it was stopped.
             self._answer_pending = (
                 self._answer_pending or self._state.armed is Trigger.FREE or self._session.is_answer_due()
             )
@@ -469,7 +471,7 @@ class GenicamCamera:
         self._connection.close()
 
     def _read_info(self) -> CameraInfo:
-        with self._connection.access("asking what it is") as camera:
+        with self._connection.access("reading its identity") as camera:
             model = f"{camera.get_vendor_name()} {camera.get_model_name()}"
             serial = str(camera.get_device_serial_number() or camera.get_device_id())
             least_us, most_us = camera.get_exposure_time_bounds()
@@ -499,15 +501,15 @@ class GenicamCamera:
         return AppliedSettings(exposure_s, gain, 1 / rate_hz if rate_hz > 0 else None)
 
     def _buffers(self, count: int) -> int:
-        """As many as frames are asked for, so that none is lost while nobody reads; fewer if memory forbids."""
-        with self._connection.access("asking for the size of a frame") as camera:
+        """Return the number of buffers: as many as requested frames, so that none is lost, limited by memory."""
+        with self._connection.access("reading the size of a frame") as camera:
             payload = int(camera.get_payload())
         return max(_MIN_BUFFERS, min(count + 2, _MAX_BUFFER_BYTES // max(payload, 1)))
 
     def _require_connected(self) -> None:
         self._state.require_open()
         if self._connection.is_lost:
-            raise self._connection.gone_error("noticed before")
+            raise self._connection.gone_error("noticed earlier")
 
 
 def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
@@ -516,7 +518,7 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     Parameters
     ----------
     name
-        As the rig file calls it.
+        Name in the rig file.
     options
         `GenicamOptions`.
     folder
@@ -533,7 +535,7 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     DeviceBusyError
         Another program controls it.
     UnsupportedByDeviceError
-        The camera does not take an option, or takes it otherwise.
+        The camera does not accept an option, or changes it.
     """
     del folder
     table = checked(GenicamOptions, options, f"the [[camera]] table of '{name}' (driver genicam)")
@@ -543,27 +545,8 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
 def open_gentl_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
     """Open a camera behind a GenTL producer from a rig file's `[[camera]]` table.
 
-    Parameters
-    ----------
-    name
-        As the rig file calls it.
-    options
-        `GentlOptions`.
-    folder
-        Where the path of a producer counts from.
-
-    Raises
-    ------
-    ConfigError
-        The options have faults, all of them in one message.
-    LibraryMissingError
-        harvesters is not installed, or there is no producer.
-    DeviceGoneError
-        No such camera answers.
-    DeviceBusyError
-        Another program controls it.
-    UnsupportedByDeviceError
-        The camera does not take an option, or takes it otherwise.
+    `options` are `GentlOptions`; the path of a producer is relative to `folder`. Raises the errors of `open_camera`;
+    LibraryMissingError also if no producer is found.
     """
     table = checked(GentlOptions, options, f"the [[camera]] table of '{name}' (driver gentl)")
     return GenicamCamera(GentlConnection(name, table, folder), table)

@@ -1,11 +1,15 @@
-"""A camera behind a GenTL producer, through harvesters: how it is got, how its frames come, and how it is let go.
+"""Cameras behind a GenTL producer, through harvesters: producers, node map, connection and stream.
 
-A GenTL producer does not tell when a frame arrived, so a thread takes each one as it comes. That thread looks once a
-millisecond and does not wait: harvesters' wheel keeps Python's lock while it waits for a frame, and nothing else would
-run meanwhile. Frames are read as they lie in memory; harvesters' own reading of them does not take off padding.
+A producer is the part of a vendor's driver that speaks GenTL: a .cti file from the maker of the camera or of its
+interface card. harvesters (Apache 2.0) and the `genicam` wheel beneath it (EMVA, three-clause BSD) include none for a
+real camera. A process can load a producer only once, so its cameras share it.
+
+A GenTL producer does not report when a frame arrived, so a thread takes each frame as it comes. The thread polls once a
+millisecond without waiting, because harvesters' wheel holds Python's lock while it waits. Frames are read from raw
+memory, since harvesters does not remove padding.
 """
 
-# ruff: noqa: D102 - NodeMapCamera has the calls of Aravis
+# ruff: noqa: D102 - the methods of NodeMapCamera are named as in Aravis
 from __future__ import annotations
 
 import importlib
@@ -41,12 +45,12 @@ GAIN = ("Gain", "GainAbs", "GainRaw")
 _KINDS = ("Boolean", "Enumeration", "String", "Integer", "Float", "Command", "Register", "Category")
 _LOOK_S = 0.001
 _ASK_S = 1e-5
-"""harvesters asks again and again for so long. With 0 it would never stop, and with much less it may not ask at all."""
+"""Polling time of harvesters. With 0 it would never return, and with much less it may not poll at all."""
 
 
 @lru_cache(maxsize=1)
 def load_harvesters() -> Any:
-    """The only module of harvesters.
+    """Return the module `harvesters.core`.
 
     Raises
     ------
@@ -62,12 +66,12 @@ def load_harvesters() -> Any:
 
 @contextmanager
 def translate_gentl_errors(name: str, doing: str) -> Iterator[None]:
-    """Turn the errors of producers and node maps within the block into ours.
+    """Translate errors of producers and node maps within the block into slrig's.
 
     Raises
     ------
     DeviceGoneError
-        The device does not answer any more.
+        The device no longer answers.
     DeviceBusyError
         Another program controls it.
     UnsupportedByDeviceError
@@ -94,13 +98,13 @@ def translate_gentl_errors(name: str, doing: str) -> Iterator[None]:
 
 
 def producer_files() -> tuple[Path, ...]:
-    """The producers that are installed: every .cti file in the folders that GENICAM_GENTL64_PATH names."""
+    """Return the installed producers: every .cti file in the folders that GENICAM_GENTL64_PATH names."""
     folders = [Path(folder) for folder in os.environ.get(PATHS, "").split(os.pathsep) if folder]
     return tuple(sorted({file.resolve() for folder in folders for file in folder.glob("*.cti")}))
 
 
 class GentlProducer:
-    """A producer in use. Get one by `use_producer`."""
+    """A loaded producer. Get one by `use_producer`."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
@@ -111,32 +115,32 @@ class GentlProducer:
 
     @property
     def devices(self) -> tuple[Any, ...]:
-        """What it saw when it was loaded, as harvesters' `DeviceInfo`."""
+        """Devices found when it was loaded, as harvesters' `DeviceInfo`."""
         return tuple(self._harvester.device_info_list)
 
     def acquirer(self, device: Any) -> Any:
-        """Open a device, as harvesters' `ImageAcquirer`. Raises what GenTL does."""
+        """Open a device, as harvesters' `ImageAcquirer`. Raises GenTL's errors."""
         key = load_harvesters().ParameterKey
-        # A wait of the wheel keeps every other thread waiting, too: it must not wait. Chunks are not read.
+        # The wheel blocks every other thread while it waits: it must not wait. Chunks are not read.
         settings = {key.TIMEOUT_PERIOD_ON_UPDATE_EVENT_DATA_CALL: 0, key.ENABLE_AUTO_CHUNK_DATA_UPDATE: False}
         with _preserve_interrupt_handler():
             return self._harvester.create(device, config=load_harvesters().ParameterSet(settings))
 
     def close(self) -> None:
-        """Let the producer go, with all that it opened."""
+        """Unload the producer and close all its devices."""
         self._harvester.reset()
 
 
 def acquire_producer(file: Path) -> GentlProducer:
-    """Return the producer of a file, loaded if it is not yet; `release_producer` it after use.
+    """Return the producer of a file, loading it if necessary; call `release_producer` after use.
 
     Raises
     ------
     LibraryMissingError
-        harvesters is not installed, or there is no such file.
+        harvesters is not installed, or the file does not exist.
     """
     if not file.is_file():
-        message = f"there is no GenTL producer {file}; install the one that comes with the camera, and write its path"
+        message = f"GenTL producer {file} not found; install the one that comes with the camera, and write its path"
         raise LibraryMissingError(message, install=f"the camera maker's GenTL producer, as {file}")
     with _lock:
         producer = _loaded.get(file) or GentlProducer(file)
@@ -146,7 +150,7 @@ def acquire_producer(file: Path) -> GentlProducer:
 
 
 def release_producer(file: Path) -> None:
-    """Give a producer back; the last one closes it."""
+    """Release a producer; the last user closes it."""
     with _lock:
         producer = _loaded[file]
         producer.users -= 1
@@ -157,7 +161,7 @@ def release_producer(file: Path) -> None:
 
 @contextmanager
 def use_producer(file: Path) -> Iterator[GentlProducer]:
-    """A producer, for the block."""
+    """Provide a producer for the block."""
     producer = acquire_producer(file)
     try:
         yield producer
@@ -166,7 +170,7 @@ def use_producer(file: Path) -> Iterator[GentlProducer]:
 
 
 def list_gentl_cameras() -> tuple[tuple[str, str], ...]:
-    """Id and label of every camera behind the producers that are installed. Opens none.
+    """Return id and label of every camera behind the installed producers, without opening any.
 
     Raises
     ------
@@ -184,7 +188,7 @@ def list_gentl_cameras() -> tuple[tuple[str, str], ...]:
 
 
 def device_field(device: Any, what: str) -> str:
-    """What a producer tells of a device, "" if it does not."""
+    """Return a producer's information on a device, "" if it has none."""
     with suppress(importlib.import_module("genicam.gentl").GenericException):
         return str(getattr(device, what) or "")
     return ""
@@ -192,33 +196,35 @@ def device_field(device: Any, what: str) -> str:
 
 @contextmanager
 def _preserve_interrupt_handler() -> Iterator[None]:
-    """Keep the handler of Ctrl-C, which harvesters sets to its own."""
-    kept = signal.getsignal(signal.SIGINT)
+    """Restore the Ctrl-C handler, which harvesters replaces."""
+    handler = signal.getsignal(signal.SIGINT)
     try:
         yield
     finally:
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, kept)
+            signal.signal(signal.SIGINT, handler)
 
 
 def feature_type(node: Any) -> str:
-    """Boolean, Enumeration, String, Integer, Float, or another kind of GenApi's interfaces."""
+    """Return Boolean, Enumeration, String, Integer, Float, or another of GenApi's interface types."""
     genapi = importlib.import_module("genicam.genapi")
     principal = node.node.principal_interface_type
     return next((kind for kind in _KINDS if principal == getattr(genapi.EInterfaceType, f"intfI{kind}")), "unknown")
 
 
 class NodeMapCamera:
-    """The calls of `Aravis.Camera`, each of which may raise GenApi's and GenTL's errors.
+    """A camera's features through GenApi's node map, with the methods of `Aravis.Camera` that this driver calls.
+
+    Each may raise GenApi's and GenTL's errors.
 
     Parameters
     ----------
     name
-        The camera's, for messages.
+        Name of the camera, for messages.
     nodes
         Its `NodeMap`.
     device
-        The producer's description of it.
+        The producer's description of the device.
     """
 
     def __init__(self, name: str, nodes: Any, device: Any) -> None:
@@ -228,7 +234,7 @@ class NodeMapCamera:
         self._access = importlib.import_module("genicam.genapi").EAccessMode
 
     def node(self, feature: str) -> Any:
-        """The feature's node. Raises UnsupportedByDeviceError: the camera has no such feature."""
+        """Return a feature's node. Raises UnsupportedByDeviceError if the camera has no such feature."""
         if not self._nodes.has_node(feature):
             message = (
                 f"camera '{self._name}' has no feature {feature}, which the gentl driver needs; use another camera"
@@ -332,7 +338,7 @@ class NodeMapCamera:
         return str(self._device.id_)
 
     def _read(self, feature: str) -> Any:
-        # Not from the node map's cache: a camera may have taken a value otherwise than it was written.
+        # Bypass the node map's cache: a camera may have adjusted the written value.
         verify, ignore_cache = False, True
         return self.node(feature).get_value(verify, ignore_cache)
 
@@ -344,7 +350,7 @@ class NodeMapCamera:
         node.value = round(value) if feature_type(node) == "Integer" else value
 
     def _first(self, features: tuple[str, ...]) -> str:
-        """The first feature that the camera offers; the first of all if it offers none."""
+        """Return the first feature that the camera offers, or the first of all if it offers none."""
         return next(filter(self.is_feature_available, features), features[0])
 
     def _is_offered(self, node: Any) -> bool:
@@ -357,16 +363,16 @@ class GentlConnection(GenICamConnection):
     Parameters
     ----------
     name
-        The camera's, for messages.
+        Name of the camera, for messages.
     options
         `GentlOptions`.
     folder
-        Where the producer's path counts from.
+        Folder to which the producer's path is relative.
 
     Raises
     ------
     LibraryMissingError
-        harvesters is not installed, or there is no producer.
+        harvesters is not installed, or no producer is found.
     DeviceGoneError
         No such camera answers.
     DeviceBusyError
@@ -379,7 +385,7 @@ class GentlConnection(GenICamConnection):
         files = producer_files() if options.producer is None else ((folder / options.producer).resolve(),)
         if not files:
             message = (
-                f"camera '{name}': no GenTL producer is known; install the one that comes with the camera, and write "
+                f"camera '{name}': no GenTL producer found; install the one that comes with the camera, and write "
                 f"the path of its .cti file as producer, or set {PATHS} to its folder"
             )
             raise LibraryMissingError(message, install="the camera maker's GenTL producer (a .cti file)")
@@ -412,7 +418,7 @@ class GentlConnection(GenICamConnection):
         release_producer(self._file)
 
     def _find_device(self, files: tuple[Path, ...], device: str) -> tuple[Path, Any]:
-        """The producer that has the device, which is then in use, and the device's acquirer."""
+        """Return the producer that has the device, acquired, and the device's acquirer."""
         known = []
         for file in files:
             producer = acquire_producer(file)
@@ -434,23 +440,23 @@ class GentlConnection(GenICamConnection):
 
 
 class GentlStream:
-    """Implements `GenICamStream` on an acquisition that runs.
+    """Implements `GenICamStream` on a running acquisition.
 
     Parameters
     ----------
     connection
-        Whose it is.
+        The connection that started it.
     acquirer
         harvesters' `ImageAcquirer`.
     lost
-        Set when frames cannot be asked for any more.
+        Set when no more frames can be requested.
     """
 
     def __init__(self, connection: GentlConnection, acquirer: Any, lost: threading.Event) -> None:
         self._acquirer = acquirer
         self._lost = lost
         self._translate_errors = connection.translate_errors
-        self._came: queue.SimpleQueue[RawFrame] = queue.SimpleQueue()
+        self._delivered: queue.SimpleQueue[RawFrame] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._pump, name=f"frames of {connection.name}", daemon=True)
         self._thread.start()
@@ -458,7 +464,7 @@ class GentlStream:
     def take(self, max_s: float) -> RawFrame | None:
         """See `GenICamStream`."""
         try:
-            return self._came.get(timeout=max_s) if max_s > 0 else self._came.get_nowait()
+            return self._delivered.get(timeout=max_s) if max_s > 0 else self._delivered.get_nowait()
         except queue.Empty:
             return None
 
@@ -466,7 +472,7 @@ class GentlStream:
         """See `GenICamStream`."""
         self._ending.set()
         self._thread.join()
-        # A camera that is lost only now is told of by the next call that needs it.
+        # If the camera is lost only now, the next call that needs it reports that.
         with suppress(DeviceError), self._translate_errors("stopping"):
             self._acquirer.stop()
 
@@ -474,10 +480,10 @@ class GentlStream:
         while not self._ending.is_set():
             try:
                 with self._translate_errors("taking a frame"):
-                    # Frames that are not whole do not come; they are counted by the gap that they leave.
+                    # Incomplete frames are not delivered; the gap in the numbers counts them.
                     buffer = self._acquirer.try_fetch(timeout=_ASK_S, is_raw=True)
                     if buffer is not None:
-                        self._came.put(_read_buffer(buffer, time.monotonic_ns()))
+                        self._delivered.put(_read_buffer(buffer, time.monotonic_ns()))
                         buffer.parent.queue_buffer(buffer)
                         continue
             except DeviceError:
@@ -487,7 +493,7 @@ class GentlStream:
 
 
 def _read_buffer(buffer: Any, arrived_ns: int) -> RawFrame:
-    """A frame that came whole, with what its producer tells of it."""
+    """Read a complete frame and its metadata."""
     width_px = _buffer_field(buffer, "width", 0)
     height_px = _buffer_field(buffer, "delivered_image_height", 0) or _buffer_field(buffer, "height", 0)
     image = None

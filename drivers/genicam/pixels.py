@@ -1,4 +1,4 @@
-"""Pixel formats of the PFNC (Pixel Format Naming Convention): what the camera sends, in grey and in colour."""
+"""Pixel formats of the PFNC (Pixel Format Naming Convention), decoded to grey and to colour."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _GREY_CONVERSIONS = {
 
 
 class SamplePacking(Enum):
-    """How samples lie in memory: each in 8 or 16 bits (little endian, right aligned), or packed.
+    """Layout of samples in memory: each in 8 or 16 bits (little endian, right aligned), or packed.
 
     `LSB` is PFNC's "p": a stream of bits, least significant first. `GIGE` is GigE Vision's "Packed": of two samples,
-    the high bits are bytes 0 and 2, their low bits share byte 1.
+    the high bits are bytes 0 and 2, and their low bits share byte 1.
     """
 
     BYTE = 1
@@ -40,7 +40,9 @@ class SamplePacking(Enum):
 
 @dataclass(frozen=True, slots=True)
 class PfncFormat:
-    """A format: bits per sample, packing, and the colours. `mosaic` is "" for grey, RGGB and its like, RGB or BGR."""
+    """Format: bits per sample, packing, and colours. `mosaic` is "" for grey, a Bayer pattern such as RGGB, or RGB or
+    BGR.
+    """
 
     name: str
     bit_depth: int
@@ -53,7 +55,7 @@ class PfncFormat:
         return 3 if self.mosaic in {"RGB", "BGR"} else 1
 
     def size_bytes(self, size: Size) -> int:
-        """How many bytes an image takes."""
+        """Number of bytes of an image."""
         count = size.width_px * size.height_px * self.samples
         bits = {
             SamplePacking.BYTE: 8,
@@ -77,17 +79,16 @@ def _build_formats() -> Mapping[str, PfncFormat]:
 
 
 FORMATS: Mapping[str, PfncFormat] = _build_formats()
-"""Every format that the driver reads, by its PFNC name."""
+"""Every supported format by its PFNC name."""
 
 
 def decode_pixels(
     data: bytes, form: PfncFormat, size: Size, *, padding_bytes: int = 0, in_colour: bool = False
 ) -> Pixels:
-    """(H, W) uint8 or uint16: the image in a buffer; in_colour : (H, W, 3), blue, green and red, of a format that is
-    not grey.
+    """Decode the image in a buffer: (H, W) uint8 or uint16, or with in_colour (H, W, 3), blue, green and red.
 
-    A colour filter's mosaic is interpolated and weighted as luma (OpenCV), so a mono camera sees sharper. Samples
-    beyond the bit depth are cut off; `padding_bytes` follow every row of an unpacked format.
+    A Bayer mosaic is interpolated and converted to luma (OpenCV), so a mono camera is sharper. Samples beyond the bit
+    depth are clipped; `padding_bytes` follow every row of an unpacked format.
 
     Raises
     ------
@@ -135,7 +136,7 @@ def _take_bytes(data: bytes, count: int, form: PfncFormat) -> Bytes:
 
 
 def _byte_groups(packed: Bytes, group: int) -> NDArray[np.uint16]:
-    """(n, group) uint16: the bytes in groups that hold whole samples; the last is filled up with zeros."""
+    """(n, group) uint16: the bytes in groups of whole samples; the last group is padded with zeros."""
     short = -len(packed) % group
     whole = np.concatenate([packed, np.zeros(short, np.uint8)]) if short else packed
     return whole.reshape(-1, group).astype(np.uint16)

@@ -1,14 +1,14 @@
-"""When an exposure began, on CLOCK_MONOTONIC, from what a camera and the network tell; values and arithmetic only.
+"""Start of exposures on CLOCK_MONOTONIC, from the camera's time stamps and the frames' arrivals; arithmetic only.
 
-Three things are known, each as an interval that certainly holds the truth:
+Three facts are known, each as an interval that certainly contains the true instant:
 
 - the frame's first packet arrived after the exposure ended: start ≤ arrival - exposure;
 - a software trigger cannot be answered before it is sent: start ≥ the beginning of the call;
-- the camera's own time stamp, once its clock is tied to the host's: by latching it between two looks at the host's
-  clock, by the triggers and arrivals of the frames before, or both. A crystal may be off by `DRIFT`.
+- the camera's own time stamp, once its clock is related to the host's: by latching it between two readings of the
+  host's clock, by the triggers and arrivals of earlier frames, or both. A crystal may be off by `DRIFT`.
 
-What is not known is for how long a frame may lie in the camera before it is sent; `transfer_ns` bounds that for
-exposures that nobody asked for, `answer_ns` for those that a software trigger asked for.
+The time that a frame stays in the camera before it is sent is unknown; `transfer_ns` bounds it for exposures without a
+trigger of the host, `answer_ns` for those of a software trigger.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 DRIFT = 1e-4
-"""How far a camera's clock may run from the host's: crystals are good to 50 parts per million each."""
+"""Largest relative rate difference of the camera's clock from the host's: crystals are good to 50 parts per million
+each."""
 
 _FOREVER_NS = 1 << 62
 _EXPIRY_FACTOR = 4
@@ -26,7 +27,7 @@ _GIGE_IDS = (1 << 16) - 1
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """From `min_ns` to `max_ns`; empty if that is backwards."""
+    """From `min_ns` to `max_ns`; empty if min_ns is larger."""
 
     min_ns: int
     max_ns: int
@@ -36,14 +37,14 @@ class Interval:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no instant lies in it."""
+        """True if the interval contains no instant."""
         return self.min_ns > self.max_ns
 
 
 class FrameNumbers:
-    """Frame ids, unwrapped into numbers that count from 0 with the first frame of a session.
+    """Unwraps frame ids into numbers that count from 0 with the first frame of an acquisition.
 
-    GigE Vision counts blocks from 1 to 65535 and on with 1; its extended ids and USB3 Vision have 64 bits.
+    GigE Vision counts blocks from 1 to 65535 and then from 1 again; its extended ids and USB3 Vision have 64 bits.
     """
 
     def __init__(self) -> None:
@@ -70,12 +71,12 @@ class FrameNumbers:
 
 
 class StartClock:
-    """A camera's clock tied to the host's: which start of exposure a time stamp means.
+    """Relates a camera's clock to the host's: start of exposure for a time stamp.
 
     Parameters
     ----------
     lag_ns
-        By how much a time stamp may be later than the start of its exposure.
+        Bounds of the delay of a time stamp after the start of its exposure.
     """
 
     def __init__(self, lag_ns: Interval) -> None:
@@ -85,20 +86,20 @@ class StartClock:
 
     @property
     def is_tied(self) -> bool:
-        """Whether the clock was latched: its word then counts more than that of the network."""
+        """True if the clock was latched; it is then more reliable than the network's timing."""
         return self._latched is not None
 
     def latch(self, looks: list[tuple[int, int, int]]) -> bool:
-        """Tie the clock by latches: host's time before, camera's time, host's time after, all ns; at least two.
+        """Relate the clocks by latches: host time before, camera time, host time after, all ns; at least two.
 
-        Return whether they agree; if not (a clock that stands, a stamp in other units) they are not used.
+        Return True if they agree; otherwise (a stopped clock, a stamp in other units) they are not used.
         """
         offset, at_ns = Interval(-_FOREVER_NS, _FOREVER_NS), 0
         for before_ns, stamp_ns, after_ns in looks:
             at_ns = max(at_ns, stamp_ns)
-            seen = Interval(before_ns - stamp_ns, after_ns - stamp_ns)
-            offset &= Interval(seen.min_ns - self._lag_ns.max_ns, seen.max_ns - self._lag_ns.min_ns)
-        # Without the play of the lag: two looks at a clock that stands are farther apart than each is long.
+            observed = Interval(before_ns - stamp_ns, after_ns - stamp_ns)
+            offset &= Interval(observed.min_ns - self._lag_ns.max_ns, observed.max_ns - self._lag_ns.min_ns)
+        # Without the lag's uncertainty: latches of a stopped clock contradict each other.
         bare = Interval(
             max(before_ns - stamp_ns for before_ns, stamp_ns, _ in looks),
             min(after_ns - stamp_ns for _, stamp_ns, after_ns in looks),
@@ -110,7 +111,7 @@ class StartClock:
         return True
 
     def learn(self, stamp_ns: int, start: Interval) -> None:
-        """Tie the clock closer by a frame whose start is known otherwise; do not learn from a contradiction."""
+        """Narrow the relation by a frame whose start is known otherwise; ignore a contradiction."""
         offset = Interval(start.min_ns - stamp_ns, start.max_ns - stamp_ns)
         if self._offset is not None:
             offset &= self._with_drift(stamp_ns, self._offset)
@@ -118,11 +119,11 @@ class StartClock:
             self._offset = (stamp_ns, offset)
 
     def forget(self) -> None:
-        """Go back to what the latches said."""
+        """Return to the relation known from the latches."""
         self._offset = self._latched
 
     def start(self, stamp_ns: int) -> Interval:
-        """When the exposure with this stamp began, as far as the clock can tell."""
+        """Return the start of the exposure with this stamp, as known from the clock."""
         if self._offset is None:
             return Interval(-_FOREVER_NS, _FOREVER_NS)
         offset = self._with_drift(stamp_ns, self._offset)
@@ -136,7 +137,7 @@ class StartClock:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """What came with a frame: its number, the camera's time stamp (None: not to be used), and its first packet."""
+    """A frame's number, the camera's time stamp (None: do not use), and the arrival of its first packet."""
 
     number: int
     stamp_ns: int | None
@@ -144,7 +145,7 @@ class Arrival:
 
 
 class UntriggeredStarts:
-    """Starts of exposures that the host did not ask for: a free-running camera, or one triggered by wire."""
+    """Starts of exposures that the host did not trigger: free-running, or triggered by wire."""
 
     def __init__(self, exposure_ns: int, transfer_ns: int, clock: StartClock) -> None:
         self._exposure_ns = exposure_ns
@@ -152,11 +153,11 @@ class UntriggeredStarts:
         self._clock = clock
 
     def start(self, frame: Arrival) -> Interval | None:
-        """When the exposure began; None if the camera's clock contradicts the frame's arrival."""
+        """Return the start of the exposure; None if the camera's clock contradicts the frame's arrival."""
         latest_ns = frame.arrived_ns - self._exposure_ns
         if frame.stamp_ns is None:
             return Interval(latest_ns - self._transfer_ns, latest_ns)
-        # A frame may come late and never early, so the quickest ones tie the clock from above.
+        # A frame may arrive late and never early, so the fastest frames bound the clock from above.
         self._clock.learn(frame.stamp_ns, Interval(-_FOREVER_NS, latest_ns))
         start = self._clock.start(frame.stamp_ns) & Interval(-_FOREVER_NS, latest_ns)
         if not self._clock.is_tied:
@@ -167,11 +168,10 @@ class UntriggeredStarts:
 class TriggeredStarts:
     """Starts of exposures that software triggers began.
 
-    Frames answer triggers in order, and a frame that was lost on its way answered one, too: its number is missing. A
-    camera may ignore a trigger, so frame n may answer the nth or a later one. The earliest that is possible is taken;
-    where that is too early for a reader, the frame is only thought to be older than it is. A trigger is not possible
-    any more when it is four times as old as an answer may be, or when the camera answered after it and then kept
-    silent for as long as an answer may take.
+    Frames answer triggers in order; a lost frame answered one as well, and its number is missing. A camera may ignore a
+    trigger, so frame n may answer the nth or a later one. The earliest possible trigger is assumed: at worst a frame is
+    taken for older than it is. A trigger expires when it is four times as old as an answer may be, or when the camera
+    answered after it and was then silent for as long as an answer may take.
     """
 
     def __init__(self, exposure_ns: int, answer_ns: int, clock: StartClock) -> None:
@@ -180,27 +180,27 @@ class TriggeredStarts:
         self._clock = clock
         self._triggers: list[Interval] = []
         self._answered = -1
-        self._heard = -1
+        self._last_known = -1
         self._closed = -1
         self._number = -1
 
     def note_trigger(self, begun_ns: int, ended_ns: int, *, times: int = 1) -> None:
-        """Note a trigger, and how often it may have been sent."""
+        """Note a trigger, and how many times it may have been sent."""
         if self.answer_due_ns(begun_ns) <= 0:
-            self._closed = self._heard
+            self._closed = self._last_known
         self._triggers += [Interval(begun_ns, ended_ns)] * times
 
     def answer_due_ns(self, now_ns: int) -> int:
-        """For how long the answer to a trigger may still come; 0 or less if none is due."""
+        """Remaining time in which the answer to a trigger may arrive; 0 or less if none is due."""
         unanswered = self._triggers[max(self._answered, self._closed) + 1 :]
         last_ns = max((trigger.max_ns for trigger in unanswered), default=-_FOREVER_NS)
         return last_ns + self._exposure_ns + self._answer_ns - now_ns
 
     def start(self, frame: Arrival) -> Interval | None:
-        """When the exposure began; None if the frame answers no trigger."""
+        """Return the start of the exposure; None if the frame answers no trigger."""
         first = max(self._answered + frame.number - self._number, self._closed + 1)
         self._number = frame.number
-        self._heard = len(self._triggers) - 1
+        self._last_known = len(self._triggers) - 1
         latest_ns = frame.arrived_ns - self._exposure_ns
         for index in range(first, len(self._triggers)):
             trigger = self._triggers[index]
