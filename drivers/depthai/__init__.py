@@ -1,4 +1,4 @@
-"""Luxonis OAK cameras through DepthAI: one camera, or several of one device exposed together. Extra: `depthai`."""
+"""Luxonis OAK cameras through DepthAI: one camera, or several of one device, exposed together. Extra: `depthai`."""
 
 from drivers.depthai.calibration import FactoryCalibration, Lens, read_calibration, read_factory_calibration
 from drivers.depthai.camera import OakCamera, open_camera

@@ -1,9 +1,8 @@
-"""An OAK camera: fixed settings that are read back from its frames, and frames that began after an instant.
+"""An OAK camera: fixed settings that are verified in its frames, and frames that began after a given instant.
 
-The sensor runs by itself, so `read` waits for a frame whose exposure began late enough; with the option
-`external_trigger` an edge on FSIN starts every exposure. Every frame tells the exposure, the sensitivity and the lens
-position that it was taken with: one that was taken otherwise than asked, because a setting takes a few frames to reach
-the sensor, is passed over.
+The sensor runs freely, so `read` waits for a frame whose exposure began late enough; with the option `external_trigger`
+an edge on FSIN starts every exposure. Every frame carries the exposure, sensitivity and lens position it was taken
+with. Settings take a few frames to reach the sensor; frames with other settings are skipped.
 """
 
 from __future__ import annotations
@@ -33,11 +32,11 @@ from slrig.model import CameraFormat, Frame, Size
 
 MIN_EXPOSURE_S = 100e-6
 MAX_EXPOSURE_FRACTION = 0.95
-"""The longest exposure as a share of the frame period: the rest is the sensor's."""
+"""Longest exposure as a fraction of the frame period."""
 
 ISO_OF_GAIN_1 = 100
 MAX_GAIN = 16.0
-"""ISO 1600, the end of the range that the library calls usual."""
+"""ISO 1600, the upper end of the range that the library recommends."""
 
 DEFAULT_EXPOSURE_S = 1 / 60
 
@@ -51,18 +50,18 @@ class OakCamera:
     Parameters
     ----------
     name
-        As the rig file calls it.
+        Name in the rig file.
     options
-        Checked already.
+        Validated options.
 
     Raises
     ------
     LibraryMissingError, DeviceBusyError, DeviceGoneError, DeviceError
         See `open_device`.
     ConfigError
-        The device's other cameras run otherwise.
+        The settings differ from those of the device's other cameras.
     UnsupportedByDeviceError
-        The device has no such camera, or the camera cannot do what an option asks.
+        The device has no such camera, or the camera does not support an option.
     """
 
     def __init__(self, name: str, options: OakOptions) -> None:
@@ -74,7 +73,7 @@ class OakCamera:
             self._stream = self._plan_stream(options)
             self._info = self._build_info()
             low_s, high_s = self._info.exposure_range_s
-            self._asked = (round(min(max(DEFAULT_EXPOSURE_S, low_s), high_s) * 1e6), ISO_OF_GAIN_1)
+            self._requested = (round(min(max(DEFAULT_EXPOSURE_S, low_s), high_s) * 1e6), ISO_OF_GAIN_1)
             self._frames: FrameQueue = self._device.join(CameraLink(self._stream, self._prepare, FrameQueue()))
         except BaseException:
             self._device.close_unless_used()
@@ -88,8 +87,8 @@ class OakCamera:
         return self._info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. Waits until a frame comes that was taken so; with an external trigger, where no frame comes
-        before the first edge, each frame is held against what was asked.
+        """See `Camera`. Waits for a frame with these settings. With an external trigger no frame arrives before the
+        first edge, so each frame is checked later instead.
 
         Raises
         ------
@@ -99,13 +98,13 @@ class OakCamera:
         hint = f"exposures are that long at fps = {self._stream.fps:g}"
         self._state.check_settings(settings, self._info, hint=hint)
         self._device.start()
-        self._asked = (round(settings.exposure_s * 1e6), round(settings.gain * ISO_OF_GAIN_1))
+        self._requested = (round(settings.exposure_s * 1e6), round(settings.gain * ISO_OF_GAIN_1))
         control = self._vendor.CameraControl()
-        control.setManualExposure(*self._asked)
+        control.setManualExposure(*self._requested)
         self._frames.begin()
         self._device.send(self._stream.socket, control)
         if self._stream.external_trigger:
-            return AppliedSettings(self._asked[0] / 1e6, self._asked[1] / ISO_OF_GAIN_1, 1 / self._stream.fps)
+            return AppliedSettings(self._requested[0] / 1e6, self._requested[1] / ISO_OF_GAIN_1, 1 / self._stream.fps)
         until_ns = time.monotonic_ns() + round((_SETTLE_S + 8 / self._stream.fps) * 1e9)
         last: OakFrame | None = None
         while (delivery := self._frames.take(until_ns)) is not None:
@@ -117,41 +116,39 @@ class OakCamera:
         raise self._settling_error(last)
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`. Frames beyond `count` can be had."""
+        """See `Camera`. More than `count` frames are available."""
         self._state.check_arming(count, trigger, self._info, hint=self._trigger_hint(trigger))
         self._device.start()
-        # Edges that come while nobody reads must not be lost; a camera that runs by itself has newer frames.
+        # Triggered frames must not be lost before they are read; a free-running camera has newer frames.
         self._frames.begin(max(MAX_WAITING_FRAMES, 2 * count) if trigger is Trigger.HARDWARE else MAX_WAITING_FRAMES)
         self._armed_ns = time.monotonic_ns()
         self._state.armed = trigger
 
     def trigger(self) -> None:
-        """See `Camera`. An OAK takes no software trigger."""
+        """See `Camera`. An OAK has no software trigger."""
         self._state.require_armed(Trigger.SOFTWARE)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`. A frame may have begun earlier than it says by the error of its time stamp: that is allowed
-        for.
-        """
+        """See `Camera`. Accounts for the error of the time stamps."""
         self._state.require_armed()
         until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
-        stale = otherwise = 0
+        stale = other_settings = 0
         while (delivery := self._frames.take(until_ns)) is not None:
             if delivery.t_start_ns - self._device.err_ns < after_ns or delivery.t_start_ns < self._armed_ns:
                 stale += 1
             elif not self._matches_settings(delivery):
-                otherwise += 1
+                other_settings += 1
                 self._frames.count_loss()
             else:
                 return self._frame(delivery)
-            # Frames that keep coming must not keep this from ending.
+            # A continuous stream of unusable frames must not delay the time-out.
             if time.monotonic_ns() > until_ns:
                 break
         lost, why = self._frames.losses
         damage = f", the last damaged one: {why}" if why else ""
         message = (
-            f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s; passed over: "
-            f"{stale} that began earlier, {otherwise} taken otherwise than asked; lost since it was armed: {lost}"
+            f"camera '{self._name}': no frame that began after {after_ns} ns arrived in {timeout_s:g} s; skipped: "
+            f"{stale} that began earlier, {other_settings} with other settings; lost since it was armed: {lost}"
             f"{damage}; check {'the trigger wire' if self._state.armed is Trigger.HARDWARE else 'cable and USB port'}"
         )
         raise FrameTimeoutError(message)
@@ -166,25 +163,26 @@ class OakCamera:
             self._device.leave(self._stream.socket)
 
     def _choose_sensor(self, options: OakOptions) -> OakSensor:
-        """The sensor at the socket, if it can do what is asked."""
-        board = self._device
-        sensor = board.sensors.get(options.socket)
+        """Return the sensor at the socket, if it supports the options."""
+        device = self._device
+        sensor = device.sensors.get(options.socket)
         if sensor is None:
-            has = ", ".join(f"{s.socket} ({s.name}, {s.size})" for s in board.sensors.values()) or "none"
+            has = ", ".join(f"{s.socket} ({s.name}, {s.size})" for s in device.sensors.values()) or "none"
             message = (
-                f"camera '{self._name}': asked for {options.socket} of OAK device '{board.device_id}', which has: {has}"
+                f"camera '{self._name}': requested {options.socket} of OAK device '{device.device_id}', which has: "
+                f"{has}"
             )
             raise UnsupportedByDeviceError(message)
         if options.external_trigger and not sensor.snapshot:
             message = (
-                f"camera '{self._name}': asked for external_trigger, and its sensor {sensor.name} follows FSIN only at "
+                f"camera '{self._name}': requested external_trigger, but its sensor {sensor.name} follows FSIN only at "
                 "its own steady frame rate, not at any time; leave external_trigger out, or use a camera with OV9282, "
                 "OV9782 or AR0234"
             )
             raise UnsupportedByDeviceError(message)
         if options.focus is not None and not sensor.autofocus:
             message = (
-                f"camera '{self._name}': asked for focus {options.focus}, and {options.socket} ({sensor.name}) has a "
+                f"camera '{self._name}': requested focus {options.focus}, but {options.socket} ({sensor.name}) has a "
                 "fixed lens; leave focus out"
             )
             raise UnsupportedByDeviceError(message)
@@ -194,7 +192,7 @@ class OakCamera:
         sensor = self._sensor
         size = sensor.size if options.size_px is None else Size(*options.size_px)
         if size.width_px > sensor.size.width_px or size.height_px > sensor.size.height_px:
-            message = f"camera '{self._name}': asked for {size}, its sensor {sensor.name} has {sensor.size}"
+            message = f"camera '{self._name}': requested {size}, its sensor {sensor.name} has {sensor.size}"
             raise UnsupportedByDeviceError(message)
         focus = options.focus
         if sensor.autofocus and focus is None:
@@ -231,9 +229,9 @@ class OakCamera:
         )
 
     def _prepare(self, control: Any) -> None:
-        """Write what the camera starts with: nothing automatic, nothing that bends grey levels, no light of its own."""
+        """Write the initial settings: manual, without processing of grey levels, without the camera's own light."""
         vendor, stream = self._vendor, self._stream
-        control.setManualExposure(*self._asked)
+        control.setManualExposure(*self._requested)
         control.setSharpness(0)
         control.setLumaDenoise(0)
         control.setStrobeDisable()
@@ -248,7 +246,7 @@ class OakCamera:
             control.setExternalTrigger(1, 0)
 
     def _matches_settings(self, delivery: OakFrame) -> bool:
-        exposure_us, iso = self._asked
+        exposure_us, iso = self._requested
         return (
             abs(delivery.exposure_us - exposure_us) <= max(_TOLERANCE * exposure_us, 1)
             and abs(delivery.iso - iso) <= max(_TOLERANCE * iso, 1)
@@ -256,7 +254,7 @@ class OakCamera:
         )
 
     def _frame(self, delivery: OakFrame) -> Frame:
-        # The last row was read out by the time the frame was here.
+        # The last row was read out before the frame arrived.
         skew_ns = min(self._sensor.longest_skew_ns(self._stream.fps), delivery.received_ns - delivery.t_end_ns)
         skew_ns = max(skew_ns, 0)
         image = read_luminance(delivery.message, self._stream)
@@ -275,20 +273,20 @@ class OakCamera:
         )
 
     def _settling_error(self, last: OakFrame | None) -> Exception:
-        exposure_us, iso = self._asked
+        exposure_us, iso = self._requested
         focus = "" if self._stream.focus is None else f", focus {self._stream.focus}"
-        asked = f"exposure {exposure_us} µs, ISO {iso}{focus}"
+        requested = f"exposure {exposure_us} µs, ISO {iso}{focus}"
         if last is None:
             lost, why = self._frames.losses
             message = (
-                f"camera '{self._name}' delivers no frame after {asked} was asked for ({lost} lost"
+                f"camera '{self._name}' delivers no frame after {requested} was requested ({lost} lost"
                 f"{f', the last one: {why}' if why else ''}); check cable and USB port, or lower fps or size_px"
             )
             return FrameTimeoutError(message)
         got_focus = "" if self._stream.focus is None else f", focus {last.lens_position}"
         message = (
-            f"camera '{self._name}': asked for {asked}, the driver gives exposure {last.exposure_us} µs, ISO {last.iso}"
-            f"{got_focus}; ask for that, or lower fps for a longer exposure"
+            f"camera '{self._name}': requested {requested}, the camera gives exposure {last.exposure_us} µs, "
+            f"ISO {last.iso}{got_focus}; request that, or lower fps for a longer exposure"
         )
         return UnsupportedByDeviceError(message)
 

@@ -1,8 +1,11 @@
-"""An OAK device, opened once per process however many of its cameras are: one pipeline, frames paired on the host.
+"""An OAK device, opened once per process for all its cameras: one pipeline, frames synchronised on the host.
 
-A pipeline cannot be changed once it runs, so it starts when the first camera is used, with every camera that has been
-opened by then. A thread takes what it delivers, checks it, and hands each camera its frames: reading one camera keeps
-the partners of its frames for the others.
+A running pipeline cannot be changed, so it starts when the first camera is used, with every camera opened by then. A
+thread takes the delivered frames, checks them and distributes them to the cameras.
+
+The library's time stamp is that of the first byte on the sensor's bus: a few microseconds after the end of the
+exposure, of the first row for a rolling shutter (github.com/luxonis/depthai/issues/795). It counts in the library's
+clock, which is CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations
@@ -43,10 +46,10 @@ from slrig.errors import (
 from slrig.model import Pixels
 
 MAX_WAITING_FRAMES = 4
-"""How many frames wait for a reader while a camera runs by itself; older ones are stale."""
+"""Number of frames stored for a reader while a camera runs freely; older ones are stale."""
 STAMP_ERR_NS = {"USB": 600_000, "network": 1_500_000}
-"""How well the library knows when a device's clock ticks: three times the standard deviations that Luxonis states
-(200 µs by USB, 500 µs by Ethernet; docs.luxonis.com, Device, host clock syncing)."""
+"""Error of the device's clock: three times the standard deviations that Luxonis states (200 µs by USB, 500 µs by
+Ethernet; docs.luxonis.com, Device, host clock syncing)."""
 _QUEUED_MESSAGES = 16
 _LISTEN = timedelta(milliseconds=200)
 _CLOSE_S = 10.0
@@ -57,9 +60,9 @@ _DEVICES_LOCK = threading.Lock()
 
 @dataclass(frozen=True, slots=True)
 class OakFrame:
-    """A whole frame, as it came. `t_start_ns` and `t_end_ns` are those of the first row, CLOCK_MONOTONIC.
+    """A complete frame. `t_start_ns` and `t_end_ns` are those of the first row, CLOCK_MONOTONIC.
 
-    message : the library's `ImgFrame`; its pixels are copied only if the frame is wanted.
+    message : the library's `ImgFrame`; its pixels are copied only if the frame is used.
     """
 
     message: Any
@@ -73,26 +76,26 @@ class OakFrame:
 
 
 def find_frame_fault(message: Any, stream: OakStream, received_ns: int, err_ns: int, vendor: Any) -> str | None:
-    """Say what makes a frame unusable; None if it is whole.
+    """Return the reason why a frame is unusable; None if it is complete.
 
-    A frame that was cut on its way has less data than its header announces; one whose header was damaged has another
-    size or kind than was asked for. A frame that says it ends later than it came would pass for a fresh one.
+    A truncated frame has less data than its header announces; a frame with a damaged header has a wrong size or type. A
+    frame that claims to end after it arrived would pass as a new one.
     """
     size, kind = stream.size, frame_type(stream, vendor)
     if message.getType() != kind or (message.getWidth(), message.getHeight()) != (size.width_px, size.height_px):
-        return f"{message.getWidth()} x {message.getHeight()} {message.getType()} where {size} {kind} was asked for"
+        return f"{message.getWidth()} x {message.getHeight()} {message.getType()} where {size} {kind} was requested"
     stride, rows = message.getStride(), size.height_px * (3 if stream.colour else 2) // 2
     if stride < size.width_px or len(message.getData()) < stride * rows:
         return f"{len(message.getData())} bytes where {stride} x {rows} were announced"
     if microseconds(message.getExposureTime()) <= 0:
-        return "no exposure told"
+        return "no exposure time given"
     if nanoseconds(message.getTimestamp()) - err_ns > received_ns:
-        return "stamped later than it came"
+        return "time stamp later than its arrival"
     return None
 
 
 def read_frame(message: Any, received_ns: int, vendor: Any) -> OakFrame:
-    """Read what a whole frame says of itself."""
+    """Read the metadata of a complete frame."""
     offsets = vendor.CameraExposureOffset
     return OakFrame(
         message=message,
@@ -107,15 +110,16 @@ def read_frame(message: Any, received_ns: int, vendor: Any) -> OakFrame:
 
 
 def read_luminance(message: Any, stream: OakStream) -> Pixels:
-    """(H, W) uint8, a copy: the grey levels, or a colour frame's luminance, which NV12 begins with."""
+    """Copy the grey levels, or the luminance of a colour frame, with which NV12 begins: (H, W) uint8."""
     stride, size = message.getStride(), stream.size
     plane = np.asarray(message.getData(), dtype=np.uint8)[: stride * size.height_px]
     return plane.reshape(size.height_px, stride)[:, : size.width_px].copy()
 
 
 def colour_reader(message: Any, luma: Pixels) -> Callable[[], Pixels]:
-    """What makes a colour frame of its brightness and of the differences of blue and red, copied, which follow it in
-    NV12: in turn, half as many rows and columns.
+    """Return a function that makes a colour frame from its luminance and chrominance.
+
+    The chrominance, copied here, follows the luminance in NV12: blue and red in turn, half as many rows and columns.
     """
     stride, (rows, columns) = message.getStride(), luma.shape
     planes = np.asarray(message.getData(), dtype=np.uint8)[stride * rows :][: stride * (rows // 2)]
@@ -124,12 +128,15 @@ def colour_reader(message: Any, luma: Pixels) -> Callable[[], Pixels]:
 
 
 def frame_type(stream: OakStream, vendor: Any) -> Any:
-    """The library's name of the frames' layout."""
+    """Return the library's type of the frames."""
     return vendor.ImgFrame.Type.NV12 if stream.colour else vendor.ImgFrame.Type.GRAY8
 
 
 class FrameQueue:
-    """Safe between threads. Counts what was lost: gaps in the sequence numbers, which damaged frames leave, too."""
+    """Frames of one camera from the receiving thread to the reader. Thread-safe.
+
+    Counts lost frames by gaps in the sequence numbers; damaged frames leave gaps as well.
+    """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -141,18 +148,18 @@ class FrameQueue:
 
     @property
     def losses(self) -> tuple[int, str]:
-        """How many frames were lost since `begin`, and what was wrong with the last damaged one."""
+        """Number of frames lost since `begin`, and the fault of the last damaged one."""
         with self._changed:
             return self._lost, self._damage
 
-    def begin(self, kept: int = MAX_WAITING_FRAMES) -> None:
-        """Forget what is waiting, and count anew."""
+    def begin(self, capacity: int = MAX_WAITING_FRAMES) -> None:
+        """Drop waiting frames and reset the counter."""
         with self._changed:
-            self._waiting = deque(maxlen=kept)
+            self._waiting = deque(maxlen=capacity)
             self._lost, self._damage = 0, ""
 
     def put(self, delivery: OakFrame) -> None:
-        """Take a frame. One that came before is dropped; a gap in the numbers before it counts as lost."""
+        """Add a frame. Repeated frames are dropped; a gap in the numbers counts as lost."""
         with self._changed:
             if delivery.number <= self._last_number:
                 return
@@ -163,22 +170,22 @@ class FrameQueue:
             self._changed.notify_all()
 
     def note_damage(self, fault: str) -> None:
-        """Note what was wrong with a frame. The gap that it leaves counts it: its own number may be damaged, too."""
+        """Note the fault of a frame. It is counted by its gap, since its own number may be damaged."""
         with self._changed:
             self._damage = fault
 
     def count_loss(self) -> None:
-        """Count one more frame that the reader had to pass over."""
+        """Count one more frame that the reader had to skip."""
         with self._changed:
             self._lost += 1
 
     def take(self, until_ns: int) -> OakFrame | None:
-        """Return the oldest frame that waits, or None if none came until then (CLOCK_MONOTONIC).
+        """Return the oldest waiting frame, or None if none arrives by this time (CLOCK_MONOTONIC).
 
         Raises
         ------
         DeviceGoneError
-            No frame will come any more.
+            No more frames will arrive.
         """
         with self._changed:
             while True:
@@ -192,7 +199,7 @@ class FrameQueue:
                 self._changed.wait(left_ns / 1e9)
 
     def end(self, reason: str) -> None:
-        """No frame will come any more. The first reason stays."""
+        """Mark that no more frames will arrive. The first reason is kept."""
         with self._changed:
             if self._ended is None:
                 self._ended = reason
@@ -202,7 +209,7 @@ class FrameQueue:
 
 @dataclass(frozen=True, slots=True)
 class CameraLink:
-    """A camera that uses a board: what it is to deliver, and where its frames go. `start` : its first settings."""
+    """A camera that uses a device: its stream, its first settings (`start`) and the queue of its frames."""
 
     stream: OakStream
     start: Callable[[Any], None]
@@ -227,7 +234,7 @@ class OakDevice:
             self._device = vendor.Device(info)
         try:
             with _translate_errors(self.device_id, vendor):
-                # A device that comes back by itself comes back with other settings: gone is gone.
+                # A reconnected device would have other settings, so reconnection is disabled.
                 self._device.setMaxReconnectionAttempts(0)
                 self.model: str = self._device.getProductName() or self._device.getDeviceName() or "OAK"
                 self.sensors: Mapping[str, OakSensor] = read_sensors(self._device.getConnectedCameraFeatures(), vendor)
@@ -250,7 +257,7 @@ class OakDevice:
         self._refusal: str | None = None
 
     def factory_calibration(self) -> Any:
-        """The library's handler of what was measured in the factory. Raises CalibrationError where there is none."""
+        """Return the library's handler of the factory calibration. Raises CalibrationError if there is none."""
         with _translate_errors(self.device_id, self._vendor):
             try:
                 return self._device.readCalibration2()
@@ -264,14 +271,14 @@ class OakDevice:
                 raise CalibrationError(message) from cause
 
     def join(self, link: CameraLink) -> FrameQueue:
-        """Use one camera; return where its frames come.
+        """Use one camera; return the queue of its frames.
 
         Raises
         ------
         DeviceBusyError
             The camera is in use already, or the device streams without it.
         ConfigError
-            It is to run otherwise than the device's other cameras.
+            Its settings differ from those of the device's other cameras.
         DeviceGoneError
             The device was unplugged.
         """
@@ -285,15 +292,15 @@ class OakDevice:
                 )
                 raise DeviceBusyError(message)
             for other in self._links.values():
-                for key, asked, has in (
+                for key, requested, current in (
                     ("fps", stream.fps, other.stream.fps),
                     ("external_trigger", stream.external_trigger, other.stream.external_trigger),
                 ):
-                    if stream.socket != other.stream.socket and asked != has:
+                    if stream.socket != other.stream.socket and requested != current:
                         message = (
-                            f"camera {stream.socket} of OAK device '{self.device_id}': {key} is {asked}, that of its "
-                            f"camera {other.stream.socket} is {has}; one device exposes its cameras together: write "
-                            "the same for all of them"
+                            f"camera {stream.socket} of OAK device '{self.device_id}': {key} is {requested}, that of "
+                            f"its camera {other.stream.socket} is {current}; one device exposes its cameras together: "
+                            "write the same for all of them"
                         )
                         raise ConfigError(message)
             if self._running is None:
@@ -322,7 +329,7 @@ class OakDevice:
                 self._close()
 
     def close(self) -> None:
-        """Close the device, whoever uses it. Idempotent; works after an unplug."""
+        """Close the device, also if cameras use it. Idempotent; works after an unplug."""
         with _DEVICES_LOCK, self._lock:
             self._close()
 
@@ -344,7 +351,7 @@ class OakDevice:
                 try:
                     queue = self._build_pipeline()
                     self._pipeline.start()
-                except Exception as cause:  # noqa: BLE001 - it raises errors of many kinds, its own and Python's
+                except Exception as cause:  # noqa: BLE001 - the library raises its own and Python's errors
                     self._note_refusal(cause)
             if self._refusal is not None:
                 raise UnsupportedByDeviceError(self._refusal)
@@ -356,18 +363,18 @@ class OakDevice:
             self._darken()
 
     def _note_refusal(self, cause: Exception) -> None:
-        """Remember why the device does not stream: what was laid out half cannot be laid out again."""
+        """Note why the device does not stream: a partly built pipeline cannot be built again."""
         if self._device.isClosed():
             self._end(f"OAK device '{self.device_id}' is gone ({cause}); plug it in and open it again")
             self._require_connected()
         streams = ", ".join(f"{link.stream.size} from {socket}" for socket, link in self._links.items())
         self._refusal = (
-            f"OAK device '{self.device_id}': asked for {streams}, the device refuses: {cause}; ask for another size_px "
+            f"OAK device '{self.device_id}': requested {streams}, the device refuses: {cause}; choose another size_px "
             "or fps, and open it again"
         )
 
     def send(self, socket: str, control: Any) -> None:
-        """Send a camera its settings. Raises DeviceGoneError."""
+        """Send settings to a camera. Raises DeviceGoneError."""
         with self._lock:
             self._require_connected()
             try:
@@ -377,7 +384,7 @@ class OakDevice:
                 self._require_connected()
 
     def _build_pipeline(self) -> Any:
-        """Lay out the pipeline; return the queue that it fills."""
+        """Build the pipeline; return its output queue."""
         vendor, pipeline = self._vendor, self._pipeline
         outputs = {}
         for socket, link in self._links.items():
@@ -404,20 +411,20 @@ class OakDevice:
         return sync.out.createOutputQueue(maxSize=_QUEUED_MESSAGES, blocking=False)
 
     def _darken(self) -> None:
-        """Switch the device's own light off: a dot pattern over ours would spoil every frame."""
+        """Switch the device's own infrared light off: its dot pattern would spoil every frame."""
         with _translate_errors(self.device_id, self._vendor):
             if not self._device.getIrDrivers():
                 return
-            obeyed = [self._device.setIrLaserDotProjectorIntensity(0.0), self._device.setIrFloodLightIntensity(0.0)]
-        if not any(obeyed):
+            results = [self._device.setIrLaserDotProjectorIntensity(0.0), self._device.setIrFloodLightIntensity(0.0)]
+        if not any(results):
             message = (
-                f"OAK device '{self.device_id}' does not switch its infrared light off, which would lie over the "
+                f"OAK device '{self.device_id}' does not switch its infrared light off, which would overlay the "
                 "patterns; unplug it, plug it in again, and update depthai"
             )
             raise DeviceError(message)
 
     def _listen(self, queue: Any) -> None:
-        """Take what the pipeline delivers until it ends: the body of the board's thread."""
+        """Distribute frames until the pipeline ends: the body of the device's thread."""
         try:
             while not self._closing.is_set():
                 message = queue.get(_LISTEN)
@@ -427,7 +434,7 @@ class OakDevice:
                 elif not self._pipeline.isRunning():
                     break
             reason = "the pipeline has ended"
-        except Exception as cause:  # noqa: BLE001 - whatever ends this thread, readers must learn of it
+        except Exception as cause:  # noqa: BLE001 - readers must be notified of every error
             reason = str(cause)
         self._end(
             f"OAK device '{self.device_id}' was closed; open it again"
@@ -458,12 +465,12 @@ class OakDevice:
         if self._closing.is_set():
             return
         self._closing.set()
-        # The library may wait for a device that does not answer any more; its owner must not.
+        # The library may wait for a device that no longer answers; the caller must not.
         closing = threading.Thread(target=self._shut_down, name=f"oak-{self.device_id}-closing", daemon=True)
         try:
             closing.start()
         except RuntimeError:
-            # The interpreter is ending, and starts no thread any more.
+            # The interpreter is shutting down, and starts no more threads.
             self._shut_down()
         else:
             closing.join(_CLOSE_S)
@@ -472,18 +479,18 @@ class OakDevice:
         with suppress(Exception):
             self._pipeline.stop()
         with suppress(Exception):
-            # Destroyed before its threads have ended, a pipeline waits for them with the interpreter's lock held.
+            # A pipeline that is destroyed earlier waits for its threads with the interpreter's lock held.
             self._pipeline.wait()
         with suppress(Exception):
             self._device.close()
         if self._listener is not None:
-            # A thread that comes back from the library when the interpreter has ended takes the program down.
+            # A thread that returns from the library after the interpreter has ended crashes the program.
             self._listener.join()
 
 
 @contextmanager
 def _translate_errors(device_id: str, vendor: Any) -> Iterator[None]:
-    """Say what the library's errors mean."""
+    """Translate the library's errors into slrig's."""
     try:
         yield
     except RuntimeError as cause:
@@ -499,8 +506,8 @@ def _translate_errors(device_id: str, vendor: Any) -> Iterator[None]:
 
 
 def require_one_clock(vendor: Any) -> None:
-    """Make sure that the library's time stamps count in CLOCK_MONOTONIC. Raises DeviceError."""
-    # On a busy machine this thread may rest between two readings: what lies between before and after is no offset.
+    """Check that the library's time stamps count in CLOCK_MONOTONIC. Raises DeviceError."""
+    # On a busy machine this thread may pause between readings: a value between before and after is not an offset.
     before_ns, now_ns, after_ns = time.monotonic_ns(), nanoseconds(vendor.Clock.now()), time.monotonic_ns()
     offset_ns = now_ns - min(max(now_ns, before_ns), after_ns)
     if abs(offset_ns) > _MAX_CLOCK_OFFSET_NS:
@@ -512,7 +519,7 @@ def require_one_clock(vendor: Any) -> None:
 
 
 def open_device(device: str) -> OakDevice:
-    """The board of a device, opened now unless this process has it open.
+    """Return a device, opened now unless this process has it open.
 
     Raises
     ------
@@ -533,19 +540,19 @@ def open_device(device: str) -> OakDevice:
 
 @atexit.register
 def close_devices() -> None:
-    """Close whatever a program left open: the library's threads would keep it from ending."""
-    for board in tuple(_DEVICES.values()):
-        board.close()
+    """Close all devices left open: the library's threads would prevent the program from ending."""
+    for device in tuple(_DEVICES.values()):
+        device.close()
 
 
 def open_device_ids() -> frozenset[str]:
-    """The ids of the devices that this process holds."""
+    """Return the ids of the devices that this process has open."""
     with _DEVICES_LOCK:
         return frozenset(_DEVICES)
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """Every OAK device that the library sees on USB and on the network, in half a second.
+    """List every OAK device on USB and on the network, in half a second.
 
     Raises
     ------
@@ -554,17 +561,17 @@ def find_devices() -> tuple[FoundDevice, ...]:
     """
     vendor = load_depthai()
     found = {info.deviceId or info.name: info for info in vendor.Device.getAllConnectedDevices()}
-    held = open_device_ids()
+    in_use = open_device_ids()
     return tuple(
-        FoundDevice("depthai", device, _label(info, device in held, vendor)) for device, info in sorted(found.items())
+        FoundDevice("depthai", device, _label(info, device in in_use, vendor)) for device, info in sorted(found.items())
     ) + tuple(
-        FoundDevice("depthai", device, "OAK device, in use by this process") for device in sorted(held - set(found))
+        FoundDevice("depthai", device, "OAK device, in use by this process") for device in sorted(in_use - set(found))
     )
 
 
-def _label(info: Any, held: bool, vendor: Any) -> str:
+def _label(info: Any, in_use: bool, vendor: Any) -> str:
     where = f"OAK device at {info.name}" if info.name else "OAK device"
-    if held:
+    if in_use:
         return f"{where}, in use by this process"
     if not is_permitted(info, vendor):
         return f"{where}, not permitted: it needs the udev rule {UDEV_RULE}"

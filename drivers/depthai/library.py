@@ -1,4 +1,12 @@
-"""The vendor's library, loaded when a device is first asked for: importing it takes seconds."""
+"""The library DepthAI, the OAK devices it finds, and the properties of their sensors.
+
+https://docs.luxonis.com/hardware/platform/deploy/frame-sync lists the sensors with a global shutter, and those that
+expose at any time when triggered (snapshot). The others can only be synchronised to a continuous stream at their own
+frame rate, which cannot wait for a pattern.
+
+Availability is checked before opening, because opening an absent device blocks for seconds. The library is loaded when
+a device is first requested, because its import takes seconds.
+"""
 
 from __future__ import annotations
 
@@ -20,18 +28,18 @@ GLOBAL_SHUTTER = frozenset({"OV9281", "OV9282", "OV9782", "OV7251", "AR0234"})
 SNAPSHOT = frozenset({"OV9282", "OV9782", "AR0234"})
 INSTALL = "pip install 'slrig[depthai]'"
 ENVIRONMENT = {
-    # It warns of every bus that it cannot see (a container without USB, for example).
+    # Without this it warns of every invisible bus (in a container without USB, for example).
     "DEPTHAI_LEVEL": "error",
-    # It reports its use to its maker, and asks there for news. A rig tells nobody what it does.
+    # Switch off usage reports and update checks.
     "DEPTHAI_TELEMETRY": "0",
     "DEPTHAI_DISABLE_STARTUP_NOTIFICATIONS": "1",
 }
-"""What the library reads when it is imported; what the user has set stays."""
+"""Variables that the library reads on import; values set by the user are kept."""
 _MICROSECOND = timedelta(microseconds=1)
 
 
 def is_permitted(info: Any, vendor: Any) -> bool:
-    """Whether the system lets this user open a device."""
+    """True if this user may open the device."""
     return bool(info.status != vendor.XLinkError_t.X_LINK_INSUFFICIENT_PERMISSIONS)
 
 
@@ -43,9 +51,9 @@ def find_available(device: str, vendor: Any) -> Any:
     DeviceBusyError
         Another program holds it.
     DeviceGoneError
-        It is not there.
+        It is not connected.
     DeviceError
-        The system does not let this user open it.
+        This user may not open it.
     """
     info = _find_by_name(device, vendor.Device.getAllAvailableDevices())
     if info is not None and is_permitted(info, vendor):
@@ -53,10 +61,10 @@ def find_available(device: str, vendor: Any) -> Any:
     connected = vendor.Device.getAllConnectedDevices()
     info = info or _find_by_name(device, connected)
     if info is None:
-        seen = ", ".join(sorted(other.deviceId or other.name for other in connected)) or "none"
+        connected_ids = ", ".join(sorted(other.deviceId or other.name for other in connected)) or "none"
         message = (
-            f"OAK device '{device}' is not there; found: {seen}. Plug it in, wait for it to start, and write its id "
-            "as `slrig devices` shows it"
+            f"OAK device '{device}' not found; found: {connected_ids}. Plug it in, wait for it to start, and write its "
+            "id as `slrig devices` shows it"
         )
         raise DeviceGoneError(message)
     if not is_permitted(info, vendor):
@@ -74,7 +82,7 @@ def _find_by_name(device: str, infos: Iterable[Any]) -> Any:
 
 def _permission_message(device: str) -> str:
     return (
-        f"OAK device '{device}' is there and this user may not open it; write {UDEV_RULE} into "
+        f"OAK device '{device}': this user may not open it; write {UDEV_RULE} into "
         "/etc/udev/rules.d/80-movidius.rules, run `udevadm control --reload-rules && udevadm trigger`, and plug it in "
         "again"
     )
@@ -82,7 +90,7 @@ def _permission_message(device: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class OakSensor:
-    """One camera on a device. `name` is the chip's; `fastest_fps` is 0 where the device does not tell."""
+    """One camera on a device. `name` is the chip's; `fastest_fps` is 0 if unknown."""
 
     socket: str
     name: str
@@ -93,18 +101,18 @@ class OakSensor:
 
     @property
     def global_shutter(self) -> bool:
-        """All rows are exposed together. A sensor that is not known is taken to roll."""
+        """True if all rows are exposed together. Unknown sensors are assumed to have a rolling shutter."""
         return self.name.upper() in GLOBAL_SHUTTER
 
     @property
     def snapshot(self) -> bool:
-        """An edge on FSIN starts an exposure at any time."""
+        """True if an edge on FSIN starts an exposure at any time."""
         return self.name.upper() in SNAPSHOT
 
     def longest_skew_ns(self, fps: float) -> int:
-        """How much later the last row may be exposed than the first, at most, ns.
+        """Maximum delay of the last row's exposure after the first row's, ns.
 
-        Rows are read out one after the other within one period of the fastest mode that reads them all.
+        All rows are read out within one period of the fastest full-frame mode.
         """
         if self.global_shutter:
             return 0
@@ -112,11 +120,11 @@ class OakSensor:
 
 
 def read_sensors(features: Iterable[Any], vendor: Any) -> Mapping[str, OakSensor]:
-    """The cameras that a device says it has, by socket; others than mono and colour are left out."""
+    """Return the mono and colour cameras of a device by socket."""
     kinds = vendor.CameraSensorType
     found = {}
     for feature in features:
-        # The first is what the sensor is used for unless asked otherwise.
+        # The first type is the default.
         kind = feature.supportedTypes[0] if feature.supportedTypes else kinds.MONO
         if kind not in (kinds.MONO, kinds.COLOR) or feature.width < 1 or feature.height < 1:
             continue
@@ -144,7 +152,7 @@ def load_depthai() -> Any:
     LibraryMissingError
         It is not installed, cannot be loaded, or is too old.
     """
-    # Asking whether it is there takes no time; importing it does.
+    # Finding it is fast; importing it is slow.
     if importlib.util.find_spec("depthai") is None:
         message = f"OAK cameras need the library depthai, which is not installed: {INSTALL}"
         raise LibraryMissingError(message, install=INSTALL)
@@ -163,14 +171,13 @@ def load_depthai() -> Any:
 
 
 def nanoseconds(span: timedelta) -> int:
-    """A duration of the library's, ns; its resolution is a microsecond.
+    """Convert a duration of the library to ns; its resolution is a microsecond.
 
-    >>> nanoseconds(timedelta(milliseconds=2))
-    2000000
+    >>> nanoseconds(timedelta(milliseconds=2)) 2000000
     """
     return span // _MICROSECOND * 1_000
 
 
 def microseconds(span: timedelta) -> int:
-    """A duration of the library's, µs."""
+    """Convert a duration of the library to µs."""
     return span // _MICROSECOND

@@ -105,7 +105,7 @@ def test_a_gentl_camera_is_found_while_it_is_open_and_opened_by_its_serial_numbe
         with pytest.raises(LibraryMissingError, match=r"GenTL producer .*acme\.cti"):
             gentl_bench.opened(producer, producer="acme.cti")
         monkeypatch.delenv("GENICAM_GENTL64_PATH")
-        with pytest.raises(LibraryMissingError, match=r"no GenTL producer is known.*GENICAM_GENTL64_PATH"):
+        with pytest.raises(LibraryMissingError, match=r"no GenTL producer found.*GENICAM_GENTL64_PATH"):
             gentl_bench.opened(producer, producer=None)
         assert find_gentl_devices() == ()
         producer.opened = True
