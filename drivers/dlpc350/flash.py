@@ -1,17 +1,23 @@
-"""What lies in the engine's flash, as a list says, and the pictures that a person puts there.
+"""Contents of the engine's flash, as listed in a file, and the pictures that a person writes into it.
 
-The engine's flash is written by TI's program (LightCrafter 4500 GUI, "Firmware": add pictures, build, upload), not by
-this driver: a write that fails may leave an engine that does not start. The list is `images.json`, beside the pictures:
+The flash is written by TI's program (LightCrafter 4500 GUI, "Firmware": add pictures, build, upload), not by this
+driver: a failed write may leave an engine that does not start. The list is `images.json`, next to the pictures:
 
     {"format": "slrig-dlpc350-images", "version": 1, "tag": "slrig-1a2b3c4d",
      "images": [{"flash_index": 0, "file": "slrig-1a2b3c4d-0.bmp", "sha256": "…", "planes": ["white", …]}]}
 
-`flash_index` is the picture's place in the flash, `tag` the firmware tag given to TI's program (null: none was). What a
-plane shows is read from the picture itself; `planes` says it in words, and how many of the 24 are in use.
+`flash_index` is the picture's position in the flash, `tag` the firmware tag given to TI's program (null: none). The
+contents of a plane are read from the picture itself; `planes` describes them, and its length is the number of used
+planes.
 
-A pattern and its inverse are one plane: the pattern table can invert. White, black, 8 Gray bits with their inverses and
-8 lines are 17 planes, one picture. The pictures are filled in the order of play, and a later one holds again what a
-sequence comes back to (white): so each is needed once, and two of them, 48 planes, are loaded before a sequence starts.
+Plane n of a picture is bit n of green for n = 0 to 7, bit n - 8 of red up to 15, bit n - 16 of blue up to 23, the least
+significant first: DLPU010, "Pattern Number Mapping", as copied at github.com/agmarrugo/bit-plane-image-coding; and the
+LightCrafter 4500 user's guide (DLPU011), "Relationship Between Bit-Planes and 24-bit RGB Images". TI's program takes
+pictures of 912 x 1140 pixels with 24 bits per pixel.
+
+A pattern and its inverse share one plane, since the pattern table can invert. White, black, 8 Gray bits with their
+inverses and 8 lines are 17 planes, one picture. Pictures are filled in the order of play, and a later one repeats a
+pattern that returns (white): so each is loaded once, and two of them, 48 planes, are loaded before a sequence starts.
 """
 
 from __future__ import annotations
@@ -40,7 +46,7 @@ PLANES = 24
 _FILE_HEADER = struct.Struct("<2sIHHI")
 _PICTURE_HEADER = struct.Struct("<IiiHHIIiiII")
 _CHANNELS = (1, 2, 0)
-"""Where green, red and blue lie in a BMP's pixel."""
+"""Positions of green, red and blue in a BMP's pixel."""
 
 
 LIST_FILE = "images.json"
@@ -51,11 +57,11 @@ _MAX_LIST_BYTES = 1_000_000
 
 
 def encode_picture(planes: Sequence[Plane]) -> bytes:
-    """Return up to 24 planes as a BMP file of 24 bits per pixel; those that are left are dark."""
+    """Return up to 24 planes as a BMP file of 24 bits per pixel; unused planes are dark."""
     pixels = np.zeros((*MIRRORS.shape, 3), np.uint8)
     for number, plane in enumerate(planes):
         pixels[..., _CHANNELS[number // 8]] |= plane.astype(np.uint8) << np.uint8(number % 8)
-    # Rows from the bottom up; 912 pixels of 3 bytes fill whole words.
+    # BMP rows run from the bottom up; 912 pixels of 3 bytes need no padding.
     data = pixels[::-1].tobytes()
     offset = _FILE_HEADER.size + _PICTURE_HEADER.size
     header = _PICTURE_HEADER.pack(40, MIRRORS.width_px, MIRRORS.height_px, 1, 24, 0, len(data), 2835, 2835, 0, 0)
@@ -63,7 +69,7 @@ def encode_picture(planes: Sequence[Plane]) -> bytes:
 
 
 def decode_planes(picture: bytes, name: str) -> tuple[Plane, ...]:
-    """Return the 24 planes of a BMP file. Raises ConfigError, naming it, if it is none of 912 x 1140 with 24 bits."""
+    """Return the 24 planes of a BMP file. Raises ConfigError, naming it, unless it has 912 x 1140 pixels of 24 bits."""
     least = _FILE_HEADER.size + _PICTURE_HEADER.size
     kind, offset, width, height, bits, packing = b"", 0, 0, 0, 0, 0
     if len(picture) >= least:
@@ -75,7 +81,7 @@ def decode_planes(picture: bytes, name: str) -> tuple[Plane, ...]:
     if not fits or len(picture) < offset + size:
         message = (
             f"{name}: expected a BMP file of {MIRRORS} pixels with 24 bits each, found {width} x {height} with {bits} "
-            f"bits, {len(picture)} bytes; take the one that this driver wrote"
+            f"bits, {len(picture)} bytes; use the file that this driver wrote"
         )
         raise ConfigError(message)
     pixels = np.frombuffer(picture, np.uint8, size, offset).reshape(rows, columns, 3)
@@ -100,7 +106,7 @@ class _ImageList(Strict):
 
 @dataclass(frozen=True, slots=True)
 class FlashedPlane:
-    """Where a pattern lies: the picture's index in the flash, the plane's number, and whether it is to be inverted."""
+    """Location of a pattern: the picture's index in the flash, the plane's number, and inversion."""
 
     image: int
     plane: int
@@ -109,7 +115,7 @@ class FlashedPlane:
 
 @dataclass(frozen=True, slots=True)
 class FlashedPicture:
-    """One picture of the flash. numbers : by the key of a plane, its number; content : the BMP file."""
+    """One picture of the flash. numbers : plane number by the key of a plane; content : the BMP file."""
 
     flash_index: int
     content: bytes
@@ -117,7 +123,7 @@ class FlashedPicture:
     planes: tuple[str, ...]
 
     def place(self, keys: tuple[bytes, bytes]) -> FlashedPlane | None:
-        """Return where a plane or its inverse, told by their keys, lies here, if it does."""
+        """Return the location of a plane or its inverse, given their keys; None if it is not here."""
         for inverted, key in enumerate(keys):
             if key in self.numbers:
                 return FlashedPlane(self.flash_index, self.numbers[key], bool(inverted))
@@ -126,14 +132,14 @@ class FlashedPicture:
 
 @dataclass(frozen=True, slots=True)
 class FlashContents:
-    """Everything that the list says of the flash. folder : where it lies, or would; tag : the firmware's, if known."""
+    """Contents of the flash. folder : of the list, which need not exist; tag : the firmware's, if known."""
 
     folder: Path
     tag: str | None = None
     pictures: tuple[FlashedPicture, ...] = ()
 
     def places(self, sequence: PatternSequence) -> tuple[FlashedPlane, ...]:
-        """Return where each pattern lies, with as few changes of picture as possible.
+        """Return the location of each pattern, with as few changes of picture as possible.
 
         Raises
         ------
@@ -146,7 +152,7 @@ class FlashContents:
             raise self._missing_error(sequence, missing)
         chosen: list[FlashedPlane] = []
         for index, candidates in enumerate(found):
-            # Stay with the picture that is in the buffer; change to the one that lasts longest.
+            # Stay with the picture in the buffer; else choose the one that lasts longest.
             image = chosen[-1].image if chosen else -1
             if image not in candidates:
                 image = max(candidates, key=lambda image: _run_length(found[index:], image))
@@ -162,14 +168,15 @@ class FlashContents:
         named = ", ".join(describe_pattern(sequence.patterns[index]) for index in missing[:3])
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         return UnsupportedByDeviceError(
-            f"the engine's flash, as {self.folder / LIST_FILE} lists it, lacks {len(missing)} of {len(sequence)} patterns "
-            f"({named}{more}); flash it once with all that this rig shows: slrig patterns RIG writes the pictures into "
+            f"the engine's flash, as {self.folder / LIST_FILE} lists it, lacks {len(missing)} of {len(sequence)} "
+            f"patterns ({named}{more}); flash it once with all patterns of this rig: slrig patterns RIG writes the "
+            "pictures into "
             f"{self.folder / EXPORT_FOLDER}"
         )
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """Write pictures that hold a sequence, beside those that are flashed, and say what to do with them.
-        Raises as `write_pictures`.
+        """Write pictures that hold a sequence, in addition to those in the flash; return the instructions. Raises as
+        `write_pictures`.
         """
         written = write_pictures(self.folder / EXPORT_FOLDER, sequence, self.pictures)
         return (
@@ -180,17 +187,17 @@ class FlashContents:
 
 
 def _run_length(found: Sequence[Mapping[int, FlashedPlane]], image: int) -> int:
-    """How many patterns in a row lie in a picture."""
+    """Number of consecutive patterns that are in a picture."""
     return next((count for count, candidates in enumerate(found) if image not in candidates), len(found))
 
 
 def read_flash_list(folder: Path) -> FlashContents:
-    """Return what the list in a folder says; an empty flash where there is no list yet.
+    """Read the list in a folder; without a list, return an empty flash.
 
     Raises
     ------
     ConfigError
-        The list has faults, or a picture is not the one that it names.
+        The list has faults, or a picture does not match the list.
     """
     path = folder / LIST_FILE
     if not path.exists():
@@ -213,8 +220,8 @@ def _read_picture(folder: Path, image: _ImageEntry) -> FlashedPicture:
         raise ConfigError(message) from error
     if hashlib.sha256(content).hexdigest() != image.sha256:
         message = (
-            f"{path}: this is not the picture that {LIST_FILE} lists (SHA-256 differs): what lies in the flash cannot be "
-            "told; copy the folder again, or write and flash new pictures"
+            f"{path}: this is not the picture that {LIST_FILE} lists (SHA-256 differs): the contents of the flash are "
+            "unknown; copy the folder again, or write and flash new pictures"
         )
         raise ConfigError(message)
     return _build_picture(image.flash_index, content, tuple(image.planes), str(path))
@@ -228,16 +235,16 @@ def _build_picture(flash_index: int, content: bytes, planes: tuple[str, ...], na
 
 
 def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[FlashedPicture] = ()) -> FlashContents:
-    """Write pictures that hold every pattern of a sequence, and the list of them, for TI's program.
+    """Write pictures with every pattern of a sequence, and their list, for TI's program.
 
     Parameters
     ----------
     folder
-        Made if need be; a list that is there is replaced.
+        Created if necessary; an existing list is replaced.
     sequence
         For 912 x 1140 mirrors.
     others
-        Pictures that are to stay in the flash: they keep their places, the new ones come after them.
+        Pictures that stay in the flash: they keep their positions, the new ones follow.
 
     Raises
     ------
@@ -256,8 +263,8 @@ def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Fla
     pictures = (*others, *made)
     if len(pictures) > MAX_IMAGES:
         message = (
-            f"asked for {len(made)} pictures beside the {len(others)} in the flash, it takes {MAX_IMAGES}; begin "
-            "anew: let patterns in the rig file name an empty folder"
+            f"{len(made)} pictures in addition to the {len(others)} in the flash exceed its limit of {MAX_IMAGES}; "
+            "start again: let patterns in the rig file name an empty folder"
         )
         raise UnsupportedByDeviceError(message)
     together = hashlib.sha256(b"".join(picture.content for picture in pictures)).hexdigest()
@@ -275,13 +282,13 @@ def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Fla
         listed = {"format": "slrig-dlpc350-images", "version": 1, "tag": tag, "images": entries}
         (folder / LIST_FILE).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
-        message = f"{folder}: asked to write pictures for the engine's flash, found: {error.strerror}; make room there"
+        message = f"{folder}: cannot write pictures for the engine's flash ({error.strerror}); make room there"
         raise StorageError(message) from error
     return FlashContents(folder, tag, pictures)
 
 
 def _group_planes(sequence: PatternSequence) -> list[list[tuple[Plane, str]]]:
-    """Planes picture by picture: each holds all patterns from its first to its last one in the order of play."""
+    """Group planes into pictures: each holds all patterns from its first to its last one in the order of play."""
     groups: list[list[tuple[Plane, str]]] = [[]]
     held: set[bytes] = set()
     for index, pattern in enumerate(sequence.patterns):

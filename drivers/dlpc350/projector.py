@@ -1,4 +1,4 @@
-"""The light engine as a projector: a table of patterns is shown once, or one pattern is held."""
+"""The DLPC350 light engine as a projector: shows a table of patterns once, or holds one pattern."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from slrig.model import PatternSequence
 DLPC350 = UsbController("dlpc350", 0x6401, "3.0")
 VALIDATION_TIMEOUT_S = 5.0
 _POLLABLE_US = 1_000_000
-"""A sequence of this length still runs when the engine is asked whether it does."""
+"""A sequence of at least this length still runs when the engine is polled."""
 
 
 class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
@@ -35,16 +35,16 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
     Parameters
     ----------
     link
-        An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
+        An open engine in any state; it is dark and ready afterwards, or closed if that failed.
     options, flash
-        What the rig file says, and what lies in the engine's flash.
+        Options of the rig file, and contents of the engine's flash.
     clock
-        The rig's; else the system's.
+        The rig's; default: the system's.
 
     Raises
     ------
     UnsupportedByDeviceError
-        The flash does not hold what the list says, or the engine does not take a setting.
+        The flash does not match the list, or the engine does not accept a setting.
     DeviceError, DeviceGoneError
         The engine failed.
     """
@@ -64,25 +64,25 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         self._serial = serial
         self._places: tuple[FlashedPlane, ...] = ()
         self._colours: tuple[LedColour, ...] = ()
-        # What the engine was told last, and which picture it shows; None where that is not known.
+        # The tables sent last and the picture shown; None if unknown.
         self._last_sent: tuple[Timing, PatternTables] | None = None
         self._shown_picture: int | None = None
         self._initialise()
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """See `FlashedProjector`. What is flashed already keeps its place."""
+        """See `FlashedProjector`. Pictures in the flash keep their positions."""
         self._state.require_size(sequence, MIRRORS)
         return self._flash.write_patterns(sequence)
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`. Refuses patterns that the flash lacks, and writes the pictures that hold them."""
+        """See `Projector`. Refuses patterns that the flash lacks."""
         self._state.require_open()
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, MIRRORS)
         if len(sequence) > MAX_PATTERNS:
             message = (
-                f"asked for a sequence of {len(sequence)} patterns, the engine's table takes {MAX_PATTERNS}; scan one "
+                f"the sequence has {len(sequence)} patterns, the engine's table takes {MAX_PATTERNS}; scan one "
                 "axis only, or with a shorter line_shift_period_px"
             )
             raise UnsupportedByDeviceError(message)
@@ -93,13 +93,13 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
     def show(self, index: int) -> Shown:
         """See `Projector`. Dark again after `hold_s`, and `MAX_UNATTENDED_S` after the end of this program.
 
-        When light begins is not told by the engine: it is after the command to start was sent, and before its sequencer
-        says that it runs and a picture has had its time from the flash to the mirrors. The error is half of that span.
+        The engine does not report when light begins: it is after the command to start was sent, and before the
+        sequencer reports that it runs plus the loading time of a picture. The error is half of that span.
         """
         self._state.require_pattern(index)
         place = self._places[index]
         load_s = self._options.load_s(kept=self._shown_picture == place.image)
-        # The sequence ends by itself: until it began, a picture may have to be loaded.
+        # The sequence ends by itself; it may have to load a picture first.
         alone_us = round((MAX_UNATTENDED_S - self._options.image_load_s) * 1e6)
         if self.unproven:
             timing, count = DIM_TIMING, min(alone_us // DIM_TIMING.period_us, MAX_PATTERNS)
@@ -112,7 +112,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         return self._wait_for_light(index, earliest_ns, running_ns + round(load_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
+        """See `Projector`. Refuses an unsupported timing before the engine does; the message names the rule."""
         self._state.require_loaded("play")
         self._require_known_polarity()
         options = self._options
@@ -124,22 +124,24 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
     def _start_sequence(
         self, places: tuple[FlashedPlane, ...], colours: tuple[LedColour, ...], timing: Timing
     ) -> tuple[int, int]:
-        """Stop, set, validate, start. Return when the command to start was sent, and when the engine said it runs."""
+        """Stop, set, validate, start. Return the times of the command to start and of the engine's report that it
+        runs.
+        """
         tables = build_tables(places, colours, dark_between=timing.dark_between)
         engine = self._engine
         with self._lock:
             self._state.require_open()
             try:
                 self.blank()
-                told, self._last_sent = self._last_sent, None
-                if told is None or told[0] != timing:
+                previous, self._last_sent = self._last_sent, None
+                if previous is None or previous[0] != timing:
                     engine.set_timing(timing)
-                engine.set_tables(tables, None if told is None else told[1])
+                engine.set_tables(tables, None if previous is None else previous[1])
                 engine.validate(VALIDATION_TIMEOUT_S)
                 started_ns = self._clock.now_ns()
                 engine.switch_leds(by_sequence=True)
                 engine.start()
-                # A short sequence may be over before the engine could be asked.
+                # A short sequence may end before the engine is polled.
                 if tables.length * timing.period_us >= _POLLABLE_US:
                     engine.wait_until_running(START_TIMEOUT_S)
                 self._last_sent, self._shown_picture = (timing, tables), places[-1].image
@@ -157,7 +159,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         engine.settle_byte(Dlpc350Command.TRIGGER_MODE, 1)
         self._configure_leds()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
-        # Changing the mode may start what the engine shows by itself.
+        # A change of mode may start the engine's default sequence.
         self.blank()
         return ProjectorInfo(
             name="projector",
@@ -175,12 +177,12 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         flash = self._flash
         if not flash.pictures:
             return
-        held = self._engine.byte(Dlpc350Command.IMAGES_IN_FLASH)
+        available = self._engine.byte(Dlpc350Command.IMAGES_IN_FLASH)
         wanted = max(picture.flash_index for picture in flash.pictures) + 1
-        if held < wanted:
+        if available < wanted:
             message = (
                 f"{self._engine.name}: the list in {flash.folder} names picture {wanted - 1} of its flash, it holds "
-                f"{held}; flash the pictures of that folder with TI's LightCrafter 4500 program"
+                f"{available}; flash the pictures of that folder with TI's LightCrafter 4500 program"
             )
             raise UnsupportedByDeviceError(message)
         tag = self._engine.firmware_tag()

@@ -1,4 +1,6 @@
-"""The light engine as a projector: pictures are sent when a sequence is loaded, then a table of them is shown."""
+"""The DLPC900 light engine as a projector: pictures are sent when a sequence is loaded, then a table of them is
+shown.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ from slrig.model import PatternSequence
 
 DLPC900 = UsbController("dlpc900", 0xC900, "6.0")
 OLDEST_FIRMWARE = (6, 0)
-"""Before 5.0 patterns cannot be put into another order (DLPU101, "Edit LUT"); up to 5.0.0 blocks of mirrors may lock
-after a change of mode (DLPT028)."""
+"""Before 5.0 patterns cannot be reordered (DLPU101, "Edit LUT"); up to 5.0.0 blocks of mirrors may lock after a change
+of mode (DLPT028)."""
 _DARK_END_US = 10_000
 _ALONE_US = round(MAX_UNATTENDED_S * 1e6) - _DARK_END_US
 
@@ -35,16 +37,16 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
     Parameters
     ----------
     link
-        An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
+        An open engine in any state; it is dark and ready afterwards, or closed if that failed.
     options
-        What the rig file says.
+        Options of the rig file.
     clock
-        The rig's; else the system's.
+        The rig's; default: the system's.
 
     Raises
     ------
     UnsupportedByDeviceError
-        Its firmware or its mirrors are not ones that are known, or it does not take a setting.
+        Its firmware or its mirrors are not supported, or it does not accept a setting.
     DeviceError, DeviceGoneError
         The engine failed.
     """
@@ -58,12 +60,12 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
         self._mirrors: Dlpc900Mirrors
         self._places: tuple[MemoryPlane, ...] = ()
         self._leds: tuple[int, ...] = ()
-        # The pattern table, as far as the engine has it.
+        # The part of the pattern table that the engine has.
         self._table: dict[int, bytes] = {}
         self._initialise()
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`. Sends the patterns, of some 10 kB for 24 of them, at 64 kB a second at the most."""
+        """See `Projector`. Sends the patterns, some 10 kB for 24 of them, at no more than 64 kB a second."""
         self._state.require_open()
         self._state.loaded = None
         self.blank()
@@ -75,7 +77,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
             self._table.clear()
             self._places = memory.places
             self._leds = (*map(self._options.led_colour, sequence.patterns), 0)
-            # The table first: pictures are lost when its length changes (DLPU018 section 2.4.4.4.2).
+            # Table first: pictures are lost when its length changes (DLPU018 section 2.4.4.4.2).
             for index in range(len(memory.places)):
                 self._define(index, DIM_TIMING)
             self._engine.configure(len(memory.places), len(sequence))
@@ -88,7 +90,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
     def show(self, index: int) -> Shown:
         """See `Projector`. Dark again after `hold_s`, and `MAX_UNATTENDED_S` after the end of this program.
 
-        A pattern without any LED ends what is shown: it is dark, whatever the mirrors do after a sequence.
+        A pattern without any LED ends each show, so that it is dark regardless of the mirrors after a sequence.
         """
         self._state.require_pattern(index)
         if self.unproven:
@@ -115,7 +117,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
         return self._wait_for_light(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
+        """See `Projector`. Refuses an unsupported timing before the engine does; the message names the rule."""
         self._state.require_loaded("play")
         self._require_known_polarity()
         options = self._options
@@ -141,7 +143,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
                 raise
 
     def _define(self, index: int, timing: Timing) -> None:
-        """Set an entry of the pattern table, unless the engine has it."""
+        """Set an entry of the pattern table, unless it is already set."""
         dark_us = timing.period_us - timing.exposure_us
         entry = encode_definition(
             index, self._places[index], exposure_us=timing.exposure_us, dark_us=dark_us, leds=self._leds[index]
@@ -152,7 +154,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
             self._table[index] = entry
 
     def _start(self) -> int:
-        """Start the sequence; return when that was begun."""
+        """Start the sequence; return the time of the command."""
         started_ns = self._clock.now_ns()
         self._engine.switch_leds(by_sequence=True)
         self._engine.start()
@@ -171,7 +173,7 @@ class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
             message += "switch it off and on"
             raise DeviceError(message)
         engine.settle_byte(UsbCommand.DISPLAY_MODE, ON_THE_FLY, within_s=MODE_CHANGE_S)
-        # A new mode may start what the engine shows by itself.
+        # A change of mode may start the engine's default sequence.
         self.blank()
         self._configure_leds()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)

@@ -1,4 +1,4 @@
-"""Patterns as planes of mirrors: each mirror sends light or does not."""
+"""Patterns of a pattern engine: as planes of mirrors that send light or not, and the timing of their light."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
 
 MAX_UNATTENDED_S = 2.0
-"""So long after its host has died a shown pattern is dark."""
+"""Time after the death of its host in which a shown pattern becomes dark."""
 
 
 Plane = NDArray[np.bool_]
-"""(H, W) bool: which mirrors send light."""
+"""(H, W) bool: mirrors that send light."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How long each pattern is lit, and from one pattern to the next, whole microseconds."""
+    """Duration of each pattern's light and period of the patterns, whole microseconds."""
 
     exposure_us: int
     period_us: int
 
     @property
     def dark_between(self) -> bool:
-        """Whether the mirrors are cleared after each pattern."""
+        """True if the mirrors are cleared after each pattern."""
         return self.exposure_us < self.period_us
 
 
 def light_duration_us(exposure_s: float, period_s: float, *, margin_s: float, least_us: int, dark_us: int = 0) -> int:
-    """How long to light patterns of which cameras take `exposure_s`, whole microseconds.
+    """Duration of the light for an exposure of `exposure_s`, whole microseconds.
 
     Parameters
     ----------
     margin_s
-        Light beyond the exposure: it covers what a camera takes from the pulse to its first row.
+        Light beyond the exposure: covers the camera's delay from the pulse to its first row.
     least_us
         The engine's shortest light.
     dark_us
-        What the engine needs of dark between two patterns.
+        Dark time that the engine needs between two patterns.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def light_duration_us(exposure_s: float, period_s: float, *, margin_s: float, le
     if exposure_s <= 0 or wanted_us + dark_us > period_us:
         dark = f" and the dark after it {dark_us} µs" if dark_us else ""
         message = (
-            f"asked for {exposure_s:.6f} s of light every {period_s:.6f} s: with {margin_s:.6f} s for the cameras to "
+            f"requested {exposure_s:.6f} s of light every {period_s:.6f} s: with {margin_s:.6f} s for the cameras to "
             f"start, light takes {wanted_us} µs{dark}, the period is {period_us} µs; lengthen the period"
         )
         raise UnsupportedByDeviceError(message)
@@ -62,11 +62,11 @@ def light_duration_us(exposure_s: float, period_s: float, *, margin_s: float, le
 
 
 def check_duty(timing: Timing, duty_limit: float) -> None:
-    """Raise UnsupportedByDeviceError if light would be on for more of the time than the rig file allows."""
+    """Raise UnsupportedByDeviceError if the light exceeds the duty limit of the rig file."""
     duty = timing.exposure_us / timing.period_us
     if duty > duty_limit:
         message = (
-            f"asked for {timing.exposure_us} µs of light every {timing.period_us} µs: light is on for {duty:.0%} of "
+            f"requested {timing.exposure_us} µs of light every {timing.period_us} µs: light is on for {duty:.0%} of "
             f"the time, duty_limit of the rig file allows {duty_limit:.0%}; lengthen the period, or shorten exposure_s"
         )
         raise UnsupportedByDeviceError(message)
@@ -78,7 +78,7 @@ def pattern_plane(sequence: PatternSequence, index: int) -> Plane:
     lit: NDArray[np.bool_] = profile == np.iinfo(profile.dtype).max
     if not (lit | (profile == 0)).all():
         message = (
-            f"asked for pattern {index} with shades of grey; a mirror is on or off: use Gray code and shifted lines, "
+            f"pattern {index} has shades of grey; a mirror is on or off: use Gray code and shifted lines, "
             "which are black and white"
         )
         raise UnsupportedByDeviceError(message)
@@ -86,13 +86,13 @@ def pattern_plane(sequence: PatternSequence, index: int) -> Plane:
 
 
 def plane_keys(plane: Plane) -> tuple[bytes, bytes]:
-    """Return what tells a plane and its inverse from all others: SHA-256 of their bits."""
+    """Return keys of a plane and of its inverse: SHA-256 of their bits."""
     bits = np.packbits(plane)
     return hashlib.sha256(bits.tobytes()).digest(), hashlib.sha256((~bits).tobytes()).digest()
 
 
 def describe_pattern(pattern: Pattern) -> str:
-    """Words for a pattern."""
+    """Return a short description of a pattern."""
     match pattern:
         case White() | Black():
             return pattern.kind

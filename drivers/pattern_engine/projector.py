@@ -1,4 +1,7 @@
-"""A pattern engine with a USB port as a projector, as far as these are alike: woken, and dim until proven."""
+"""Projectors with a pattern engine: hold a shown pattern while the host lives, and darken the engine on every path.
+
+Engines with a USB port are dim until the polarity of their LED current is known.
+"""
 
 from __future__ import annotations
 
@@ -16,26 +19,26 @@ from slrig.devices import Clock, ProjectorInfo, ProjectorState, Shown, SystemClo
 from slrig.errors import DeviceGoneError, SlrigError, UnsupportedByDeviceError
 
 WAKE_TIMEOUT_S = 10.0
-"""How long an engine may take to wake up."""
+"""Longest time for an engine to wake up."""
 START_TIMEOUT_S = 2.0
 COMMANDS_S = 0.04
-"""What the commands of one `show` take, typically: a dozen, of about 3 ms each."""
+"""Typical time for the commands of one `show`: a dozen, of about 3 ms each."""
 DIM_TIMING = Timing(1_250, 15_000)
-"""Light for a twelfth of the time: at half current that is 4.2 % of the most, and never above 5 % at 60 %."""
+"""Light for a twelfth of the time: 4.2 % of the maximum at half current, and never above 5 % at 60 %."""
 _HALF_CURRENT = 128
-"""A current that is half of the most, whichever way the register counts."""
+"""Half of the maximum current, for either polarity of the register."""
 EngineT = TypeVar("EngineT", bound=UsbEngine)
 
 
 class LightSource(Protocol):
-    """An engine, as far as light goes. `start` begins anew what was told last."""
+    """Light control of an engine. `start` restarts the sequence that was set last."""
 
     def switch_leds(self, *, by_sequence: bool) -> None:
         """Let the sequence switch the LEDs, or switch them all off."""
         ...
 
     def start(self) -> None:
-        """Start the sequence that was set."""
+        """Start the current sequence."""
         ...
 
     def stop(self) -> None:
@@ -43,7 +46,7 @@ class LightSource(Protocol):
         ...
 
     def close(self) -> None:
-        """Let the engine go. Idempotent."""
+        """Close the engine. Idempotent."""
         ...
 
 
@@ -51,10 +54,10 @@ SourceT = TypeVar("SourceT", bound=LightSource)
 
 
 class EngineProjector(ABC, Generic[SourceT]):
-    """What implements `slrig.devices.Projector` on any engine, as far as engines are alike.
+    """Implements `slrig.devices.Projector` as far as all engines are alike.
 
-    A kind of engine calls `_initialise` when it is constructed, and `_hold_pattern` when it has begun what it shows.
-    `_lock` keeps the engine's commands together. clock : the rig's; else the system's.
+    Subclasses call `_initialise` at the end of their constructor, and `_hold_pattern` when a shown pattern has begun.
+    `_lock` keeps sequences of commands together. clock : the rig's; default: the system's.
     """
 
     def __init__(self, engine: SourceT, options: LightOptions, *, clock: Clock | None = None) -> None:
@@ -69,15 +72,15 @@ class EngineProjector(ABC, Generic[SourceT]):
 
     @abstractmethod
     def _wake(self) -> None:
-        """Darken the engine first of all, and return when it takes commands."""
+        """Darken the engine first, and return when it takes commands."""
 
     @abstractmethod
     def _prepare(self) -> ProjectorInfo:
-        """Look whether the engine is what the rig file says, and set what never changes. It is awake and dark."""
+        """Check the engine against the rig file, and set what never changes. It is awake and dark."""
 
     @property
     def info(self) -> ProjectorInfo:
-        """See `Projector`. It steps, and it plays, with a pulse on a trigger output per pattern."""
+        """See `Projector`. It steps, and it plays with a pulse on a trigger output per pattern."""
         return self._info
 
     def stop(self) -> None:
@@ -85,16 +88,16 @@ class EngineProjector(ABC, Generic[SourceT]):
         self.blank()
 
     def blank(self) -> None:
-        """See `Projector`. LEDs off, then the sequence stopped: each is tried, whatever becomes of the other."""
+        """See `Projector`. Switches the LEDs off, then stops the sequence; tries both even if one fails."""
         with self._lock:
             faults = [] if self._state.closed.is_set() else self._darken()
-        # With the LEDs off it is dark, but an engine that does not do as it is told is to be known.
+        # With the LEDs off it is dark, but an engine that disobeys is an error.
         if faults:
             raise faults[0]
 
     def close(self) -> None:
         """See `Projector`."""
-        # Whoever waits for light need not wait any more.
+        # End all waits for light.
         already = self._state.closed.is_set()
         self._state.closed.set()
         with self._lock:
@@ -102,7 +105,7 @@ class EngineProjector(ABC, Generic[SourceT]):
                 self._shut_down()
 
     def _initialise(self) -> None:
-        """Wake the engine, darken it first of all, and prepare it; close it if that fails."""
+        """Wake the engine, darken it first, and prepare it; close it if that fails."""
         try:
             self._wake()
             self._info = self._prepare()
@@ -112,7 +115,7 @@ class EngineProjector(ABC, Generic[SourceT]):
         threading.Thread(target=self._hold_loop, name="light engine", daemon=True).start()
 
     def _hold_pattern(self, alone_s: float, *, again_s: float) -> None:
-        """Hold what was begun now, and ends by itself `alone_s` later; then each `again_s`."""
+        """Hold the pattern that has just begun and ends by itself after `alone_s`; then restart it every `again_s`."""
         now_s = self._now_s()
         self._held_until_s = now_s + self._light.hold_s
         self._next_restart_s, self._restart_interval_s = now_s + alone_s / 2, again_s
@@ -127,8 +130,8 @@ class EngineProjector(ABC, Generic[SourceT]):
         return self._clock.now_ns() / 1e9
 
     def _hold_loop(self) -> None:
-        """Start what is shown anew, before the engine ends it: it says that this program lives. End what does not
-        end by itself, from `_dark_at_s` on. Runs until `close`.
+        """Restart the shown pattern before the engine ends it, which proves that this program lives. End a sequence
+        that does not end by itself at `_dark_at_s`. Runs until `close`.
         """
         while True:
             self._clock.wait_until(self._clock.now_ns() + round(MAX_UNATTENDED_S * 1e9 / 20), self._state.closed)
@@ -145,11 +148,11 @@ class EngineProjector(ABC, Generic[SourceT]):
                     self._engine.stop()
                     self._engine.start()
                 except SlrigError:
-                    # The owner's next call finds out; until then the engine goes dark by itself.
+                    # The next call of the user reports it; until then the engine goes dark by itself.
                     self._held_until_s = 0.0
 
     def _darken(self) -> list[SlrigError]:
-        """LEDs off, then stop, each tried whatever becomes of the other. Return what the engine said against it."""
+        """Switch the LEDs off, then stop; try both even if one fails. Return the errors."""
         self._held_until_s, self._dark_at_s = 0.0, math.inf
         faults: list[SlrigError] = []
         for darken in (partial(self._engine.switch_leds, by_sequence=False), self._engine.stop):
@@ -160,10 +163,10 @@ class EngineProjector(ABC, Generic[SourceT]):
         return faults
 
     def _before_close(self) -> None:
-        """What else is done before the engine is let go. It is dark."""
+        """Hook called before the engine is closed. It is dark."""
 
     def _shut_down(self) -> None:
-        """Darken as far as the engine lets, and let it go."""
+        """Darken the engine as far as possible, and close it."""
         self._darken()
         with suppress(SlrigError):
             self._before_close()
@@ -173,7 +176,7 @@ class EngineProjector(ABC, Generic[SourceT]):
 
 
 class UsbEngineProjector(EngineProjector[EngineT], ABC):
-    """What implements `slrig.devices.Projector` and `UnprovenLight` on an engine with a USB port."""
+    """Implements `slrig.devices.Projector` and `UnprovenLight` on an engine with a USB port."""
 
     def __init__(self, engine: EngineT, options: UsbLightOptions, *, clock: Clock | None = None) -> None:
         super().__init__(engine, options, clock=clock)
@@ -192,7 +195,7 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
     def try_current(self, share: float) -> None:
         """See `UnprovenLight`."""
         if not self.unproven or not 0.4 <= share <= 0.6:
-            message = f"asked to try a current register at {share:g}: only 0.4 to 0.6, while its sense is not known"
+            message = f"cannot try a current of {share:g}: only 0.4 to 0.6 is allowed while its polarity is unknown"
             raise UnsupportedByDeviceError(message)
         with self._lock:
             self._state.require_open()
@@ -205,7 +208,7 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
         return f"led_current_inverted = {str(inverted).lower()}"
 
     def _wake(self) -> None:
-        # An engine in standby is dark, and takes no other command.
+        # An engine in standby is dark, and accepts no other command.
         if self._engine.byte(UsbCommand.POWER) & 1:
             self._engine.set_byte(UsbCommand.POWER, 0)
         else:
@@ -216,7 +219,7 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
         self.blank()
 
     def _configure_leds(self) -> None:
-        """No mirroring, no inversion, and the current of the LEDs: half of it where its sense is not known."""
+        """Reset mirroring and inversion, and set the LED current: half of it if its polarity is unknown."""
         engine, light = self._engine, self._light
         for unchanged in (UsbCommand.FLIP_LONG, UsbCommand.FLIP_SHORT, UsbCommand.INVERT_DATA):
             engine.settle_byte(unchanged, 0)
@@ -228,7 +231,7 @@ class UsbEngineProjector(EngineProjector[EngineT], ABC):
     def _require_known_polarity(self) -> None:
         if self.unproven:
             message = (
-                "asked to play, but it is not known which way the LEDs' current goes, and light is dim until it is: "
-                "slrig doctor finds it out, and says what to write into the rig file"
+                "cannot play: the polarity of the LED current is unknown, and light is dim until then; "
+                "run slrig doctor, which determines it and says what to write into the rig file"
             )
             raise UnsupportedByDeviceError(message)

@@ -1,4 +1,25 @@
-"""USB pattern engines."""
+"""Pattern engines with a USB port: finding them, the link to one over a hidraw node, and the common commands.
+
+Finding uses /sys alone and opens nothing. A hidraw node's `device/uevent` names bus, vendor and product (HID_ID), the
+serial number (HID_UNIQ) and the port (HID_PHYS): kernel, drivers/hid/hid-core.c. An engine may have several HID
+interfaces; commands go to the first (TI's usb.c, `USB_Open`), whose port ends in "/input0" (kernel,
+drivers/hid/usbhid/hid-core.c). An engine without a unique serial number is named by its port.
+
+Framing (TI DLPU010 §1.2 and, for the DLPC900, DLPU018 §1.2; TI's sources dlpc350_api.cpp): reports of 64 bytes both
+ways, without a report number (the kernel wants a zero before each). The first report of a message begins with a header:
+
+    flags     bits 0-2 destination (0), 5 error, 6 answer wanted, 7 read
+    sequence  the answer has the number of its command
+    length    2 bytes, low first: of all that follows, including the command's 2 bytes
+    command   2 bytes, low first (of CMD2 and CMD3, CMD3 comes first); an answer has none
+
+The remainder follows in further reports without a header. One command is processed at a time.
+
+Command numbers are CMD2 and CMD3. For the DLPC350: its programmer's guide (DLPU010) and TI's own sources
+(dlpc350_api.cpp, `CmdList`, in github.com/jakobwilm/slstudio under src/projector/LC4500API). For the DLPC900: its
+programmer's guide (DLPU018, revisions F and J) and TI's own sources (API.c of TI's program for it, `CmdList`, in
+github.com/RhojAnn/DLPC900_CLI under lib).
+"""
 
 from __future__ import annotations
 
@@ -30,7 +51,7 @@ REPORT = 64
 HEADER = 4
 READ, ANSWER, FAILED = 0x80, 0x40, 0x20
 MAX_DATA = 512 - HEADER
-"""The engine's buffer holds 512 bytes of a message (DLPU018 §1.2)."""
+"""Message buffer of the engine: 512 bytes (DLPU018 §1.2)."""
 
 ANSWER_TIMEOUT_S = 1.0
 _RAW_INFO = 0x8008_4803
@@ -47,7 +68,9 @@ _ASK_AGAIN_S = 0.005
 
 @dataclass(frozen=True, slots=True)
 class UsbController:
-    """A controller on USB. driver : slrig's; product : its id under TI's; firmware : the oldest that serves."""
+    """A type of controller on USB. driver : slrig's name; product : its USB product id; firmware : oldest supported
+    version.
+    """
 
     driver: str
     product: int
@@ -55,7 +78,7 @@ class UsbController:
 
     @property
     def udev_rule(self) -> str:
-        """The line that lets a user open it."""
+        """The udev rule that lets users open it."""
         return (
             f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{TI:04x}", ATTRS{{idProduct}}=="{self.product:04x}", '
             'MODE="0660", TAG+="uaccess"'
@@ -63,22 +86,22 @@ class UsbController:
 
 
 class CommandRefusedError(DeviceError):
-    """The controller said that it does not take a command."""
+    """The controller refused a command."""
 
 
 class UsbLink:
-    """An open engine. Threads may share it: each command and its answer are one step.
+    """An open engine. Thread-safe: each command and its answer are one step.
 
     Parameters
     ----------
     handle
-        A file descriptor of a hidraw node, or of anything that keeps reports apart as it does. The link closes it.
+        File descriptor of a hidraw node, or of anything that preserves report boundaries. The link closes it.
     name
-        Words for the engine, for messages.
+        Name of the engine, for messages.
     kind
-        What it is.
+        Type of the controller.
     answer_s
-        How long an answer may take.
+        Longest time for an answer.
     """
 
     def __init__(self, handle: int, name: str, kind: UsbController, *, answer_s: float = ANSWER_TIMEOUT_S) -> None:
@@ -92,19 +115,19 @@ class UsbLink:
         self._drain()
 
     def write(self, command: int, data: bytes = b"") -> None:
-        """Send a command, and wait until the engine has taken it. Raises as `read`."""
+        """Send a command and wait for its acknowledgement. Raises as `read`."""
         self._exchange(command, data, ANSWER)
 
     def send(self, command: int, data: bytes) -> None:
-        """Send a command that is given no answer. Raises as `read`."""
+        """Send a command that is not acknowledged. Raises as `read`."""
         self._exchange(command, data, 0)
 
     def read(self, command: int, length: int) -> bytes:
-        """Ask for `length` bytes, and return these and what else there is.
+        """Request `length` bytes; return at least these.
 
         Raises
         ------
-        RefusedError
+        CommandRefusedError
             The engine refused.
         DeviceError
             It did not answer.
@@ -116,14 +139,14 @@ class UsbLink:
         data = self._exchange(command, b"", READ | ANSWER)
         if len(data) < length:
             message = (
-                f"{self.name}: asked for {length} bytes of {command:#06x}, it gave {len(data)}; its firmware is not "
-                f"one that this driver knows: update it to {self.kind.firmware} or later"
+                f"{self.name}: requested {length} bytes of {command:#06x}, it gave {len(data)}; update its firmware to "
+                f"{self.kind.firmware} or later"
             )
             raise DeviceError(message)
         return data
 
     def close(self) -> None:
-        """Let the node go. Idempotent."""
+        """Close the node. Idempotent."""
         with self._lock:
             handle, self._handle = self._handle, None
             if handle is not None:
@@ -131,7 +154,9 @@ class UsbLink:
 
     def _exchange(self, command: int, data: bytes, flags: int) -> bytes:
         if len(data) > MAX_DATA - 2:
-            message = f"{self.name}: asked to send {len(data)} bytes at once, it takes {MAX_DATA - 2}; send fewer"
+            message = (
+                f"{self.name}: a command of {len(data)} bytes is too long, the limit is {MAX_DATA - 2}; send fewer"
+            )
             raise DeviceError(message)
         with self._lock:
             self._open_handle()
@@ -151,7 +176,7 @@ class UsbLink:
             while len(data) < length:
                 data += self._receive(command, until)
             if report[1] != self._sequence:
-                # The answer to a command that was given up.
+                # The answer to an earlier command that timed out.
                 continue
             if report[0] & FAILED:
                 message = (
@@ -196,7 +221,7 @@ class UsbLink:
         return self._handle
 
     def _drain(self) -> None:
-        """Forget what another program left unread."""
+        """Discard reports that another program left unread."""
         with suppress(OSError):
             while os.read(self._open_handle(), REPORT):
                 pass
@@ -210,18 +235,18 @@ class UsbLink:
 
 
 def open_link(path: Path, kind: UsbController, *, answer_s: float = ANSWER_TIMEOUT_S) -> UsbLink:
-    """Open a hidraw node for this program alone.
+    """Open a hidraw node exclusively.
 
     Raises
     ------
     DeviceBusyError
-        Another program holds it. Only programs that lock the node are noticed: TI's own does not.
+        Another program holds it. Only programs that lock the node are detected; TI's own does not.
     DeviceGoneError
-        There is no such node.
+        The node does not exist.
     DeviceError
-        It may not be opened.
+        This user may not open it.
     """
-    # Late, so that what looks at this module on another system is not refused.
+    # Imported here, so that this module can be imported on other systems.
     import fcntl
 
     try:
@@ -229,13 +254,13 @@ def open_link(path: Path, kind: UsbController, *, answer_s: float = ANSWER_TIMEO
     except OSError as error:
         if error.errno in (errno.EACCES, errno.EPERM):
             message = (
-                f"{path}: asked to open the light engine, this user may not; write the line {kind.udev_rule} into "
+                f"{path}: this user may not open the light engine; write the line {kind.udev_rule} into "
                 f"/etc/udev/rules.d/60-{kind.driver}.rules, run: sudo udevadm control --reload, and plug it in again"
             )
             raise DeviceError(message) from error
         if error.errno == errno.EBUSY:
             raise _busy_error(path) from error
-        message = f"{path}: asked to open the light engine, found: {error.strerror}; plug it in, and power it"
+        message = f"{path}: cannot open the light engine ({error.strerror}); plug it in, and power it"
         raise DeviceGoneError(message) from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -250,30 +275,30 @@ def open_link(path: Path, kind: UsbController, *, answer_s: float = ANSWER_TIMEO
 
 
 def _require_engine(handle: int, path: Path, kind: UsbController) -> None:
-    """Compare vendor and product of an open node: numbers of nodes are given again after an unplug."""
+    """Check vendor and product of an open node: node numbers are reused after an unplug."""
     import fcntl
 
     answer = bytearray(8)
     try:
         fcntl.ioctl(handle, _RAW_INFO, answer)
     except OSError as error:
-        message = f"{path}: asked for the light engine, found no hidraw node ({error.strerror}); see: slrig devices"
+        message = f"{path}: expected a light engine, found no hidraw node ({error.strerror}); see: slrig devices"
         raise DeviceGoneError(message) from error
     found = struct.unpack("=IHH", answer)[1:]
     if found != (TI, kind.product):
-        asked, got = (f"{vendor:04x}:{product:04x}" for vendor, product in ((TI, kind.product), found))
-        message = f"{path}: asked for the light engine {asked}, found {got}; plug it in again"
+        expected, got = (f"{vendor:04x}:{product:04x}" for vendor, product in ((TI, kind.product), found))
+        message = f"{path}: expected the light engine {expected}, found {got}; plug it in again"
         raise DeviceGoneError(message)
 
 
 def _busy_error(path: Path) -> DeviceBusyError:
-    message = f"{path}: asked for the light engine, another program holds it; end that one (see: fuser -v {path})"
+    message = f"{path}: another program holds the light engine; end that program (see: fuser -v {path})"
     return DeviceBusyError(message)
 
 
 @dataclass(frozen=True, slots=True)
 class EngineNode:
-    """An engine's node. name : the serial number where that is the engine's alone, else its port, else the path."""
+    """Node of an engine. name : the serial number if unique, else its port, else the path."""
 
     path: Path
     name: str
@@ -281,7 +306,7 @@ class EngineNode:
 
 
 def find_engines(kind: UsbController, sysfs: Path = SYSFS, dev: Path = DEV) -> tuple[EngineNode, ...]:
-    """Return the engines that are plugged in, each under a name that no other has."""
+    """Return the engines that are plugged in, each with a unique name."""
     try:
         names = sorted((entry.name for entry in sysfs.iterdir()), key=_number)
     except OSError:
@@ -289,11 +314,11 @@ def find_engines(kind: UsbController, sysfs: Path = SYSFS, dev: Path = DEV) -> t
     wanted = f"{TI:08X}:{kind.product:08X}"
     listed = ((dev / name, _read_facts(sysfs / name)) for name in names)
     found = [(path, facts) for path, facts in listed if wanted in facts.get("HID_ID", "") and _is_first(facts)]
-    for_key = {key: Counter(facts.get(key, "") for _, facts in found) for key in ("HID_UNIQ", "HID_PHYS")}
+    counts = {key: Counter(facts.get(key, "") for _, facts in found) for key in ("HID_UNIQ", "HID_PHYS")}
     nodes = []
     for path, facts in found:
-        own = [facts[key] for key, often in for_key.items() if facts.get(key) and often[facts[key]] == 1]
-        nodes.append(EngineNode(path, (own or [str(path)])[0], facts.get("HID_NAME", "light engine")))
+        unique = [facts[key] for key, count in counts.items() if facts.get(key) and count[facts[key]] == 1]
+        nodes.append(EngineNode(path, (unique or [str(path)])[0], facts.get("HID_NAME", "light engine")))
     return tuple(nodes)
 
 
@@ -303,7 +328,7 @@ def require_hidraw(kind: UsbController) -> None:
 
 
 def list_devices(kind: UsbController, sysfs: Path = SYSFS) -> tuple[FoundDevice, ...]:
-    """The engines in the words of `slrig devices`. Raises WrongSystemError: this is not Linux."""
+    """Return the engines as listed by `slrig devices`. Raises WrongSystemError unless this is Linux."""
     require_hidraw(kind)
     return tuple(
         FoundDevice(kind.driver, node.name, f"{node.label} ({node.path})") for node in find_engines(kind, sysfs)
@@ -311,29 +336,31 @@ def list_devices(kind: UsbController, sysfs: Path = SYSFS) -> tuple[FoundDevice,
 
 
 def choose_engine(device: str | None, found: tuple[EngineNode, ...]) -> EngineNode:
-    """Return the engine that a rig file means: a name that `find_engines` gives, a path, or the only one there is.
+    """Return the engine that a rig file names: by a name from `find_engines`, a path, or the only one.
 
     Raises
     ------
     DeviceGoneError
-        There is none such now.
+        No such engine is plugged in.
     ConfigError
         Several are plugged in, and the file names none.
     """
-    have = "; ".join(f"{node.name} ({node.path})" for node in found) or "none"
+    available = "; ".join(f"{node.name} ({node.path})" for node in found) or "none"
     chosen = [node for node in found if device in (None, node.name, str(node.path))]
     if not chosen:
-        asked = "a light engine" if device is None else f'the light engine "{device}"'
-        message = f"asked for {asked}, plugged in: {have}; plug it in and power it, or write one of those names"
+        requested = "no light engine" if device is None else f'light engine "{device}" not'
+        message = f"{requested} found, plugged in: {available}; plug it in and power it, or write one of those names"
         raise DeviceGoneError(message)
     if len(chosen) > 1:
-        message = f'[projector] names no light engine, plugged in: {have}; write device = "…" with one of those names'
+        message = (
+            f'[projector] names no light engine, plugged in: {available}; write device = "…" with one of those names'
+        )
         raise ConfigError(message)
     return chosen[0]
 
 
 def _is_first(facts: dict[str, str]) -> bool:
-    """Whether this is the engine's first interface, as far as its port tells."""
+    """True if this is the engine's first interface, as far as its port shows."""
     number = re.search(r"/input(\d+)$", facts.get("HID_PHYS", ""))
     return number is None or int(number[1]) == 0
 
@@ -352,7 +379,7 @@ def _number(name: str) -> tuple[int, str]:
 
 
 class UsbCommand(IntEnum):
-    """USB commands of both."""
+    """USB commands common to both controllers."""
 
     POWER = 0x0200  # 1 standby, 0 normal
     LED_CURRENT = 0x0B01  # red, green, blue: 8 bits each
@@ -376,7 +403,7 @@ class MainStatus(IntFlag):
 
 
 class HardwareStatus(IntFlag):
-    """Hardware status. INITIALISED is well when set, the others when not."""
+    """Hardware status. INITIALISED is set in normal operation, the others are clear."""
 
     INITIALISED = 1
     RESET_CONTROLLER = 4
@@ -394,7 +421,7 @@ FAULTS = {
 
 
 class UsbEngine:
-    """The controller behind a link. Every method raises DeviceError and DeviceGoneError as the link does."""
+    """The controller behind a link. Every method raises the link's DeviceError and DeviceGoneError."""
 
     def __init__(self, link: UsbLink) -> None:
         self._link = link
@@ -402,11 +429,11 @@ class UsbEngine:
 
     @property
     def name(self) -> str:
-        """Words for it, for messages."""
+        """Name of the engine, for messages."""
         return self._link.name
 
     def close(self) -> None:
-        """Let the link go. Idempotent."""
+        """Close the link. Idempotent."""
         self._link.close()
 
     def set_byte(self, command: int, value: int) -> None:
@@ -418,20 +445,18 @@ class UsbEngine:
         return self._link.read(command, 1)[0]
 
     def settle_byte(self, command: IntEnum, value: int, *, within_s: float = 0.0) -> None:
-        """Set a register of one byte and read it back. Raises UnsupportedByDeviceError if it says otherwise."""
+        """Set a register of one byte and read it back. Raises UnsupportedByDeviceError if it differs."""
         self.settle(command, bytes([value]), within_s=within_s)
 
     def settle(self, command: IntEnum, data: bytes, *, within_s: float = 0.0) -> None:
-        """Set a register and compare what is read back, within some time. Raises UnsupportedByDeviceError if that is
-        something else.
-        """
+        """Set a register and read it back within a time. Raises UnsupportedByDeviceError if it differs."""
         self._link.write(command, data)
         until = time.monotonic() + within_s
         while (got := self._link.read(command, len(data))[: len(data)]) != data and time.monotonic() < until:
             self._never.wait(_ASK_AGAIN_S)
         if got != data:
             name = command.name.lower().replace("_", " ")
-            message = f"{self.name}: asked for {name} {data.hex(' ')}, the engine gives {got.hex(' ')}; "
+            message = f"{self.name}: requested {name} {data.hex(' ')}, the engine gives {got.hex(' ')}; "
             message += f"switch it off and on, and update its firmware to {self._link.kind.firmware} or later"
             raise UnsupportedByDeviceError(message)
 
@@ -440,50 +465,50 @@ class UsbEngine:
         self.set_byte(UsbCommand.LED_ENABLE, 8 if by_sequence else 0)
 
     def set_led_current(self, colours: int, current: int, *, inverted: bool) -> None:
-        """Set the current of the LEDs in `colours` (0 to 255), and none of the others; compare what is read back."""
+        """Set the current (0 to 255) of the LEDs in `colours`, and 0 for the others; verify by reading back."""
         wanted = [current if colours & bit else 0 for bit in (1, 2, 4)]
-        # The register's polarity turns the sense of the values around once more.
+        # The polarity register inverts the values again.
         if inverted != self.is_led_polarity_inverted:
             wanted = [255 - value for value in wanted]
         self.set_led_registers(bytes(wanted))
 
     @property
     def is_led_polarity_inverted(self) -> bool:
-        """Whether the register of the polarity is set."""
+        """True if the polarity register is set."""
         return bool(self.byte(UsbCommand.LED_POLARITY) & 1)
 
     def set_led_registers(self, values: bytes) -> None:
-        """Set the registers of red, green and blue, whatever their values mean; compare what is read back."""
+        """Set the raw registers of red, green and blue; verify by reading back."""
         self.settle(UsbCommand.LED_CURRENT, values)
 
     def start(self) -> None:
-        """Start the sequence that was set."""
+        """Start the current sequence from its beginning."""
         self.set_byte(UsbCommand.START_STOP, 2)
 
     def stop(self) -> None:
-        """Stop the sequence; the next start begins it anew."""
+        """Stop the sequence."""
         self.set_byte(UsbCommand.START_STOP, 0)
 
     def wait_until_running(self, timeout_s: float) -> None:
-        """Return when the sequencer says that it runs. Raises DeviceError if it does not in time."""
+        """Wait until the sequencer runs. Raises DeviceError on time-out."""
         until = time.monotonic() + timeout_s
         while not self.byte(UsbCommand.MAIN_STATUS) & MainStatus.RUNNING:
             self._wait(until, "start the sequence")
 
     def wait_until_initialised(self, timeout_s: float) -> None:
-        """Return when the engine is ready for commands. Raises DeviceError if it is not in time."""
+        """Wait until the engine is ready for commands. Raises DeviceError on time-out."""
         until = time.monotonic() + timeout_s
         while not self.byte(UsbCommand.HARDWARE_STATUS) & HardwareStatus.INITIALISED:
             self._wait(until, "finish its initialisation")
 
     def faults(self) -> str:
-        """What the hardware status complains of, in words; empty if of nothing."""
+        """Return the faults in the hardware status as text; empty if none."""
         status = self.byte(UsbCommand.HARDWARE_STATUS)
-        return "; ".join(words for bit, words in FAULTS.items() if status & bit)
+        return "; ".join(text for bit, text in FAULTS.items() if status & bit)
 
-    def _wait(self, until: float, what: str) -> None:
+    def _wait(self, until: float, action: str) -> None:
         if time.monotonic() > until:
-            told = self.faults() or "nothing is wrong"
-            message = f"{self.name} did not {what} in time, and says: {told}; switch it off and on"
+            status = self.faults() or "no fault"
+            message = f"{self.name} did not {action} in time, and reports: {status}; switch it off and on"
             raise DeviceError(message)
         self._never.wait(_ASK_AGAIN_S)

@@ -117,7 +117,7 @@ def test_what_the_engine_refuses_is_reported_in_its_words_and_it_is_dark(bench: 
         projector.show(0)
     # Data is not answered: what is wrong with it is found in the error code.
     bench.engine.refusing = {0x1A2B: 9}
-    with pytest.raises(UnsupportedByDeviceError, match="take picture 0, and says: it does not know the packing"):
+    with pytest.raises(UnsupportedByDeviceError, match="take picture 0: the picture.s encoding is unknown"):
         projector.load(SEQUENCE)
     bench.engine.refusing = {}
     projector.load(SEQUENCE)
@@ -138,7 +138,7 @@ def test_a_piece_of_a_picture_that_went_wrong_is_not_hidden_by_the_next(
     assert bench.commands().count(0x1A2B) > 2
     answers = iter((6, *[0] * 100))
     monkeypatch.setattr(bench.engine, "_load", lambda _half, _data: next(answers))
-    with pytest.raises(UnsupportedByDeviceError, match="take picture 0, and says: a parameter is not one that it has"):
+    with pytest.raises(UnsupportedByDeviceError, match="take picture 0: a parameter is invalid"):
         projector.load(SEQUENCE)
     assert bench.commands().count(0x1A2B) == 1
 
