@@ -162,8 +162,8 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
         if not light.supported:
             message = (
                 f"requested {wanted_us} µs of {colour.name.lower()} light, which the engine does not support; its "
-                f"shortest is {light.least_us} µs, the longest that TI states {MAX_LIGHT_US} µs; shorten exposure_s, or trigger "
-                "the cameras by software, where exposures may be longer"
+                f"shortest is {light.least_us} µs, the longest that TI states {MAX_LIGHT_US} µs; shorten exposure_s, "
+                "or trigger the cameras by software, where exposures may be longer"
             )
             raise UnsupportedByDeviceError(message)
         self._lights[colour, wanted_us] = light

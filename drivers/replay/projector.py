@@ -1,4 +1,4 @@
-"""The projector of a recording: it shows what was recorded, and says what was not."""
+"""The projector of a recording: it shows the recorded patterns, and refuses others."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ class ReplayProjector:
         self._state.require_open()
         self._state.require_size(sequence, self._info.size)
         for pattern in sequence.patterns:
-            lacking = [name for name, camera in self._cameras.items() if not camera.recorded_frames(pattern)]
-            if lacking:
+            missing = [name for name, camera in self._cameras.items() if not camera.recorded_frames(pattern)]
+            if missing:
                 recorded = "; ".join(dict.fromkeys(map(_describe_family, self._recorded)))
                 message = (
                     f"the recording '{self._info.serial}' has no frame of {_describe_pattern(pattern)} from camera "
-                    f"{', '.join(lacking)}; it has {recorded}. Leave the patterns out of the "
-                    "request and of the rig file's [scan], and all that was recorded is played; or ask for some of it: "
-                    f"{setting('gray_cell_px')}, {setting('line_shift_period_px')} and their like"
+                    f"{', '.join(missing)}; it has {recorded}. Leave the patterns out of the "
+                    "request and of the rig file's [scan] to replay all recorded ones; or request some of them: "
+                    f"{setting('gray_cell_px')}, {setting('line_shift_period_px')} and similar settings"
                 )
                 raise UnsupportedByDeviceError(message)
         self.blank()
@@ -77,7 +77,7 @@ class ReplayProjector:
         return Shown(index, self._clock.change_light(first_s), 0)
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. A recording does not play."""
+        """See `Projector`. Not supported."""
         self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
@@ -98,7 +98,7 @@ class ReplayProjector:
 
 
 def _describe_pattern(pattern: Pattern) -> str:
-    """Which pattern of its family."""
+    """Describe a pattern within its family."""
     match pattern:
         case Gray():
             return f"bit {pattern.bit} of {_describe_family(pattern)}"
@@ -109,7 +109,7 @@ def _describe_pattern(pattern: Pattern) -> str:
 
 
 def _describe_family(pattern: Pattern) -> str:
-    """What a pattern is one of, in the words of a request."""
+    """Describe the family of a pattern as in a request."""
     match pattern:
         case White() | Black():
             return pattern.kind

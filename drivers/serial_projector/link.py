@@ -1,7 +1,9 @@
-"""One command, one answer, over a line that loses and damages bytes: sent again until it is answered, obeyed once.
+"""The serial link to a trigger box: its ports, SLTP/1 lines, and commands that are repeated until answered.
 
-A command that is sent again keeps its number, and the box answers a number that it has obeyed already with what it
-answered then. So an answer that is lost costs time, and never shows a pattern twice.
+A repeated command keeps its number, and the box answers a number that it has already executed with its earlier answer.
+A lost answer therefore costs time, and never shows a pattern twice.
+
+Finding uses information of the system alone: opening a port restarts many boards, and disturbs other devices.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ _EVENTS = 4096
 
 
 class RefusalCode(IntEnum):
-    """Why a box does not obey, the code of an ERR line."""
+    """Reason of a refusal, the code of an ERR line."""
 
     FRAMING = 1
     VERB = 2
@@ -49,7 +51,7 @@ class RefusalCode(IntEnum):
 
 
 class BoxFault(IntEnum):
-    """Why a box went dark by itself, the code of a FAULT event."""
+    """Reason why a box went dark by itself, the code of a FAULT event."""
 
     WATCHDOG = 1
     ON_TIME = 2
@@ -58,7 +60,7 @@ class BoxFault(IntEnum):
 
 
 class SequenceMode(IntEnum):
-    """What starts each pattern of a sequence: the box's own clock, or a TRIG from the host."""
+    """Start of each pattern of a sequence: by the box's own clock, or by a TRIG from the host."""
 
     FREE = 0
     STEP = 1
@@ -66,7 +68,7 @@ class SequenceMode(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class BoxAnswer:
-    """A line that answers a command of ours. code : None for OK, else what `RefusalCode` lists (or a number beyond it)."""
+    """Answer to a command. code : None for OK, else of `RefusalCode` (or an unknown number)."""
 
     session: str
     number: int
@@ -76,7 +78,7 @@ class BoxAnswer:
 
 @dataclass(frozen=True, slots=True)
 class BoxEvent:
-    """A line that answers nothing: `! FRAME 3 123456`."""
+    """Line that answers no command: `! FRAME 3 123456`."""
 
     name: str
     words: tuple[str, ...]
@@ -84,24 +86,23 @@ class BoxEvent:
 
 @dataclass(frozen=True, slots=True)
 class UnreadableLine:
-    """The box says that it could not read a line."""
+    """The box reports that it could not read a line."""
 
 
 BoxLine = BoxAnswer | BoxEvent | UnreadableLine
 
 
 def encode_line(text: str) -> bytes:
-    """Return a line as it goes over the wire.
+    """Encode a line for the wire.
 
-    >>> framed("1A2B 7 SHOW 3").rstrip()
-    b'1A2B 7 SHOW 3*FFE7'
+    >>> encode_line("1A2B 7 SHOW 3").rstrip() b'1A2B 7 SHOW 3*FFE7'
     """
     body = text.encode("ascii")
     return b"%s*%04X\n" % (body, binascii.crc_hqx(body, 0xFFFF))
 
 
 def parse_line(line: bytes) -> BoxLine | None:
-    """Return what a line that came in says; None where it is damaged, or no SLTP at all."""
+    """Parse a received line; None if it is damaged or not SLTP."""
     body, star, crc = line.rstrip(b"\r\n").rpartition(b"*")
     if not star or len(line) > MAX_LINE_BYTES + 2 or b"%04X" % binascii.crc_hqx(body, 0xFFFF) != crc:
         return None
@@ -124,41 +125,41 @@ def parse_line(line: bytes) -> BoxLine | None:
 
 @dataclass(slots=True)
 class LineSplitter:
-    """Cuts what comes in, in pieces of any size, into lines."""
+    """Splits received data, in pieces of any size, into lines."""
 
     _rest: bytes = field(default=b"")
 
     def lines(self, data: bytes) -> list[bytes]:
-        """Return the lines that are complete now, without their ends; empty ones are left out."""
+        """Return the completed lines without their ends; empty ones are omitted."""
         *whole, self._rest = (self._rest + data).split(b"\n")
-        # A line that is too long is damaged in any case.
+        # A longer line is invalid in any case.
         self._rest = self._rest[-2 * MAX_LINE_BYTES :]
         return [line for line in whole if line.strip(b"\r")]
 
 
 def find_ports(by_id: Path = BY_ID) -> tuple[FoundDevice, ...]:
-    """Return the USB serial ports, each by a name that stays the same where it has one. Raises LibraryMissingError."""
+    """Return the USB serial ports, each by a persistent name if available. Raises LibraryMissingError."""
     try:
         list_ports = importlib.import_module("serial.tools.list_ports")
     except ImportError as missing:
         install = "pip install pyserial"
         message = f"driver 'serial_projector' needs pyserial, which is not installed ({missing}); {install}"
         raise LibraryMissingError(message, install=install) from missing
-    lasting = _links_by_target(by_id)
+    persistent = _links_by_target(by_id)
     ports = sorted(list_ports.comports(), key=lambda port: str(port.device))
     return tuple(
-        FoundDevice("serial_projector", lasting.get(os.path.realpath(port.device), port.device), _label(port))
+        FoundDevice("serial_projector", persistent.get(os.path.realpath(port.device), port.device), _label(port))
         for port in ports
         if port.vid is not None
     )
 
 
 def _label(port: Any) -> str:
-    """What the system says of a port, and that nobody asked it."""
+    """Label of a port from the system's information."""
     name = " ".join(filter(None, (port.manufacturer, port.product))) or "USB serial port"
     serial = f", serial number {port.serial_number}" if port.serial_number else ""
-    likely = "MicroPython on an RP2040: " if (port.vid, port.pid) == MICROPYTHON_RP2 else ""
-    return f"{likely}{name} ({port.device}, {port.vid:04X}:{port.pid or 0:04X}{serial}), not asked whether it is a box"
+    prefix = "MicroPython on an RP2040: " if (port.vid, port.pid) == MICROPYTHON_RP2 else ""
+    return f"{prefix}{name} ({port.device}, {port.vid:04X}:{port.pid or 0:04X}{serial}), may be a trigger box"
 
 
 def _links_by_target(folder: Path) -> dict[str, str]:
@@ -169,7 +170,7 @@ def _links_by_target(folder: Path) -> dict[str, str]:
 
 
 class BoxRefusedError(DeviceError):
-    """The box answered, and does not obey. `number` is one of `RefusalCode` (or a number that newer firmware knows)."""
+    """The box refused a command. `number` is of `RefusalCode` (or an unknown number of newer firmware)."""
 
     def __init__(self, verb: str, number: int, words: tuple[str, ...]) -> None:
         self.verb, self.number, self.words = verb, number, words
@@ -178,12 +179,12 @@ class BoxRefusedError(DeviceError):
 
 
 class NoAnswerError(DeviceError):
-    """No answer came, however often the command was sent: the box may have obeyed, or never heard of it."""
+    """No answer arrived after all repetitions: the box may or may not have executed the command."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What the box answered. It obeyed at some instant between `sent_ns` and `received_ns` (the link's clock)."""
+    """Answer of the box. It executed the command between `sent_ns` and `received_ns` (the link's clock)."""
 
     words: tuple[str, ...]
     sent_ns: int
@@ -192,7 +193,7 @@ class Reply:
 
 @dataclass(slots=True)
 class LinkCounters:
-    """What the line did: commands, sent again, damaged lines that came in, answers to somebody else."""
+    """Counters of the link: commands, repetitions, damaged lines, answers to another host."""
 
     commands: int = 0
     again: int = 0
@@ -202,16 +203,16 @@ class LinkCounters:
 
 @dataclass(slots=True)
 class BoxLink:
-    """Commands to one box. One thread at a time uses it; `closing` ends a wait from another one.
+    """Commands to one box. Used by one thread at a time; setting `closing` ends a wait from another thread.
 
-    reply_s : how long an answer may take, beyond what the command itself takes. deadline_s : after which a command is
-    not sent again. clock : of both, and of the answers' instants.
+    reply_s : longest time for an answer, beyond the command's own duration. deadline_s : after it, a command is not
+    repeated. clock : of both, and of the answers' instants.
     """
 
     port: BytePort
     reply_s: float
     deadline_s: float
-    # So many that two hosts hardly share one; never the number of a session before.
+    # Random, so that it differs from other hosts' and earlier sessions.
     session: str = field(default_factory=lambda: secrets.token_hex(2).upper())
     closing: threading.Event = field(default_factory=threading.Event)
     events: deque[BoxEvent] = field(default_factory=lambda: deque(maxlen=_EVENTS))
@@ -222,7 +223,7 @@ class BoxLink:
     _waiting: deque[bytes] = field(default_factory=deque)
 
     def replace_port(self, port: BytePort) -> None:
-        """Go on over another port. What was under way on the old one is lost."""
+        """Continue on another port. Pending data of the old one is dropped."""
         self.port, self._splitter = port, LineSplitter()
         self._waiting.clear()
 
@@ -240,15 +241,15 @@ class BoxLink:
         Parameters
         ----------
         takes_s
-            How long the box may be busy with it.
+            Duration of the command itself.
         while_closing
-            Ask although `closing` is set.
+            Send it even if `closing` is set.
 
         Raises
         ------
-        RefusedError
-            The box does not obey.
-        SilentError
+        BoxRefusedError
+            The box refuses.
+        NoAnswerError
             No answer.
         DeviceGoneError
             The port is gone.
@@ -272,17 +273,17 @@ class BoxLink:
                 return Reply(answer.words, first_ns, self.clock.now_ns())
         took_s = (self.clock.now_ns() - first_ns) / _NS_PER_S
         message = (
-            f"asked the trigger box for {verb} {sent} times in {took_s:.2f} s, found no answer "
+            f"the trigger box did not answer {verb}, sent {sent} times in {took_s:.2f} s "
             f"({self.tally.damaged} damaged lines so far); check its cable, its power and the baud rate"
         )
         raise NoAnswerError(message)
 
     def after(self, seconds: float) -> int:
-        """The time in so many seconds, ns."""
+        """Return the time `seconds` from now, ns."""
         return self.clock.now_ns() + round(seconds * _NS_PER_S)
 
     def _answer(self, until_ns: int, while_closing: bool) -> BoxAnswer | None:
-        """The answer to the command that was sent last; None when it is time to send it again."""
+        """Return the answer to the last command; None when it should be repeated."""
         while True:
             while self._waiting:
                 raw = self._waiting.popleft()
@@ -297,7 +298,7 @@ class BoxLink:
                         return None
                     case None:
                         self.tally.damaged += 1
-                        # That may have been it: a little longer, for what else is under way.
+                        # It may have been the answer: wait only briefly for other lines.
                         until_ns = min(until_ns, self.after(SLICE_S))
             if self.closing.is_set() and not while_closing:
                 message = "the projector was closed while it waited for the trigger box; open the rig again"

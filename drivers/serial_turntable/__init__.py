@@ -52,12 +52,12 @@ def open_turntable(options: Mapping[str, object], folder: Path, *, clock: Clock 
     options
         `drivers.serial_turntable.options.LineOptions`.
     folder
-        The rig file's own; nothing counts from it.
+        Folder of the rig file, not used.
     clock
-        By which it settles and gives up; else the system's.
+        For settling and time-outs; default: the system's.
 
-    Raises what `drivers.serial_port.SerialPort` does, ConfigError with all faults of the options, and
-    UnsupportedByDeviceError or DeviceError where what answers is another controller, or none.
+    Raises the errors of `drivers.serial_port.SerialPort`, ConfigError with all faults of the options, and
+    UnsupportedByDeviceError or DeviceError if another controller or none answers.
     """
     from drivers.serial_port import SerialPort
     from drivers.serial_turntable.controllers import LineController

@@ -1,8 +1,8 @@
-"""G-code as GRBL 1.1 takes it, and how it tells where it is and what is wrong.
+"""Controllers of a turntable: GRBL 1.1, and boards with the protocol of lines (see the docstring of the package).
 
-A line is answered `ok` when it is understood, not when it has been obeyed: a turn is over when the status report, which
-the byte `?` asks for, says Idle at the place that was asked for. Source: GRBL's own documents of its
-interface, commands and numbers (github.com/gnea/grbl, version 1.1).
+GRBL answers a line with `ok` when it is understood, not when it is executed: a turn is over when the status report,
+requested by the byte `?`, is Idle at the requested position. Source: GRBL's own documents of its interface, commands
+and numbers (github.com/gnea/grbl, version 1.1).
 """
 
 from __future__ import annotations
@@ -22,51 +22,51 @@ _ANGLE = re.compile(r"OK (-?\d+(?:\.\d+)?)")
 
 _RESET, _STATUS_REQUEST, _HOLD = b"\x18", b"?", b"!"
 _RETRY_S = 0.5
-"""After this a byte or a line that nothing answered is sent again: far longer than any answer takes."""
+"""After this time an unanswered byte or line is repeated: much longer than any answer takes."""
 _REPLY_S = 2.0
-"""GRBL answers a line at once, unless its look-ahead is full, which one move never does."""
+"""Longest time for an answer that needs no movement."""
 _POLL_S = 0.1
-"""GRBL's documentation asks for 5 Hz at the least and 10 Hz at the most."""
+"""GRBL's documentation recommends 5 to 10 Hz."""
 _STILL_S = 1.0
-"""A controller that is Idle elsewhere for so long does not begin to move any more."""
+"""A controller that is Idle at another position for this time will not move any more."""
 _PRINT_STEP = 0.001
-"""Places are printed with three decimals."""
+"""Positions are printed with three decimals."""
 _HOLD_POLLS = 10
 _BANNER = re.compile(r"grbl(hal)? ?v?\d", re.IGNORECASE)
 _REPORT = re.compile(r"<([A-Za-z]+(?::\d+)?)\|(.*)>")
 _SETTING = re.compile(r"\$(\d+)=(\d+(?:\.\d+)?)")
 _NUMBERED = re.compile(r"(error|ALARM):\s*(\d+)")
 _ERRORS = {
-    1: "it found a number without a letter: the line came damaged",
-    2: "it found a letter without a number: the line came damaged",
-    3: "it does not know this $ command",
+    1: "it found a number without a letter: the line was damaged",
+    2: "it found a letter without a number: the line was damaged",
+    3: "unknown $ command",
     5: "homing is switched off ($22)",
     7: "its EEPROM could not be read, and its settings are the factory's now: set them again",
-    8: "it takes $ commands at rest only",
+    8: "it accepts $ commands only at rest",
     9: "it is locked, by an alarm or a jog",
     11: "the line is longer than it takes",
     13: "its safety door is open",
-    15: "the place lies beyond the axis' travel ($130 to $132)",
-    20: "it does not know such G-code: is it GRBL 1.1?",
+    15: "the position is beyond the axis' travel ($130 to $132)",
+    20: "unknown G-code: is it GRBL 1.1?",
     22: "it has no feed rate: give speed_deg_s",
-    25: "a word came twice: the line came damaged",
+    25: "a repeated word: the line was damaged",
     26: "it found no axis: it lacks the one that `axis` names",
     36: "it cannot use a word of it: it lacks the axis that `axis` names",
 }
 _ALARMS = {
     1: "a limit switch was hit; a turntable has none: switch them off ($21=0)",
-    2: "the place lies beyond the axis' travel: switch soft limits off ($20=0)",
+    2: "the position is beyond the axis' travel: switch soft limits off ($20=0)",
     3: "it was reset while it turned, and has lost steps",
     6: "homing was broken off",
     7: "homing was broken off by the safety door",
     8: "homing did not get off its switch",
     9: "homing found no switch: a turntable needs no homing ($22=0)",
-    10: "it lost its place: see to its emergency stop",
+    10: "it lost its position: check its emergency stop",
 }
 
 
 class LineController:
-    """Implements `Controller`. Its unit is a degree.
+    """Implements `TurntableController` for the protocol of lines. Its unit is a degree.
 
     Raises
     ------
@@ -75,7 +75,7 @@ class LineController:
     UnsupportedByDeviceError
         It speaks another version.
     DeviceError
-        Nothing that speaks this protocol answers.
+        No answer in this protocol.
     """
 
     def __init__(self, lines: ControllerLink, options: LineOptions) -> None:
@@ -83,46 +83,46 @@ class LineController:
         self.step = 360 / self._steps_per_turn(lines.after(options.open_s))
 
     def position(self) -> float:
-        """See `Controller`."""
+        """See `TurntableController`."""
         return self._send_command("STOP", self._lines.after(_REPLY_S))
 
-    def move_to(self, place: float, until_ns: int) -> float:
-        """See `Controller`."""
-        return self._send_command(f"TURN {place:.3f}", until_ns)
+    def move_to(self, position: float, until_ns: int) -> float:
+        """See `TurntableController`."""
+        return self._send_command(f"TURN {position:.3f}", until_ns)
 
     def halt(self) -> None:
-        """See `Controller`."""
+        """See `TurntableController`."""
         self._lines.send("STOP")
 
     def _steps_per_turn(self, until_ns: int) -> int:
-        heard: str | None = None
+        received: str | None = None
         while self._lines.clock.now_ns() < until_ns:
-            # A host that was killed may have left the board turning, and then it heeds nothing but STOP.
+            # A killed host may have left the board turning, in which it accepts only STOP.
             self._lines.send("STOP")
             again_ns = self._lines.after(_RETRY_S)
             while (line := self._lines.next_line(again_ns)) is not None:
-                heard = line
+                received = line
                 if _ANGLE.fullmatch(line):
                     break
             self._lines.send("ID?")
             again_ns = self._lines.after(_RETRY_S)
             while (line := self._lines.next_line(again_ns)) is not None:
-                heard, found = line, _IDENTITY.fullmatch(line)
+                received, found = line, _IDENTITY.fullmatch(line)
                 if found is None or not int(found[2]):
                     continue
                 if int(found[1]) != _VERSION:
                     message = f"{self._lines.label} speaks version {found[1]} of its protocol, this driver {_VERSION}"
                     raise UnsupportedByDeviceError(message)
                 return int(found[2])
-        said = "nothing answered" if heard is None else f"found {heard!r}"
+        answer = "got no answer" if received is None else f"found {received!r}"
         message = (
-            f"asked {self._lines.label} for its identity (ID?), expected 'slrig-turntable 1 STEPS', {said}; see its "
-            "baud rate, its power and its firmware"
+            f"asked {self._lines.label} for its identity (ID?), expected 'slrig-turntable 1 STEPS', {answer}; check "
+            "its baud rate, its power and its firmware"
         )
         raise DeviceError(message)
 
     def _send_command(self, command: str, until_ns: int) -> float:
-        """Send a command; return the angle that its answer tells."""
+        """Send a command; return the angle in its answer."""
         for early in self._lines.read_waiting():
             self._check_line(early, command)
         self._lines.send(command)
@@ -133,39 +133,39 @@ class LineController:
                 return float(reached[1])
         self.halt()
         message = (
-            f"{self._lines.label} did not answer {command!r} in time, and was told to stop; see to its power and "
+            f"{self._lines.label} did not answer {command!r} in time, and was stopped; check its power and "
             "cable, or give it longer (turn_s)"
         )
         raise DeviceError(message)
 
     def _check_line(self, line: str, command: str) -> None:
-        """Raise DeviceError if a line says that something is wrong."""
+        """Raise DeviceError if a line reports an error."""
         if line == "START":
-            message = f"{self._lines.label} restarted, and no longer knows where it stands; see to its power"
+            message = f"{self._lines.label} restarted, and lost its position; check its power"
             raise DeviceError(message)
-        refused, _, words = line.partition(" ")
-        if refused == "ERR":
-            message = f"{self._lines.label} answered {command!r} with: {words or 'an error that it does not name'}"
+        verb, _, reason = line.partition(" ")
+        if verb == "ERR":
+            message = f"{self._lines.label} answered {command!r} with: {reason or 'an unnamed error'}"
             raise DeviceError(message)
 
 
 @dataclass(frozen=True, slots=True)
 class _GrblStatus:
     state: str
-    place: float
+    position: float
 
 
 class GrblController:
-    """Implements `Controller` on GRBL 1.1 and what takes the same (grblHAL, FluidNC).
+    """Implements `TurntableController` for GRBL 1.1 and compatible firmware (grblHAL, FluidNC).
 
     Raises
     ------
     DeviceGoneError
         The port is gone.
     UnsupportedByDeviceError
-        It is no GRBL, lacks the axis, or is set so that a table cannot turn round and round.
+        It is not GRBL, lacks the axis, or has settings that do not allow endless rotation.
     DeviceError
-        Nothing answers.
+        No answer.
     """
 
     def __init__(self, lines: ControllerLink, options: GrblOptions) -> None:
@@ -175,11 +175,11 @@ class GrblController:
         self._feed = None if options.speed_deg_s is None else options.speed_deg_s * 60 * options.units_per_deg
         self._reset(lines.after(options.open_s))
         if self._status(lines.after(_REPLY_S)).state == "Alarm":
-            # Locked at its start where homing is on; a table has nowhere to run into.
+            # With homing on it is locked at its start; a turntable has no end stops.
             self._send_command("$X")
-        told = filter(None, map(_SETTING.match, self._send_command("$$")))
-        settings = {int(each[1]): float(each[2]) for each in told}
-        for key, wanted in ((13, "to report mm"), (20, "without soft limits, for a table turns round")):
+        matches = filter(None, map(_SETTING.match, self._send_command("$$")))
+        settings = {int(each[1]): float(each[2]) for each in matches}
+        for key, wanted in ((13, "to report mm"), (20, "without soft limits, for endless rotation")):
             if settings.get(key):
                 message = f"{lines.label} has ${key}={settings[key]:g}; set it {wanted}: ${key}=0"
                 raise UnsupportedByDeviceError(message)
@@ -187,88 +187,87 @@ class GrblController:
         self.step = 1 / steps if steps else 0.0
 
     def position(self) -> float:
-        """See `Controller`. Raises DeviceError, also where it has restarted or told an alarm meanwhile."""
+        """See `TurntableController`. Raises DeviceError also if it has restarted or reported an alarm meanwhile."""
         for line in self._lines.read_waiting():
             self._check_line(line, "before a turn")
-        return self._status(self._lines.after(_REPLY_S)).place
+        return self._status(self._lines.after(_REPLY_S)).position
 
-    def move_to(self, place: float, until_ns: int) -> float:
-        """See `Controller`."""
-        # G53: places of the machine itself, as status reports have them, whatever offsets somebody has set.
+    def move_to(self, position: float, until_ns: int) -> float:
+        """See `TurntableController`."""
+        # G53: machine coordinates, as in status reports, independent of offsets.
         motion = "G0" if self._feed is None else f"G1 F{self._feed:.3f}"
-        self._send_command(f"G21 G90 G53 {motion} {self._axis}{place:.4f}")
+        self._send_command(f"G21 G90 G53 {motion} {self._axis}{position:.4f}")
         still_ns: int | None = None
         while True:
             found = self._status(until_ns)
             now_ns = self._lines.clock.now_ns()
             if found.state == "Idle":
                 still_ns = self._lines.after(_STILL_S) if still_ns is None else still_ns
-                if abs(found.place - place) <= self.step / 2 + _PRINT_STEP or now_ns >= still_ns:
-                    return found.place
+                if abs(found.position - position) <= self.step / 2 + _PRINT_STEP or now_ns >= still_ns:
+                    return found.position
             elif found.state in {"Alarm", "Check", "Sleep"}:
-                message = f"{self._lines.label} is in the state {found.state} and does not turn; reset it"
+                message = f"{self._lines.label} is in state {found.state} and does not turn; reset it"
                 raise DeviceError(message)
             else:
                 still_ns = None
             if now_ns >= until_ns:
                 self.halt()
                 message = (
-                    f"{self._lines.label} did not get to {place:.3f} {self._axis} within turn_s; it was at "
-                    f"{found.place:.3f}, in the state {found.state}, and was stopped; let it turn faster, or give more"
+                    f"{self._lines.label} did not reach {position:.3f} {self._axis} within turn_s; it was at "
+                    f"{found.position:.3f}, in state {found.state}, and was stopped; let it turn faster or raise turn_s"
                 )
                 raise DeviceError(message)
             self._lines.wait(_POLL_S)
 
     def halt(self) -> None:
-        """See `Controller`. Held first, which slows down, then reset, which forgets what was left of the turn."""
+        """See `TurntableController`. Feed hold first, which decelerates, then reset, which drops the rest of the
+        turn.
+        """
         self._lines.send_byte(_HOLD)
         for _ in range(_HOLD_POLLS):
             self._lines.send_byte(_STATUS_REQUEST)
-            held = re.search(rb"<(Hold:0|Idle|Alarm)\b", self._lines.port.read(_POLL_S))
-            if held is not None:
+            if re.search(rb"<(Hold:0|Idle|Alarm)\b", self._lines.port.read(_POLL_S)) is not None:
                 break
         self._lines.send_byte(_RESET)
 
     def _reset(self, until_ns: int) -> None:
-        """Reset it, which keeps its place while it stands, until it greets; a board that just restarts is deaf."""
-        heard: list[str] = []
+        """Reset it until it greets. Its position is kept at rest; a board that just restarted does not listen yet."""
+        received: list[str] = []
         while self._lines.clock.now_ns() < until_ns:
             self._lines.send_byte(_RESET)
             again_ns = self._lines.after(_RETRY_S)
             while (line := self._lines.next_line(again_ns)) is not None:
-                heard.append(line)
+                received.append(line)
                 if _BANNER.match(line):
-                    # What was sent to a deaf board may still be greeted, and is so before this is answered.
+                    # Earlier resets may cause more greetings, which arrive before this is answered.
                     self._lines.send("")
-                elif line == "ok" and any(map(_BANNER.match, heard)):
+                elif line == "ok" and any(map(_BANNER.match, received)):
                     return
-        said = f"it said {heard[-1]!r}" if heard else "nothing answered"
+        answer = f"found {received[-1]!r}" if received else "got no answer"
         message = (
-            f"asked {self._lines.label} to greet as GRBL does, {said}; see its baud rate, its power and whether its "
-            "firmware is GRBL 1.1, grblHAL or FluidNC (Marlin is not served)"
+            f"reset {self._lines.label}, expected GRBL's greeting, {answer}; check its baud rate, its power and that "
+            "its firmware is GRBL 1.1, grblHAL or FluidNC (Marlin is not supported)"
         )
-        raise UnsupportedByDeviceError(message) if heard else DeviceError(message)
+        raise UnsupportedByDeviceError(message) if received else DeviceError(message)
 
     def _send_command(self, text: str) -> list[str]:
-        """Send a line; return what came before its `ok`."""
+        """Send a line; return the lines before its `ok`."""
         for early in self._lines.read_waiting():
             self._check_line(early, text)
         self._lines.send(text)
         until_ns = self._lines.after(_REPLY_S)
-        told: list[str] = []
+        answer: list[str] = []
         while (line := self._lines.next_line(until_ns)) is not None:
             if line == "ok":
-                return told
+                return answer
             self._check_line(line, text)
-            told.append(line)
-        message = (
-            f"{self._lines.label} did not answer {text!r} in {_REPLY_S:g} s; see to its power, cable and baud rate"
-        )
+            answer.append(line)
+        message = f"{self._lines.label} did not answer {text!r} in {_REPLY_S:g} s; check its power, cable and baud rate"
         raise DeviceError(message)
 
     def _status(self, until_ns: int) -> _GrblStatus:
-        """Where it is, asked again while nothing that can be read comes."""
-        # At least once, and past the deadline of a turn as well, which is to tell where it was.
+        """Request the status until a valid report arrives."""
+        # At least once, also after the deadline of a turn, whose error states the position.
         until_ns = max(until_ns, self._lines.after(_REPLY_S))
         while self._lines.clock.now_ns() < until_ns:
             self._lines.send_byte(_STATUS_REQUEST)
@@ -278,40 +277,40 @@ class GrblController:
                 report = _REPORT.fullmatch(line)
                 if report is not None:
                     return _GrblStatus(report[1], self._parse_position(report[2]))
-        message = f"{self._lines.label} does not tell where it is any more; see to its power and cable"
+        message = f"{self._lines.label} no longer reports its position; check its power and cable"
         raise DeviceError(message)
 
     def _parse_position(self, fields: str) -> float:
-        told = dict(field.partition(":")[::2] for field in fields.split("|"))
-        if "MPos" not in told:
-            message = f"{self._lines.label} does not report places of the machine (MPos): set $10=1"
+        report = dict(field.partition(":")[::2] for field in fields.split("|"))
+        if "MPos" not in report:
+            message = f"{self._lines.label} does not report machine positions (MPos): set $10=1"
             raise UnsupportedByDeviceError(message)
-        places = told["MPos"].split(",")
-        if len(places) <= self._index:
+        positions = report["MPos"].split(",")
+        if len(positions) <= self._index:
             message = (
-                f"{self._lines.label} has no axis {self._axis}, only {', '.join(AXES[: len(places)])}; name another as "
-                "`axis`, with units_per_deg"
+                f"{self._lines.label} has no axis {self._axis}, only {', '.join(AXES[: len(positions)])}; name another "
+                "as `axis`, with units_per_deg"
             )
             raise UnsupportedByDeviceError(message)
         try:
-            return float(places[self._index])
+            return float(positions[self._index])
         except ValueError as error:
-            message = f"{self._lines.label} reported {fields!r}, which holds no place; see to its cable"
+            message = f"{self._lines.label} reported {fields!r}, which has no position; check its cable"
             raise DeviceError(message) from error
 
-    def _check_line(self, line: str, asked: str) -> None:
-        """Raise DeviceError if a line says that something is wrong."""
+    def _check_line(self, line: str, command: str) -> None:
+        """Raise DeviceError if a line reports an error."""
         if _BANNER.match(line):
             message = (
-                f"{self._lines.label} restarted by itself ({line!r}) and no longer knows where it stands; see to its "
-                "power and its emergency stop"
+                f"{self._lines.label} restarted by itself ({line!r}) and lost its position; check its power and its "
+                "emergency stop"
             )
             raise DeviceError(message)
         numbered = _NUMBERED.fullmatch(line)
         if numbered is not None:
-            self._raise_refusal(numbered[1], int(numbered[2]), asked)
+            self._raise_refusal(numbered[1], int(numbered[2]), command)
 
-    def _raise_refusal(self, kind: str, number: int, asked: str) -> NoReturn:
-        words = (_ERRORS if kind == "error" else _ALARMS).get(number, "see GRBL's list of its numbers")
-        message = f"{self._lines.label} answered {kind}:{number} to {asked!r}: {words}"
+    def _raise_refusal(self, kind: str, number: int, command: str) -> NoReturn:
+        reason = (_ERRORS if kind == "error" else _ALARMS).get(number, "see GRBL's documentation of its numbers")
+        message = f"{self._lines.label} answered {kind}:{number} to {command!r}: {reason}"
         raise DeviceError(message)

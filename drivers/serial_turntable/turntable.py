@@ -1,4 +1,4 @@
-"""A turntable behind a controller on a serial line: where it stands, how it gets there, and when that is not known."""
+"""A turntable behind a controller on a serial line: the line-based link, and the turntable itself."""
 
 from __future__ import annotations
 
@@ -18,12 +18,16 @@ from slrig.model import StageAxis
 
 NS_PER_S = 1_000_000_000
 _MAX_LINE_BYTES = 1024
-"""Bytes without an end of line that are kept: no controller sends so long a line."""
+"""Maximum length of a line; longer data without a line end is dropped."""
 
 
 @dataclass(slots=True)
 class ControllerLink:
-    """A controller's port, line by line. `closing` ends a wait from another thread. label : what errors call it."""
+    """Line-based access to a controller's port, with time-outs.
+
+    Setting `closing` ends a wait from another thread. Anything that is not a line of printable ASCII is ignored. label
+    : name for errors.
+    """
 
     port: BytePort
     clock: Clock
@@ -37,20 +41,20 @@ class ControllerLink:
         self.port.write(text.encode("ascii") + b"\n")
 
     def send_byte(self, byte: bytes) -> None:
-        """Send a byte that is obeyed at once. Raises DeviceGoneError."""
+        """Send a real-time command byte. Raises DeviceGoneError."""
         self.port.write(byte)
 
     def after(self, seconds: float) -> int:
-        """The time in so many seconds, ns."""
+        """Return the time `seconds` from now, ns."""
         return self.clock.now_ns() + round(seconds * NS_PER_S)
 
     def wait(self, seconds: float) -> None:
-        """Let time pass. Raises DeviceStateError: it was closed meanwhile."""
+        """Wait for a time. Raises DeviceStateError if the link is closed meanwhile."""
         self.clock.wait_until(self.after(seconds), self.closing)
         self._require_open()
 
     def next_line(self, until_ns: int) -> str | None:
-        """The next line, or None when it is time. Raises DeviceGoneError; DeviceStateError: it was closed meanwhile."""
+        """Return the next line; None at `until_ns`. Raises DeviceGoneError, or DeviceStateError if closed meanwhile."""
         while True:
             self._require_open()
             if self._waiting:
@@ -61,7 +65,7 @@ class ControllerLink:
                 return None
 
     def read_waiting(self) -> list[str]:
-        """What has come in already. Raises DeviceGoneError."""
+        """Return the lines already received. Raises DeviceGoneError."""
         lines: list[str] = []
         while (line := self.next_line(0)) is not None:
             lines.append(line)
@@ -77,45 +81,45 @@ class ControllerLink:
 
     def _require_open(self) -> None:
         if self.closing.is_set():
-            message = f"{self.label} was closed while it was waited for; open the rig again"
+            message = f"{self.label} was closed during a request; open the rig again"
             raise DeviceStateError(message)
 
 
 class TurntableController(Protocol):
-    """What moves the motor. Places are in its own units."""
+    """Controller of the motor. Positions are in its own units."""
 
     step: float
-    """Its smallest move; 0 where it tells none."""
+    """Its smallest step; 0 if unknown."""
 
     def position(self) -> float:
-        """Where it stands. Raises DeviceError."""
+        """Return the position. Raises DeviceError."""
         ...
 
-    def move_to(self, place: float, until_ns: int) -> float:
-        """Go there, and return where it stands when it stands still. Raises DeviceError: it did not, or not in time."""
+    def move_to(self, position: float, until_ns: int) -> float:
+        """Move to a position and return the position at rest. Raises DeviceError on failure or time-out."""
         ...
 
     def halt(self) -> None:
-        """Stop now, wherever that is. Raises DeviceError."""
+        """Stop immediately. Raises DeviceError."""
         ...
 
 
 class SerialTurntable(AnyAngle):
     """Implements `slrig.devices.Turntable`.
 
-    A controller that restarts begins to count anew. So before each turn it is asked where it stands, and after whatever
-    went wrong in a turn nothing is turned any more: the rig has to be opened again, and angles count from there.
+    A controller that restarts counts from zero again. So its position is checked before each turn, and after a failed
+    turn the turntable refuses to move: the rig has to be opened again, and angles count from there.
 
     Parameters
     ----------
     port
-        Open; the turntable closes it, also when it cannot be opened.
+        Open port; the turntable closes it, also if opening fails.
     options
-        Checked.
+        Validated options.
     open_controller
         Returns the controller at the other end of the line.
     clock
-        By which it settles and gives up.
+        For settling and time-outs.
     """
 
     def __init__(
@@ -141,7 +145,7 @@ class SerialTurntable(AnyAngle):
 
     @property
     def axis(self) -> StageAxis | None:
-        """See `Turntable`. Nobody has told it."""
+        """See `Turntable`. Unknown."""
         return None
 
     @property
@@ -150,15 +154,15 @@ class SerialTurntable(AnyAngle):
         return self._origin / self._units_per_deg
 
     def turn(self, angle_deg: float) -> None:
-        """See `Turntable`. Raises DeviceError, also ever after, once it is not known where the table stands."""
+        """See `Turntable`. Raises DeviceError, also on later calls, once the position is unknown."""
         if self._lines.closing.is_set():
             message = f"{self._lines.label} is closed; open the rig again"
             raise DeviceStateError(message)
         if self._lost is not None:
-            message = f"it is not known where {self._lines.label} stands since a turn failed ({self._lost}); "
-            raise DeviceError(message + "open the rig again: angles count from there, so begin its views anew")
+            message = f"the position of {self._lines.label} is unknown since a turn failed ({self._lost}); "
+            raise DeviceError(message + "open the rig again: angles count from there, so repeat all views")
         if not math.isfinite(angle_deg):
-            message = f"asked {self._lines.label} for {angle_deg}°; ask for a number of degrees"
+            message = f"{self._lines.label} cannot turn to {angle_deg}°; request a finite angle"
             raise UnsupportedByDeviceError(message)
         until_ns = self._lines.after(self._options.turn_s)
         self._turning = True
@@ -175,7 +179,7 @@ class SerialTurntable(AnyAngle):
         self._last_angle_deg = angle_deg
 
     def close(self) -> None:
-        """See `Positioner`. From any thread; a turn that is under way is stopped."""
+        """See `Positioner`. From any thread; stops a turn in progress."""
         if self._lines.closing.is_set():
             return
         self._lines.closing.set()
@@ -185,7 +189,7 @@ class SerialTurntable(AnyAngle):
         self._lines.port.close()
 
     def _waypoints_deg(self, angle_deg: float) -> tuple[float, ...]:
-        """The way to an angle: there, or by way of the side from which angles are approached."""
+        """Return the angles on the way to an angle, including the approach against backlash."""
         approach_deg = self._options.approach_deg
         here_deg = (self._position - self._origin) / self._units_per_deg
         straight = approach_deg == 0 or angle_deg == self._last_angle_deg or (angle_deg - here_deg) / approach_deg >= 1
@@ -196,20 +200,20 @@ class SerialTurntable(AnyAngle):
         reached_deg = (self._position - self._origin) / self._units_per_deg
         if abs(reached_deg - angle_deg) > self._options.tolerance_deg:
             step_deg = self._controller.step / self._options.units_per_deg
-            steps = f", whose steps are {step_deg:.3g}°," if step_deg else ""
+            steps = f", whose steps are {step_deg:.3g}°," if step_deg else ","
             message = (
-                f"asked {self._lines.label}{steps} for {angle_deg:.3f}°, it stands at {reached_deg:.3f}°, which is off "
-                f"by more than tolerance_deg = {self._options.tolerance_deg:g}; see what holds it, ask for whole "
-                "steps, or allow more"
+                f"requested {angle_deg:.3f}° of {self._lines.label}{steps} it is at {reached_deg:.3f}°, which is off "
+                f"by more than tolerance_deg = {self._options.tolerance_deg:g}; check if it is blocked, request whole "
+                "steps, or raise the tolerance"
             )
             raise DeviceError(message)
 
     def _require_unmoved(self) -> None:
-        """Raise DeviceError unless it stands where it was left."""
-        place = self._controller.position()
-        if abs(place - self._position) > self._options.tolerance_deg * self._options.units_per_deg:
+        """Raise DeviceError unless the controller's position is unchanged."""
+        position = self._controller.position()
+        if abs(position - self._position) > self._options.tolerance_deg * self._options.units_per_deg:
             message = (
-                f"{self._lines.label} was left at {self._position:.3f} of its controller's units and now says "
-                f"{place:.3f}: it was moved by somebody else, or restarted and counts anew; see to its power and cable"
+                f"{self._lines.label} was left at {self._position:.3f} of its controller's units and is now at "
+                f"{position:.3f}: it was moved by someone else, or restarted; check its power and cable"
             )
             raise DeviceError(message)

@@ -117,7 +117,7 @@ def test_what_the_engine_refuses_is_reported_in_its_words_and_it_is_dark(bench: 
         projector.show(0)
     # Data is not answered: what is wrong with it is found in the error code.
     bench.engine.refusing = {0x1A2B: 9}
-    with pytest.raises(UnsupportedByDeviceError, match="take picture 0: the picture.s encoding is unknown"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"take picture 0: the picture.s encoding is unknown"):
         projector.load(SEQUENCE)
     bench.engine.refusing = {}
     projector.load(SEQUENCE)

@@ -128,7 +128,7 @@ class MemoryLine(Line):
 
     def opened(self) -> MemoryLine:
         if self._cut:
-            message = "asked to open the line, there is none such"
+            message = "the line does not exist"
             raise DeviceGoneError(message)
         self._waiting = b""
         return self
@@ -179,7 +179,7 @@ class MemoryLine(Line):
 
     def _require_plugged(self) -> None:
         if self._cut:
-            message = "asked to use the line, found it gone: it was unplugged"
+            message = "cannot use the line, it is gone: it was unplugged"
             raise DeviceGoneError(message)
 
 
