@@ -1,19 +1,19 @@
-"""The pins of the reference trigger box: a Raspberry Pi Pico (RP2040) with MicroPython, and a light engine that steps.
+"""The pins of the reference trigger box: a Raspberry Pi Pico (RP2040) with MicroPython, and a stepping light engine.
 
-The engine keeps its patterns in a flash of its own: a pulse on STEP makes the next one current, a pulse on HOME the
-first one, and its light follows LAMP. Engines whose patterns are advanced by a trigger input and whose LED has an
-enable or dimming input are wired so.
+The engine keeps its patterns in its own flash: a pulse on STEP selects the next one, a pulse on HOME the first one, and
+its light follows LAMP. This wiring suits engines whose patterns are advanced by a trigger input and whose LED has an
+enable or dimming input.
 
     GP2  STEP    out, engine's trigger input      GP5  CAMERA  out, cameras' trigger inputs (opto-isolated)
-    GP3  HOME    out, engine's reset input        GP6  READY   in, engine shows what it was stepped to; None: settles
+    GP3  HOME    out, engine's reset input        GP6  READY   in, engine shows the selected pattern; None: settles
     GP4  LAMP    out, LED enable or dimming input, with a resistor of 10 kΩ to ground
 
-The resistor on LAMP is what keeps it dark while the box starts, restarts or has no firmware: a pin is an input then.
-A watchdog timer restarts the box when this program stands still for a second. This program does not listen to Ctrl-C:
-to change its files, start the box with SERVICE (GP15) on ground, and it ends at once.
+The resistor on LAMP keeps it dark while the box starts, restarts or has no firmware, when the pin is an input. A
+watchdog timer restarts the box if this program hangs for a second. The program ignores Ctrl-C: to change its files,
+start the box with SERVICE (GP15) on ground, and it ends at once.
 """
 
-# MicroPython has no `__future__`, its modules have no types, and the words of `asm_pio` are no names of this module.
+# MicroPython has no `__future__`, its modules have no types, and `asm_pio` has names that are not defined here.
 # ruff: noqa: F821, ANN001, ANN202
 # mypy: disable-error-code="name-defined, no-untyped-def, no-untyped-call, untyped-decorator, type-arg"
 # mypy: disable-error-code="call-overload, redundant-expr, import-not-found"
@@ -22,7 +22,7 @@ try:
     from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError
     from drivers.serial_projector.device.protocol import TriggerBox
 except ImportError:
-    # On a box the files lie side by side.
+    # On a box the files are in one folder.
     from box import HardwareError  # type: ignore[no-redef]
 
 MODEL, FIRMWARE = "slrig-pico", "1.1.0"
@@ -31,28 +31,28 @@ WIDTH_PX, HEIGHT_PX = 912, 1140
 STEP_PIN, HOME_PIN, LAMP_PIN, CAMERA_PIN, READY_PIN, SERVICE_PIN = 2, 3, 4, 5, 6, 15
 
 HOME_LEVEL = 1
-"""Level of a pulse on HOME. 0 for an engine that runs while this input is high and begins anew after it was low."""
+"""Level of a pulse on HOME. 0 for an engine that runs while this input is high and restarts after it was low."""
 
 STEPS_TO_FIRST = 0
-"""Pulses on STEP from HOME to the first pattern: 1 where that one waits for a trigger, too."""
+"""Pulses on STEP from HOME to the first pattern: 1 if the first pattern also waits for a trigger."""
 
 STEP_US = 50
 """Length of a pulse on STEP or HOME, and of the pause after it."""
 
 SETTLE_US = 500
-"""From the last step to a pattern that stands still, where there is no READY."""
+"""Time from the last step to a stable pattern, without READY."""
 
 READY_US = 20000
 """Longest wait for READY."""
 
 LAMP_US = 20
-"""From LAMP to light."""
+"""Delay from LAMP to light."""
 
 PULSE_US = 100
 """Length of the cameras' trigger pulse."""
 
 HOLD_US = 500
-"""How long a pattern of a sequence stays lit beyond its exposure: longer than this program is ever late."""
+"""How long a pattern of a sequence stays lit beyond its exposure: longer than the largest delay of this program."""
 
 MIN_EXPOSURE_US = 200
 ERROR_US = 50
@@ -63,7 +63,7 @@ TIDY_AFTER = 64
 
 
 def describe_box(patterns: dict) -> BoxDescription:
-    """What HELLO says, from the patterns.json that was written with the engine's images."""
+    """Return the box's properties, from the patterns.json that was written with the engine's images."""
     fits = patterns.get("size_px") == [WIDTH_PX, HEIGHT_PX]
     crc32 = [int(each, 16) for each in patterns["crc32"]] if fits else []
     return BoxDescription(
@@ -121,7 +121,7 @@ class PicoBoard(BoxHardware):
         begun_us = self.time_us()
         while not self._ready.value():
             if self.time_us() - begun_us > READY_US:
-                # Where it stands is unknown: home first, next time.
+                # The position is unknown: home first, next time.
                 self._position = -1
                 raise HardwareError("the engine is not READY")
 
@@ -136,7 +136,7 @@ class PicoBoard(BoxHardware):
         self._time.sleep_us(LAMP_US)
 
     def pulse(self) -> None:
-        """See `BoxHardware`. The state machine ends it, so nobody waits."""
+        """See `BoxHardware`. The state machine ends it, without waiting."""
         self._camera.put(PULSE_US)
 
     def set_brightness(self, permille: int) -> int:
@@ -152,7 +152,7 @@ class PicoBoard(BoxHardware):
 
 
 def _pulses(machine, rp2):
-    """A state machine that makes one pulse, of so many µs as it is given."""
+    """Return a state machine that makes a pulse of the given number of µs."""
 
     @rp2.asm_pio(set_init=rp2.PIO.OUT_LOW)
     def program() -> None:
@@ -177,19 +177,19 @@ class UsbPort:
         self._poll.register(sys.stdin, select.POLLIN)
 
     def read(self) -> bytes:
-        """What came in; does not wait."""
+        """Return the received bytes without waiting."""
         data = b""
         while len(data) < 64 and self._poll.poll(0):
             data += self._in.read(1)
         return data
 
     def write(self, data: bytes) -> None:
-        """Send it."""
+        """Send bytes."""
         self._out.write(data)
 
 
 def serve(device: TriggerBox, port: UsbPort, alive, tidy) -> None:
-    """Run a box without end. alive : feeds the watchdog timer. tidy : collects garbage, where that disturbs least."""
+    """Run a box forever. alive : feeds the watchdog timer. tidy : collects garbage, at the least disturbing time."""
     sent = 0
     while True:
         alive()
@@ -198,15 +198,15 @@ def serve(device: TriggerBox, port: UsbPort, alive, tidy) -> None:
         if out:
             port.write(out)
             sent += 1
-            # Memory is tidied by choice, in the dark: of itself it would happen in the middle of an exposure.
+            # Collect garbage in the dark: automatic collection could occur during an exposure.
             if sent >= TIDY_AFTER and device.wait_us() < 0:
                 tidy()
                 sent = 0
 
 
 def run() -> None:
-    """Be a trigger box. Called on the board only."""
-    # ruff: noqa: I001 - what only the board has
+    """Run as a trigger box. Called on the board only."""
+    # ruff: noqa: I001 - modules of the board only
     import gc
     import json
     import machine
@@ -219,7 +219,7 @@ def run() -> None:
 
     if not machine.Pin(SERVICE_PIN, machine.Pin.IN, machine.Pin.PULL_UP).value():
         return
-    # Bytes from the host are never a keyboard interrupt.
+    # Do not treat bytes from the host as keyboard interrupts.
     micropython.kbd_intr(-1)
     board = PicoBoard(machine, rp2, time)
     try:

@@ -1,7 +1,7 @@
-"""SLTP/1 as a trigger box speaks it: bytes in, bytes out, and a `BoxHardware` between them and the light.
+"""The protocol core of a trigger box: SLTP/1 bytes in and out, and calls of a `BoxHardware`.
 
-Pure: no pin, no port, no clock of its own. Runs unchanged in MicroPython (1.20 or newer) and in CPython. What the
-verbs, fields and codes mean is in the docstring of `drivers.serial_projector`.
+Pure: no pin, no port, no clock of its own. Runs unchanged in MicroPython (1.20 or newer) and in CPython. The docstring
+of `drivers.serial_projector` describes verbs, fields and codes.
 """
 
 # MicroPython has no `__future__`.
@@ -12,18 +12,18 @@ try:
     from drivers.serial_projector.device import wire
     from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError, LightTime
 except ImportError:
-    # On a box the files lie side by side.
+    # On a box the files are in one folder.
     import wire  # type: ignore[import-not-found, no-redef]
     from box import HardwareError, LightTime  # type: ignore[import-not-found, no-redef]
 
 MIN_WATCHDOG_MS = 50
 MAX_PICKED = 512
-"""Patterns of one sequence; PICK takes no more."""
+"""Maximum number of patterns of PICK."""
 _UNDER_LIGHT = ("lit", "playing", "waiting")
 
 
-class BoxRefusal(Exception):  # noqa: N818 - an answer, not a failure of the box
-    """The answer to a command that is not obeyed."""
+class BoxRefusal(Exception):  # noqa: N818 - an answer, not an error of the box
+    """Refusal of a command."""
 
     def __init__(self, code: int, words: str) -> None:
         super().__init__(words)
@@ -31,8 +31,8 @@ class BoxRefusal(Exception):  # noqa: N818 - an answer, not a failure of the box
 
 
 class TriggerBox:
-    """A box. Give it every byte that comes in (`feed`), let it look at its clock as often as possible (`poll`), and
-    send what both return.
+    """A box. Pass it every received byte (`feed`), call `poll` as often as possible, and send the bytes that both
+    return.
     """
 
     def __init__(self, hardware: BoxHardware, description: BoxDescription, boot_id: int) -> None:
@@ -62,7 +62,7 @@ class TriggerBox:
         self._switch_off()
 
     def feed(self, data: bytes) -> bytes:
-        """Take what came from the host; return what is to be sent."""
+        """Process received bytes; return the bytes to send."""
         self._check_time()
         self._buffer += data
         while True:
@@ -77,12 +77,12 @@ class TriggerBox:
         return self._flush()
 
     def poll(self) -> bytes:
-        """Do what is due by now; return what is to be sent."""
+        """Do all due work; return the bytes to send."""
         self._check_time()
         return self._flush()
 
     def wait_us(self) -> int:
-        """How long until `poll` has something to do, at the latest; -1 if only a command can change that."""
+        """Return the time until `poll` has work; -1 if only a command can cause any."""
         now_us = self._hardware.time_us()
         due = []
         if self._must_darken:
@@ -104,7 +104,7 @@ class TriggerBox:
     def _event(self, text: str) -> None:
         self._out.append(wire.encode_line("! " + text))
 
-    # What happens by itself.
+    # Timed actions.
 
     def _check_time(self) -> None:
         now_us = self._hardware.time_us()
@@ -124,7 +124,7 @@ class TriggerBox:
                 self._raise_fault(wire.LIGHT)
 
     def _advance_sequence(self, now_us: int) -> None:
-        """A sequence's next step, if it is due."""
+        """Do the next step of a sequence, if it is due."""
         first, count, _, period_us = self._sequence
         if self._lit and now_us >= self._off_us:
             self._switch_off()
@@ -138,7 +138,7 @@ class TriggerBox:
             self._light_frame()
 
     def _light_frame(self) -> int:
-        """Light the selected pattern of a sequence, and tell the cameras."""
+        """Light the selected pattern of a sequence, and trigger the cameras."""
         first, _, exposure_us, _ = self._sequence
         t_us = self._light()
         self._hardware.pulse()
@@ -161,7 +161,7 @@ class TriggerBox:
         try:
             self._hardware.switch_off()
         except HardwareError:
-            # Tried again at every look, until it obeys.
+            # Retried by every poll.
             if self._fault != wire.LIGHT:
                 self._fault = wire.LIGHT
                 self._event(f"FAULT {wire.LIGHT}")
@@ -176,7 +176,7 @@ class TriggerBox:
         self._fault = code
         self._event(f"FAULT {code}")
 
-    # What the host asks for.
+    # Commands of the host.
 
     def _answer(self, line: bytes) -> bytes:
         text = wire.decode_line(line)
@@ -186,7 +186,7 @@ class TriggerBox:
         session, number, verb = words[0], int(words[1]), words[2]
         now_us = self._hardware.time_us()
         if session == self._session:
-            # The host lives, even if this is not news.
+            # A sign of life, even if the line is a repetition.
             self._heard_us = now_us
             ahead = (number - self._number) % wire.NUMBERS
             if ahead == 0:
@@ -215,14 +215,14 @@ class TriggerBox:
     def _execute(self, verb: str, words: list[str]) -> str:
         if verb not in ("HELLO", "PING", "PICK", "LOAD", "SHOW", "SEQ", "TRIG", "STOP", "BLANK", "STATUS", "BYE"):
             raise BoxRefusal(wire.VERB, verb)
-        wanted = {"HELLO": 5, "LOAD": 2, "SHOW": 1, "SEQ": 5, "PICK": max(len(words), 2)}.get(verb, 0)
+        expected = {"HELLO": 5, "LOAD": 2, "SHOW": 1, "SEQ": 5, "PICK": max(len(words), 2)}.get(verb, 0)
         checksums = verb in ("PICK", "LOAD")
         try:
             numbers = [int(word, 16 if checksums and at else 10) for at, word in enumerate(words)]
         except ValueError:
             numbers = []
-        if len(numbers) != len(words) or len(words) != wanted or (numbers and min(numbers) < 0):
-            raise BoxRefusal(wire.RANGE, f"{verb} takes {wanted} numbers")
+        if len(numbers) != len(words) or len(words) != expected or (numbers and min(numbers) < 0):
+            raise BoxRefusal(wire.RANGE, f"{verb} takes {expected} numbers")
         answer: str = getattr(self, "_" + verb.lower())(*numbers)
         return answer
 
@@ -272,7 +272,7 @@ class TriggerBox:
         return f"{count} {order[0]} {self._gap_us}"
 
     def _find_run(self, count: int, crc32: int) -> list[int]:
-        """So many patterns of the flash, one after another, that have this checksum."""
+        """Find consecutive patterns of the flash with this checksum."""
         about = self._description
         if not 1 <= count <= about.count:
             raise BoxRefusal(wire.RANGE, f"{count} of {about.count}")
@@ -330,7 +330,7 @@ class TriggerBox:
         return ""
 
     def _status(self) -> str:
-        # Before the first light there is no pattern to tell.
+        # No pattern was lit before the first light.
         index = f"index={self._index} " if self._index >= 0 else ""
         return (
             f"state={self._state} loaded={len(self._order)} first={self._order[0] if self._order else 0} {index}"
@@ -357,7 +357,7 @@ class TriggerBox:
         return self._duty < 1000 and self._light_time.left_us(self._duty) <= 0
 
     def _darken(self, state: str) -> None:
-        """End whatever goes on, by the host's wish: that also acknowledges a fault."""
+        """End any activity on the host's request, which also acknowledges a fault."""
         self._state = state
         if state == "idle":
             self._order = []
