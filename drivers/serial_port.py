@@ -1,8 +1,8 @@
-"""A serial port with slrig's errors: pyserial's own ones, and those that it lets through, told apart.
+"""A serial port with slrig's errors, which distinguish the causes of pyserial's.
 
-pyserial raises `SerialException` for most, a bare `OSError` where the file descriptor fails under it (`in_waiting`
-after an unplug), and `termios.error` from the line discipline. A port that is open elsewhere is `EAGAIN` (its lock) or
-`EBUSY` (TIOCEXCL, which root passes by). When two programs read one port all the same, it takes that for an unplug.
+pyserial raises `SerialException` in most cases, a bare `OSError` if the file descriptor fails under it (`in_waiting`
+after an unplug), and `termios.error` from the line discipline. A port that is open elsewhere gives `EAGAIN` (its lock)
+or `EBUSY` (TIOCEXCL, which does not apply to root). pyserial reports two programs reading one port as an unplug.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError
 
 SLICE_S = 0.02
-"""How long one read waits at most: what is asked of the port meanwhile waits as long."""
+"""Longest wait of one read; other requests to the port wait for it."""
 
 _BY_ID = Path("/dev/serial/by-id")
 _WRITE_S = 1.0
@@ -28,33 +28,33 @@ _BUSY = {errno.EAGAIN, errno.EBUSY}
 _ABSENT = {errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO}
 
 
-class Port(Protocol):
+class BytePort(Protocol):
     """Bytes to and from a device."""
 
     def read(self, timeout_s: float) -> bytes:
-        """Return what came in, as soon as there is something; nothing after the time-out. Raises DeviceGoneError."""
+        """Return the received bytes as soon as there are some; nothing after the time-out. Raises DeviceGoneError."""
         ...
 
     def write(self, data: bytes) -> None:
-        """Send all of it. Raises DeviceGoneError."""
+        """Send all bytes. Raises DeviceGoneError."""
         ...
 
     def close(self) -> None:
-        """Let the port go. Idempotent; never raises."""
+        """Close the port. Idempotent; never raises."""
         ...
 
 
 class SerialPort:
-    """Implements `Port` with pyserial, on a port's name or a pyserial URL (`socket://…`, `rfc2217://…`).
+    """Implements `BytePort` with pyserial, on a port's name or a pyserial URL (`socket://…`, `rfc2217://…`).
 
-    device : what is behind it, in words, as "trigger box"; driver : whose port it is; both for errors.
+    device : name of the device, as "trigger box"; driver : name of the driver; both for errors.
 
     Raises
     ------
     LibraryMissingError
         pyserial is not installed.
     DeviceGoneError
-        There is no such port.
+        The port does not exist.
     DeviceBusyError
         Another program holds it.
     DeviceError
@@ -64,23 +64,23 @@ class SerialPort:
     def __init__(self, name: str, *, baud: int, device: str, driver: str) -> None:
         serial = _library(driver)
         self._name, self._device, self._driver = name, device, driver
-        target = resolved(name)
-        # Two programs on one port read one another's answers; a URL's handler has no lock.
+        target = resolve_port(name)
+        # Two programs on one port would read each other's answers; a URL's handler has no lock.
         exclusive = {} if "://" in target else {"exclusive": True}
         try:
             self._serial = serial.serial_for_url(
                 target, baudrate=baud, timeout=SLICE_S, write_timeout=_WRITE_S, **exclusive
             )
         except (serial.SerialException, OSError, ValueError) as error:
-            raise _unopened(name, target, error, device) from error
+            raise _open_error(name, target, error, device) from error
         with suppress(Exception):
-            # FTDI bridges hold bytes back for 16 ms otherwise. Others have no such mode, and say so in many ways.
+            # Otherwise FTDI bridges delay bytes by 16 ms. Others raise various errors here.
             self._serial.set_low_latency_mode(True)
 
     def read(self, timeout_s: float) -> bytes:
-        """See `Port`."""
+        """See `BytePort`."""
         until_s = time.monotonic() + timeout_s
-        with self._told("read from"):
+        with self._translate_errors("read from"):
             while True:
                 left_s = max(until_s - time.monotonic(), 0.0)
                 self._serial.timeout = min(left_s, SLICE_S)
@@ -89,12 +89,12 @@ class SerialPort:
                     return data
 
     def write(self, data: bytes) -> None:
-        """See `Port`."""
-        with self._told("write to"):
+        """See `BytePort`."""
+        with self._translate_errors("write to"):
             self._serial.write(data)
 
     def close(self) -> None:
-        """See `Port`."""
+        """See `BytePort`."""
         with suppress(Exception):
             self._serial.close()
 
@@ -102,38 +102,38 @@ class SerialPort:
         try:
             data: bytes = self._serial.read(max(1, self._serial.in_waiting))
         except _library(self._driver).SerialException:
-            # Raised alike when another program read first what this one was told of, and when the port is gone.
-            if not self._alive():
+            # Raised both when another program has read the bytes and when the port is gone.
+            if not self._is_alive():
                 raise
             return b""
         return data
 
-    def _alive(self) -> bool:
-        """Whether the system still has a line here: one that was hung up answers with EIO."""
+    def _is_alive(self) -> bool:
+        """True if the system still has a line here: a line that was hung up answers with EIO."""
         try:
             import termios
 
             termios.tcgetattr(self._serial.fileno())
-        except Exception:  # noqa: BLE001 - no terminal, no such module, no open file: nobody to ask
+        except Exception:  # noqa: BLE001 - no terminal, no such module, or no open file
             return False
         return True
 
     @contextmanager
-    def _told(self, what: str) -> Iterator[None]:
+    def _translate_errors(self, action: str) -> Iterator[None]:
         try:
             if not self._serial.is_open:
                 raise _library(self._driver).PortNotOpenError
             yield
         except (_library(self._driver).SerialException, OSError, _line_discipline_error()) as error:
             message = (
-                f"asked to {what} the {self._device} on {self._name}, found it gone ({error}): it was unplugged, lost "
-                "its power or reset itself; plug it in and open the rig again"
+                f"cannot {action} the {self._device} on {self._name}, it is gone ({error}): it was unplugged, lost its "
+                "power or reset itself; plug it in and open the rig again"
             )
             raise DeviceGoneError(message) from error
 
 
-def resolved(name: str) -> str:
-    """Return the port that a rig file means: a path, a URL, a system name (COM3), or a name in /dev/serial/by-id."""
+def resolve_port(name: str) -> str:
+    """Return the port that a rig file names: a path, a URL, a system name (COM3), or a name in /dev/serial/by-id."""
     link = _BY_ID / name
     return str(link) if "/" not in name and link.exists() else name
 
@@ -155,16 +155,15 @@ def _line_discipline_error() -> type[Exception]:
     return termios.error
 
 
-def _unopened(name: str, target: str, error: Exception, device: str) -> DeviceError:
-    """What it means that a port does not open."""
+def _open_error(name: str, target: str, error: Exception, device: str) -> DeviceError:
+    """Return the error for a port that cannot be opened."""
     number = _error_number(error)
     if number in _BUSY or "exclusively lock" in str(error):
-        holders = " and ".join(_holders(target)) or "another program (or you may not see whose it is)"
+        holders = " and ".join(_find_holders(target)) or "another program"
         return DeviceBusyError(f"port {name} is held by {holders}; end that, or use another port")
     if number in _ABSENT or "could not find" in str(error).lower():
         return DeviceGoneError(
-            f"asked to open port {name}, there is none such ({error}); plug the {device} in, and see which port it "
-            "has: slrig devices"
+            f"port {name} does not exist ({error}); plug the {device} in, and look up its port: slrig devices"
         )
     if number == errno.EACCES and os.name == "posix":
         return DeviceError(f"you may not open port {name} ({error}); sudo usermod -aG dialout $USER, and log in again")
@@ -172,7 +171,7 @@ def _unopened(name: str, target: str, error: Exception, device: str) -> DeviceEr
 
 
 def _error_number(error: Exception) -> int | None:
-    """The system's error number; pyserial keeps it in the text where it wraps one error into another."""
+    """Return the system's error number; pyserial has it in the text if it wraps another error."""
     number = getattr(error, "errno", None)
     if isinstance(number, int):
         return number
@@ -180,8 +179,8 @@ def _error_number(error: Exception) -> int | None:
     return int(found.group(1)) if found else None
 
 
-def _holders(target: str) -> list[str]:
-    """The programs that have a port open, as far as the system tells: name and process number."""
+def _find_holders(target: str) -> list[str]:
+    """Return the programs that have a port open, as far as the system shows: name and process number."""
     found = []
     real = os.path.realpath(target)
     for process in Path("/proc").glob("[0-9]*"):

@@ -1,38 +1,212 @@
-"""The rendered rig as an instrument: cameras and a projector on one world, opened from a rig file's `[head]` table."""
+"""The simulated rig as a device: its projector, and cameras and projector opened from a rig file's `[head]` table."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from simulated_rig.camera import SimulatedCamera
-from simulated_rig.options import HeadOptions
-from simulated_rig.projector import SimulatedProjector
-from simulated_rig.rendering import Stage, View
+from simulated_rig.light import (
+    NS_PER_S,
+    Lamp,
+    LightFlicker,
+    LightTable,
+    VirtualClock,
+    dark_table,
+    desktop_table,
+    light_table,
+    nanoseconds,
+)
+from simulated_rig.movements import SimulatedTurntable
+from simulated_rig.options import Faults, HeadOptions, SimulatedProjectorOptions
+from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import read_scene
-from simulated_rig.staging import Script, Staging
-from simulated_rig.turning import RenderedTurntable
-from simulated_rig.world import Flicker, VirtualClock
+from simulated_rig.staging import PoseScript, SceneController
 from slrig.bundle.validation import validate
-from slrig.devices import Camera, Clock, Positioner, ScannerHead, SystemClock, progress_reporter
+from slrig.devices import (
+    COMPUTED_LIMITS,
+    Camera,
+    Clock,
+    DisplayedPattern,
+    Positioner,
+    ProjectorInfo,
+    ProjectorState,
+    ScannerHead,
+    SystemClock,
+    progress_reporter,
+)
+from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.kernels import report_compilations
-from slrig.model import Calibration, Surface, Truth
+from slrig.model import Calibration, PatternSequence, Primary, Surface, Truth
+
+NAME = "projector"
+CHANNELS = ("blue", "green", "red")
+
+
+class SimulatedProjector:
+    """Implements `slrig.devices.Projector` in the simulated world. Notifies the scene controller of captures and
+    patterns.
+    """
+
+    def __init__(
+        self,
+        options: SimulatedProjectorOptions,
+        clock: Clock,
+        *,
+        faults: Faults,
+        seed: int,
+        scene_controller: SceneController | None = None,
+    ) -> None:
+        self._options = options
+        self._clock = clock
+        self._faults = faults
+        self._scene_controller = scene_controller
+        self._response = options.response()
+        self._dark = self._table(np.zeros((1, 1), np.uint8))
+        swing = LightFlicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
+        self.lamp = Lamp(self._dark, swing)
+        self._rng = np.random.default_rng((seed, 0x70726F6A))
+        self._state = ProjectorState("the simulated projector")
+        self._tables: dict[int, LightTable] = {}
+        self._shows = 0
+        self._shown_pattern: int | None = None
+        self._gone = False
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        return ProjectorInfo(
+            name=NAME,
+            model="rendered projector",
+            serial="simulated",
+            size=self._options.size,
+            plays=False,
+            latency_s=self._options.latency_s,
+            refresh_s=None if self._options.refresh_hz is None else 1 / self._options.refresh_hz,
+            limits=COMPUTED_LIMITS,
+            lights=self._options.lights is not None,
+        )
+
+    @property
+    def shown_pattern(self) -> int | None:
+        """Index of the requested pattern, None if dark."""
+        return self._shown_pattern
+
+    @property
+    def is_lit(self) -> bool:
+        """True if the scene receives more light than the dark projector's leak."""
+        return self.lamp.light_at(self._clock.now_ns()).peak > self._dark.peak * (1 + 1e-6)
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`. Goes dark."""
+        self._require_usable()
+        self._state.require_size(sequence, self._options.size)
+        if len(sequence) > self._options.max_patterns:
+            message = (
+                f"the sequence has {len(sequence)} patterns, the projector holds {self._options.max_patterns}; "
+                "shorten it or raise max_patterns"
+            )
+            raise UnsupportedByDeviceError(message)
+        for index, profile in enumerate(sequence.profiles):
+            if min(profile.shape) > 1:
+                message = (
+                    f"pattern {index} varies along both axes ({profile.shape}); the simulated projector shows patterns "
+                    "that vary along one axis only"
+                )
+                raise UnsupportedByDeviceError(message)
+        self.blank()
+        self._state.loaded, self._tables = sequence, {}
+        if self._scene_controller is not None:
+            self._scene_controller.start_capture(len(sequence))
+
+    def show(self, index: int) -> DisplayedPattern:
+        """See `Projector`."""
+        self._require_usable()
+        sequence = self._state.require_pattern(index)
+        if self._faults.unplug_projector_at_show is not None and self._shows >= self._faults.unplug_projector_at_show:
+            self._gone, self._shown_pattern = True, None
+            self.lamp.darken(at_ns=self._clock.now_ns())
+            self._require_usable()
+        self._shows += 1
+        if self._scene_controller is not None:
+            self._scene_controller.advance_pattern()
+        if index not in self._tables:
+            table, pattern = self._table(sequence.profiles[index]), sequence.patterns[index]
+            if isinstance(pattern, Primary) and self._options.lights is not None:
+                channel = CHANNELS.index(pattern.colour)
+                table = replace(table, channel=channel, power=self._options.lights[channel])
+            self._tables[index] = table
+        error_s = self._options.visible_error_s
+        t_visible_ns = self._at_refresh(self._clock.now_ns() + nanoseconds(self._options.latency_s))
+        off_s = float(self._rng.uniform(-error_s, error_s)) + self._faults.light_delay_s
+        self.lamp.show(self._tables[index], at_ns=t_visible_ns + nanoseconds(off_s))
+        self._shown_pattern = index
+        self._clock.wait_until(t_visible_ns + nanoseconds(error_s), self._state.closed)
+        return DisplayedPattern(index, t_visible_ns, nanoseconds(error_s))
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. Not supported."""
+        self._require_usable()
+        self._state.refuse_to_play(exposure_s, period_s)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self.blank()
+
+    def blank(self) -> None:
+        """See `Projector`. Raises DeviceGoneError after an unplug, since the state of the light is unknown."""
+        if self._state.closed.is_set():
+            return
+        if self._gone:
+            self._require_usable()
+        self._shown_pattern = None
+        self.lamp.darken(at_ns=self._clock.now_ns())
+
+    def close(self) -> None:
+        """See `Projector`."""
+        if not self._gone:
+            self.blank()
+        self._shown_pattern, self._state.loaded, self._tables = None, None, {}
+        self._state.closed.set()
+
+    def _at_refresh(self, t_ns: int) -> int:
+        refresh_hz = self._options.refresh_hz
+        return t_ns if refresh_hz is None else round(-(-t_ns * refresh_hz // NS_PER_S) / refresh_hz * NS_PER_S)
+
+    def _table(self, profile: np.ndarray[tuple[int, ...], np.dtype[np.unsignedinteger]]) -> LightTable:
+        if self._faults.lamp_off:
+            return dark_table(self._options.size)
+        if self._faults.picture in ("mirrored", "rotated"):
+            profile = profile[:, ::-1]
+        if self._faults.picture in ("upside_down", "rotated"):
+            profile = profile[::-1]
+        if self._faults.other_display:
+            glow = self._faults.other_display_glow * float(self._response.light(profile).mean())
+            return replace(desktop_table(self._options.size, self._response), glow=glow)
+        return light_table(profile, self._options.size, self._response)
+
+    def _require_usable(self) -> None:
+        self._state.require_open()
+        if self._gone:
+            message = "the projector is gone (unplugged or powered off); plug it in and open the rig again"
+            raise DeviceGoneError(message)
 
 
 class SimulatedHead:
-    """Implements `slrig.devices.ScannerHead` on the rendered world.
+    """Implements `slrig.devices.ScannerHead` on the simulated world.
 
-    The calibration it carries is exact. `clock` is the world's time; all time stamps count in it. `script` says what
-    stands where.
+    Its calibration is exact. `clock` is the world's time, in which all time stamps count. `script` gives the object
+    poses.
     """
 
-    def __init__(self, options: HeadOptions, script: Script) -> None:
+    def __init__(self, options: HeadOptions, script: PoseScript) -> None:
         self.clock: Clock = SystemClock() if options.realtime else VirtualClock()
         lens = options.projector.pinhole()
-        self._stage = Stage(
+        self._scene_state = SceneState(
             script.surface(0),
             lens,
             working_distance_mm=options.projector.working_distance_mm or float(np.linalg.norm(lens.centre_mm)),
@@ -40,11 +214,11 @@ class SimulatedHead:
         )
         swing = None
         if options.ambient_flicker_depth > 0:
-            swing = Flicker(options.ambient_flicker_hz, options.ambient_flicker_depth)
+            swing = LightFlicker(options.ambient_flicker_hz, options.ambient_flicker_depth)
         self._views = {
-            camera.name: View(
+            camera.name: CameraView(
                 camera.pinhole(),
-                self._stage,
+                self._scene_state,
                 blur_px=camera.blur_px,
                 focus=(options.projector.focus, camera.focus),
                 ambient=options.ambient,
@@ -55,12 +229,18 @@ class SimulatedHead:
             )
             for camera in options.camera
         }
-        self._staging = Staging(options, script, self._stage, self._views, self.clock)
-        self._positioner: Positioner | None = self._staging if self._staging.poses else None
+        self._scene_controller = SceneController(options, script, self._scene_state, self._views, self.clock)
+        self._positioner: Positioner | None = self._scene_controller if self._scene_controller.poses else None
         if options.turntable is not None:
-            self._positioner = RenderedTurntable(options.turntable, self._staging.turn_table, seed=options.seed)
+            self._positioner = SimulatedTurntable(
+                options.turntable, self._scene_controller.turn_table, seed=options.seed
+            )
         self._projector = SimulatedProjector(
-            options.projector, self.clock, faults=options.faults, seed=options.seed, staging=self._staging
+            options.projector,
+            self.clock,
+            faults=options.faults,
+            seed=options.seed,
+            scene_controller=self._scene_controller,
         )
         self._cameras = {
             camera.name: SimulatedCamera(
@@ -85,7 +265,7 @@ class SimulatedHead:
 
     @property
     def projector(self) -> SimulatedProjector:
-        """See `ScannerHead`. Also says what it shows: `showing`, `lit`."""
+        """See `ScannerHead`. Also has `shown_pattern` and `is_lit`."""
         return self._projector
 
     @property
@@ -95,25 +275,25 @@ class SimulatedHead:
 
     @property
     def exact_calibration(self) -> Calibration:
-        """What the options say of the devices, whether or not the head carries it."""
+        """Calibration of the options, regardless of `carries_calibration`."""
         return self._calibration
 
     def prepare(self) -> None:
-        """Do what takes long the first time, telling of it: compile kernels, trace the light of what stands there."""
+        """Compile kernels and trace the light of the current scene, reporting progress."""
         tell = progress_reporter()
         with report_compilations(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")):
             for name, view in self._views.items():
-                view.prepare(told=partial(_tell_traced, tell, name))
+                view.prepare(report_progress=partial(_report_tracing, tell, name))
 
     @property
     def positioner(self) -> Positioner | None:
-        """See `slrig.devices.HasPositioner`. None where the options have neither poses nor a turntable."""
+        """See `slrig.devices.HasPositioner`. None without poses or turntable."""
         return self._positioner
 
     def truth(self) -> Truth:
-        """See `ScannerHead`. Of what stands there now. Works in every state, also after close."""
+        """See `ScannerHead`. Ground truth of the current scene. Works in every state, also after close."""
         cameras = {name: view.truth() for name, view in self._views.items()}
-        shape = self._stage.setting.surface
+        shape = self._scene_state.snapshot.surface
         known = self._truth
         if (
             known is None
@@ -124,27 +304,27 @@ class SimulatedHead:
         return known
 
 
-def _tell_traced(tell: Callable[[str], None], camera: str, share: float) -> None:
+def _report_tracing(tell: Callable[[str], None], camera: str, share: float) -> None:
     tell(f"tracing light for camera '{camera}', {share:.0%}")
 
 
 def open_head(options: Mapping[str, object], folder: Path) -> ScannerHead:
-    """Open the rendered rig described by a rig file's `[head]` table (without its `driver`).
+    """Open the simulated rig described by a rig file's `[head]` table (without its `driver`).
 
-    `folder` is the rig file's own: the scene's path counts from there.
+    `folder` is that of the rig file: the scene's path is relative to it.
 
     Raises
     ------
     ConfigError
         The options or the scene have faults: all of them, in one message.
     """
-    head = simulated_head(options, folder)
+    head = open_simulated_head(options, folder)
     head.prepare()
     return head
 
 
-def simulated_head(options: Mapping[str, object], folder: Path) -> SimulatedHead:
-    """Return `open_head`'s instrument under its own type."""
-    table = validate(HeadOptions, options, "the [head] table of the rendered rig")
+def open_simulated_head(options: Mapping[str, object], folder: Path) -> SimulatedHead:
+    """Open the rig as `open_head` does, typed as `SimulatedHead` and without preparing it."""
+    table = validate(HeadOptions, options, "the [head] table of the simulated rig")
     path = folder / table.scene
-    return SimulatedHead(table, Script(table, read_scene(path), path.parent))
+    return SimulatedHead(table, PoseScript(table, read_scene(path), path.parent))

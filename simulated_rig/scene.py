@@ -1,7 +1,10 @@
-"""Scenes: what stands before the rig, described in TOML, and its one triangle surface.
+"""Scenes of the simulated rig: objects described in TOML, and their combined triangle surface.
 
-The world and each object's own frame look like a camera image: x to the right, y down, z away from the devices.
-An object's front therefore faces -z, and a relief of positive height comes towards the devices.
+The world and each object's own frame are oriented like a camera image: x to the right, y down, z away from the devices.
+The front of an object faces -z, and a relief of positive height extends towards the devices.
+
+A board's origin is the centre of its corners. Its print is piecewise constant: dark and light rectangles between two
+sets of lines, or dark discs on a light ground.
 """
 
 from __future__ import annotations
@@ -10,48 +13,341 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
+from scipy.spatial.transform import Rotation
 
 from simulated_rig import shapes
-from simulated_rig.boards import Board, Print
-from simulated_rig.placed import Colour, Placed, turned_by
-from simulated_rig.shapes import Part
-from simulated_rig.tables import NotNegative, Pair, Positive, at_least_one
+from simulated_rig.shapes import MeshPart, bent_sheet, rectangle_between
 from slrig.bundle.validation import Strict, read_toml, validate
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, IntArray
 
-_MOST_BYTES = 1 << 24
+Pair = Annotated[tuple[float, float], Field(strict=False)]
+Triple = Annotated[tuple[float, float, float], Field(strict=False)]
+Names = Annotated[tuple[str, ...], Field(strict=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+NotNegative = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
 
 
-class Plane(Placed):
-    """A rectangle in the object's x-y plane."""
+Item = TypeVar("Item")
+
+
+TEXTURES = ("uniform", "checker", "noise")
+Colour = Annotated[tuple[Fraction, Fraction, Fraction], Field(strict=False)]
+"""Albedo for blue, green and red light, as a fraction of the albedo."""
+WHITE: Colour = (1.0, 1.0, 1.0)
+Albedo = Annotated[float, Field(gt=0, le=1)]
+Corners = Annotated[int, Field(ge=2, le=60)]
+_MAX_FILE_BYTES = 1 << 24
+
+
+def require_one(items: tuple[Item, ...]) -> tuple[Item, ...]:
+    """Return `items`; raise ValueError if there are none. A length rule of pydantic would also count invalid items."""
+    if not items:
+        message = "at least one is needed"
+        raise ValueError(message)
+    return items
+
+
+class Texture(Strict):
+    """Texture of an object: the albedo times 1 - contrast * t, with t in 0..1 over the object's own coordinates.
+
+    `checker` alternates squares of `scale_mm` over x and y; `noise` is smooth random shading with grains of that size.
+    colour : colour where t is 1; the object's colour if None.
+    """
+
+    kind: Literal["uniform", "checker", "noise"] = "uniform"
+    contrast: Fraction = 0.5
+    scale_mm: Positive = 10.0
+    colour: Colour | None = None
+
+
+class Specular(Strict):
+    """Phong lobe added to the Lambertian light: strength * cos(angle to the mirror direction) ^ exponent."""
+
+    strength: NotNegative = 0.0
+    exponent: Annotated[float, Field(ge=1)] = 20.0
+
+
+class SceneObject(Strict):
+    """Object with a pose (rotation about its own x, then y, then z axis as fixed axes) and a gloss."""
+
+    name: str = ""
+    position_mm: Triple = (0.0, 0.0, 0.0)
+    rotation_deg: Triple = (0.0, 0.0, 0.0)
+    specular: Specular = Specular()
+
+    def colours(self) -> tuple[Colour, Colour]:
+        """Return the colours where a texture is light and where it is dark."""
+        return WHITE, WHITE
+
+
+class TexturedObject(SceneObject):
+    """Object of uniform or textured albedo and colour."""
+
+    albedo: Annotated[float, Field(gt=0, le=1)] = 0.8
+    colour: Colour = WHITE
+    texture: Texture = Texture()
+
+    def material(self) -> tuple[float, ...]:
+        """Return (6,): albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent."""
+        texture, lobe = self.texture, self.specular
+        kind = float(TEXTURES.index(texture.kind))
+        return (self.albedo, kind, texture.contrast, texture.scale_mm, lobe.strength, lobe.exponent)
+
+    def colours(self) -> tuple[Colour, Colour]:
+        """See `SceneObject`."""
+        return self.colour, self.colour if self.texture.colour is None else self.texture.colour
+
+
+ObjectT = TypeVar("ObjectT", bound=SceneObject)
+
+
+def place_object(thing: ObjectT, position_mm: FloatArray, rotation: FloatArray) -> ObjectT:
+    """Return the object in another pose. rotation : (3, 3), object to world."""
+    x, y, z = (float(each) for each in position_mm)
+    a, b, c = (float(each) for each in Rotation.from_matrix(rotation).as_euler("xyz", degrees=True))
+    return thing.model_copy(update={"position_mm": (x, y, z), "rotation_deg": (a, b, c)})
+
+
+def rotation_matrix(rotation_deg: Triple) -> FloatArray:
+    """Return (3, 3) float64: object to world, from the rotation angles of a pose."""
+    return np.asarray(Rotation.from_euler("xyz", rotation_deg, degrees=True).as_matrix(), np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardPrint:
+    """Print on a flat or bent sheet, in coordinates along it, mm, from the origin of its frame.
+
+    across_mm, down_mm : (n,), (m,) float64, ascending lines; dark : (m - 1, n - 1) uint8, 1 where the rectangle between
+    them is dark. centres_mm : (k, 2) float64, of dark discs of radius_mm instead. Everything else is light.
+    dark_share : albedo of the dark over that of the light. curvature_per_mm : the sheet is z = curvature x²; 0 is flat.
+    """
+
+    across_mm: FloatArray
+    down_mm: FloatArray
+    dark: NDArray[np.uint8]
+    centres_mm: FloatArray
+    radius_mm: float
+    dark_share: float
+    curvature_per_mm: float
+
+
+class PrintedBoard(SceneObject):
+    """Calibration board: `shape = "board"`.
+
+    kind, columns, rows : "chessboard" or "charuco" with this number of inner corners, or "circles": rows of circles,
+    every other row shifted by half their distance. square_mm : side of a square, or distance of two rows of circles.
+    marker_mm, dictionary : of a ChArUco board; default 0.75 of the square. circle_mm : diameter; default square_mm.
+    margin_mm : light paper around the print. The pose is that of the centre of the corners.
+
+    mirrored : the print is mirrored. scale : of the printer, in x and y; 1.05 makes 12 mm squares 12.6 mm wide.
+    bow_mm : the sheet is bent about y; its middle is this much nearer to the devices than its left and right ends
+    (negative: farther). The length along the bend is unchanged.
+    """
+
+    shape: Literal["board"]
+    kind: Literal["chessboard", "charuco", "circles"]
+    columns: Corners
+    rows: Corners
+    square_mm: Positive
+    marker_mm: Positive | None = None
+    dictionary: str = "DICT_5X5_250"
+    circle_mm: Positive | None = None
+    margin_mm: NotNegative = 10.0
+    albedo_light: Albedo = 0.85
+    albedo_dark: Albedo = 0.05
+    mirrored: bool = False
+    scale: Annotated[tuple[Positive, Positive], Field(strict=False)] = (1.0, 1.0)
+    bow_mm: float = 0.0
+
+    @model_validator(mode="after")
+    def _check_print(self) -> PrintedBoard:
+        if self.albedo_dark >= self.albedo_light:
+            message = "albedo_dark must be below albedo_light"
+            raise ValueError(message)
+        if self.kind == "charuco":
+            if not self._marker_mm < self.square_mm:
+                message = f"marker_mm must be below square_mm, {self.square_mm} mm"
+                raise ValueError(message)
+            available, needed = len(self._markers().bytesList), (self.columns + 1) * (self.rows + 1) // 2
+            if available < needed:
+                message = (
+                    f"the board needs {needed} markers, {self.dictionary} has {available}; choose a larger dictionary"
+                )
+                raise ValueError(message)
+        elif self.marker_mm is not None:
+            message = "marker_mm applies to ChArUco boards only; remove it"
+            raise ValueError(message)
+        half_mm = self.print_mm[:, 0] @ (-0.5, 0.5) + self.margin_mm
+        if abs(self.bow_mm) > half_mm / 4:
+            message = f"bow_mm must be at most a quarter of half the board's width, {half_mm / 4:.1f} mm"
+            raise ValueError(message)
+        return self
+
+    @property
+    def _marker_mm(self) -> float:
+        return 0.75 * self.square_mm if self.marker_mm is None else self.marker_mm
+
+    @property
+    def _circle_mm(self) -> float:
+        return self.square_mm if self.circle_mm is None else self.circle_mm
+
+    def _markers(self) -> cv2.aruco.Dictionary:
+        number: int | None = getattr(cv2.aruco, self.dictionary, None) if self.dictionary[:5] == "DICT_" else None
+        if number is None:
+            message = f"unknown dictionary {self.dictionary!r}; use one of OpenCV's: DICT_4X4_50, DICT_5X5_250, …"
+            raise ValueError(message)
+        return cv2.aruco.getPredefinedDictionary(number)
+
+    @property
+    def middle_mm(self) -> tuple[float, float]:
+        """Centre of the corners measured from corner 0, as designed."""
+        across = 2 * self.columns - 1 if self.kind == "circles" else self.columns - 1
+        return across * self.square_mm / 2, (self.rows - 1) * self.square_mm / 2
+
+    @property
+    def corners_mm(self) -> FloatArray:
+        """True positions of the corners (or circle centres) in the board's own frame, (n, 3) float64.
+
+        They include the printer's scale and the bend. Corner 0 of a mirrored print is at the right.
+        """
+        row, column = (each.ravel() for each in np.mgrid[: self.rows, : self.columns])
+        across = 2 * column + row % 2 if self.kind == "circles" else column
+        designed = np.column_stack([across, row]) * self.square_mm - self.middle_mm
+        along = designed * self.scale * (-1.0 if self.mirrored else 1.0, 1.0)
+        return self.on_sheet_mm(along)
+
+    @property
+    def print_mm(self) -> FloatArray:
+        """Smallest and largest (x, y) of the print along the sheet, without margin, (2, 2) float64."""
+        border = self.square_mm if self.kind != "circles" else self.square_mm / 2 + self._circle_mm / 2
+        reach = (np.array(self.middle_mm) + border) * self.scale
+        return np.stack([-reach, reach])
+
+    @property
+    def paper_mm(self) -> FloatArray:
+        """Smallest and largest (x, y) of the paper along the sheet, (2, 2) float64."""
+        outwards = np.array([[-1.0], [1.0]])
+        return self.print_mm + self.margin_mm * outwards
+
+    @property
+    def curvature_per_mm(self) -> float:
+        """Curvature of the bent sheet: z = curvature x²."""
+        half_mm = float(self.paper_mm[1, 0])
+        # Fixed-point iteration: x of the ends depends on the curvature, which depends on x.
+        reach = half_mm
+        for _ in range(20):
+            curvature = self.bow_mm / reach**2
+            reach = float(x_at_arc_length_mm(np.array([half_mm]), curvature)[0])
+        return self.bow_mm / reach**2
+
+    def on_sheet_mm(self, along_mm: FloatArray) -> FloatArray:
+        """Convert (n, 2) coordinates along the sheet into points of the board's own frame, (n, 3) float64."""
+        curvature = self.curvature_per_mm
+        x = x_at_arc_length_mm(along_mm[:, 0], curvature)
+        return np.column_stack([x, along_mm[:, 1], curvature * x**2])
+
+    def parts(self, _folder: Path) -> list[MeshPart]:
+        """Return the paper: a rectangle or a bent sheet."""
+        least, most = self.paper_mm
+        if self.bow_mm == 0:
+            return [rectangle_between(least, most)]
+        reach = float(x_at_arc_length_mm(most[:1], self.curvature_per_mm)[0])
+        return [bent_sheet((-reach, reach), (least[1], most[1]), self.curvature_per_mm)]
+
+    def material(self) -> tuple[float, ...]:
+        """Return the material of the light paper, see `TexturedObject.material`."""
+        return (self.albedo_light, 0.0, 0.0, 1.0, self.specular.strength, self.specular.exponent)
+
+    def print_layout(self) -> BoardPrint:
+        """Return the layout of the print."""
+        ratio = self.albedo_dark / self.albedo_light
+        if self.kind == "circles":
+            row, column = (each.ravel() for each in np.mgrid[: self.rows, : self.columns])
+            designed = np.column_stack([2 * column + row % 2, row]) * self.square_mm - self.middle_mm
+            centres = designed * self.scale * (-1.0 if self.mirrored else 1.0, 1.0)
+            none = np.zeros(2)
+            # A printer that stretches unequally makes ellipses; they are approximated by discs of the mean radius.
+            radius = self._circle_mm / 2 * float(np.sqrt(self.scale[0] * self.scale[1]))
+            return BoardPrint(none, none, np.zeros((1, 1), np.uint8), centres, radius, ratio, self.curvature_per_mm)
+        across, down, dark = self._rectangles()
+        across, down = (across - self.middle_mm[0]) * self.scale[0], (down - self.middle_mm[1]) * self.scale[1]
+        if self.mirrored:
+            across, dark = -across[::-1], dark[:, ::-1]
+        dark = np.ascontiguousarray(dark)
+        return BoardPrint(across, down, dark, np.zeros((0, 2)), 0.0, ratio, self.curvature_per_mm)
+
+    def _rectangles(self) -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
+        """Return the designed lines across and down from corner 0, mm, and which rectangles between them are dark."""
+        squares = (np.indices((self.rows + 1, self.columns + 1)).sum(axis=0) + 1) % 2  # top left is dark
+        if self.kind == "chessboard":
+            across, down = (np.arange(-1.0, n + 1) * self.square_mm for n in (self.columns, self.rows))
+            return across, down, squares.astype(np.uint8)
+        markers = self._markers()
+        modules = markers.markerSize + 2
+        border = (self.square_mm - self._marker_mm) / 2
+        inside = np.concatenate([[0.0], border + self._marker_mm * np.arange(modules + 1) / modules])
+        across, down = (
+            np.append((np.arange(-1, n)[:, None] * self.square_mm + inside).ravel(), n * self.square_mm)
+            for n in (self.columns, self.rows)
+        )
+        size = modules + 2
+        dark = np.kron(squares, np.ones((size, size), np.int64)).astype(np.uint8)
+        # Markers fill the light squares, numbered row by row.
+        for number, (row, column) in enumerate(np.argwhere(squares == 0)):
+            drawn = markers.generateImageMarker(number, modules)
+            top, left = row * size + 1, column * size + 1
+            dark[top : top + modules, left : left + modules] = drawn == 0
+        return across, down, dark
+
+
+def arc_length_mm(x_mm: FloatArray, curvature_per_mm: float) -> FloatArray:
+    """Length along z = c x² from 0 to x, mm: x √(1 + 4c²x²) / 2 + asinh(2 c x) / (4 c)."""
+    if curvature_per_mm == 0:
+        return x_mm
+    steep = 2 * curvature_per_mm * x_mm
+    return np.asarray(x_mm * np.sqrt(1 + steep**2) / 2 + np.arcsinh(steep) / (4 * curvature_per_mm), np.float64)
+
+
+def x_at_arc_length_mm(along_mm: FloatArray, curvature_per_mm: float) -> FloatArray:
+    """Invert `arc_length_mm` by Newton's method: x of the points at these lengths along z = c x², mm."""
+    x = np.array(along_mm, np.float64)
+    for _ in range(8):
+        x = x - (arc_length_mm(x, curvature_per_mm) - along_mm) / np.sqrt(1 + (2 * curvature_per_mm * x) ** 2)
+    return x
+
+
+class PlaneObject(TexturedObject):
+    """Rectangle in the object's x-y plane."""
 
     shape: Literal["plane"]
     size_mm: Annotated[tuple[Positive, Positive], Field(strict=False)]
 
-    def parts(self, _folder: Path) -> list[Part]:
-        """The rectangle."""
+    def parts(self, _folder: Path) -> list[MeshPart]:
+        """Return the rectangle."""
         return [shapes.rectangle(*self.size_mm)]
 
 
-class Sphere(Placed):
-    """A ball about the object's origin. Light and truth use the exact sphere, not its facets."""
+class Sphere(TexturedObject):
+    """Ball about the object's origin. Rendering and truth use the exact sphere, not its facets."""
 
     shape: Literal["sphere"]
     radius_mm: Positive
 
-    def parts(self, _folder: Path) -> list[Part]:
-        """The ball."""
+    def parts(self, _folder: Path) -> list[MeshPart]:
+        """Return the ball."""
         return [shapes.ball(self.radius_mm)]
 
 
-class BallBar(Placed):
-    """Two equal balls, `distance_mm` between their centres along x, and the bar that joins them."""
+class BallBar(TexturedObject):
+    """Two equal balls, with `distance_mm` between their centres along x, and the bar that joins them."""
 
     shape: Literal["ball_bar"]
     radius_mm: Positive
@@ -59,24 +355,25 @@ class BallBar(Placed):
     bar_radius_mm: Positive
 
     @model_validator(mode="after")
-    def _apart(self) -> BallBar:
+    def _check_clearance(self) -> BallBar:
         if self.distance_mm <= 2 * self.radius_mm or self.bar_radius_mm >= self.radius_mm:
             message = (
-                f"the balls must lie apart (distance above {2 * self.radius_mm} mm) and the bar be thinner than them"
+                f"the balls must not touch (distance_mm above {2 * self.radius_mm}), and the bar must be thinner than "
+                "the balls"
             )
             raise ValueError(message)
         return self
 
-    def parts(self, _folder: Path) -> list[Part]:
-        """Two balls and a rod."""
+    def parts(self, _folder: Path) -> list[MeshPart]:
+        """Return two balls and a rod."""
         half = self.distance_mm / 2
         left = shapes.ball(self.radius_mm, centre_mm=(-half, 0.0, 0.0))
         right = shapes.ball(self.radius_mm, centre_mm=(half, 0.0, 0.0))
         return [left, right, shapes.rod(self.bar_radius_mm, self.distance_mm)]
 
 
-class Stairs(Placed):
-    """Steps along x, each `rise_mm` nearer to the devices than the one on its left, `height_mm` long in y."""
+class Stairs(TexturedObject):
+    """Steps along x, each `rise_mm` nearer to the devices than its left neighbour, `height_mm` long in y."""
 
     shape: Literal["stairs"]
     steps: Annotated[int, Field(ge=1, le=1000)]
@@ -84,13 +381,13 @@ class Stairs(Placed):
     rise_mm: Positive
     height_mm: Positive
 
-    def parts(self, _folder: Path) -> list[Part]:
-        """Treads and risers, flat."""
+    def parts(self, _folder: Path) -> list[MeshPart]:
+        """Return flat treads and risers."""
         return [shapes.staircase(self.steps, self.tread_mm, self.rise_mm, self.height_mm)]
 
 
 class Wave(Strict):
-    """One sine of a relief: amplitude_mm * sin(2 pi s / wavelength_mm + phase), s along `direction_deg` from x."""
+    """Sine wave of a relief: amplitude_mm * sin(2 pi s / wavelength_mm + phase), s along `direction_deg` from x."""
 
     amplitude_mm: float
     wavelength_mm: Positive
@@ -98,28 +395,28 @@ class Wave(Strict):
     phase_deg: float = 0.0
 
 
-class Bump(Strict):
-    """One Gaussian hill (or hollow, with a negative height) of a relief."""
+class ReliefBump(Strict):
+    """Gaussian hill of a relief; a hollow if the height is negative."""
 
     centre_mm: Pair
     height_mm: float
     sigma_mm: Positive
 
 
-class Relief(Placed):
-    """A height field over a rectangle: a sum of waves and bumps, sampled every `step_mm`."""
+class Relief(TexturedObject):
+    """Height field over a rectangle: a sum of waves and bumps, sampled every `step_mm`."""
 
     shape: Literal["relief"]
     size_mm: Annotated[tuple[Positive, Positive], Field(strict=False)]
     step_mm: Positive = 0.5
     wave: Annotated[tuple[Wave, ...], Field(strict=False)] = ()
-    bump: Annotated[tuple[Bump, ...], Field(strict=False)] = ()
+    bump: Annotated[tuple[ReliefBump, ...], Field(strict=False)] = ()
 
     @model_validator(mode="after")
-    def _bounded(self) -> Relief:
+    def _check_cell_count(self) -> Relief:
         cells = self.size_mm[0] * self.size_mm[1] / self.step_mm**2
         if cells > 4e6:
-            message = f"size_mm and step_mm ask for {cells:.0f} cells, at most 4000000 are made; use a larger step_mm"
+            message = f"size_mm and step_mm give {cells:.0f} cells, the limit is 4000000; use a larger step_mm"
             raise ValueError(message)
         return self
 
@@ -135,16 +432,16 @@ class Relief(Placed):
             total += bump.height_mm * np.exp(-square / (2 * bump.sigma_mm**2))
         return total
 
-    def parts(self, _folder: Path) -> list[Part]:
-        """The height field."""
+    def parts(self, _folder: Path) -> list[MeshPart]:
+        """Return the height field."""
         return [shapes.height_field(self.size_mm, self.step_mm, self.height_mm)]
 
 
-class Turned(Placed):
-    """A vessel turned on a lathe about y: a smooth curve through (radius, height) points, fluted if asked.
+class Vessel(TexturedObject):
+    """Vessel of revolution about y: a smooth curve through (radius, height) points, optionally fluted.
 
-    `flutes` grooves run along the axis and change the radius by ± `flute_depth_mm`, twisted by `twist_deg` over
-    the height. Heights count upwards, against y.
+    `flutes` grooves run along the axis and change the radius by ± `flute_depth_mm`, twisted by `twist_deg` over the
+    height. Heights count upwards, against y.
     """
 
     shape: Literal["turned"]
@@ -155,7 +452,7 @@ class Turned(Placed):
     step_mm: Positive = 0.5
 
     @model_validator(mode="after")
-    def _turnable(self) -> Turned:
+    def _check_profile(self) -> Vessel:
         if len(self.profile_mm) < 3:
             message = f"profile_mm needs at least 3 points, found {len(self.profile_mm)}"
             raise ValueError(message)
@@ -165,17 +462,17 @@ class Turned(Placed):
             raise ValueError(message)
         return self
 
-    def parts(self, _folder: Path) -> list[Part]:
-        """The open vessel's outer wall."""
+    def parts(self, _folder: Path) -> list[MeshPart]:
+        """Return the outer wall of the open vessel."""
         profile = np.array(self.profile_mm)
-        return [shapes.turned(profile, self.flutes, self.flute_depth_mm, np.deg2rad(self.twist_deg), self.step_mm)]
+        return [shapes.vessel(profile, self.flutes, self.flute_depth_mm, np.deg2rad(self.twist_deg), self.step_mm)]
 
 
-class MeshFile(Placed):
-    """A triangle mesh from a file (STL, PLY, OBJ, GLB), in units of `unit_mm`, in its own frame.
+class MeshFile(TexturedObject):
+    """Triangle mesh from a file (STL, PLY, OBJ, GLB), in units of `unit_mm`, in its own frame.
 
-    A GLB's frame is glTF's: metres, y up. unit_mm = 1000 and rotation_deg = [180, 0, 0] bring a scan's mesh.glb back.
-    Edges sharper than `crease_deg` stay sharp in the shading.
+    The frame of a GLB file is that of glTF: metres, y up. Use unit_mm = 1000 and rotation_deg = [180, 0, 0] for the
+    mesh.glb of a scan. Edges sharper than `crease_deg` stay sharp in the shading.
     """
 
     shape: Literal["mesh"]
@@ -183,22 +480,22 @@ class MeshFile(Placed):
     unit_mm: Positive = 1.0
     crease_deg: Annotated[float, Field(ge=0, le=180)] = 30.0
 
-    def parts(self, folder: Path) -> list[Part]:
-        """The mesh. Raises ConfigError when the file cannot be read or holds no triangle."""
+    def parts(self, folder: Path) -> list[MeshPart]:
+        """Return the mesh. Raises ConfigError when the file cannot be read or contains no triangle."""
         return [shapes.mesh_file(folder / self.file, self.unit_mm, crease_rad=np.deg2rad(self.crease_deg))]
 
 
-Thing = Annotated[
-    Plane | Sphere | BallBar | Stairs | Relief | Turned | MeshFile | Board,
+AnyObject = Annotated[
+    PlaneObject | Sphere | BallBar | Stairs | Relief | Vessel | MeshFile | PrintedBoard,
     Field(discriminator="shape"),
 ]
 
 
 class Scene(Strict):
-    """A scene file: a name and one or more objects."""
+    """Scene file: a name and one or more objects."""
 
     name: str = ""
-    object: Annotated[tuple[Thing, ...], Field(strict=False), AfterValidator(at_least_one)]
+    object: Annotated[tuple[AnyObject, ...], Field(strict=False), AfterValidator(require_one)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,11 +503,11 @@ class SceneSurface:
     """The whole scene as triangles in the world, with materials by part.
 
     vertices_mm : (V, 3) float64; faces : (F, 3) int32; corner_normals : (F, 3, 3) float32, unit; part : (F,) int32.
-    sphere_mm : (P, 4) float64, centre and radius of a part that is a ball, radius 0 for the others.
+    sphere_mm : (P, 4) float64, centre and radius of a ball; radius 0 for other parts.
     to_object : (P, 3, 4) float64, world to the object's own frame.
     material : (P, 6) float64: albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent.
     colours : (P, 2, 3) float64, blue, green and red where a texture is light, and where it is dark.
-    prints : what is printed on the parts that are boards.
+    prints : print of each part that is a board.
     """
 
     vertices_mm: FloatArray
@@ -221,33 +518,33 @@ class SceneSurface:
     to_object: FloatArray
     material: FloatArray
     colours: FloatArray
-    prints: Mapping[int, Print] = field(default_factory=dict)
+    prints: Mapping[int, BoardPrint] = field(default_factory=dict)
 
 
 def read_scene(path: Path) -> Scene:
-    """Return the scene of a TOML file. Raises ConfigError that lists all faults."""
-    return validate(Scene, read_toml(path, _MOST_BYTES), f"the scene file {path}")
+    """Read a scene from a TOML file. Raises ConfigError that lists all faults."""
+    return validate(Scene, read_toml(path, _MAX_FILE_BYTES), f"the scene file {path}")
 
 
-def surface_of(scene: Scene, folder: Path) -> SceneSurface:
-    """Return the triangles of a scene; mesh files are looked for from `folder`. Raises ConfigError."""
+def build_surface(scene: Scene, folder: Path) -> SceneSurface:
+    """Build the triangles of a scene; paths of mesh files are relative to `folder`. Raises ConfigError."""
     vertices, faces, normals, owners = [], [], [], []
     spheres: list[tuple[float, ...]] = []
     inverses: list[FloatArray] = []
     materials: list[tuple[float, ...]] = []
     colours: list[tuple[Colour, Colour]] = []
-    prints: dict[int, Print] = {}
+    prints: dict[int, BoardPrint] = {}
     faults, first = [], 0
     for thing in scene.object:
-        rotation = turned_by(thing.rotation_deg)
+        rotation = rotation_matrix(thing.rotation_deg)
         shift = np.array(thing.position_mm)
         try:
             parts = thing.parts(folder)
         except ConfigError as error:
             faults.append(str(error))
             continue
-        if isinstance(thing, Board):
-            prints[len(spheres)] = thing.printed()
+        if isinstance(thing, PrintedBoard):
+            prints[len(spheres)] = thing.print_layout()
         for part in parts:
             vertices.append(part.vertices_mm @ rotation.T + shift)
             faces.append(part.faces + first)

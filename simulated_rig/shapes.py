@@ -1,4 +1,4 @@
-"""Tessellation: each shape as triangles in its own frame, fine enough that facets lie within FACET_ERROR_MM of it.
+"""Tessellation of shapes: triangles in the shape's own frame, within FACET_ERROR_MM of the exact surface.
 
 Triangles are counter-clockwise seen from outside (from -z for open shapes).
 """
@@ -19,12 +19,12 @@ from slrig.kernels import kernel
 from slrig.model import FloatArray, IntArray
 
 FACET_ERROR_MM = 0.003
-"""The largest distance between a facet and the curved surface that it stands for, by construction of the spheres
-and rods; reliefs and turned shapes are as fine as their `step_mm`, and are themselves the truth."""
+"""Largest distance between a facet and the exact surface of spheres and rods. Reliefs and vessels are as fine as their
+`step_mm`; their triangles are the truth."""
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class MeshPart:
     """One primitive in its object's frame.
 
     vertices_mm : (V, 3) float64; faces : (F, 3) int32; corner_normals : (F, 3, 3) float64, unit.
@@ -37,32 +37,32 @@ class Part:
     sphere_mm: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
-def rectangle(width_mm: float, height_mm: float) -> Part:
-    """A flat rectangle in x and y that faces -z."""
+def rectangle(width_mm: float, height_mm: float) -> MeshPart:
+    """Flat rectangle in x and y, centred on the origin, that faces -z."""
     reach = np.array([width_mm, height_mm]) / 2
     return rectangle_between(-reach, reach)
 
 
-def rectangle_between(least_mm: FloatArray, most_mm: FloatArray) -> Part:
-    """A flat rectangle that faces -z between two corners (x, y)."""
+def rectangle_between(least_mm: FloatArray, most_mm: FloatArray) -> MeshPart:
+    """Flat rectangle that faces -z between two corners (x, y)."""
     (left, top), (right, bottom) = least_mm, most_mm
     vertices = np.array([(left, top, 0), (right, top, 0), (right, bottom, 0), (left, bottom, 0)], np.float64)
-    return _flat(vertices, np.array([(0, 2, 1), (0, 3, 2)], np.int32))
+    return _flat_part(vertices, np.array([(0, 2, 1), (0, 3, 2)], np.int32))
 
 
-def bent_sheet(across_mm: tuple[float, float], down_mm: tuple[float, float], curvature_per_mm: float) -> Part:
-    """The sheet z = curvature x² that faces -z, in strips narrow enough for FACET_ERROR_MM / 30."""
+def bent_sheet(across_mm: tuple[float, float], down_mm: tuple[float, float], curvature_per_mm: float) -> MeshPart:
+    """Sheet z = curvature x² that faces -z, in strips narrow enough for FACET_ERROR_MM / 30."""
     # A chord of a parabola over a strip of width w sags by curvature w² / 4.
     width = np.sqrt(4 * FACET_ERROR_MM / 30 / abs(curvature_per_mm))
     count = int(np.ceil((across_mm[1] - across_mm[0]) / width)) + 1
     x = np.linspace(*across_mm, count)
     z = curvature_per_mm * x**2
     vertices = np.concatenate([np.column_stack([x, np.full(count, y), z]) for y in down_mm])
-    return _smooth(vertices, _grid_faces(2, count, closed=False), crease_rad=np.pi)
+    return _smooth_part(vertices, _grid_faces(2, count, closed=False), crease_rad=np.pi)
 
 
-def ball(radius_mm: float, *, centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:
-    """An icosphere whose facets' mid points lie at most FACET_ERROR_MM inside the sphere."""
+def ball(radius_mm: float, *, centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> MeshPart:
+    """Icosphere whose facet centres are at most FACET_ERROR_MM inside the sphere."""
     # The icosahedron's edge is 1.05 radii and halves with each subdivision, though the longest stay up to 1.24 times
     # that; the middle of an equilateral triangle of edge e (circumradius e/√3) sags by e²/(6 r).
     level = int(np.ceil(np.log2(1.3 * np.sqrt(radius_mm / (6 * FACET_ERROR_MM)))))
@@ -70,11 +70,11 @@ def ball(radius_mm: float, *, centre_mm: tuple[float, float, float] = (0.0, 0.0,
     vertices = np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces, np.int32)
     normals = vertices[faces] / np.linalg.norm(vertices[faces], axis=2, keepdims=True)
-    return Part(vertices + np.array(centre_mm), faces, normals, (*centre_mm, radius_mm))
+    return MeshPart(vertices + np.array(centre_mm), faces, normals, (*centre_mm, radius_mm))
 
 
-def rod(radius_mm: float, length_mm: float) -> Part:
-    """The wall of a cylinder along x, open at both ends."""
+def rod(radius_mm: float, length_mm: float) -> MeshPart:
+    """Wall of a cylinder along x, open at both ends."""
     count = int(np.ceil(np.pi / np.arccos(max(1 - FACET_ERROR_MM / radius_mm, 0.0)))) + 3
     turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
     ring = np.column_stack([np.zeros(count), radius_mm * np.cos(turn), radius_mm * np.sin(turn)])
@@ -86,11 +86,11 @@ def rod(radius_mm: float, length_mm: float) -> Part:
         [np.column_stack([here, after, after + count]), np.column_stack([here, after + count, here + count])]
     ).astype(np.int32)
     radial = np.concatenate([ring, ring]) / radius_mm
-    return Part(vertices, faces, radial[faces])
+    return MeshPart(vertices, faces, radial[faces])
 
 
-def staircase(steps: int, tread_mm: float, rise_mm: float, height_mm: float) -> Part:
-    """Treads facing -z and risers facing -x, centred on the origin; each step is nearer than the one on its left."""
+def staircase(steps: int, tread_mm: float, rise_mm: float, height_mm: float) -> MeshPart:
+    """Treads facing -z and risers facing -x, centred on the origin; each step is nearer than its left neighbour."""
     x = (np.repeat(np.arange(steps + 1), 2)[1:-1] - steps / 2) * tread_mm
     z = -(np.repeat(np.arange(steps), 2) - (steps - 1) / 2) * rise_mm
     count = len(x)
@@ -103,23 +103,23 @@ def staircase(steps: int, tread_mm: float, rise_mm: float, height_mm: float) -> 
             np.column_stack([here, here + count, here + 1 + count]),
         ]
     ).astype(np.int32)
-    return _flat(vertices, faces)
+    return _flat_part(vertices, faces)
 
 
 def height_field(
     size_mm: tuple[float, float], step_mm: float, height_mm: Callable[[FloatArray, FloatArray], FloatArray]
-) -> Part:
-    """A rectangle sampled every `step_mm` (or a little finer) and raised towards -z."""
+) -> MeshPart:
+    """Rectangle sampled every `step_mm` (or slightly finer) and raised towards -z."""
     columns, rows = (max(int(np.ceil(extent / step_mm)), 1) + 1 for extent in size_mm)
     x, y = np.meshgrid(
         np.linspace(-size_mm[0] / 2, size_mm[0] / 2, columns), np.linspace(-size_mm[1] / 2, size_mm[1] / 2, rows)
     )
     vertices = np.stack([x, y, -height_mm(x, y)], axis=-1).reshape(-1, 3)
-    return _smooth(vertices, _grid_faces(rows, columns, closed=False), crease_rad=np.pi)
+    return _smooth_part(vertices, _grid_faces(rows, columns, closed=False), crease_rad=np.pi)
 
 
-def turned(profile_mm: FloatArray, flutes: int, flute_depth_mm: float, twist_rad: float, step_mm: float) -> Part:
-    """The wall of a vessel about the y axis: radius by a cubic spline through (radius, height), with flutes."""
+def vessel(profile_mm: FloatArray, flutes: int, flute_depth_mm: float, twist_rad: float, step_mm: float) -> MeshPart:
+    """Wall of a vessel about the y axis: radius by a cubic spline through (radius, height), with flutes."""
     radius, height = profile_mm.T
     curve = CubicSpline(height, radius)
     rows = max(int(np.ceil((height[-1] - height[0]) / step_mm)), 2) + 1
@@ -130,13 +130,13 @@ def turned(profile_mm: FloatArray, flutes: int, flute_depth_mm: float, twist_rad
     twist = twist_rad * (h - height[0]) / (height[-1] - height[0])
     r = curve(h) + flute_depth_mm * np.cos(flutes * (turn - twist))
     vertices = np.stack([r * np.sin(turn), -h, -r * np.cos(turn)], axis=-1).reshape(-1, 3)
-    return _smooth(vertices, _grid_faces(rows, columns, closed=True)[:, ::-1].copy(), crease_rad=np.pi)
+    return _smooth_part(vertices, _grid_faces(rows, columns, closed=True)[:, ::-1].copy(), crease_rad=np.pi)
 
 
-def mesh_file(path: Path, unit_mm: float, *, crease_rad: float) -> Part:
-    """The triangles of an STL, PLY, OBJ or GLB file, times `unit_mm`. Raises ConfigError."""
+def mesh_file(path: Path, unit_mm: float, *, crease_rad: float) -> MeshPart:
+    """Read the triangles of an STL, PLY, OBJ or GLB file, scaled by `unit_mm`. Raises ConfigError."""
     if not path.is_file():
-        message = f"mesh file {path}: there is no such file; paths count from the folder of the scene file"
+        message = f"mesh file {path}: not found; paths are relative to the folder of the scene file"
         raise ConfigError(message)
     try:
         mesh = trimesh.load_mesh(path)
@@ -150,7 +150,7 @@ def mesh_file(path: Path, unit_mm: float, *, crease_rad: float) -> Part:
     if not np.isfinite(vertices).all():
         message = f"mesh file {path}: some vertices are not finite; repair the mesh"
         raise ConfigError(message)
-    return _smooth(vertices, np.asarray(mesh.faces, np.int32), crease_rad=crease_rad)
+    return _smooth_part(vertices, np.asarray(mesh.faces, np.int32), crease_rad=crease_rad)
 
 
 def _grid_faces(rows: int, columns: int, *, closed: bool) -> IntArray:
@@ -164,30 +164,35 @@ def _grid_faces(rows: int, columns: int, *, closed: bool) -> IntArray:
 
 
 def _face_normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """(F, 3): twice the area times the unit normal."""
+    """(F, 3): unit normal times twice the area."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     return np.cross(b - a, c - a)
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def _normalise(vectors: FloatArray) -> FloatArray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.where(length > 0, length, 1.0), dtype=np.float64)
 
 
-def _flat(vertices: FloatArray, faces: IntArray) -> Part:
-    normals = _unit(_face_normals(vertices, faces))
-    return Part(vertices, faces, np.repeat(normals[:, None], 3, axis=1))
+def _flat_part(vertices: FloatArray, faces: IntArray) -> MeshPart:
+    normals = _normalise(_face_normals(vertices, faces))
+    return MeshPart(vertices, faces, np.repeat(normals[:, None], 3, axis=1))
 
 
-def _smooth(vertices: FloatArray, faces: IntArray, *, crease_rad: float) -> Part:
-    """Corner normals: the area-weighted mean of the faces at the vertex that bend less than a crease from this one."""
+def _smooth_part(vertices: FloatArray, faces: IntArray, *, crease_rad: float) -> MeshPart:
+    """Smooth corner normals: area-weighted mean over the faces at the vertex that bend less than a crease."""
     weighted = _face_normals(vertices, faces)
     corners = np.argsort(faces, axis=None, kind="stable")
     first = np.searchsorted(faces.ravel()[corners], np.arange(len(vertices) + 1))
     normals = _corner_normals(
-        np.ascontiguousarray(faces), first, corners // 3, weighted, _unit(weighted), float(np.cos(crease_rad)) - 1e-12
+        np.ascontiguousarray(faces),
+        first,
+        corners // 3,
+        weighted,
+        _normalise(weighted),
+        float(np.cos(crease_rad)) - 1e-12,
     )
-    return Part(vertices, faces, normals)
+    return MeshPart(vertices, faces, normals)
 
 
 @kernel(in_every_scan=False)
@@ -199,7 +204,7 @@ def _corner_normals(
     unit: FloatArray,
     cos_crease: float,
 ) -> FloatArray:
-    """(F, 3, 3) float64, unit. Vertex v lies in the faces around[first[v]:first[v + 1]]."""
+    """(F, 3, 3) float64, unit. Vertex v belongs to the faces around[first[v]:first[v + 1]]."""
     out = np.zeros((len(faces), 3, 3))
     for face in range(len(faces)):
         n = unit[face]

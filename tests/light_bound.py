@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulated_rig.light import NODES_PER_PX, Float32Array, LightTable, Response, light_table
-from simulated_rig.rendering import View
-from simulated_rig.sensor import Sensor
+from simulated_rig.rendering import CameraView, SensorModel
 from slrig.model import FloatArray, IntArray, Pixels, Size
 
 _STEP_PX = 1.0 / NODES_PER_PX
@@ -31,10 +30,10 @@ _BLACK = np.zeros((1, 1), np.uint8)
 class ExposedView:
     """One camera's view of a scene, the projector that lights it, and how the sensor is exposed."""
 
-    view: View
+    view: CameraView
     projector: Size
     response: Response
-    sensor: Sensor
+    sensor: SensorModel
     exposure_s: float
     gain: float = 1.0
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from simulated_rig.device import SimulatedHead, simulated_head
+from simulated_rig.device import SimulatedHead, open_simulated_head
 from slrig.devices import CameraSettings, Rig
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
@@ -106,7 +106,7 @@ def board_head(folder: Path, options: Mapping[str, Any], scene: str | None = Non
     """Open a head of `board_options` before a scene, whose file is written into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scene.toml").write_text(scene if scene is not None else board_scene(), encoding="utf-8")
-    return simulated_head(options, folder)
+    return open_simulated_head(options, folder)
 
 
 def board_rig(head: SimulatedHead, options: Mapping[str, Any]) -> Rig:

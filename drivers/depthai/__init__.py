@@ -1,8 +1,8 @@
-"""Luxonis OAK cameras through DepthAI: one camera, or several of one device exposed together. Extra: `depthai`."""
+"""Luxonis OAK cameras through DepthAI: one camera, or several of one device, exposed together. Extra: `depthai`."""
 
 from drivers.depthai.calibration import FactoryCalibration, Lens, read_calibration, read_factory_calibration
 from drivers.depthai.camera import OakCamera, open_camera
-from drivers.depthai.finder import find_devices
+from drivers.depthai.device import find_devices
 from drivers.depthai.options import OakOptions
 
 __all__ = [

@@ -1,9 +1,8 @@
-"""The calibration that an OAK device carries from the factory, as ours: millimetres, five coefficients of Brown's.
+"""Factory calibration of an OAK device, converted to millimetres and five Brown coefficients.
 
-The device stores a lens as up to fourteen coefficients (rational, thin prism, tilt) or as a fisheye's four. Where more
-than Brown's five (k1, k2, p1, p2, k3) are in use, focal lengths, centre and those five are fitted to the stored model
-over the whole image: a calibration is which ray falls on which pixel, however it is written down. A lens that they
-cannot follow to a tenth of a pixel everywhere is refused.
+The device stores a lens as up to fourteen coefficients (rational, thin prism, tilt) or as a fisheye's four. If more
+than Brown's five (k1, k2, p1, p2, k3) are used, focal lengths, centre and those five are fitted to the stored model
+over the whole image. A lens that they cannot follow to a tenth of a pixel everywhere is refused.
 """
 
 from __future__ import annotations
@@ -15,12 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drivers.depthai.board import board_of
-from drivers.depthai.library import library
+from drivers.depthai.device import open_device
+from drivers.depthai.library import load_depthai
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size
 
-MOST_RESIDUAL_PX = 0.1
+MAX_RESIDUAL_PX = 0.1
 
 _BROWN = 5
 _GRID = 25
@@ -32,7 +31,7 @@ _FIT_STEPS = 30
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """One camera of a device, as a rig uses it. size : of its frames; the sensor's own where None."""
+    """One camera of a device in a rig. size : of its frames; the sensor's size if None."""
 
     socket: str
     size: Size | None = None
@@ -40,10 +39,10 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class FactoryCalibration:
-    """What a device carries. The world is the first camera's frame.
+    """Factory calibration of a device. The world is the first camera's frame.
 
-    residual_px : by camera, the largest distance over the image between the stored lens model and ours.
-    lens_position : by camera, the focus that it was calibrated at; None for a fixed lens.
+    residual_px : by camera, the largest distance over the image between the stored lens model and the converted one.
+    lens_position : by camera, the focus at calibration; None for a fixed lens.
     """
 
     calibration: Calibration
@@ -57,49 +56,48 @@ def read_calibration(device: str, cameras: Mapping[str, Lens] | None = None) -> 
 
 
 def read_factory_calibration(device: str, cameras: Mapping[str, Lens] | None = None) -> FactoryCalibration:
-    """Read what a device carries. It is opened for that, unless this process has it open.
+    """Read the factory calibration of a device, opening it unless this process has it open.
 
     Parameters
     ----------
     device
         Its id, as in a rig file.
     cameras
-        Name in the rig, and socket and size of its frames. Every camera of the device under its socket's name where
-        None.
+        Socket and frame size by name in the rig. If None, every camera of the device under its socket's name.
 
     Raises
     ------
     CalibrationError
-        Nothing is stored for one of the cameras, or its lens cannot be written with five coefficients.
+        One of the cameras has no calibration, or its lens cannot be converted to five coefficients.
     LibraryMissingError, DeviceBusyError, DeviceGoneError, DeviceError
-        See `drivers.depthai.board.board_of`.
+        See `drivers.depthai.device.open_device`.
     """
-    vendor = library()
-    board = board_of(device)
+    vendor = load_depthai()
+    oak = open_device(device)
     try:
-        handler = board.factory_calibration()
+        handler = oak.factory_calibration()
         wanted = cameras or {
             socket: Lens(socket)
-            for socket in board.sensors
+            for socket in oak.sensors
             if handler.hasCameraCalibration(getattr(vendor.CameraBoardSocket, socket))
         }
         sized = {
             name: (
                 lens.socket,
-                lens.size or (board.sensors[lens.socket].size if lens.socket in board.sensors else None),
+                lens.size or (oak.sensors[lens.socket].size if lens.socket in oak.sensors else None),
             )
             for name, lens in wanted.items()
         }
-        focusing = {socket for socket, sensor in board.sensors.items() if sensor.autofocus}
-        return calibration_of(handler, sized, focusing, vendor)
+        focusing = {socket for socket, sensor in oak.sensors.items() if sensor.autofocus}
+        return convert_calibration(handler, sized, focusing, vendor)
     finally:
-        board.close_unless_used()
+        oak.close_unless_used()
 
 
-def calibration_of(
+def convert_calibration(
     handler: Any, cameras: Mapping[str, tuple[str, Size | None]], focusing: set[str], vendor: Any
 ) -> FactoryCalibration:
-    """Translate the library's handler.
+    """Convert the library's calibration.
 
     Parameters
     ----------
@@ -121,16 +119,16 @@ def calibration_of(
         message = "the device stores no calibration of any of its cameras; calibrate the rig with a board"
         raise CalibrationError(message)
     sockets = {name: getattr(vendor.CameraBoardSocket, socket) for name, (socket, _) in cameras.items()}
-    lacking = [name for name, socket in sockets.items() if not handler.hasCameraCalibration(socket)]
-    if lacking:
-        message = f"the device stores no calibration of {', '.join(lacking)}; calibrate the rig with a board"
+    missing = [name for name, socket in sockets.items() if not handler.hasCameraCalibration(socket)]
+    if missing:
+        message = f"the device stores no calibration of {', '.join(missing)}; calibrate the rig with a board"
         raise CalibrationError(message)
     first = next(iter(sockets.values()))
     pinholes, residual_px = {}, {}
-    for name, (_, asked) in cameras.items():
+    for name, (_, requested) in cameras.items():
         socket = sockets[name]
         _, width_px, height_px = handler.getDefaultIntrinsics(socket)
-        size = asked or Size(width_px, height_px)
+        size = requested or Size(width_px, height_px)
         matrix = np.array(handler.getCameraIntrinsics(socket, size.width_px, size.height_px), dtype=np.float64)
         stored = np.array(handler.getDistortionCoefficients(socket), dtype=np.float64)
         fisheye = handler.getDistortionModel(socket) == vendor.CameraModel.Fisheye
@@ -140,16 +138,16 @@ def calibration_of(
                 "read; calibrate the rig with a board"
             )
             raise CalibrationError(message)
-        matrix, distortion, residual_px[name] = brown_lens(matrix, stored, size, fisheye=fisheye)
-        if residual_px[name] > MOST_RESIDUAL_PX:
+        matrix, distortion, residual_px[name] = fit_brown_lens(matrix, stored, size, fisheye=fisheye)
+        if residual_px[name] > MAX_RESIDUAL_PX:
             message = (
                 f"camera '{name}': its lens is stored with {len(stored)} distortion coefficients, which five follow to "
-                f"{residual_px[name]:.2f} px only; {MOST_RESIDUAL_PX} px are allowed. Calibrate the rig with a board"
+                f"{residual_px[name]:.2f} px only; {MAX_RESIDUAL_PX} px are allowed. Calibrate the rig with a board"
             )
             raise CalibrationError(message)
         pose = np.eye(4)
         if socket != first:
-            # Centimetres unless asked otherwise.
+            # The default unit is centimetres.
             pose = np.array(handler.getCameraExtrinsics(first, socket, False, vendor.LengthUnit.MILLIMETER))
         pinholes[name] = Pinhole(
             size=size,
@@ -168,10 +166,10 @@ def calibration_of(
     )
 
 
-def brown_lens(
+def fit_brown_lens(
     matrix: FloatArray, stored: FloatArray, size: Size, *, fisheye: bool = False
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Write a lens with five coefficients.
+    """Convert a lens to five coefficients.
 
     Parameters
     ----------
@@ -182,12 +180,12 @@ def brown_lens(
     size
         Of the image.
     fisheye
-        Which of the two.
+        True for a fisheye model.
 
     Returns
     -------
     matrix : (3, 3) float64; distortion : (5,) float64; residual_px : the largest distance between both models over a
-    grid on the image, infinite where the stored model cannot be inverted.
+    grid on the image, infinite if the stored model cannot be inverted.
     """
     if not fisheye and not np.any(stored[_BROWN:]):
         return matrix, np.pad(stored[:_BROWN], (0, _BROWN - len(stored[:_BROWN]))), 0.0
@@ -196,14 +194,14 @@ def brown_lens(
     rays = _rays(pixels, matrix, stored, fisheye=fisheye)
     if rays is None:
         return matrix, np.zeros(_BROWN), float("inf")
-    fitted, distortion = _fitted(rays, pixels, matrix)
-    off_px = np.linalg.norm(_projected(rays, fitted, distortion) - pixels, axis=1)
+    fitted, distortion = _fit_lens(rays, pixels, matrix)
+    off_px = np.linalg.norm(_project(rays, fitted, distortion) - pixels, axis=1)
     worst_px = float(off_px.max())
     return fitted, distortion, worst_px if np.isfinite(worst_px) else float("inf")
 
 
 def _rays(pixels: FloatArray, matrix: FloatArray, stored: FloatArray, *, fisheye: bool) -> FloatArray | None:
-    """(n, 2) float64: x/z and y/z of what falls on each pixel, by the stored model; None where that has no answer."""
+    """Rays (x/z, y/z) of the pixels by the stored model, (n, 2) float64; None if it cannot be inverted."""
     end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _INVERSE_STEPS, 1e-12)
     given = pixels.reshape(-1, 1, 2)
     if fisheye:
@@ -211,19 +209,19 @@ def _rays(pixels: FloatArray, matrix: FloatArray, stored: FloatArray, *, fisheye
         again = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), matrix, stored[:4]).reshape(-1, 2)
     else:
         rays = cv2.undistortPoints(given, matrix, stored, criteria=end).reshape(-1, 2)
-        again = _projected(rays, matrix, stored)
+        again = _project(rays, matrix, stored)
     off_px = np.linalg.norm(again - pixels, axis=1)
-    return rays if np.isfinite(rays).all() and float(off_px.max()) < MOST_RESIDUAL_PX / 100 else None
+    return rays if np.isfinite(rays).all() and float(off_px.max()) < MAX_RESIDUAL_PX / 100 else None
 
 
-def _fitted(rays: FloatArray, pixels: FloatArray, matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least squares of fx, fy, cx, cy, k1, k2, p1, p2, k3 by Gauss and Newton; OpenCV gives the derivatives."""
+def _fit_lens(rays: FloatArray, pixels: FloatArray, matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fit fx, fy, cx, cy, k1, k2, p1, p2, k3 by Gauss-Newton, with OpenCV's derivatives."""
     matrix, distortion = matrix.copy(), np.zeros(_BROWN)
     points = np.column_stack([rays, np.ones(len(rays))])
     for _ in range(_FIT_STEPS):
-        seen, slopes = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
+        projected, jacobian = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
         # Columns: rotation 3, translation 3, focal lengths 2, centre 2, distortion.
-        step = np.linalg.lstsq(slopes[:, 6 : 10 + _BROWN], (pixels - seen.reshape(-1, 2)).ravel(), rcond=None)[0]
+        step = np.linalg.lstsq(jacobian[:, 6 : 10 + _BROWN], (pixels - projected.reshape(-1, 2)).ravel(), rcond=None)[0]
         matrix[0, 0], matrix[1, 1] = matrix[0, 0] + step[0], matrix[1, 1] + step[1]
         matrix[0, 2], matrix[1, 2] = matrix[0, 2] + step[2], matrix[1, 2] + step[3]
         distortion = distortion + step[4:]
@@ -232,7 +230,7 @@ def _fitted(rays: FloatArray, pixels: FloatArray, matrix: FloatArray) -> tuple[F
     return matrix, distortion
 
 
-def _projected(rays: FloatArray, matrix: FloatArray, distortion: FloatArray) -> FloatArray:
+def _project(rays: FloatArray, matrix: FloatArray, distortion: FloatArray) -> FloatArray:
     points = np.column_stack([rays, np.ones(len(rays))])
-    seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
-    return np.asarray(seen, dtype=np.float64).reshape(-1, 2)
+    projected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
+    return np.asarray(projected, dtype=np.float64).reshape(-1, 2)

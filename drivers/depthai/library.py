@@ -1,30 +1,150 @@
-"""The vendor's library, loaded when a device is first asked for: importing it takes seconds."""
+"""The library DepthAI, the OAK devices it finds, and the properties of their sensors.
+
+https://docs.luxonis.com/hardware/platform/deploy/frame-sync lists the sensors with a global shutter, and those that
+expose at any time when triggered (snapshot). The others can only be synchronised to a continuous stream at their own
+frame rate, which cannot wait for a pattern.
+
+Availability is checked before opening, because opening an absent device blocks for seconds. The library is loaded when
+a device is first requested, because its import takes seconds.
+"""
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
 import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
-from slrig.errors import LibraryMissingError
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError
+from slrig.model import Size
 
+UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"'
+
+
+GLOBAL_SHUTTER = frozenset({"OV9281", "OV9282", "OV9782", "OV7251", "AR0234"})
+SNAPSHOT = frozenset({"OV9282", "OV9782", "AR0234"})
 INSTALL = "pip install 'slrig[depthai]'"
-
 ENVIRONMENT = {
-    # It warns of every bus that it cannot see (a container without USB, for example).
+    # Without this it warns of every invisible bus (in a container without USB, for example).
     "DEPTHAI_LEVEL": "error",
-    # It reports its use to its maker, and asks there for news. A rig tells nobody what it does.
+    # Switch off usage reports and update checks.
     "DEPTHAI_TELEMETRY": "0",
     "DEPTHAI_DISABLE_STARTUP_NOTIFICATIONS": "1",
 }
-"""What the library reads when it is imported; what the user has set stays."""
-
+"""Variables that the library reads on import; values set by the user are kept."""
 _MICROSECOND = timedelta(microseconds=1)
 
 
-def library() -> Any:
+def is_permitted(info: Any, vendor: Any) -> bool:
+    """True if this user may open the device."""
+    return bool(info.status != vendor.XLinkError_t.X_LINK_INSUFFICIENT_PERMISSIONS)
+
+
+def find_available(device: str, vendor: Any) -> Any:
+    """Return the library's description of a device that can be opened, by id, address or port.
+
+    Raises
+    ------
+    DeviceBusyError
+        Another program holds it.
+    DeviceGoneError
+        It is not connected.
+    DeviceError
+        This user may not open it.
+    """
+    info = _find_by_name(device, vendor.Device.getAllAvailableDevices())
+    if info is not None and is_permitted(info, vendor):
+        return info
+    connected = vendor.Device.getAllConnectedDevices()
+    info = info or _find_by_name(device, connected)
+    if info is None:
+        connected_ids = ", ".join(sorted(other.deviceId or other.name for other in connected)) or "none"
+        message = (
+            f"OAK device '{device}' not found; found: {connected_ids}. Plug it in, wait for it to start, and write its "
+            "id as `slrig devices` shows it"
+        )
+        raise DeviceGoneError(message)
+    if not is_permitted(info, vendor):
+        raise DeviceError(_permission_message(device))
+    message = (
+        f"OAK device '{device}' is held by another program (state {info.state.name}); close that program, or unplug "
+        "the device and plug it in again"
+    )
+    raise DeviceBusyError(message)
+
+
+def _find_by_name(device: str, infos: Iterable[Any]) -> Any:
+    return next((info for info in infos if device in (info.deviceId, info.name)), None)
+
+
+def _permission_message(device: str) -> str:
+    return (
+        f"OAK device '{device}': this user may not open it; write {UDEV_RULE} into "
+        "/etc/udev/rules.d/80-movidius.rules, run `udevadm control --reload-rules && udevadm trigger`, and plug it in "
+        "again"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OakSensor:
+    """One camera on a device. `name` is the chip's; `fastest_fps` is 0 if unknown."""
+
+    socket: str
+    name: str
+    size: Size
+    colour: bool
+    autofocus: bool
+    fastest_fps: float
+
+    @property
+    def global_shutter(self) -> bool:
+        """True if all rows are exposed together. Unknown sensors are assumed to have a rolling shutter."""
+        return self.name.upper() in GLOBAL_SHUTTER
+
+    @property
+    def snapshot(self) -> bool:
+        """True if an edge on FSIN starts an exposure at any time."""
+        return self.name.upper() in SNAPSHOT
+
+    def longest_skew_ns(self, fps: float) -> int:
+        """Maximum delay of the last row's exposure after the first row's, ns.
+
+        All rows are read out within one period of the fastest full-frame mode.
+        """
+        if self.global_shutter:
+            return 0
+        return round(1e9 / max(self.fastest_fps, fps))
+
+
+def read_sensors(features: Iterable[Any], vendor: Any) -> Mapping[str, OakSensor]:
+    """Return the mono and colour cameras of a device by socket."""
+    kinds = vendor.CameraSensorType
+    found = {}
+    for feature in features:
+        # The first type is the default.
+        kind = feature.supportedTypes[0] if feature.supportedTypes else kinds.MONO
+        if kind not in (kinds.MONO, kinds.COLOR) or feature.width < 1 or feature.height < 1:
+            continue
+        whole = [
+            config.maxFps
+            for config in feature.configs
+            if (config.width, config.height) == (feature.width, feature.height)
+        ]
+        found[feature.socket.name] = OakSensor(
+            socket=feature.socket.name,
+            name=feature.sensorName,
+            size=Size(feature.width, feature.height),
+            colour=kind == kinds.COLOR,
+            autofocus=feature.hasAutofocus,
+            fastest_fps=max(whole, default=0.0),
+        )
+    return found
+
+
+def load_depthai() -> Any:
     """Return the module `depthai`, version 3.12 or later.
 
     Raises
@@ -32,7 +152,7 @@ def library() -> Any:
     LibraryMissingError
         It is not installed, cannot be loaded, or is too old.
     """
-    # Asking whether it is there takes no time; importing it does.
+    # Finding it is fast; importing it is slow.
     if importlib.util.find_spec("depthai") is None:
         message = f"OAK cameras need the library depthai, which is not installed: {INSTALL}"
         raise LibraryMissingError(message, install=INSTALL)
@@ -51,14 +171,13 @@ def library() -> Any:
 
 
 def nanoseconds(span: timedelta) -> int:
-    """A duration of the library's, ns; its resolution is a microsecond.
+    """Convert a duration of the library to ns; its resolution is a microsecond.
 
-    >>> nanoseconds(timedelta(milliseconds=2))
-    2000000
+    >>> nanoseconds(timedelta(milliseconds=2)) 2000000
     """
     return span // _MICROSECOND * 1_000
 
 
 def microseconds(span: timedelta) -> int:
-    """A duration of the library's, µs."""
+    """Convert a duration of the library to µs."""
     return span // _MICROSECOND

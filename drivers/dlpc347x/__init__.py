@@ -1,38 +1,37 @@
-"""Light engines with TI's controllers DLPC3470 and DLPC3478 over I²C: the light-control modules of DLP2010 and DLP3010.
+"""Light engines with TI's controllers DLPC3470 and DLPC3478 over I²C (experimental): modules of DLP2010 and DLP3010.
 
-Linux only: the engine is at an address of a bus that the kernel has (/dev/i2c-*, e.g. a Raspberry Pi's). Needs no
-library. TI's evaluation modules have a USB port beside it, through a bridge and its vendor's library: not used here.
+Experimental: untested on hardware; tested against a simulated device that keeps the rules of the guides.
 
-What is established, and from what. Commands, lengths and bits: TI's programmer's guides and TI's own sources, in two of
-them each but what `drivers.dlpc347x.engine` names. The block of patterns in the flash: two editions of TI's source. How
-it is written: the guide (DLPU075B §3, "update internal pattern data"). Light of 0.2 to 7.6 ms and the dark around it
-(171 and 31 µs): the release notes of TI's firmware, and the engine is asked (9Dh) before anything is lit. TRIG_OUT_2 is
-on while a pattern is lit: the data sheets of both. Only facts were taken.
+Linux only: the engine is at an address of a kernel's bus (/dev/i2c-*, e.g. of a Raspberry Pi). Needs no library. The
+USB port of TI's evaluation modules needs its vendor's library and is not used.
 
-Patterns come from the engine's flash ("internal pattern streaming"). `slrig patterns RIG` writes them there, over what
-was there before, and reads them back; when the engine is opened its flash is read, so that what it holds is known from
-itself and no list is kept. External pattern streaming is not used: which picture of the video is on the mirrors when
-cannot be known from here.
+Sources. Commands, lengths and bits: TI's programmer's guides and TI's own sources, in both of them except as noted in
+`drivers.dlpc347x.engine`. The block of patterns in the flash: two editions of TI's source. Writing it: the guide
+(DLPU075B §3, "update internal pattern data"). Light of 0.2 to 7.6 ms and the dark around it (171 and 31 µs): the
+release notes of TI's firmware, and the engine is queried (9Dh) before anything is lit. TRIG_OUT_2 is on while a pattern
+is lit: the data sheets of both.
+
+Patterns come from the engine's flash ("internal pattern streaming"). `slrig patterns RIG` overwrites its patterns and
+verifies them; when the engine is opened its flash is read, so no list is kept. External pattern streaming is not used:
+the time at which a video picture is on the mirrors cannot be known.
 
 `play` shows the loaded sequence with a pulse on TRIG_OUT_2 per pattern, and this program stops the engine at its end.
-It takes sequences of one axis: how long an engine takes from one set of its flash to the next is not documented. `show`
-lights one pattern again and again, 7.6 ms of 7.8, since no longer light is known: short exposures see it unsteadily, by
-0.2 ms of each. A sequence is repeated a counted number of times, so it ends by itself: what is shown 2 s after its host
-has died, what is played after twice its length at the latest. Dark means: every LED off, read back, and the sequence
-stopped.
+It takes sequences of one axis: the time from one set of its flash to the next is not documented. `show` lights one
+pattern repeatedly, 7.6 ms of 7.8, the longest documented light: short exposures may lose 0.2 ms of it. A sequence has a
+counted number of repeats, so it ends by itself: 2 s after the death of its host for `show`, after twice its length at
+most for `play`. Dark means: every LED off, read back, and the sequence stopped.
 
-Current. It goes to the LED driver as a number that "directly controls the LED current" (TI's header), as a share of the
-most that the engine's flash states; no polarity can be set, so there is none to be found out, and no dim first light.
-A board with another LED driver than TI's is not known to this driver.
+LED current. The number that "directly controls the LED current" (TI's header) is set as a fraction of the maximum in
+the engine's flash; its polarity cannot be inverted, so there is no dim first light. Boards with another LED driver than
+TI's are not supported.
 
-Untested on metal: all of it was tested against a peer that keeps the guides' rules. To be watched on the first day:
-that the firmware takes an entry of 25 bytes (older ones, of 2019, do not, and are refused with that); whether LEDs come
-on after LED enables were off, and are off by them in this mode; whether all is dark after the end of a sequence;
-whether a repeat counts the first time (programs of others disagree; either is allowed for); whether 1 s of dark is
-allowed at the end; which side column 0 is on (`mirror_columns`); how often a flash may be written; and how long light
-takes to begin (`start_s`).
+To be checked on hardware: that the firmware takes an entry of 25 bytes (older ones, of 2019, do not, and are refused
+with that reason); whether LEDs come on after LED enables were off, and are off by them in this mode; whether all is
+dark after the end of a sequence; whether a repeat counts the first time (third-party programs differ; either is allowed
+for); whether 1 s of dark is allowed at the end; the side of column 0 (`mirror_columns`); how often a flash may be
+written; and the delay of the light (`start_s`).
 
-The DLPC3479 (DLP4710) has two controllers, whose halves two editions of TI's source fill in two ways: it is refused.
+The DLPC3479 (DLP4710) has two controllers, whose halves two editions of TI's source fill differently: it is refused.
 """
 
 from __future__ import annotations
@@ -43,40 +42,39 @@ from pathlib import Path
 from slrig.bundle.validation import validate
 from slrig.devices import Projector
 
+__all__ = ["open_projector"]
 
-def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  # noqa: ARG001 - no path is in them
+
+def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  # noqa: ARG001 - the options have no path
     """Open a light engine from a rig file's `[projector]` table (without its `driver`). It is dark afterwards.
 
     Parameters
     ----------
     options
-        `drivers.dlpc347x.options.EngineOptions`.
+        `drivers.dlpc347x.options.Dlpc347xEngineOptions`.
     folder
-        The rig file's own.
+        Folder of the rig file, not used.
 
     Raises
     ------
     ConfigError
         The options have faults, all of them in one message.
     DeviceGoneError
-        There is no such bus, or nobody answers at the address.
+        The bus does not exist, or no device answers at the address.
     DeviceBusyError
         Another program, or a driver of the kernel, has it.
     UnsupportedByDeviceError
-        It is another controller, or does not take a setting.
+        It is another controller, or does not accept a setting.
     WrongSystemError
         This is not Linux.
     DeviceError
-        It may not be opened, or failed.
+        This user may not open it, or it failed.
     """
     from drivers.dlpc347x.bus import open_bus
-    from drivers.dlpc347x.options import EngineOptions
-    from drivers.dlpc347x.projector import LightEngine
+    from drivers.dlpc347x.options import Dlpc347xEngineOptions
+    from drivers.dlpc347x.projector import Dlpc347xProjector
     from drivers.linux import require_linux
 
     require_linux("dlpc347x", through="the kernel's /dev/i2c-*", instead="run slrig on Linux for it")
-    table = validate(EngineOptions, options, "the [projector] table of a light engine")
-    return LightEngine(open_bus(Path(table.device), table.address), table)
-
-
-__all__ = ["open_projector"]
+    table = validate(Dlpc347xEngineOptions, options, "the [projector] table of a light engine")
+    return Dlpc347xProjector(open_bus(Path(table.device), table.address), table)

@@ -1,10 +1,9 @@
-"""One command to the engine, and its answer, over a bus of Linux.
+"""Commands and answers of the engine over an I²C bus of Linux.
 
 Framing (TI DLPU081B §1.2, DLPU075B §1.2): a write is the number of a command and its parameters. A read is such a
-write, then a read of what it answers. TI's own program ends the write with a stop before it reads (cypress_i2c.c,
-`isStopBit`, in github.com/isabella232/LightField under dlp-4710); so it is here, where each `write` and each `read` of
-the node is one transaction of its own (kernel, Documentation/i2c/dev-interface.rst). The engine holds the clock while
-it works on a command.
+write, then a read of the answer. As in TI's own program, the write ends with a stop before the read (cypress_i2c.c,
+`isStopBit`, in github.com/isabella232/LightField under dlp-4710): each `write` and each `read` of the node is one
+transaction (kernel, Documentation/i2c/dev-interface.rst). The engine stretches the clock while it processes a command.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ from typing import Protocol
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError
 
 ADDRESS = 0x1B
-"""TI's firmware listens at 36h, its bit for the direction included (release notes of DLPC3478 8.0.1: "0x36")."""
+"""TI's firmware uses 36h, including the direction bit (release notes of DLPC3478 8.0.1: "0x36")."""
 _I2C_SLAVE = 0x0703
-"""Choose the address; refused where a driver of the kernel has it (include/uapi/linux/i2c-dev.h)."""
+"""Selects the address; refused if a driver of the kernel has it (include/uapi/linux/i2c-dev.h)."""
 _GONE = {errno.ENXIO, errno.EREMOTEIO, errno.EIO, errno.ENODEV, errno.ESHUTDOWN}
-"""ENXIO and EREMOTEIO: nobody answered at the address (kernel, Documentation/i2c/fault-codes.rst)."""
+"""ENXIO and EREMOTEIO: no acknowledgement at the address (kernel, Documentation/i2c/fault-codes.rst)."""
 
 
-class Port(Protocol):
+class I2cPort(Protocol):
     """One address of a bus. Every call is one transaction; raises OSError as the kernel does."""
 
     def write(self, data: bytes) -> None:
@@ -33,20 +32,20 @@ class Port(Protocol):
         ...
 
     def read(self, length: int) -> bytes:
-        """Return so many bytes."""
+        """Read `length` bytes."""
         ...
 
     def close(self) -> None:
-        """Let it go."""
+        """Close the port."""
         ...
 
 
-class Bus:
-    """An open port. Threads may share it: each command and its answer are one step. name : for messages."""
+class I2cBus:
+    """An open port. Thread-safe: each command and its answer are one step. name : for messages."""
 
-    def __init__(self, port: Port, name: str) -> None:
+    def __init__(self, port: I2cPort, name: str) -> None:
         self.name = name
-        self._port: Port | None = port
+        self._port: I2cPort | None = port
         self._lock = threading.Lock()
 
     def write(self, command: int, data: bytes = b"") -> None:
@@ -60,7 +59,7 @@ class Bus:
         Raises
         ------
         DeviceGoneError
-            Nobody answers, or the bus is gone.
+            No device answers, or the bus is gone.
         DeviceError
             The bus failed.
         DeviceStateError
@@ -70,7 +69,7 @@ class Bus:
             return self._transfer(bytes([command]) + data, length)
 
     def close(self) -> None:
-        """Let the port go. Idempotent."""
+        """Close the port. Idempotent."""
         with self._lock:
             port, self._port = self._port, None
             if port is not None:
@@ -93,42 +92,42 @@ class Bus:
             raise DeviceError(message) from error
 
 
-class Node:
-    """Implements `Port` on a node of the kernel's i2c-dev."""
+class I2cNode:
+    """Implements `I2cPort` on a node of the kernel's i2c-dev."""
 
     def __init__(self, handle: int) -> None:
         self._handle = handle
 
     def write(self, data: bytes) -> None:
-        """See `Port`."""
+        """See `I2cPort`."""
         if os.write(self._handle, data) != len(data):
-            raise OSError(errno.EIO, "it took a part of a command")
+            raise OSError(errno.EIO, "incomplete write")
 
     def read(self, length: int) -> bytes:
-        """See `Port`."""
+        """See `I2cPort`."""
         data = os.read(self._handle, length)
         if len(data) != length:
-            raise OSError(errno.EIO, "it gave a part of an answer")
+            raise OSError(errno.EIO, "incomplete read")
         return data
 
     def close(self) -> None:
-        """See `Port`."""
+        """See `I2cPort`."""
         os.close(self._handle)
 
 
-def open_bus(path: Path, address: int) -> Bus:
-    """Open an address of a bus for this program alone.
+def open_bus(path: Path, address: int) -> I2cBus:
+    """Open an address of a bus exclusively.
 
     Raises
     ------
     DeviceBusyError
         A driver of the kernel, or another slrig, has it.
     DeviceGoneError
-        There is no such bus.
+        The bus does not exist.
     DeviceError
-        It may not be opened.
+        This user may not open it.
     """
-    # Late, so that what looks at this module on another system is not refused.
+    # Imported here, so that this module can be imported on other systems.
     import fcntl
 
     name = f"light engine {path} {address:#04x}"
@@ -138,8 +137,8 @@ def open_bus(path: Path, address: int) -> Bus:
         message = f"{name}: this user may not open it; run: sudo usermod -aG i2c $USER, and log in again"
         raise DeviceError(message) from error
     except OSError as error:
-        have = ", ".join(sorted(map(str, Path("/dev").glob("i2c-*")))) or "none"
-        message = f"{name}: {error.strerror}; buses that are there: {have}; run: sudo modprobe i2c-dev, and name one"
+        available = ", ".join(sorted(map(str, Path("/dev").glob("i2c-*")))) or "none"
+        message = f"{name}: {error.strerror}; available buses: {available}; run: sudo modprobe i2c-dev, and name one"
         raise DeviceGoneError(message) from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -147,8 +146,8 @@ def open_bus(path: Path, address: int) -> Bus:
     except OSError as error:
         os.close(handle)
         if error.errno in (errno.EBUSY, errno.EWOULDBLOCK):
-            message = f"{name}: another program, or a driver of the kernel, has it; end that one"
+            message = f"{name}: another program, or a driver of the kernel, uses it; end that one"
             raise DeviceBusyError(message) from error
-        message = f"{name}: this is no I²C bus ({error.strerror}); name one of /dev/i2c-*"
+        message = f"{name}: not an I²C bus ({error.strerror}); name one of /dev/i2c-*"
         raise DeviceGoneError(message) from error
-    return Bus(Node(handle), name)
+    return I2cBus(I2cNode(handle), name)

@@ -1,9 +1,9 @@
-"""What the DLPC347x understands, in words: each method is one of its commands, with what it answers.
+"""Commands of the DLPC347x: each method is one command with its answer.
 
 Numbers, lengths and bits: the programmer's guides (DLPC3479: DLPU081B; DLPC3470 and DLPC3478: DLPU075B), and TI's own
-sources of 2019 (dlpc347x.c, in github.com/isabella232/LightField under dlp-4710/dlpc347x). Where both are known and
-contradict each other, the guide is followed, for it is later: an entry of the order has 25 bytes there and 24 in TI's
-source (the number of the first pattern was added), and the kind of flash data has 4 bytes and not 1.
+sources of 2019 (dlpc347x.c, in github.com/isabella232/LightField under dlp-4710/dlpc347x). If they contradict each
+other, the guide is followed, since it is newer: an entry of the order has 25 bytes there and 24 in TI's source (the
+number of the first pattern was added), and the kind of flash data has 4 bytes instead of 1.
 """
 
 from __future__ import annotations
@@ -15,54 +15,21 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from enum import IntEnum
 
-from drivers.dlpc347x.bus import Bus
-from drivers.dlpc347x.flash import HEAD, Place, size_of
-from drivers.pattern_engine.options import Colour
+from drivers.dlpc347x.bus import I2cBus
+from drivers.dlpc347x.flash import HEAD_BYTES, FlashedLine, block_size
+from drivers.pattern_engine.options import LedColour
 from slrig.errors import DeviceError, UnsupportedByDeviceError
-
-
-class Command(IntEnum):
-    """Writes. That with the next number reads what was set."""
-
-    MODE = 0x05  # 4: patterns from flash
-    LED_CONTROL = 0x50  # 0: by the currents that are set
-    LED_ENABLE = 0x52  # bits 0-2 red, green, blue
-    LED_CURRENT = 0x54  # red, green, blue: 2 bytes each; more is more current ("directly controls the LED current")
-    TRIGGER_IN = 0x90  # bit 0: patterns wait for it
-    TRIGGER_OUT = 0x92  # bit 0: 2, not 1; bit 1 on; bit 2 inverted; delay (4, µs)
-    ORDER = 0x98
-    CONTROL = 0x9E  # 0 start, 1 stop; how often it is repeated
-    FLASH_KIND = 0xDE
-    FLASH_LENGTH = 0xDF
-    FLASH_ERASE = 0xE0
-    FLASH_WRITE = 0xE1  # and E2h for what follows
-
-
-class Read(IntEnum):
-    """Reads of what is not set."""
-
-    LED_MOST = 0x5D
-    LIGHT = 0x9D  # mode, depth, light (4, µs): bit 0 supported; least light, dark before, dark after (4 each, µs)
-    STATE = 0x9F  # ready, entries of the order, and five more
-    SHORT = 0xD0
-    SYSTEM = 0xD1
-    VERSION = 0xD2  # patch (2), minor, major
-    COMMUNICATION = 0xD3  # 2: of this bus
-    CONTROLLER = 0xD4
-    FLASH_CHECK = 0xDD  # bytes (4): 0 is well
-    FLASH = 0xE3  # and E4h for what follows
-
 
 INITIALISED, COMMUNICATION, SYSTEM, ERASING, FLASH, SEQUENCE, MAIN = (1 << bit for bit in (0, 1, 3, 4, 5, 6, 7))
 """Bits of the short status."""
 REFUSALS = (
-    "it does not know the command",
-    "a parameter is not one that it has",
-    "it failed while it worked on it",
+    "unknown command",
+    "invalid parameter",
+    "processing error",
     "a batch file failed",
-    "it could not answer",
+    "no answer possible",
     "the command has more or fewer parameters in its firmware: update it to TI's latest",
-    "its bus timed out",
+    "bus time-out",
 )
 """By bit of the communication status."""
 FAULTS = {
@@ -78,28 +45,60 @@ FAULTS = {
     29: "its watchdog ran out",
 }
 """By bit of the system status' four bytes."""
-SEQUENCES = {
-    1: "it has no such light",
+SEQUENCE_FAULTS = {
+    1: "the light is not supported",
     2: "the dark before the light is too short or too long",
     3: "the dark after the light is too short or too long",
-    4: "it has no such delay of TRIG_OUT_1",
-    5: "it has no such delay of TRIG_OUT_2",
-    6: "its order has fewer entries",
+    4: "the delay of TRIG_OUT_1 is not supported",
+    5: "the delay of TRIG_OUT_2 is not supported",
+    6: "the order has too few entries",
 }
 """By number in bits 19 to 23 of the system status."""
-READY_S, ERASED_S = 1.0, 20.0
-MOST_READ, MOST_WRITTEN = 256, 256
-"""Bytes of flash at once: 256 are read at the most, 1024 written; adapters on USB take fewer."""
-PATTERNS = bytes([0xD0, 0, 0, 0])
+READY_TIMEOUT_S, ERASE_TIMEOUT_S = 1.0, 20.0
+MAX_READ_BYTES, MAX_WRITE_BYTES = 256, 256
+"""Bytes of flash in one transfer: up to 256 can be read and 1024 written; adapters on USB take fewer."""
+PATTERN_DATA = bytes([0xD0, 0, 0, 0])
 """The kind of flash data ("entire sensing pattern data", dlpc347x.h)."""
 _ENTRY = struct.Struct("<BBBQIIIB")
 _INTERNAL_MODE, _INTERNAL = 4, 1
 _ASK_AGAIN_S = 0.005
 
 
+class Dlpc347xCommand(IntEnum):
+    """Write commands. The next number reads the value back."""
+
+    MODE = 0x05  # 4: patterns from flash
+    LED_CONTROL = 0x50  # 0: by the currents that are set
+    LED_ENABLE = 0x52  # bits 0-2 red, green, blue
+    LED_CURRENT = 0x54  # red, green, blue: 2 bytes each; more is more current ("directly controls the LED current")
+    TRIGGER_IN = 0x90  # bit 0: patterns wait for it
+    TRIGGER_OUT = 0x92  # bit 0: 2, not 1; bit 1 on; bit 2 inverted; delay (4, µs)
+    ORDER = 0x98
+    CONTROL = 0x9E  # 0 start, 1 stop; how often it is repeated
+    FLASH_KIND = 0xDE
+    FLASH_LENGTH = 0xDF
+    FLASH_ERASE = 0xE0
+    FLASH_WRITE = 0xE1  # and E2h for what follows
+
+
+class Dlpc347xRead(IntEnum):
+    """Read-only commands."""
+
+    LED_MOST = 0x5D
+    LIGHT = 0x9D  # mode, depth, light (4, µs): bit 0 supported; least light, dark before, dark after (4 each, µs)
+    STATE = 0x9F  # ready, entries of the order, and five more
+    SHORT = 0xD0
+    SYSTEM = 0xD1
+    VERSION = 0xD2  # patch (2), minor, major
+    COMMUNICATION = 0xD3  # 2: of this bus
+    CONTROLLER = 0xD4
+    FLASH_CHECK = 0xDD  # bytes (4): 0 is well
+    FLASH = 0xE3  # and E4h for what follows
+
+
 @dataclass(frozen=True, slots=True)
-class Light:
-    """What the engine says of a light, µs."""
+class LightLimits:
+    """Limits of a light as reported by the engine, µs."""
 
     supported: bool
     least_us: int
@@ -108,10 +107,10 @@ class Light:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """An entry of the order: patterns of a set from one on, lit alike, none of them inverted. Times in µs."""
+class OrderEntry:
+    """Entry of the order: patterns of a set from one on, lit alike, none of them inverted. Times in µs."""
 
-    place: Place
+    place: FlashedLine
     count: int
     leds: int
     light_us: int
@@ -119,85 +118,87 @@ class Entry:
     after_us: int
 
     @property
-    def packed(self) -> bytes:
-        """As it is read back; it is sent with one byte before it."""
+    def encoded(self) -> bytes:
+        """Encoded entry, as it is read back; it is sent with one byte before it."""
         return _ENTRY.pack(self.place.set, self.count, self.leds, 0, *astuple(self)[3:], self.place.index)
 
     @property
-    def lasts_us(self) -> int:
-        """All its patterns together."""
+    def duration_us(self) -> int:
+        """Duration of all its patterns."""
         return self.count * (self.before_us + self.light_us + self.after_us)
 
 
-class Engine:
-    """The controller behind a bus. Every method raises DeviceError and DeviceGoneError as the bus does."""
+class Dlpc347xEngine:
+    """The controller behind a bus. Every method raises the bus's DeviceError and DeviceGoneError."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: I2cBus) -> None:
         self._bus = bus
         self._never = threading.Event()
         self._repeats = 0
 
     @property
     def name(self) -> str:
-        """Words for it, for messages."""
+        """Name of the engine, for messages."""
         return self._bus.name
 
     def close(self) -> None:
-        """Let the bus go. Idempotent."""
+        """Close the bus. Idempotent."""
         self._bus.close()
 
-    def tell(self, command: int, data: bytes = b"") -> None:
-        """Send a command, and ask whether it was taken.
-        Raises UnsupportedByDeviceError, with what the engine says, if it was not; DeviceError if the engine failed.
+    def send(self, command: int, data: bytes = b"") -> None:
+        """Send a command, and check that it was accepted. Raises UnsupportedByDeviceError, with the engine's reason, if
+        not; DeviceError if the engine failed.
         """
         self._bus.write(command, data)
-        short = self._short()
+        short = self._short_status()
         if short & COMMUNICATION:
-            told = self._bus.read(Read.COMMUNICATION, 2, b"\2")[0]
-            causes = "; ".join(words for bit, words in enumerate(REFUSALS) if told >> bit & 1) or f"{told:#04x}"
-            message = f"{self.name} does not take the command {command:02x}h {data.hex(' ')}: {causes}"
+            status = self._bus.read(Dlpc347xRead.COMMUNICATION, 2, b"\2")[0]
+            causes = "; ".join(text for bit, text in enumerate(REFUSALS) if status >> bit & 1) or f"{status:#04x}"
+            message = f"{self.name} refuses the command {command:02x}h {data.hex(' ')}: {causes}"
             raise UnsupportedByDeviceError(message)
         if short & (SYSTEM | SEQUENCE | FLASH):
-            raise self._fault(short)
+            raise self._system_fault(short)
 
-    def settle(self, command: Command, data: bytes, asked: bytes = b"", *, read: bytes | None = None) -> None:
-        """Set something, and compare what is read back. asked : what the read is sent; read : what it should give.
-        Raises UnsupportedByDeviceError if that is something else.
+    def settle(
+        self, command: Dlpc347xCommand, data: bytes, query: bytes = b"", *, expected: bytes | None = None
+    ) -> None:
+        """Set a value and read it back. query : parameters of the read; expected : its answer, if it differs from
+        `data`. Raises UnsupportedByDeviceError if another value is read back.
         """
-        wanted = data if read is None else read
-        self.tell(command, data)
-        got = self._bus.read(command + 1, len(wanted), asked)
+        wanted = data if expected is None else expected
+        self.send(command, data)
+        got = self._bus.read(command + 1, len(wanted), query)
         if got != wanted:
             name = command.name.lower().replace("_", " ")
-            message = f"{self.name}: asked for {name} {wanted.hex(' ')}, the engine gives {got.hex(' ')}; "
+            message = f"{self.name}: requested {name} {wanted.hex(' ')}, the engine gives {got.hex(' ')}; "
             raise UnsupportedByDeviceError(message + "switch it off and on, and update its firmware to TI's latest")
 
     def wait_until_initialised(self, timeout_s: float) -> None:
-        """Return when the main program takes commands. What was wrong before is forgotten."""
+        """Wait until the main program takes commands, and clear earlier errors."""
         self._wait(INITIALISED | MAIN, INITIALISED | MAIN, timeout_s, "finish its initialisation")
-        # Errors are told once, by whoever reads them (DLPU075B, "Read System Status").
-        self._bus.read(Read.COMMUNICATION, 2, b"\2")
-        self._bus.read(Read.SYSTEM, 4)
+        # Reading the errors clears them (DLPU075B, "Read System Status").
+        self._bus.read(Dlpc347xRead.COMMUNICATION, 2, b"\2")
+        self._bus.read(Dlpc347xRead.SYSTEM, 4)
 
     def controller(self) -> int:
-        """The number of its kind."""
-        return self._bus.read(Read.CONTROLLER, 1)[0]
+        """Return the number of the controller type."""
+        return self._bus.read(Dlpc347xRead.CONTROLLER, 1)[0]
 
     def version(self) -> str:
-        """Of its firmware."""
-        patch, minor, major = struct.unpack("<HBB", self._bus.read(Read.VERSION, 4))
+        """Return the version of its firmware."""
+        patch, minor, major = struct.unpack("<HBB", self._bus.read(Dlpc347xRead.VERSION, 4))
         return f"{major}.{minor}.{patch}"
 
     def take_patterns_from_flash(self) -> None:
-        """Choose the mode. Patterns wait for nobody."""
-        self.settle(Command.MODE, bytes([_INTERNAL_MODE]))
-        self.settle(Command.TRIGGER_IN, b"\0")
+        """Select patterns from flash, without external trigger."""
+        self.settle(Dlpc347xCommand.MODE, bytes([_INTERNAL_MODE]))
+        self.settle(Dlpc347xCommand.TRIGGER_IN, b"\0")
 
     def set_current(self, share: float) -> None:
-        """Set the current of every LED, as a share of its most, which stands in the engine's flash."""
-        most = struct.unpack("<3H", self._bus.read(Read.LED_MOST, 6))
-        self.settle(Command.LED_CONTROL, b"\0")
-        self.settle(Command.LED_CURRENT, struct.pack("<3H", *(round(share * each) for each in most)))
+        """Set the current of every LED, as a fraction of its maximum in the engine's flash."""
+        most = struct.unpack("<3H", self._bus.read(Dlpc347xRead.LED_MOST, 6))
+        self.settle(Dlpc347xCommand.LED_CONTROL, b"\0")
+        self.settle(Dlpc347xCommand.LED_CURRENT, struct.pack("<3H", *(round(share * each) for each in most)))
 
     def set_trigger_out(self, *, active_low: bool, delay_us: int) -> None:
         """Set TRIG_OUT_2, which is on while a pattern is lit; TRIG_OUT_1, of whole sets, is off."""
@@ -206,99 +207,101 @@ class Engine:
             sent, got = (
                 struct.pack("<Bi", flags, late) for flags in (number | on << 1 | inverted << 2, on | inverted << 1)
             )
-            self.settle(Command.TRIGGER_OUT, sent, bytes([number]), read=got)
+            self.settle(Dlpc347xCommand.TRIGGER_OUT, sent, bytes([number]), expected=got)
 
-    def light(self, leds: Colour, light_us: int) -> Light:
-        """Ask whether a pattern of 1 bit can be lit for so long, and what dark that takes."""
-        depth = int(leds is Colour.WHITE)
-        told = self._bus.read(Read.LIGHT, 13, struct.pack("<BBI", _INTERNAL, depth, light_us))
-        return Light(bool(told[0] & 1), *struct.unpack_from("<3I", told, 1))
+    def light_limits(self, leds: LedColour, light_us: int) -> LightLimits:
+        """Query if a 1-bit pattern can be lit for this time, and the dark time that it needs."""
+        depth = int(leds is LedColour.WHITE)
+        answer = self._bus.read(Dlpc347xRead.LIGHT, 13, struct.pack("<BBI", _INTERNAL, depth, light_us))
+        return LightLimits(bool(answer[0] & 1), *struct.unpack_from("<3I", answer, 1))
 
-    def order(self, entries: Sequence[Entry], repeats: int) -> None:
-        """Set what `start` shows: these, and so many times again. Whether "again" counts the first, nobody says."""
+    def order(self, entries: Sequence[OrderEntry], repeats: int) -> None:
+        """Set the order that `start` shows, and its number of repeats. It is not documented if repeats include the
+        first time.
+        """
         for number, entry in enumerate(entries):
-            self.tell(Command.ORDER, bytes([number == 0]) + entry.packed)
+            self.send(Dlpc347xCommand.ORDER, bytes([number == 0]) + entry.encoded)
         for number, entry in enumerate(entries):
-            got = self._bus.read(Command.ORDER + 1, _ENTRY.size, bytes([number]))
-            if got != entry.packed:
-                message = f"{self.name}: entry {number} was {entry.packed.hex(' ')}, the engine gives {got.hex(' ')}"
+            got = self._bus.read(Dlpc347xCommand.ORDER + 1, _ENTRY.size, bytes([number]))
+            if got != entry.encoded:
+                message = f"{self.name}: entry {number} was {entry.encoded.hex(' ')}, the engine gives {got.hex(' ')}"
                 raise UnsupportedByDeviceError(message + "; update its firmware to TI's latest")
         self._repeats = repeats
-        until = time.monotonic() + READY_S
-        while (told := self._bus.read(Read.STATE, 7))[0] != 1 or told[1] != len(entries):
+        until = time.monotonic() + READY_TIMEOUT_S
+        while (state := self._bus.read(Dlpc347xRead.STATE, 7))[0] != 1 or state[1] != len(entries):
             if time.monotonic() > until:
-                message = f"{self.name} is not ready for {len(entries)} entries, and says {told.hex(' ')}"
+                message = f"{self.name} is not ready for {len(entries)} entries, its state is {state.hex(' ')}"
                 raise DeviceError(message + "; switch it off and on, and write its flash: slrig patterns RIG")
             self._never.wait(_ASK_AGAIN_S)
 
-    def leds(self, *, by_sequence: bool) -> None:
-        """Let the sequence switch the LEDs, or switch them all off; compare what is read back."""
-        self.settle(Command.LED_ENABLE, bytes([7 if by_sequence else 0]))
+    def switch_leds(self, *, by_sequence: bool) -> None:
+        """Let the sequence switch the LEDs, or switch them all off; verify by reading back."""
+        self.settle(Dlpc347xCommand.LED_ENABLE, bytes([7 if by_sequence else 0]))
 
     def start(self) -> None:
-        """Start what was ordered."""
-        self.tell(Command.CONTROL, bytes([0, self._repeats]))
+        """Start the order."""
+        self.send(Dlpc347xCommand.CONTROL, bytes([0, self._repeats]))
 
     def stop(self) -> None:
-        """Stop it."""
-        self.tell(Command.CONTROL, b"\1\0")
+        """Stop the order."""
+        self.send(Dlpc347xCommand.CONTROL, b"\1\0")
 
     def flash(self) -> bytes:
-        """Return the block of patterns in its flash; empty where there is none."""
-        self.tell(Command.FLASH_KIND, PATTERNS)
-        size = size_of(head) if len(head := self._read_flash(HEAD)) == HEAD else 0
-        if not HEAD < size < 1 << 20:
+        """Return the block of patterns in its flash; empty if there is none."""
+        self.send(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
+        size = block_size(head) if len(head := self._read_flash(HEAD_BYTES)) == HEAD_BYTES else 0
+        if not HEAD_BYTES < size < 1 << 20:
             return b""
-        self.tell(Command.FLASH_KIND, PATTERNS)
+        self.send(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
         return self._read_flash(size)
 
     def write_flash(self, block: bytes) -> None:
-        """Erase the patterns in its flash, write others, and compare what is read back (DLPU075B §3, "update internal
-        pattern data": kind, check, erase, length, start, continue).
+        """Replace the patterns in its flash, and verify them (DLPU075B §3, "update internal pattern data": kind, check,
+        erase, length, start, continue).
         """
-        self.tell(Command.FLASH_KIND, PATTERNS)
-        if told := self._bus.read(Read.FLASH_CHECK, 1, struct.pack("<I", len(block)))[0]:
-            message = f"{self.name}: asked for {len(block)} bytes of patterns, its flash has no room ({told:#04x}); "
+        self.send(Dlpc347xCommand.FLASH_KIND, PATTERN_DATA)
+        if status := self._bus.read(Dlpc347xRead.FLASH_CHECK, 1, struct.pack("<I", len(block)))[0]:
+            message = f"{self.name}: its flash has no room for {len(block)} bytes of patterns ({status:#04x}); "
             raise UnsupportedByDeviceError(message + "scan one axis only, or with a shorter line_shift_period_px")
-        self.tell(Command.FLASH_ERASE, bytes.fromhex("AABBCCDD"))
-        self._wait(ERASING, 0, ERASED_S, "erase its flash")
+        self.send(Dlpc347xCommand.FLASH_ERASE, bytes.fromhex("AABBCCDD"))
+        self._wait(ERASING, 0, ERASE_TIMEOUT_S, "erase its flash")
         length = 0
-        for start in range(0, len(block), MOST_WRITTEN):
-            part = block[start : start + MOST_WRITTEN]
+        for start in range(0, len(block), MAX_WRITE_BYTES):
+            part = block[start : start + MAX_WRITE_BYTES]
             length = self._set_length(len(part), length)
-            self.tell(Command.FLASH_WRITE + (start > 0), part)
+            self.send(Dlpc347xCommand.FLASH_WRITE + (start > 0), part)
         if self.flash() != block:
-            message = f"{self.name}: its flash does not give back what was written; write it again: slrig patterns RIG"
+            message = f"{self.name}: its flash differs from the written data; write it again: slrig patterns RIG"
             raise DeviceError(message)
 
     def _read_flash(self, size: int) -> bytes:
         data, length = b"", 0
         while len(data) < size:
-            length = self._set_length(min(size - len(data), MOST_READ), length)
-            data += self._bus.read(Read.FLASH + (len(data) > 0), length)
+            length = self._set_length(min(size - len(data), MAX_READ_BYTES), length)
+            data += self._bus.read(Dlpc347xRead.FLASH + (len(data) > 0), length)
         return data
 
     def _set_length(self, length: int, before: int) -> int:
         if length != before:
-            self.tell(Command.FLASH_LENGTH, struct.pack("<H", length))
+            self.send(Dlpc347xCommand.FLASH_LENGTH, struct.pack("<H", length))
         return length
 
-    def _short(self) -> int:
-        return self._bus.read(Read.SHORT, 1)[0]
+    def _short_status(self) -> int:
+        return self._bus.read(Dlpc347xRead.SHORT, 1)[0]
 
-    def _wait(self, mask: int, wanted: int, timeout_s: float, what: str) -> None:
+    def _wait(self, mask: int, wanted: int, timeout_s: float, action: str) -> None:
         until = time.monotonic() + timeout_s
-        while (short := self._short()) & mask != wanted:
+        while (short := self._short_status()) & mask != wanted:
             if time.monotonic() > until:
-                message = f"{self.name} did not {what} in {timeout_s:g} s (status {short:#04x}); switch it off and on"
+                message = f"{self.name} did not {action} in {timeout_s:g} s (status {short:#04x}); switch it off and on"
                 raise DeviceError(message)
             self._never.wait(_ASK_AGAIN_S)
 
-    def _fault(self, short: int) -> DeviceError:
-        system = int.from_bytes(self._bus.read(Read.SYSTEM, 4), "little")
+    def _system_fault(self, short: int) -> DeviceError:
+        system = int.from_bytes(self._bus.read(Dlpc347xRead.SYSTEM, 4), "little")
         if sequence := system >> 19 & 0x1F:
-            told = SEQUENCES.get(sequence, f"sequence error {sequence}")
-            return UnsupportedByDeviceError(f"{self.name} does not take the sequence: {told}")
-        told = "; ".join(words for bit, words in FAULTS.items() if system >> bit & 1)
-        told = told or ("its flash failed" if short & FLASH else f"status {short:#04x}, {system:#010x}")
-        return DeviceError(f"{self.name} says: {told}; switch it off and on")
+            reason = SEQUENCE_FAULTS.get(sequence, f"sequence error {sequence}")
+            return UnsupportedByDeviceError(f"{self.name} refuses the sequence: {reason}")
+        faults = "; ".join(text for bit, text in FAULTS.items() if system >> bit & 1)
+        faults = faults or ("its flash failed" if short & FLASH else f"status {short:#04x}, {system:#010x}")
+        return DeviceError(f"{self.name} reports: {faults}; switch it off and on")

@@ -1,4 +1,4 @@
-"""The light engine as a projector: an order of patterns in its flash is shown."""
+"""The DLPC347x light engine as a projector: shows an order of patterns in its flash."""
 
 from __future__ import annotations
 
@@ -7,68 +7,76 @@ from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 
-from drivers.dlpc347x.bus import Bus
-from drivers.dlpc347x.engine import Engine, Entry, Light
-from drivers.dlpc347x.flash import Line, Lines, Mirrors, Place, block_of, places_in, places_of
-from drivers.dlpc347x.options import EngineOptions
-from drivers.pattern_engine.light import HeldLight
-from drivers.pattern_engine.options import Colour
-from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing, check_duty, light_us
+from drivers.dlpc347x.bus import I2cBus
+from drivers.dlpc347x.engine import Dlpc347xEngine, LightLimits, OrderEntry
+from drivers.dlpc347x.flash import (
+    Dlpc347xMirrors,
+    FlashedLine,
+    LineEncoder,
+    PatternLine,
+    build_block,
+    find_lines,
+    locate_patterns,
+)
+from drivers.dlpc347x.options import Dlpc347xEngineOptions
+from drivers.pattern_engine.options import LedColour
+from drivers.pattern_engine.patterns import MAX_UNATTENDED_S, Timing, check_duty, light_duration_us
+from drivers.pattern_engine.projector import EngineProjector
 from slrig.devices import Clock, DisplayedPattern, ProjectorInfo
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
 MIRRORS = {
-    0x0F: ("DLPC3470", Mirrors("DLP2010", Size(854, 480), before=(32, 0), after=(0, 10))),
-    0x0B: ("DLPC3478", Mirrors("DLP3010", Size(1280, 720), before=(48, 0), after=(0, 0))),
+    0x0F: ("DLPC3470", Dlpc347xMirrors("DLP2010", Size(854, 480), before=(32, 0), after=(0, 10))),
+    0x0B: ("DLPC3478", Dlpc347xMirrors("DLP3010", Size(1280, 720), before=(48, 0), after=(0, 0))),
 }
-"""By the number of the controller (dlpc347x.h, `ControllerDeviceId_e`): its name, and its mirrors (its data sheet,
-features). Mirrors beyond the picture: dlpc347x_internal_patterns.c, `SetDMDInfo`."""
-AWAKE_S = 10.0
+"""Name and mirror array by the number of the controller (dlpc347x.h, `ControllerDeviceId_e`; data sheets, features).
+Mirrors outside the picture: dlpc347x_internal_patterns.c, `SetDMDInfo`."""
+WAKE_TIMEOUT_S = 10.0
 COMMANDS_S = 0.06
-"""What the commands of one `show` take, typically: 100 bits per ms, and some 600 bytes."""
-HELD_US = 7_600
-"""The longest light of a pattern of 1 bit (release notes of DLPC3478 8.0.1, timings of internal patterns)."""
-END_US = 1_000_000
-"""Dark at the end of a played sequence, in which this program stops the engine."""
-MOST_REPEATS = 254
-"""255 is for ever, as TI's programs use it."""
+"""Typical time for the commands of one `show`: 100 bits per ms, and some 600 bytes."""
+MAX_LIGHT_US = 7_600
+"""Longest light of a 1-bit pattern (release notes of DLPC3478 8.0.1, timings of internal patterns)."""
+END_DARK_US = 1_000_000
+"""Dark time at the end of a played sequence, in which this program stops the engine."""
+MAX_REPEATS = 254
+"""255 repeats forever in TI's programs."""
 
 
-class LightEngine(HeldLight[Engine]):
+class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
     """Implements `slrig.devices.StoredPatternProjector` on a DLPC3470 or DLPC3478.
 
     Parameters
     ----------
     bus
-        An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
+        An open engine in any state; it is dark and ready afterwards, or closed if that failed.
     options
-        What the rig file says.
+        Options of the rig file.
     clock
-        The rig's; else the system's.
+        The rig's; default: the system's.
 
     Raises
     ------
     UnsupportedByDeviceError
-        It is another controller, or does not take a setting.
+        It is another controller, or does not accept a setting.
     DeviceError, DeviceGoneError
         The engine failed.
     """
 
-    def __init__(self, bus: Bus, options: EngineOptions, *, clock: Clock | None = None) -> None:
-        super().__init__(Engine(bus), options, clock=clock)
+    def __init__(self, bus: I2cBus, options: Dlpc347xEngineOptions, *, clock: Clock | None = None) -> None:
+        super().__init__(Dlpc347xEngine(bus), options, clock=clock)
         self._options = options
-        self._lines: Lines
-        self._held: Mapping[Line, tuple[Place, ...]] = {}
-        self._places: tuple[Place, ...] = ()
-        self._colours: tuple[Colour, ...] = ()
-        self._lights: dict[tuple[Colour, int], Light] = {}
-        self._take_over()
+        self._lines: LineEncoder
+        self._held: Mapping[PatternLine, tuple[FlashedLine, ...]] = {}
+        self._places: tuple[FlashedLine, ...] = ()
+        self._colours: tuple[LedColour, ...] = ()
+        self._lights: dict[tuple[LedColour, int], LightLimits] = {}
+        self._initialise()
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """See `StoredPatternProjector`. Into the engine itself, if it lacks any; this overwrites its flash."""
+        """See `StoredPatternProjector`. Replaces the patterns in the engine's flash if it lacks any."""
         self._state.require_size(sequence, self._lines.mirrors.size)
-        block = block_of(sequence, self._lines)
+        block = build_block(sequence, self._lines)
         with self._lock:
             self._state.require_open()
             self._state.loaded = None
@@ -76,7 +84,7 @@ class LightEngine(HeldLight[Engine]):
             if self._engine.flash() == block:
                 return f"the flash of {self._engine.name} holds these {len(sequence)} patterns already"
             self._engine.write_flash(block)
-            self._held = places_in(block)
+            self._held = find_lines(block)
             self._engine.take_patterns_from_flash()
             self.blank()
         return (
@@ -89,37 +97,37 @@ class LightEngine(HeldLight[Engine]):
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, self._lines.mirrors.size)
-        self._places = places_of(sequence, self._lines, self._held)
-        self._colours = tuple(map(self._options.colour_of, sequence.patterns))
+        self._places = locate_patterns(sequence, self._lines, self._held)
+        self._colours = tuple(map(self._options.led_colour, sequence.patterns))
         self._state.loaded = sequence
 
     def show(self, index: int) -> DisplayedPattern:
-        """See `Projector`. Light that pulses, 97 % of the time; dark again after `hold_s`, and `LEFT_ALONE_S` after the
-        end of this program.
+        """See `Projector`. The light pulses, 97 % of the time; dark again after `hold_s`, and `MAX_UNATTENDED_S` after
+        the end of this program.
         """
         self._state.require_pattern(index)
-        entry = self._entry(self._places[index], 1, self._colours[index], HELD_US)
-        # A repeat more or less than counted is within what it is left alone for.
-        repeats = min(round(LEFT_ALONE_S * 1e6) // entry.lasts_us - 1, MOST_REPEATS)
+        entry = self._entry(self._places[index], 1, self._colours[index], MAX_LIGHT_US)
+        # One repeat more or less stays within the allowed time.
+        repeats = min(round(MAX_UNATTENDED_S * 1e6) // entry.duration_us - 1, MAX_REPEATS)
         with self._lock:
-            started_ns = self._run((entry,), repeats)
-            self._begin_holding(repeats * entry.lasts_us / 1e6, again_s=LEFT_ALONE_S / 2)
-            # Whether LEDs stay dark after the last repeat is not documented.
-            self._dark_at_s = self._held_until_s + LEFT_ALONE_S
-        return self._shown(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
+            started_ns = self._start_sequence((entry,), repeats)
+            self._hold_pattern(repeats * entry.duration_us / 1e6, again_s=MAX_UNATTENDED_S / 2)
+            # It is not documented that LEDs stay dark after the last repeat.
+            self._dark_at_s = self._held_until_s + MAX_UNATTENDED_S
+        return self._wait_for_light(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
+        """See `Projector`. Refuses an unsupported timing before the engine does; the message names the rule."""
         sequence = self._state.require_loaded("play")
         if len({place.set for place in self._places}) > 1:
             message = (
-                f"asked to play {len(sequence)} patterns of both axes, or more than a set of the flash holds: how long "
-                "the engine takes from one set to the next is not known; scan one axis only, or without the wire"
+                f"cannot play {len(sequence)} patterns of both axes, or more than one set of the flash holds: the time "
+                "from one set to the next is unknown; scan one axis only, or with software trigger"
             )
             raise UnsupportedByDeviceError(message)
         options = self._options
-        least = self._light_of(options.colour, HELD_US)
-        wanted_us = light_us(
+        least = self._light_limits(options.colour, MAX_LIGHT_US)
+        wanted_us = light_duration_us(
             exposure_s,
             period_s,
             margin_s=options.light_margin_s,
@@ -127,49 +135,49 @@ class LightEngine(HeldLight[Engine]):
             dark_us=least.before_us + least.after_us,
         )
         check_duty(Timing(wanted_us, round(period_s * 1e6)), options.duty_limit)
-        entries: list[Entry] = []
-        # The last pattern has an entry of its own, and stays dark after it until this program stops the engine: it is
-        # not documented whether a repeat of 0 is once or for ever, and 1 is once or twice.
-        begins = [at for at in range(len(sequence)) if at in (0, len(sequence) - 1) or self._breaks(at)]
+        entries: list[OrderEntry] = []
+        # The last pattern has its own entry, with dark time in which this program stops the engine: it is not
+        # documented if a repeat of 0 is once or forever, and if 1 is once or twice.
+        begins = [at for at in range(len(sequence)) if at in (0, len(sequence) - 1) or self._needs_own_entry(at)]
         for begin, end in pairwise([*begins, len(sequence)]):
             lit = self._entry(self._places[begin], end - begin, self._colours[begin], wanted_us)
-            dark_us = round(period_s * 1e6) - wanted_us - lit.before_us + (END_US if end == len(sequence) else 0)
+            dark_us = round(period_s * 1e6) - wanted_us - lit.before_us + (END_DARK_US if end == len(sequence) else 0)
             entries.append(replace(lit, after_us=dark_us))
-        lasts_us = sum(entry.lasts_us for entry in entries)
+        duration_us = sum(entry.duration_us for entry in entries)
         with self._lock:
-            self._run(tuple(entries), 1)
-            self._dark_at_s = self._now_s() + options.start_s + (lasts_us - END_US / 2) / 1e6
+            self._start_sequence(tuple(entries), 1)
+            self._dark_at_s = self._now_s() + options.start_s + (duration_us - END_DARK_US / 2) / 1e6
 
-    def _breaks(self, at: int) -> bool:
-        """Whether pattern `at` needs an entry of its own: it is not the next one in the flash, or lit otherwise."""
+    def _needs_own_entry(self, at: int) -> bool:
+        """True if pattern `at` is not the next one in the flash, or has other LEDs than its predecessor."""
         return self._places[at].index != self._places[at - 1].index + 1 or self._colours[at] != self._colours[at - 1]
 
-    def _entry(self, place: Place, count: int, colour: Colour, wanted_us: int) -> Entry:
-        light = self._light_of(colour, wanted_us)
-        return Entry(place, count, colour, wanted_us, light.before_us, light.after_us)
+    def _entry(self, place: FlashedLine, count: int, colour: LedColour, wanted_us: int) -> OrderEntry:
+        light = self._light_limits(colour, wanted_us)
+        return OrderEntry(place, count, colour, wanted_us, light.before_us, light.after_us)
 
-    def _light_of(self, colour: Colour, wanted_us: int) -> Light:
-        """What the engine says of a light; it is asked once. Raises UnsupportedByDeviceError: it has none such."""
-        light = self._lights.get((colour, wanted_us)) or self._engine.light(colour, wanted_us)
+    def _light_limits(self, colour: LedColour, wanted_us: int) -> LightLimits:
+        """Return the limits of a light, queried once. Raises UnsupportedByDeviceError if it is not supported."""
+        light = self._lights.get((colour, wanted_us)) or self._engine.light_limits(colour, wanted_us)
         if not light.supported:
             message = (
-                f"asked for {wanted_us} µs of {colour.name.lower()} light, the engine has none; its shortest is "
-                f"{light.least_us} µs, the longest that TI states {HELD_US} µs; shorten exposure_s, or trigger the "
-                "cameras by software, where exposures may be longer"
+                f"requested {wanted_us} µs of {colour.name.lower()} light, which the engine does not support; its "
+                f"shortest is {light.least_us} µs, the longest that TI states {MAX_LIGHT_US} µs; shorten exposure_s, "
+                "or trigger the cameras by software, where exposures may be longer"
             )
             raise UnsupportedByDeviceError(message)
         self._lights[colour, wanted_us] = light
         return light
 
-    def _run(self, entries: tuple[Entry, ...], repeats: int) -> int:
-        """Stop, set, start. Return when the command to start was sent."""
+    def _start_sequence(self, entries: tuple[OrderEntry, ...], repeats: int) -> int:
+        """Stop, set, start. Return the time of the command to start."""
         with self._lock:
             self._state.require_open()
             try:
                 self.blank()
                 self._engine.order(entries, repeats)
                 started_ns = self._clock.now_ns()
-                self._engine.leds(by_sequence=True)
+                self._engine.switch_leds(by_sequence=True)
                 self._engine.start()
             except BaseException:
                 self._darken()
@@ -180,28 +188,28 @@ class LightEngine(HeldLight[Engine]):
         for fault in self._darken():
             if isinstance(fault, DeviceGoneError):
                 raise fault
-        self._engine.wait_until_initialised(AWAKE_S)
+        self._engine.wait_until_initialised(WAKE_TIMEOUT_S)
 
     def _prepare(self) -> ProjectorInfo:
         engine, options = self._engine, self._options
-        engine.leds(by_sequence=False)
+        engine.switch_leds(by_sequence=False)
         number = engine.controller()
         if number not in MIRRORS:
             message = f"{engine.name} is controller {number:#04x}, this driver knows the DLPC3470 and the DLPC3478"
-            two = "; how the flash of a DLPC3479 is filled, TI's sources tell in two ways: it is not served"
+            two = "; the DLPC3479 is not supported, because TI's sources differ on its flash format"
             raise UnsupportedByDeviceError(message + (two if number == 0x0C else ""))
         name, mirrors = MIRRORS[number]
-        self._lines = Lines(mirrors, (options.mirror_rows, options.mirror_columns))
+        self._lines = LineEncoder(mirrors, (options.mirror_rows, options.mirror_columns))
         engine.take_patterns_from_flash()
-        # Another mode may start what the engine shows by itself.
+        # A change of mode may start the engine's default sequence.
         self.blank()
         try:
-            self._held = places_in(block) if (block := engine.flash()) else {}
+            self._held = find_lines(block) if (block := engine.flash()) else {}
         except struct.error:
             self._held = {}
         engine.set_current(options.led_current)
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
-        light = self._light_of(options.colour, HELD_US)
+        light = self._light_limits(options.colour, MAX_LIGHT_US)
         return ProjectorInfo(
             name="projector",
             model=f"{name} light engine, {mirrors.name}, firmware {engine.version()}",
@@ -211,5 +219,5 @@ class LightEngine(HeldLight[Engine]):
             latency_s=options.start_s + COMMANDS_S,
             gap_s=options.light_margin_s + (light.before_us + light.after_us) / 1e6,
             duty=options.duty_limit,
-            lights=options.colour is Colour.WHITE,
+            lights=options.colour is LedColour.WHITE,
         )

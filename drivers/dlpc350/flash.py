@@ -1,59 +1,112 @@
-"""What lies in the engine's flash, as a list says, and the pictures that a person puts there.
+"""Contents of the engine's flash, as listed in a file, and the pictures that a person writes into it.
 
-The engine's flash is written by TI's program (LightCrafter 4500 GUI, "Firmware": add pictures, build, upload), not by
-this driver: a write that fails may leave an engine that does not start. The list is `images.json`, beside the pictures:
+The flash is written by TI's program (LightCrafter 4500 GUI, "Firmware": add pictures, build, upload), not by this
+driver: a failed write may leave an engine that does not start. The list is `images.json`, next to the pictures:
 
     {"format": "slrig-dlpc350-images", "version": 1, "tag": "slrig-1a2b3c4d",
      "images": [{"flash_index": 0, "file": "slrig-1a2b3c4d-0.bmp", "sha256": "…", "planes": ["white", …]}]}
 
-`flash_index` is the picture's place in the flash, `tag` the firmware tag given to TI's program (null: none was). What a
-plane shows is read from the picture itself; `planes` says it in words, and how many of the 24 are in use.
+`flash_index` is the picture's position in the flash, `tag` the firmware tag given to TI's program (null: none). The
+contents of a plane are read from the picture itself; `planes` describes them, and its length is the number of used
+planes.
 
-A pattern and its inverse are one plane: the pattern table can invert. White, black, 8 Gray bits with their inverses and
-8 lines are 17 planes, one picture. The pictures are filled in the order of play, and a later one holds again what a
-sequence comes back to (white): so each is needed once, and two of them, 48 planes, are loaded before a sequence starts.
+Plane n of a picture is bit n of green for n = 0 to 7, bit n - 8 of red up to 15, bit n - 16 of blue up to 23, the least
+significant first: DLPU010, "Pattern Number Mapping", as copied at github.com/agmarrugo/bit-plane-image-coding; and the
+LightCrafter 4500 user's guide (DLPU011), "Relationship Between Bit-Planes and 24-bit RGB Images". TI's program takes
+pictures of 912 x 1140 pixels with 24 bits per pixel.
+
+A pattern and its inverse share one plane, since the pattern table can invert. White, black, 8 Gray bits with their
+inverses and 8 lines are 17 planes, one picture. Pictures are filled in the order of play, and a later one repeats a
+pattern that returns (white): so each is loaded once, and two of them, 48 planes, are loaded before a sequence starts.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.dlpc350.planes import PLANES, picture_of, planes_in
-from drivers.dlpc350.timing import MOST_IMAGES
-from drivers.pattern_engine.planes import Plane, keys_of_plane, plane_of, words
+from drivers.pattern_engine.patterns import Plane, describe_pattern, pattern_plane, plane_keys
 from slrig.bundle.validation import Strict, read_json, read_text, validate
 from slrig.errors import ConfigError, StorageError, UnsupportedByDeviceError
-from slrig.model import PatternSequence
+from slrig.model import PatternSequence, Size
 
-LIST = "images.json"
-TO_FLASH = "to_flash"
-_MOST_BYTES = 1_000_000
+MIRRORS = Size(912, 1140)
+"""Columns and rows of the DLP4500, addressed as the controller addresses them."""
+PLANES = 24
+
+_FILE_HEADER = struct.Struct("<2sIHHI")
+_PICTURE_HEADER = struct.Struct("<IiiHHIIiiII")
+_CHANNELS = (1, 2, 0)
+"""Positions of green, red and blue in a BMP's pixel."""
 
 
-class _Image(Strict):
+LIST_FILE = "images.json"
+MAX_IMAGES = 64
+"""Entries of the image table."""
+EXPORT_FOLDER = "to_flash"
+_MAX_LIST_BYTES = 1_000_000
+
+
+def encode_picture(planes: Sequence[Plane]) -> bytes:
+    """Return up to 24 planes as a BMP file of 24 bits per pixel; unused planes are dark."""
+    pixels = np.zeros((*MIRRORS.shape, 3), np.uint8)
+    for number, plane in enumerate(planes):
+        pixels[..., _CHANNELS[number // 8]] |= plane.astype(np.uint8) << np.uint8(number % 8)
+    # BMP rows run from the bottom up; 912 pixels of 3 bytes need no padding.
+    data = pixels[::-1].tobytes()
+    offset = _FILE_HEADER.size + _PICTURE_HEADER.size
+    header = _PICTURE_HEADER.pack(40, MIRRORS.width_px, MIRRORS.height_px, 1, 24, 0, len(data), 2835, 2835, 0, 0)
+    return _FILE_HEADER.pack(b"BM", offset + len(data), 0, 0, offset) + header + data
+
+
+def decode_planes(picture: bytes, name: str) -> tuple[Plane, ...]:
+    """Return the 24 planes of a BMP file. Raises ConfigError, naming it, unless it has 912 x 1140 pixels of 24 bits."""
+    least = _FILE_HEADER.size + _PICTURE_HEADER.size
+    kind, offset, width, height, bits, packing = b"", 0, 0, 0, 0, 0
+    if len(picture) >= least:
+        kind, _, _, _, offset = _FILE_HEADER.unpack_from(picture)
+        _, width, height, _, bits, packing, *_ = _PICTURE_HEADER.unpack_from(picture, _FILE_HEADER.size)
+    rows, columns = MIRRORS.shape
+    size = rows * columns * 3
+    fits = (kind, width, abs(height), bits, packing) == (b"BM", columns, rows, 24, 0)
+    if not fits or len(picture) < offset + size:
+        message = (
+            f"{name}: expected a BMP file of {MIRRORS} pixels with 24 bits each, found {width} x {height} with {bits} "
+            f"bits, {len(picture)} bytes; use the file that this driver wrote"
+        )
+        raise ConfigError(message)
+    pixels = np.frombuffer(picture, np.uint8, size, offset).reshape(rows, columns, 3)
+    upright: NDArray[Any] = pixels[::-1] if height > 0 else pixels
+    channels = [np.ascontiguousarray(upright[..., channel]) for channel in _CHANNELS]
+    return tuple(channels[number // 8] & np.uint8(1 << number % 8) != 0 for number in range(PLANES))
+
+
+class _ImageEntry(Strict):
     flash_index: Annotated[int, Field(ge=0, lt=256)]
     file: Annotated[str, Field(min_length=1)]
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     planes: Annotated[list[str], Field(min_length=1, max_length=PLANES)]
 
 
-class _List(Strict):
+class _ImageList(Strict):
     format: Literal["slrig-dlpc350-images"]
     version: Literal[1]
     tag: Annotated[str, Field(min_length=1, max_length=31)] | None = None
-    images: Annotated[list[_Image], Field(max_length=MOST_IMAGES)]
+    images: Annotated[list[_ImageEntry], Field(max_length=MAX_IMAGES)]
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where a pattern lies: the picture's index in the flash, the plane's number, and whether it is to be inverted."""
+class FlashedPlane:
+    """Location of a pattern: the picture's index in the flash, the plane's number, and inversion."""
 
     image: int
     plane: int
@@ -61,70 +114,71 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """One picture of the flash. numbers : by the key of a plane, its number; content : the BMP file."""
+class FlashedPicture:
+    """One picture of the flash. numbers : plane number by the key of a plane; content : the BMP file."""
 
     flash_index: int
     content: bytes
     numbers: Mapping[bytes, int]
     planes: tuple[str, ...]
 
-    def place(self, keys: tuple[bytes, bytes]) -> Place | None:
-        """Return where a plane or its inverse, told by their keys, lies here, if it does."""
+    def place(self, keys: tuple[bytes, bytes]) -> FlashedPlane | None:
+        """Return the location of a plane or its inverse, given their keys; None if it is not here."""
         for inverted, key in enumerate(keys):
             if key in self.numbers:
-                return Place(self.flash_index, self.numbers[key], bool(inverted))
+                return FlashedPlane(self.flash_index, self.numbers[key], bool(inverted))
         return None
 
 
 @dataclass(frozen=True, slots=True)
-class Flash:
-    """Everything that the list says of the flash. folder : where it lies, or would; tag : the firmware's, if known."""
+class FlashContents:
+    """Contents of the flash. folder : of the list, which need not exist; tag : the firmware's, if known."""
 
     folder: Path
     tag: str | None = None
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[FlashedPicture, ...] = ()
 
-    def places(self, sequence: PatternSequence) -> tuple[Place, ...]:
-        """Return where each pattern lies, with as few changes of picture as possible.
+    def places(self, sequence: PatternSequence) -> tuple[FlashedPlane, ...]:
+        """Return the location of each pattern, with as few changes of picture as possible.
 
         Raises
         ------
         UnsupportedByDeviceError
             The flash lacks patterns; the message says what to do.
         """
-        found = [self._candidates(plane_of(sequence, index)) for index in range(len(sequence))]
+        found = [self._candidates(pattern_plane(sequence, index)) for index in range(len(sequence))]
         missing = [index for index, candidates in enumerate(found) if not candidates]
         if missing:
-            raise self._lacking(sequence, missing)
-        chosen: list[Place] = []
+            raise self._missing_error(sequence, missing)
+        chosen: list[FlashedPlane] = []
         for index, candidates in enumerate(found):
-            # Stay with the picture that is in the buffer; change to the one that lasts longest.
+            # Stay with the picture in the buffer; else choose the one that lasts longest.
             image = chosen[-1].image if chosen else -1
             if image not in candidates:
-                image = max(candidates, key=lambda image: _lasts(found[index:], image))
+                image = max(candidates, key=lambda image: _run_length(found[index:], image))
             chosen.append(candidates[image])
         return tuple(chosen)
 
-    def _candidates(self, plane: Plane) -> dict[int, Place]:
-        keys = keys_of_plane(plane)
+    def _candidates(self, plane: Plane) -> dict[int, FlashedPlane]:
+        keys = plane_keys(plane)
         places = (picture.place(keys) for picture in self.pictures)
         return {place.image: place for place in places if place is not None}
 
-    def _lacking(self, sequence: PatternSequence, missing: Sequence[int]) -> UnsupportedByDeviceError:
-        named = ", ".join(words(sequence.patterns[index]) for index in missing[:3])
+    def _missing_error(self, sequence: PatternSequence, missing: Sequence[int]) -> UnsupportedByDeviceError:
+        named = ", ".join(describe_pattern(sequence.patterns[index]) for index in missing[:3])
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         return UnsupportedByDeviceError(
-            f"the engine's flash, as {self.folder / LIST} lists it, lacks {len(missing)} of {len(sequence)} patterns "
-            f"({named}{more}); flash it once with all that this rig shows: slrig patterns RIG writes the pictures into "
-            f"{self.folder / TO_FLASH}"
+            f"the engine's flash, as {self.folder / LIST_FILE} lists it, lacks {len(missing)} of {len(sequence)} "
+            f"patterns ({named}{more}); flash it once with all patterns of this rig: slrig patterns RIG writes the "
+            "pictures into "
+            f"{self.folder / EXPORT_FOLDER}"
         )
 
-    def written(self, sequence: PatternSequence) -> str:
-        """Write pictures that hold a sequence, beside those that are flashed, and say what to do with them.
-        Raises as `write_pictures`.
+    def write_patterns(self, sequence: PatternSequence) -> str:
+        """Write pictures that hold a sequence, in addition to those in the flash; return the instructions. Raises as
+        `write_pictures`.
         """
-        written = write_pictures(self.folder / TO_FLASH, sequence, self.pictures)
+        written = write_pictures(self.folder / EXPORT_FOLDER, sequence, self.pictures)
         return (
             f"the pictures to flash are in {written.folder}: add them to the firmware with TI's LightCrafter 4500 "
             f'program, in the order of their numbers, with the firmware tag "{written.tag}", upload it, and let '
@@ -132,65 +186,65 @@ class Flash:
         )
 
 
-def _lasts(found: Sequence[Mapping[int, Place]], image: int) -> int:
-    """How many patterns in a row lie in a picture."""
+def _run_length(found: Sequence[Mapping[int, FlashedPlane]], image: int) -> int:
+    """Number of consecutive patterns that are in a picture."""
     return next((count for count, candidates in enumerate(found) if image not in candidates), len(found))
 
 
-def read_flash(folder: Path) -> Flash:
-    """Return what the list in a folder says; an empty flash where there is no list yet.
+def read_flash_list(folder: Path) -> FlashContents:
+    """Read the list in a folder; without a list, return an empty flash.
 
     Raises
     ------
     ConfigError
-        The list has faults, or a picture is not the one that it names.
+        The list has faults, or a picture does not match the list.
     """
-    path = folder / LIST
+    path = folder / LIST_FILE
     if not path.exists():
-        return Flash(folder)
-    data = read_json(read_text(path, _MOST_BYTES, ConfigError), path, ConfigError)
-    listed = validate(_List, data, f"{path}: the list of the flashed pictures")
+        return FlashContents(folder)
+    data = read_json(read_text(path, _MAX_LIST_BYTES, ConfigError), path, ConfigError)
+    listed = validate(_ImageList, data, f"{path}: the list of the flashed pictures")
     indices = [image.flash_index for image in listed.images]
     if len(set(indices)) != len(indices):
         message = f"{path}: expected each flash_index once, found {indices}; correct the list"
         raise ConfigError(message)
-    return Flash(folder, listed.tag, tuple(_read(folder, image) for image in listed.images))
+    return FlashContents(folder, listed.tag, tuple(_read_picture(folder, image) for image in listed.images))
 
 
-def _read(folder: Path, image: _Image) -> Picture:
+def _read_picture(folder: Path, image: _ImageEntry) -> FlashedPicture:
     path = folder / image.file
     try:
         content = path.read_bytes()
     except OSError as error:
-        message = f"{path}: {LIST} names this picture, found: {error.strerror}; copy it there"
+        message = f"{path}: {LIST_FILE} names this picture, found: {error.strerror}; copy it there"
         raise ConfigError(message) from error
     if hashlib.sha256(content).hexdigest() != image.sha256:
         message = (
-            f"{path}: this is not the picture that {LIST} lists (SHA-256 differs): what lies in the flash cannot be "
-            "told; copy the folder again, or write and flash new pictures"
+            f"{path}: this is not the picture that {LIST_FILE} lists (SHA-256 differs): the contents of the flash are "
+            "unknown; copy the folder again, or write and flash new pictures"
         )
         raise ConfigError(message)
-    return _picture(image.flash_index, content, tuple(image.planes), str(path))
+    return _build_picture(image.flash_index, content, tuple(image.planes), str(path))
 
 
-def _picture(flash_index: int, content: bytes, planes: tuple[str, ...], name: str) -> Picture:
+def _build_picture(flash_index: int, content: bytes, planes: tuple[str, ...], name: str) -> FlashedPicture:
     numbers: dict[bytes, int] = {}
-    for number, plane in enumerate(planes_in(content, name)[: len(planes)]):
-        numbers.setdefault(keys_of_plane(plane)[0], number)
-    return Picture(flash_index, content, numbers, planes)
+    for number, plane in enumerate(decode_planes(content, name)[: len(planes)]):
+        numbers.setdefault(plane_keys(plane)[0], number)
+    return FlashedPicture(flash_index, content, numbers, planes)
 
 
-def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Picture] = ()) -> Flash:
-    """Write pictures that hold every pattern of a sequence, and the list of them, for TI's program.
+def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[FlashedPicture] = ()) -> FlashContents:
+    """Write pictures with every pattern of a sequence, and their list, for TI's program.
 
     Parameters
     ----------
     folder
-        Made if need be; a list that is there is replaced.
+        Created if necessary; an existing list is replaced.
     sequence
         For 912 x 1140 mirrors.
     others
-        Pictures that are to stay in the flash: they keep their places, the new ones come after them.
+        Pictures that stay in the flash: they keep their positions, the new ones follow.
 
     Raises
     ------
@@ -201,14 +255,16 @@ def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Pic
     """
     first = max((picture.flash_index for picture in others), default=-1) + 1
     made = [
-        _picture(first + number, picture_of([plane for plane, _ in group]), tuple(word for _, word in group), "made")
-        for number, group in enumerate(_grouped(sequence))
+        _build_picture(
+            first + number, encode_picture([plane for plane, _ in group]), tuple(word for _, word in group), "made"
+        )
+        for number, group in enumerate(_group_planes(sequence))
     ]
     pictures = (*others, *made)
-    if len(pictures) > MOST_IMAGES:
+    if len(pictures) > MAX_IMAGES:
         message = (
-            f"asked for {len(made)} pictures beside the {len(others)} in the flash, it takes {MOST_IMAGES}; begin "
-            "anew: let patterns in the rig file name an empty folder"
+            f"{len(made)} pictures in addition to the {len(others)} in the flash exceed its limit of {MAX_IMAGES}; "
+            "start again: let patterns in the rig file name an empty folder"
         )
         raise UnsupportedByDeviceError(message)
     together = hashlib.sha256(b"".join(picture.content for picture in pictures)).hexdigest()
@@ -224,25 +280,25 @@ def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Pic
                 {"flash_index": picture.flash_index, "file": file, "sha256": digest, "planes": list(picture.planes)}
             )
         listed = {"format": "slrig-dlpc350-images", "version": 1, "tag": tag, "images": entries}
-        (folder / LIST).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
+        (folder / LIST_FILE).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
-        message = f"{folder}: asked to write pictures for the engine's flash, found: {error.strerror}; make room there"
+        message = f"{folder}: cannot write pictures for the engine's flash ({error.strerror}); make room there"
         raise StorageError(message) from error
-    return Flash(folder, tag, pictures)
+    return FlashContents(folder, tag, pictures)
 
 
-def _grouped(sequence: PatternSequence) -> list[list[tuple[Plane, str]]]:
-    """Planes picture by picture: each holds all patterns from its first to its last one in the order of play."""
+def _group_planes(sequence: PatternSequence) -> list[list[tuple[Plane, str]]]:
+    """Group planes into pictures: each holds all patterns from its first to its last one in the order of play."""
     groups: list[list[tuple[Plane, str]]] = [[]]
     held: set[bytes] = set()
     for index, pattern in enumerate(sequence.patterns):
-        plane = plane_of(sequence, index)
-        keys = keys_of_plane(plane)
+        plane = pattern_plane(sequence, index)
+        keys = plane_keys(plane)
         if not held.isdisjoint(keys):
             continue
         if len(groups[-1]) == PLANES:
             groups.append([])
             held = set()
         held.update(keys)
-        groups[-1].append((plane, words(pattern)))
+        groups[-1].append((plane, describe_pattern(pattern)))
     return groups

@@ -1,149 +1,165 @@
-"""The light engine as a projector: a table of patterns is shown once, or one pattern is held."""
+"""The DLPC350 light engine as a projector: shows a table of patterns once, or holds one pattern."""
 
 from __future__ import annotations
 
-from drivers.dlpc350.engine import Command, Engine
-from drivers.dlpc350.flash import Flash, Place
-from drivers.dlpc350.options import EngineOptions
-from drivers.dlpc350.planes import MIRRORS
-from drivers.dlpc350.tables import Tables, tables_of
-from drivers.dlpc350.timing import DARK_US, MOST_PATTERNS, check_loading, check_timing, lit
-from drivers.pattern_engine.engine import Command as Shared
-from drivers.pattern_engine.link import Kind, Link
-from drivers.pattern_engine.options import Colour
-from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
-from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
+from drivers.dlpc350.engine import (
+    DARK_US,
+    MAX_PATTERNS,
+    Dlpc350Command,
+    Dlpc350Engine,
+    PatternTables,
+    build_tables,
+    check_loading,
+    check_timing,
+    play_timing,
+)
+from drivers.dlpc350.flash import MIRRORS, FlashContents, FlashedPlane
+from drivers.dlpc350.options import Dlpc350EngineOptions
+from drivers.pattern_engine.options import LedColour
+from drivers.pattern_engine.patterns import MAX_UNATTENDED_S, Timing
+from drivers.pattern_engine.projector import COMMANDS_S, DIM_TIMING, START_TIMEOUT_S, UsbEngineProjector
+from drivers.pattern_engine.usb import UsbCommand, UsbController, UsbLink
 from slrig.devices import Clock, DisplayedPattern, ProjectorInfo
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
-DLPC350 = Kind("dlpc350", 0x6401, "3.0")
-VALIDATED_S = 5.0
-_LONG_US = 1_000_000
-"""A sequence of this length still runs when the engine is asked whether it does."""
+DLPC350 = UsbController("dlpc350", 0x6401, "3.0")
+VALIDATION_TIMEOUT_S = 5.0
+_POLLABLE_US = 1_000_000
+"""A sequence of at least this length still runs when the engine is polled."""
 
 
-class LightEngine(PatternEngine[Engine]):
+class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
     """Implements `slrig.devices.Projector` on a DLPC350.
 
     Parameters
     ----------
     link
-        An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
+        An open engine in any state; it is dark and ready afterwards, or closed if that failed.
     options, flash
-        What the rig file says, and what lies in the engine's flash.
+        Options of the rig file, and contents of the engine's flash.
     clock
-        The rig's; else the system's.
+        The rig's; default: the system's.
 
     Raises
     ------
     UnsupportedByDeviceError
-        The flash does not hold what the list says, or the engine does not take a setting.
+        The flash does not match the list, or the engine does not accept a setting.
     DeviceError, DeviceGoneError
         The engine failed.
     """
 
     def __init__(
-        self, link: Link, options: EngineOptions, flash: Flash, *, serial: str = "", clock: Clock | None = None
+        self,
+        link: UsbLink,
+        options: Dlpc350EngineOptions,
+        flash: FlashContents,
+        *,
+        serial: str = "",
+        clock: Clock | None = None,
     ) -> None:
-        super().__init__(Engine(link), options, clock=clock)
+        super().__init__(Dlpc350Engine(link), options, clock=clock)
         self._options = options
         self._flash = flash
         self._serial = serial
-        self._places: tuple[Place, ...] = ()
-        self._colours: tuple[Colour, ...] = ()
-        # What the engine was told last, and which picture it shows; None where that is not known.
-        self._told: tuple[Timing, Tables] | None = None
-        self._picture: int | None = None
-        self._take_over()
+        self._places: tuple[FlashedPlane, ...] = ()
+        self._colours: tuple[LedColour, ...] = ()
+        # The tables sent last and the picture shown; None if unknown.
+        self._last_sent: tuple[Timing, PatternTables] | None = None
+        self._shown_picture: int | None = None
+        self._initialise()
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """See `StoredPatternProjector`. What is flashed already keeps its place."""
+        """See `StoredPatternProjector`. Pictures in the flash keep their positions."""
         self._state.require_size(sequence, MIRRORS)
-        return self._flash.written(sequence)
+        return self._flash.write_patterns(sequence)
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`. Refuses patterns that the flash lacks, and writes the pictures that hold them."""
+        """See `Projector`. Refuses patterns that the flash lacks."""
         self._state.require_open()
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, MIRRORS)
-        if len(sequence) > MOST_PATTERNS:
+        if len(sequence) > MAX_PATTERNS:
             message = (
-                f"asked for a sequence of {len(sequence)} patterns, the engine's table takes {MOST_PATTERNS}; scan one "
+                f"the sequence has {len(sequence)} patterns, the engine's table takes {MAX_PATTERNS}; scan one "
                 "axis only, or with a shorter line_shift_period_px"
             )
             raise UnsupportedByDeviceError(message)
         self._places = self._flash.places(sequence)
-        self._colours = tuple(map(self._options.colour_of, sequence.patterns))
+        self._colours = tuple(map(self._options.led_colour, sequence.patterns))
         self._state.loaded = sequence
 
     def show(self, index: int) -> DisplayedPattern:
-        """See `Projector`. Dark again after `hold_s`, and `LEFT_ALONE_S` after the end of this program.
+        """See `Projector`. Dark again after `hold_s`, and `MAX_UNATTENDED_S` after the end of this program.
 
-        When light begins is not told by the engine: it is after the command to start was sent, and before its sequencer
-        says that it runs and a picture has had its time from the flash to the mirrors. The error is half of that span.
+        The engine does not report when light begins: it is after the command to start was sent, and before the
+        sequencer reports that it runs plus the loading time of a picture. The error is half of that span.
         """
         self._state.require_pattern(index)
         place = self._places[index]
-        load_s = self._options.load_s(kept=self._picture == place.image)
-        # The sequence ends by itself: until it began, a picture may have to be loaded.
-        alone_us = round((LEFT_ALONE_S - self._options.image_load_s) * 1e6)
+        load_s = self._options.load_s(kept=self._shown_picture == place.image)
+        # The sequence ends by itself; it may have to load a picture first.
+        alone_us = round((MAX_UNATTENDED_S - self._options.image_load_s) * 1e6)
         if self.is_polarity_unknown:
-            timing, count = DIM, min(alone_us // DIM.period_us, MOST_PATTERNS)
+            timing, count = DIM_TIMING, min(alone_us // DIM_TIMING.period_us, MAX_PATTERNS)
         else:
             timing, count = Timing(alone_us - DARK_US, alone_us), 1
         check_timing(timing)
         with self._lock:
-            earliest_ns, running_ns = self._run((place,) * count, (self._colours[index],) * count, timing)
-            self._begin_holding(alone_us / 1e6, again_s=(LEFT_ALONE_S - self._options.image_load_s) / 2)
-        return self._shown(index, earliest_ns, running_ns + round(load_s * 1e9))
+            earliest_ns, running_ns = self._start_sequence((place,) * count, (self._colours[index],) * count, timing)
+            self._hold_pattern(alone_us / 1e6, again_s=(MAX_UNATTENDED_S - self._options.image_load_s) / 2)
+        return self._wait_for_light(index, earliest_ns, running_ns + round(load_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
+        """See `Projector`. Refuses an unsupported timing before the engine does; the message names the rule."""
         self._state.require_loaded("play")
-        self._require_proven()
+        self._require_known_polarity()
         options = self._options
-        timing = lit(exposure_s, period_s, margin_s=options.light_margin_s, duty_limit=options.duty_limit)
-        counts = tables_of(self._places, self._colours, dark_between=timing.dark_between).counts
+        timing = play_timing(exposure_s, period_s, margin_s=options.light_margin_s, duty_limit=options.duty_limit)
+        counts = build_tables(self._places, self._colours, dark_between=timing.dark_between).counts
         check_loading(counts, timing.period_us, options.image_load_s)
-        self._run(self._places, self._colours, timing)
+        self._start_sequence(self._places, self._colours, timing)
 
-    def _run(self, places: tuple[Place, ...], colours: tuple[Colour, ...], timing: Timing) -> tuple[int, int]:
-        """Stop, set, validate, start. Return when the command to start was sent, and when the engine said it runs."""
-        tables = tables_of(places, colours, dark_between=timing.dark_between)
+    def _start_sequence(
+        self, places: tuple[FlashedPlane, ...], colours: tuple[LedColour, ...], timing: Timing
+    ) -> tuple[int, int]:
+        """Stop, set, validate, start. Return the times of the command to start and of the engine's report that it
+        runs.
+        """
+        tables = build_tables(places, colours, dark_between=timing.dark_between)
         engine = self._engine
         with self._lock:
             self._state.require_open()
             try:
                 self.blank()
-                told, self._told = self._told, None
-                if told is None or told[0] != timing:
+                previous, self._last_sent = self._last_sent, None
+                if previous is None or previous[0] != timing:
                     engine.set_timing(timing)
-                engine.set_tables(tables, None if told is None else told[1])
-                engine.validate(VALIDATED_S)
+                engine.set_tables(tables, None if previous is None else previous[1])
+                engine.validate(VALIDATION_TIMEOUT_S)
                 started_ns = self._clock.now_ns()
-                engine.leds(by_sequence=True)
+                engine.switch_leds(by_sequence=True)
                 engine.start()
-                # A short sequence may be over before the engine could be asked.
-                if tables.length * timing.period_us >= _LONG_US:
-                    engine.wait_until_running(RUNNING_S)
-                self._told, self._picture = (timing, tables), places[-1].image
+                # A short sequence may end before the engine is polled.
+                if tables.length * timing.period_us >= _POLLABLE_US:
+                    engine.wait_until_running(START_TIMEOUT_S)
+                self._last_sent, self._shown_picture = (timing, tables), places[-1].image
                 return started_ns, self._clock.now_ns()
             except BaseException:
-                self._picture = None
+                self._shown_picture = None
                 self._darken()
                 raise
 
     def _prepare(self) -> ProjectorInfo:
         engine, options = self._engine, self._options
         self._check_flash()
-        engine.settle_byte(Shared.DISPLAY_MODE, 1)
-        engine.settle_byte(Command.PATTERN_SOURCE, 3)
-        engine.settle_byte(Command.TRIGGER_MODE, 1)
-        self._set_up_light()
+        engine.settle_byte(UsbCommand.DISPLAY_MODE, 1)
+        engine.settle_byte(Dlpc350Command.PATTERN_SOURCE, 3)
+        engine.settle_byte(Dlpc350Command.TRIGGER_MODE, 1)
+        self._configure_leds()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
-        # Changing the mode may start what the engine shows by itself.
+        # A change of mode may start the engine's default sequence.
         self.blank()
         return ProjectorInfo(
             name="projector",
@@ -154,19 +170,19 @@ class LightEngine(PatternEngine[Engine]):
             latency_s=options.load_s(kept=True) + COMMANDS_S,
             gap_s=options.light_margin_s,
             duty=options.duty_limit,
-            lights=options.colour is Colour.WHITE,
+            lights=options.colour is LedColour.WHITE,
         )
 
     def _check_flash(self) -> None:
         flash = self._flash
         if not flash.pictures:
             return
-        held = self._engine.byte(Command.IMAGES_IN_FLASH)
+        available = self._engine.byte(Dlpc350Command.IMAGES_IN_FLASH)
         wanted = max(picture.flash_index for picture in flash.pictures) + 1
-        if held < wanted:
+        if available < wanted:
             message = (
                 f"{self._engine.name}: the list in {flash.folder} names picture {wanted - 1} of its flash, it holds "
-                f"{held}; flash the pictures of that folder with TI's LightCrafter 4500 program"
+                f"{available}; flash the pictures of that folder with TI's LightCrafter 4500 program"
             )
             raise UnsupportedByDeviceError(message)
         tag = self._engine.firmware_tag()
@@ -178,6 +194,6 @@ class LightEngine(PatternEngine[Engine]):
             )
             raise UnsupportedByDeviceError(message)
 
-    def _rest(self) -> None:
+    def _before_close(self) -> None:
         if self._options.standby:
-            self._engine.set_byte(Shared.POWER, 1)
+            self._engine.set_byte(UsbCommand.POWER, 1)

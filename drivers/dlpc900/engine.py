@@ -1,18 +1,24 @@
-"""What the DLPC900 understands beside `drivers.pattern_engine.engine`: its pattern table, and pictures over USB.
+"""Commands of the DLPC900 in addition to `drivers.pattern_engine.usb`: its pattern table, timing, and pictures over
+USB.
 
-Each command is in the guide (DLPU018 revisions F and J, the number of its table is beside it) and in TI's own program
-(API.c, `CmdList`, in github.com/RhojAnn/DLPC900_CLI under lib). Where they contradict each other, the driver does not
-depend on it: bit 0 of byte 9 of a definition means "no TRIG_OUT_2" in the guide and "TRIG_OUT_2" in API.c; TRIG_OUT_2
-is not used. Revision F calls the second number of the configuration repetitions; revision J calls it the number of
-patterns to show, and TI's program uses it so (`on_updateLUT_Button_clicked`: as many as there are entries is once).
+Each command is in the guide (DLPU018 revisions F and J, with the number of its table) and in TI's own program (API.c,
+`CmdList`, in github.com/RhojAnn/DLPC900_CLI under lib). The driver does not depend on their contradictions: bit 0 of
+byte 9 of a definition means "no TRIG_OUT_2" in the guide and "TRIG_OUT_2" in API.c; TRIG_OUT_2 is not used. Revision F
+calls the second number of the configuration repetitions; revision J calls it the number of patterns to show, and TI's
+program uses it so (`on_updateLUT_Button_clicked`: as many as there are entries is once).
 
-TI's program asks for no answer to pictures' data and to the order (API.c, `LCR_SendMsg`); so it is here, and the error
-code is read after each: it is the last command's only, so that a later message would hide what was wrong with this one.
-Programs of others do so after every command (pycrafter6500.py, `checkforerrors`).
+TI's program requests no acknowledgement of picture data and of the order (API.c, `LCR_SendMsg`), and neither does this
+driver. It reads the error code after each, because the code is that of the last command only (as pycrafter6500.py,
+`checkforerrors`).
 
-Bit 0 of byte 5 of a definition clears the mirrors after the exposure. Revision J says that it matters with a trigger
-from outside only; TI's program, that it is for every pattern of one bit (API.c, `LCR_AddToPatLut`). It is set, as in
-the guide's example of patterns on the fly and in pycrafter6500.py: else a pattern could stay through its dark time.
+Bit 0 of byte 5 of a definition clears the mirrors after the exposure. Revision J restricts it to external triggers;
+TI's program requires it for every pattern of one bit (API.c, `LCR_AddToPatLut`). It is set, as in the guide's example
+of patterns on the fly and in pycrafter6500.py: otherwise a pattern could stay through its dark time.
+
+Timing rules are checked before they are sent; each error names its rule (DLPU018 revision F). Shortest exposures of a
+1-bit pattern with all blocks of mirrors: table 2-103. Field widths: table 2-137. Delays of the trigger output: table
+2-112. The guide states no shortest dark time; dark is shown as a pattern, so a pattern's shortest exposure is assumed.
+Without dark time, TRIG_OUT_1 does not change between patterns (section 2.4.4.1), and the cameras are not triggered.
 """
 
 from __future__ import annotations
@@ -21,14 +27,67 @@ import struct
 from collections.abc import Sequence
 from enum import IntEnum
 
-from drivers.dlpc900.pictures import Place
-from drivers.pattern_engine import engine
-from drivers.pattern_engine.link import RefusedError
+from drivers.dlpc900.pictures import MemoryPlane
+from drivers.pattern_engine.patterns import Timing, check_duty, light_duration_us
+from drivers.pattern_engine.usb import CommandRefusedError, UsbCommand, UsbEngine
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import Size
 
+MAX_US = 2**24 - 1
+"""Limit of exposure and dark time, 24 bits each."""
+TRIGGER_DELAY_RANGE_US = (-20, 20_000)
 
-class Command(IntEnum):
+
+_CLEARED = 1
+ON_THE_FLY = 3
+"""Display mode: pictures are sent over USB (DLPU018 table 2-97)."""
+MODE_CHANGE_S = 0.6
+"""Longest time of a change of mode. The guide states 0.3 s for another change, in which the previous mode may be read
+(table 2-97); this is twice that."""
+MAX_MESSAGE_BYTES = 504
+"""Picture bytes in one message (DLPU018 table 5-3)."""
+SECOND_READY, INCOMPATIBLE = 16, 2
+"""Bits of the hardware status (DLPU018 table 2-2)."""
+ERRORS = {
+    2: "a device failed",
+    3: "it does not know the command",
+    4: "controller and mirrors do not fit",
+    5: "not in this mode",
+    6: "a parameter is invalid",
+    7: "a parameter refers to something that does not exist",
+    8: "its memory is full",
+    9: "the picture's encoding is unknown",
+    10: "the bit position is invalid",
+    11: "the picture does not exist",
+    12: "the dark time is not supported",
+    13: "the delay is not supported",
+    14: "the exposure is not supported",
+    15: "the pattern's number is invalid",
+    16: "the definition of the pattern is invalid",
+    17: "the picture's position in its memory is invalid",
+    255: "internal error",
+}
+"""DLPU018 table 2-12."""
+
+
+def play_timing(exposure_s: float, period_s: float, *, margin_s: float, duty_limit: float, least_us: int) -> Timing:
+    """Return the timing for an exposure of `exposure_s` per period; see `light_duration_us` and `check_duty`. Raises
+    UnsupportedByDeviceError if the engine does not support it, or the duty limit forbids it.
+    """
+    wanted_us = light_duration_us(exposure_s, period_s, margin_s=margin_s, least_us=least_us, dark_us=least_us)
+    timing = Timing(wanted_us, round(period_s * 1e6))
+    dark_us = timing.period_us - timing.exposure_us
+    if max(timing.exposure_us, dark_us) > MAX_US:
+        message = (
+            f"requested {timing.exposure_us} µs of light and {dark_us} µs of dark after it: the longest is {MAX_US} "
+            "µs each; shorten exposure_s, or the period"
+        )
+        raise UnsupportedByDeviceError(message)
+    check_duty(timing, duty_limit)
+    return timing
+
+
+class Dlpc900Command(IntEnum):
     """USB commands."""
 
     ERROR_CODE = 0x0100  # 2-11: of the last command
@@ -36,49 +95,15 @@ class Command(IntEnum):
     HARDWARE = 0x0206  # 2-9: which mirrors
     CONFIGURATION = 0x1A31  # 2-132: entries (2), patterns to show (4)
     ORDER = 0x1A32  # 2-134: entries (2), patterns to show (4), indices (2 each)
-    DEFINITION = 0x1A34  # 2-136: see `definition`
+    DEFINITION = 0x1A34  # 2-136: see `encode_definition`
     PICTURE_1 = 0x1A2A  # 2-138: index (2), bytes with the header (4); of the first controller
     DATA_1 = 0x1A2B  # 2-140: bytes (2), data
     PICTURE_2 = 0x1A2C  # of the second controller
     DATA_2 = 0x1A2D
 
 
-_CLEARED = 1
-ON_THE_FLY = 3
-"""Display mode: pictures come over USB (DLPU018 table 2-97)."""
-MODE_S = 0.6
-"""How long a change of mode may take. The guide says of another one that it takes 0.3 s, and that what is read before
-may be the mode that was (table 2-97); of this one it says nothing, so it has twice that.
-"""
-MOST_DATA = 504
-"""Bytes of a picture in one message (DLPU018 table 5-3)."""
-SECOND_READY, INCOMPATIBLE = 16, 2
-"""Bits of the hardware status (DLPU018 table 2-2)."""
-
-ERRORS = {
-    2: "a device failed",
-    3: "it does not know the command",
-    4: "controller and mirrors do not fit",
-    5: "not in this mode",
-    6: "a parameter is not one that it has",
-    7: "what a parameter refers to is not there",
-    8: "its memory is full",
-    9: "it does not know the packing of the picture",
-    10: "the bit position is not one that it has",
-    11: "the picture is not there",
-    12: "the dark time is not one that it has",
-    13: "the delay is not one that it has",
-    14: "the exposure is not one that it has",
-    15: "the pattern's number is not one that it has",
-    16: "the definition of the pattern is not one that it takes",
-    17: "the picture's place in its memory is not one that it has",
-    255: "it failed inside",
-}
-"""DLPU018 table 2-12."""
-
-
-class Mirrors(IntEnum):
-    """Hardware by its number (DLPU018 table 2-10)."""
+class Dlpc900Mirrors(IntEnum):
+    """Mirror arrays by their hardware number (DLPU018 table 2-10)."""
 
     DLP6500 = 1
     DLP9000 = 2
@@ -92,8 +117,8 @@ class Mirrors(IntEnum):
 
     @property
     def controllers(self) -> int:
-        """How many share the columns (DLPS037, features)."""
-        return 1 if self is Mirrors.DLP6500 else 2
+        """Number of controllers that share the columns (DLPS037, features)."""
+        return 1 if self is Dlpc900Mirrors.DLP6500 else 2
 
     @property
     def least_us(self) -> int:
@@ -101,10 +126,11 @@ class Mirrors(IntEnum):
         return {1: 105, 2: 105, 3: 100, 4: 62}[self]
 
 
-def definition(index: int, place: Place, *, exposure_us: int, dark_us: int, leds: int) -> bytes:
-    """Return an entry of the pattern table: number (2), exposure (3, µs), LEDs in bits 4 to 6 and that the mirrors are
-    cleared in bit 0, dark time after it (3, µs), nothing, and picture (11 bits) and plane (5 bits). One bit deep, not
-    triggered from outside.
+def encode_definition(index: int, place: MemoryPlane, *, exposure_us: int, dark_us: int, leds: int) -> bytes:
+    """Return an entry of the pattern table, of a 1-bit pattern without external trigger.
+
+    Fields: number (2 bytes), exposure (3, µs), LEDs in bits 4 to 6 and clearing of the mirrors in bit 0, dark time
+    after it (3, µs), zero, and picture (11 bits) and plane (5 bits).
     """
     return (
         struct.pack("<H", index)
@@ -116,79 +142,82 @@ def definition(index: int, place: Place, *, exposure_us: int, dark_us: int, leds
     )
 
 
-class Engine(engine.Engine):
+class Dlpc900Engine(UsbEngine):
     """A DLPC900 behind a link."""
 
     def version(self) -> tuple[int, int]:
-        """Major and minor number of its firmware."""
-        told = self._link.read(Command.VERSION, 4)
-        return told[3], told[2]
+        """Return major and minor number of its firmware."""
+        answer = self._link.read(Dlpc900Command.VERSION, 4)
+        return answer[3], answer[2]
 
-    def mirrors(self) -> Mirrors:
-        """Which mirrors it drives. Raises UnsupportedByDeviceError: none that this driver knows."""
-        number = self._link.read(Command.HARDWARE, 1)[0]
+    def mirrors(self) -> Dlpc900Mirrors:
+        """Return its mirror array. Raises UnsupportedByDeviceError if it is unknown."""
+        number = self._link.read(Dlpc900Command.HARDWARE, 1)[0]
         try:
-            return Mirrors(number)
+            return Dlpc900Mirrors(number)
         except ValueError as error:
-            known = ", ".join(mirrors.name for mirrors in Mirrors)
+            known = ", ".join(mirrors.name for mirrors in Dlpc900Mirrors)
             message = f"{self.name} has mirrors of type {number}, this driver knows {known}; use one of these"
             raise UnsupportedByDeviceError(message) from error
 
     def set_trigger_out(self, *, active_low: bool, delay_us: int) -> None:
-        """Set TRIG_OUT_1 (DLPU018 table 2-112): polarity, and both edges later than the light's by the delay."""
-        self.settle(engine.Command.TRIGGER_OUT_1, struct.pack("<Bhh", active_low, delay_us, delay_us))
+        """Set TRIG_OUT_1 (DLPU018 table 2-112): polarity, and delay of both edges after the light's."""
+        self.settle(UsbCommand.TRIGGER_OUT_1, struct.pack("<Bhh", active_low, delay_us, delay_us))
 
     def define(self, entry: bytes) -> None:
-        """Set an entry of the pattern table. It holds from the next `configure` on."""
-        self._tell(Command.DEFINITION, entry)
+        """Set an entry of the pattern table, effective from the next `configure` on."""
+        self._send(Dlpc900Command.DEFINITION, entry)
 
     def configure(self, entries: int, shown: int) -> None:
-        """Take the table's first entries in their order, and show as many patterns of them."""
-        self._tell(Command.CONFIGURATION, struct.pack("<HI", entries, shown))
+        """Use the first entries of the table in their order, and show this number of patterns."""
+        self._send(Dlpc900Command.CONFIGURATION, struct.pack("<HI", entries, shown))
 
     def order(self, indices: Sequence[int], shown: int) -> None:
-        """Show as many patterns as asked of these entries, over and over."""
-        self._link.send(Command.ORDER, struct.pack(f"<HI{len(indices)}H", len(indices), shown, *indices))
-        self._require_done("take the order of the patterns")
+        """Show this number of patterns, cycling through these entries."""
+        self._link.send(Dlpc900Command.ORDER, struct.pack(f"<HI{len(indices)}H", len(indices), shown, *indices))
+        self._check_error_code("take the order of the patterns")
 
     def upload(self, number: int, parts: Sequence[bytes]) -> None:
-        """Send a picture, a part for each controller. Pictures are sent with the last one first (table 2-139)."""
+        """Send a picture, a part for each controller. Pictures are sent last first (table 2-139)."""
         for part, begin, data in zip(
-            parts, (Command.PICTURE_1, Command.PICTURE_2), (Command.DATA_1, Command.DATA_2), strict=False
+            parts,
+            (Dlpc900Command.PICTURE_1, Dlpc900Command.PICTURE_2),
+            (Dlpc900Command.DATA_1, Dlpc900Command.DATA_2),
+            strict=False,
         ):
-            self._tell(begin, struct.pack("<HI", number, len(part)))
-            for start in range(0, len(part), MOST_DATA):
-                piece = part[start : start + MOST_DATA]
+            self._send(begin, struct.pack("<HI", number, len(part)))
+            for start in range(0, len(part), MAX_MESSAGE_BYTES):
+                piece = part[start : start + MAX_MESSAGE_BYTES]
                 self._link.send(data, struct.pack("<H", len(piece)) + piece)
-                self._require_done(f"take picture {number}")
+                self._check_error_code(f"take picture {number}")
 
     def faults(self) -> str:
-        """What the hardware status complains of, in words; empty if of nothing."""
-        told = [super().faults()]
-        if self.byte(engine.Command.HARDWARE_STATUS) & INCOMPATIBLE:
-            told.append(ERRORS[4])
-        return "; ".join(filter(None, told))
+        """Return the faults in the hardware status as text; empty if none."""
+        faults = [super().faults()]
+        if self.byte(UsbCommand.HARDWARE_STATUS) & INCOMPATIBLE:
+            faults.append(ERRORS[4])
+        return "; ".join(filter(None, faults))
 
-    def require_well(self) -> None:
-        """Raise DeviceError, with its cause, if the hardware status complains."""
+    def require_healthy(self) -> None:
+        """Raise DeviceError, with its cause, if the hardware status has faults."""
         if faults := self.faults():
-            message = f"{self.name} says: {faults}; switch it off and on"
+            message = f"{self.name} reports: {faults}; switch it off and on"
             raise DeviceError(message)
 
-    def _tell(self, command: Command, data: bytes) -> None:
-        """Send a command. Raises UnsupportedByDeviceError if the engine refuses it, with what it says."""
+    def _send(self, command: Dlpc900Command, data: bytes) -> None:
+        """Send a command. Raises UnsupportedByDeviceError, with the engine's error, if it is refused."""
         try:
             self._link.write(command, data)
-        except RefusedError as error:
-            raise self._refusal(f"take {command.name.lower().replace('_', ' ')} {data.hex(' ')}") from error
+        except CommandRefusedError as error:
+            raise self._refusal_error(f"take {command.name.lower().replace('_', ' ')} {data.hex(' ')}") from error
 
-    def _require_done(self, doing: str) -> None:
-        if self.byte(Command.ERROR_CODE):
-            raise self._refusal(doing)
+    def _check_error_code(self, action: str) -> None:
+        if self.byte(Dlpc900Command.ERROR_CODE):
+            raise self._refusal_error(action)
 
-    def _refusal(self, doing: str) -> UnsupportedByDeviceError:
-        code = self.byte(Command.ERROR_CODE)
-        told = ERRORS.get(code, f"error code {code}")
+    def _refusal_error(self, action: str) -> UnsupportedByDeviceError:
+        code = self.byte(Dlpc900Command.ERROR_CODE)
+        reason = ERRORS.get(code, f"error code {code}")
         return UnsupportedByDeviceError(
-            f"{self.name} was asked to {doing}, and says: {told}; report this message to the driver's maintainer"
+            f"{self.name} did not {action}: {reason}; report this message to the driver's maintainer"
         )

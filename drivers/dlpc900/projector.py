@@ -1,91 +1,101 @@
-"""The light engine as a projector: pictures are sent when a sequence is loaded, then a table of them is shown."""
+"""The DLPC900 light engine as a projector: pictures are sent when a sequence is loaded, then a table of them is
+shown.
+"""
 
 from __future__ import annotations
 
-from drivers.dlpc900.engine import MODE_S, ON_THE_FLY, SECOND_READY, Engine, Mirrors, definition
-from drivers.dlpc900.options import EngineOptions
-from drivers.dlpc900.pictures import Place, memory_of, packed
-from drivers.dlpc900.timing import lit
-from drivers.pattern_engine.engine import Command
-from drivers.pattern_engine.link import Kind, Link
-from drivers.pattern_engine.options import Colour
-from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
-from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
+from drivers.dlpc900.engine import (
+    MODE_CHANGE_S,
+    ON_THE_FLY,
+    SECOND_READY,
+    Dlpc900Engine,
+    Dlpc900Mirrors,
+    encode_definition,
+    play_timing,
+)
+from drivers.dlpc900.options import Dlpc900EngineOptions
+from drivers.dlpc900.pictures import MemoryPlane, encode_picture, pack_sequence
+from drivers.pattern_engine.options import LedColour
+from drivers.pattern_engine.patterns import MAX_UNATTENDED_S, Timing
+from drivers.pattern_engine.projector import COMMANDS_S, DIM_TIMING, START_TIMEOUT_S, UsbEngineProjector
+from drivers.pattern_engine.usb import UsbCommand, UsbController, UsbLink
 from slrig.devices import Clock, DisplayedPattern, ProjectorInfo
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
-DLPC900 = Kind("dlpc900", 0xC900, "6.0")
-OLDEST = (6, 0)
-"""Before 5.0 patterns cannot be put into another order (DLPU101, "Edit LUT"); up to 5.0.0 blocks of mirrors may lock
-after a change of mode (DLPT028)."""
+DLPC900 = UsbController("dlpc900", 0xC900, "6.0")
+OLDEST_FIRMWARE = (6, 0)
+"""Before 5.0 patterns cannot be reordered (DLPU101, "Edit LUT"); up to 5.0.0 blocks of mirrors may lock after a change
+of mode (DLPT028)."""
 _DARK_END_US = 10_000
-_ALONE_US = round(LEFT_ALONE_S * 1e6) - _DARK_END_US
+_ALONE_US = round(MAX_UNATTENDED_S * 1e6) - _DARK_END_US
 
 
-class LightEngine(PatternEngine[Engine]):
+class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
     """Implements `slrig.devices.Projector` on a DLPC900.
 
     Parameters
     ----------
     link
-        An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
+        An open engine in any state; it is dark and ready afterwards, or closed if that failed.
     options
-        What the rig file says.
+        Options of the rig file.
     clock
-        The rig's; else the system's.
+        The rig's; default: the system's.
 
     Raises
     ------
     UnsupportedByDeviceError
-        Its firmware or its mirrors are not ones that are known, or it does not take a setting.
+        Its firmware or its mirrors are not supported, or it does not accept a setting.
     DeviceError, DeviceGoneError
         The engine failed.
     """
 
-    def __init__(self, link: Link, options: EngineOptions, *, serial: str = "", clock: Clock | None = None) -> None:
-        super().__init__(Engine(link), options, clock=clock)
+    def __init__(
+        self, link: UsbLink, options: Dlpc900EngineOptions, *, serial: str = "", clock: Clock | None = None
+    ) -> None:
+        super().__init__(Dlpc900Engine(link), options, clock=clock)
         self._options = options
         self._serial = serial
-        self._mirrors: Mirrors
-        self._places: tuple[Place, ...] = ()
+        self._mirrors: Dlpc900Mirrors
+        self._places: tuple[MemoryPlane, ...] = ()
         self._leds: tuple[int, ...] = ()
-        # The pattern table, as far as the engine has it.
+        # The part of the pattern table that the engine has.
         self._table: dict[int, bytes] = {}
-        self._take_over()
+        self._initialise()
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`. Sends the patterns, of some 10 kB for 24 of them, at 64 kB a second at the most."""
+        """See `Projector`. Sends the patterns, some 10 kB for 24 of them, at no more than 64 kB a second."""
         self._state.require_open()
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, self._mirrors.size)
-        memory = memory_of(sequence)
+        memory = pack_sequence(sequence)
         columns = self._mirrors.size.width_px // self._mirrors.controllers
         with self._lock:
             self._state.require_open()
             self._table.clear()
             self._places = memory.places
-            self._leds = (*map(self._options.colour_of, sequence.patterns), 0)
-            # The table first: pictures are lost when its length changes (DLPU018 section 2.4.4.4.2).
+            self._leds = (*map(self._options.led_colour, sequence.patterns), 0)
+            # Table first: pictures are lost when its length changes (DLPU018 section 2.4.4.4.2).
             for index in range(len(memory.places)):
-                self._define(index, DIM)
+                self._define(index, DIM_TIMING)
             self._engine.configure(len(memory.places), len(sequence))
             for number in reversed(range(len(memory.pictures))):
                 picture = memory.pictures[number]
                 halves = [picture[:, at : at + columns] for at in range(0, picture.shape[1], columns)]
-                self._engine.upload(number, [packed(half) for half in halves])
+                self._engine.upload(number, [encode_picture(half) for half in halves])
         self._state.loaded = sequence
 
     def show(self, index: int) -> DisplayedPattern:
-        """See `Projector`. Dark again after `hold_s`, and `LEFT_ALONE_S` after the end of this program.
+        """See `Projector`. Dark again after `hold_s`, and `MAX_UNATTENDED_S` after the end of this program.
 
-        A pattern without any LED ends what is shown: it is dark, whatever the mirrors do after a sequence.
+        A pattern without any LED ends each show, so that it is dark regardless of the mirrors after a sequence.
         """
         self._state.require_pattern(index)
         if self.is_polarity_unknown:
-            exposure_us, dark_us = DIM.exposure_us, DIM.period_us - DIM.exposure_us
-            times = _ALONE_US // DIM.period_us
+            exposure_us, dark_us = DIM_TIMING.exposure_us, DIM_TIMING.period_us - DIM_TIMING.exposure_us
+            times = _ALONE_US // DIM_TIMING.period_us
         else:
             exposure_us, dark_us, times = _ALONE_US, _DARK_END_US, 1
         with self._lock:
@@ -98,20 +108,20 @@ class LightEngine(PatternEngine[Engine]):
                 self._engine.configure(len(self._places), len(self._places))
                 self._engine.order((index, last), 2 * times)
                 started_ns = self._start()
-                self._engine.wait_until_running(RUNNING_S)
-                self._engine.require_well()
+                self._engine.wait_until_running(START_TIMEOUT_S)
+                self._engine.require_healthy()
             except BaseException:
                 self._darken()
                 raise
-            self._begin_holding(LEFT_ALONE_S, again_s=LEFT_ALONE_S / 2)
-        return self._shown(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
+            self._hold_pattern(MAX_UNATTENDED_S, again_s=MAX_UNATTENDED_S / 2)
+        return self._wait_for_light(index, started_ns, self._clock.now_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
+        """See `Projector`. Refuses an unsupported timing before the engine does; the message names the rule."""
         self._state.require_loaded("play")
-        self._require_proven()
+        self._require_known_polarity()
         options = self._options
-        timing = lit(
+        timing = play_timing(
             exposure_s,
             period_s,
             margin_s=options.light_margin_s,
@@ -127,15 +137,15 @@ class LightEngine(PatternEngine[Engine]):
                     self._define(index, timing)
                 self._engine.configure(len(self._places), patterns)
                 self._start()
-                self._engine.require_well()
+                self._engine.require_healthy()
             except BaseException:
                 self._darken()
                 raise
 
     def _define(self, index: int, timing: Timing) -> None:
-        """Set an entry of the pattern table, unless the engine has it."""
+        """Set an entry of the pattern table, unless it is already set."""
         dark_us = timing.period_us - timing.exposure_us
-        entry = definition(
+        entry = encode_definition(
             index, self._places[index], exposure_us=timing.exposure_us, dark_us=dark_us, leds=self._leds[index]
         )
         if self._table.get(index) != entry:
@@ -144,28 +154,28 @@ class LightEngine(PatternEngine[Engine]):
             self._table[index] = entry
 
     def _start(self) -> int:
-        """Start the sequence; return when that was begun."""
+        """Start the sequence; return the time of the command."""
         started_ns = self._clock.now_ns()
-        self._engine.leds(by_sequence=True)
+        self._engine.switch_leds(by_sequence=True)
         self._engine.start()
         return started_ns
 
     def _prepare(self) -> ProjectorInfo:
         engine, options = self._engine, self._options
         version = engine.version()
-        if version < OLDEST:
-            found, wanted = (".".join(map(str, each)) for each in (version, OLDEST))
+        if version < OLDEST_FIRMWARE:
+            found, wanted = (".".join(map(str, each)) for each in (version, OLDEST_FIRMWARE))
             message = f"{engine.name} has firmware {found}, this driver needs {wanted}; update it with TI's program"
             raise UnsupportedByDeviceError(message)
         self._mirrors = mirrors = engine.mirrors()
-        if mirrors.controllers > 1 and not engine.byte(Command.HARDWARE_STATUS) & SECOND_READY:
+        if mirrors.controllers > 1 and not engine.byte(UsbCommand.HARDWARE_STATUS) & SECOND_READY:
             message = f"{engine.name}: a {mirrors.name} has two controllers, the second one does not answer; "
             message += "switch it off and on"
             raise DeviceError(message)
-        engine.settle_byte(Command.DISPLAY_MODE, ON_THE_FLY, within_s=MODE_S)
-        # A new mode may start what the engine shows by itself.
+        engine.settle_byte(UsbCommand.DISPLAY_MODE, ON_THE_FLY, within_s=MODE_CHANGE_S)
+        # A change of mode may start the engine's default sequence.
         self.blank()
-        self._set_up_light()
+        self._configure_leds()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
         return ProjectorInfo(
             name="projector",
@@ -176,5 +186,5 @@ class LightEngine(PatternEngine[Engine]):
             latency_s=options.start_s + COMMANDS_S,
             gap_s=options.light_margin_s + mirrors.least_us / 1e6,
             duty=options.duty_limit,
-            lights=options.colour is Colour.WHITE,
+            lights=options.colour is LedColour.WHITE,
         )

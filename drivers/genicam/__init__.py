@@ -1,14 +1,15 @@
 """Cameras that speak GenICam, through one of two libraries.
 
-`genicam`: GigE Vision and USB3 Vision through Aravis; extra `genicam`. Tried on a GigE Vision camera over loopback;
-USB3 Vision goes the same way through Aravis, and was not tried.
+`genicam`: GigE Vision and USB3 Vision through Aravis; extra `genicam`. Tested with a GigE Vision camera over loopback;
+USB3 Vision takes the same path through Aravis and is untested.
 
-`gentl`: what a vendor's GenTL producer serves (GigE Vision, USB3 Vision, CoaXPress, Camera Link and others) through
-harvesters; extra `gentl`. Tried on a producer of our own.
+`gentl`: cameras behind a vendor's GenTL producer (GigE Vision, USB3 Vision, CoaXPress, Camera Link and others) through
+harvesters; extra `gentl`. Tested with our own producer.
 """
 
+from drivers.genicam.aravis import find_devices
 from drivers.genicam.camera import GenicamCamera, open_camera, open_gentl_camera
-from drivers.genicam.finder import find_devices, find_gentl_devices
+from drivers.genicam.gentl import find_gentl_devices
 from drivers.genicam.options import GenicamOptions, GentlOptions
 
 __all__ = [

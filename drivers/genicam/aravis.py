@@ -1,37 +1,136 @@
-"""A GigE Vision or USB3 Vision camera through Aravis: how it is got, how its frames come, and how it is let go."""
+"""GigE Vision and USB3 Vision cameras through Aravis: loading the library, connection, stream and device list.
+
+Aravis (LGPL) comes from the system's packages and is reached through GObject introspection: PyGObject and the
+`Aravis-0.8` typelib. Neither has wheels, so the error message names the packages to install.
+"""
 
 from __future__ import annotations
 
+import importlib
+import sys
 import threading
 import time
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
-from drivers.genicam.connection import Connection, Delivery, Memory, Stream
-from drivers.genicam.library import library, told
+from drivers.genicam.connection import GenICamConnection, GenICamStream, RawFrame, RawImage
 from drivers.genicam.options import GenicamOptions
-from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
+from slrig.devices import FoundDevice
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import Size
 
-PROTOCOLS = ("GigEVision", "USB3Vision")
-"""What this driver opens of the things that Aravis lists."""
+_BUILDS = "libcairo2-dev gcc pkg-config python3-dev"
 
+
+PROTOCOLS = ("GigEVision", "USB3Vision")
+"""Protocols of the devices that this driver opens; Aravis lists others as well."""
 _LATCH = 0x0944
 _LATCH_BIT = 2
 _LATCHED_HIGH, _LATCHED_LOW = 0x0948, 0x094C
-
 _OLDEST_NS = 60_000_000_000
 _CLOCK_TRIES = 5
 _CLOCK_TIGHT_NS = 20_000
 
 
-class AravisConnection(Connection):
-    """An open device. Aravis' own thread tells when control is lost.
+@dataclass(frozen=True, slots=True)
+class AravisLibrary:
+    """The loaded library: the `Aravis` namespace, and the class of its errors."""
+
+    aravis: Any
+    error: type[Exception]
+
+
+@lru_cache(maxsize=1)
+def load_aravis() -> AravisLibrary:
+    """Load Aravis once.
+
+    Raises
+    ------
+    LibraryMissingError
+        PyGObject or the Aravis typelib is not installed.
+    """
+    try:
+        gi = importlib.import_module("gi")
+        # PyGObject raises ValueError if the system has no typelib of that name.
+        gi.require_version("Aravis", "0.8")
+        aravis = importlib.import_module("gi.repository.Aravis")
+        error = importlib.import_module("gi.repository.GLib").Error
+    except (ImportError, ValueError, AttributeError) as cause:
+        install = install_command()
+        message = (
+            f"the genicam driver needs Aravis 0.8 and PyGObject, found: {cause}; on Debian or Ubuntu: "
+            f"{install_command(system='linux')} (other systems: install Aravis with its introspection data, then the "
+            "extra)"
+        )
+        raise LibraryMissingError(message, install=install) from cause
+    return AravisLibrary(aravis, error)
+
+
+def install_command(python: tuple[int, int] = sys.version_info[:2], system: str = sys.platform) -> str:
+    """Return the command that installs the missing libraries, for a version of Python and a system as in
+    `sys.platform`.
+
+    PyGObject from 3.51 on builds against girepository 2.0, which is newer than the systems with Python 3.11 and 3.12;
+    the extra requires an older PyGObject there.
+
+    >>> "libgirepository1.0-dev" in install_command((3, 11)), "libgirepository-2.0-dev" in install_command((3, 13))
+    (True, True) >>> install_command(system="win32") "pip install 'slrig[genicam]' (Aravis with its introspection data
+    first)"
+    """
+    if system != "linux":
+        return "pip install 'slrig[genicam]' (Aravis with its introspection data first)"
+    introspection = "libgirepository-2.0-dev" if python >= (3, 13) else "libgirepository1.0-dev"
+    return f"sudo apt install gir1.2-aravis-0.8 {introspection} {_BUILDS} && pip install 'slrig[genicam]'"
+
+
+@contextmanager
+def translate_aravis_errors(name: str, doing: str) -> Iterator[None]:
+    """Translate Aravis errors within the block into slrig's; the message names the camera and the action.
+
+    Raises
+    ------
+    DeviceGoneError
+        The device does not answer (after several attempts by Aravis), or is not connected.
+    DeviceBusyError
+        Another program controls it.
+    UnsupportedByDeviceError
+        It has no such feature, or refused the value.
+    DeviceError
+        Anything else.
+    """
+    loaded = load_aravis()
+    try:
+        yield
+    except loaded.error as cause:
+        raise _slrig_error(loaded.aravis, name, doing, cause) from cause
+
+
+def _slrig_error(aravis: Any, name: str, doing: str, cause: Any) -> DeviceError:
+    what = f"camera '{name}', {doing}: {cause.message}"
+    if cause.domain == "arv-gc-error-quark":
+        return UnsupportedByDeviceError(f"{what}; look up what the camera offers in its manual, and ask for that")
+    if cause.domain != "arv-device-error-quark":
+        return DeviceError(f"{what}; check the camera's cable and power, and try again")
+    codes = aravis.DeviceError
+    if cause.code in {int(codes.NOT_CONNECTED), int(codes.TIMEOUT), int(codes.NOT_FOUND)}:
+        return DeviceGoneError(f"{what}; the camera does not answer: check its cable and power, and open it again")
+    if cause.code in {int(codes.NOT_CONTROLLER), int(codes.PROTOCOL_ERROR_ACCESS_DENIED)}:
+        return DeviceBusyError(f"{what}; another program controls the camera: close that program")
+    if cause.code in {int(codes.PROTOCOL_ERROR_BUSY), int(codes.TRANSFER_ERROR), int(codes.UNKNOWN)}:
+        return DeviceError(f"{what}; check the camera's cable and load, and try again")
+    return UnsupportedByDeviceError(f"{what}; look up what the camera offers in its manual, and ask for that")
+
+
+class AravisConnection(GenICamConnection):
+    """An open device. Aravis signals the loss of control on its own thread.
 
     Parameters
     ----------
     name
-        The camera's, for messages.
+        Name of the camera, for messages.
     options
         `GenicamOptions`.
 
@@ -47,13 +146,13 @@ class AravisConnection(Connection):
 
     def __init__(self, name: str, options: GenicamOptions) -> None:
         super().__init__(name)
-        aravis = library().aravis
+        aravis = load_aravis().aravis
         self._options = options
-        self._camera = _opened(aravis, name, options.device)
+        self._camera = _open_device(aravis, name, options.device)
         self._device = self._camera.get_device()
         self._is_gige = bool(self._camera.is_gv_device())
         self._device.set_register_cache_policy(aravis.RegisterCachePolicy.DISABLE)
-        # Not a method of ours: the device would keep us, and we it.
+        # Not a bound method: that would create a reference cycle with the device.
         lost = self._lost
         self._handler = self._device.connect("control-lost", lambda *_: lost.set())
         try:
@@ -64,24 +163,24 @@ class AravisConnection(Connection):
             self.close()
             raise
 
-    def told(self, doing: str) -> AbstractContextManager[None]:
-        """See `Connection`."""
-        return told(self.name, doing)
+    def translate_errors(self, doing: str) -> AbstractContextManager[None]:
+        """See `GenICamConnection`."""
+        return translate_aravis_errors(self.name, doing)
 
-    def kind(self, feature: str) -> str:
-        """See `Connection`."""
-        aravis = library().aravis
-        with self.asking(f"feature {feature}"):
+    def feature_type(self, feature: str) -> str:
+        """See `GenICamConnection`."""
+        aravis = load_aravis().aravis
+        with self.access(f"feature {feature}"):
             node = self._device.get_feature(feature)
         for kind in ("Boolean", "Enumeration", "String", "Integer", "Float"):
             if isinstance(node, getattr(aravis, f"Gc{kind}")):
                 return kind
         return type(node).__name__.removeprefix("Gc").removesuffix("Node")
 
-    def start(self, buffers: int) -> Stream:
-        """See `Connection`. A new `Aravis.Stream`: no buffer of an earlier one can come out of it."""
-        aravis = library().aravis
-        with self.asking("opening a stream") as camera:
+    def start(self, buffers: int) -> GenICamStream:
+        """See `GenICamConnection`. Uses a new `Aravis.Stream`, which returns no buffer of an earlier one."""
+        aravis = load_aravis().aravis
+        with self.access("opening a stream") as camera:
             stream = camera.create_stream(None, None)
         if stream is None:
             message = f"camera '{self.name}' gave no stream; close other programs that read from it, and try again"
@@ -90,7 +189,7 @@ class AravisConnection(Connection):
             resend = aravis.GvStreamPacketResend
             stream.set_property("packet-resend", resend.ALWAYS if self._options.packet_resend else resend.NEVER)
             stream.set_property("socket-buffer", aravis.GvStreamSocketBuffer.AUTO)
-        with self.asking("starting") as camera:
+        with self.access("starting") as camera:
             payload = camera.get_payload()
             for _ in range(buffers):
                 stream.push_buffer(aravis.Buffer.new_allocate(payload))
@@ -98,41 +197,41 @@ class AravisConnection(Connection):
         return AravisStream(self, stream)
 
     def latch(self) -> tuple[int, int, int] | None:
-        """See `Connection`. GigE Vision has it in registers that every device shares, USB3 Vision in features."""
+        """See `GenICamConnection`. GigE Vision has standard registers for it, USB3 Vision features."""
         if not self._is_gige:
             return super().latch()
         try:
-            return self._latched_gige()
+            return self._latch_gige()
         except UnsupportedByDeviceError:
             return None
 
     @property
     def has_stamps(self) -> bool:
-        """See `Connection`."""
+        """See `GenICamConnection`."""
         return not self._is_gige or self._device.get_timestamp_tick_frequency() > 0
 
     def close(self) -> None:
-        """Let the device go. Idempotent; works after it is lost."""
+        """Close the device. Idempotent; works after it is lost."""
         if not self.state.close():
             return
         with suppress(Exception):
             self._device.disconnect(self._handler)
-        held, self._device, self._camera = [self._camera, self._device], None, None
-        self.let_go(held)
+        references, self._device, self._camera = [self._camera, self._device], None, None
+        self.release(references)
 
-    def let_go(self, held: list[Any]) -> None:
-        """Drop Aravis' objects, the only references to which are in the list."""
+    def release(self, references: list[Any]) -> None:
+        """Drop Aravis objects; the list has the only references to them."""
         if self._lost.is_set():
-            # Each of them says goodbye to the device first, and waits 5 s for an answer that will not come.
-            threading.Thread(target=held.clear, name=f"goodbye to {self.name}", daemon=True).start()
+            # Their destructors contact the lost device and wait 5 s for an answer.
+            threading.Thread(target=references.clear, name=f"releasing {self.name}", daemon=True).start()
         else:
-            held.clear()
+            references.clear()
 
-    def _latched_gige(self) -> tuple[int, int, int] | None:
+    def _latch_gige(self) -> tuple[int, int, int] | None:
         frequency_hz = self._device.get_timestamp_tick_frequency()
         if not frequency_hz:
             return None
-        with self.asking("looking at its clock"):
+        with self.access("reading its clock"):
             before_ns = time.monotonic_ns()
             self._device.write_register(_LATCH, _LATCH_BIT)
             after_ns = time.monotonic_ns()
@@ -150,7 +249,7 @@ class AravisConnection(Connection):
 
     def _prepare_network(self, aravis: Any, options: GenicamOptions) -> None:
         kind = aravis.GvStreamOption
-        with self.asking("setting up the network") as camera:
+        with self.access("setting up the network") as camera:
             camera.gv_set_stream_options(kind.NONE if options.packet_socket else kind.PACKET_SOCKET_DISABLED)
             if options.packet_delay_ns is not None:
                 camera.gv_set_packet_delay(options.packet_delay_ns)
@@ -162,54 +261,54 @@ class AravisConnection(Connection):
             got = camera.gv_get_packet_size()
         if got != options.packet_size_bytes:
             message = (
-                f"camera '{self.name}': asked for packet_size_bytes {options.packet_size_bytes}, it gives {got}; write "
-                "that, or leave it out"
+                f"camera '{self.name}': requested packet_size_bytes {options.packet_size_bytes}, it uses {got}; "
+                "write that, or leave it out"
             )
             raise DeviceError(message)
 
 
 class AravisStream:
-    """Implements `Stream` on an `Aravis.Stream` that runs."""
+    """Implements `GenICamStream` on a running `Aravis.Stream`."""
 
     def __init__(self, connection: AravisConnection, stream: Any) -> None:
         self._connection = connection
         self._stream = stream
 
-    def take(self, most_s: float) -> Delivery | None:
-        """See `Stream`."""
-        if most_s > 0:
-            buffer = self._stream.timeout_pop_buffer(round(most_s * 1e6) + 1)
+    def take(self, max_s: float) -> RawFrame | None:
+        """See `GenICamStream`."""
+        if max_s > 0:
+            buffer = self._stream.timeout_pop_buffer(round(max_s * 1e6) + 1)
         else:
             buffer = self._stream.try_pop_buffer()
         if buffer is None:
             return None
         try:
-            arrived_ns = _arrived_ns(buffer)
+            arrived_ns = _arrival_ns(buffer)
             image = None
-            if buffer.get_status() == library().aravis.BufferStatus.SUCCESS:
+            if buffer.get_status() == load_aravis().aravis.BufferStatus.SUCCESS:
                 size = Size(buffer.get_image_width(), buffer.get_image_height())
-                image = Memory(buffer.get_data(), size, buffer.get_image_padding()[0])
-            return Delivery(int(buffer.get_frame_id()), arrived_ns, int(buffer.get_timestamp()), image)
+                image = RawImage(buffer.get_data(), size, buffer.get_image_padding()[0])
+            return RawFrame(int(buffer.get_frame_id()), arrived_ns, int(buffer.get_timestamp()), image)
         finally:
             self._stream.push_buffer(buffer)
 
     def end(self) -> None:
-        """See `Stream`."""
+        """See `GenICamStream`."""
         connection = self._connection
         if not connection.is_lost:
-            # A camera that is lost only now is told of by the next call that needs it.
-            with suppress(DeviceError), connection.asking("stopping") as camera:
+            # If the camera is lost only now, the next call that needs it reports that.
+            with suppress(DeviceError), connection.access("stopping") as camera:
                 camera.stop_acquisition()
-        held, self._stream = [self._stream], None
-        connection.let_go(held)
+        references, self._stream = [self._stream], None
+        connection.release(references)
 
 
-def _opened(aravis: Any, name: str, device: str) -> Any:
+def _open_device(aravis: Any, name: str, device: str) -> Any:
     try:
-        with told(name, f"opening {device}"):
+        with translate_aravis_errors(name, f"opening {device}"):
             return aravis.Camera.new(device)
     except DeviceGoneError as error:
-        known = ", ".join(label for _, label in listed()) or "none"
+        known = ", ".join(label for _, label in list_aravis_cameras()) or "none"
         message = (
             f"camera '{name}': no GenICam camera '{device}' answers; found: {known}. Check cable, power, and that its "
             "IP address lies in the network of this machine's card"
@@ -217,9 +316,9 @@ def _opened(aravis: Any, name: str, device: str) -> Any:
         raise DeviceGoneError(message) from error
 
 
-def listed() -> tuple[tuple[str, str], ...]:
-    """Id and label of every camera that answers. Opens nothing; takes Aravis about one second."""
-    aravis = library().aravis
+def list_aravis_cameras() -> tuple[tuple[str, str], ...]:
+    """Return id and label of every camera that answers, without opening any. Aravis takes about one second."""
+    aravis = load_aravis().aravis
     aravis.update_device_list()
     found = []
     for index in range(aravis.get_n_devices()):
@@ -236,22 +335,33 @@ def listed() -> tuple[tuple[str, str], ...]:
     return tuple(sorted(found))
 
 
-def _arrived_ns(buffer: Any) -> int:
-    """When the frame's first packet arrived, CLOCK_MONOTONIC: Aravis notes it on the wall clock."""
-    now_ns, wall_ns = _both_clocks()
+def _arrival_ns(buffer: Any) -> int:
+    """Arrival of the frame's first packet, CLOCK_MONOTONIC, from the wall-clock time that Aravis records."""
+    now_ns, wall_ns = _read_clocks()
     ago_ns = wall_ns - int(buffer.get_system_timestamp())
-    # A wall clock that was set meanwhile tells nothing; the frame has arrived by now in any case.
+    # If the wall clock was set meanwhile, now is the only safe bound.
     return now_ns - ago_ns if 0 <= ago_ns < _OLDEST_NS else now_ns
 
 
-def _both_clocks() -> tuple[int, int]:
-    """CLOCK_MONOTONIC and the wall clock at one instant, as near as a few tries bring them."""
+def _read_clocks() -> tuple[int, int]:
+    """Read CLOCK_MONOTONIC and the wall clock at nearly the same instant, the best of a few tries."""
     best_ns, found = _OLDEST_NS, (0, 0)
     for _ in range(_CLOCK_TRIES):
         before_ns, wall_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         if after_ns - before_ns < best_ns:
-            # The later of the two: a frame must not seem to have arrived before it did.
+            # The later reading: a frame must never be dated before its arrival.
             best_ns, found = after_ns - before_ns, (after_ns, wall_ns)
         if best_ns < _CLOCK_TIGHT_NS:
             break
     return found
+
+
+def find_devices() -> tuple[FoundDevice, ...]:
+    """List every GigE Vision and USB3 Vision camera that answers Aravis. Opens none.
+
+    Raises
+    ------
+    LibraryMissingError
+        Aravis or PyGObject is not installed.
+    """
+    return tuple(FoundDevice("genicam", identity, label) for identity, label in list_aravis_cameras())

@@ -1,42 +1,363 @@
-"""A GenICam camera: settings that are read back, and frames whose exposure is known to lie after an instant.
+"""A GenICam camera: settings that are read back, and frames whose exposure began after a given instant.
 
-What is known of an exposure's start, and from where, is in `drivers.genicam.timing`. `Frame.t_start_ns` is the middle
-of that interval and `t_err_ns` half of it; `read` returns a frame only if the whole interval lies after `after_ns`:
+`drivers.genicam.timing` bounds the start of each exposure. `Frame.t_start_ns` is the middle of that interval and
+`t_err_ns` half of it; `read` returns a frame only if the whole interval is after `after_ns`:
 
-- software trigger: the exposure began after the call of `trigger` did, so a pattern that was shown before is whole;
-- free-running: as the camera's clock says, tied to the host's by latching it; a camera without a latch is trusted to
-  send a frame within the option `transfer_s` after its exposure;
+- software trigger: the exposure began after the call of `trigger`, so a pattern shown before is complete;
+- free-running: by the camera's clock, related to the host's by latching it; a camera without a latch is assumed to send
+  a frame within the option `transfer_s` after its exposure;
 - hardware trigger: the same, and a frame that follows a delivered one began after that one's reported end.
 
-With a rolling shutter these are the times of the first row; the others follow it.
+With a rolling shutter these are the times of the first row.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from drivers.genicam.aravis import AravisConnection
-from drivers.genicam.connection import Connection
-from drivers.genicam.features import differ
+from drivers.genicam.connection import GenICamConnection, GenICamStream, RawFrame, differs
 from drivers.genicam.gentl import GentlConnection
-from drivers.genicam.options import CameraOptions, GenicamOptions, GentlOptions
-from drivers.genicam.pixels import FORMATS
-from drivers.genicam.session import Session
-from drivers.genicam.setup import line_of, prepare, set_trigger
+from drivers.genicam.options import GenICamCameraOptions, GenicamOptions, GentlOptions, SensorRegion
+from drivers.genicam.pixels import FORMATS, PfncFormat, decode_pixels
+from drivers.genicam.timing import Arrival, FrameNumbers, Interval, StartClock, TriggeredStarts, UntriggeredStarts
 from slrig.bundle.validation import validate
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
-from slrig.errors import UnsupportedByDeviceError
-from slrig.model import CameraFormat, Frame
+from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
+from slrig.model import CameraFormat, Frame, Pixels, Size
 
-_RESENT_AFTER_NS = 400_000_000
-_LATE_S = 0.2
-_MOST_BUFFER_BYTES = 1 << 30
-_FEWEST_BUFFERS = 8
+_SLICE_S = 0.05
+_LATCHES = 5
+_TIE_AGAIN_NS = 5_000_000_000
 
-_RATES = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
-"""What tells the fastest rate that exposure, read-out and link allow: SFNC has no name for it, makers have theirs."""
+
+_SELECTOR = "TriggerSelector"
+_START_SELECTORS = ("FrameStart", "ExposureStart")
+"""Selectors that start one frame; IDS cameras (uEye+) have the latter only. For one exposure per frame they are
+equivalent."""
+_AUTOMATIC = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto", "GammaAuto")
+_RESEND_AFTER_NS = 400_000_000
+_DRAIN_MARGIN_S = 0.2
+_MAX_BUFFER_BYTES = 1 << 30
+_MIN_BUFFERS = 8
+_FRAME_RATE_FEATURES = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
+"""Features that give the fastest rate that exposure, read-out and link allow: SFNC has no name for it, makers have
+their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class _TimedFrame:
+    """A complete frame, also in colour if available, and the bounds of the start of its exposure."""
+
+    image: Pixels
+    colour: Callable[[], Pixels] | None
+    number: int
+    start: Interval
+
+
+class Acquisition:
+    """Acquisition of an armed camera: its stream, and its frames in order. Used by one thread.
+
+    Parameters
+    ----------
+    connection
+        The open device, set up.
+    options, form, size
+        Current settings.
+    """
+
+    def __init__(
+        self, connection: GenICamConnection, options: GenICamCameraOptions, form: PfncFormat, size: Size
+    ) -> None:
+        self._connection = connection
+        self._options = options
+        self._form = form
+        self._size = size
+        self._stream: GenICamStream | None = None
+        self._numbers = FrameNumbers()
+        self._good = 0
+        self._last_end_ns = 0
+        self._waiting: deque[_TimedFrame] = deque()
+        self._skipped = dict.fromkeys(("stale", "corrupt", "repeated", "untriggered"), 0)
+        self.trigger = Trigger.FREE
+        self._applied = AppliedSettings(0.0, 0.0)
+        self._exposure_ns = 0
+
+    def begin(self, trigger: Trigger, applied: AppliedSettings, buffers: int) -> None:
+        """Open the stream with `buffers` buffers, relate the camera's clock to the host's, and start."""
+        self.trigger = trigger
+        self._applied = applied
+        self._exposure_ns = round(applied.exposure_s * 1e9)
+        self._clock = StartClock(self._lag_ns())
+        self._reset_counting()
+        self._stamped = self._options.time_stamp != "none" and self._connection.has_stamps
+        self._tied_ns = 0
+        self._tie_clock(_LATCHES)
+        self._stream = self._connection.start(buffers)
+
+    def end(self) -> None:
+        """Stop, in any state of the camera."""
+        if self._stream is not None:
+            stream, self._stream = self._stream, None
+            stream.end()
+
+    def note_trigger(self, begun_ns: int, ended_ns: int, *, times: int) -> None:
+        """Note a software trigger, and how many times it may have been sent."""
+        self._triggered.note_trigger(begun_ns, ended_ns, times=times)
+
+    def is_answer_due(self) -> bool:
+        """True if the answer to a software trigger may still arrive."""
+        return self._triggered.answer_due_ns(time.monotonic_ns()) > 0
+
+    def settle(self) -> None:
+        """Wait until no answer to a software trigger is due: a camera ignores a trigger during an exposure."""
+        while (left_ns := self._triggered.answer_due_ns(time.monotonic_ns())) > 0 and not self._connection.is_lost:
+            self._take_frame(left_ns / 1e9)
+
+    def drain(self, seconds: float) -> None:
+        """Discard frames that arrive without a trigger, for this time."""
+        end_s = time.monotonic() + seconds
+        while (left_s := end_s - time.monotonic()) > 0 and not self._connection.is_lost:
+            self._take_frame(left_s)
+        self._reset_counting()
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        """See `slrig.devices.Camera`."""
+        if self.trigger is not Trigger.SOFTWARE and time.monotonic_ns() - self._tied_ns > _TIE_AGAIN_NS:
+            self._tie_clock(2)
+        deadline_s = time.monotonic() + timeout_s
+        self._skipped = dict.fromkeys(self._skipped, 0)
+        while True:
+            while self._waiting:
+                frame = self._waiting.popleft()
+                # Wire-triggered frames are identified by their order.
+                follows = self.trigger is Trigger.HARDWARE and after_ns <= self._last_end_ns
+                if frame.start.min_ns >= after_ns or follows:
+                    return self._frame(frame)
+                self._skipped["stale"] += 1
+            left_s = deadline_s - time.monotonic()
+            if self._take_frame(left_s):
+                continue
+            if self._connection.is_lost:
+                raise self._connection.gone_error("waiting for a frame")
+            if left_s <= 0:
+                raise self._timeout_error(after_ns, timeout_s)
+
+    def _reset_counting(self) -> None:
+        """Restart counting: the next frame is number 0, and no trigger is pending."""
+        answer_ns, transfer_ns = round(self._options.answer_s * 1e9), round(self._options.transfer_s * 1e9)
+        self._triggered = TriggeredStarts(self._exposure_ns, answer_ns, self._clock)
+        self._untriggered = UntriggeredStarts(self._exposure_ns, transfer_ns, self._clock)
+        self._numbers = FrameNumbers()
+        self._good = 0
+        self._waiting.clear()
+
+    def _take_frame(self, max_s: float) -> bool:
+        """Take and process one frame from the stream, waiting at most a slice; return False if none arrived."""
+        delivery = None if self._stream is None else self._stream.take(min(max_s, _SLICE_S))
+        if delivery is not None:
+            self._process(delivery)
+        return delivery is not None
+
+    def _process(self, delivery: RawFrame) -> None:
+        number = self._numbers.next(delivery.block_id)
+        images = self._decode(delivery)
+        if images is None:
+            self._skipped["corrupt"] += 1
+            return
+        if number is None:
+            self._skipped["repeated"] += 1
+            return
+        self._good += 1
+        stamp_ns = delivery.stamp_ns if self._stamped else 0
+        arrival = Arrival(number, stamp_ns or None, delivery.arrived_ns)
+        start = self._triggered.start(arrival) if self.trigger is Trigger.SOFTWARE else self._untriggered.start(arrival)
+        if start is None:
+            self._skipped["untriggered"] += 1
+            return
+        self._waiting.append(_TimedFrame(*images, number, start))
+
+    def _frame(self, frame: _TimedFrame) -> Frame:
+        start = frame.start
+        t_start_ns = (start.min_ns + start.max_ns) // 2
+        # Exposures of a camera do not overlap.
+        t_start_ns = min(max(t_start_ns, self._last_end_ns), start.max_ns)
+        self._last_end_ns = t_start_ns + self._exposure_ns
+        return Frame(
+            camera=self._connection.name,
+            image=frame.image,
+            t_start_ns=t_start_ns,
+            t_end_ns=self._last_end_ns,
+            t_err_ns=max(start.max_ns - t_start_ns, t_start_ns - start.min_ns),
+            sequence_number=frame.number,
+            dropped_count=self._numbers.frame_count - self._good,
+            exposure_s=self._applied.exposure_s,
+            gain=self._applied.gain,
+            colour=frame.colour,
+        )
+
+    def _decode(self, delivery: RawFrame) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
+        """Return the image and a function that makes it in colour; None if packets are missing or the size is wrong."""
+        image = delivery.image
+        if image is None or image.size != self._size:
+            return None
+        decode = partial(decode_pixels, image.data, self._form, self._size, padding_bytes=image.padding_bytes)
+        try:
+            return decode(), partial(decode, in_colour=True) if self._form.mosaic else None
+        except ValueError:
+            return None
+
+    def _timeout_error(self, after_ns: int, timeout_s: float) -> FrameTimeoutError:
+        # If the camera is gone, this raises DeviceGoneError instead.
+        with self._connection.access("checking the connection") as camera:
+            camera.get_exposure_time()
+        skipped = ", ".join(f"{count} {kind}" for kind, count in self._skipped.items() if count) or "none"
+        remedy = {
+            Trigger.FREE: "check the frame rate and the network's load",
+            Trigger.SOFTWARE: "trigger after the pattern is shown, and wait for the exposure",
+            Trigger.HARDWARE: "check the trigger's cable, level and edge",
+        }[self.trigger]
+        message = (
+            f"camera '{self._connection.name}': no frame that began after {after_ns} ns arrived in {timeout_s} s "
+            f"({self.trigger} trigger; skipped: {skipped}); {remedy}"
+        )
+        return FrameTimeoutError(message)
+
+    def _lag_ns(self) -> Interval:
+        """Bounds of the delay of a time stamp after the start of its exposure."""
+        min_ns = self._exposure_ns if self._options.time_stamp == "exposure_end" else 0
+        return Interval(min_ns, 0 if self._options.time_stamp == "exposure_start" else self._exposure_ns)
+
+    def _tie_clock(self, count: int) -> None:
+        """Latch the camera's clock, if it supports that."""
+        self._tied_ns = time.monotonic_ns()
+        if not self._stamped:
+            return
+        latches = [latch for latch in (self._connection.latch() for _ in range(count)) if latch is not None]
+        if len(latches) == count:
+            self._clock.latch(latches)
+
+
+def set_up_camera(connection: GenICamConnection, options: GenICamCameraOptions) -> Size:
+    """Stop the camera, switch automatic functions off, set format, region and features. Return the image size.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        The camera does not accept a value, or changes it.
+    """
+    features = connection.features
+    with connection.access("stopping it") as camera:
+        # Another program may have left it running, with locked settings.
+        camera.stop_acquisition()
+    if options.pixel_format not in FORMATS:
+        message = (
+            f"camera '{connection.name}': requested pixel_format {options.pixel_format}, the driver reads "
+            f"{', '.join(FORMATS)}; choose one that the camera offers: {', '.join(features.choices('PixelFormat'))}"
+        )
+        raise UnsupportedByDeviceError(message)
+    features.choose("PixelFormat", options.pixel_format)
+    for automatic in _AUTOMATIC:
+        if features.has(automatic) and "Off" in features.choices(automatic):
+            features.choose(automatic, "Off")
+    if features.has("ExposureMode"):
+        features.choose("ExposureMode", "Timed")
+    if features.has("AcquisitionMode"):
+        features.choose("AcquisitionMode", "Continuous")
+    # These may include binning, which limits the region.
+    for feature, value in options.features.items():
+        features.set_any(feature, value)
+    return _set_region(connection, options)
+
+
+def _set_region(connection: GenICamConnection, options: GenICamCameraOptions) -> Size:
+    features = connection.features
+    # The offsets limit the size: reset them first, set them last.
+    for offset in ("OffsetX", "OffsetY"):
+        if features.has(offset):
+            features.set_integer(offset, 0)
+    with connection.access("reading its size") as camera:
+        width_px, height_px = int(camera.get_width_bounds()[1]), int(camera.get_height_bounds()[1])
+    region = options.region
+    if region is None:
+        region = SensorRegion(width_px=width_px, height_px=height_px)
+    if region.x_px + region.width_px > width_px or region.y_px + region.height_px > height_px:
+        message = (
+            f"camera '{connection.name}': requested a region of {region.width_px} x {region.height_px} px at "
+            f"column {region.x_px}, row {region.y_px}; its image is {width_px} x {height_px} px; choose a part of it"
+        )
+        raise UnsupportedByDeviceError(message)
+    features.set_integer("Width", region.width_px)
+    features.set_integer("Height", region.height_px)
+    for offset, value in (("OffsetX", region.x_px), ("OffsetY", region.y_px)):
+        if value:
+            features.set_integer(offset, value)
+    return Size(region.width_px, region.height_px)
+
+
+def choose_trigger_line(connection: GenICamConnection, options: GenICamCameraOptions) -> str | None:
+    """Return the input of the hardware trigger; None if the camera has none.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        The camera does not have the requested line.
+    """
+    features = connection.features
+    if features.has(_SELECTOR):
+        features.choose(_SELECTOR, _start_selector(features.choices(_SELECTOR)))
+    lines = (
+        tuple(source for source in features.choices("TriggerSource") if source.startswith("Line"))
+        if (features.has("TriggerSource"))
+        else ()
+    )
+    if options.trigger_line is None:
+        return lines[0] if lines else None
+    if options.trigger_line not in lines:
+        message = (
+            f"camera '{connection.name}': requested trigger_line {options.trigger_line}, it offers "
+            f"{', '.join(lines) or 'none'}; choose one of these, or leave it out"
+        )
+        raise UnsupportedByDeviceError(message)
+    return options.trigger_line
+
+
+def set_trigger(connection: GenICamConnection, source: str | None, options: GenICamCameraOptions) -> None:
+    """Let `source` start every exposure; None lets the camera run freely.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        The camera does not accept it, or another value is read back.
+    """
+    features = connection.features
+    selectors = features.choices(_SELECTOR) if features.has(_SELECTOR) else ()
+    start = _start_selector(selectors)
+    for selector in selectors:
+        if selector != start:
+            features.choose(_SELECTOR, selector)
+            if features.has("TriggerMode"):
+                features.choose("TriggerMode", "Off")
+    if selectors:
+        features.choose(_SELECTOR, start)
+    if source is None:
+        if features.has("TriggerMode"):
+            features.choose("TriggerMode", "Off")
+        return
+    features.choose("TriggerMode", "On")
+    features.choose("TriggerSource", source)
+    if source != "Software" and features.has("TriggerActivation"):
+        features.choose("TriggerActivation", options.trigger_activation)
+
+
+def _start_selector(selectors: tuple[str, ...]) -> str:
+    """Return the selector that starts a frame; the standard one if none is available."""
+    return next((each for each in _START_SELECTORS if each in selectors), _START_SELECTORS[0])
 
 
 class GenicamCamera:
@@ -47,96 +368,100 @@ class GenicamCamera:
     connection
         The open device; this camera closes it.
     options
-        Checked already.
+        Validated options.
 
     Raises
     ------
     UnsupportedByDeviceError
-        The device does not take an option, or takes it otherwise.
+        The device does not accept an option, or changes it.
     """
 
-    def __init__(self, connection: Connection, options: CameraOptions) -> None:
+    def __init__(self, connection: GenICamConnection, options: GenICamCameraOptions) -> None:
         self._name = connection.name
         self._options = options
         self._connection = connection
         self._state = self._connection.state
-        self._session: Session
-        self._owes = False
+        self._session: Acquisition
+        self._answer_pending = False
         try:
-            self._size = prepare(self._connection, options)
-            self._line = line_of(self._connection, options)
-            self._info = self._declared()
-            self._rate = next((each for each in _RATES if self._connection.features.has(each)), None)
-            self._applied = self._in_use()
+            self._size = set_up_camera(self._connection, options)
+            self._line = choose_trigger_line(self._connection, options)
+            self._info = self._read_info()
+            self._rate_feature = next(
+                (each for each in _FRAME_RATE_FEATURES if self._connection.features.has(each)), None
+            )
+            self._applied = self._read_settings()
         except BaseException:
             self._connection.close()
             raise
 
     @property
     def info(self) -> CameraInfo:
-        """See `Camera`. `gain` is in the camera's own unit, mostly dB."""
+        """See `Camera`. `gain` is in the camera's own unit, usually dB."""
         return self._info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. A value that the camera rounds by more than 1 % is refused, with what it would use."""
-        self._require_there()
+        """See `Camera`. Refuses a value that the camera rounds by more than 1 %; the message has the rounded value."""
+        self._require_connected()
         self._state.check_settings(settings, self._info)
-        with self._connection.asking("setting exposure and gain") as camera:
+        with self._connection.access("setting exposure and gain") as camera:
             camera.set_exposure_time(settings.exposure_s * 1e6)
             if camera.is_gain_available():
                 camera.set_gain(settings.gain)
-        self._applied = self._in_use()
-        for what, asked, got in (
+        self._applied = self._read_settings()
+        for what, requested, got in (
             ("exposure_s", settings.exposure_s, self._applied.exposure_s),
             ("gain", settings.gain, self._applied.gain),
         ):
-            if differ(got, asked):
+            if differs(got, requested):
                 message = (
-                    f"camera '{self._name}': asked for {what} {asked:g}, it gives {got:g}; ask for that, or for what "
-                    "its other settings allow (frame rate, pixel format)"
+                    f"camera '{self._name}': requested {what} {requested:g}, it gives {got:g}; request that, or a "
+                    "value that its other settings allow (frame rate, pixel format)"
                 )
                 raise UnsupportedByDeviceError(message)
         return self._applied
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`. Opens a stream of its own, so no frame of an earlier arming can come."""
-        self._require_there()
+        """See `Camera`. Opens a new stream, so no frame of an earlier arming can arrive."""
+        self._require_connected()
         self._state.check_arming(count, trigger, self._info)
         source = {Trigger.FREE: None, Trigger.SOFTWARE: "Software", Trigger.HARDWARE: self._line}[trigger]
         set_trigger(self._connection, source, self._options)
-        self._applied = self._in_use()
-        session = Session(self._connection, self._options, FORMATS[self._options.pixel_format], self._size)
-        session.begin(trigger, self._applied, _FEWEST_BUFFERS if trigger is Trigger.FREE else self._buffers(count))
+        self._applied = self._read_settings()
+        session = Acquisition(self._connection, self._options, FORMATS[self._options.pixel_format], self._size)
+        session.begin(trigger, self._applied, _MIN_BUFFERS if trigger is Trigger.FREE else self._buffers(count))
         self._session = session
         self._state.armed = trigger
-        if self._owes and trigger is not Trigger.FREE:
-            # A camera may keep a trigger that came while it was stopped, and expose now.
-            session.drain(self._applied.exposure_s + _LATE_S)
-            self._owes = False
+        if self._answer_pending and trigger is not Trigger.FREE:
+            # A camera may have stored a trigger while it was stopped, and expose now.
+            session.drain(self._applied.exposure_s + _DRAIN_MARGIN_S)
+            self._answer_pending = False
 
     def trigger(self) -> None:
-        """See `Camera`. While the frame of an earlier trigger is due, waits for that first."""
-        self._require_there()
+        """See `Camera`. Waits first for the frame of an earlier trigger, if it is due."""
+        self._require_connected()
         self._state.require_armed(Trigger.SOFTWARE)
         self._session.settle()
-        with self._connection.asking("triggering") as camera:
+        with self._connection.access("triggering") as camera:
             begun_ns = time.monotonic_ns()
             camera.software_trigger()
             ended_ns = time.monotonic_ns()
-        # A command whose answer was lost is sent again: the camera may have exposed twice.
-        self._session.triggered(begun_ns, ended_ns, times=2 if ended_ns - begun_ns > _RESENT_AFTER_NS else 1)
+        # Aravis repeats a command whose answer was lost: the camera may have exposed twice.
+        self._session.note_trigger(begun_ns, ended_ns, times=2 if ended_ns - begun_ns > _RESEND_AFTER_NS else 1)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`, and the head of this module. Exposure and gain are those read back when it was armed."""
-        self._require_there()
+        """See `Camera` and the docstring of this module. Exposure and gain are those read back when it was armed."""
+        self._require_connected()
         self._state.require_armed()
         return self._session.read(after_ns, timeout_s)
 
     def disarm(self) -> None:
         """See `Camera`."""
         if self._state.armed is not None:
-            # One that runs free is in the middle of an exposure, and may send it later than it is told to stop.
-            self._owes = self._owes or self._state.armed is Trigger.FREE or self._session.owed()
+            # A free-running camera may send the frame of its current exposure after it was stopped.
+            self._answer_pending = (
+                self._answer_pending or self._state.armed is Trigger.FREE or self._session.is_answer_due()
+            )
             self._state.armed = None
             self._session.end()
 
@@ -145,8 +470,8 @@ class GenicamCamera:
         self.disarm()
         self._connection.close()
 
-    def _declared(self) -> CameraInfo:
-        with self._connection.asking("asking what it is") as camera:
+    def _read_info(self) -> CameraInfo:
+        with self._connection.access("reading its identity") as camera:
             model = f"{camera.get_vendor_name()} {camera.get_model_name()}"
             serial = str(camera.get_device_serial_number() or camera.get_device_id())
             least_us, most_us = camera.get_exposure_time_bounds()
@@ -168,23 +493,23 @@ class GenicamCamera:
             colour=bool(FORMATS[self._options.pixel_format].mosaic),
         )
 
-    def _in_use(self) -> AppliedSettings:
-        with self._connection.asking("reading exposure and gain") as camera:
+    def _read_settings(self) -> AppliedSettings:
+        with self._connection.access("reading exposure and gain") as camera:
             gain = float(camera.get_gain()) if camera.is_gain_available() else 1.0
             exposure_s = camera.get_exposure_time() / 1e6
-        rate_hz = self._connection.features.number(self._rate) if self._rate is not None else 0.0
+        rate_hz = self._connection.features.number(self._rate_feature) if self._rate_feature is not None else 0.0
         return AppliedSettings(exposure_s, gain, 1 / rate_hz if rate_hz > 0 else None)
 
     def _buffers(self, count: int) -> int:
-        """As many as frames are asked for, so that none is lost while nobody reads; fewer if memory forbids."""
-        with self._connection.asking("asking for the size of a frame") as camera:
+        """Return the number of buffers: as many as requested frames, so that none is lost, limited by memory."""
+        with self._connection.access("reading the size of a frame") as camera:
             payload = int(camera.get_payload())
-        return max(_FEWEST_BUFFERS, min(count + 2, _MOST_BUFFER_BYTES // max(payload, 1)))
+        return max(_MIN_BUFFERS, min(count + 2, _MAX_BUFFER_BYTES // max(payload, 1)))
 
-    def _require_there(self) -> None:
+    def _require_connected(self) -> None:
         self._state.require_open()
         if self._connection.is_lost:
-            raise self._connection.gone("noticed before")
+            raise self._connection.gone_error("noticed earlier")
 
 
 def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
@@ -193,7 +518,7 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     Parameters
     ----------
     name
-        As the rig file calls it.
+        Name in the rig file.
     options
         `GenicamOptions`.
     folder
@@ -210,7 +535,7 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     DeviceBusyError
         Another program controls it.
     UnsupportedByDeviceError
-        The camera does not take an option, or takes it otherwise.
+        The camera does not accept an option, or changes it.
     """
     del folder
     table = validate(GenicamOptions, options, f"the [[camera]] table of '{name}' (driver genicam)")
@@ -220,27 +545,8 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
 def open_gentl_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
     """Open a camera behind a GenTL producer from a rig file's `[[camera]]` table.
 
-    Parameters
-    ----------
-    name
-        As the rig file calls it.
-    options
-        `GentlOptions`.
-    folder
-        Where the path of a producer counts from.
-
-    Raises
-    ------
-    ConfigError
-        The options have faults, all of them in one message.
-    LibraryMissingError
-        harvesters is not installed, or there is no producer.
-    DeviceGoneError
-        No such camera answers.
-    DeviceBusyError
-        Another program controls it.
-    UnsupportedByDeviceError
-        The camera does not take an option, or takes it otherwise.
+    `options` are `GentlOptions`; the path of a producer is relative to `folder`. Raises the errors of `open_camera`;
+    LibraryMissingError also if no producer is found.
     """
     table = validate(GentlOptions, options, f"the [[camera]] table of '{name}' (driver gentl)")
     return GenicamCamera(GentlConnection(name, table, folder), table)

@@ -1,24 +1,171 @@
-"""What the driver asks of a library for GenICam cameras, whichever it is: Aravis, or a GenTL producer."""
+"""Interface of the driver to a GenICam library (Aravis or a GenTL producer): features, frames and connection."""
 
 from __future__ import annotations
 
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from drivers.genicam.features import Features
 from slrig.devices import CameraState
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
 
+TOLERANCE = 0.01
+"""Allowed relative difference of a number from the requested one: cameras round to their steps."""
+
+
+class Features:
+    """Features of a device by name: set, read back and compared. Each call may raise the errors of
+    `GenICamConnection.access`.
+
+    Parameters
+    ----------
+    name
+        Name of the camera, for messages.
+    access
+        Gives the `Aravis.Camera` for one request; its registers must not be cached, so that values read back come from
+        the camera.
+    feature_type
+        Returns the type of a feature: see `GenICamConnection`.
+    """
+
+    def __init__(
+        self, name: str, access: Callable[[str], AbstractContextManager[Any]], feature_type: Callable[[str], str]
+    ) -> None:
+        self._name = name
+        self._access_camera = access
+        self._feature_type = feature_type
+
+    def has(self, feature: str) -> bool:
+        """True if the device has the feature and currently offers it."""
+        with self._access(feature) as camera:
+            return bool(camera.is_feature_available(feature))
+
+    def choices(self, feature: str) -> tuple[str, ...]:
+        """Return the currently available entries of an enumeration."""
+        with self._access(feature) as camera:
+            return tuple(camera.dup_available_enumerations_as_strings(feature) or ())
+
+    def text(self, feature: str) -> str:
+        """Return the value of an enumeration or a string."""
+        with self._access(feature) as camera:
+            return str(camera.get_string(feature))
+
+    def integer(self, feature: str) -> int:
+        """Return the value of an integer."""
+        with self._access(feature) as camera:
+            return int(camera.get_integer(feature))
+
+    def number(self, feature: str) -> float:
+        """Return the value of a float."""
+        with self._access(feature) as camera:
+            return float(camera.get_float(feature))
+
+    def execute(self, feature: str) -> None:
+        """Execute a command."""
+        with self._access(feature) as camera:
+            camera.execute_command(feature)
+
+    def choose(self, feature: str, entry: str) -> None:
+        """Set an enumeration.
+
+        Raises
+        ------
+        UnsupportedByDeviceError
+            It has no such entry, or reads back another.
+        """
+        offered = self.choices(feature)
+        if entry not in offered:
+            raise self._refusal(
+                feature, entry, f"it offers {', '.join(offered) or 'nothing now'}", "choose one of these"
+            )
+        if self.text(feature) == entry:
+            # Some cameras offer a single, read-only entry.
+            return
+        with self._access(feature) as camera:
+            camera.set_string(feature, entry)
+        self._require_equal(feature, entry, self.text(feature))
+
+    def set_integer(self, feature: str, value: int) -> None:
+        """Set an integer. Raises UnsupportedByDeviceError if it is out of range or between steps, or another is read
+        back.
+        """
+        with self._access(feature) as camera:
+            least, most = camera.get_integer_bounds(feature)
+            step = camera.get_integer_increment(feature)
+        if not least <= value <= most or (step > 1 and (value - least) % step):
+            steps = f" in steps of {step}" if step > 1 else ""
+            raise self._refusal(feature, value, f"it takes {least} to {most}{steps}", "ask for such a value")
+        with self._access(feature) as camera:
+            camera.set_integer(feature, value)
+        self._require_equal(feature, value, self.integer(feature))
+
+    def set_any(self, feature: str, value: bool | int | float | str) -> None:
+        """Set a feature of any type. Raises UnsupportedByDeviceError if it is missing, of another type, or not
+        accepted.
+        """
+        if not self.has(feature):
+            message = (
+                f"camera '{self._name}' has no feature {feature}, or does not offer it in its current state; remove it "
+                "from features, or set what enables it before"
+            )
+            raise UnsupportedByDeviceError(message)
+        match value, self._feature_type(feature):
+            case bool(), "Boolean":
+                with self._access(feature) as camera:
+                    camera.set_boolean(feature, value)
+                    got = bool(camera.get_boolean(feature))
+                self._require_equal(feature, value, got)
+            case str(), "Enumeration":
+                self.choose(feature, value)
+            case str(), "String":
+                with self._access(feature) as camera:
+                    camera.set_string(feature, value)
+                self._require_equal(feature, value, self.text(feature))
+            case int(), "Integer" if not isinstance(value, bool):
+                self.set_integer(feature, value)
+            case int() | float(), "Float" if not isinstance(value, bool):
+                self._set_number(feature, float(value))
+            case _, kind:
+                raise self._refusal(feature, value, f"the feature is of type {kind}", "write a value of that type")
+
+    def _set_number(self, feature: str, value: float) -> None:
+        with self._access(feature) as camera:
+            least, most = camera.get_float_bounds(feature)
+        if not least <= value <= most:
+            raise self._refusal(feature, value, f"it takes {least:g} to {most:g}", "ask for such a value")
+        with self._access(feature) as camera:
+            camera.set_float(feature, value)
+            got = float(camera.get_float(feature))
+        if differs(got, value):
+            raise self._refusal(feature, value, f"it gives {got:g}", "ask for a value that it can give")
+
+    def _require_equal(self, feature: str, requested: object, got: object) -> None:
+        if got != requested:
+            raise self._refusal(feature, requested, f"it gives {got}", "ask for a value that it can give")
+
+    def _refusal(self, feature: str, requested: object, found: str, remedy: str) -> UnsupportedByDeviceError:
+        return UnsupportedByDeviceError(f"camera '{self._name}': requested {feature} {requested}, {found}; {remedy}")
+
+    def _access(self, feature: str) -> AbstractContextManager[Any]:
+        return self._access_camera(f"feature {feature}")
+
+
+def differs(got: float, requested: float) -> bool:
+    """True if a number that was read back is not the requested one.
+
+    >>> differs(0.01001, 0.01), differs(0.0, 0.0), differs(2.0, 1.5) (False, False, True)
+    """
+    return abs(got - requested) > TOLERANCE * abs(requested) + 1e-12
+
 
 @dataclass(frozen=True, slots=True)
-class Memory:
-    """An image as it lies in memory; so many bytes follow each row."""
+class RawImage:
+    """Image in memory; `padding_bytes` follow each row."""
 
     data: bytes
     size: Size
@@ -26,84 +173,84 @@ class Memory:
 
 
 @dataclass(frozen=True, slots=True)
-class Delivery:
-    """What a library delivered of a frame.
+class RawFrame:
+    """Frame as delivered by a library.
 
-    block_id : the camera's number of it. arrived_ns : when it came, CLOCK_MONOTONIC; not before it did. stamp_ns : the
-    camera's own time, 0 if there is none. image : None if it is not whole.
+    block_id : the camera's number of it. arrived_ns : upper bound of its arrival, CLOCK_MONOTONIC. stamp_ns : the
+    camera's own time, 0 if none. image : None if it is incomplete.
     """
 
     block_id: int
     arrived_ns: int
     stamp_ns: int
-    image: Memory | None
+    image: RawImage | None
 
 
-class Stream(Protocol):
+class GenICamStream(Protocol):
     """A running acquisition."""
 
-    def take(self, most_s: float) -> Delivery | None:
-        """Return the next frame, waiting for it no longer than that; None if none came."""
+    def take(self, max_s: float) -> RawFrame | None:
+        """Return the next frame, waiting at most `max_s`; None if none arrived."""
         ...
 
     def end(self) -> None:
-        """Stop, whatever state the camera is in. What has not been taken is gone."""
+        """Stop, in any state of the camera. Frames not yet taken are dropped."""
         ...
 
 
-class Connection(ABC):
-    """An open device. One thread uses it; one of the library may tell that it is lost.
+class GenICamConnection(ABC):
+    """An open device. Used by one thread; a thread of the library may report its loss.
 
     Parameters
     ----------
     name
-        The camera's, for messages.
+        Name of the camera, for messages.
     """
 
     _camera: Any
-    """`Aravis.Camera`, or what does the same calls."""
+    """`Aravis.Camera`, or an object with the same methods."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.state = CameraState(name)
         self._lost = threading.Event()
-        self.features = Features(name, self.asking, self.kind)
+        self.features = Features(name, self.access, self.feature_type)
 
     @property
     def is_lost(self) -> bool:
-        """Whether the device has gone since it was opened."""
+        """True if the device was lost since it was opened."""
         return self._lost.is_set()
 
     @contextmanager
-    def asking(self, doing: str) -> Iterator[Any]:
-        """The camera as `Aravis.Camera` presents it, for the block.
+    def access(self, doing: str) -> Iterator[Any]:
+        """Provide the camera, with the interface of `Aravis.Camera`, for the block.
 
         Raises
         ------
         DeviceStateError
             It was closed.
         DeviceGoneError
-            It is lost, before or by what the block asked.
+            It is lost, before or during the block.
         DeviceError
-            What `told` makes of the library's errors.
+            As `translate_errors` translates the library's errors.
         """
         self.state.require_open()
         if self._lost.is_set():
-            raise self.gone(doing)
+            raise self.gone_error(doing)
         try:
-            with self.told(doing):
+            with self.translate_errors(doing):
                 yield self._camera
         except DeviceGoneError:
             self._lost.set()
             raise
 
-    def gone(self, doing: str) -> DeviceGoneError:
-        """The error of a device that is lost."""
+    def gone_error(self, doing: str) -> DeviceGoneError:
+        """Return the error of a lost device."""
         message = f"camera '{self.name}' is gone ({doing}); check its cable and power, and open the rig again"
         return DeviceGoneError(message)
 
     def latch(self) -> tuple[int, int, int] | None:
-        """Host's time, the device's, host's time again, ns; None if it has no clock that can be looked at."""
+        """Return host time before, device time, host time after, ns; None if the clock cannot be latched."""
         command, value = "TimestampLatch", "TimestampLatchValue"
         try:
             if not (self.features.has(command) and self.features.has(value)):
@@ -111,27 +258,27 @@ class Connection(ABC):
             before_ns = time.monotonic_ns()
             self.features.execute(command)
             after_ns = time.monotonic_ns()
-            return before_ns, self.features.whole(value), after_ns
+            return before_ns, self.features.integer(value), after_ns
         except UnsupportedByDeviceError:
             return None
 
     @property
     def has_stamps(self) -> bool:
-        """Whether frames may carry the device's own time."""
+        """True if frames may carry the device's own time."""
         return True
 
     @abstractmethod
-    def told(self, doing: str) -> AbstractContextManager[None]:
-        """Turn the library's errors within the block into slrig's."""
+    def translate_errors(self, doing: str) -> AbstractContextManager[None]:
+        """Translate the library's errors within the block into slrig's."""
 
     @abstractmethod
-    def kind(self, feature: str) -> str:
-        """Boolean, Enumeration, String, Integer, Float, or what else the library calls a feature that it has."""
+    def feature_type(self, feature: str) -> str:
+        """Return Boolean, Enumeration, String, Integer, Float, or the library's own name of the type of a feature."""
 
     @abstractmethod
-    def start(self, buffers: int) -> Stream:
-        """Start the acquisition, with room for so many frames. No frame of an earlier one comes out of it."""
+    def start(self, buffers: int) -> GenICamStream:
+        """Start the acquisition with this number of buffers. It delivers no frame of an earlier one."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let the device go. Idempotent; works after it is lost."""
+        """Close the device. Idempotent; works after it is lost."""

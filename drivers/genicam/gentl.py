@@ -1,48 +1,378 @@
-"""A camera behind a GenTL producer, through harvesters: how it is got, how its frames come, and how it is let go.
+"""Cameras behind a GenTL producer, through harvesters: producers, node map, connection and stream.
 
-A GenTL producer does not tell when a frame arrived, so a thread takes each one as it comes. That thread looks once a
-millisecond and does not wait: harvesters' wheel keeps Python's lock while it waits for a frame, and nothing else would
-run meanwhile. Frames are read as they lie in memory; harvesters' own reading of them does not take off padding.
+A producer is the part of a vendor's driver that speaks GenTL: a .cti file from the maker of the camera or of its
+interface card. harvesters (Apache 2.0) and the `genicam` wheel beneath it (EMVA, three-clause BSD) include none for a
+real camera. A process can load a producer only once, so its cameras share it.
+
+A GenTL producer does not report when a frame arrived, so a thread takes each frame as it comes. The thread polls once a
+millisecond without waiting, because harvesters' wheel holds Python's lock while it waits. Frames are read from raw
+memory, since harvesters does not remove padding.
 """
 
+# ruff: noqa: D102 - the methods of NodeMapCamera are named as in Aravis
 from __future__ import annotations
 
 import importlib
+import os
 import queue
+import signal
 import threading
 import time
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from drivers.genicam import producers
-from drivers.genicam.connection import Connection, Delivery, Memory, Stream
-from drivers.genicam.nodes import NodeMapCamera, kind_of
+from drivers.genicam.connection import GenICamConnection, GenICamStream, RawFrame, RawImage
 from drivers.genicam.options import GentlOptions
-from slrig.errors import DeviceError, DeviceGoneError, LibraryMissingError
+from slrig.devices import FoundDevice
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import Size
 
+INSTALL = "pip install 'slrig[gentl]'"
+PATHS = "GENICAM_GENTL64_PATH"
+
+_GONE = ("IoException", "TimeoutException", "InvalidHandleException", "NotInitializedException", "ClosedException")
+_BUSY = ("AccessDeniedException", "ResourceInUseException", "BusyException")
+_REFUSED = ("AccessException", "InvalidArgumentException", "LogicalErrorException", "OutOfRangeException")
+
+
+_loaded: dict[Path, GentlProducer] = {}
+_lock = threading.Lock()
+EXPOSURE_US = ("ExposureTime", "ExposureTimeAbs")
+GAIN = ("Gain", "GainAbs", "GainRaw")
+_KINDS = ("Boolean", "Enumeration", "String", "Integer", "Float", "Command", "Register", "Category")
 _LOOK_S = 0.001
 _ASK_S = 1e-5
-"""harvesters asks again and again for so long. With 0 it would never stop, and with much less it may not ask at all."""
+"""Polling time of harvesters. With 0 it would never return, and with much less it may not poll at all."""
 
 
-class GentlConnection(Connection):
+@lru_cache(maxsize=1)
+def load_harvesters() -> Any:
+    """Return the module `harvesters.core`.
+
+    Raises
+    ------
+    LibraryMissingError
+        harvesters, or the wheel of GenICam that it needs, is not installed.
+    """
+    try:
+        return importlib.import_module("harvesters.core")
+    except ImportError as cause:
+        message = f"the gentl driver needs harvesters, found: {cause}; {INSTALL}"
+        raise LibraryMissingError(message, install=INSTALL) from cause
+
+
+@contextmanager
+def translate_gentl_errors(name: str, doing: str) -> Iterator[None]:
+    """Translate errors of producers and node maps within the block into slrig's.
+
+    Raises
+    ------
+    DeviceGoneError
+        The device no longer answers.
+    DeviceBusyError
+        Another program controls it.
+    UnsupportedByDeviceError
+        It has no such feature, or refused the value.
+    DeviceError
+        Anything else.
+    """
+    load_harvesters()
+    gentl, genapi = importlib.import_module("genicam.gentl"), importlib.import_module("genicam.genapi")
+    errors: tuple[type[Exception], ...] = (gentl.GenericException, genapi.GenericException)
+    try:
+        yield
+    except errors as cause:
+        what = f"camera '{name}', {doing}: {str(cause).split(' : ')[0]}"
+        if isinstance(cause, tuple(getattr(gentl, each) for each in _BUSY)):
+            raise DeviceBusyError(f"{what}; another program controls the camera: close that program") from cause
+        if isinstance(cause, tuple(getattr(genapi, each) for each in _REFUSED)):
+            message = f"{what}; look up what the camera offers in its manual, and ask for that"
+            raise UnsupportedByDeviceError(message) from cause
+        if isinstance(cause, (genapi.TimeoutException, *(getattr(gentl, each) for each in _GONE))):
+            message = f"{what}; the camera does not answer: check its cable and power, and open it again"
+            raise DeviceGoneError(message) from cause
+        raise DeviceError(f"{what}; check the camera's cable and power, and try again") from cause
+
+
+def producer_files() -> tuple[Path, ...]:
+    """Return the installed producers: every .cti file in the folders that GENICAM_GENTL64_PATH names."""
+    folders = [Path(folder) for folder in os.environ.get(PATHS, "").split(os.pathsep) if folder]
+    return tuple(sorted({file.resolve() for folder in folders for file in folder.glob("*.cti")}))
+
+
+class GentlProducer:
+    """A loaded producer. Get one by `use_producer`."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._harvester = load_harvesters().Harvester()
+        self._harvester.add_file(str(file))
+        self._harvester.update()
+        self.users = 0
+
+    @property
+    def devices(self) -> tuple[Any, ...]:
+        """Devices found when it was loaded, as harvesters' `DeviceInfo`."""
+        return tuple(self._harvester.device_info_list)
+
+    def acquirer(self, device: Any) -> Any:
+        """Open a device, as harvesters' `ImageAcquirer`. Raises GenTL's errors."""
+        key = load_harvesters().ParameterKey
+        # The wheel blocks every other thread while it waits: it must not wait. Chunks are not read.
+        settings = {key.TIMEOUT_PERIOD_ON_UPDATE_EVENT_DATA_CALL: 0, key.ENABLE_AUTO_CHUNK_DATA_UPDATE: False}
+        with _preserve_interrupt_handler():
+            return self._harvester.create(device, config=load_harvesters().ParameterSet(settings))
+
+    def close(self) -> None:
+        """Unload the producer and close all its devices."""
+        self._harvester.reset()
+
+
+def acquire_producer(file: Path) -> GentlProducer:
+    """Return the producer of a file, loading it if necessary; call `release_producer` after use.
+
+    Raises
+    ------
+    LibraryMissingError
+        harvesters is not installed, or the file does not exist.
+    """
+    if not file.is_file():
+        message = f"GenTL producer {file} not found; install the one that comes with the camera, and write its path"
+        raise LibraryMissingError(message, install=f"the camera maker's GenTL producer, as {file}")
+    with _lock:
+        producer = _loaded.get(file) or GentlProducer(file)
+        _loaded[file] = producer
+        producer.users += 1
+        return producer
+
+
+def release_producer(file: Path) -> None:
+    """Release a producer; the last user closes it."""
+    with _lock:
+        producer = _loaded[file]
+        producer.users -= 1
+        if not producer.users:
+            del _loaded[file]
+            producer.close()
+
+
+@contextmanager
+def use_producer(file: Path) -> Iterator[GentlProducer]:
+    """Provide a producer for the block."""
+    producer = acquire_producer(file)
+    try:
+        yield producer
+    finally:
+        release_producer(file)
+
+
+def list_gentl_cameras() -> tuple[tuple[str, str], ...]:
+    """Return id and label of every camera behind the installed producers, without opening any.
+
+    Raises
+    ------
+    LibraryMissingError
+        harvesters is not installed.
+    """
+    load_harvesters()
+    found = []
+    for file in producer_files():
+        with use_producer(file) as producer:
+            for device in producer.devices:
+                parts = filter(None, (device_field(device, each) for each in ("vendor", "model", "serial_number")))
+                found.append((device.id_, f"{' '.join(parts)} ({device_field(device, 'tl_type')}, {file.name})"))
+    return tuple(sorted(found))
+
+
+def device_field(device: Any, what: str) -> str:
+    """Return a producer's information on a device, "" if it has none."""
+    with suppress(importlib.import_module("genicam.gentl").GenericException):
+        return str(getattr(device, what) or "")
+    return ""
+
+
+@contextmanager
+def _preserve_interrupt_handler() -> Iterator[None]:
+    """Restore the Ctrl-C handler, which harvesters replaces."""
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, handler)
+
+
+def feature_type(node: Any) -> str:
+    """Return Boolean, Enumeration, String, Integer, Float, or another of GenApi's interface types."""
+    genapi = importlib.import_module("genicam.genapi")
+    principal = node.node.principal_interface_type
+    return next((kind for kind in _KINDS if principal == getattr(genapi.EInterfaceType, f"intfI{kind}")), "unknown")
+
+
+class NodeMapCamera:
+    """A camera's features through GenApi's node map, with the methods of `Aravis.Camera` that this driver calls.
+
+    Each may raise GenApi's and GenTL's errors.
+
+    Parameters
+    ----------
+    name
+        Name of the camera, for messages.
+    nodes
+        Its `NodeMap`.
+    device
+        The producer's description of the device.
+    """
+
+    def __init__(self, name: str, nodes: Any, device: Any) -> None:
+        self._name = name
+        self._nodes = nodes
+        self._device = device
+        self._access = importlib.import_module("genicam.genapi").EAccessMode
+
+    def node(self, feature: str) -> Any:
+        """Return a feature's node. Raises UnsupportedByDeviceError if the camera has no such feature."""
+        if not self._nodes.has_node(feature):
+            message = (
+                f"camera '{self._name}' has no feature {feature}, which the gentl driver needs; use another camera"
+            )
+            raise UnsupportedByDeviceError(message)
+        return self._nodes.get_node(feature)
+
+    def is_feature_available(self, feature: str) -> bool:
+        return self._nodes.has_node(feature) and self._is_offered(self.node(feature))
+
+    def dup_available_enumerations_as_strings(self, feature: str) -> list[str]:
+        return [entry.symbolic for entry in self.node(feature).entries if self._is_offered(entry)]
+
+    def get_string(self, feature: str) -> str:
+        return str(self._read(feature))
+
+    def set_string(self, feature: str, value: str) -> None:
+        self.node(feature).value = value
+
+    def get_boolean(self, feature: str) -> bool:
+        return bool(self._read(feature))
+
+    set_boolean = set_integer = set_float = set_string
+
+    def get_integer(self, feature: str) -> int:
+        return int(self._read(feature))
+
+    def get_integer_bounds(self, feature: str) -> tuple[int, int]:
+        node = self.node(feature)
+        return int(node.min), int(node.max)
+
+    def get_integer_increment(self, feature: str) -> int:
+        return int(self.node(feature).inc)
+
+    def get_float(self, feature: str) -> float:
+        return float(self._read(feature))
+
+    def get_float_bounds(self, feature: str) -> tuple[float, float]:
+        node = self.node(feature)
+        return float(node.min), float(node.max)
+
+    def execute_command(self, feature: str) -> None:
+        self.node(feature).execute()
+
+    def stop_acquisition(self) -> None:
+        for feature, stop in (("AcquisitionStop", self.execute_command), ("TLParamsLocked", self._unlock)):
+            if self.is_feature_available(feature):
+                stop(feature)
+
+    def get_width_bounds(self) -> tuple[int, int]:
+        return self.get_integer_bounds("Width")
+
+    def get_height_bounds(self) -> tuple[int, int]:
+        return self.get_integer_bounds("Height")
+
+    def get_exposure_time(self) -> float:
+        return self.get_float(self._first(EXPOSURE_US))
+
+    def get_exposure_time_bounds(self) -> tuple[float, float]:
+        return self.get_float_bounds(self._first(EXPOSURE_US))
+
+    def set_exposure_time(self, exposure_us: float) -> None:
+        self._set_number(self._first(EXPOSURE_US), exposure_us)
+
+    def is_gain_available(self) -> bool:
+        return any(map(self.is_feature_available, GAIN))
+
+    def get_gain(self) -> float:
+        return self.get_float(self._first(GAIN))
+
+    def get_gain_bounds(self) -> tuple[float, float]:
+        return self.get_float_bounds(self._first(GAIN))
+
+    def set_gain(self, gain: float) -> None:
+        self._set_number(self._first(GAIN), gain)
+
+    def is_software_trigger_supported(self) -> bool:
+        source = "TriggerSource"
+        return (
+            self._nodes.has_node("TriggerSoftware")
+            and self.is_feature_available(source)
+            and "Software" in self.dup_available_enumerations_as_strings(source)
+        )
+
+    def software_trigger(self) -> None:
+        self.execute_command("TriggerSoftware")
+
+    def get_payload(self) -> int:
+        return self.get_integer("PayloadSize")
+
+    def get_vendor_name(self) -> str:
+        return str(self._device.vendor)
+
+    def get_model_name(self) -> str:
+        return str(self._device.model)
+
+    def get_device_serial_number(self) -> str:
+        return str(self._device.serial_number)
+
+    def get_device_id(self) -> str:
+        return str(self._device.id_)
+
+    def _read(self, feature: str) -> Any:
+        # Bypass the node map's cache: a camera may have adjusted the written value.
+        verify, ignore_cache = False, True
+        return self.node(feature).get_value(verify, ignore_cache)
+
+    def _unlock(self, feature: str) -> None:
+        self.node(feature).value = 0
+
+    def _set_number(self, feature: str, value: float) -> None:
+        node = self.node(feature)
+        node.value = round(value) if feature_type(node) == "Integer" else value
+
+    def _first(self, features: tuple[str, ...]) -> str:
+        """Return the first feature that the camera offers, or the first of all if it offers none."""
+        return next(filter(self.is_feature_available, features), features[0])
+
+    def _is_offered(self, node: Any) -> bool:
+        return node.get_access_mode() in {self._access.WO, self._access.RO, self._access.RW}
+
+
+class GentlConnection(GenICamConnection):
     """An open device.
 
     Parameters
     ----------
     name
-        The camera's, for messages.
+        Name of the camera, for messages.
     options
         `GentlOptions`.
     folder
-        Where the producer's path counts from.
+        Folder to which the producer's path is relative.
 
     Raises
     ------
     LibraryMissingError
-        harvesters is not installed, or there is no producer.
+        harvesters is not installed, or no producer is found.
     DeviceGoneError
         No such camera answers.
     DeviceBusyError
@@ -51,57 +381,57 @@ class GentlConnection(Connection):
 
     def __init__(self, name: str, options: GentlOptions, folder: Path) -> None:
         super().__init__(name)
-        producers.core()
-        files = producers.producer_files() if options.producer is None else ((folder / options.producer).resolve(),)
+        load_harvesters()
+        files = producer_files() if options.producer is None else ((folder / options.producer).resolve(),)
         if not files:
             message = (
-                f"camera '{name}': no GenTL producer is known; install the one that comes with the camera, and write "
-                f"the path of its .cti file as producer, or set {producers.PATHS} to its folder"
+                f"camera '{name}': no GenTL producer found; install the one that comes with the camera, and write "
+                f"the path of its .cti file as producer, or set {PATHS} to its folder"
             )
             raise LibraryMissingError(message, install="the camera maker's GenTL producer (a .cti file)")
-        self._file, self._acquirer = self._opened(files, options.device)
+        self._file, self._acquirer = self._find_device(files, options.device)
         self._camera = NodeMapCamera(name, self._acquirer.remote_device.node_map, self._acquirer.device)
 
-    def told(self, doing: str) -> AbstractContextManager[None]:
-        """See `Connection`."""
-        return producers.told(self.name, doing)
+    def translate_errors(self, doing: str) -> AbstractContextManager[None]:
+        """See `GenICamConnection`."""
+        return translate_gentl_errors(self.name, doing)
 
-    def kind(self, feature: str) -> str:
-        """See `Connection`."""
-        with self.asking(f"feature {feature}") as camera:
-            return kind_of(camera.node(feature))
+    def feature_type(self, feature: str) -> str:
+        """See `GenICamConnection`."""
+        with self.access(f"feature {feature}") as camera:
+            return feature_type(camera.node(feature))
 
-    def start(self, buffers: int) -> Stream:
-        """See `Connection`. The producer's queue is emptied when an acquisition ends."""
-        with self.asking("starting"):
+    def start(self, buffers: int) -> GenICamStream:
+        """See `GenICamConnection`. The producer's queue is emptied when an acquisition ends."""
+        with self.access("starting"):
             self._acquirer.num_buffers = max(buffers, self._acquirer.min_num_buffers)
             self._acquirer.start()
         return GentlStream(self, self._acquirer, self._lost)
 
     def close(self) -> None:
-        """See `Connection`."""
+        """See `GenICamConnection`."""
         if not self.state.close():
             return
         acquirer, self._acquirer, self._camera = self._acquirer, None, None
         with suppress(Exception):
             acquirer.destroy()
-        producers.release(self._file)
+        release_producer(self._file)
 
-    def _opened(self, files: tuple[Path, ...], device: str) -> tuple[Path, Any]:
-        """The producer that has the device, which is then in use, and the device's acquirer."""
+    def _find_device(self, files: tuple[Path, ...], device: str) -> tuple[Path, Any]:
+        """Return the producer that has the device, acquired, and the device's acquirer."""
         known = []
         for file in files:
-            producer = producers.take(file)
+            producer = acquire_producer(file)
             try:
                 for found in producer.devices:
-                    if device in {found.id_, producers.told_by(found, "serial_number")}:
-                        with self.told(f"opening {device}"):
+                    if device in {found.id_, device_field(found, "serial_number")}:
+                        with self.translate_errors(f"opening {device}"):
                             return file, producer.acquirer(found)
                     known.append(found.id_)
             except BaseException:
-                producers.release(file)
+                release_producer(file)
                 raise
-            producers.release(file)
+            release_producer(file)
         message = (
             f"camera '{self.name}': no GenTL camera '{device}' answers; found: {', '.join(known) or 'none'} (by "
             f"{', '.join(file.name for file in files)}). Check cable and power, and close the maker's viewer"
@@ -110,50 +440,50 @@ class GentlConnection(Connection):
 
 
 class GentlStream:
-    """Implements `Stream` on an acquisition that runs.
+    """Implements `GenICamStream` on a running acquisition.
 
     Parameters
     ----------
     connection
-        Whose it is.
+        The connection that started it.
     acquirer
         harvesters' `ImageAcquirer`.
     lost
-        Set when frames cannot be asked for any more.
+        Set when no more frames can be requested.
     """
 
     def __init__(self, connection: GentlConnection, acquirer: Any, lost: threading.Event) -> None:
         self._acquirer = acquirer
         self._lost = lost
-        self._told = connection.told
-        self._came: queue.SimpleQueue[Delivery] = queue.SimpleQueue()
+        self._translate_errors = connection.translate_errors
+        self._delivered: queue.SimpleQueue[RawFrame] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._pump, name=f"frames of {connection.name}", daemon=True)
         self._thread.start()
 
-    def take(self, most_s: float) -> Delivery | None:
-        """See `Stream`."""
+    def take(self, max_s: float) -> RawFrame | None:
+        """See `GenICamStream`."""
         try:
-            return self._came.get(timeout=most_s) if most_s > 0 else self._came.get_nowait()
+            return self._delivered.get(timeout=max_s) if max_s > 0 else self._delivered.get_nowait()
         except queue.Empty:
             return None
 
     def end(self) -> None:
-        """See `Stream`."""
+        """See `GenICamStream`."""
         self._ending.set()
         self._thread.join()
-        # A camera that is lost only now is told of by the next call that needs it.
-        with suppress(DeviceError), self._told("stopping"):
+        # If the camera is lost only now, the next call that needs it reports that.
+        with suppress(DeviceError), self._translate_errors("stopping"):
             self._acquirer.stop()
 
     def _pump(self) -> None:
         while not self._ending.is_set():
             try:
-                with self._told("taking a frame"):
-                    # Frames that are not whole do not come; they are counted by the gap that they leave.
+                with self._translate_errors("taking a frame"):
+                    # Incomplete frames are not delivered; the gap in the numbers counts them.
                     buffer = self._acquirer.try_fetch(timeout=_ASK_S, is_raw=True)
                     if buffer is not None:
-                        self._came.put(_delivery(buffer, time.monotonic_ns()))
+                        self._delivered.put(_read_buffer(buffer, time.monotonic_ns()))
                         buffer.parent.queue_buffer(buffer)
                         continue
             except DeviceError:
@@ -162,18 +492,29 @@ class GentlStream:
             self._ending.wait(_LOOK_S)
 
 
-def _delivery(buffer: Any, arrived_ns: int) -> Delivery:
-    """A frame that came whole, with what its producer tells of it."""
-    width_px = _asked(buffer, "width", 0)
-    height_px = _asked(buffer, "delivered_image_height", 0) or _asked(buffer, "height", 0)
+def _read_buffer(buffer: Any, arrived_ns: int) -> RawFrame:
+    """Read a complete frame and its metadata."""
+    width_px = _buffer_field(buffer, "width", 0)
+    height_px = _buffer_field(buffer, "delivered_image_height", 0) or _buffer_field(buffer, "height", 0)
     image = None
     if width_px and height_px:
-        data = bytes(memoryview(buffer.raw_buffer)[_asked(buffer, "image_offset", 0) :])
-        image = Memory(data, Size(width_px, height_px), _asked(buffer, "padding_x", 0))
-    return Delivery(buffer.frame_id, arrived_ns, _asked(buffer, "timestamp_ns", 0), image)
+        data = bytes(memoryview(buffer.raw_buffer)[_buffer_field(buffer, "image_offset", 0) :])
+        image = RawImage(data, Size(width_px, height_px), _buffer_field(buffer, "padding_x", 0))
+    return RawFrame(buffer.frame_id, arrived_ns, _buffer_field(buffer, "timestamp_ns", 0), image)
 
 
-def _asked(buffer: Any, what: str, otherwise: int) -> int:
+def _buffer_field(buffer: Any, what: str, otherwise: int) -> int:
     with suppress(importlib.import_module("genicam.gentl").GenericException):
         return int(getattr(buffer, what))
     return otherwise
+
+
+def find_gentl_devices() -> tuple[FoundDevice, ...]:
+    """List every camera that an installed GenTL producer sees. Opens none.
+
+    Raises
+    ------
+    LibraryMissingError
+        harvesters is not installed.
+    """
+    return tuple(FoundDevice("gentl", identity, label) for identity, label in list_gentl_cameras())

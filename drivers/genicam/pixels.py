@@ -1,4 +1,4 @@
-"""Pixel formats of the PFNC (Pixel Format Naming Convention): what the camera sends, in grey and in colour."""
+"""Pixel formats of the PFNC (Pixel Format Naming Convention), decoded to grey and to colour."""
 
 from __future__ import annotations
 
@@ -15,56 +15,7 @@ from slrig.model import Pixels, Size
 Bytes = NDArray[np.uint8]
 
 
-class Packing(Enum):
-    """How samples lie in memory: each in 8 or 16 bits (little endian, right aligned), or packed.
-
-    `LSB` is PFNC's "p": a stream of bits, least significant first. `GIGE` is GigE Vision's "Packed": of two samples,
-    the high bits are bytes 0 and 2, their low bits share byte 1.
-    """
-
-    BYTE = 1
-    WORD = 2
-    LSB = 3
-    GIGE = 4
-
-
-@dataclass(frozen=True, slots=True)
-class PixelFormat:
-    """A format: bits per sample, packing, and the colours. `mosaic` is "" for grey, RGGB and its like, RGB or BGR."""
-
-    name: str
-    bit_depth: int
-    packing: Packing
-    mosaic: str = ""
-
-    @property
-    def samples(self) -> int:
-        """Samples per pixel."""
-        return 3 if self.mosaic in {"RGB", "BGR"} else 1
-
-    def size_bytes(self, size: Size) -> int:
-        """How many bytes an image takes."""
-        count = size.width_px * size.height_px * self.samples
-        bits = {Packing.BYTE: 8, Packing.WORD: 16, Packing.LSB: self.bit_depth, Packing.GIGE: 12}[self.packing]
-        return -(-count * bits // 8)
-
-
-def _formats() -> Mapping[str, PixelFormat]:
-    mosaics = {"Mono": "", "BayerRG": "RGGB", "BayerGR": "GRBG", "BayerGB": "GBRG", "BayerBG": "BGGR"}
-    found = []
-    for family, mosaic in mosaics.items():
-        found.append(PixelFormat(f"{family}8", 8, Packing.BYTE, mosaic))
-        found += [PixelFormat(f"{family}{depth}", depth, Packing.WORD, mosaic) for depth in (10, 12, 14, 16)]
-        found += [PixelFormat(f"{family}{depth}p", depth, Packing.LSB, mosaic) for depth in (10, 12)]
-        found += [PixelFormat(f"{family}{depth}Packed", depth, Packing.GIGE, mosaic) for depth in (10, 12)]
-    found += [PixelFormat("RGB8", 8, Packing.BYTE, "RGB"), PixelFormat("BGR8", 8, Packing.BYTE, "BGR")]
-    return {form.name: form for form in found}
-
-
-FORMATS: Mapping[str, PixelFormat] = _formats()
-"""Every format that the driver reads, by its PFNC name."""
-
-_GREY = {
+_GREY_CONVERSIONS = {
     "RGGB": cv2.COLOR_BayerRGGB2GRAY,
     "GRBG": cv2.COLOR_BayerGRBG2GRAY,
     "GBRG": cv2.COLOR_BayerGBRG2GRAY,
@@ -74,33 +25,95 @@ _GREY = {
 }
 
 
-def grey(data: bytes, form: PixelFormat, size: Size, *, padding_bytes: int = 0, in_colour: bool = False) -> Pixels:
-    """(H, W) uint8 or uint16: the image in a buffer; in_colour : (H, W, 3), blue, green and red, of a format that is
-    not grey.
+class SamplePacking(Enum):
+    """Layout of samples in memory: each in 8 or 16 bits (little endian, right aligned), or packed.
 
-    A colour filter's mosaic is interpolated and weighted as luma (OpenCV), so a mono camera sees sharper. Samples
-    beyond the bit depth are cut off; `padding_bytes` follow every row of an unpacked format.
+    `LSB` is PFNC's "p": a stream of bits, least significant first. `GIGE` is GigE Vision's "Packed": of two samples,
+    the high bits are bytes 0 and 2, and their low bits share byte 1.
+    """
+
+    BYTE = 1
+    WORD = 2
+    LSB = 3
+    GIGE = 4
+
+
+@dataclass(frozen=True, slots=True)
+class PfncFormat:
+    """Format: bits per sample, packing, and colours. `mosaic` is "" for grey, a Bayer pattern such as RGGB, or RGB or
+    BGR.
+    """
+
+    name: str
+    bit_depth: int
+    packing: SamplePacking
+    mosaic: str = ""
+
+    @property
+    def samples(self) -> int:
+        """Samples per pixel."""
+        return 3 if self.mosaic in {"RGB", "BGR"} else 1
+
+    def size_bytes(self, size: Size) -> int:
+        """Number of bytes of an image."""
+        count = size.width_px * size.height_px * self.samples
+        bits = {
+            SamplePacking.BYTE: 8,
+            SamplePacking.WORD: 16,
+            SamplePacking.LSB: self.bit_depth,
+            SamplePacking.GIGE: 12,
+        }[self.packing]
+        return -(-count * bits // 8)
+
+
+def _build_formats() -> Mapping[str, PfncFormat]:
+    mosaics = {"Mono": "", "BayerRG": "RGGB", "BayerGR": "GRBG", "BayerGB": "GBRG", "BayerBG": "BGGR"}
+    found = []
+    for family, mosaic in mosaics.items():
+        found.append(PfncFormat(f"{family}8", 8, SamplePacking.BYTE, mosaic))
+        found += [PfncFormat(f"{family}{depth}", depth, SamplePacking.WORD, mosaic) for depth in (10, 12, 14, 16)]
+        found += [PfncFormat(f"{family}{depth}p", depth, SamplePacking.LSB, mosaic) for depth in (10, 12)]
+        found += [PfncFormat(f"{family}{depth}Packed", depth, SamplePacking.GIGE, mosaic) for depth in (10, 12)]
+    found += [PfncFormat("RGB8", 8, SamplePacking.BYTE, "RGB"), PfncFormat("BGR8", 8, SamplePacking.BYTE, "BGR")]
+    return {form.name: form for form in found}
+
+
+FORMATS: Mapping[str, PfncFormat] = _build_formats()
+"""Every supported format by its PFNC name."""
+
+
+def decode_pixels(
+    data: bytes, form: PfncFormat, size: Size, *, padding_bytes: int = 0, in_colour: bool = False
+) -> Pixels:
+    """Decode the image in a buffer: (H, W) uint8 or uint16, or with in_colour (H, W, 3), blue, green and red.
+
+    A Bayer mosaic is interpolated and converted to luma (OpenCV), so a mono camera is sharper. Samples beyond the bit
+    depth are clipped; `padding_bytes` follow every row of an unpacked format.
 
     Raises
     ------
     ValueError
         The buffer is too short, or pads the rows of a packed format.
     """
-    if form.packing in {Packing.LSB, Packing.GIGE}:
+    if form.packing in {SamplePacking.LSB, SamplePacking.GIGE}:
         if padding_bytes:
             message = f"{form.name}: rows are padded by {padding_bytes} bytes, which a packed format cannot be"
             raise ValueError(message)
-        packed = _bytes(data, form.size_bytes(size), form)
-        flat = _lsb(packed, form.bit_depth) if form.packing is Packing.LSB else _gige(packed, form.bit_depth)
+        packed = _take_bytes(data, form.size_bytes(size), form)
+        flat = (
+            _unpack_lsb(packed, form.bit_depth)
+            if form.packing is SamplePacking.LSB
+            else _unpack_gige(packed, form.bit_depth)
+        )
         image: Pixels = flat[: size.width_px * size.height_px].reshape(size.shape)
     else:
         row_bytes = size.width_px * form.samples * form.packing.value
         stride = row_bytes + padding_bytes
-        raw = _bytes(data, stride * size.height_px - padding_bytes, form)
+        raw = _take_bytes(data, stride * size.height_px - padding_bytes, form)
         # The last row need not be padded.
         padded = np.concatenate([raw, np.zeros(padding_bytes, np.uint8)]) if padding_bytes else raw
         rows = np.ascontiguousarray(padded.reshape(size.height_px, stride)[:, :row_bytes])
-        if form.packing is Packing.WORD:
+        if form.packing is SamplePacking.WORD:
             image = np.minimum(rows.view("<u2"), np.uint16(2**form.bit_depth - 1))
         else:
             image = rows
@@ -109,37 +122,37 @@ def grey(data: bytes, form: PixelFormat, size: Size, *, padding_bytes: int = 0, 
     if form.samples > 1:
         image = image.reshape(*size.shape, form.samples)
     if not in_colour:
-        return np.asarray(cv2.cvtColor(image, _GREY[form.mosaic]))
+        return np.asarray(cv2.cvtColor(image, _GREY_CONVERSIONS[form.mosaic]))
     if form.samples > 1:
         return image if form.mosaic == "BGR" else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_Bayer{form.mosaic}2BGR")))
 
 
-def _bytes(data: bytes, count: int, form: PixelFormat) -> Bytes:
+def _take_bytes(data: bytes, count: int, form: PfncFormat) -> Bytes:
     if len(data) < count:
         message = f"{form.name}: expected {count} bytes, found {len(data)}"
         raise ValueError(message)
     return np.frombuffer(data, np.uint8, count)
 
 
-def _groups(packed: Bytes, group: int) -> NDArray[np.uint16]:
-    """(n, group) uint16: the bytes in groups that hold whole samples; the last is filled up with zeros."""
+def _byte_groups(packed: Bytes, group: int) -> NDArray[np.uint16]:
+    """(n, group) uint16: the bytes in groups of whole samples; the last group is padded with zeros."""
     short = -len(packed) % group
     whole = np.concatenate([packed, np.zeros(short, np.uint8)]) if short else packed
     return whole.reshape(-1, group).astype(np.uint16)
 
 
-def _lsb(packed: Bytes, bit_depth: int) -> NDArray[np.uint16]:
+def _unpack_lsb(packed: Bytes, bit_depth: int) -> NDArray[np.uint16]:
     if bit_depth == 12:
-        low, middle, high = _groups(packed, 3).T
+        low, middle, high = _byte_groups(packed, 3).T
         return np.stack([low | (middle & 0x0F) << 8, middle >> 4 | high << 4], axis=1).ravel()
-    a, b, c, d, e = _groups(packed, 5).T
+    a, b, c, d, e = _byte_groups(packed, 5).T
     samples = [a | (b & 0x03) << 8, b >> 2 | (c & 0x0F) << 6, c >> 4 | (d & 0x3F) << 4, d >> 6 | e << 2]
     return np.stack(samples, axis=1).ravel()
 
 
-def _gige(packed: Bytes, bit_depth: int) -> NDArray[np.uint16]:
-    first, low, second = _groups(packed, 3).T
+def _unpack_gige(packed: Bytes, bit_depth: int) -> NDArray[np.uint16]:
+    first, low, second = _byte_groups(packed, 3).T
     bits = bit_depth - 8
     mask = (1 << bits) - 1
     return np.stack([first << bits | low & mask, second << bits | low >> 4 & mask], axis=1).ravel()

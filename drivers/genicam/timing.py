@@ -1,14 +1,14 @@
-"""When an exposure began, on CLOCK_MONOTONIC, from what a camera and the network tell; values and arithmetic only.
+"""Start of exposures on CLOCK_MONOTONIC, from the camera's time stamps and the frames' arrivals; arithmetic only.
 
-Three things are known, each as an interval that certainly holds the truth:
+Three facts are known, each as an interval that certainly contains the true instant:
 
 - the frame's first packet arrived after the exposure ended: start ≤ arrival - exposure;
 - a software trigger cannot be answered before it is sent: start ≥ the beginning of the call;
-- the camera's own time stamp, once its clock is tied to the host's: by latching it between two looks at the host's
-  clock, by the triggers and arrivals of the frames before, or both. A crystal may be off by `DRIFT`.
+- the camera's own time stamp, once its clock is related to the host's: by latching it between two readings of the
+  host's clock, by the triggers and arrivals of earlier frames, or both. A crystal may be off by `DRIFT`.
 
-What is not known is for how long a frame may lie in the camera before it is sent; `transfer_ns` bounds that for
-exposures that nobody asked for, `answer_ns` for those that a software trigger asked for.
+The time that a frame stays in the camera before it is sent is unknown; `transfer_ns` bounds it for exposures without a
+trigger of the host, `answer_ns` for those of a software trigger.
 """
 
 from __future__ import annotations
@@ -16,40 +16,41 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 DRIFT = 1e-4
-"""How far a camera's clock may run from the host's: crystals are good to 50 parts per million each."""
+"""Largest relative rate difference of the camera's clock from the host's: crystals are good to 50 parts per million
+each."""
 
-_EVER_NS = 1 << 62
-_FORGOTTEN = 4
+_FOREVER_NS = 1 << 62
+_EXPIRY_FACTOR = 4
 _HALF = 1 << 15
 _GIGE_IDS = (1 << 16) - 1
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """From `least_ns` to `most_ns`; empty if that is backwards."""
+    """From `min_ns` to `max_ns`; empty if min_ns is larger."""
 
-    least_ns: int
-    most_ns: int
+    min_ns: int
+    max_ns: int
 
     def __and__(self, other: Interval) -> Interval:
-        return Interval(max(self.least_ns, other.least_ns), min(self.most_ns, other.most_ns))
+        return Interval(max(self.min_ns, other.min_ns), min(self.max_ns, other.max_ns))
 
     @property
-    def empty(self) -> bool:
-        """Whether no instant lies in it."""
-        return self.least_ns > self.most_ns
+    def is_empty(self) -> bool:
+        """True if the interval contains no instant."""
+        return self.min_ns > self.max_ns
 
 
 class FrameNumbers:
-    """Frame ids, unwrapped into numbers that count from 0 with the first frame of a session.
+    """Unwraps frame ids into numbers that count from 0 with the first frame of an acquisition.
 
-    GigE Vision counts blocks from 1 to 65535 and on with 1; its extended ids and USB3 Vision have 64 bits.
+    GigE Vision counts blocks from 1 to 65535 and then from 1 again; its extended ids and USB3 Vision have 64 bits.
     """
 
     def __init__(self) -> None:
         self._last: int | None = None
         self._number = 0
-        self.made = 0
+        self.frame_count = 0
 
     def next(self, block_id: int) -> int | None:
         """Return the number of a frame; None for one that repeats or precedes the last."""
@@ -65,17 +66,17 @@ class FrameNumbers:
             self._last = last
             return None
         self._number += step
-        self.made = self._number + 1
+        self.frame_count = self._number + 1
         return self._number
 
 
 class StartClock:
-    """A camera's clock tied to the host's: which start of exposure a time stamp means.
+    """Relates a camera's clock to the host's: start of exposure for a time stamp.
 
     Parameters
     ----------
     lag_ns
-        By how much a time stamp may be later than the start of its exposure.
+        Bounds of the delay of a time stamp after the start of its exposure.
     """
 
     def __init__(self, lag_ns: Interval) -> None:
@@ -84,59 +85,59 @@ class StartClock:
         self._offset: tuple[int, Interval] | None = None
 
     @property
-    def tied(self) -> bool:
-        """Whether the clock was latched: its word then counts more than that of the network."""
+    def is_tied(self) -> bool:
+        """True if the clock was latched; it is then more reliable than the network's timing."""
         return self._latched is not None
 
     def latch(self, looks: list[tuple[int, int, int]]) -> bool:
-        """Tie the clock by latches: host's time before, camera's time, host's time after, all ns; at least two.
+        """Relate the clocks by latches: host time before, camera time, host time after, all ns; at least two.
 
-        Return whether they agree; if not (a clock that stands, a stamp in other units) they are not used.
+        Return True if they agree; otherwise (a stopped clock, a stamp in other units) they are not used.
         """
-        offset, at_ns = Interval(-_EVER_NS, _EVER_NS), 0
+        offset, at_ns = Interval(-_FOREVER_NS, _FOREVER_NS), 0
         for before_ns, stamp_ns, after_ns in looks:
             at_ns = max(at_ns, stamp_ns)
-            seen = Interval(before_ns - stamp_ns, after_ns - stamp_ns)
-            offset &= Interval(seen.least_ns - self._lag_ns.most_ns, seen.most_ns - self._lag_ns.least_ns)
-        # Without the play of the lag: two looks at a clock that stands are farther apart than each is long.
+            observed = Interval(before_ns - stamp_ns, after_ns - stamp_ns)
+            offset &= Interval(observed.min_ns - self._lag_ns.max_ns, observed.max_ns - self._lag_ns.min_ns)
+        # Without the lag's uncertainty: latches of a stopped clock contradict each other.
         bare = Interval(
             max(before_ns - stamp_ns for before_ns, stamp_ns, _ in looks),
             min(after_ns - stamp_ns for _, stamp_ns, after_ns in looks),
         )
         moved = len({stamp_ns for _, stamp_ns, _ in looks}) == len(looks) > 1
-        if bare.empty or not moved:
+        if bare.is_empty or not moved:
             return False
         self._latched = self._offset = (at_ns, offset)
         return True
 
     def learn(self, stamp_ns: int, start: Interval) -> None:
-        """Tie the clock closer by a frame whose start is known otherwise; do not learn from a contradiction."""
-        offset = Interval(start.least_ns - stamp_ns, start.most_ns - stamp_ns)
+        """Narrow the relation by a frame whose start is known otherwise; ignore a contradiction."""
+        offset = Interval(start.min_ns - stamp_ns, start.max_ns - stamp_ns)
         if self._offset is not None:
-            offset &= self._drifted(stamp_ns, self._offset)
-        if not offset.empty:
+            offset &= self._with_drift(stamp_ns, self._offset)
+        if not offset.is_empty:
             self._offset = (stamp_ns, offset)
 
     def forget(self) -> None:
-        """Go back to what the latches said."""
+        """Return to the relation known from the latches."""
         self._offset = self._latched
 
     def start(self, stamp_ns: int) -> Interval:
-        """When the exposure with this stamp began, as far as the clock can tell."""
+        """Return the start of the exposure with this stamp, as known from the clock."""
         if self._offset is None:
-            return Interval(-_EVER_NS, _EVER_NS)
-        offset = self._drifted(stamp_ns, self._offset)
-        return Interval(offset.least_ns + stamp_ns, offset.most_ns + stamp_ns)
+            return Interval(-_FOREVER_NS, _FOREVER_NS)
+        offset = self._with_drift(stamp_ns, self._offset)
+        return Interval(offset.min_ns + stamp_ns, offset.max_ns + stamp_ns)
 
-    def _drifted(self, stamp_ns: int, offset: tuple[int, Interval]) -> Interval:
+    def _with_drift(self, stamp_ns: int, offset: tuple[int, Interval]) -> Interval:
         at_ns, known = offset
         play_ns = round(DRIFT * abs(stamp_ns - at_ns))
-        return Interval(known.least_ns - play_ns, known.most_ns + play_ns)
+        return Interval(known.min_ns - play_ns, known.max_ns + play_ns)
 
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """What came with a frame: its number, the camera's time stamp (None: not to be used), and its first packet."""
+    """A frame's number, the camera's time stamp (None: do not use), and the arrival of its first packet."""
 
     number: int
     stamp_ns: int | None
@@ -144,7 +145,7 @@ class Arrival:
 
 
 class UntriggeredStarts:
-    """Starts of exposures that the host did not ask for: a free-running camera, or one triggered by wire."""
+    """Starts of exposures that the host did not trigger: free-running, or triggered by wire."""
 
     def __init__(self, exposure_ns: int, transfer_ns: int, clock: StartClock) -> None:
         self._exposure_ns = exposure_ns
@@ -152,26 +153,25 @@ class UntriggeredStarts:
         self._clock = clock
 
     def start(self, frame: Arrival) -> Interval | None:
-        """When the exposure began; None if the camera's clock contradicts the frame's arrival."""
+        """Return the start of the exposure; None if the camera's clock contradicts the frame's arrival."""
         latest_ns = frame.arrived_ns - self._exposure_ns
         if frame.stamp_ns is None:
             return Interval(latest_ns - self._transfer_ns, latest_ns)
-        # A frame may come late and never early, so the quickest ones tie the clock from above.
-        self._clock.learn(frame.stamp_ns, Interval(-_EVER_NS, latest_ns))
-        start = self._clock.start(frame.stamp_ns) & Interval(-_EVER_NS, latest_ns)
-        if not self._clock.tied:
-            start &= Interval(start.most_ns - self._transfer_ns, _EVER_NS)
-        return None if start.empty else start
+        # A frame may arrive late and never early, so the fastest frames bound the clock from above.
+        self._clock.learn(frame.stamp_ns, Interval(-_FOREVER_NS, latest_ns))
+        start = self._clock.start(frame.stamp_ns) & Interval(-_FOREVER_NS, latest_ns)
+        if not self._clock.is_tied:
+            start &= Interval(start.max_ns - self._transfer_ns, _FOREVER_NS)
+        return None if start.is_empty else start
 
 
 class TriggeredStarts:
     """Starts of exposures that software triggers began.
 
-    Frames answer triggers in order, and a frame that was lost on its way answered one, too: its number is missing. A
-    camera may ignore a trigger, so frame n may answer the nth or a later one. The earliest that is possible is taken;
-    where that is too early for a reader, the frame is only thought to be older than it is. A trigger is not possible
-    any more when it is four times as old as an answer may be, or when the camera answered after it and then kept
-    silent for as long as an answer may take.
+    Frames answer triggers in order; a lost frame answered one as well, and its number is missing. A camera may ignore a
+    trigger, so frame n may answer the nth or a later one. The earliest possible trigger is assumed: at worst a frame is
+    taken for older than it is. A trigger expires when it is four times as old as an answer may be, or when the camera
+    answered after it and was then silent for as long as an answer may take.
     """
 
     def __init__(self, exposure_ns: int, answer_ns: int, clock: StartClock) -> None:
@@ -180,36 +180,36 @@ class TriggeredStarts:
         self._clock = clock
         self._triggers: list[Interval] = []
         self._answered = -1
-        self._heard = -1
+        self._last_known = -1
         self._closed = -1
         self._number = -1
 
-    def triggered(self, begun_ns: int, ended_ns: int, *, times: int = 1) -> None:
-        """Note a trigger, and how often it may have been sent."""
-        if self.owed_ns(begun_ns) <= 0:
-            self._closed = self._heard
+    def note_trigger(self, begun_ns: int, ended_ns: int, *, times: int = 1) -> None:
+        """Note a trigger, and how many times it may have been sent."""
+        if self.answer_due_ns(begun_ns) <= 0:
+            self._closed = self._last_known
         self._triggers += [Interval(begun_ns, ended_ns)] * times
 
-    def owed_ns(self, now_ns: int) -> int:
-        """For how long the answer to a trigger may still come; 0 or less if none is due."""
+    def answer_due_ns(self, now_ns: int) -> int:
+        """Remaining time in which the answer to a trigger may arrive; 0 or less if none is due."""
         unanswered = self._triggers[max(self._answered, self._closed) + 1 :]
-        last_ns = max((trigger.most_ns for trigger in unanswered), default=-_EVER_NS)
+        last_ns = max((trigger.max_ns for trigger in unanswered), default=-_FOREVER_NS)
         return last_ns + self._exposure_ns + self._answer_ns - now_ns
 
     def start(self, frame: Arrival) -> Interval | None:
-        """When the exposure began; None if the frame answers no trigger."""
+        """Return the start of the exposure; None if the frame answers no trigger."""
         first = max(self._answered + frame.number - self._number, self._closed + 1)
         self._number = frame.number
-        self._heard = len(self._triggers) - 1
+        self._last_known = len(self._triggers) - 1
         latest_ns = frame.arrived_ns - self._exposure_ns
         for index in range(first, len(self._triggers)):
             trigger = self._triggers[index]
-            if trigger.most_ns < latest_ns - _FORGOTTEN * self._answer_ns:
+            if trigger.max_ns < latest_ns - _EXPIRY_FACTOR * self._answer_ns:
                 continue
-            start = Interval(trigger.least_ns, latest_ns)
+            start = Interval(trigger.min_ns, latest_ns)
             if frame.stamp_ns is not None:
                 start &= self._clock.start(frame.stamp_ns)
-            if not start.empty:
+            if not start.is_empty:
                 if frame.stamp_ns is not None:
                     self._clock.learn(frame.stamp_ns, start)
                 self._answered = index

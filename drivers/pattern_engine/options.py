@@ -1,4 +1,4 @@
-"""What a rig file says of the light of a pattern engine."""
+"""Options for the light of a pattern engine in the rig file."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from slrig.model import Pattern, Primary
 Share = Annotated[float, Field(gt=0, le=1)]
 
 
-class Colour(IntEnum):
-    """LEDs of a pattern, as the pattern table has them: bit 0 red, 1 green, 2 blue."""
+class LedColour(IntEnum):
+    """LEDs of a pattern, as in the pattern table: bit 0 red, 1 green, 2 blue."""
 
     RED = 1
     GREEN = 2
@@ -26,34 +26,34 @@ class Colour(IntEnum):
 
 
 class LightOptions(Strict, use_attribute_docstrings=True):
-    """The keys of a `[projector]` table that pattern engines have in common."""
+    """The keys of a `[projector]` table common to all pattern engines."""
 
     device: Annotated[str, Field(min_length=1)] | None = None
-    """What `slrig devices` lists, or a path; else the only engine that is plugged in."""
+    """A name as listed by `slrig devices`, or a path; default: the only engine that is plugged in."""
 
     led: Literal["white", "red", "green", "blue", "yellow", "cyan", "magenta"] = "white"
-    """The LEDs that patterns are lit with."""
+    """LEDs that light the patterns."""
 
     led_current: Share = 0.3
-    """Current of these LEDs, as a share of the board's most."""
+    """Current of these LEDs, as a fraction of the board's maximum."""
 
     led_current_limit: Share = 0.5
-    """No more current than this, whatever led_current says."""
+    """Upper limit of led_current."""
 
     duty_limit: Share = 1.0
-    """Light is on for no more than this share of the time while a sequence is played."""
+    """Largest fraction of the time with light while a sequence is played."""
 
     hold_s: Annotated[float, Field(ge=2, le=200)] = 30.0
-    """A shown pattern is held for this long, and dark 2 s later at the latest; so it is after its host has died."""
+    """A shown pattern is held for this long, and is dark at most 2 s later, also after its host has died."""
 
     light_margin_s: Annotated[float, Field(ge=0, le=1)] = 0.0005
-    """In a played sequence, light lasts this much longer than the exposure."""
+    """In a played sequence, the light exceeds the exposure by this time."""
 
     trigger_polarity: Literal["high", "low"] = "high"
-    """Which way the trigger output goes as the pattern's light begins: high, it rises; low, it falls."""
+    """Level of the trigger output when the pattern's light begins: "high" rises, "low" falls."""
 
     @model_validator(mode="after")
-    def _within_limits(self) -> Self:
+    def _check_current(self) -> Self:
         if self.led_current > self.led_current_limit:
             message = (
                 f"led_current is {self.led_current:g}, led_current_limit allows {self.led_current_limit:g}; lower the "
@@ -63,24 +63,24 @@ class LightOptions(Strict, use_attribute_docstrings=True):
         return self
 
     @property
-    def colour(self) -> Colour:
-        """The LEDs that patterns are lit with."""
-        return Colour[self.led.upper()]
+    def colour(self) -> LedColour:
+        """LEDs that light the patterns."""
+        return LedColour[self.led.upper()]
 
-    def colour_of(self, pattern: Pattern) -> Colour:
-        """The LEDs that a pattern is lit with."""
-        return Colour[pattern.colour.upper()] if isinstance(pattern, Primary) else self.colour
+    def led_colour(self, pattern: Pattern) -> LedColour:
+        """Return the LEDs of a pattern."""
+        return LedColour[pattern.colour.upper()] if isinstance(pattern, Primary) else self.colour
 
 
 class UsbLightOptions(LightOptions, use_attribute_docstrings=True):
-    """The same, of engines with a USB port."""
+    """The keys common to engines with a USB port."""
 
     led_current_inverted: bool | None = None
-    """True where 255 switches an LED off and 0 gives it the most current, with the polarity register at "normal"; false
-    on boards that are built as TI's guides say. `slrig doctor` finds it out. Until it is written here, led_current is
-    not used: light is 5 % of the board's most at the most, on average and whichever it is, and nothing is played."""
+    """True if 255 switches an LED off and 0 gives it the maximum current, with the polarity register at "normal"; false
+    on boards built according to TI's guides. `slrig doctor` determines it. Until it is set, led_current is not used:
+    the average light is at most 5 % of the board's maximum for either polarity, and nothing is played."""
 
     @property
     def current_byte(self) -> int:
-        """The current in 255ths of the most."""
+        """Current in 255ths of the maximum."""
         return round(self.led_current * 255)

@@ -1,7 +1,7 @@
-"""A recorded scan bundle as a rig: showing a pattern makes the cameras deliver the frames that were taken of it.
+"""A recorded scan bundle as a rig: showing a pattern makes the cameras deliver the frames recorded of it.
 
-A scan of it finds the times, exposures and images of the recording again, at any speed: see `ReplayClock`. Each scan
-begins the recording anew; a bracket (one sequence per exposure) goes on in it from one sequence to the next.
+A scan of it reproduces the times, exposures and images of the recording, at any speed: see `ReplayClock`. Each scan
+restarts the recording; a bracket (one sequence per exposure) continues in it from one sequence to the next.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import structlog
 from pydantic import Field, field_validator
 
-from drivers.replay.camera import ReplayCamera, Stage
+from drivers.replay.camera import ReplayCamera, ReplayState
 from drivers.replay.clock import ReplayClock
 from drivers.replay.projector import ReplayProjector
 from slrig.bundle import Bundle, read_bundle
@@ -33,14 +33,14 @@ class ReplayOptions(Strict, use_attribute_docstrings=True):
     """The `[head]` table of a replayed rig."""
 
     bundle: str = Field(min_length=1)
-    """The folder of the recording, from the rig file's own."""
+    """Folder of the recording, relative to the rig file's."""
 
     speed: float = 0.0
-    """1 takes as long as the recording did, 2 half of that, 0.05 to 1000; 0 goes as fast as the machine can."""
+    """Speed of the replay: 1 takes as long as the recording, 2 half of that, 0.05 to 1000; 0 is as fast as possible."""
 
     @field_validator("speed")
     @classmethod
-    def _possible(cls, speed: float) -> float:
+    def _check_speed(cls, speed: float) -> float:
         least, most = _SPEEDS
         if speed != 0 and not least <= speed <= most:
             message = f"expected 0, or {least:g} to {most:g} times the recording's own speed, found {speed:g}"
@@ -51,12 +51,12 @@ class ReplayOptions(Strict, use_attribute_docstrings=True):
 class ReplayHead:
     """Implements `slrig.devices.ScannerHead` on a recorded bundle.
 
-    `clock` says how fast, by default without a pace; all time stamps count in it.
+    `clock` sets the speed, by default as fast as possible; all time stamps count in it.
     """
 
     def __init__(self, bundle: Bundle, clock: ReplayClock | None = None) -> None:
         self.clock = clock = ReplayClock() if clock is None else clock
-        stage = Stage()
+        stage = ReplayState()
         self._calibration = bundle.calibration
         self._cameras = {name: ReplayCamera(name, bundle, clock, stage) for name in bundle.capture.cameras}
         self._projector = ReplayProjector(bundle, self._cameras, clock, stage)
@@ -73,11 +73,11 @@ class ReplayHead:
 
     @property
     def calibration(self) -> Calibration | None:
-        """See `ScannerHead`: the calibration that lies in the bundle."""
+        """See `ScannerHead`: the calibration in the bundle."""
         return self._calibration
 
     def truth(self) -> Truth | None:
-        """See `ScannerHead`. A recording knows its frames only."""
+        """See `ScannerHead`. A recording has frames only."""
         return None
 
 
@@ -89,21 +89,23 @@ def open_head(options: Mapping[str, object], folder: Path) -> ScannerHead:
     options
         `ReplayOptions`.
     folder
-        The rig file's own: the bundle's path counts from there.
+        Folder of the rig file: the bundle's path is relative to it.
 
     Raises
     ------
     ConfigError
-        The options have faults, all of them in one message, or there is no bundle.
+        The options have faults, all of them in one message, or the bundle does not exist.
     BundleError
         The bundle is damaged.
     CalibrationError
-        Its calibration is.
+        Its calibration is damaged.
     """
     table = validate(ReplayOptions, options, "the [head] table of a replayed rig")
     path = folder / table.bundle
     if not (path / "bundle.json").is_file():
-        message = f'[head] bundle = "{table.bundle}": {path} is no scan bundle (it has no bundle.json); name its folder'
+        message = (
+            f'[head] bundle = "{table.bundle}": {path} is not a scan bundle (it has no bundle.json); name its folder'
+        )
         raise ConfigError(message)
     bundle = read_bundle(path)
     if not bundle.capture.shots:

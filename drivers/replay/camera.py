@@ -1,4 +1,4 @@
-"""A camera of a recording: it delivers the frames that were taken of the pattern that is shown."""
+"""A camera of a recording: it delivers the frames recorded of the shown pattern."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from slrig.devices import COMPUTED_LIMITS, AppliedSettings, CameraInfo, CameraSe
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Black, Frame, Pattern, Shot
 
-_SAME_EXPOSURE = 0.01
+_EXPOSURE_TOLERANCE = 0.01
 
 
 @dataclass(slots=True)
-class Stage:
-    """What lies before the cameras: the pattern shown, and how often it was shown before in the sequence."""
+class ReplayState:
+    """The shown pattern, and how often it was shown before in the sequence."""
 
     shown: tuple[Pattern, int] | None = None
 
@@ -25,7 +25,7 @@ class Stage:
 class ReplayCamera:
     """Implements `slrig.devices.Camera` on one camera's recorded frames."""
 
-    def __init__(self, name: str, bundle: Bundle, clock: ReplayClock, stage: Stage) -> None:
+    def __init__(self, name: str, bundle: Bundle, clock: ReplayClock, stage: ReplayState) -> None:
         capture = bundle.capture
         self._recorded: dict[Pattern, list[Shot]] = defaultdict(list)
         for shot in capture.shots:
@@ -39,7 +39,7 @@ class ReplayCamera:
             serial=f"{bundle.folder.name}-{name}",
             format=capture.cameras[name],
             triggers=frozenset({Trigger.SOFTWARE}),
-            # A recording that does not tell its exposure agrees with every one.
+            # A recording without exposure accepts every one.
             exposure_range_s=(exposures[0], exposures[-1]) if exposures else (1e-6, 3600.0),
             gain_range=(1.0, 1.0),
             limits=COMPUTED_LIMITS,
@@ -59,38 +59,38 @@ class ReplayCamera:
         return self._info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. Takes an exposure that was recorded, within 1 %, and gain 1."""
+        """See `Camera`. Accepts an exposure that was recorded, within 1 %, and gain 1."""
         self._state.require_settable()
         nearest_s = min(self._exposures_s, key=lambda have: abs(have - settings.exposure_s), default=None)
         low_s, high_s = self._info.exposure_range_s
         if nearest_s is None:
             fits, had = low_s <= settings.exposure_s <= high_s, f"{low_s:g} to {high_s:g} s"
         else:
-            fits = abs(nearest_s - settings.exposure_s) <= _SAME_EXPOSURE * nearest_s
+            fits = abs(nearest_s - settings.exposure_s) <= _EXPOSURE_TOLERANCE * nearest_s
             had = ", ".join(f"{exposure_s:.6g} s" for exposure_s in self._exposures_s)
         if not fits:
             message = (
-                f"camera '{self._info.name}': asked for an exposure of {settings.exposure_s:.6g} s, the recording was "
+                f"camera '{self._info.name}': requested an exposure of {settings.exposure_s:.6g} s, the recording was "
                 f"made with {had}; write that as exposure_s into the rig file, or leave exposure_s out"
             )
             raise UnsupportedByDeviceError(message)
-        if abs(settings.gain - 1) > _SAME_EXPOSURE:
+        if abs(settings.gain - 1) > _EXPOSURE_TOLERANCE:
             message = (
-                f"camera '{self._info.name}': asked for gain {settings.gain:g}, a recording cannot be amplified; use 1"
+                f"camera '{self._info.name}': requested gain {settings.gain:g}, a recording has gain 1 only; use 1"
             )
             raise UnsupportedByDeviceError(message)
         self._applied = AppliedSettings(nearest_s if nearest_s is not None else settings.exposure_s, 1.0)
         return self._applied
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`. Frames beyond `count` can be had: a caller may take one again."""
+        """See `Camera`. More than `count` frames are available: a caller may repeat one."""
         self._state.check_arming(count, trigger, self._info)
         self._state.armed = trigger
 
     def trigger(self) -> None:
-        """See `Camera`. Takes the recorded frame of what is shown now; in the dark, that of the black pattern."""
+        """See `Camera`. Takes the recorded frame of the shown pattern; in the dark, that of the black pattern."""
         self._state.require_armed()
-        shot = self._shot()
+        shot = self._recorded_shot()
         exposure_s = self._applied.exposure_s if shot.exposure_s is None else shot.exposure_s
         colour = shot.colour
         start_ns = max(self._clock.now_ns(), self._busy_ns, self._clock.recorded_ns(shot.time_s))
@@ -114,17 +114,17 @@ class ReplayCamera:
         self._number += 1
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`. A frame that was not triggered will never come: without a pace nothing is waited for."""
+        """See `Camera`. Does not wait for a frame that was not triggered, since it will never arrive."""
         self._state.require_armed()
         while self._pending:
             frame = self._pending[0]
             if frame.t_start_ns >= after_ns:
-                if not self._clock.reached(frame.t_end_ns, timeout_s):
+                if not self._clock.wait_until_reached(frame.t_end_ns, timeout_s):
                     break
                 self._state.require_armed()
                 return self._pending.popleft()
             self._pending.popleft()
-        self._clock.idle(timeout_s)
+        self._clock.pass_time(timeout_s)
         message = (
             f"camera '{self._info.name}': no frame that began after {after_ns} ns was triggered and exposed within "
             f"{timeout_s} s; trigger after show"
@@ -143,23 +143,25 @@ class ReplayCamera:
         self._state.close()
         self._clock.release()
 
-    def frames_of(self, pattern: Pattern) -> Sequence[Shot]:
-        """Return the recorded frames of a pattern at the exposure in use; at any exposure where there is none such."""
+    def recorded_frames(self, pattern: Pattern) -> Sequence[Shot]:
+        """Return the recorded frames of a pattern at the current exposure, or at any exposure if there are none."""
         shots = self._recorded.get(pattern, [])
         in_use_s = self._applied.exposure_s
-        alike = [
-            s for s in shots if s.exposure_s is not None and abs(s.exposure_s - in_use_s) <= _SAME_EXPOSURE * in_use_s
+        same_exposure = [
+            s
+            for s in shots
+            if s.exposure_s is not None and abs(s.exposure_s - in_use_s) <= _EXPOSURE_TOLERANCE * in_use_s
         ]
-        return alike or shots
+        return same_exposure or shots
 
-    def _shot(self) -> Shot:
+    def _recorded_shot(self) -> Shot:
         pattern, showing = self._stage.shown if self._stage.shown is not None else (Black(), 0)
-        shots = self.frames_of(pattern)
+        shots = self.recorded_frames(pattern)
         if not shots:
             message = (
                 f"camera '{self._info.name}': triggered while the projector is dark, and the recording has no black "
                 "frame; show a pattern first"
             )
             raise DeviceStateError(message)
-        # A pattern that is shown more often than it was recorded looks as it did the last time.
+        # A pattern shown more often than recorded repeats its last frame.
         return shots[min(showing, len(shots) - 1)]

@@ -1,4 +1,4 @@
-"""The time of a recording that is played again, and how fast it goes by."""
+"""The clock of a replayed recording, and its speed."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from collections.abc import Callable
 _TICK_NS = 1_000
 _GLANCE_S = 0.05
 _LEAD_NS = 1_000_000
-"""From the first `show` to the recording's first frame: room for what happens before, so that it is not late."""
+"""From the first `show` to the recording's first frame: margin so that the frame is not late."""
 
 
 class ReplayClock:
-    """The rig's clock, ns. Devices move it, to the times at which things were recorded; it never runs by itself.
+    """The rig's clock, ns. Devices advance it to the recorded times; it never runs by itself.
 
     Implements `slrig.devices.Clock`.
 
-    At speed 0 it starts at 0 and jumps: a replay is as fast as the disk was. At a speed above 0 it starts at
-    CLOCK_MONOTONIC, and a jump takes the recording's time over the speed. It waits for no more than that: whoever is
-    later than the recording was is not made later still, and finds the recorded times all the same.
+    At speed 0 it starts at 0 and jumps, so a replay is as fast as the disk. At a speed above 0 it starts at
+    CLOCK_MONOTONIC, and a jump takes the recording's time divided by the speed. A caller that is slower than the
+    recording is not delayed further, and still finds the recorded times.
 
     Parameters
     ----------
     speed
-        Seconds of the recording per second; 0 for no pace at all.
+        Seconds of the recording per second; 0 for no pacing.
     real_ns, wait
-        The clock of the pace, and how to wait for some seconds; by default until `release`.
+        The pacing clock, and a function that waits for some seconds; by default until `release`.
     """
 
     def __init__(
@@ -59,19 +59,19 @@ class ReplayClock:
             self._now_ns = max(self._now_ns, t_ns)
 
     def rewind(self) -> None:
-        """Let the recording begin again with what is shown next, unless that is still to come in it."""
+        """Restart the recording with the next shown pattern, unless that is still to come in it."""
         self._rewound = True
 
     def recorded_ns(self, time_s: float | None) -> int:
-        """When a frame of this recorded time is due; the past where the recording tells no time."""
+        """Return the time at which a frame of this recorded time is due; 0 if the recording has no time."""
         return 0 if time_s is None or self._origin_ns is None else self._origin_ns + round(time_s * 1e9)
 
     def hold(self, until_ns: int) -> None:
-        """Keep the light as it is until an exposure has ended."""
+        """Keep the light unchanged until an exposure has ended."""
         self._held_ns = max(self._held_ns, until_ns)
 
     def change_light(self, time_s: float | None = None) -> int:
-        """Move on to where nothing is exposed any more, and not before a recorded time; return the time there."""
+        """Advance to the end of all exposures, and at least to a recorded time; return the new time."""
         earliest_ns = max(self._now_ns, self._held_ns) + _TICK_NS
         if time_s is not None:
             if self._rewound and (self._origin_ns is None or self.recorded_ns(time_s) < earliest_ns):
@@ -81,22 +81,22 @@ class ReplayClock:
         self._pace(self._now_ns)
         return self._now_ns
 
-    def reached(self, at_ns: int, within_s: float) -> bool:
-        """Wait until the clock may stand at `at_ns`; False, at once, if that would take longer than `within_s`."""
+    def wait_until_reached(self, at_ns: int, within_s: float) -> bool:
+        """Wait until the clock may be at `at_ns`; return False at once if that would take longer than `within_s`."""
         if self._left_s(at_ns) > within_s:
             return False
         self._pace(at_ns)
         return True
 
-    def idle(self, seconds: float) -> None:
-        """Let so much time pass, of the pace's clock where there is a pace."""
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass, also in real time if the replay is paced."""
         passed_ns = round(seconds * 1e9 * (self._speed or 1))
         self._now_ns = self._held_ns = max(self._now_ns + passed_ns, self._held_ns)
         if self._speed:
             self._wait(seconds)
 
     def release(self) -> None:
-        """Make nobody wait any longer. For `close`, from any thread."""
+        """End all waits. For `close`, from any thread."""
         self._released.set()
 
     def _begin(self, earliest_ns: int, time_s: float) -> None:

@@ -1,10 +1,10 @@
-"""The projector of a recording: it shows what was recorded, and says what was not."""
+"""The projector of a recording: it shows the recorded patterns, and refuses others."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from drivers.replay.camera import ReplayCamera, Stage
+from drivers.replay.camera import ReplayCamera, ReplayState
 from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
 from slrig.devices import COMPUTED_LIMITS, DisplayedPattern, ProjectorInfo, ProjectorState
@@ -15,7 +15,9 @@ from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, Primar
 class ReplayProjector:
     """Implements `slrig.devices.Projector` on the patterns of a recording."""
 
-    def __init__(self, bundle: Bundle, cameras: Mapping[str, ReplayCamera], clock: ReplayClock, stage: Stage) -> None:
+    def __init__(
+        self, bundle: Bundle, cameras: Mapping[str, ReplayCamera], clock: ReplayClock, stage: ReplayState
+    ) -> None:
         self._info = ProjectorInfo(
             name="projector",
             model="recorded projector",
@@ -27,7 +29,7 @@ class ReplayProjector:
             recorded=tuple(
                 pattern
                 for pattern in bundle.capture.patterns
-                if all(camera.frames_of(pattern) for camera in cameras.values())
+                if all(camera.recorded_frames(pattern) for camera in cameras.values())
             ),
             lights=any(isinstance(pattern, Primary) for pattern in bundle.capture.patterns),
         )
@@ -47,14 +49,14 @@ class ReplayProjector:
         self._state.require_open()
         self._state.require_size(sequence, self._info.size)
         for pattern in sequence.patterns:
-            lacking = [name for name, camera in self._cameras.items() if not camera.frames_of(pattern)]
-            if lacking:
-                recorded = "; ".join(dict.fromkeys(map(_family, self._recorded)))
+            missing = [name for name, camera in self._cameras.items() if not camera.recorded_frames(pattern)]
+            if missing:
+                recorded = "; ".join(dict.fromkeys(map(_describe_family, self._recorded)))
                 message = (
-                    f"the recording '{self._info.serial}' has no frame of {_member(pattern)} from camera "
-                    f"{', '.join(lacking)}; it has {recorded}. Leave the patterns out of the "
-                    "request and of the rig file's [scan], and all that was recorded is played; or ask for some of it: "
-                    f"{setting('gray_cell_px')}, {setting('line_shift_period_px')} and their like"
+                    f"the recording '{self._info.serial}' has no frame of {_describe_pattern(pattern)} from camera "
+                    f"{', '.join(missing)}; it has {recorded}. Leave the patterns out of the "
+                    "request and of the rig file's [scan] to replay all recorded ones; or request some of them: "
+                    f"{setting('gray_cell_px')}, {setting('line_shift_period_px')} and similar settings"
                 )
                 raise UnsupportedByDeviceError(message)
         self.blank()
@@ -69,13 +71,13 @@ class ReplayProjector:
         self._stage.shown = (pattern, showing)
         times_s = [
             shots[min(showing, len(shots) - 1)].time_s
-            for shots in (camera.frames_of(pattern) for camera in self._cameras.values())
+            for shots in (camera.recorded_frames(pattern) for camera in self._cameras.values())
         ]
         first_s = min((time_s for time_s in times_s if time_s is not None), default=0.0)
         return DisplayedPattern(index, self._clock.change_light(first_s), 0)
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. A recording does not play."""
+        """See `Projector`. Not supported."""
         self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
@@ -95,19 +97,19 @@ class ReplayProjector:
         self._state.closed.set()
 
 
-def _member(pattern: Pattern) -> str:
-    """Which pattern of its family."""
+def _describe_pattern(pattern: Pattern) -> str:
+    """Describe a pattern within its family."""
     match pattern:
         case Gray():
-            return f"bit {pattern.bit} of {_family(pattern)}"
+            return f"bit {pattern.bit} of {_describe_family(pattern)}"
         case LineShift():
-            return f"shift {pattern.shift} of {_family(pattern)}"
+            return f"shift {pattern.shift} of {_describe_family(pattern)}"
         case _:
-            return _family(pattern)
+            return _describe_family(pattern)
 
 
-def _family(pattern: Pattern) -> str:
-    """What a pattern is one of, in the words of a request."""
+def _describe_family(pattern: Pattern) -> str:
+    """Describe the family of a pattern as in a request."""
     match pattern:
         case White() | Black():
             return pattern.kind

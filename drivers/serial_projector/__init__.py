@@ -2,57 +2,58 @@
 
     [projector]
     driver = "serial_projector"
-    port = "usb-MicroPython_Board_in_FS_mode_e66-if00"     # as slrig devices lists it; see options.py for the rest
+    port = "usb-MicroPython_Board_in_FS_mode_e66-if00"     # as slrig devices lists it; other options: options.py
 
-Below is the protocol, enough to write firmware for a box of one's own. `device/` has a reference in MicroPython.
+The protocol below is sufficient to write firmware for another box. `device/` has a reference in MicroPython.
 
 The line
 --------
 8 bits, no parity, one stop bit, 115200 baud unless agreed otherwise; USB (CDC-ACM) has no baud rate. The host opens the
-port exclusively and leaves DTR raised. Many boards restart when DTR rises, so the host says HELLO again and again for
-some seconds; the box must cope with half a line before it, the host with a boot message.
+port exclusively and leaves DTR raised. Many boards restart when DTR rises, so the host repeats HELLO for some
+seconds; the box must tolerate half a line before it, the host a boot message.
 
-A line is printable ASCII, words with one space between them, at most 240 bytes, and ends with LF (CR before it is
-passed over). Its last five bytes are `*` and a checksum of all before it in four hexadecimal digits (capitals):
-CRC-16/CCITT-FALSE, polynomial 0x1021, begun with 0xFFFF, neither reflected nor inverted; "123456789" gives 29B1.
+A line is printable ASCII, words separated by one space, at most 240 bytes, and ends with LF (a preceding CR is
+ignored). Its last five bytes are `*` and a checksum of everything before it in four hexadecimal digits (capitals):
+CRC-16/CCITT-FALSE, polynomial 0x1021, initial value 0xFFFF, neither reflected nor inverted; "123456789" gives 29B1.
 
     host    <session> <number> <verb> <numbers>*<crc>
-    box     <session> <number> OK <words>*<crc>             obeyed
-            <session> <number> ERR <code> <words>*<crc>     not obeyed, nothing was changed unless it is said below
-            ? ERR 1 bad frame*<crc>                         a line came that is no line: send it again
-            ! <event> <words>*<crc>                         something happened; never answered, may be lost
+    box     <session> <number> OK <words>*<crc>             executed
+            <session> <number> ERR <code> <words>*<crc>     refused, nothing was changed unless stated below
+            ? ERR 1 bad frame*<crc>                         an invalid line was received: send it again
+            ! <event> <words>*<crc>                         an event; never answered, may be lost
 
-Once, and only once
--------------------
-<session> is four characters that the host chooses at random when it opens the port. <number>, 0 to 9999, is one more
-for each command, and 0 after 9999. A host that gets no answer in 150 ms (longer for what `light_us` allows) sends the
-same line again, with the same number: 12 times at most, within 2.5 s. A box remembers the number that came last and
-what it answered. The same number again: it sends that answer again, and does nothing. A number up to 4999 ahead: a new
-command. Any other: ERR 3. So a line that is lost on either way costs time, and never moves a pattern twice.
+Exactly-once execution
+----------------------
+<session> is four characters that the host chooses at random when it opens the port. <number>, 0 to 9999, is increased
+by one for each command, with 0 after 9999. A host that gets no answer in 150 ms (plus `light_us` if applicable) sends
+the same line again, with the same number: at most 12 times, within 2.5 s. A box stores the last number and its answer.
+The same number again: it repeats that answer, and does nothing else. A number up to 4999 ahead: a new command. Any
+other: ERR 3. A line lost in either direction therefore costs time, and never shows a pattern twice.
 
-Only HELLO makes a session. While it lives (its host was heard within its watchdog's time), every line of another one
-is answered with ERR 5, HELLO too. Without a session, all but HELLO are answered with ERR 8.
+Only HELLO begins a session. While it is alive (lines of its host were received within the watchdog time), every line of
+another session is answered with ERR 5, including HELLO. Without a session, all verbs except HELLO are answered with
+ERR 8.
 
 Verbs
 -----
-Numbers are decimal and whole, crc32 is hexadecimal. *dark* : the verb puts the light out, ends what goes on, and
+Numbers are decimal integers, crc32 is hexadecimal. *dark* : the verb switches the light off, ends any activity, and
 acknowledges a fault, before it is answered, even with an error.
 
     HELLO version watchdog_ms on_ms duty bright    dark; begins a session, nothing is loaded. OK and <key>=<value> words
-                                                   in any order; a host passes over keys that it does not know.
+                                                   in any order; a host ignores unknown keys.
     PING                                           OK <µs> <state> <fault>; µs since the box started
     PICK at crc32 crc32 …                          dark, nothing is loaded; these are the patterns <at>, <at> + 1 … of
-                                                   the next LOAD, wherever they lie in the flash. Begins anew at 0, and
-                                                   goes on without a gap. OK <picked so far> <those of this line that
-                                                   the box does not hold> …
-    LOAD count crc32                               dark; OK <count> <first> <gap_us>; the patterns that were picked, or
-                                                   else a run of that length, if they have that checksum. The first one
-                                                   is <first> of the flash. ERR 9 <held> <crc32 of all> if neither has
-    SHOW index                                     OK <index> <µs>, once its light is on the scene, since µs; it stays.
-                                                   What was lit before is put out first.
+                                                   the next LOAD, at any position in the flash. Restarts at 0, and
+                                                   continues without a gap. OK <picked so far> <those of this line that
+                                                   the box lacks> …
+    LOAD count crc32                               dark; OK <count> <first> <gap_us>; loads the picked patterns, or else
+                                                   a run of that length, with that checksum. The first one is <first> of
+                                                   the flash. ERR 9 <available> <crc32 of all> if neither matches
+    SHOW index                                     OK <index> <µs>, once it is lit, since µs; it stays lit. The previous
+                                                   pattern is switched off first.
     SEQ first count exposure_us period_us mode     OK <µs> of the first light. mode 0: the box lights one pattern each
                                                    period; mode 1: one at each TRIG. It is lit, a pulse goes to the
-                                                   cameras, and it is put out exposure_us + hold_us later.
+                                                   cameras, and it is switched off exposure_us + hold_us later.
     TRIG                                           OK <index> <µs>; the next pattern of a sequence of mode 1
     STOP                                           dark; OK <patterns of the last sequence that were lit>
     BLANK                                          dark; OK
@@ -60,60 +61,61 @@ acknowledges a fault, before it is answered, even with an error.
                                                    index= before the first light
     BYE                                            dark; ends the session; nothing is loaded; OK
 
-HELLO's version is 1. The other numbers are limits that the box keeps to from then on; it grants less if it must, and
-never more. watchdog_ms (50 or more): the host's longest silence. on_ms: how long one pattern may be lit. duty: permille
-of any 10 s in which there may be light (2 % more before it is put out: no box switches without a delay). bright:
-permille of full power; a box that cannot go so low answers ERR 4 bright 1000. Its answer tells
+HELLO's version is 1. The other numbers are limits for the session; the box may grant lower ones, never higher.
+watchdog_ms (50 or more): the host's longest silence. on_ms: longest light of one pattern. duty: permille of light in
+any 10 s (with a tolerance of 2 %, since boxes switch with a delay). bright: permille of full power; a box that cannot
+dim so far answers ERR 4 bright 1000. Its answer contains
 
-    sltp=1 model= fw=            protocol, and two words of the maker's
-    w= h= max=                   extent in pixels; how many patterns are in its flash, 0 for none yet
-    boot=                        eight hexadecimal digits that differ from start to start
-    watchdog_ms= on_ms= duty= bright=       the limits that it keeps to
+    sltp=1 model= fw=            protocol, and two words of the manufacturer
+    w= h= max=                   size in pixels; number of patterns in its flash, 0 if empty
+    boot=                        eight hexadecimal digits that change with each start
+    watchdog_ms= on_ms= duty= bright=       the granted limits
     light_us= error_us=          longest time from a command to its light; error of its time stamps
     gap_us= hold_us= least_us=   least time from one exposure's end to the next; how long a pattern of a sequence stays
                                  lit beyond its exposure; shortest exposure
-    pick=                        how many patterns PICK takes; a box without this word has no PICK, and holds runs only
+    pick=                        maximum patterns of PICK; a box without this word has no PICK, and loads runs only
 
-gap_us in HELLO is for patterns in the order of the flash; LOAD answers that of the sequence, longer where it goes back.
+gap_us in HELLO is for patterns in the order of the flash; LOAD returns that of the sequence, longer if it steps back.
 
 States and events
 -----------------
     idle      nothing loaded, dark               LOAD -> ready
     ready     dark                               SHOW -> lit, SEQ -> playing or waiting
-    lit       a pattern is lit until told        SHOW -> lit, SEQ
+    lit       a pattern is lit                   SHOW -> lit, SEQ
     playing   a sequence of mode 0 runs          its end -> ready
     waiting   a sequence of mode 1, from its beginning to its end; lit and dark
 
     ! FRAME index µs    a pattern of a sequence is lit since µs
     ! DONE count        a sequence has ended, dark
-    ! FAULT code        the box put the light out by itself, and is ready (or idle)
+    ! FAULT code        the box switched the light off by itself, and is ready (or idle)
 
-A fault stays until a verb that is dark acknowledges it: SHOW, SEQ and TRIG are refused until then, so that a host
-cannot miss it. 1: nothing of the session's was heard for watchdog_ms while lit, playing or waiting. 2: on_ms is over.
-3: duty is used up. 4: the light engine failed; a box that cannot put its light out goes on trying.
+A fault stays until a *dark* verb acknowledges it: SHOW, SEQ and TRIG are refused until then, so that a host
+cannot miss it. 1: no line of the session for watchdog_ms while lit, playing or waiting. 2: on_ms exceeded. 3: duty
+exceeded. 4: the light engine failed; a box that cannot switch its light off keeps trying.
 
-Errors: 1 no line (see above). 2 unknown verb. 3 not in this state, or an old number. 4 a number out of range.
-5 busy, another session lives. 6 the light engine failed: dark, fault 4. 7 <fault> dark by a fault not acknowledged yet.
-8 no such session: say HELLO. 9 other patterns. 10 a limit: more light than duty allows.
+Errors: 1 invalid line (see above). 2 unknown verb. 3 not in this state, or an old number. 4 a number out of range.
+5 busy, another session is alive. 6 the light engine failed: dark, fault 4. 7 <fault> dark by an unacknowledged fault.
+8 no such session: send HELLO. 9 other patterns. 10 a limit: more light than duty allows.
 
-What the host does with that
-----------------------------
-It sends PING five times per watchdog_ms while the port is open, lit or not, and stops that when a command fails and
-darkness is not confirmed: then the watchdog sees to it. ERR 8 in the middle of a session means that the box restarted
-(another boot) or that somebody else was there. Was it dark, the host says HELLO and LOAD again, and goes on; was
-something lit, frames may be dark, and the scan ends with DeviceGoneError. So does an unplugged cable.
+Behaviour of the host
+---------------------
+It sends PING five times per watchdog_ms while the port is open, lit or not, and stops when a command fails and darkness
+is not confirmed, so that the watchdog switches the light off. ERR 8 in the middle of a session means that the box
+restarted (another boot) or that another host used it. If it was dark, the host sends HELLO and LOAD again and
+continues; if it was lit, frames may be dark, and the scan ends with DeviceGoneError, as after an unplugged cable.
 
-The box's time stamps become the host's by bounds, not by a guess: what was stamped happened between the first byte of a
-command and its answer. Its clock may be 1000 ppm off, steadily; drift falls out as PINGs come to lie further apart.
+The box's time stamps are converted to the host's clock with guaranteed bounds: a stamped instant is between the first
+byte of a command and its answer. The box's clock may have a steady error of 1000 ppm; the bounds tighten as PINGs are
+further apart.
 
 A pattern's checksum is the CRC-32 (zlib's) of its image, a byte per pixel, row by row from the top left, 0 dark, 255
 lit. The checksum in LOAD is the CRC-32 of those of its patterns, in order, four bytes each, most significant first.
-`slrig patterns` writes the images of all that a rig shows, and the checksums as patterns.json, once, for flashing.
+`slrig patterns` writes the images of all patterns of a rig, and the checksums as patterns.json, for flashing.
 
 A session
 ---------
-A box of 4 x 2 pixels that holds white (2144DF1C), black (6522DF69) and a left half (B1C2A1A3). At the left the box's
-own clock, µs; `>` to the box, `<` from it, a line that begins with `|` goes on, after a space, with the one before it.
+A box of 4 x 2 pixels that holds white (2144DF1C), black (6522DF69) and a left half (B1C2A1A3). At the left is the box's
+own clock, µs; `>` is to the box, `<` from it, and a line that begins with `|` continues the previous one after a space.
 
        1000 > 1A2B 1 HELLO 1 2000 60000 1000 1000*0F42
             < 1A2B 1 OK sltp=1 model=example fw=1.0 w=4 h=2 max=3 boot=00C0FFEE watchdog_ms=2000 on_ms=60000
@@ -154,9 +156,9 @@ own clock, µs; `>` to the box, `<` from it, a line that begins with `|` goes on
     2402000 > 1A2B 13 BYE*AB6E
             < 1A2B 13 OK*A571
 
-The first answer to SHOW 1 was lost, and came again; the line to SHOW 2 was damaged. A second host was turned away. The
-first one fell silent: its watchdog put the light out, and it had to acknowledge that. Last it picked the left half and
-white, which do not lie so in the flash.
+The first answer to SHOW 1 was lost and repeated; the line to SHOW 2 was damaged. A second host was refused. The first
+one was silent: the watchdog switched the light off, which it had to acknowledge. Last it picked the left half and
+white, which are not consecutive in the flash.
 """
 
 from __future__ import annotations
@@ -167,6 +169,8 @@ from pathlib import Path
 from slrig.bundle.validation import validate
 from slrig.devices import FoundDevice, Projector
 
+__all__ = ["find_devices", "open_projector"]
+
 
 def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     """Open a trigger box from a rig file's `[projector]` table (without its `driver`).
@@ -176,7 +180,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     options
         `drivers.serial_projector.options.SerialProjectorOptions`.
     folder
-        The rig file's own: `export_folder` counts from there.
+        Folder of the rig file: `export_folder` is relative to it.
 
     Raises
     ------
@@ -185,13 +189,13 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     LibraryMissingError
         pyserial is not installed.
     DeviceGoneError
-        There is no such port.
+        The port does not exist.
     DeviceBusyError
         Another program holds the port, or another host is in a session with the box.
     UnsupportedByDeviceError
         The box cannot keep to the limits.
     DeviceError
-        Nothing on the port speaks SLTP/1, or it may not be opened.
+        No answer in SLTP/1, or this user may not open the port.
     """
     from drivers.serial_port import SerialPort
     from drivers.serial_projector.options import SerialProjectorOptions
@@ -206,10 +210,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """Return the USB serial ports; opens none of them. Raises LibraryMissingError."""
-    from drivers.serial_projector.finding import found_ports
+    """List the USB serial ports without opening them. Raises LibraryMissingError."""
+    from drivers.serial_projector.link import find_ports
 
-    return found_ports()
-
-
-__all__ = ["find_devices", "open_projector"]
+    return find_ports()

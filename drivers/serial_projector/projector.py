@@ -1,30 +1,34 @@
-"""A trigger box as a projector: patterns in its flash, light by command, darkness whenever anything is in doubt."""
+"""A trigger box as a projector: patterns in its flash, light by command, and darkness in case of doubt."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from drivers.serial_port import Port
-from drivers.serial_projector.client import Client, Limits
-from drivers.serial_projector.frames import Fault, Mode, Refused
-from drivers.serial_projector.keeping import KeepAlive
-from drivers.serial_projector.link import Link, RefusedError
+import cv2
+import numpy as np
+
+from drivers.serial_port import BytePort
+from drivers.serial_projector.client import BoxClient, BoxLimits, KeepAlive, pattern_checksums, sequence_checksum
+from drivers.serial_projector.link import BoxFault, BoxLink, BoxRefusedError, RefusalCode, SequenceMode
 from drivers.serial_projector.options import SerialProjectorOptions
-from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each, export
 from slrig.devices import Clock, DisplayedPattern, ProjectorInfo, ProjectorState, SystemClock
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
+DESCRIPTION = "patterns.json"
+"""File that describes a pattern set to the box."""
+
 _FAULTS = {
-    Fault.WATCHDOG: "it heard nothing from this host for watchdog_s: the host was too busy or the cable is bad; raise "
-    "watchdog_s in the rig file, or give the host less to do",
-    Fault.ON_TIME: "a pattern was lit for max_on_s without another one being asked for; raise max_on_s in the rig file "
+    BoxFault.WATCHDOG: "it received nothing from this host for watchdog_s: the host was too busy or the cable is bad; "
+    "raise watchdog_s in the rig file, or give the host less to do",
+    BoxFault.ON_TIME: "a pattern was lit for max_on_s without another request; raise max_on_s in the rig file "
     "if the light may be on for longer",
-    Fault.DUTY: "there was light for max_duty of 10 s; raise max_duty in the rig file if it may, or wait between scans",
-    Fault.LIGHT: "its light engine failed; see to its cables and power",
+    BoxFault.DUTY: "max_duty of light in 10 s was reached; raise max_duty in the rig file, or wait between scans",
+    BoxFault.LIGHT: "its light engine failed; check its cables and power",
 }
 _Value = TypeVar("_Value")
 
@@ -32,24 +36,24 @@ _Value = TypeVar("_Value")
 class SerialProjector:
     """Implements `slrig.devices.Projector` on a box that speaks SLTP/1.
 
-    The box's watchdog is fed by a thread of the driver's own. When a command fails and the box does not confirm that
-    it is dark, that thread falls silent, and the watchdog puts the light out.
+    A thread of the driver feeds the box's watchdog. When a command fails and the box does not confirm that it is dark,
+    that thread stops, and the watchdog puts the light out.
 
     Parameters
     ----------
     open_port
-        Opens the port, now and again when the box was unplugged in the dark; the projector closes it.
+        Opens the port, at first and after the box was unplugged while dark; the projector closes it.
     options
-        Checked.
+        Validated options.
     export_folder
-        Where `write_patterns` writes.
+        Folder for `write_patterns`.
     clock
         The rig's.
     """
 
     def __init__(
         self,
-        open_port: Callable[[], Port],
+        open_port: Callable[[], BytePort],
         options: SerialProjectorOptions,
         *,
         export_folder: Path,
@@ -59,16 +63,16 @@ class SerialProjector:
         self._clock = clock or SystemClock()
         self._options = options
         self._export_folder = export_folder
-        limits = Limits(
+        limits = BoxLimits(
             watchdog_ms=round(options.watchdog_s * 1000),
             on_ms=round(options.max_on_s * 1000),
             duty=round(options.max_duty * 1000),
             bright=round(options.brightness * 1000),
         )
         port = open_port()
-        link = Link(port, options.reply_s, options.deadline_s, clock=self._clock)
+        link = BoxLink(port, options.reply_s, options.deadline_s, clock=self._clock)
         try:
-            self._client = Client(link, limits, label=options.port, open_s=options.open_s)
+            self._client = BoxClient(link, limits, label=options.port, open_s=options.open_s)
         except BaseException:
             port.close()
             raise
@@ -86,9 +90,9 @@ class SerialProjector:
         )
         self._boot = box.boot
         self._state = ProjectorState(f"the trigger box on {options.port}")
-        self._wanted: tuple[int, ...] = ()
+        self._checksums: tuple[int, ...] = ()
         self._lit: str | None = None
-        self._keeping = KeepAlive(self._client, watchdog_s=box.watchdog_ms / 1000, clock=self._clock)
+        self._keep_alive = KeepAlive(self._client, watchdog_s=box.watchdog_ms / 1000, clock=self._clock)
 
     @property
     def info(self) -> ProjectorInfo:
@@ -96,13 +100,13 @@ class SerialProjector:
         return self._info
 
     @property
-    def client(self) -> Client:
-        """The session with the box, for what `Projector` has no word for."""
+    def client(self) -> BoxClient:
+        """The session with the box, for functions beyond `Projector`."""
         return self._client
 
     @property
-    def played(self) -> tuple[DisplayedPattern, ...]:
-        """When each pattern of the last `play` became visible, as far as the box's events came through."""
+    def played_patterns(self) -> tuple[DisplayedPattern, ...]:
+        """Times at which the patterns of the last `play` became visible, as far as the box's events were received."""
         return tuple(DisplayedPattern(*frame) for frame in self._client.frames())
 
     def load(self, sequence: PatternSequence) -> None:
@@ -111,97 +115,99 @@ class SerialProjector:
         Raises
         ------
         UnsupportedByDeviceError
-            It lacks some of them, or the sequence is for another size, or too long.
+            Patterns are missing, or the sequence has another size, or is too long.
         """
         self._state.require_open()
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, self._size)
-        self._wanted = crc32_of_each(sequence)
+        self._checksums = pattern_checksums(sequence)
         try:
-            lacking = self._sent(lambda: self._client.load(self._wanted))
+            missing = self._send(lambda: self._client.load(self._checksums))
         except UnsupportedByDeviceError as error:
-            lacking, why = tuple(range(len(sequence))), f"it takes runs of its flash only, and this is none ({error})"
+            missing, reason = tuple(range(len(sequence))), f"it supports only runs of its flash ({error})"
         else:
-            why = f"it lacks {len(lacking)} of them, pattern {lacking[0]} the first" if lacking else ""
-        if lacking:
+            reason = f"it lacks {len(missing)} of them, pattern {missing[0]} first" if missing else ""
+        if missing:
             message = (
-                f"asked for {len(sequence)} patterns, the trigger box on {self._options.port} holds "
-                f"{self._client.box.max}: {why}. Flash it once with all that this rig shows: slrig patterns RIG writes "
-                f"them into {self._export_folder}"
+                f"requested {len(sequence)} patterns, the trigger box on {self._options.port} holds "
+                f"{self._client.box.max}: {reason}. Flash it once with all patterns of this rig: slrig patterns RIG "
+                f"writes them into {self._export_folder}"
             )
             raise UnsupportedByDeviceError(message)
         self._state.loaded = sequence
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """See `StoredPatternProjector`. Into a folder of its own: no other set is written over."""
+        """See `StoredPatternProjector`. Writes each set into its own folder."""
         self._state.require_size(sequence, self._size)
-        crc32 = crc32_of_all(crc32_of_each(sequence))
+        crc32 = sequence_checksum(pattern_checksums(sequence))
         folder = self._export_folder / f"{crc32:08X}"
-        export(sequence, folder)
+        export_patterns(sequence, folder)
         return (
             f"{len(sequence)} images and patterns.json are in {folder}: put the images into the light engine's memory, "
             "in the order of their numbers, and patterns.json onto the box"
         )
 
     def show(self, index: int) -> DisplayedPattern:
-        """See `Projector`. The instant is the box's own stamp; its error comes from the exchanges with its clock."""
+        """See `Projector`. The instant is the box's own time stamp; its error comes from the exchanges with its
+        clock.
+        """
         self._state.require_pattern(index)
-        with self._dark_if_it_fails():
-            t_visible_ns, t_err_ns = self._sent(lambda: self._client.show(index))
+        with self._darken_on_error():
+            t_visible_ns, t_err_ns = self._send(lambda: self._client.show(index))
             self._lit = f"pattern {index} was lit"
             self._clock.wait_until(t_visible_ns + t_err_ns, self._state.closed)
         return DisplayedPattern(index, t_visible_ns, t_err_ns)
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. Returns when the box has begun; a play that ends by itself ends dark."""
+        """See `Projector`. Returns when the box has begun; the sequence ends dark."""
         count = len(self._state.require_loaded("play"))
         exposure_us, period_us = round(exposure_s * 1e6), round(period_s * 1e6)
         self._check_timing(exposure_us, period_us)
-        with self._dark_if_it_fails():
-            # A box that restarted since is found here: below, it could have begun to play before it did.
-            self._sent(self._client.ping)
+        with self._darken_on_error():
+            # Detect a restart before the sequence begins.
+            self._send(self._client.ping)
             self._lit = "a sequence played"
-            self._sent(lambda: self._client.sequence(0, count, exposure_us, period_us, Mode.FREE))
+            self._send(lambda: self._client.sequence(0, count, exposure_us, period_us, SequenceMode.FREE))
 
     def stop(self) -> None:
         """See `Projector`."""
         self._darken(self._client.stop)
 
     def blank(self) -> None:
-        """See `Projector`. Raises DeviceError where the box does not confirm it; its watchdog goes on to see to it."""
+        """See `Projector`. Raises DeviceError if the box does not confirm it; then its watchdog puts the light out."""
         self._darken(self._client.blank)
 
     def close(self) -> None:
         """See `Projector`."""
         self._state.closed.set()
         self._client.close()
-        self._keeping.stop()
+        self._keep_alive.stop()
         self._state.loaded = self._lit = None
 
     def _darken(self, command: Callable[[], object]) -> None:
         if self._state.closed.is_set():
             return
         try:
-            self._sent(command)
+            self._send(command)
         except BaseException as error:
             self._abandon()
             if self._state.closed.is_set() and isinstance(error, DeviceStateError):
-                # By another thread, meanwhile: dark.
+                # Closed by another thread meanwhile, and dark.
                 return
             raise
         finally:
             self._lit = None
 
     @contextmanager
-    def _dark_if_it_fails(self) -> Iterator[None]:
+    def _darken_on_error(self) -> Iterator[None]:
         try:
             yield
         except BaseException:
             self._lit = None
             try:
                 self._client.blank()
-            except Exception:  # noqa: BLE001 - the error that led here is the one to tell
+            except Exception:  # noqa: BLE001 - the original error is raised
                 self._abandon()
             raise
 
@@ -210,74 +216,74 @@ class SerialProjector:
         self._state.loaded = None
         self._client.abandon()
 
-    def _sent(self, command: Callable[[], _Value]) -> _Value:
-        """Send a command; to a box that restarted in the dark, once more after it was greeted and loaded again."""
+    def _send(self, command: Callable[[], _Value]) -> _Value:
+        """Send a command; if the box restarted while dark, greet it, load again, and repeat the command once."""
         try:
-            return self._obeyed(command)
+            return self._run_command(command)
         except _RestartedError:
-            # Told below, if it does not go better.
+            # Repeat it below.
             pass
         except DeviceGoneError:
-            # Unplugged and plugged in again while nothing was lit: nobody has lost anything.
+            # Unplugged and plugged in again while dark: nothing is lost.
             if self._lit is not None or self._state.closed.is_set():
                 raise
             self._client.reconnect(self._open_port)
         try:
-            self._meet_again()
-            return self._obeyed(command)
+            self._resume_session()
+            return self._run_command(command)
         except _RestartedError as error:
-            message = f"the trigger box on {self._options.port} restarts again and again; see to its power supply"
+            message = f"the trigger box on {self._options.port} restarts repeatedly; check its power supply"
             raise DeviceGoneError(message) from error
 
-    def _obeyed(self, command: Callable[[], _Value]) -> _Value:
-        """Send a command; what the box refuses becomes an error of slrig's."""
+    def _run_command(self, command: Callable[[], _Value]) -> _Value:
+        """Run a command; translate refusals of the box into slrig's errors."""
         try:
             return command()
-        except RefusedError as refusal:
+        except BoxRefusedError as refusal:
             match refusal.number:
-                case Refused.SESSION:
+                case RefusalCode.SESSION:
                     raise _RestartedError from refusal
-                case Refused.STATE:
-                    raise DeviceStateError(f"{refusal}; stop what it does first") from refusal
-                case Refused.RANGE | Refused.LIMIT | Refused.PATTERNS:
+                case RefusalCode.STATE:
+                    raise DeviceStateError(f"{refusal}; stop its current action first") from refusal
+                case RefusalCode.RANGE | RefusalCode.LIMIT | RefusalCode.PATTERNS:
                     raise UnsupportedByDeviceError(str(refusal)) from refusal
-                case Refused.BUSY:
+                case RefusalCode.BUSY:
                     message = (
-                        f"another host took the trigger box on {self._options.port} over ({refusal}); end that one"
+                        f"another host took over the trigger box on {self._options.port} ({refusal}); end that one"
                     )
                     raise DeviceBusyError(message) from refusal
-                case Refused.FAULT:
-                    raise DeviceError(_went_dark(self._options.port, refusal.words)) from refusal
+                case RefusalCode.FAULT:
+                    raise DeviceError(_fault_message(self._options.port, refusal.words)) from refusal
                 case _:
                     raise
 
-    def _meet_again(self) -> None:
-        """Greet and load a box that does not know its session any more. Raises DeviceGoneError where it was lit."""
+    def _resume_session(self) -> None:
+        """Greet and load a box that lost its session. Raises DeviceGoneError if it was lit."""
         lit, self._lit = self._lit, None
         box = self._client.greet()
-        how = "restarted" if box.boot != self._boot else "was taken over by another host"
+        event = "restarted" if box.boot != self._boot else "was taken over by another host"
         boots = f"boot {self._boot}, now {box.boot}"
         if lit is not None:
             message = (
-                f"the trigger box on {self._options.port} {how} ({boots}) while {lit}: frames since then may be dark; "
-                "see to its power supply and cable, open the rig again, and scan again"
+                f"the trigger box on {self._options.port} {event} ({boots}) while {lit}: frames since then may be "
+                "dark; check its power supply and cable, open the rig again, and scan again"
             )
             raise DeviceGoneError(message)
         if (box.w, box.h) != (self._size.width_px, self._size.height_px):
             message = (
-                f"the trigger box on {self._options.port} {how} ({boots}) and projects {box.w} x {box.h} instead of "
+                f"the trigger box on {self._options.port} {event} ({boots}) and projects {box.w} x {box.h} instead of "
                 f"{self._size}; open the rig again"
             )
             raise DeviceGoneError(message)
         self._boot = box.boot
-        if self._state.loaded is not None and self._obeyed(lambda: self._client.load(self._wanted)):
-            message = f"the trigger box on {self._options.port} {how} and holds other patterns; load them again"
+        if self._state.loaded is not None and self._run_command(lambda: self._client.load(self._checksums)):
+            message = f"the trigger box on {self._options.port} {event} and holds other patterns; load them again"
             raise DeviceGoneError(message)
 
     def _check_timing(self, exposure_us: int, period_us: int) -> None:
         box = self._client.box
         lit_us = exposure_us + box.hold_us
-        asked = f"asked to play {exposure_us / 1e6:.6g} s exposures every {period_us / 1e6:.6g} s"
+        requested = f"requested {exposure_us / 1e6:.6g} s exposures every {period_us / 1e6:.6g} s"
         for fits, found, remedy in (
             (exposure_us >= box.least_us, f"at least {box.least_us / 1e6:.6g} s", "expose for longer"),
             (
@@ -293,15 +299,46 @@ class SerialProjector:
             ),
         ):
             if not fits:
-                message = f"{asked}, the trigger box on {self._options.port} gives {found}; {remedy}"
+                message = f"{requested}, the trigger box on {self._options.port} gives {found}; {remedy}"
                 raise UnsupportedByDeviceError(message)
 
 
 class _RestartedError(DeviceError):
-    """The box does not know the session any more."""
+    """The box no longer knows the session."""
 
 
-def _went_dark(port: str, words: tuple[str, ...]) -> str:
-    known = {str(fault.value): why for fault, why in _FAULTS.items()}
-    why = known.get(words[0] if words else "", f"fault {' '.join(words)}, which is unknown here")
-    return f"the trigger box on {port} had gone dark by itself: {why}. Frames since then may be dark; scan again"
+def _fault_message(port: str, words: tuple[str, ...]) -> str:
+    reasons = {str(fault.value): reason for fault, reason in _FAULTS.items()}
+    reason = reasons.get(words[0] if words else "", f"unknown fault {' '.join(words)}")
+    return f"the trigger box on {port} went dark by itself: {reason}. Frames since then may be dark; scan again"
+
+
+def export_patterns(sequence: PatternSequence, folder: Path) -> None:
+    """Write the images for the light engine's flash, `000.png` …, and `patterns.json` for the box.
+
+    Raises
+    ------
+    DeviceError
+        The folder cannot be written.
+    UnsupportedByDeviceError
+        A pattern has more than 8 bits.
+    """
+    size = sequence.projector
+    checksums = pattern_checksums(sequence)
+    description = {
+        "size_px": [size.width_px, size.height_px],
+        "crc32": [f"{crc32:08X}" for crc32 in checksums],
+        "crc32_of_all": f"{sequence_checksum(checksums):08X}",
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for index in range(len(sequence)):
+            encoded, png = cv2.imencode(".png", np.ascontiguousarray(sequence.image(index)))
+            if not encoded:
+                message = f"pattern {index} could not be encoded as PNG; report it"
+                raise DeviceError(message)
+            (folder / f"{index:03d}.png").write_bytes(png.tobytes())
+        (folder / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        message = f"export_folder: {folder} cannot be written ({error}); name another folder"
+        raise DeviceError(message) from error

@@ -41,6 +41,8 @@ from pathlib import Path
 from slrig.bundle.validation import validate
 from slrig.devices import Clock, SystemClock, Turntable
 
+__all__ = ["open_grbl", "open_turntable"]
+
 
 def open_turntable(options: Mapping[str, object], folder: Path, *, clock: Clock | None = None) -> Turntable:
     """Open a turntable that speaks the protocol of lines, from a rig file's `[positioner]` table without its `driver`.
@@ -50,22 +52,22 @@ def open_turntable(options: Mapping[str, object], folder: Path, *, clock: Clock 
     options
         `drivers.serial_turntable.options.LineOptions`.
     folder
-        The rig file's own; nothing counts from it.
+        Folder of the rig file, not used.
     clock
-        By which it settles and gives up; else the system's.
+        For settling and time-outs; default: the system's.
 
-    Raises what `drivers.serial_port.SerialPort` does, ConfigError with all faults of the options, and
-    UnsupportedByDeviceError or DeviceError where what answers is another controller, or none.
+    Raises the errors of `drivers.serial_port.SerialPort`, ConfigError with all faults of the options, and
+    UnsupportedByDeviceError or DeviceError if another controller or none answers.
     """
     from drivers.serial_port import SerialPort
+    from drivers.serial_turntable.controllers import LineController
     from drivers.serial_turntable.options import LineOptions
-    from drivers.serial_turntable.simple import SimpleController
     from drivers.serial_turntable.turntable import SerialTurntable
 
     del folder
     table = validate(LineOptions, options, "the [positioner] table of a serial turntable")
     port = SerialPort(table.port, baud=table.baud, device="turntable", driver="serial_turntable")
-    return SerialTurntable(port, table, lambda lines: SimpleController(lines, table), clock or SystemClock())
+    return SerialTurntable(port, table, lambda lines: LineController(lines, table), clock or SystemClock())
 
 
 def open_grbl(options: Mapping[str, object], folder: Path, *, clock: Clock | None = None) -> Turntable:
@@ -74,14 +76,11 @@ def open_grbl(options: Mapping[str, object], folder: Path, *, clock: Clock | Non
     Parameters and errors are those of `open_turntable`.
     """
     from drivers.serial_port import SerialPort
-    from drivers.serial_turntable.grbl import Grbl
+    from drivers.serial_turntable.controllers import GrblController
     from drivers.serial_turntable.options import GrblOptions
     from drivers.serial_turntable.turntable import SerialTurntable
 
     del folder
     table = validate(GrblOptions, options, "the [positioner] table of a turntable behind GRBL")
     port = SerialPort(table.port, baud=table.baud, device="turntable", driver="grbl_turntable")
-    return SerialTurntable(port, table, lambda lines: Grbl(lines, table), clock or SystemClock())
-
-
-__all__ = ["open_grbl", "open_turntable"]
+    return SerialTurntable(port, table, lambda lines: GrblController(lines, table), clock or SystemClock())

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from simulated_rig import transport
-from simulated_rig.options import CameraOptions, ProjectorOptions
-from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import Scene, surface_of
+from simulated_rig.options import SimulatedCameraOptions, SimulatedProjectorOptions
+from simulated_rig.rendering import CameraView, SceneState
+from simulated_rig.scene import Scene, build_surface
 from slrig.model import Axis, CameraFormat, Capture, FloatArray, Gray, LineShift, PatternSequence, Shot
 from slrig.patterns.codes import cell_positions, index_of_word, line_positions
 from slrig.patterns.sequence import encode, scan_patterns
@@ -42,10 +42,10 @@ _FINEST_SMOOTHING_PX = 1.0
 class Rig:
     """A rendered camera and projector before one scene, and what the projector shows."""
 
-    camera: CameraOptions
-    projector: ProjectorOptions
-    stage: Stage
-    view: View
+    camera: SimulatedCameraOptions
+    projector: SimulatedProjectorOptions
+    stage: SceneState
+    view: CameraView
     sequence: PatternSequence
 
     def exposed(self, exposure_s: float, gain: float) -> ExposedView:
@@ -65,7 +65,7 @@ class Rig:
     def columns_at(self, points_px: FloatArray) -> FloatArray:
         """(n,) float64: true projector columns at camera positions (x, y), (n, 2) float64."""
         stage, (u, v) = self.stage, points_px.T.copy()
-        return transport.trace(
+        return transport.trace_rays(
             u, v, self.camera.pinhole(), stage.projector, stage.surface, stage.rays,
             working_distance_mm=stage.working_distance_mm,
         ).column_px  # fmt: skip
@@ -77,18 +77,18 @@ def rig(thing: Mapping[str, object], *, size_px: tuple[int, int], blur_px: float
     blur_px : of both lenses; columns : of the projector. The sensor reads 8 bits, 30 000 electrons deep, above a
     pedestal that keeps its noise.
     """
-    lamp = ProjectorOptions.model_validate({
+    lamp = SimulatedProjectorOptions.model_validate({
         "size_px": [columns, 384], "focal_px": [2200.0, 2202.2], "distortion": [0.03, -0.02, 0.0003, 0.0, 0.0],
         "position_mm": [105.0, -10.0, -590.0], "target_mm": [0.0, 0.0, 0.0], "blur_px": blur_px,
     })  # fmt: skip
-    eye = CameraOptions.model_validate({
+    eye = SimulatedCameraOptions.model_validate({
         "name": "eye", "size_px": list(size_px), "focal_px": [1900.0, 1901.9], "saturation_s": 0.02,
         "distortion": [-0.11, 0.15, -0.0003, 0.0005, 0.0], "position_mm": [-150.0, -12.0, -560.0],
         "target_mm": [0.0, 0.0, 0.0], "blur_px": blur_px, "full_well_e": 30000.0, "pedestal_dn": 8.0,
     })  # fmt: skip
     scene = Scene.model_validate({"object": [{**thing, "albedo": 0.8}]})
-    stage = Stage(surface_of(scene, Path()), lamp.pinhole(), working_distance_mm=600.0)
-    view = View(
+    stage = SceneState(build_surface(scene, Path()), lamp.pinhole(), working_distance_mm=600.0)
+    view = CameraView(
         eye.pinhole(), stage, blur_px=eye.blur_px, ambient=0.01, samples_per_axis=4, jitter=False, seed=1, workers=2
     )
     patterns = scan_patterns(

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from drivers.dlpc347x.bus import Bus
-from drivers.dlpc347x.options import EngineOptions
-from drivers.dlpc347x.projector import LightEngine
+from drivers.dlpc347x.bus import I2cBus
+from drivers.dlpc347x.options import Dlpc347xEngineOptions
+from drivers.dlpc347x.projector import Dlpc347xProjector
 from slrig.model import Pixels, Size
 from slrig.patterns.sequence import merge_sequences
 from tests.contract.dlpc347x_device import Fake347x
@@ -27,8 +27,8 @@ class Table(WiredTable):
         )
         self.engine = Fake347x(light=self._change, pulse=self.pulse, **engine)
 
-    def opened(self) -> LightEngine:
-        return LightEngine(Bus(self.engine, "light engine"), EngineOptions.model_validate(_USUAL))
+    def opened(self) -> Dlpc347xProjector:
+        return Dlpc347xProjector(I2cBus(self.engine, "light engine"), Dlpc347xEngineOptions.model_validate(_USUAL))
 
     def connected(self) -> BenchHead:
         return self.head(self.opened())

@@ -34,7 +34,7 @@ class _Entry:
 
 
 class Fake347x(Sequencer):
-    """Implements `drivers.dlpc347x.bus.Port`.
+    """Implements `drivers.dlpc347x.bus.I2cPort`.
 
     light, pulse : told of every change of light (None: dark), and of every edge of TRIG_OUT_2, and when (ns).
     controller : its number. entry_bytes : of an entry, without its control: 23 in firmware of 2019. most_entries : of
@@ -74,7 +74,7 @@ class Fake347x(Sequencer):
         self._relight()
 
     def close(self) -> None:
-        """See `Port`. The engine goes on."""
+        """See `I2cPort`. The engine goes on."""
 
     def unplug(self) -> None:
         """Without power, there is no light, and no answer."""
@@ -102,7 +102,7 @@ class Fake347x(Sequencer):
                 self._set(command, parameters)
 
     def read(self, length: int) -> bytes:
-        """See `Port`. Beyond what it has to say, the bus reads ones."""
+        """See `I2cPort`. Beyond what it has to say, the bus reads ones."""
         if self.gone:
             raise OSError(errno.EREMOTEIO, "Remote I/O error")
         return self._answer[:length].ljust(length, b"\xff")

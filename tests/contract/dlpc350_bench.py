@@ -19,12 +19,10 @@ from typing import Any
 import pytest
 
 from drivers import dlpc350, dlpc900
-from drivers.dlpc350.flash import read_flash, write_pictures
-from drivers.dlpc350.options import EngineOptions
-from drivers.dlpc350.planes import MIRRORS
-from drivers.dlpc350.projector import DLPC350, LightEngine
-from drivers.pattern_engine.finding import engines
-from drivers.pattern_engine.link import Link
+from drivers.dlpc350.flash import MIRRORS, read_flash_list, write_pictures
+from drivers.dlpc350.options import Dlpc350EngineOptions
+from drivers.dlpc350.projector import DLPC350, Dlpc350Projector
+from drivers.pattern_engine.usb import UsbLink, find_engines
 from slrig.capture.sequencer import capture
 from slrig.capture.verifier import Evidence
 from slrig.conformance import run_checks
@@ -58,9 +56,9 @@ class Table(WiredTable):
         return {**usual, "led_current_inverted": True, **more}
 
     def connected(self, **more: object) -> BenchHead:
-        link = Link(Cable(self.engine).host, "light engine", DLPC350)
-        options = EngineOptions.model_validate(self.options(**more))
-        return self.head(LightEngine(link, options, read_flash(self.folder / PICTURES), serial="LC4500-1"))
+        link = UsbLink(Cable(self.engine).host, "light engine", DLPC350)
+        options = Dlpc350EngineOptions.model_validate(self.options(**more))
+        return self.head(Dlpc350Projector(link, options, read_flash_list(self.folder / PICTURES), serial="LC4500-1"))
 
     def opened(self, **more: object) -> BenchHead:
         """The driver as a rig opens it, on whatever engine the kernel has."""
@@ -95,7 +93,7 @@ def a_dlpc900_beside_it_is_told_from_it_and_scans(_: Table, notes: Notes) -> Non
 
 def an_engine_that_another_program_holds_is_busy(table: Table, notes: Notes) -> None:
     """Hold it as another program does, and as this driver does."""
-    path = engines(DLPC350)[0].path
+    path = find_engines(DLPC350)[0].path
     other = os.open(path, os.O_RDWR)
     try:
         fcntl.flock(other, fcntl.LOCK_EX)

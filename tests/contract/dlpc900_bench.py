@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from drivers import dlpc900
-from drivers.dlpc900.options import EngineOptions
-from drivers.dlpc900.projector import DLPC900, LightEngine
-from drivers.pattern_engine.link import Link
+from drivers.dlpc900.options import Dlpc900EngineOptions
+from drivers.dlpc900.projector import DLPC900, Dlpc900Projector
+from drivers.pattern_engine.usb import UsbLink
 from slrig.model import Size
 from tests.contract.dlpc350_device import Cable
 from tests.contract.dlpc900_device import Fake900
@@ -27,8 +27,8 @@ class Table(WiredTable):
         self.engine = Fake900(light=self.stage.show, pulse=self.pulse, **engine)
 
     def connected(self, **more: object) -> BenchHead:
-        link = Link(Cable(self.engine).host, "light engine", DLPC900, answer_s=5.0)
-        return self.head(LightEngine(link, EngineOptions.model_validate(_USUAL | more), serial="LCR6500-1"))
+        link = UsbLink(Cable(self.engine).host, "light engine", DLPC900, answer_s=5.0)
+        return self.head(Dlpc900Projector(link, Dlpc900EngineOptions.model_validate(_USUAL | more), serial="LCR6500-1"))
 
     def opened(self, **more: object) -> BenchHead:
         """The driver as a rig opens it, on whatever engine the kernel has."""

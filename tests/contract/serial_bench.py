@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers.serial_projector import open_projector
-from drivers.serial_projector.pattern_set import crc32_of_each
+from drivers.serial_projector.client import pattern_checksums
 from slrig.devices import Projector
 from slrig.model import PatternSequence
 from tests.contract.stage import Stage
@@ -33,7 +33,7 @@ class TriggerBox:
     def __post_init__(self) -> None:
         size = self.flashed.projector
         scene = Scene(watch=[self._lit], on_pulse=[self._pulsed])
-        about = description(crc32_of_each(self.flashed), width_px=size.width_px, height_px=size.height_px)
+        about = description(pattern_checksums(self.flashed), width_px=size.width_px, height_px=size.height_px)
         self.line = SerialLine(CoreEngine(scene, about, drift=self.drift))
         atexit.register(self.line.close)
 

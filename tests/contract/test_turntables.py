@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulated_rig.device import SimulatedHead, simulated_head
+from simulated_rig.device import SimulatedHead, open_simulated_head
 from slrig.conformance import CHECKS, CheckOutcome, ConformanceRun
 from slrig.devices import Rig, Turntable
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
@@ -50,11 +50,11 @@ def rendered(folder: Path) -> Bench:
     heads: list[SimulatedHead] = []
 
     def open_table() -> Turntable:
-        heads.append(simulated_head(options, folder))
+        heads.append(open_simulated_head(options, folder))
         assert isinstance(heads[-1].positioner, Turntable)
         return heads[-1].positioner
 
-    begun = simulated_head(options, folder).truth().surface.vertices_mm[0]
+    begun = open_simulated_head(options, folder).truth().surface.vertices_mm[0]
 
     def stands_deg() -> float:
         arms = [at - AXIS_POINT for at in (begun, heads[-1].truth().surface.vertices_mm[0])]

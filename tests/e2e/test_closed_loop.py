@@ -27,12 +27,12 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from simulated_rig.device import simulated_head
+from simulated_rig.device import open_simulated_head
 from simulated_rig.light import light_table
 from simulated_rig.options import HeadOptions
-from simulated_rig.rendering import Stage, View
+from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import read_scene
-from simulated_rig.staging import Script
+from simulated_rig.staging import PoseScript
 from slrig.bundle.calibration import write_calibration
 from slrig.bundle.validation import validate
 from slrig.config import read_rig
@@ -98,13 +98,13 @@ class World:
         (camera,) = options.camera
         scene = rig.parent / options.scene
         lens = options.projector.pinhole()
-        self._script = Script(options, read_scene(scene), scene.parent)
-        self._stage = Stage(
+        self._script = PoseScript(options, read_scene(scene), scene.parent)
+        self._stage = SceneState(
             self._script.surface(0),
             lens,
             working_distance_mm=options.projector.working_distance_mm or float(np.linalg.norm(lens.centre_mm)),
         )
-        self._view = View(
+        self._view = CameraView(
             camera.pinhole(),
             self._stage,
             blur_px=camera.blur_px,
@@ -428,7 +428,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Reference:
     noise_mm = {below: rms_mm(pairs, below_mm=below) for below in BELOW_MM}
     head = read_rig(rigs[0]).head
     assert head is not None
-    return Reference(rigs[0], meshes, noise_mm, simulated_head(head.options, rigs[0].parent).truth())
+    return Reference(rigs[0], meshes, noise_mm, open_simulated_head(head.options, rigs[0].parent).truth())
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,8 @@ import numpy as np
 
 from simulated_rig.light import Float32Array
 from simulated_rig.options import HeadOptions
-from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import Scene, SceneSurface, read_scene, surface_of
+from simulated_rig.rendering import CameraView, SceneState
+from simulated_rig.scene import Scene, SceneSurface, build_surface, read_scene
 from slrig.bundle import write_bundle, write_truth
 from slrig.model import Calibration, CameraFormat, Capture, Pattern, Pixels, Shot, Surface, Truth
 from slrig.patterns.sequence import profile
@@ -109,8 +109,10 @@ class LitScene:
         self.eye, lamp = options.camera[0], options.projector
         self.light, self.projector = light, lamp.size
         self.surface = _surface(light, scene or read_scene(SCENES / "relief.toml"))
-        stage = Stage(self.surface, lamp.pinhole(), working_distance_mm=float(np.linalg.norm(lamp.pinhole().centre_mm)))
-        self.view = View(
+        stage = SceneState(
+            self.surface, lamp.pinhole(), working_distance_mm=float(np.linalg.norm(lamp.pinhole().centre_mm))
+        )
+        self.view = CameraView(
             self.eye.pinhole(), stage, blur_px=self.eye.blur_px, ambient=options.ambient, jitter=False,
             seed=options.seed, samples_per_axis=options.samples_per_axis, workers=options.workers,
         )  # fmt: skip
@@ -198,7 +200,7 @@ def _surface(light: Light, scene: Scene) -> SceneSurface:
         "specular": {"strength": light.lobe, "exponent": light.lobe_exponent},
     }
     things = tuple(type(thing).model_validate(thing.model_dump() | material) for thing in scene.object)
-    return surface_of(scene.model_copy(update={"object": things}), SCENES)
+    return build_surface(scene.model_copy(update={"object": things}), SCENES)
 
 
 def _cut(device: Mapping[str, Any], share: float) -> dict[str, Any]:

@@ -18,10 +18,9 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from simulated_rig.casting import caster
 from simulated_rig.options import HeadOptions
-from simulated_rig.scene import read_scene, surface_of
-from simulated_rig.transport import trace
+from simulated_rig.scene import build_surface, read_scene
+from simulated_rig.transport import build_caster, trace_rays
 from slrig.bundle import read_bundle, read_calibration, write_calibration
 from slrig.capture.verifier import check_capture
 from slrig.cli.commands import app
@@ -87,14 +86,14 @@ def channels(rig: Path, work: Path, plan: ScanPlan | None = None, *, mapped: Lig
     mesh = decode_mesh_ply((work / "out" / "mesh.ply").read_bytes())
     table = tomllib.loads(rig.read_text())["head"]
     options = HeadOptions.model_validate({key: value for key, value in table.items() if key != "driver"})
-    surface = surface_of(read_scene(rig.parent / options.scene), rig.parent)
-    rays, lamp = caster(surface.vertices_mm, surface.faces), options.projector.pinhole()
+    surface = build_surface(read_scene(rig.parent / options.scene), rig.parent)
+    rays, lamp = build_caster(surface.vertices_mm, surface.faces), options.projector.pinhole()
     truth, brightness = np.zeros((len(mesh.vertices_mm), 3)), np.zeros(len(mesh.vertices_mm))
     vertices = mesh.vertices_mm.astype(np.float64)
     for eye in options.camera:
         pixels = opencv_pixels(eye.pinhole(), vertices)
         columns, rows = pixels.T.copy()
-        met = trace(columns, rows, eye.pinhole(), lamp, surface, rays, working_distance_mm=600.0)
+        met = trace_rays(columns, rows, eye.pinhole(), lamp, surface, rays, working_distance_mm=600.0)
         mine = (truth == 0).all(axis=1) & (np.linalg.norm(met.points_mm - vertices, axis=1) < 0.3)
         truth[mine] = met.albedo[mine, None] * met.hue[mine, ::-1]
         nearest = np.rint(np.clip(pixels[mine], 0, np.array(eye.size_px) - 1)).astype(int)

@@ -151,8 +151,8 @@ def examined(path: Path) -> Diagnosis:
     with open_rig(read_rig(path)) as rig:
         diagnosis = examine(rig, own_sequence=own_sequence(rig), displays=displays)
         assert isinstance(rig.head, SimulatedHead)
-        assert rig.head.projector.showing is None
-        assert not rig.head.projector.lit
+        assert rig.head.projector.shown_pattern is None
+        assert not rig.head.projector.is_lit
         return diagnosis
 
 

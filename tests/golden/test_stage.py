@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from simulated_rig.device import simulated_head
+from simulated_rig.device import open_simulated_head
 from slrig.bundle import write_calibration
 from slrig.bundle.options import read_stage
 from slrig.cli.commands import app
@@ -128,7 +128,7 @@ def scanned(
     }  # fmt: skip
     options["projector"] |= devices["projector"]
     options["camera"][0] |= devices["camera"]
-    head, scans = simulated_head(options, folder), []
+    head, scans = open_simulated_head(options, folder), []
     settings = {"left": CameraSettings(0.0167)}
     with Rig(
         "from above", head.cameras, head.projector, settings, head.calibration, head, clock=head.clock,

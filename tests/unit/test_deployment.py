@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.depthai import presence
+from drivers.depthai import library
 from drivers.dlpc350.projector import DLPC350
 from drivers.dlpc900.projector import DLPC900
-from drivers.pattern_engine.link import TI
-from drivers.serial_projector.finding import MICROPYTHON_RP2
+from drivers.pattern_engine.usb import TI
+from drivers.serial_projector.link import MICROPYTHON_RP2
 from tests.npm import lacking
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -75,7 +75,7 @@ def test_classes_are_there_before_their_first_device() -> None:
 def test_rules_name_the_devices_that_the_drivers_open() -> None:
     rules = [line for line in RULES.splitlines() if line and not line.startswith("#")]
     ids = {(vendor, product) for line in rules for vendor, product in [_ids(line)] if vendor}
-    vendor = re.search(r'idVendor\}=="(\w+)"', presence.UDEV_RULE)
+    vendor = re.search(r'idVendor\}=="(\w+)"', library.UDEV_RULE)
     assert vendor is not None
     assert ids == {
         (vendor.group(1), None),

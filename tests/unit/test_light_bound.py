@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 from simulated_rig.light import Response
-from simulated_rig.options import CameraOptions, ProjectorOptions
-from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import Scene, surface_of
-from simulated_rig.sensor import Sensor
+from simulated_rig.options import SimulatedCameraOptions, SimulatedProjectorOptions
+from simulated_rig.rendering import CameraView, SceneState, SensorModel
+from simulated_rig.scene import Scene, build_surface
 from slrig.model import FloatArray, Pixels
 from tests.light_bound import ExposedView, StripeBound, pixel_bound, stripe_bound
 from tests.unit.simulated_rig.building import line_profile
@@ -41,23 +40,23 @@ def exposed_view(
     **thing: Any,
 ) -> ExposedView:
     """A plate before the rig; `phase_px` moves the camera's image."""
-    lamp = ProjectorOptions.model_validate({
+    lamp = SimulatedProjectorOptions.model_validate({
         "size_px": [256, 192], "focal_px": [400.0, 400.0], "principal_px": [128.0, 96.0], "blur_px": BLUR_PX,
         "position_mm": [20.0, 0.0, -500.0], "target_mm": [20.0, 0.0, 0.0], "leak": leak,
     })  # fmt: skip
-    eye = CameraOptions.model_validate({
+    eye = SimulatedCameraOptions.model_validate({
         "name": "eye", "size_px": [120, 60], "focal_px": [400.0, 400.0], "principal_px": [60.0 + phase_px, 30.0],
         "position_mm": [-20.0, 0.0, -500.0], "target_mm": [-20.0, 0.0, 0.0],
     })  # fmt: skip
     plate: dict[str, Any] = {"shape": "plane", "size_mm": [800.0, 800.0], "albedo": 0.8} | thing
-    stage = Stage(
-        surface_of(Scene.model_validate({"object": [plate]}), Path()), lamp.pinhole(), working_distance_mm=500
+    stage = SceneState(
+        build_surface(Scene.model_validate({"object": [plate]}), Path()), lamp.pinhole(), working_distance_mm=500
     )
-    view = View(
+    view = CameraView(
         eye.pinhole(), stage, blur_px=0.0, ambient=0.0, samples_per_axis=SAMPLES, jitter=False, seed=1, workers=1
     )
     numbers = dict(sensor)
-    camera = Sensor(bit_depth=int(numbers.pop("bit_depth")), **numbers)
+    camera = SensorModel(bit_depth=int(numbers.pop("bit_depth")), **numbers)
     return ExposedView(view, lamp.size, Response(1.0, leak, BLUR_PX), camera, exposure_s, 1.0)
 
 

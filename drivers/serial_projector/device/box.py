@@ -1,57 +1,57 @@
-"""What the protocol core knows of a box: what it is asked for, what it says of itself, and how long it was lit.
+"""Model of a box for the protocol core: the hardware interface, the box's properties, and the time it was lit.
 
 Runs unchanged in MicroPython and in CPython.
 """
 
-# MicroPython has neither `__future__` nor `abc` or `dataclasses`: plain classes do.
+# MicroPython has neither `__future__` nor `abc` or `dataclasses`, so these are plain classes.
 
 import binascii
 
 DUTY_WINDOW_US = 10000000
 DUTY_SLOTS = 20
 DUTY_SLACK = 20
-"""Permille of the window by which the light may overrun: no box switches without a delay."""
+"""Permille of the window by which the light may overrun, since every box switches with a delay."""
 
 
 class HardwareError(Exception):
-    """The light engine did not do what it was told. Raised by the methods of a `Hardware`."""
+    """The light engine failed. Raised by the methods of a `BoxHardware`."""
 
 
-class Hardware:
-    """What the core asks of a box. Every method may raise `HardwareError`; then the box goes dark."""
+class BoxHardware:
+    """Hardware interface of a box. Every method may raise `HardwareError`; then the box goes dark."""
 
     def time_us(self) -> int:
-        """Microseconds since the box started; never wraps, never goes back."""
+        """Return microseconds since the box started; it never wraps or decreases."""
         raise NotImplementedError
 
     def select(self, pattern: int) -> None:
-        """Make this pattern of the flash the current one, and return once it is. It is dark until `light`."""
+        """Make this pattern of the flash current, and return when it is. It is dark until `light`."""
         raise NotImplementedError
 
     def light(self) -> None:
-        """Light the current pattern, and return once it is on the scene."""
+        """Light the current pattern, and return when it is lit."""
         raise NotImplementedError
 
-    def dark(self) -> None:
-        """Put the light out, and return once it is."""
+    def switch_off(self) -> None:
+        """Switch the light off, and return when it is off."""
         raise NotImplementedError
 
     def pulse(self) -> None:
         """Begin one trigger pulse to the cameras."""
         raise NotImplementedError
 
-    def dim(self, permille: int) -> int:
-        """Set the brightness; return what it is now. A box that cannot dim returns 1000."""
+    def set_brightness(self, permille: int) -> int:
+        """Set the brightness; return the actual value. A box that cannot dim returns 1000."""
         raise NotImplementedError
 
 
-class Description:
-    """What a box is, as it says in HELLO, and the CRC-32 of every pattern in its flash.
+class BoxDescription:
+    """Properties of a box for HELLO, and the CRC-32 of every pattern in its flash.
 
     light_us : longest time from a command to its light. error_us : error of its time stamps. gap_us : least time from
     the end of an exposure to the next one. hold_us : how long a pattern of a sequence stays lit beyond its exposure.
-    least_us : shortest exposure. step_us : how much longer it takes for each pattern that it must pass by, or go back
-    over, to get from one pattern to the next. on_ms, duty, watchdog_ms : the most that it grants.
+    least_us : shortest exposure. step_us : additional time for each pattern to skip, or to step over again, between two
+    patterns. on_ms, duty, watchdog_ms : upper limits that it grants.
     """
 
     def __init__(
@@ -80,36 +80,36 @@ class Description:
         self.gap_us, self.hold_us, self.least_us, self.step_us = gap_us, hold_us, least_us, step_us
         self.watchdog_ms, self.on_ms, self.duty = watchdog_ms, on_ms, duty
 
-    def found(self, crc32: int) -> int:
-        """Where a pattern lies in the flash, the first place if there are several; -1 if it does not."""
+    def find(self, crc32: int) -> int:
+        """Return the first position of a pattern in the flash; -1 if it is missing."""
         wanted, at = crc32.to_bytes(4, "big"), -1
         while True:
             at = self.crc32.find(wanted, at + 1)
             if at < 0 or at % 4 == 0:
                 return at // 4
 
-    def crc32_of(self, order: list[int]) -> int:
-        """The checksum of a sequence of the flash's patterns."""
+    def checksum(self, order: list[int]) -> int:
+        """Return the checksum of a sequence of the flash's patterns."""
         return binascii.crc32(b"".join([self.crc32[4 * at : 4 * at + 4] for at in order]))
 
-    def gap_of(self, order: list[int]) -> int:
-        """Least time between exposures of a sequence of the flash's patterns, µs."""
+    def gap_for(self, order: list[int]) -> int:
+        """Return the least time between exposures of a sequence of the flash's patterns, µs."""
         most = 0
         for before, after in zip(order, order[1:]):  # noqa: B905, RUF007 - MicroPython has neither
-            # Back means from the first one on, again.
+            # Stepping back restarts at the first pattern.
             most = max(most, after - before - 1 if after >= before else after)
         return self.gap_us + most * self.step_us
 
 
 class LightTime:
-    """How long it was lit in the last 10 s, in slots of half a second."""
+    """Measures the lit time of the last 10 s, in slots of half a second."""
 
     def __init__(self) -> None:
         self.slots = [0] * DUTY_SLOTS
         self.until_us = 0
 
     def note(self, now_us: int, lit: bool) -> None:
-        """It was lit, or dark, since the last note."""
+        """Note that it was lit, or dark, since the last call."""
         slot_us = DUTY_WINDOW_US // DUTY_SLOTS
         if now_us - self.until_us > DUTY_WINDOW_US:
             self.slots = [slot_us if lit else 0] * DUTY_SLOTS
@@ -124,5 +124,5 @@ class LightTime:
             self.until_us += step_us
 
     def left_us(self, duty: int) -> int:
-        """How long it may stay lit now."""
+        """Return how long it may stay lit now."""
         return min(duty + DUTY_SLACK, 1000) * (DUTY_WINDOW_US // 1000) - sum(self.slots)

@@ -1,30 +1,29 @@
-"""The pins of the reference trigger box: a Raspberry Pi Pico (RP2040) with MicroPython, and a light engine that steps.
+"""The pins of the reference trigger box: a Raspberry Pi Pico (RP2040) with MicroPython, and a stepping light engine.
 
-The engine keeps its patterns in a flash of its own: a pulse on STEP makes the next one current, a pulse on HOME the
-first one, and its light follows LAMP. Engines whose patterns are advanced by a trigger input and whose LED has an
-enable or dimming input are wired so.
+The engine keeps its patterns in its own flash: a pulse on STEP selects the next one, a pulse on HOME the first one, and
+its light follows LAMP. This wiring suits engines whose patterns are advanced by a trigger input and whose LED has an
+enable or dimming input.
 
     GP2  STEP    out, engine's trigger input      GP5  CAMERA  out, cameras' trigger inputs (opto-isolated)
-    GP3  HOME    out, engine's reset input        GP6  READY   in, engine shows what it was stepped to; None: settles
+    GP3  HOME    out, engine's reset input        GP6  READY   in, engine shows the selected pattern; None: settles
     GP4  LAMP    out, LED enable or dimming input, with a resistor of 10 kΩ to ground
 
-The resistor on LAMP is what keeps it dark while the box starts, restarts or has no firmware: a pin is an input then.
-A watchdog timer restarts the box when this program stands still for a second. This program does not listen to Ctrl-C:
-to change its files, start the box with SERVICE (GP15) on ground, and it ends at once.
+The resistor on LAMP keeps it dark while the box starts, restarts or has no firmware, when the pin is an input. A
+watchdog timer restarts the box if this program hangs for a second. The program ignores Ctrl-C: to change its files,
+start the box with SERVICE (GP15) on ground, and it ends at once.
 """
 
-# MicroPython has no `__future__`, its modules have no types, and the words of `asm_pio` are no names of this module.
+# MicroPython has no `__future__`, its modules have no types, and `asm_pio` has names that are not defined here.
 # ruff: noqa: F821, ANN001, ANN202
 # mypy: disable-error-code="name-defined, no-untyped-def, no-untyped-call, untyped-decorator, type-arg"
 # mypy: disable-error-code="call-overload, redundant-expr, import-not-found"
 
 try:
-    from drivers.serial_projector.device.box import Description, Hardware, HardwareError
-    from drivers.serial_projector.device.protocol import Device
+    from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError
+    from drivers.serial_projector.device.protocol import TriggerBox
 except ImportError:
-    # On a box the files lie side by side.
-    from box import Description, Hardware, HardwareError  # type: ignore[no-redef]
-    from protocol import Device  # type: ignore[no-redef]
+    # On a box the files are in one folder.
+    from box import HardwareError  # type: ignore[no-redef]
 
 MODEL, FIRMWARE = "slrig-pico", "1.1.0"
 WIDTH_PX, HEIGHT_PX = 912, 1140
@@ -32,42 +31,42 @@ WIDTH_PX, HEIGHT_PX = 912, 1140
 STEP_PIN, HOME_PIN, LAMP_PIN, CAMERA_PIN, READY_PIN, SERVICE_PIN = 2, 3, 4, 5, 6, 15
 
 HOME_LEVEL = 1
-"""Level of a pulse on HOME. 0 for an engine that runs while this input is high and begins anew after it was low."""
+"""Level of a pulse on HOME. 0 for an engine that runs while this input is high and restarts after it was low."""
 
 STEPS_TO_FIRST = 0
-"""Pulses on STEP from HOME to the first pattern: 1 where that one waits for a trigger, too."""
+"""Pulses on STEP from HOME to the first pattern: 1 if the first pattern also waits for a trigger."""
 
 STEP_US = 50
 """Length of a pulse on STEP or HOME, and of the pause after it."""
 
 SETTLE_US = 500
-"""From the last step to a pattern that stands still, where there is no READY."""
+"""Time from the last step to a stable pattern, without READY."""
 
 READY_US = 20000
 """Longest wait for READY."""
 
 LAMP_US = 20
-"""From LAMP to light."""
+"""Delay from LAMP to light."""
 
 PULSE_US = 100
 """Length of the cameras' trigger pulse."""
 
 HOLD_US = 500
-"""How long a pattern of a sequence stays lit beyond its exposure: longer than this program is ever late."""
+"""How long a pattern of a sequence stays lit beyond its exposure: longer than the largest delay of this program."""
 
-LEAST_US = 200
+MIN_EXPOSURE_US = 200
 ERROR_US = 50
 DIM_HZ = 100000
 RESTART_MS = 1000
-MOST_DUTY, MOST_ON_MS = 1000, 3600000
+MAX_DUTY, MAX_ON_MS = 1000, 3600000
 TIDY_AFTER = 64
 
 
-def described(patterns: dict) -> Description:
-    """What HELLO says, from the patterns.json that was written with the engine's images."""
+def describe_box(patterns: dict) -> BoxDescription:
+    """Return the box's properties, from the patterns.json that was written with the engine's images."""
     fits = patterns.get("size_px") == [WIDTH_PX, HEIGHT_PX]
     crc32 = [int(each, 16) for each in patterns["crc32"]] if fits else []
-    return Description(
+    return BoxDescription(
         MODEL,
         FIRMWARE,
         WIDTH_PX,
@@ -77,14 +76,14 @@ def described(patterns: dict) -> Description:
         error_us=ERROR_US,
         gap_us=HOLD_US + 2 * STEP_US + SETTLE_US + 1000,
         hold_us=HOLD_US,
-        least_us=LEAST_US,
+        least_us=MIN_EXPOSURE_US,
         step_us=2 * STEP_US,
-        duty=MOST_DUTY,
-        on_ms=MOST_ON_MS,
+        duty=MAX_DUTY,
+        on_ms=MAX_ON_MS,
     )
 
 
-class Board(Hardware):
+class PicoBoard(BoxHardware):
     """The pins. machine, rp2, time : MicroPython's modules."""
 
     def __init__(self, machine, rp2, time) -> None:
@@ -100,14 +99,14 @@ class Board(Hardware):
         self._us = 0
 
     def time_us(self) -> int:
-        """See `Hardware`. The board's own counter wraps after 18 minutes."""
+        """See `BoxHardware`. The board's own counter wraps after 18 minutes."""
         ticks = self._time.ticks_us()
         self._us += self._time.ticks_diff(ticks, self._ticks)
         self._ticks = ticks
         return self._us
 
     def select(self, pattern: int) -> None:
-        """See `Hardware`."""
+        """See `BoxHardware`."""
         if self._position < 0 or pattern < self._position:
             self._send(self._home, HOME_LEVEL)
             for _ in range(STEPS_TO_FIRST):
@@ -122,26 +121,26 @@ class Board(Hardware):
         begun_us = self.time_us()
         while not self._ready.value():
             if self.time_us() - begun_us > READY_US:
-                # Where it stands is unknown: home first, next time.
+                # The position is unknown: home first, next time.
                 self._position = -1
                 raise HardwareError("the engine is not READY")
 
     def light(self) -> None:
-        """See `Hardware`."""
+        """See `BoxHardware`."""
         self._lamp.duty_u16(self._level)
         self._time.sleep_us(LAMP_US)
 
-    def dark(self) -> None:
-        """See `Hardware`."""
+    def switch_off(self) -> None:
+        """See `BoxHardware`."""
         self._lamp.duty_u16(0)
         self._time.sleep_us(LAMP_US)
 
     def pulse(self) -> None:
-        """See `Hardware`. The state machine ends it, so nobody waits."""
+        """See `BoxHardware`. The state machine ends it, without waiting."""
         self._camera.put(PULSE_US)
 
-    def dim(self, permille: int) -> int:
-        """See `Hardware`."""
+    def set_brightness(self, permille: int) -> int:
+        """See `BoxHardware`."""
         self._level = 65535 * permille // 1000
         return permille
 
@@ -153,7 +152,7 @@ class Board(Hardware):
 
 
 def _pulses(machine, rp2):
-    """A state machine that makes one pulse, of so many µs as it is given."""
+    """Return a state machine that makes a pulse of the given number of µs."""
 
     @rp2.asm_pio(set_init=rp2.PIO.OUT_LOW)
     def program() -> None:
@@ -178,19 +177,19 @@ class UsbPort:
         self._poll.register(sys.stdin, select.POLLIN)
 
     def read(self) -> bytes:
-        """What came in; does not wait."""
+        """Return the received bytes without waiting."""
         data = b""
         while len(data) < 64 and self._poll.poll(0):
             data += self._in.read(1)
         return data
 
     def write(self, data: bytes) -> None:
-        """Send it."""
+        """Send bytes."""
         self._out.write(data)
 
 
-def serve(device: Device, port: UsbPort, alive, tidy) -> None:
-    """Run a box without end. alive : feeds the watchdog timer. tidy : collects garbage, where that disturbs least."""
+def serve(device: TriggerBox, port: UsbPort, alive, tidy) -> None:
+    """Run a box forever. alive : feeds the watchdog timer. tidy : collects garbage, at the least disturbing time."""
     sent = 0
     while True:
         alive()
@@ -199,15 +198,15 @@ def serve(device: Device, port: UsbPort, alive, tidy) -> None:
         if out:
             port.write(out)
             sent += 1
-            # Memory is tidied by choice, in the dark: of itself it would happen in the middle of an exposure.
+            # Collect garbage in the dark: automatic collection could occur during an exposure.
             if sent >= TIDY_AFTER and device.wait_us() < 0:
                 tidy()
                 sent = 0
 
 
 def run() -> None:
-    """Be a trigger box. Called on the board only."""
-    # ruff: noqa: I001 - what only the board has
+    """Run as a trigger box. Called on the board only."""
+    # ruff: noqa: I001 - modules of the board only
     import gc
     import json
     import machine
@@ -220,20 +219,20 @@ def run() -> None:
 
     if not machine.Pin(SERVICE_PIN, machine.Pin.IN, machine.Pin.PULL_UP).value():
         return
-    # Bytes from the host are never a keyboard interrupt.
+    # Do not treat bytes from the host as keyboard interrupts.
     micropython.kbd_intr(-1)
-    board = Board(machine, rp2, time)
+    board = PicoBoard(machine, rp2, time)
     try:
         with open("patterns.json") as file:  # noqa: PTH123 - MicroPython has no pathlib
             patterns = json.load(file)
     except (OSError, ValueError):
         patterns = {}
-    device = Device(board, described(patterns), int.from_bytes(os.urandom(4), "big"))
+    device = TriggerBox(board, describe_box(patterns), int.from_bytes(os.urandom(4), "big"))
     watchdog = machine.WDT(timeout=RESTART_MS)
     try:
         serve(device, UsbPort(select, sys), watchdog.feed, gc.collect)
     finally:
-        board.dark()
+        board.switch_off()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""SLTP/1 on the wire: lines with their checksums, and the numbers that verbs, errors and faults go by.
+"""SLTP/1 on the wire: lines with their checksums, and the numbers of errors, faults and modes.
 
 Runs unchanged in MicroPython and in CPython.
 """
@@ -6,13 +6,13 @@ Runs unchanged in MicroPython and in CPython.
 # MicroPython has no `__future__`.
 
 VERSION = 1
-MOST_LINE_BYTES = 240
+MAX_LINE_BYTES = 240
 NUMBERS = 10000
 
 # Errors, as in `<session> <number> ERR <code> <words>`.
 FRAMING, VERB, STATE, RANGE, BUSY, HARDWARE, FAULT, SESSION, PATTERNS, LIMIT = 1, 2, 3, 4, 5, 6, 7, 8, 9, 10
 
-# Faults, as in `! FAULT <code>`: why the box went dark by itself.
+# Faults, as in `! FAULT <code>`: reasons why the box went dark by itself.
 WATCHDOG, ON_TIME, DUTY, LIGHT = 1, 2, 3, 4
 
 # Modes of SEQ.
@@ -33,24 +33,24 @@ _CRC16 = _table()
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE: polynomial 0x1021, begins with 0xFFFF, neither reflected nor inverted."""
+    """CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF, neither reflected nor inverted."""
     value = 0xFFFF
     for byte in data:
         value = (value << 8 & 0xFF00) ^ _CRC16[value >> 8 ^ byte]
     return value
 
 
-def framed(text: str) -> bytes:
-    """A line as it goes over the wire."""
+def encode_line(text: str) -> bytes:
+    """Encode a line for the wire."""
     body = text.encode("ascii")
     return body + b"*" + f"{crc16(body):04X}".encode("ascii") + b"\n"
 
 
-def unframed(line: bytes) -> "str | None":
-    """The text of a line that came over the wire (without its end); None where it is damaged."""
+def decode_line(line: bytes) -> "str | None":
+    """Return the text of a received line (without its end); None if it is damaged."""
     line = line.rstrip(b"\r")
     body, star, crc = line[:-5], line[-5:-4], line[-4:]
-    if star != b"*" or len(line) > MOST_LINE_BYTES or f"{crc16(body):04X}".encode("ascii") != crc:
+    if star != b"*" or len(line) > MAX_LINE_BYTES or f"{crc16(body):04X}".encode("ascii") != crc:
         return None
     for byte in body:
         if not 32 <= byte < 127:

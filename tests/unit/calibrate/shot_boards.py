@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from simulated_rig.options import HeadOptions
-from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import Scene, surface_of
+from simulated_rig.rendering import CameraView, SceneState
+from simulated_rig.scene import Scene, build_surface
 from slrig.calibration.board import Board, BoardKind
 from slrig.model import CameraFormat, CameraTruth, Capture, FloatArray, Pattern, Shot, Size
 from slrig.patterns.sequence import encode, scan_patterns
@@ -54,7 +54,7 @@ def patterns_for(size: Size, *, line_shift: bool = True) -> tuple[Pattern, ...]:
 
 
 @cache
-def exposed(standing: Standing) -> tuple[ExposedView, View]:
+def exposed(standing: Standing) -> tuple[ExposedView, CameraView]:
     """The rig's camera before a board, exposed so that its brightest paper comes to `_WHITE` of full scale."""
     table = tomllib.loads(_RIG.read_text(encoding="utf-8"))["head"]
     head = {key: table[key] for key in ("scene", "seed", "samples_per_axis", "ambient")}
@@ -62,12 +62,12 @@ def exposed(standing: Standing) -> tuple[ExposedView, View]:
     head["camera"] = [_scaled(table["camera"][0], _SCALE) | {"blur_px": 0.6}]
     options = HeadOptions.model_validate(head)
     eye, lamp = options.camera[0], options.projector
-    stage = Stage(
-        surface_of(_scene(standing), _RIG.parent),
+    stage = SceneState(
+        build_surface(_scene(standing), _RIG.parent),
         lamp.pinhole(),
         working_distance_mm=float(np.linalg.norm(lamp.pinhole().centre_mm)),
     )
-    view = View(
+    view = CameraView(
         eye.pinhole(), stage, blur_px=eye.blur_px, ambient=options.ambient, jitter=False, seed=options.seed,
         samples_per_axis=options.samples_per_axis, workers=1,
     )  # fmt: skip

@@ -82,7 +82,7 @@ def test_the_rig_is_dark_and_usable_after_the_test(tmp_path: Path, interrupted: 
     assert fractions[0] == 0
     assert interrupted or fractions[-1] == 1
     assert usual.head is not None
-    assert not usual.head.projector.lit  # type: ignore[attr-defined]
+    assert not usual.head.projector.is_lit  # type: ignore[attr-defined]
 
 
 def test_a_lamp_that_is_off_and_a_way_of_triggering_that_a_camera_has_not_end_the_test(tmp_path: Path) -> None:

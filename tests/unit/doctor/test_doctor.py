@@ -110,7 +110,7 @@ def small_rig(
     settings = {"eye": CameraSettings(exposure_s)}
     with Rig("small", dict(head.cameras), head.projector, settings, head.calibration, head, clock=head.clock) as opened:
         yield opened
-        assert not head.projector.lit
+        assert not head.projector.is_lit
 
 
 @pytest.fixture
@@ -344,7 +344,7 @@ def pinhole(rotation: FloatArray, centre_mm: tuple[float, ...]) -> Pinhole:
 # The fake engine is a thread: a busy machine may hold it for longer than `image_load_s`.
 @pytest.mark.realtime
 def test_the_sense_of_the_current_is_found_and_all_else_waits_for_it(tmp_path: Path) -> None:
-    from drivers.dlpc350.planes import MIRRORS
+    from drivers.dlpc350.flash import MIRRORS
     from tests.contract.dlpc350_bench import Table
     from tests.contract.suite import rig_of
 

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 from drivers import depthai, genicam, picamera2
-from drivers.depthai.library import ENVIRONMENT, library
-from drivers.genicam.library import install_command
-from drivers.genicam.library import library as aravis
-from drivers.genicam.producers import core
+from drivers.depthai.library import ENVIRONMENT, load_depthai
+from drivers.genicam.aravis import install_command
+from drivers.genicam.aravis import load_aravis as aravis
+from drivers.genicam.gentl import load_harvesters
 from slrig.bundle.validation import validate
 from slrig.discovery import driver_kinds, drivers_with_options, option_model
 from slrig.errors import ConfigError, LibraryMissingError
@@ -106,7 +106,7 @@ def test_no_vendors_library_is_needed() -> None:
 
 
 OAK = {"device": "14442C10D13EABCE00", "socket": "CAM_B"}
-LOADED = (aravis, core)
+LOADED = (aravis, load_harvesters)
 ARAVIS: tuple[Callable[[], object], ...] = (
     genicam.find_devices,
     lambda: genicam.open_camera("left", {"device": "x"}, Path()),
@@ -173,7 +173,7 @@ def test_depthai_reports_nothing_to_its_maker_unless_the_user_asks_for_it(monkey
         monkeypatch.setenv(variable, "")
         monkeypatch.delenv(variable)
     monkeypatch.setenv("DEPTHAI_LEVEL", "debug")
-    assert library() is new
+    assert load_depthai() is new
     assert os.environ["DEPTHAI_TELEMETRY"] == "0"
     assert os.environ["DEPTHAI_DISABLE_STARTUP_NOTIFICATIONS"] == "1"
     assert os.environ["DEPTHAI_LEVEL"] == "debug"

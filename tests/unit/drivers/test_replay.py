@@ -184,7 +184,7 @@ def test_darkness_looks_as_it_was_recorded_and_is_not_made_up(tmp_path: Path) ->
         ({"bundle": "rec", "folder": "x", "sped": 2}, r"(?s)folder: unknown key.*sped: unknown key; .*'speed'"),
         ({"bundle": "rec", "speed": 0.01}, r"speed: expected 0, or 0.05 to 1000 times .*found 0.01"),
         ({"bundle": "rec", "speed": -1}, "speed: expected 0, or"),
-        ({"bundle": "nowhere"}, "nowhere is no scan bundle"),
+        ({"bundle": "nowhere"}, "nowhere is not a scan bundle"),
     ],
 )
 def test_options_are_checked(tmp_path: Path, options: dict[str, object], words: str) -> None:

@@ -13,7 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from simulated_rig.casting import caster
+from simulated_rig.transport import build_caster
 from slrig.meshing.surface import vertex_normals
 from slrig.meshing.topology import used_vertices
 from slrig.model import FloatArray, Mesh
@@ -100,7 +100,7 @@ def _view(truth: trimesh.Trimesh, direction: FloatArray, pixel_mm: float, noise:
     ).reshape(-1, 3)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     faces = np.asarray(truth.faces, np.int32)
-    hit = caster(vertices, faces).first_hit(eye, rays)
+    hit = build_caster(vertices, faces).first_hit(eye, rays)
     normals = np.asarray(truth.face_normals)[hit]
     # Where the ray meets the plane of the triangle, in double precision.
     corner = vertices[faces[hit, 0]]

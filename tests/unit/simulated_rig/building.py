@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from simulated_rig.boards import Board
-from simulated_rig.device import SimulatedHead, simulated_head
-from simulated_rig.placed import turned_by
-from simulated_rig.tables import Triple
+from simulated_rig.device import SimulatedHead, open_simulated_head
+from simulated_rig.scene import PrintedBoard, Triple, rotation_matrix
 from slrig.devices import Trigger
 from slrig.model import Axis, Black, FloatArray, Frame, LineShift, Pattern, PatternSequence, Pixels, Size, White
 
@@ -52,7 +50,7 @@ def head_options(
 def small_head(folder: Path, scene: str = FACING_PLATE, **options: Any) -> SimulatedHead:
     """Open a rig of `head_options` before `scene`, whose file is written into `folder`."""
     (folder / "scene.toml").write_text(scene)
-    return simulated_head(head_options(**options), folder)
+    return open_simulated_head(head_options(**options), folder)
 
 
 def coarser(head: Mapping[str, Any], times: int) -> dict[str, Any]:
@@ -99,6 +97,6 @@ def frames_of(
     return found
 
 
-def corners_in_world_mm(board: Board, position_mm: Triple, rotation_deg: Triple) -> FloatArray:
+def corners_in_world_mm(board: PrintedBoard, position_mm: Triple, rotation_deg: Triple) -> FloatArray:
     """(n, 3) float64: the print's corners in the world, of a board in a pose."""
-    return np.asarray(board.corners_mm @ turned_by(rotation_deg).T + position_mm, np.float64)
+    return np.asarray(board.corners_mm @ rotation_matrix(rotation_deg).T + position_mm, np.float64)

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from simulated_rig.boards import Board, Print, across_of, along_of
+from simulated_rig.scene import BoardPrint, PrintedBoard, arc_length_mm, x_at_arc_length_mm
 from slrig.calibration.board import Board as Designed
 from slrig.calibration.board import BoardKind
 from slrig.model import FloatArray
@@ -23,11 +23,11 @@ SIZES: dict[str, dict[str, Any]] = {
 }
 
 
-def board(kind: str = "chessboard", **options: Any) -> Board:
-    return Board.model_validate({"shape": "board", "kind": kind, **SIZES[kind], **options})
+def board(kind: str = "chessboard", **options: Any) -> PrintedBoard:
+    return PrintedBoard.model_validate({"shape": "board", "kind": kind, **SIZES[kind], **options})
 
 
-def dark_at(shown: Print, points_mm: FloatArray) -> NDArray[np.bool_]:
+def dark_at(shown: BoardPrint, points_mm: FloatArray) -> NDArray[np.bool_]:
     """Whether the print is dark at points (n, 2) that lie on no line of it."""
     if len(shown.centres_mm):
         apart = np.linalg.norm(points_mm[:, None] - shown.centres_mm, axis=2)
@@ -39,7 +39,7 @@ def dark_at(shown: Print, points_mm: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(inside & dark)
 
 
-def on_print(each: Board, columns: int, rows: int, *, per_mm: int) -> FloatArray:
+def on_print(each: PrintedBoard, columns: int, rows: int, *, per_mm: int) -> FloatArray:
     """(n, 2): centres of the pixels of a drawing of so many squares, in the board's frame."""
     y, x = np.mgrid[: rows * 9 * per_mm, : columns * 9 * per_mm]
     at = (np.column_stack([x.ravel(), y.ravel()]) + 0.5) / per_mm - each.square_mm
@@ -50,13 +50,13 @@ def test_a_charuco_board_is_the_one_that_opencv_draws() -> None:
     each, per_mm = board("charuco"), 4
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
     drawn = cv2.aruco.CharucoBoard((6, 5), 9.0, 7.0, dictionary).generateImage((6 * 9 * per_mm, 5 * 9 * per_mm))
-    found = dark_at(each.printed(), on_print(each, 6, 5, per_mm=per_mm)).reshape(drawn.shape)
+    found = dark_at(each.print_layout(), on_print(each, 6, 5, per_mm=per_mm)).reshape(drawn.shape)
     np.testing.assert_array_equal(found, drawn < 128)
 
 
 def test_a_chessboard_begins_with_a_dark_square() -> None:
     each = board()
-    shown, s = each.printed(), each.square_mm
+    shown, s = each.print_layout(), each.square_mm
     corner = each.corners_mm[0, :2]
     around = corner + np.array([(-s, -s), (s, -s), (-s, s), (s, s)]) / 2
     assert dark_at(shown, around).tolist() == [True, False, False, True]
@@ -77,7 +77,7 @@ def test_corners_lie_where_the_calibration_expects_them(kind: BoardKind) -> None
 
 def test_circles_are_dark_discs_about_their_centres() -> None:
     each = board("circles", circle_mm=6.0)
-    shown = each.printed()
+    shown = each.print_layout()
     np.testing.assert_allclose(shown.centres_mm, each.corners_mm[:, :2])
     assert dark_at(shown, shown.centres_mm + np.array([2.9, 0.0])).all()
     assert not dark_at(shown, shown.centres_mm + np.array([3.1, 0.0])).any()
@@ -87,14 +87,18 @@ def test_circles_are_dark_discs_about_their_centres() -> None:
 def test_a_mirrored_print_is_the_print_seen_from_behind(kind: str) -> None:
     plain, mirrored = board(kind), board(kind, mirrored=True)
     points = np.random.default_rng(3).uniform(-40, 40, (5000, 2))
-    np.testing.assert_array_equal(dark_at(mirrored.printed(), points), dark_at(plain.printed(), points * [-1.0, 1.0]))
+    np.testing.assert_array_equal(
+        dark_at(mirrored.print_layout(), points), dark_at(plain.print_layout(), points * [-1.0, 1.0])
+    )
     np.testing.assert_allclose(mirrored.corners_mm, plain.corners_mm * [-1.0, 1.0, 1.0])
 
 
 def test_a_printer_that_scales_moves_corners_and_print_alike() -> None:
     plain, scaled = board(), board(scale=(1.05, 0.98))
     points = np.random.default_rng(4).uniform(-30, 30, (5000, 2))
-    np.testing.assert_array_equal(dark_at(scaled.printed(), points * [1.05, 0.98]), dark_at(plain.printed(), points))
+    np.testing.assert_array_equal(
+        dark_at(scaled.print_layout(), points * [1.05, 0.98]), dark_at(plain.print_layout(), points)
+    )
     np.testing.assert_allclose(scaled.corners_mm, plain.corners_mm * [1.05, 0.98, 1.0])
 
 
@@ -109,7 +113,7 @@ def test_a_bent_board_keeps_its_length_along_the_bend(bow_mm: float) -> None:
     fine = each.on_sheet_mm(np.column_stack([np.linspace(-half, half, 20001), np.zeros(20001)]))
     assert np.linalg.norm(np.diff(fine, axis=0), axis=1).sum() == pytest.approx(2 * half, rel=1e-8)
     x = np.linspace(-half, half, 7)
-    np.testing.assert_allclose(across_of(along_of(x, 0.004), 0.004), x, atol=1e-10)
+    np.testing.assert_allclose(x_at_arc_length_mm(arc_length_mm(x, 0.004), 0.004), x, atol=1e-10)
     (part,) = each.parts(None)  # type: ignore[arg-type]  # a board reads no file
     vertices = part.vertices_mm
     np.testing.assert_allclose(vertices[:, 2], each.curvature_per_mm * vertices[:, 0] ** 2, atol=1e-12)
@@ -129,11 +133,11 @@ def test_corners_in_the_world_turn_about_the_middle() -> None:
     ("kind", "options", "words"),
     [
         ("charuco", {"marker_mm": 9.0}, "below square_mm"),
-        ("charuco", {"dictionary": "DICT_9X9"}, "no dictionary"),
+        ("charuco", {"dictionary": "DICT_9X9"}, "unknown dictionary"),
         ("charuco", {"dictionary": "DICT_5X5_50", "columns": 12, "rows": 9}, "needs 65 markers"),
-        ("chessboard", {"marker_mm": 5.0}, "belongs to a ChArUco"),
+        ("chessboard", {"marker_mm": 5.0}, "applies to ChArUco"),
         ("chessboard", {"albedo_dark": 0.9}, "below albedo_light"),
-        ("chessboard", {"bow_mm": 30.0}, "bow_mm must lie within"),
+        ("chessboard", {"bow_mm": 30.0}, "bow_mm must be at most"),
         ("chessboard", {"albedo": 0.5}, "albedo"),
     ],
 )

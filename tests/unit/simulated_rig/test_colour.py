@@ -46,7 +46,7 @@ def light_of(white: Frame, black: Frame) -> FloatArray:
 def reflectance(head: SimulatedHead) -> FloatArray:
     """(H, W, 3): the truth."""
     paths = head._views["eye"].prepare()
-    return np.stack([paths.in_light(channel).albedo for channel in range(3)], axis=2).astype(float)
+    return np.stack([paths.for_channel(channel).albedo for channel in range(3)], axis=2).astype(float)
 
 
 def test_a_camera_that_sees_colour_has_the_grey_frames_that_it_had_without(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulated_rig.device import open_head, simulated_head
+from simulated_rig.device import open_head, open_simulated_head
 from slrig.errors import ConfigError
 from tests.unit.simulated_rig.building import FACING_PLATE, coarser, head_options, small_head
 
@@ -29,7 +29,7 @@ RENDERED = [path for path in RIGS if tomllib.loads(path.read_text()).get("head",
 def test_every_rendered_rig_we_ship_sees_a_lit_surface(path: Path) -> None:
     table = tomllib.loads(path.read_text())["head"]
     table.pop("driver")
-    head = simulated_head(coarser(table, 8), path.parent)
+    head = open_simulated_head(coarser(table, 8), path.parent)
     assert (head.calibration is None) is ("calibration" in path.stem)
     truth = head.truth()
     assert list(truth.cameras) == list(head.exact_calibration.cameras) == list(head.cameras)
@@ -115,7 +115,10 @@ def test_a_pose_may_be_given_as_a_calibration_has_it(tmp_path: Path) -> None:
         ('[[object]]\nshape = "mesh"\nfile = "absent.stl"\n', "absent.stl"),
         ('[[object]]\nshape = "mesh"\nfile = "broken.stl"\n', "broken.stl"),
         ('[[object]]\nshape = "mesh"\nfile = "strange.xyzzy"\n', "strange.xyzzy"),
-        ('[[object]]\nshape = "ball_bar"\nradius_mm = 9.0\ndistance_mm = 10.0\nbar_radius_mm = 1.0\n', "lie apart"),
+        (
+            '[[object]]\nshape = "ball_bar"\nradius_mm = 9.0\ndistance_mm = 10.0\nbar_radius_mm = 1.0\n',
+            "must not touch",
+        ),
         ('[[object]]\nshape = "relief"\nsize_mm = [5000.0, 5000.0]\nstep_mm = 0.1\n', "larger step_mm"),
         ('[[object]]\nshape = "turned"\nprofile_mm = [[9.0, 0.0], [9.0, 5.0], [9.0, 4.0]]\n', "rising heights"),
         ('[[object]]\nshape = "turned"\nprofile_mm = [[9.0, 0.0], [9.0, 5.0]]\n', "at least 3 points"),

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_rig.defocus import LEVELS_PX, Focus, level_weights
 from simulated_rig.light import Float32Array, Response, light_table
-from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import Scene, surface_of
+from simulated_rig.optics import LEVELS_PX, Focus, level_weights
+from simulated_rig.rendering import CameraView, SceneState
+from simulated_rig.scene import Scene, build_surface
 from slrig.model import FloatArray, Pinhole, Size
 from tests.unit.simulated_rig.building import line_profile
 
@@ -37,8 +37,10 @@ def image(
         "rotation_deg": [0.0, turned_deg, 0.0],
     }  # fmt: skip
     projector = device(10.0, LAMP)
-    stage = Stage(surface_of(Scene.model_validate({"object": [plate]}), Path()), projector, working_distance_mm=500)
-    view = View(
+    stage = SceneState(
+        build_surface(Scene.model_validate({"object": [plate]}), Path()), projector, working_distance_mm=500
+    )
+    view = CameraView(
         device(-10.0, SIZE), stage, blur_px=blur_px, focus=(lamp, lens), ambient=0.0, samples_per_axis=3, jitter=False,
         seed=1, workers=1,
     )  # fmt: skip

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_rig.device import SimulatedHead
-from simulated_rig.projector import SimulatedProjector
+from simulated_rig.device import SimulatedHead, SimulatedProjector
 from slrig.devices import Camera, CameraSettings, Trigger
 from slrig.errors import (
     DeviceGoneError,
@@ -76,7 +75,7 @@ def test_two_cameras_expose_at_the_same_time_with_noise_of_their_own(tmp_path: P
 
 def test_sequences_that_cannot_be_shown_are_refused(tmp_path: Path) -> None:
     projector = small_head(tmp_path, projector={"max_patterns": 3}).projector
-    with pytest.raises(UnsupportedByDeviceError, match="3 patterns"):
+    with pytest.raises(UnsupportedByDeviceError, match="holds 3"):
         projector.load(white_black_lines(SIZE))
     picture = PatternSequence(SIZE, (White(),), (np.eye(60, 80, dtype=np.uint8),))
     with pytest.raises(UnsupportedByDeviceError, match="both axes"):
@@ -85,21 +84,21 @@ def test_sequences_that_cannot_be_shown_are_refused(tmp_path: Path) -> None:
 
 def test_the_projector_is_dark_unless_it_shows(tmp_path: Path) -> None:
     projector = small_head(tmp_path).projector
-    assert not projector.lit
+    assert not projector.is_lit
     projector.load(white_black_lines(SIZE))
-    assert not projector.lit
+    assert not projector.is_lit
     for ending in (projector.blank, projector.stop, lambda: projector.load(white_black_lines(SIZE)), projector.close):
         projector.show(0)
-        assert (projector.lit, projector.showing) == (True, 0)
+        assert (projector.is_lit, projector.shown_pattern) == (True, 0)
         ending()
-        assert (projector.lit, projector.showing) == (False, None)
+        assert (projector.is_lit, projector.shown_pattern) == (False, None)
 
 
 def test_a_black_pattern_is_not_lit(tmp_path: Path) -> None:
     projector = small_head(tmp_path).projector
     projector.load(white_black_lines(SIZE))
     projector.show(1)
-    assert (projector.lit, projector.showing) == (False, 1)
+    assert (projector.is_lit, projector.shown_pattern) == (False, 1)
     with pytest.raises(UnsupportedByDeviceError, match="0 to 9"):
         projector.show(10)
 
@@ -220,7 +219,7 @@ def test_an_unplugged_projector_is_dark_and_gone(tmp_path: Path) -> None:
     for _ in range(2):
         with pytest.raises(DeviceGoneError, match="gone"):
             projector.show(0)
-    assert not projector.lit
+    assert not projector.is_lit
     with pytest.raises(DeviceGoneError):
         projector.blank()
     projector.close()
@@ -241,15 +240,15 @@ def test_faults_befall_only_the_cameras_they_name(tmp_path: Path) -> None:
 def test_a_lamp_that_is_off_lights_nothing(tmp_path: Path) -> None:
     head, _camera = armed(tmp_path, faults={"lamp_off": True})
     assert taken(head, 0).image.mean() < 1
-    assert not head.projector.lit
+    assert not head.projector.is_lit
 
 
 def test_light_later_than_reported_gives_the_pattern_before(tmp_path: Path) -> None:
     head, _camera = armed(tmp_path, faults={"light_delay_s": 0.5})
     frame = taken(head, 0)
     assert frame.image.mean() < 3
-    assert head.projector.showing == 0
-    assert not head.projector.lit
+    assert head.projector.shown_pattern == 0
+    assert not head.projector.is_lit
 
 
 def test_the_light_comes_within_the_stated_error(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.device import SimulatedHead
-from simulated_rig.disturbing import Drift, Push, pushed
 from simulated_rig.light import Float32Array
+from simulated_rig.movements import PoseDrift, PoseOffset, apply_pose_offset
 from slrig.devices import Trigger
 from slrig.errors import ConfigError
 from tests.rendered_boards import board_head, board_options
@@ -40,16 +40,16 @@ def frames(head: SimulatedHead, count: int = 10) -> list[Float32Array]:
 
 def test_a_push_turns_and_shifts_a_device_in_its_own_frame(tmp_path: Path) -> None:
     device = small_head(tmp_path).exact_calibration.cameras["eye"]
-    push = Push(device="eye", turn_deg=(0.0, 0.0, 90.0), shift_mm=(1.0, 2.0, 3.0))
-    now = pushed(device, push)
+    push = PoseOffset(device="eye", turn_deg=(0.0, 0.0, 90.0), shift_mm=(1.0, 2.0, 3.0))
+    now = apply_pose_offset(device, push)
     point = np.array([4.0, 5.0, 6.0])
     seen = device.rotation @ point + device.translation_mm
     moved = now.rotation @ point + now.translation_mm
     np.testing.assert_allclose(moved, [-(seen[1] + 2), seen[0] + 1, seen[2] + 3], atol=1e-12)
-    half = pushed(device, push, share=0.5)
+    half = apply_pose_offset(device, push, share=0.5)
     angle = Rotation.from_matrix(half.rotation @ device.rotation.T).magnitude()
     assert np.rad2deg(angle) == pytest.approx(45.0)
-    np.testing.assert_allclose(pushed(device, push, share=0.0).translation_mm, device.translation_mm)
+    np.testing.assert_allclose(apply_pose_offset(device, push, share=0.0).translation_mm, device.translation_mm)
 
 
 def test_a_bumped_camera_sees_otherwise_than_its_calibration_says(tmp_path: Path) -> None:
@@ -65,7 +65,9 @@ def test_a_bumped_camera_sees_otherwise_than_its_calibration_says(tmp_path: Path
     stated, again = bumped.exact_calibration.cameras["left"], steady.exact_calibration.cameras["left"]
     np.testing.assert_array_equal(stated.rotation, again.rotation)
     # What it sees at pose 1 is what a rig sees whose camera stands there from the beginning.
-    there = pushed(stated, Push.model_validate({k: v for k, v in BUMP.items() if k != "pose"} | {"device": "left"}))
+    there = apply_pose_offset(
+        stated, PoseOffset.model_validate({k: v for k, v in BUMP.items() if k != "pose"} | {"device": "left"})
+    )
     options = coarser(board_options(poses=None, pose=POSES), 2)
     posed = {key: options["camera"][0][key] for key in options["camera"][0] if key not in ("position_mm", "target_mm")}
     posed |= {"rotation": there.rotation.tolist(), "translation_mm": there.translation_mm.tolist()}
@@ -93,14 +95,14 @@ def test_a_bumped_projector_lights_otherwise_and_moves_no_depth(tmp_path: Path) 
 
 
 def test_drift_settles() -> None:
-    drift = Drift(device="left", turn_deg=(0.0, 0.1, 0.0), settle_s=100.0)
-    shares = [drift.share(time_s, 0) for time_s in (0.0, 100.0, 1e6)]
+    drift = PoseDrift(device="left", turn_deg=(0.0, 0.1, 0.0), settle_s=100.0)
+    shares = [drift.progress(time_s, 0) for time_s in (0.0, 100.0, 1e6)]
     np.testing.assert_allclose(shares, [0.0, 1 - np.exp(-1), 1.0])
-    counted = Drift(device="left", settle_captures=2.0)
-    np.testing.assert_allclose([counted.share(99.0, n) for n in (0, 2)], [0.0, 1 - np.exp(-1)])
+    counted = PoseDrift(device="left", settle_captures=2.0)
+    np.testing.assert_allclose([counted.progress(99.0, n) for n in (0, 2)], [0.0, 1 - np.exp(-1)])
     for table in ({}, {"settle_s": 1.0, "settle_captures": 1.0}):
-        with pytest.raises(ValueError, match="not both"):
-            Drift.model_validate({"device": "left", **table})
+        with pytest.raises(ValueError, match="either settle_s"):
+            PoseDrift.model_validate({"device": "left", **table})
 
 
 def test_a_device_drifts_from_capture_to_capture_and_stands_still_within_one(tmp_path: Path) -> None:
@@ -130,7 +132,7 @@ def test_a_device_drifts_with_the_time_of_the_world(tmp_path: Path) -> None:
         eye.read(0, 10.0)
     assert head.clock.now_ns() - begun == 10 * 10**9
     head.projector.load(sequence)
-    now, stated = head._stage.projector, head.exact_calibration.projector
+    now, stated = head._scene_state.projector, head.exact_calibration.projector
     assert stated is not None
     np.testing.assert_allclose(now.translation_mm - stated.translation_mm, [0.0, 1 - np.exp(-1), 0.0], atol=1e-9)
 
@@ -171,8 +173,8 @@ def test_an_object_moves_without_a_script_too(tmp_path: Path) -> None:
     [
         ({"faults": {"bump": [BUMP | {"device": "third"}]}}, "third.*the rig has.*left.*projector"),
         ({"drift": [{"device": "third", "settle_s": 1.0}]}, "third"),
-        ({"faults": {"bump": [BUMP | {"device": "left", "pose": 9}]}}, "there is no pose 9, the script has 3"),
-        ({"faults": {"moving": [{"pose": 3}]}}, "there is no pose 3"),
+        ({"faults": {"bump": [BUMP | {"device": "left", "pose": 9}]}}, "pose 9 does not exist; the script has 3"),
+        ({"faults": {"moving": [{"pose": 3}]}}, "pose 3 does not exist"),
         ({"faults": {"moving": [{"steps": 1}]}}, "steps"),
     ],
 )
@@ -183,8 +185,8 @@ def test_faults_of_what_is_not_there_are_refused(tmp_path: Path, options: dict[s
 
 def test_nothing_is_disturbed_by_default(tmp_path: Path) -> None:
     head = small_head(tmp_path)
-    stage, eye = head._stage.setting, head._views["eye"].camera
+    stage, eye = head._scene_state.snapshot, head._views["eye"].camera
     frames(head)
-    assert head._stage.setting is stage
+    assert head._scene_state.snapshot is stage
     assert head._views["eye"].camera is eye
     assert head_options().keys().isdisjoint({"drift", "pose", "poses", "faults"})

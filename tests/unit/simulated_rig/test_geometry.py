@@ -11,7 +11,7 @@ import trimesh
 
 from simulated_rig import shapes
 from simulated_rig.device import SimulatedHead
-from simulated_rig.scene import read_scene, surface_of
+from simulated_rig.scene import build_surface, read_scene
 from slrig.model import FloatArray, IntArray
 from slrig.scan.mesh_formats import encode_mesh_glb
 from tests.unit.scan.test_mesh_formats import half_ball
@@ -113,7 +113,7 @@ def test_a_ball_bar_has_its_balls_at_the_given_distance(tmp_path: Path) -> None:
         '[[object]]\nshape = "ball_bar"\nradius_mm = 10.0\ndistance_mm = 50.0\nbar_radius_mm = 2.0\n'
         "rotation_deg = [0.0, 0.0, 90.0]\nposition_mm = [1.0, 2.0, 3.0]\n"
     )
-    surface = surface_of(read_scene(tmp_path / "s.toml"), tmp_path)
+    surface = build_surface(read_scene(tmp_path / "s.toml"), tmp_path)
     np.testing.assert_allclose(surface.sphere_mm[0], [1, -23, 3, 10], atol=1e-12)
     np.testing.assert_allclose(surface.sphere_mm[1], [1, 27, 3, 10], atol=1e-12)
     bar = surface.vertices_mm[surface.faces[surface.part == 2]].reshape(-1, 3)
@@ -143,7 +143,7 @@ def test_a_turned_vessel_passes_through_its_profile_and_is_fluted(tmp_path: Path
         '[[object]]\nshape = "turned"\nprofile_mm = [[20.0, -30.0], [30.0, 0.0], [15.0, 30.0]]\n'
         "flutes = 6\nflute_depth_mm = 1.0\n"
     )
-    vertices = surface_of(read_scene(tmp_path / "s.toml"), tmp_path).vertices_mm
+    vertices = build_surface(read_scene(tmp_path / "s.toml"), tmp_path).vertices_mm
     for radius, height in ((20.0, -30.0), (30.0, 0.0), (15.0, 30.0)):
         ring = vertices[np.isclose(vertices[:, 1], -height)]
         spread = np.hypot(ring[:, 0], ring[:, 2])
@@ -168,7 +168,7 @@ def test_a_scan_s_own_glb_can_be_put_back_where_it_was_scanned(tmp_path: Path) -
     (tmp_path / "scan.glb").write_bytes(encode_mesh_glb(mesh))
     scene = '[[object]]\nshape = "mesh"\nfile = "scan.glb"\nunit_mm = 1000.0\nrotation_deg = [180.0, 0.0, 0.0]\n'
     (tmp_path / "s.toml").write_text(scene)
-    surface = surface_of(read_scene(tmp_path / "s.toml"), tmp_path)
+    surface = build_surface(read_scene(tmp_path / "s.toml"), tmp_path)
     wanted = mesh.vertices_mm[mesh.faces]
     np.testing.assert_allclose(surface.vertices_mm[surface.faces], wanted, rtol=0, atol=1e-4)
 
@@ -191,7 +191,7 @@ def test_triangles_run_counter_clockwise_seen_from_the_devices(tmp_path: Path, s
     normal = np.cross(b - a, c - a)
     assert (np.linalg.norm(normal, axis=1) > 0).all()
     view = head._views["eye"]
-    hit = view._stage.rays.first_hit(np.array([0.0, 0, -500]), _directions_to(a + (b - a + c - a) / 3))
+    hit = view._scene.rays.first_hit(np.array([0.0, 0, -500]), _directions_to(a + (b - a + c - a) / 3))
     first = hit == np.arange(len(hit))
     assert first.sum() >= 2
     assert (normal[first] @ np.array([0.0, 0, 1]) < 1e-9).mean() > 0.97
@@ -207,7 +207,7 @@ def _directions_to(points: FloatArray) -> FloatArray:
 def test_facets_of_a_ball_stay_within_the_stated_error(tmp_path: Path) -> None:
     for radius in (3.0, 20.0, 60.0):
         (tmp_path / "s.toml").write_text(f'[[object]]\nshape = "sphere"\nradius_mm = {radius}\n')
-        surface = surface_of(read_scene(tmp_path / "s.toml"), tmp_path)
+        surface = build_surface(read_scene(tmp_path / "s.toml"), tmp_path)
         middle = surface.vertices_mm[surface.faces].mean(axis=1)
         assert (radius - np.linalg.norm(middle, axis=1)).max() < 0.003
 
@@ -223,7 +223,7 @@ def folded(angle_deg: float) -> tuple[FloatArray, IntArray]:
 @pytest.mark.parametrize(("angle_deg", "smooth"), [(20.0, True), (40.0, False)])
 def test_normals_are_shared_up_to_the_crease_angle(angle_deg: float, smooth: bool) -> None:
     vertices, faces = folded(angle_deg)
-    part = shapes._smooth(vertices, faces, crease_rad=np.deg2rad(30.0))
+    part = shapes._smooth_part(vertices, faces, crease_rad=np.deg2rad(30.0))
     shared = part.corner_normals[0, 0], part.corner_normals[1, 1]
     assert np.allclose(*shared) is smooth
     if not smooth:
@@ -248,7 +248,7 @@ def test_a_fine_ball_file_is_shaded_like_a_ball(tmp_path: Path) -> None:
 def test_corner_normal_kernel_equals_plain_python() -> None:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=10.0)
     vertices, faces = np.asarray(ball.vertices, np.float64) * (1, 0.5, 2), np.asarray(ball.faces, np.int32)
-    part = shapes._smooth(vertices, faces, crease_rad=0.5)
+    part = shapes._smooth_part(vertices, faces, crease_rad=0.5)
     a, b, c = vertices[faces].transpose(1, 0, 2)
     weighted = np.cross(b - a, c - a)
     unit = weighted / np.linalg.norm(weighted, axis=1, keepdims=True)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from simulated_rig import light
-from simulated_rig.light import NODES_PER_PX, LightTable, Response, blurred, light_table, no_light, radiance
-from simulated_rig.transport import Paths
+from simulated_rig.light import NODES_PER_PX, LightTable, Response, blur_image, dark_table, light_table, radiance
+from simulated_rig.transport import LightPaths
 from slrig.model import FloatArray, Pixels, Size
 from tests.unit.simulated_rig.building import line_profile, small_head
 
@@ -84,7 +84,7 @@ def test_a_row_pattern_varies_down_and_fades_at_the_sides() -> None:
 
 def test_no_light_is_dark_and_white_peaks_at_one() -> None:
     response = Response(gamma=1.8, leak=0.002, blur_px=0.6)
-    assert no_light(SIZE).peak == 0
+    assert dark_table(SIZE).peak == 0
     assert light_table(WHITE, SIZE, response).peak == pytest.approx(1, abs=1e-4)
     assert light_table(np.zeros((1, 1), np.uint8), SIZE, response).peak == pytest.approx(0.002, rel=1e-3)
 
@@ -98,7 +98,7 @@ def test_a_pattern_that_varies_both_ways_is_refused() -> None:
 def test_kernels_equal_interpolation_and_a_filter_of_all_samples_in_numpy(per_axis: int, blur_px: float) -> None:
     rng = np.random.default_rng(2)
     shape = (6, 7, per_axis**2)
-    paths = Paths(
+    paths = LightPaths(
         rng.uniform(-4, 28, shape).astype(np.float32),
         rng.uniform(-4, 20, shape).astype(np.float32),
         np.where(rng.random(shape) < 0.3, 0, rng.random(shape)).astype(np.float32),
@@ -112,10 +112,10 @@ def test_kernels_equal_interpolation_and_a_filter_of_all_samples_in_numpy(per_ax
     expected = through_optics(fine.reshape(6 * per_axis, 7 * per_axis), per_axis, blur_px)
     np.testing.assert_allclose(radiance(paths, table, blur_px=blur_px), expected, atol=1e-5)
     tables = (table.columns, table.rows, np.float32(table.margin_px))
-    shares = light._pixel_shares(blur_px, per_axis)
-    sides = [light._mirrored(length, shares.shape) for length in (7, 6)]
-    rows = light._gather.py_func(paths.column_px, paths.row_px, paths.weight, *tables, shares, sides[0])
-    np.testing.assert_allclose(light._collected.py_func(rows, shares, sides[1]), expected, atol=1e-5)
+    shares = light._pixel_weights(blur_px, per_axis)
+    sides = [light._mirror_indices(length, shares.shape) for length in (7, 6)]
+    rows = light._filter_rows.py_func(paths.column_px, paths.row_px, paths.weight, *tables, shares, sides[0])
+    np.testing.assert_allclose(light._filter_columns.py_func(rows, shares, sides[1]), expected, atol=1e-5)
 
 
 def through_optics(fine: FloatArray, per_axis: int, blur_px: float) -> FloatArray:
@@ -177,12 +177,12 @@ def view_response(*, gamma: float, leak: float) -> Response:
 def test_the_blur_of_an_image_has_the_stated_width_and_keeps_the_light() -> None:
     image = np.zeros((41, 41), np.float32)
     image[20, 20] = 1
-    out = blurred(image, 1.3).astype(np.float64)
+    out = blur_image(image, 1.3).astype(np.float64)
     offset = np.arange(41) - 20.0
     assert out.sum() == pytest.approx(1, abs=1e-5)
     assert (out.sum(axis=0) * offset**2).sum() == pytest.approx(1.3**2, rel=0.02)
     assert (out.sum(axis=1) * offset**2).sum() == pytest.approx(1.3**2, rel=0.02)
-    assert blurred(image, 0.0) is image
+    assert blur_image(image, 0.0) is image
 
 
 def test_two_lights_in_one_exposure_mix_by_their_time(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simulated_rig.optics import distorted, field_radius, lens_array, look_at, undistorted, world_directions
+from simulated_rig.optics import distort, field_radius, lens_array, look_at, undistort, world_directions
 from slrig.model import FloatArray, Pinhole, Size
 from tests.unit.reconstruction.builders import opencv_pixels
 
@@ -32,16 +32,16 @@ def test_distortion_is_that_of_opencv() -> None:
     points = np.random.default_rng(4).uniform(-0.35, 0.35, (50, 2))
     plain = Pinhole(Size(640, 480), device().matrix, STRONG, np.eye(3), np.zeros(3))
     expected = opencv_pixels(plain, np.column_stack([points, np.ones(50)]))
-    found = np.array([distorted(x, y, lens) for x, y in points])
+    found = np.array([distort(x, y, lens) for x, y in points])
     np.testing.assert_allclose(found * lens[:2] + lens[2:4], expected, atol=1e-9)
 
 
 def test_undistorting_inverts_distorting_under_numba_and_in_plain_python() -> None:
     lens = lens_array(device())
     for x, y in np.random.default_rng(5).uniform(-0.35, 0.35, (30, 2)):
-        xd, yd = distorted(x, y, lens)
-        assert undistorted(xd, yd, lens) == pytest.approx((x, y), abs=1e-12)
-        assert undistorted.py_func(xd, yd, lens) == pytest.approx((x, y), abs=1e-12)
+        xd, yd = distort(x, y, lens)
+        assert undistort(xd, yd, lens) == pytest.approx((x, y), abs=1e-12)
+        assert undistort.py_func(xd, yd, lens) == pytest.approx((x, y), abs=1e-12)
 
 
 def test_looking_at_a_point_puts_it_on_the_axis_with_the_world_upright() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from simulated_rig.device import SimulatedHead
-from simulated_rig.world import Flicker
+from simulated_rig.light import LightFlicker
 from slrig.devices import CameraSettings
 from slrig.model import Axis, Black, FloatArray, LineShift, PatternSequence, Pixels, Size, White
 from tests.unit.simulated_rig.building import frames_of, small_head, white_black_lines
@@ -32,7 +32,7 @@ def half(axis: Axis) -> PatternSequence:
 
 
 def test_flicker_averages_out_over_whole_periods() -> None:
-    flicker = Flicker(100.0, 0.5)
+    flicker = LightFlicker(100.0, 0.5)
     assert flicker.mean(3_000_000, 13_000_000) == pytest.approx(1.0)
     # A quarter of a period from the start of the sine, by its integral.
     assert flicker.mean(0, 2_500_000) == pytest.approx(1 + 0.5 * 2 / np.pi)
@@ -90,7 +90,7 @@ def test_another_display_leaves_a_desktop_on_the_scene(tmp_path: Path) -> None:
     assert black.mean() > 20
     assert np.abs(white - black).mean() < 3
     assert np.ptp(np.median(black, axis=0)) > 20
-    assert not head.projector.lit
+    assert not head.projector.is_lit
     glowing = small_head(tmp_path, faults={"other_display": True, "other_display_glow": 0.1})
     white, black = (taken(glowing, index, sequence) for index in (0, 1))
     difference = white - black

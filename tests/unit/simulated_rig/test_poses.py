@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_rig.boards import Board
 from simulated_rig.device import SimulatedHead
+from simulated_rig.movements import PoseSeries, generate_poses
 from simulated_rig.optics import image_positions
 from simulated_rig.options import HeadOptions
-from simulated_rig.placed import turned_by
-from simulated_rig.poses import PoseSeries, made_up
+from simulated_rig.scene import PrintedBoard, rotation_matrix
 from slrig.calibration.board import Board as Designed
 from slrig.calibration.board import BoardKind
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
@@ -21,7 +20,7 @@ from slrig.model import FloatArray, Pixels
 from tests.rendered_boards import board_head, board_options, board_scene
 from tests.unit.simulated_rig.building import FACING_PLATE, coarser, corners_in_world_mm, frames_of, small_head
 
-CHESSBOARD = Board.model_validate(
+CHESSBOARD = PrintedBoard.model_validate(
     {"shape": "board", "kind": "chessboard", "columns": 8, "rows": 5, "square_mm": 20.0, "margin_mm": 8.0}
 )
 OPTIONS = HeadOptions.model_validate(board_options(cameras=2))
@@ -55,20 +54,20 @@ def board_depth_mm(head: SimulatedHead, position: FloatArray, rotation: FloatArr
 
 def test_a_series_repeats_with_its_seed_and_differs_with_another() -> None:
     series = PoseSeries(count=6, seed=3, depth_mm=(-40.0, 60.0), edge_px=3.0)
-    poses = made_up(series, CHESSBOARD, DEVICES)
+    poses = generate_poses(series, CHESSBOARD, DEVICES)
     assert [pose.name for pose in poses] == [f"pose {number}" for number in range(1, 7)]
-    assert made_up(series, CHESSBOARD, DEVICES) == poses
-    assert made_up(series.model_copy(update={"seed": 4}), CHESSBOARD, DEVICES) != poses
+    assert generate_poses(series, CHESSBOARD, DEVICES) == poses
+    assert generate_poses(series.model_copy(update={"seed": 4}), CHESSBOARD, DEVICES) != poses
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
 def test_a_series_is_a_good_script(seed: int) -> None:
     series = PoseSeries(count=20, seed=seed, tilt_deg=(15.0, 40.0), depth_mm=(-60.0, 80.0), edge_px=3.0)
-    poses = made_up(series, CHESSBOARD, DEVICES[:1] + DEVICES[2:])
+    poses = generate_poses(series, CHESSBOARD, DEVICES[:1] + DEVICES[2:])
     eye, lamp = DEVICES[0], DEVICES[2]
     away = -(eye.centre_mm + lamp.centre_mm) / 2
     away /= np.linalg.norm(away)
-    normals = np.array([turned_by(pose.rotation_deg)[:, 2] for pose in poses])
+    normals = np.array([rotation_matrix(pose.rotation_deg)[:, 2] for pose in poses])
     tilts = np.rad2deg(np.arccos(normals @ away))
     assert tilts.min() > 14.9
     assert tilts.max() < 40.1
@@ -95,12 +94,12 @@ def test_a_series_is_a_good_script(seed: int) -> None:
 def test_a_board_that_does_not_fit_is_refused() -> None:
     huge = CHESSBOARD.model_copy(update={"square_mm": 60.0})
     with pytest.raises(ConfigError, match=r"pose 1 of 4.*does not fit.*smaller"):
-        made_up(PoseSeries(count=4), huge, DEVICES)
+        generate_poses(PoseSeries(count=4), huge, DEVICES)
 
 
 @pytest.mark.parametrize("table", [{"tilt_deg": [30.0, 10.0]}, {"tilt_deg": [10.0, 80.0]}, {"depth_mm": [5.0, 4.0]}])
 def test_a_series_with_crossed_bounds_is_refused(tmp_path: Path, table: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match="least <= most"):
+    with pytest.raises(ConfigError, match="minimum <= maximum"):
         head_of(tmp_path, poses=table)
 
 
@@ -134,15 +133,15 @@ def test_the_truth_follows_the_pose(tmp_path: Path) -> None:
     head.positioner.move(1)
     after = head.truth()
     for truth, pose in ((before, ONE), (after, TWO)):
-        expected = board_depth_mm(head, np.array(pose["position_mm"]), turned_by(tuple(pose["rotation_deg"])))  # type: ignore[arg-type]
+        expected = board_depth_mm(head, np.array(pose["position_mm"]), rotation_matrix(tuple(pose["rotation_deg"])))  # type: ignore[arg-type]
         near = np.s_[122:131, 156:166]
         np.testing.assert_allclose(truth.cameras["left"].depth_mm[near], expected[near], atol=0.002)
     assert not np.array_equal(before.surface.vertices_mm, after.surface.vertices_mm)
 
 
 def test_the_designed_frame_of_a_pose_has_its_origin_at_corner_0() -> None:
-    pose = made_up(PoseSeries(count=1, edge_px=3.0), CHESSBOARD, DEVICES)[0]
-    rotation = turned_by(pose.rotation_deg)
+    pose = generate_poses(PoseSeries(count=1, edge_px=3.0), CHESSBOARD, DEVICES)[0]
+    rotation = rotation_matrix(pose.rotation_deg)
     # Of the designed board, whose origin is corner 0: X_world = R X + t.
     translation = np.array(pose.position_mm) - rotation @ np.array([*CHESSBOARD.middle_mm, 0.0])
     designed = Designed(BoardKind.CHESSBOARD, 8, 5, 20.0).points_mm
@@ -176,8 +175,8 @@ def test_the_positioner_refuses_what_it_cannot_do(tmp_path: Path) -> None:
     ("scene", "options", "words"),
     [
         (FACING_PLATE, {}, "the scene has none"),
-        (FACING_PLATE, {"poses": None, "pose": [ONE]}, "pose 1: expected `object`"),
-        (None, {"pose": [ONE, TWO | {"object": "tablet"}]}, "pose 2: there is no object 'tablet'.*board.*wall"),
+        (FACING_PLATE, {"poses": None, "pose": [ONE]}, "pose 1: .object. is missing"),
+        (None, {"pose": [ONE, TWO | {"object": "tablet"}]}, "pose 2: unknown object 'tablet'.*board.*wall"),
         (None, {"pose": [{"rotation_deg": [0.0, 0.0, 0.0]}]}, "position_mm"),
         (board_scene("chessboard", more="glitter = true"), {}, "glitter"),
     ],

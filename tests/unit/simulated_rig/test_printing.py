@@ -11,13 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulated_rig.boards import Board
-from simulated_rig.casting import caster
-from simulated_rig.options import CameraOptions
-from simulated_rig.placed import turned_by
-from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import Scene, SceneSurface, surface_of
-from simulated_rig.transport import Hits, trace
+from simulated_rig.options import SimulatedCameraOptions
+from simulated_rig.rendering import CameraView, SceneState
+from simulated_rig.scene import PrintedBoard, Scene, SceneSurface, build_surface, rotation_matrix
+from simulated_rig.transport import Hits, build_caster, trace_rays
 from slrig.model import FloatArray, Pinhole, Size
 from tests.unit.reconstruction.builders import opencv_pixels, opencv_rays
 from tests.unit.simulated_rig.building import corners_in_world_mm
@@ -25,12 +22,12 @@ from tests.unit.simulated_rig.test_boards import dark_at
 
 POSITION = (6.0, -4.0, 12.0)
 ROTATION = (24.0, -19.0, 11.0)
-EYE = CameraOptions.model_validate({
+EYE = SimulatedCameraOptions.model_validate({
     "name": "eye", "size_px": [640, 512], "focal_px": [950.0, 951.0], "principal_px": [321.8, 252.9],
     "distortion": [-0.11, 0.15, -0.0003, 0.0005, 0.0], "position_mm": [-60.0, -10.0, -420.0],
     "target_mm": [0.0, 0.0, 0.0],
 }).pinhole()  # fmt: skip
-LAMP = CameraOptions.model_validate({
+LAMP = SimulatedCameraOptions.model_validate({
     "name": "lamp", "size_px": [320, 200], "focal_px": [260.0, 260.0], "position_mm": [60.0, 0.0, -430.0],
     "target_mm": [0.0, 0.0, 0.0],
 }).pinhole()  # fmt: skip
@@ -46,19 +43,19 @@ def slow(value: object) -> Any:
     return pytest.param(value, marks=pytest.mark.slow)
 
 
-def board(kind: str, **options: Any) -> Board:
+def board(kind: str, **options: Any) -> PrintedBoard:
     placed = {"position_mm": POSITION, "rotation_deg": ROTATION}
-    return Board.model_validate({"shape": "board", "kind": kind, **KINDS[kind], **placed, **options})
+    return PrintedBoard.model_validate({"shape": "board", "kind": kind, **KINDS[kind], **placed, **options})
 
 
-def surface(each: Board) -> SceneSurface:
-    return surface_of(Scene.model_validate({"object": [each.model_dump()]}), Path())
+def surface(each: PrintedBoard) -> SceneSurface:
+    return build_surface(Scene.model_validate({"object": [each.model_dump()]}), Path())
 
 
-def picture(each: Board, *, camera: Pinhole = EYE, samples_per_axis: int = 2) -> NDArray[np.float32]:
+def picture(each: PrintedBoard, *, camera: Pinhole = EYE, samples_per_axis: int = 2) -> NDArray[np.float32]:
     """The board under even light, without noise."""
-    stage = Stage(surface(each), LAMP, working_distance_mm=430.0)
-    view = View(
+    stage = SceneState(surface(each), LAMP, working_distance_mm=430.0)
+    view = CameraView(
         camera, stage, blur_px=0.6, ambient=1.0, samples_per_axis=samples_per_axis, jitter=False, seed=1, workers=1
     )
     return view.image([])
@@ -77,15 +74,15 @@ def grey(image: NDArray[np.float32]) -> NDArray[np.uint8]:
 def on_board(u: FloatArray, v: FloatArray) -> FloatArray:
     """(n, 2): where rays through pixels meet the plane of a board in POSITION, in its frame, by OpenCV's lens."""
     rays = opencv_rays(EYE, np.column_stack([u, v]))
-    turn = turned_by(ROTATION)
+    turn = rotation_matrix(ROTATION)
     eye, rays = turn.T @ (EYE.centre_mm - POSITION), rays @ turn
     return np.asarray((eye - rays * (eye[2] / rays[:, 2])[:, None])[:, :2], np.float64)
 
 
-def traced(each: Board, u: FloatArray, v: FloatArray, footprint_px: float) -> Hits:
+def traced(each: PrintedBoard, u: FloatArray, v: FloatArray, footprint_px: float) -> Hits:
     world = surface(each)
-    rays = caster(world.vertices_mm, world.faces)
-    return trace(u, v, EYE, LAMP, world, rays, working_distance_mm=430.0, footprint_px=footprint_px)
+    rays = build_caster(world.vertices_mm, world.faces)
+    return trace_rays(u, v, EYE, LAMP, world, rays, working_distance_mm=430.0, footprint_px=footprint_px)
 
 
 @pytest.mark.parametrize("kind", ["chessboard", "charuco", slow("circles")])
@@ -99,11 +96,11 @@ def test_a_cell_has_the_mean_albedo_of_what_it_sees(kind: str) -> None:
     # Only cells that an edge crosses tell anything; a few hundred of them.
     mixed = np.flatnonzero((hits.albedo > 0.06) & (hits.albedo < 0.84))[:100]
     assert len(mixed) > 90
-    turn = turned_by(ROTATION)
+    turn = rotation_matrix(ROTATION)
     worst, farthest = 0.0, 0.0
     for k in mixed:
         at = on_board(u[k] + du, v[k] + dv)
-        albedo = np.where(dark_at(each.printed(), at), each.albedo_dark, each.albedo_light)
+        albedo = np.where(dark_at(each.print_layout(), at), each.albedo_dark, each.albedo_light)
         worst = max(worst, abs(float(albedo.mean()) - float(hits.albedo[k])))
         middle = (at * albedo[:, None]).sum(axis=0) / albedo.sum()
         found = (hits.points_mm[k] - POSITION) @ turn
@@ -121,9 +118,9 @@ def test_without_a_footprint_the_print_is_taken_at_the_point() -> None:
     u, v = rng.uniform(200, 440, 4000), rng.uniform(150, 350, 4000)
     hits = traced(each, u, v, 0.0)
     at = on_board(u, v)
-    expected = np.where(dark_at(each.printed(), at), each.albedo_dark, each.albedo_light)
+    expected = np.where(dark_at(each.print_layout(), at), each.albedo_dark, each.albedo_light)
     assert (np.abs(hits.albedo - expected) < 1e-6).mean() > 0.999
-    np.testing.assert_allclose((hits.points_mm - POSITION) @ turned_by(ROTATION)[:, :2], at, atol=1e-6)
+    np.testing.assert_allclose((hits.points_mm - POSITION) @ rotation_matrix(ROTATION)[:, :2], at, atol=1e-6)
 
 
 def test_two_samples_a_side_place_edges_as_eight_do() -> None:
@@ -149,7 +146,7 @@ def test_discs_have_their_area_and_centroid() -> None:
     turn = np.linspace(0, 2 * np.pi, 720, endpoint=False)
     ring = 7.0 * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
     for corner in each.corners_mm:
-        outline = opencv_pixels(EYE, (corner + ring) @ turned_by(ROTATION).T + POSITION)
+        outline = opencv_pixels(EYE, (corner + ring) @ rotation_matrix(ROTATION).T + POSITION)
         after = np.roll(outline, -1, axis=0)
         cross = outline[:, 0] * after[:, 1] - after[:, 0] * outline[:, 1]
         area = cross.sum() / 2
@@ -193,7 +190,7 @@ def test_opencv_finds_a_charuco_board_where_it_stands_and_no_mirrored_one() -> N
     assert mirrored is None or len(mirrored) < 6
 
 
-def _chessboard(image: NDArray[np.uint8], each: Board) -> FloatArray:
+def _chessboard(image: NDArray[np.uint8], each: PrintedBoard) -> FloatArray:
     found, corners = cv2.findChessboardCornersSB(image, (each.columns, each.rows))
     assert found
     return np.asarray(corners.reshape(-1, 2), np.float64)

@@ -13,9 +13,9 @@ import pytest
 from scipy.special import ndtr
 
 from simulated_rig.light import Response, light_table
-from simulated_rig.options import CameraOptions, ProjectorOptions
-from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import Scene, surface_of
+from simulated_rig.options import SimulatedCameraOptions, SimulatedProjectorOptions
+from simulated_rig.rendering import CameraView, SceneState
+from simulated_rig.scene import Scene, build_surface
 from slrig.model import FloatArray
 from tests.unit.simulated_rig.building import line_profile
 
@@ -42,19 +42,19 @@ def light_of_stripe(distance_px: FloatArray, blur_px: float) -> FloatArray:
 
 def stripes(samples_per_axis: int, blur_px: float) -> tuple[FloatArray, FloatArray]:
     """(columns,) light over white of the image's middle row under a line pattern, and the true centres of its lines."""
-    lamp = ProjectorOptions.model_validate({
+    lamp = SimulatedProjectorOptions.model_validate({
         "size_px": [512, 64], "focal_px": [COLUMNS_PER_PX * FOCAL_PX] * 2, "blur_px": LAMP_BLUR_PX, "leak": 0.0,
         "position_mm": [20.0, 0.0, -500.0], "target_mm": [20.0, 0.0, 0.0], "principal_px": [400.0, 32.0],
     })  # fmt: skip
-    eye = CameraOptions.model_validate({
+    eye = SimulatedCameraOptions.model_validate({
         "name": "eye", "size_px": [200, 21], "focal_px": [FOCAL_PX] * 2, "principal_px": [100.0, 10.0],
         "position_mm": [-10.0, 0.0, -500.0], "target_mm": [-10.0, 0.0, 0.0], "blur_px": blur_px,
     })  # fmt: skip
     plate = {"shape": "plane", "size_mm": [800.0, 800.0]}
-    stage = Stage(
-        surface_of(Scene.model_validate({"object": [plate]}), Path()), lamp.pinhole(), working_distance_mm=500
+    stage = SceneState(
+        build_surface(Scene.model_validate({"object": [plate]}), Path()), lamp.pinhole(), working_distance_mm=500
     )
-    view = View(
+    view = CameraView(
         eye.pinhole(), stage, blur_px=blur_px, ambient=0.0, samples_per_axis=samples_per_axis, jitter=False, seed=1,
         workers=1,
     )  # fmt: skip

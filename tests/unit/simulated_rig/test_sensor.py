@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simulated_rig import sensor as sensor_module
-from simulated_rig.sensor import Sensor
+from simulated_rig import rendering as sensor_module
+from simulated_rig.rendering import SensorModel
 
 
-def sensor(**changes: float) -> Sensor:
+def sensor(**changes: float) -> SensorModel:
     values: dict[str, float] = {
         "full_well_e": 12000.0,
         "read_noise_e": 10.0,
@@ -18,7 +18,7 @@ def sensor(**changes: float) -> Sensor:
     }
     bit_depth = int(changes.pop("bit_depth", 12))
     values |= changes
-    return Sensor(bit_depth=bit_depth, **values)
+    return SensorModel(bit_depth=bit_depth, **values)
 
 
 def flat(electrons: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:

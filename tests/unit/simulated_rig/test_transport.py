@@ -9,10 +9,8 @@ import pytest
 import trimesh
 
 from simulated_rig import transport
-from simulated_rig.casting import EMBREE, Caster, EmbreeCaster, TreeCaster
 from simulated_rig.optics import lens_array, world_directions
-from simulated_rig.textures import texture_value
-from simulated_rig.transport import Hits
+from simulated_rig.transport import EMBREE, EmbreeCaster, Hits, RayCaster, TreeCaster, texture_value
 from slrig.model import FloatArray, IntArray
 from tests.unit.simulated_rig.building import FACING_PLATE, small_head
 
@@ -22,8 +20,8 @@ EYE = np.array([-60.0, 0, -500])
 
 def traced(folder: Path, scene: str, u: FloatArray, v: FloatArray) -> Hits:
     view = small_head(folder, scene)._views["eye"]
-    stage = view._stage
-    return transport.trace(
+    stage = view._scene
+    return transport.trace_rays(
         u, v, view._camera, stage.projector, stage.surface, stage.rays, working_distance_mm=stage.working_distance_mm
     )
 
@@ -60,7 +58,7 @@ def test_a_surface_turned_away_from_the_lamp_is_dark(tmp_path: Path) -> None:
     hits = traced(tmp_path, scene, np.array([31.5]), np.array([23.5]))
     facing_eye = small_head(tmp_path, scene).truth().cameras["eye"].depth_mm
     assert np.isfinite(facing_eye).any()
-    assert hits.seen.all() != hits.lit.any()
+    assert hits.is_hit.all() != hits.is_lit.any()
 
 
 def test_a_checker_alternates_squares_in_the_object_own_frame(tmp_path: Path) -> None:
@@ -100,9 +98,9 @@ def test_hit_kernel_equals_plain_python(tmp_path: Path) -> None:
         "bump = [{ centre_mm = [0.0, 0.0], height_mm = 9.0, sigma_mm = 30.0 }]\n"
     )
     view = small_head(tmp_path, scene)._views["eye"]
-    surface = view._stage.surface
+    surface = view._scene.surface
     rays = world_directions(U, V, lens_array(view._camera), view._camera.rotation)
-    triangle = view._stage.rays.first_hit(EYE, rays)
+    triangle = view._scene.rays.first_hit(EYE, rays)
     triangle[0] = -1
     arguments = (
         EYE,
@@ -148,7 +146,7 @@ def test_threads_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(one.weight, many.weight)
 
 
-def first_hits(rays: Caster) -> IntArray:
+def first_hits(rays: RayCaster) -> IntArray:
     target = np.random.default_rng(3).uniform(-14, 14, (300, 3))
     towards = target - np.array([0.0, 0, -100])
     return rays.first_hit(np.array([0.0, 0, -100]), towards / np.linalg.norm(towards, axis=1, keepdims=True))

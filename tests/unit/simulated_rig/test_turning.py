@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from simulated_rig.device import SimulatedHead
-from simulated_rig.turning import TurntableOptions
+from simulated_rig.movements import TurntableOptions
 from slrig.devices import Turntable
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray
@@ -42,7 +42,7 @@ def head_of(folder: Path, *, seed: int = 1, **table: Any) -> tuple[SimulatedHead
 
 
 def vertices(head: SimulatedHead) -> FloatArray:
-    return head._stage.surface.vertices_mm
+    return head._scene_state.surface.vertices_mm
 
 
 def turn_between(before: FloatArray, after: FloatArray) -> FloatArray:
@@ -139,11 +139,11 @@ def test_what_it_cannot_do_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"turntable": {"point_mm": [0.0, 0.0, 0.0], "objects": ["leg"]}}, r"no object 'leg'.*'arm', 'backdrop'"),
+        ({"turntable": {"point_mm": [0.0, 0.0, 0.0], "objects": ["leg"]}}, r"unknown object 'leg'.*'arm', 'backdrop'"),
         ({"turntable": {"point_mm": [0.0, 0.0, 0.0], "direction": [0.0, 0.0, 0.0]}}, "expected a direction"),
         (
             {"turntable": {"point_mm": [0.0] * 3}, "pose": [{"object": "arm", "position_mm": [0.0] * 3}]},
-            r"\[head.turntable\] beside \[\[head.pose\]\]",
+            r"\[head.turntable\] cannot be combined with \[\[head.pose\]\]",
         ),
     ],
 )

@@ -8,8 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from simulated_rig.light import LightTable
-from simulated_rig.world import Lamp, VirtualClock, nanoseconds
+from simulated_rig.light import Lamp, LightTable, VirtualClock, nanoseconds
 from slrig.devices import SystemClock
 
 

@@ -18,14 +18,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.depthai.library import library
+from drivers.depthai.library import load_depthai
 from slrig.model import Size
 from tests.contract.stage import Stage
 
 # A check that is never run is no check: on CI the library must be there.
 if importlib.util.find_spec("depthai") is None and not os.environ.get("CI"):
     pytest.skip("the library depthai is not installed: pip install 'slrig[depthai]'", allow_module_level=True)
-dai: Any = library()
+dai: Any = load_depthai()
 
 DEVICE = "14442C10D13EABCE00"
 ADDRESS = "1.2.3"

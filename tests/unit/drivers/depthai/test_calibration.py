@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.depthai import Lens, open_camera, read_calibration, read_factory_calibration
-from drivers.depthai.calibration import brown_lens
+from drivers.depthai.calibration import fit_brown_lens
 from slrig.devices import CameraSettings
 from slrig.errors import CalibrationError
 from slrig.model import Size
@@ -139,7 +139,7 @@ def test_what_cannot_be_used_is_refused(
 
 
 def test_no_point_of_the_image_is_further_off_than_the_stated_residual() -> None:
-    matrix, distortion, residual_px = brown_lens(MATRIX, np.array(STRONG), SIZE)
+    matrix, distortion, residual_px = fit_brown_lens(MATRIX, np.array(STRONG), SIZE)
     x, y = np.meshgrid(np.linspace(-0.85, 0.85, 171), np.linspace(-0.55, 0.55, 111))
     rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
     stored = seen_px(rays, MATRIX, STRONG, np.eye(3), np.zeros(3))
@@ -150,4 +150,4 @@ def test_no_point_of_the_image_is_further_off_than_the_stated_residual() -> None
 
 
 def test_a_lens_that_folds_is_no_lens() -> None:
-    assert brown_lens(MATRIX, np.array([-3.0, 0, 0, 0, 0, 0.5, 0, 0]), SIZE)[2] == float("inf")
+    assert fit_brown_lens(MATRIX, np.array([-3.0, 0, 0, 0, 0, 0.5, 0, 0]), SIZE)[2] == float("inf")

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from drivers.depthai import find_devices, open_camera
-from drivers.depthai.board import Board, require_one_clock
+from drivers.depthai.device import OakDevice, require_one_clock
 from slrig.devices import Camera, CameraSettings, FoundDevice, Trigger
 from slrig.errors import (
     ConfigError,
@@ -47,7 +47,7 @@ def armed(camera: Camera) -> Camera:
 @pytest.mark.parametrize(
     ("oak", "kind", "words"),
     [
-        ({"plugged_in": False}, DeviceGoneError, "is not there; found: none"),
+        ({"plugged_in": False}, DeviceGoneError, "not found; found: none"),
         ({"held_elsewhere": True}, DeviceBusyError, "held by another program"),
         ({"forbidden": True}, DeviceError, "80-movidius.rules"),
         (
@@ -61,8 +61,8 @@ def armed(camera: Camera) -> Camera:
             "g",
         ),
         ({"refuses": "firmware is broken"}, DeviceError, "fails: firmware is broken"),
-        ({"chips": [Chip("CAM_A", "IMX378")]}, UnsupportedByDeviceError, r"asked for CAM_B .* has: CAM_A \(IMX378, 64"),
-        ({"options": {"size_px": [128, 96]}}, UnsupportedByDeviceError, "asked for 128 x 96, its sensor OV9282 has 64"),
+        ({"chips": [Chip("CAM_A", "IMX378")]}, UnsupportedByDeviceError, r"requested CAM_B .* has: CAM_A \(IMX378, 64"),
+        ({"options": {"size_px": [128, 96]}}, UnsupportedByDeviceError, "requested 128 x 96, its sensor OV9282 has 64"),
         ({"chips": LENSES}, UnsupportedByDeviceError, r"has autofocus.* write focus = 0"),
     ],
 )
@@ -117,7 +117,7 @@ class SlowClock:
 
 def test_a_clock_of_another_kind_is_refused_however_slow_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = VirtualClock()
-    monkeypatch.setattr("drivers.depthai.board.time", SimpleNamespace(monotonic_ns=clock.now_ns))
+    monkeypatch.setattr("drivers.depthai.device.time", SimpleNamespace(monotonic_ns=clock.now_ns))
     require_one_clock(SlowClock(clock, 0.0))
     for offset_s in (-1.0, 1.0):
         with pytest.raises(DeviceError, match=r"is -?980 ms off CLOCK_MONOTONIC"):
@@ -147,14 +147,14 @@ def test_a_program_that_leaves_a_camera_open_ends() -> None:
 def test_closing_waits_for_the_thread_that_listens(monkeypatch: pytest.MonkeyPatch) -> None:
     # One that comes back from the library after the interpreter has ended aborts the program.
     ended = threading.Event()
-    end = Board._end
+    end = OakDevice._end
 
-    def slowly(board: Board, reason: str) -> None:
+    def slowly(board: OakDevice, reason: str) -> None:
         threading.Event().wait(0.05)
         end(board, reason)
         ended.set()
 
-    monkeypatch.setattr(Board, "_end", slowly)
+    monkeypatch.setattr(OakDevice, "_end", slowly)
     oak = FakeOak(small_stage())
     with oak.connected():
         camera = open_camera("left", {"device": DEVICE, "socket": "CAM_B"}, Path())
@@ -205,7 +205,7 @@ def test_a_pipeline_that_the_device_refuses_is_refused_for_good(head: Opens, mon
 
     with monkeypatch.context() as patch:
         patch.setattr("tests.unit.drivers.depthai.fake_oak.HostOnlyPipeline.start", refuse)
-        with pytest.raises(UnsupportedByDeviceError, match=r"asked for 64 x 48 from CAM_B.* no sensor mode fits"):
+        with pytest.raises(UnsupportedByDeviceError, match=r"requested 64 x 48 from CAM_B.* no sensor mode fits"):
             pair.cameras["left"].configure(CameraSettings(0.005))
     with pytest.raises(UnsupportedByDeviceError, match="no sensor mode fits"):
         pair.cameras["right"].configure(CameraSettings(0.005))
@@ -249,7 +249,7 @@ def focused() -> Any:
 
 def test_a_lens_that_does_not_go_where_it_is_sent_is_refused(head: Opens) -> None:
     left = head(chips=LENSES, options={"focus": 20}, fault=Fault(stuck_lens=True)).cameras["left"]
-    with pytest.raises(UnsupportedByDeviceError, match=r"ISO 100, focus 20, the driver gives .* focus 77"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"ISO 100, focus 20, the camera gives .* focus 77"):
         left.configure(CameraSettings(0.005))
 
 
@@ -330,7 +330,7 @@ def test_settings_that_come_late_are_waited_for(head: Opens) -> None:
     assert (frame.exposure_s, frame.gain) == (0.008, 2.0)
     left.disarm()
     pair.oak.fault.stuck_exposure_us = 3000
-    with pytest.raises(UnsupportedByDeviceError, match=r"asked for exposure 5000 µs, ISO 100.* gives exposure 3000 µs"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"requested exposure 5000 µs, ISO 100.* gives exposure 3000 µs"):
         left.configure(CameraSettings(0.005))
 
 
@@ -339,7 +339,7 @@ def test_a_frame_that_was_taken_otherwise_is_passed_over(head: Opens) -> None:
     left = armed(pair.cameras["left"])
     first = left.read(0, PATIENCE_S)
     pair.oak.fault.stuck_exposure_us = 9000
-    with pytest.raises(FrameTimeoutError, match=r"[1-9]\d* taken otherwise than asked"):
+    with pytest.raises(FrameTimeoutError, match=r"[1-9]\d* with other settings"):
         left.read(time.monotonic_ns() + 20_000_000, 0.3)
     pair.oak.fault.stuck_exposure_us = None
     later = left.read(time.monotonic_ns(), PATIENCE_S)
@@ -368,8 +368,8 @@ def test_damaged_and_lost_frames_are_passed_over_and_counted(head: Opens) -> Non
     ("fault", "words"),
     [
         (Fault(damaged=1.0), r"the last damaged one: (\d+ bytes where|64 x 24)"),
-        (Fault(dropped=1.0), "0 taken otherwise than asked"),
-        (Fault(stamped_ahead_s=0.5), "the last damaged one: stamped later than it came"),
+        (Fault(dropped=1.0), "0 with other settings"),
+        (Fault(stamped_ahead_s=0.5), "the last damaged one: time stamp later than its arrival"),
     ],
 )
 def test_a_camera_that_gives_nothing_usable_says_what_it_saw(head: Opens, fault: Fault, words: str) -> None:

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from drivers.dlpc347x import open_projector
-from drivers.dlpc347x.bus import Bus, Node, open_bus
-from drivers.dlpc347x.flash import Lines, block_of, places_in, places_of, size_of
+from drivers.dlpc347x.bus import I2cBus, I2cNode, open_bus
+from drivers.dlpc347x.flash import LineEncoder, block_size, build_block, find_lines, locate_patterns
 from drivers.dlpc347x.projector import MIRRORS as CONTROLLERS
 from slrig.devices import StoredPatternProjector, UnknownPolarityProjector
 from slrig.errors import (
@@ -107,7 +107,7 @@ def test_both_axes_are_shown_and_not_played(bench: Bench) -> None:
     projector.show(4)
     assert bench.engine.lit is not None
     assert bench.engine.lit.shape == (720, 1)
-    with pytest.raises(UnsupportedByDeviceError, match="scan one axis only, or without the wire"):
+    with pytest.raises(UnsupportedByDeviceError, match="scan one axis only, or with software trigger"):
         projector.play(0.003, 0.01)
 
 
@@ -152,7 +152,7 @@ def test_a_flash_that_has_no_room_or_forgets_is_reported(worn: bool) -> None:
     if worn:
         bench.engine.flash = Worn(bench.engine.flash)
     projector = bench.open()
-    with pytest.raises(DeviceError, match="does not give back what was written" if worn else "its flash has no room"):
+    with pytest.raises(DeviceError, match="differs from the written data" if worn else "its flash has no room"):
         projector.write_patterns(BOTH)
     assert bench.engine.erased == int(worn)
 
@@ -161,12 +161,12 @@ def test_a_flash_that_has_no_room_or_forgets_is_reported(worn: bool) -> None:
     ("engine", "bent", "error", "told"),
     [
         ({"entry_bytes": 23}, {}, UnsupportedByDeviceError, "98h .*more or fewer parameters in its firmware: update"),
-        ({"most_entries": 0}, {}, UnsupportedByDeviceError, "does not take the sequence: its order has fewer entries"),
-        ({}, {0x51: b"\1"}, UnsupportedByDeviceError, "asked for led control 00, the engine gives 01"),
+        ({"most_entries": 0}, {}, UnsupportedByDeviceError, "refuses the sequence: the order has too few entries"),
+        ({}, {0x51: b"\1"}, UnsupportedByDeviceError, "requested led control 00, the engine gives 01"),
         ({}, {0x99: b""}, UnsupportedByDeviceError, "entry 0 was 00 01 04"),
         ({}, {0x9F: bytes(7)}, DeviceError, "is not ready for 1 entries"),
-        ({}, {0x53: b"\7"}, UnsupportedByDeviceError, "asked for led enable 00, the engine gives 07"),
-        ({}, {0xD0: b"\x89", 0xD1: b"\0\x10\4\0"}, DeviceError, "says: the green LED failed; its supply is low"),
+        ({}, {0x53: b"\7"}, UnsupportedByDeviceError, "requested led enable 00, the engine gives 07"),
+        ({}, {0xD0: b"\x89", 0xD1: b"\0\x10\4\0"}, DeviceError, "reports: the green LED failed; its supply is low"),
     ],
 )
 def test_what_the_engine_does_not_take_or_gives_back_otherwise_is_reported_and_it_is_dark(
@@ -176,7 +176,7 @@ def test_what_the_engine_does_not_take_or_gives_back_otherwise_is_reported_and_i
     told: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("drivers.dlpc347x.engine.READY_S", 0.02)
+    monkeypatch.setattr("drivers.dlpc347x.engine.READY_TIMEOUT_S", 0.02)
     bench = Bench(**engine)
     bench.engine.bent = bent
     with pytest.raises(error, match=told):
@@ -187,16 +187,16 @@ def test_what_the_engine_does_not_take_or_gives_back_otherwise_is_reported_and_i
 
 def test_other_controllers_are_refused_and_left_dark() -> None:
     bench = Bench(None, controller=0x0C)
-    with pytest.raises(UnsupportedByDeviceError, match=r"controller 0x0c.*DLPC3479.*it is not served"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"controller 0x0c.*DLPC3479 is not supported"):
         bench.open()
     assert bench.engine.lit is None
 
 
 def test_what_is_no_bus_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(DeviceGoneError, match=r"No such file.*buses that are there: .*modprobe i2c-dev"):
+    with pytest.raises(DeviceGoneError, match=r"No such file.*available buses: .*modprobe i2c-dev"):
         open_projector({"device": str(tmp_path / "i2c-9")}, tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(DeviceGoneError, match="this is no I²C bus"):
+    with pytest.raises(DeviceGoneError, match="not an I²C bus"):
         open_bus(tmp_path / "file", 0x1B)
     with (tmp_path / "file").open() as other:
         fcntl.flock(other, fcntl.LOCK_EX)
@@ -209,13 +209,13 @@ def test_what_is_no_bus_is_reported(tmp_path: Path) -> None:
 def test_each_command_and_each_answer_is_a_transaction_of_its_own() -> None:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with far:
-        bus = Bus(Node(near.detach()), "light engine")
+        bus = I2cBus(I2cNode(near.detach()), "light engine")
         far.send(b"\x0b")
         assert bus.read(0xD3, 1, b"\2") == b"\x0b"
         bus.write(0x9E, b"\1\0")
         assert [far.recv(99) for _ in range(2)] == [b"\xd3\2", b"\x9e\1\0"]
         far.send(b"\1")
-        with pytest.raises(DeviceGoneError, match="a part of an answer"):
+        with pytest.raises(DeviceGoneError, match="incomplete read"):
             bus.read(0xD1, 4)
         bus.close()
         with pytest.raises(DeviceStateError, match="closed"):
@@ -250,21 +250,21 @@ def test_a_block_is_what_tis_own_source_makes_of_the_same_patterns(controller: i
     found = scanned(mirrors.size)
     ordered = sorted(zip(found.patterns, found.profiles, strict=True), key=lambda each: as_compiled(each[0]))
     patterns, profiles = zip(*ordered, strict=True)
-    block = block_of(PatternSequence(found.projector, patterns, profiles), Lines(mirrors, (False, False)))
+    block = build_block(PatternSequence(found.projector, patterns, profiles), LineEncoder(mirrors, (False, False)))
     assert (len(block), hashlib.sha256(block).hexdigest()) == (length, digest)
-    assert size_of(block[:20]) == length
+    assert block_size(block[:20]) == length
 
 
 def test_more_patterns_than_a_set_holds_go_into_further_ones_with_white_and_black() -> None:
     _, mirrors = CONTROLLERS[0x0B]
-    lines = Lines(mirrors, (False, False))
+    lines = LineEncoder(mirrors, (False, False))
     sequence = scanned(mirrors.size, period_px=80)
-    held = places_in(block_of(sequence, lines))
-    places = places_of(sequence, lines, held)
+    held = find_lines(build_block(sequence, lines))
+    places = locate_patterns(sequence, lines, held)
     assert len(held) > 2 * 80
     assert {place.set for place in places} == {0, 1, 2, 3}
     assert max(place.index for found in held.values() for place in found) == 63
     columns = encode(sequence.patterns[60:90], mirrors.size)
-    assert {place.set for place in places_of(columns, lines, held)} == {0, 1}
+    assert {place.set for place in locate_patterns(columns, lines, held)} == {0, 1}
     white_and_one = encode((sequence.patterns[0], sequence.patterns[90]), mirrors.size)
-    assert {place.set for place in places_of(white_and_one, lines, held)} == {1}
+    assert {place.set for place in locate_patterns(white_and_one, lines, held)} == {1}

@@ -11,16 +11,23 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.dlpc350.flash import LIST, TO_FLASH, Flash, Place, read_flash, write_pictures
-from drivers.dlpc350.options import EngineOptions
-from drivers.dlpc350.planes import MIRRORS, picture_of, planes_in
-from drivers.dlpc350.projector import DLPC350, LightEngine
-from drivers.dlpc350.tables import tables_of
-from drivers.dlpc350.timing import MINIMUM_US, check_loading, check_timing, lit
-from drivers.pattern_engine.link import Link
-from drivers.pattern_engine.options import Colour
-from drivers.pattern_engine.planes import plane_of
-from drivers.pattern_engine.timing import Timing
+from drivers.dlpc350.engine import MIN_EXPOSURE_US, build_tables, check_loading, check_timing, play_timing
+from drivers.dlpc350.flash import (
+    EXPORT_FOLDER,
+    LIST_FILE,
+    MIRRORS,
+    FlashContents,
+    FlashedPlane,
+    decode_planes,
+    encode_picture,
+    read_flash_list,
+    write_pictures,
+)
+from drivers.dlpc350.options import Dlpc350EngineOptions
+from drivers.dlpc350.projector import DLPC350, Dlpc350Projector
+from drivers.pattern_engine.options import LedColour
+from drivers.pattern_engine.patterns import Timing, pattern_plane
+from drivers.pattern_engine.usb import UsbLink
 from slrig.bundle.validation import validate
 from slrig.devices import StoredPatternProjector
 from slrig.errors import (
@@ -105,7 +112,7 @@ def test_a_flash_of_another_name_or_with_too_few_pictures_is_refused(tmp_path: P
     with pytest.raises(UnsupportedByDeviceError, match=f'tagged "{flash.tag}", the engine says "factory"'):
         bench.open()
     assert bench.engine.lit is None
-    bench.flash = Flash(flash.folder, None, flash.pictures)
+    bench.flash = FlashContents(flash.folder, None, flash.pictures)
     bench.open().close()
     bench.flash = write_pictures(tmp_path, SEQUENCE, flash.pictures)
     bench.engine.tag = bench.flash.tag or ""
@@ -114,7 +121,7 @@ def test_a_flash_of_another_name_or_with_too_few_pictures_is_refused(tmp_path: P
 
 
 def test_a_flash_without_a_list_asks_for_pictures(bench: Bench, tmp_path: Path) -> None:
-    bench.flash = Flash(tmp_path)
+    bench.flash = FlashContents(tmp_path)
     projector = bench.open()
     with pytest.raises(UnsupportedByDeviceError, match=r"lacks 3 of 3 patterns.*slrig patterns"):
         projector.load(SEQUENCE)
@@ -155,15 +162,15 @@ def never_runs(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (bends_its_timing, "asked for exposure period"),
-        (lacks_a_picture, "a pattern number in the table is not one that it has"),
-        (never_runs, "did not start the sequence in time, and says: a picture was taken before"),
+        (bends_its_timing, "requested exposure period"),
+        (lacks_a_picture, "a pattern number in the table does not exist"),
+        (never_runs, "did not start the sequence in time, and reports: a picture was taken before"),
     ],
 )
 def test_what_keeps_a_sequence_from_its_light_is_an_error_and_dark(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, spoil: Callable[[Bench], None], words: str
 ) -> None:
-    monkeypatch.setattr("drivers.dlpc350.projector.RUNNING_S", 0.01)
+    monkeypatch.setattr("drivers.dlpc350.projector.START_TIMEOUT_S", 0.01)
     projector = bench.loaded()
     spoil(bench)
     with pytest.raises(DeviceError, match=words) as refused:
@@ -176,15 +183,17 @@ def test_an_engine_that_is_gone_while_it_is_opened_is_gone(bench: Bench) -> None
     bench.cable = Cable(bench.engine)
     bench.cable.unplug()
     with pytest.raises(DeviceGoneError):
-        LightEngine(Link(bench.cable.host, "light engine", DLPC350), EngineOptions(patterns="p"), bench.flash)
+        Dlpc350Projector(
+            UsbLink(bench.cable.host, "light engine", DLPC350), Dlpc350EngineOptions(patterns="p"), bench.flash
+        )
 
 
 @pytest.mark.parametrize(
     ("exposure_us", "period_us", "rule"),
     [
         (234, 500, "shortest exposure of a 1-bit pattern is 235 µs"),
-        (1000, 1229, "shorter by 230 µs at least"),
-        (1001, 1000, "shorter by 230 µs at least"),
+        (1000, 1229, "at least 230 µs shorter"),
+        (1001, 1000, "at least 230 µs shorter"),
         (200_000_000, 200_000_300, "the longest is 200000000 µs"),
     ],
 )
@@ -195,9 +204,9 @@ def test_a_timing_is_judged_by_rules_with_names(exposure_us: int, period_us: int
         check_timing(Timing(exposure_us, period_us))
 
 
-@pytest.mark.parametrize("bit_depth", MINIMUM_US)
+@pytest.mark.parametrize("bit_depth", MIN_EXPOSURE_US)
 def test_the_shortest_exposure_depends_on_the_bit_depth(bit_depth: int) -> None:
-    least_us = MINIMUM_US[bit_depth]
+    least_us = MIN_EXPOSURE_US[bit_depth]
     check_timing(Timing(least_us, least_us), bit_depth=bit_depth)
     with pytest.raises(UnsupportedByDeviceError, match=f"{bit_depth}-bit pattern is {least_us} µs"):
         check_timing(Timing(least_us - 1, least_us + 1000), bit_depth=bit_depth)
@@ -215,7 +224,7 @@ def test_the_shortest_exposure_depends_on_the_bit_depth(bit_depth: int) -> None:
 def test_light_covers_the_exposure_and_the_camera_s_start(
     exposure_s: float, period_s: float, margin_s: float, expected: Timing
 ) -> None:
-    assert lit(exposure_s, period_s, margin_s=margin_s, duty_limit=1.0) == expected
+    assert play_timing(exposure_s, period_s, margin_s=margin_s, duty_limit=1.0) == expected
 
 
 @pytest.mark.parametrize(
@@ -230,7 +239,7 @@ def test_light_that_does_not_fit_is_refused(
     timing: tuple[float, float], margin_s: float, duty_limit: float, rule: str
 ) -> None:
     with pytest.raises(UnsupportedByDeviceError, match=rule):
-        lit(*timing, margin_s=margin_s, duty_limit=duty_limit)
+        play_timing(*timing, margin_s=margin_s, duty_limit=duty_limit)
 
 
 def test_pictures_beyond_the_buffers_need_time() -> None:
@@ -245,16 +254,16 @@ def test_pictures_beyond_the_buffers_need_time() -> None:
     [
         (
             [(3, 0, False), (3, 23, True), (3, 9, False)],
-            [Colour.WHITE] * 3,
+            [LedColour.WHITE] * 3,
             True,
             [0b0110_0111_0001_000000_00, 0b0011_0111_0001_010111_00, 0b0010_0111_0001_001001_00],
         ),
-        ([(0, 1, False)], [Colour.BLUE], False, [0b0100_0100_0001_000001_00]),
+        ([(0, 1, False)], [LedColour.BLUE], False, [0b0100_0100_0001_000001_00]),
         # White in one light is lit by that LED alone.
         (
             [(0, 1, False)] * 3,
             [
-                EngineOptions(patterns="p").colour_of(pattern)
+                Dlpc350EngineOptions(patterns="p").led_colour(pattern)
                 for pattern in (White(), Primary("green"), Primary("blue"))
             ],
             False,
@@ -264,10 +273,10 @@ def test_pictures_beyond_the_buffers_need_time() -> None:
     ids=["dark between", "no dark between", "colours"],
 )
 def test_table_entries_are_laid_out_as_the_manual_says(
-    places: list[tuple[int, int, bool]], colours: list[Colour], dark_between: bool, words: list[int]
+    places: list[tuple[int, int, bool]], colours: list[LedColour], dark_between: bool, words: list[int]
 ) -> None:
-    tables = tables_of(
-        [Place(image, plane, inverted=inverted) for image, plane, inverted in places],
+    tables = build_tables(
+        [FlashedPlane(image, plane, inverted=inverted) for image, plane, inverted in places],
         colours,
         dark_between=dark_between,
     )
@@ -286,8 +295,8 @@ def test_table_entries_are_laid_out_as_the_manual_says(
 def test_each_change_of_picture_swaps_the_buffer(
     pictures: list[int], swaps: list[int], images: list[int], counts: tuple[int, ...]
 ) -> None:
-    places = [Place(picture, 0, inverted=False) for picture in pictures]
-    tables = tables_of(places, (Colour.RED,) * len(places), dark_between=False)
+    places = [FlashedPlane(picture, 0, inverted=False) for picture in pictures]
+    tables = build_tables(places, (LedColour.RED,) * len(places), dark_between=False)
     assert [tables.patterns[3 * i + 2] >> 2 & 1 for i in range(len(places))] == swaps
     assert (list(tables.images), tables.counts, tables.length) == (images, counts, len(places))
 
@@ -295,17 +304,17 @@ def test_each_change_of_picture_swaps_the_buffer(
 def test_all_faults_of_the_options_are_reported_at_once() -> None:
     options: dict[str, Any] = {"patern": "p", "led": "ultraviolet", "hold_s": 1.0, "trigger_delay_us": 5.0}
     with pytest.raises(ConfigError) as refused:
-        validate(EngineOptions, options, "the table")
+        validate(Dlpc350EngineOptions, options, "the table")
     text = str(refused.value)
     for words in ("patern: unknown key; did you mean 'patterns'?", "patterns: missing", "led: ", "hold_s: ", "5.0"):
         assert words in text
 
 
 def test_the_led_current_is_limited() -> None:
-    assert EngineOptions(patterns="p", led_current=0.4).current_byte == 102
+    assert Dlpc350EngineOptions(patterns="p", led_current=0.4).current_byte == 102
     with pytest.raises(ConfigError, match=r"led_current is 0\.6, led_current_limit allows 0\.5"):
-        validate(EngineOptions, {"patterns": "p", "led_current": 0.6}, "the table")
-    assert EngineOptions(patterns="p", led_current=0.6, led_current_limit=0.6).colour is Colour.WHITE
+        validate(Dlpc350EngineOptions, {"patterns": "p", "led_current": 0.6}, "the table")
+    assert Dlpc350EngineOptions(patterns="p", led_current=0.6, led_current_limit=0.6).colour is LedColour.WHITE
 
 
 def scan(*, rows: bool = False, period_px: int = 8) -> PatternSequence:
@@ -330,7 +339,7 @@ def test_planes_fill_green_then_red_then_blue_from_the_lowest_bit_and_are_given_
     planes = [np.zeros(MIRRORS.shape, np.bool_) for _ in range(24)]
     for number, plane in enumerate(planes):
         plane[2, number] = True
-    content = picture_of(planes)
+    content = encode_picture(planes)
     picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture is not None
     assert picture.shape == (1140, 912, 3)
@@ -338,19 +347,19 @@ def test_planes_fill_green_then_red_then_blue_from_the_lowest_bit_and_are_given_
     for number, pixel in ((0, (0, 1, 0)), (7, (0, 128, 0)), (8, (0, 0, 1)), (15, (0, 0, 128)), (23, (128, 0, 0))):
         assert tuple(picture[2, number]) == pixel
     assert np.count_nonzero(picture) == 24
-    assert all(np.array_equal(a, b) for a, b in zip(planes_in(content, "made"), planes, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(decode_planes(content, "made"), planes, strict=True))
 
 
 def test_a_picture_of_another_kind_or_that_is_cut_and_shades_of_grey_are_refused() -> None:
     shapes = ((1140, 911, 3), (800, 1280, 3), (1140, 912))
     others = [cv2.imencode(".bmp", np.zeros(shape, np.uint8))[1].tobytes() for shape in shapes]
-    whole = picture_of([])
+    whole = encode_picture([])
     for content in (*others, whole[:10], whole[:60], whole[:-1]):
         with pytest.raises(ConfigError, match="expected a BMP file of 912 x 1140 pixels with 24 bits"):
-            planes_in(content, "splash.bmp")
+            decode_planes(content, "splash.bmp")
     grey = PatternSequence(MIRRORS, (White(),), (np.full((1, 1), 128, np.uint8),))
     with pytest.raises(UnsupportedByDeviceError, match="a mirror is on or off"):
-        plane_of(grey, 0)
+        pattern_plane(grey, 0)
 
 
 @pytest.mark.parametrize(
@@ -365,10 +374,10 @@ def test_every_place_holds_its_pattern(tmp_path: Path, rows: bool, planes: list[
     sequence = scan(rows=rows)
     written = write_pictures(tmp_path, sequence)
     assert [len(picture.planes) for picture in written.pictures] == planes
-    places = read_flash(tmp_path).places(sequence)
+    places = read_flash_list(tmp_path).places(sequence)
     images = [place.image for place in places]
     assert images == sorted(images)
-    listed = json.loads((tmp_path / LIST).read_text())
+    listed = json.loads((tmp_path / LIST_FILE).read_text())
     pictures = {image["flash_index"]: cv2.imread(str(tmp_path / image["file"])) for image in listed["images"]}
     for index, place in enumerate(places):
         picture = pictures[place.image]
@@ -382,13 +391,13 @@ def test_every_place_holds_its_pattern(tmp_path: Path, rows: bool, planes: list[
 
 def test_what_is_missing_is_reported_and_written_on_request(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedByDeviceError) as refused:
-        read_flash(tmp_path).places(scan())
+        read_flash_list(tmp_path).places(scan())
     text = str(refused.value)
     assert "lacks 28 of 28 patterns (white, black, column Gray bit 0 of 8, cell 4 px and 25 more)" in text
     assert list(tmp_path.iterdir()) == []
-    text = read_flash(tmp_path).written(scan())
-    flash = read_flash(tmp_path / TO_FLASH)
-    assert str(tmp_path / TO_FLASH) in text
+    text = read_flash_list(tmp_path).write_patterns(scan())
+    flash = read_flash_list(tmp_path / EXPORT_FOLDER)
+    assert str(tmp_path / EXPORT_FOLDER) in text
     assert f'"{flash.tag}"' in text
     assert len(flash.places(scan())) == 28
 
@@ -398,11 +407,11 @@ def test_what_is_flashed_already_keeps_its_place(tmp_path: Path) -> None:
         few(White(), *(LineShift(Axis.COLUMN, 1, period) for period in periods)) for periods in ((8, 9), (9, 12))
     )
     write_pictures(tmp_path, first)
-    before = read_flash(tmp_path)
+    before = read_flash_list(tmp_path)
     with pytest.raises(UnsupportedByDeviceError, match="lacks 1 of 3 patterns"):
         before.places(second)
-    before.written(second)
-    after = read_flash(tmp_path / TO_FLASH)
+    before.write_patterns(second)
+    after = read_flash_list(tmp_path / EXPORT_FOLDER)
     assert [picture.flash_index for picture in after.pictures] == [0, 1]
     assert after.places(first) == before.places(first)
     assert {place.image for place in after.places(second)} == {1}
@@ -414,11 +423,11 @@ def test_the_picture_in_the_buffer_is_kept_as_long_as_it_serves(tmp_path: Path) 
     first = write_pictures(tmp_path, few(White(), a))
     second = write_pictures(tmp_path, few(White(), b, c), first.pictures)
     assert second.places(few(White(), Black(), b, c, White())) == (
-        Place(1, 0, inverted=False),
-        Place(1, 0, inverted=True),
-        Place(1, 1, inverted=False),
-        Place(1, 2, inverted=False),
-        Place(1, 0, inverted=False),
+        FlashedPlane(1, 0, inverted=False),
+        FlashedPlane(1, 0, inverted=True),
+        FlashedPlane(1, 1, inverted=False),
+        FlashedPlane(1, 2, inverted=False),
+        FlashedPlane(1, 0, inverted=False),
     )
     assert [place.image for place in second.places(few(White(), a, b, White()))] == [0, 0, 1, 1]
 
@@ -430,29 +439,29 @@ def test_a_picture_that_was_changed_is_refused(tmp_path: Path) -> None:
     content[1000] ^= 1
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=r"not the picture that images\.json lists"):
-        read_flash(tmp_path)
+        read_flash_list(tmp_path)
     path.unlink()
     with pytest.raises(ConfigError, match="No such file"):
-        read_flash(tmp_path)
+        read_flash_list(tmp_path)
 
 
 def test_faults_of_the_list_are_reported_at_once(tmp_path: Path) -> None:
     flash = write_pictures(tmp_path, few(White()))
-    listed = json.loads((tmp_path / LIST).read_text())
+    listed = json.loads((tmp_path / LIST_FILE).read_text())
     listed["images"] *= 2
-    (tmp_path / LIST).write_text(json.dumps(listed))
+    (tmp_path / LIST_FILE).write_text(json.dumps(listed))
     with pytest.raises(ConfigError, match=r"each flash_index once, found \[0, 0\]"):
-        read_flash(tmp_path)
+        read_flash_list(tmp_path)
     image = {"flash_index": 300, "file": "a.bmp", "sha256": "0", "planes": []}
-    (tmp_path / LIST).write_text(
+    (tmp_path / LIST_FILE).write_text(
         json.dumps({"format": "slrig-dlpc350-images", "version": 2, "tagg": "x", "images": [image]})
     )
     with pytest.raises(ConfigError) as refused:
-        read_flash(tmp_path)
+        read_flash_list(tmp_path)
     for words in ("version", "tagg: unknown key; did you mean 'tag'?", "flash_index", "sha256", "planes"):
         assert words in str(refused.value)
-    with pytest.raises(UnsupportedByDeviceError, match="it takes 64"):
+    with pytest.raises(UnsupportedByDeviceError, match="limit of 64"):
         write_pictures(tmp_path, few(White()), flash.pictures * 64)
     (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match="asked to write pictures"):
+    with pytest.raises(StorageError, match="cannot write pictures"):
         write_pictures(tmp_path / "file" / "folder", few(White()))

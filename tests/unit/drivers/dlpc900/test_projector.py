@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.dlpc900.pictures import MOST_PICTURES, memory_of, packed
-from drivers.pattern_engine.planes import plane_of
+from drivers.dlpc900.pictures import MAX_PICTURES, encode_picture, pack_sequence
+from drivers.pattern_engine.patterns import pattern_plane
 from slrig.devices import StoredPatternProjector
 from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, PatternSequence, Size, White
@@ -117,7 +117,7 @@ def test_what_the_engine_refuses_is_reported_in_its_words_and_it_is_dark(bench: 
         projector.show(0)
     # Data is not answered: what is wrong with it is found in the error code.
     bench.engine.refusing = {0x1A2B: 9}
-    with pytest.raises(UnsupportedByDeviceError, match="take picture 0, and says: it does not know the packing"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"take picture 0: the picture.s encoding is unknown"):
         projector.load(SEQUENCE)
     bench.engine.refusing = {}
     projector.load(SEQUENCE)
@@ -138,7 +138,7 @@ def test_a_piece_of_a_picture_that_went_wrong_is_not_hidden_by_the_next(
     assert bench.commands().count(0x1A2B) > 2
     answers = iter((6, *[0] * 100))
     monkeypatch.setattr(bench.engine, "_load", lambda _half, _data: next(answers))
-    with pytest.raises(UnsupportedByDeviceError, match="take picture 0, and says: a parameter is not one that it has"):
+    with pytest.raises(UnsupportedByDeviceError, match="take picture 0: a parameter is invalid"):
         projector.load(SEQUENCE)
     assert bench.commands().count(0x1A2B) == 1
 
@@ -153,7 +153,7 @@ def test_a_picture_is_packed_as_the_guides_example() -> None:
     # The pixels of DLPU018 table 2-110, in lines of 13.
     first = [0x040506] * 3 + [0x777777] * 5 + [0x040506, 0x070809, 0x0A0B0C] + [0x789ABC] * 2
     picture = np.array([first, first, [0x010203] + [0x040506] * 12], np.uint32)
-    content = packed(picture)
+    content = encode_picture(picture)
     assert content[:8] == b"Spld" + bytes([13, 0, 3, 0])
     assert content[12:48] == b"\xff" * 8 + bytes(4) + bytes([0, 2, 1]) + bytes(21)
     assert int.from_bytes(content[8:12], "little") == len(content) - 48
@@ -163,7 +163,7 @@ def test_a_picture_is_packed_as_the_guides_example() -> None:
 
 
 def test_long_runs_take_two_bytes() -> None:
-    content = packed(np.full((2, 0x1234), 0x789ABC, np.uint32))
+    content = encode_picture(np.full((2, 0x1234), 0x789ABC, np.uint32))
     # The number of the guide's own example.
     assert content[48:58] == bytes.fromhex("b4 24 789abc 00 01 b4 24 00")
 
@@ -175,30 +175,30 @@ def test_any_picture_comes_out_as_it_went_in(seed: int) -> None:
     picture = np.repeat(rng.integers(0, 2**24, (7, 60), np.uint32), rng.integers(1, 9, 60), axis=1)[:, : size.width_px]
     picture = np.pad(picture, ((0, 0), (0, size.width_px - picture.shape[1])))
     picture[3] = picture[2]
-    out = unpacked(packed(picture), size)
+    out = unpacked(encode_picture(picture), size)
     assert out is not None
     assert np.array_equal(out, picture)
 
 
 def test_patterns_lie_where_the_table_says_each_once() -> None:
     shown = whole_scan(Size(480, 270), rows=True)
-    memory = memory_of(shown)
+    memory = pack_sequence(shown)
     for index in range(len(shown)):
         place = memory.places[index]
-        assert np.array_equal(memory.pictures[place.picture] >> np.uint32(place.plane) & 1, plane_of(shown, index))
+        assert np.array_equal(memory.pictures[place.picture] >> np.uint32(place.plane) & 1, pattern_plane(shown, index))
     dark = memory.places[-1]
     assert not (memory.pictures[dark.picture] >> np.uint32(dark.plane) & 1).any()
     assert len(set(memory.places)) == len({profile.tobytes() for profile in shown.profiles})
     # What 24 patterns take over USB. Mixed directions in one picture would take far more.
-    assert max(len(packed(picture)) for picture in memory.pictures) < 5_000
+    assert max(len(encode_picture(picture)) for picture in memory.pictures) < 5_000
 
 
 def test_more_than_the_engine_holds_is_refused() -> None:
     small = Size(500, 2)
     one = encode((White(),), small)
     with pytest.raises(UnsupportedByDeviceError, match=r"400 patterns .* takes 399 in 18"):
-        memory_of(PatternSequence(small, one.patterns * 400, one.profiles * 400))
-    memory_of(PatternSequence(small, one.patterns * 399, one.profiles * 399))
-    lines = tuple(LineShift(Axis.COLUMN, shift, 500) for shift in range(24 * MOST_PICTURES))
+        pack_sequence(PatternSequence(small, one.patterns * 400, one.profiles * 400))
+    pack_sequence(PatternSequence(small, one.patterns * 399, one.profiles * 399))
+    lines = tuple(LineShift(Axis.COLUMN, shift, 500) for shift in range(24 * MAX_PICTURES))
     with pytest.raises(UnsupportedByDeviceError, match="in 19 pictures"):
-        memory_of(encode((*lines, Black()), small))
+        pack_sequence(encode((*lines, Black()), small))

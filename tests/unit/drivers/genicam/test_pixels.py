@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.genicam.pixels import FORMATS, Packing, PixelFormat, grey
+from drivers.genicam.pixels import FORMATS, PfncFormat, SamplePacking, decode_pixels
 from slrig.model import Pixels, Size
 from tests.unit.drivers.genicam.conftest import encoded
 
@@ -19,11 +19,11 @@ def image_of(size: Size, bit_depth: int, seed: int = 3) -> Pixels:
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("form", [form for form in FORMATS.values() if not form.mosaic], ids=lambda form: form.name)
-def test_a_mono_image_comes_out_as_it_went_in(form: PixelFormat, size: Size) -> None:
+def test_a_mono_image_comes_out_as_it_went_in(form: PfncFormat, size: Size) -> None:
     image = image_of(size, form.bit_depth)
     data = encoded(image, form.name)
     assert len(data) == form.size_bytes(size)
-    got = grey(data + b"rest", form, size)
+    got = decode_pixels(data + b"rest", form, size)
     assert got.dtype == image.dtype
     np.testing.assert_array_equal(got, image)
 
@@ -39,11 +39,11 @@ def test_a_mosaic_is_weighted_as_luma(mosaic: str, kind: str) -> None:
     for colour, weight in luma.items():
         lit = np.array([cell == colour for cell in cells]).reshape(2, 2)
         image = (np.tile(lit, (6, 8)) * full).astype(np.uint8 if form.bit_depth <= 8 else np.uint16)
-        got = grey(encoded(image, form.name), form, size)
+        got = decode_pixels(encoded(image, form.name), form, size)
         assert got.shape == size.shape
         assert got.dtype == image.dtype
         np.testing.assert_allclose(got[2:-2, 2:-2], weight * full, atol=0.01 * full)
-        seen = grey(encoded(image, form.name), form, size, in_colour=True)
+        seen = decode_pixels(encoded(image, form.name), form, size, in_colour=True)
         assert seen.dtype == image.dtype
         expected = np.broadcast_to(full * (np.array(list("BGR")) == colour), (8, 12, 3))
         np.testing.assert_array_equal(seen[2:-2, 2:-2], expected)
@@ -53,8 +53,11 @@ def test_a_mosaic_is_weighted_as_luma(mosaic: str, kind: str) -> None:
 def test_colour_is_weighted_as_luma(name: str, first: float) -> None:
     size = Size(3, 2)
     data = (np.array([[[200, 0, 0]] * 3] * 2, np.uint8)).tobytes()
-    np.testing.assert_allclose(grey(data, FORMATS[name], size), 200 * first, atol=1)
-    assert grey(data, FORMATS[name], size, in_colour=True)[1, 2].tolist() == [0, 0, 200][:: 1 if name == "RGB8" else -1]
+    np.testing.assert_allclose(decode_pixels(data, FORMATS[name], size), 200 * first, atol=1)
+    assert (
+        decode_pixels(data, FORMATS[name], size, in_colour=True)[1, 2].tolist()
+        == [0, 0, 200][:: 1 if name == "RGB8" else -1]
+    )
 
 
 def test_padding_after_rows_is_cut_off() -> None:
@@ -62,25 +65,25 @@ def test_padding_after_rows_is_cut_off() -> None:
     image = image_of(size, 12)
     rows = image.astype("<u2").view(np.uint8).reshape(4, 12)
     padded = np.hstack([rows, np.full((4, 4), 0xAB, np.uint8)]).tobytes()
-    np.testing.assert_array_equal(grey(padded, FORMATS["Mono12"], size, padding_bytes=4), image)
-    np.testing.assert_array_equal(grey(padded[:-4], FORMATS["Mono12"], size, padding_bytes=4), image)
+    np.testing.assert_array_equal(decode_pixels(padded, FORMATS["Mono12"], size, padding_bytes=4), image)
+    np.testing.assert_array_equal(decode_pixels(padded[:-4], FORMATS["Mono12"], size, padding_bytes=4), image)
     with pytest.raises(ValueError, match="cannot be"):
-        grey(padded, FORMATS["Mono12p"], size, padding_bytes=4)
+        decode_pixels(padded, FORMATS["Mono12p"], size, padding_bytes=4)
 
 
 @pytest.mark.parametrize("form", FORMATS.values(), ids=lambda form: form.name)
-def test_a_short_buffer_is_refused(form: PixelFormat) -> None:
+def test_a_short_buffer_is_refused(form: PfncFormat) -> None:
     size = Size(8, 4)
     with pytest.raises(ValueError, match=form.name):
-        grey(bytes(form.size_bytes(size) - 1), form, size)
+        decode_pixels(bytes(form.size_bytes(size) - 1), form, size)
 
 
 def test_samples_above_the_bit_depth_are_cut_off() -> None:
     words = np.array([[4096, 65535, 17]], "<u2")
-    assert grey(words.tobytes(), FORMATS["Mono12"], Size(3, 1)).tolist() == [[4095, 4095, 17]]
+    assert decode_pixels(words.tobytes(), FORMATS["Mono12"], Size(3, 1)).tolist() == [[4095, 4095, 17]]
 
 
 def test_every_format_says_how_it_is_packed() -> None:
     for form in FORMATS.values():
-        assert form.name.endswith("p") == (form.packing is Packing.LSB)
-        assert form.name.endswith("Packed") == (form.packing is Packing.GIGE)
+        assert form.name.endswith("p") == (form.packing is SamplePacking.LSB)
+        assert form.name.endswith("Packed") == (form.packing is SamplePacking.GIGE)

@@ -41,7 +41,7 @@ AT_START = Interval(0, 0)
 def test_frame_ids_are_unwrapped(ids: list[int], numbers: list[int | None]) -> None:
     counter = FrameNumbers()
     assert [counter.next(block_id) for block_id in ids] == numbers
-    assert counter.made == 1 + max(number for number in numbers if number is not None)
+    assert counter.frame_count == 1 + max(number for number in numbers if number is not None)
     counter = FrameNumbers()
     assert [counter.next(1 + index % 65535) for index in range(70_000)] == list(range(70_000))
 
@@ -75,10 +75,10 @@ def test_a_latched_clock_is_as_good_as_its_quickest_look() -> None:
         host.look(40 * MS, out_ns=8 * MS, back_ns=1 * MS),
     ]
     assert clock.latch(looks)
-    assert clock.tied
+    assert clock.is_tied
     start = clock.start(host.stamp(30 * MS))
-    assert start.least_ns <= 30 * MS <= start.most_ns
-    assert start.most_ns - start.least_ns <= 300_000 + 4 * round(DRIFT * 20 * MS)
+    assert start.min_ns <= 30 * MS <= start.max_ns
+    assert start.max_ns - start.min_ns <= 300_000 + 4 * round(DRIFT * 20 * MS)
 
 
 @pytest.mark.parametrize(
@@ -94,14 +94,14 @@ def test_a_latched_clock_is_as_good_as_its_quickest_look() -> None:
 def test_a_clock_that_stands_is_not_used(looks: list[tuple[int, int, int]]) -> None:
     clock = StartClock(ANYWHERE)
     assert not clock.latch(looks)
-    assert not clock.tied
+    assert not clock.is_tied
 
 
 def test_a_stamp_somewhere_within_the_exposure_leaves_its_length_open() -> None:
     host = Host()
     for lag_ns in (0, EXPOSURE // 2, EXPOSURE):
         start = tied(host, ANYWHERE).start(host.stamp(100 * MS + lag_ns))
-        assert start.least_ns <= 100 * MS <= start.most_ns
+        assert start.min_ns <= 100 * MS <= start.max_ns
 
 
 @pytest.mark.parametrize("drift", [-5e-5, 5e-5])
@@ -110,8 +110,8 @@ def test_a_drifting_clock_stays_within_what_is_said(drift: float) -> None:
     clock = tied(host)
     for seconds in (1, 10, 100):
         start = clock.start(host.stamp(seconds * 1000 * MS))
-        assert start.least_ns <= seconds * 1000 * MS <= start.most_ns
-        assert start.most_ns - start.least_ns <= 2 * DRIFT * seconds * 1e9 + 300_000
+        assert start.min_ns <= seconds * 1000 * MS <= start.max_ns
+        assert start.max_ns - start.min_ns <= 2 * DRIFT * seconds * 1e9 + 300_000
 
 
 @pytest.mark.parametrize("latched", [True, False])
@@ -129,9 +129,9 @@ def test_starts_without_triggers_hold_the_truth(latched: bool, stamped: bool) ->
         stamp_ns = host.stamp(truth_ns + EXPOSURE // 3) if stamped else None
         start = starts.start(Arrival(number, stamp_ns, truth_ns + EXPOSURE + late_ns))
         assert start is not None
-        assert start.least_ns <= truth_ns <= start.most_ns
+        assert start.min_ns <= truth_ns <= start.max_ns
         # A latched clock needs no trust in the network.
-        assert start.most_ns - start.least_ns <= (EXPOSURE + 5 * MS if latched and stamped else TRANSFER)
+        assert start.max_ns - start.min_ns <= (EXPOSURE + 5 * MS if latched and stamped else TRANSFER)
 
 
 def test_a_frame_that_lay_in_the_camera_is_dated_by_the_clock_and_no_stamp_is_later_than_its_arrival() -> None:
@@ -139,7 +139,7 @@ def test_a_frame_that_lay_in_the_camera_is_dated_by_the_clock_and_no_stamp_is_la
     starts = UntriggeredStarts(EXPOSURE, TRANSFER, tied(host))
     start = starts.start(Arrival(0, host.stamp(100 * MS), 100 * MS + EXPOSURE + 900 * MS))
     assert start is not None
-    assert start.least_ns <= 100 * MS <= start.most_ns < 101 * MS
+    assert start.min_ns <= 100 * MS <= start.max_ns < 101 * MS
     assert starts.start(Arrival(1, host.stamp(500 * MS), 400 * MS)) is None
 
 
@@ -180,7 +180,7 @@ def test_a_frame_answers_a_trigger_that_it_can_be_of(steps: list[int | Came]) ->
     starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
     for step in steps:
         if isinstance(step, int):
-            starts.triggered(step * MS, (step + 1) * MS)
+            starts.note_trigger(step * MS, (step + 1) * MS)
         else:
             began = None if step.began is None else Interval(step.began[0] * MS, step.began[1] * MS)
             assert starts.start(Arrival(step.number, None, step.at * MS)) == began
@@ -189,25 +189,25 @@ def test_a_frame_answers_a_trigger_that_it_can_be_of(steps: list[int | Came]) ->
 def test_an_answer_is_owed_until_it_came_or_is_given_up() -> None:
     starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
     for begun in (100, 200):
-        starts.triggered(begun * MS, (begun + 1) * MS)
+        starts.note_trigger(begun * MS, (begun + 1) * MS)
     assert starts.start(Arrival(0, None, 215 * MS)) is not None
-    assert starts.owed_ns(216 * MS) > 0
+    assert starts.answer_due_ns(216 * MS) > 0
     assert starts.start(Arrival(1, None, 226 * MS)) is not None
-    assert starts.owed_ns(227 * MS) <= 0
-    starts.triggered(400 * MS, 401 * MS)
-    assert starts.owed_ns(430 * MS) > 0
-    assert starts.owed_ns(600 * MS) <= 0
+    assert starts.answer_due_ns(227 * MS) <= 0
+    starts.note_trigger(400 * MS, 401 * MS)
+    assert starts.answer_due_ns(430 * MS) > 0
+    assert starts.answer_due_ns(600 * MS) <= 0
 
 
 def test_a_trigger_that_may_have_been_sent_twice_is_two() -> None:
     starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
-    starts.triggered(100 * MS, 106 * MS, times=2)
+    starts.note_trigger(100 * MS, 106 * MS, times=2)
     assert starts.start(Arrival(0, None, 117 * MS)) is not None
-    starts.triggered(120 * MS, 121 * MS)
+    starts.note_trigger(120 * MS, 121 * MS)
     # The second frame of the first trigger, or that of the second one: it may be as old as the first.
     start = starts.start(Arrival(1, None, 135 * MS))
     assert start is not None
-    assert start.least_ns == 100 * MS
+    assert start.min_ns == 100 * MS
 
 
 def test_the_clock_separates_a_very_late_frame_from_that_of_the_next_trigger() -> None:
@@ -215,19 +215,19 @@ def test_the_clock_separates_a_very_late_frame_from_that_of_the_next_trigger() -
     starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
     for number in range(3):
         begun_ns = 100 * number * MS
-        starts.triggered(begun_ns, begun_ns + MS)
+        starts.note_trigger(begun_ns, begun_ns + MS)
         arrival = Arrival(number, host.stamp(begun_ns + MS), begun_ns + 12 * MS)
         assert starts.start(arrival) is not None
-    starts.triggered(300 * MS, 301 * MS)
-    starts.triggered(400 * MS, 401 * MS)
+    starts.note_trigger(300 * MS, 301 * MS)
+    starts.note_trigger(400 * MS, 401 * MS)
     # The frame of the trigger at 300 ms, which lay somewhere for 120 ms.
     late = starts.start(Arrival(3, host.stamp(301 * MS), 431 * MS))
     assert late is not None
-    assert late.least_ns <= 301 * MS <= late.most_ns < 400 * MS
-    starts.triggered(500 * MS, 501 * MS)
+    assert late.min_ns <= 301 * MS <= late.max_ns < 400 * MS
+    starts.note_trigger(500 * MS, 501 * MS)
     start = starts.start(Arrival(5, host.stamp(501 * MS), 512 * MS))
     assert start is not None
-    assert start.least_ns >= 500 * MS
+    assert start.min_ns >= 500 * MS
 
 
 def test_triggered_starts_hold_the_truth_and_are_never_too_early() -> None:
@@ -238,7 +238,7 @@ def test_triggered_starts_hold_the_truth_and_are_never_too_early() -> None:
     now_ns, made, said = 0, 0, 0
     for _ in range(3000):
         now_ns += int(rng.integers(MS, 30 * MS))
-        starts.triggered(now_ns, now_ns + MS)
+        starts.note_trigger(now_ns, now_ns + MS)
         if rng.random() < 0.05:
             now_ns += EXPOSURE + ANSWER
             continue
@@ -252,5 +252,5 @@ def test_triggered_starts_hold_the_truth_and_are_never_too_early() -> None:
         start = starts.start(Arrival(number, host.stamp(truth_ns + EXPOSURE // 2), arrived_ns))
         if start is not None:
             said += 1
-            assert start.least_ns <= truth_ns <= start.most_ns
+            assert start.min_ns <= truth_ns <= start.max_ns
     assert said > 0.95 * 0.85 * 3000

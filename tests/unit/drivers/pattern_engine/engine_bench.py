@@ -12,18 +12,17 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from drivers.dlpc347x.bus import Bus
-from drivers.dlpc347x.options import EngineOptions as Options347x
-from drivers.dlpc347x.projector import LightEngine as LightEngine347x
-from drivers.dlpc350 import planes
-from drivers.dlpc350.flash import Flash, write_pictures
-from drivers.dlpc350.options import EngineOptions as Options350
+from drivers.dlpc347x.bus import I2cBus
+from drivers.dlpc347x.options import Dlpc347xEngineOptions as Options347x
+from drivers.dlpc347x.projector import Dlpc347xProjector as LightEngine347x
+from drivers.dlpc350.flash import MIRRORS, FlashContents, write_pictures
+from drivers.dlpc350.options import Dlpc350EngineOptions as Options350
 from drivers.dlpc350.projector import DLPC350
-from drivers.dlpc350.projector import LightEngine as LightEngine350
-from drivers.dlpc900.options import EngineOptions as Options900
+from drivers.dlpc350.projector import Dlpc350Projector as LightEngine350
+from drivers.dlpc900.options import Dlpc900EngineOptions as Options900
 from drivers.dlpc900.projector import DLPC900
-from drivers.dlpc900.projector import LightEngine as LightEngine900
-from drivers.pattern_engine.link import Link
+from drivers.dlpc900.projector import Dlpc900Projector as LightEngine900
+from drivers.pattern_engine.usb import UsbLink
 from slrig.model import Axis, Black, LineShift, PatternSequence, Pixels, White
 from slrig.patterns.sequence import encode
 from tests.contract import dlpc347x_bench, dlpc900_bench
@@ -35,7 +34,7 @@ from tests.virtual_clock import VirtualClock
 
 LINES = LineShift(Axis.COLUMN, 1, 8)
 PATTERNS = (White(), Black(), LINES)
-SEQUENCE_350 = encode(PATTERNS, planes.MIRRORS)
+SEQUENCE_350 = encode(PATTERNS, MIRRORS)
 SEQUENCE_900 = encode(PATTERNS, dlpc900_bench.MIRRORS)
 SEQUENCE_347X = encode(PATTERNS, dlpc347x_bench.MIRRORS)
 LEDS, START_STOP = 0x1A07, 0x1A24
@@ -109,7 +108,7 @@ class UsbBench(Bench):
 
 
 @cache
-def flash_350() -> Flash:
+def flash_350() -> FlashContents:
     """The pictures of a DLPC350, made once for all tests."""
     with tempfile.TemporaryDirectory() as folder:
         return write_pictures(Path(folder), SEQUENCE_350)
@@ -120,7 +119,7 @@ class Bench350(UsbBench):
 
     sequence = SEQUENCE_350
 
-    def __init__(self, flash: Flash | None = None, **engine: Any) -> None:
+    def __init__(self, flash: FlashContents | None = None, **engine: Any) -> None:
         super().__init__()
         self.flash = flash or flash_350()
         pictures = {picture.flash_index: picture.content for picture in self.flash.pictures}
@@ -131,7 +130,7 @@ class Bench350(UsbBench):
         self.cable = Cable(self.engine)
         usual = {"patterns": "p", "image_load_s": 0.0, "led_current_inverted": True}
         table = Options350.model_validate({**usual, **options})
-        link = Link(self.cable.host, "light engine", DLPC350, answer_s=5.0)
+        link = UsbLink(self.cable.host, "light engine", DLPC350, answer_s=5.0)
         return opened(LightEngine350(link, table, self.flash, serial="1", clock=self.clock))
 
     def held_us(self) -> tuple[int, int, int]:
@@ -152,7 +151,7 @@ class Bench900(UsbBench):
     def open(self, **options: Any) -> LightEngine900:
         self.cable = Cable(self.engine)
         table = Options900.model_validate({"start_s": 0.02, "led_current_inverted": False, **options})
-        link = Link(self.cable.host, "light engine", DLPC900, answer_s=5.0)
+        link = UsbLink(self.cable.host, "light engine", DLPC900, answer_s=5.0)
         return opened(LightEngine900(link, table, serial="1", clock=self.clock))
 
     def held_us(self) -> tuple[int, int, int]:
@@ -180,7 +179,7 @@ class Bench347x(Bench):
     def open(self, **options: Any) -> LightEngine347x:
         usual = {"device": "/dev/i2c-1", "start_s": 0.02, "light_margin_s": 0.001, "led": "blue"}
         table = Options347x.model_validate({**usual, **options})
-        return opened(LightEngine347x(Bus(self.engine, "light engine"), table, clock=self.clock))
+        return opened(LightEngine347x(I2cBus(self.engine, "light engine"), table, clock=self.clock))
 
     def unplug(self) -> None:
         self.engine.unplug()

@@ -19,8 +19,7 @@ import pytest
 from drivers import dlpc350, dlpc900
 from drivers.dlpc350.projector import DLPC350
 from drivers.dlpc900.projector import DLPC900
-from drivers.pattern_engine.finding import engines, found_devices, resolved
-from drivers.pattern_engine.link import Kind, Link, open_link
+from drivers.pattern_engine.usb import UsbController, UsbLink, choose_engine, find_engines, list_devices, open_link
 from slrig.errors import ConfigError, DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, WrongSystemError
 from tests.contract.dlpc350_device import Cable, FakeEngine
 from tests.contract.dlpc900_device import Fake900
@@ -30,11 +29,11 @@ SHORT_S = 0.05
 
 
 @contextmanager
-def wired(*, before: bytes = b"") -> Iterator[tuple[Link, socket.socket]]:
+def wired(*, before: bytes = b"") -> Iterator[tuple[UsbLink, socket.socket]]:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     if before:
         far.send(before)
-    link = Link(near.detach(), "light engine", DLPC350, answer_s=SHORT_S if before else 5.0)
+    link = UsbLink(near.detach(), "light engine", DLPC350, answer_s=SHORT_S if before else 5.0)
     try:
         with far:
             yield link, far
@@ -47,8 +46,8 @@ def engine() -> FakeEngine:
     return FakeEngine({})
 
 
-def linked(engine: FakeEngine) -> Link:
-    link = Link(Cable(engine).host, "light engine", DLPC350, answer_s=5.0)
+def linked(engine: FakeEngine) -> UsbLink:
+    link = UsbLink(Cable(engine).host, "light engine", DLPC350, answer_s=5.0)
     OPENED.append(link)
     return link
 
@@ -78,10 +77,10 @@ def test_a_command_is_framed_as_the_manual_says() -> None:
         for at in (0, 64):
             far.send(answered(4, long[:100])[at : at + 64])
         assert link.read(0x1A34, 100) == long[:100]
-        with pytest.raises(DeviceError, match="asked to send 507 bytes at once, it takes 506"):
+        with pytest.raises(DeviceError, match="a command of 507 bytes is too long, the limit is 506"):
             link.write(0x1A34, bytes(507))
         far.send(answered(5, b"\7"))
-        with pytest.raises(DeviceError, match="asked for 8 bytes of 0x1a29, it gave 1"):
+        with pytest.raises(DeviceError, match="requested 8 bytes of 0x1a29, it gave 1"):
             link.read(0x1A29, 8)
 
 
@@ -132,7 +131,7 @@ def test_a_node_that_is_not_there_or_no_engine_is_gone_and_a_held_one_is_busy(tm
         open_link(path, DLPC350)
     with path.open("wb") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(DeviceBusyError, match="another program holds it"):
+        with pytest.raises(DeviceBusyError, match="another program holds"):
             open_link(path, DLPC350)
 
 
@@ -186,9 +185,9 @@ def test_engines_are_distinguished_from_other_devices(tmp_path: Path) -> None:
     plug(tmp_path, 10, serial="B")
     plug(tmp_path, 2, serial="A")
     (tmp_path / "hidraw3").mkdir()
-    found = engines(DLPC350, tmp_path)
+    found = find_engines(DLPC350, tmp_path)
     assert [(node.name, str(node.path)) for node in found] == [("A", "/dev/hidraw2"), ("B", "/dev/hidraw10")]
-    (first, _) = found_devices(DLPC350, tmp_path)
+    (first, _) = list_devices(DLPC350, tmp_path)
     assert (first.driver, first.device) == ("dlpc350", "A")
     assert first.label == "Texas Instruments DLPC350 (/dev/hidraw2)"
 
@@ -196,7 +195,7 @@ def test_engines_are_distinguished_from_other_devices(tmp_path: Path) -> None:
 def test_a_name_never_stands_for_two(tmp_path: Path) -> None:
     for number, port in ((0, "usb-1/input0"), (1, "usb-2/input0"), (2, ""), (3, "")):
         plug(tmp_path, number, serial="LCR2", port=port)
-    assert [node.name for node in engines(DLPC350, tmp_path)] == [
+    assert [node.name for node in find_engines(DLPC350, tmp_path)] == [
         "usb-1/input0",
         "usb-2/input0",
         "/dev/hidraw2",
@@ -206,26 +205,26 @@ def test_a_name_never_stands_for_two(tmp_path: Path) -> None:
 
 def test_the_engine_that_is_meant(tmp_path: Path) -> None:
     plug(tmp_path, 0, serial="A")
-    (only,) = engines(DLPC350, tmp_path)
-    assert resolved(None, (only,)) is resolved("A", (only,)) is resolved("/dev/hidraw0", (only,)) is only
-    with pytest.raises(DeviceGoneError, match=r'light engine "B", plugged in: A \(/dev/hidraw0\)'):
-        resolved("B", (only,))
+    (only,) = find_engines(DLPC350, tmp_path)
+    assert choose_engine(None, (only,)) is choose_engine("A", (only,)) is choose_engine("/dev/hidraw0", (only,)) is only
+    with pytest.raises(DeviceGoneError, match=r'light engine "B" not found, plugged in: A \(/dev/hidraw0\)'):
+        choose_engine("B", (only,))
     plug(tmp_path, 1, serial="B")
     with pytest.raises(ConfigError, match=r"A .*; B .*; write device"):
-        resolved(None, engines(DLPC350, tmp_path))
-    assert resolved("B", engines(DLPC350, tmp_path)).path == Path("/dev/hidraw1")
+        choose_engine(None, find_engines(DLPC350, tmp_path))
+    assert choose_engine("B", find_engines(DLPC350, tmp_path)).path == Path("/dev/hidraw1")
 
 
 def test_the_first_interface_of_an_engine_is_found(tmp_path: Path) -> None:
     for number, port in enumerate(("usb-1/input1", "usb-1/input0")):
         plug(tmp_path, number, hid="0003:00000451:0000C900", serial="LCR3", port=port)
-    assert [(node.name, str(node.path)) for node in engines(DLPC900, tmp_path)] == [("LCR3", "/dev/hidraw1")]
+    assert [(node.name, str(node.path)) for node in find_engines(DLPC900, tmp_path)] == [("LCR3", "/dev/hidraw1")]
 
 
 def test_none_is_no_error_for_the_finder_and_one_for_a_rig(tmp_path: Path) -> None:
-    assert engines(DLPC350, tmp_path / "none") == ()
+    assert find_engines(DLPC350, tmp_path / "none") == ()
     assert dlpc900.find_devices() == ()
-    with pytest.raises(DeviceGoneError, match="asked for a light engine, plugged in: none"):
+    with pytest.raises(DeviceGoneError, match="no light engine found, plugged in: none"):
         dlpc900.open_projector({}, tmp_path)
 
 
@@ -248,12 +247,12 @@ def test_a_rig_opens_the_engine_that_it_means(
         plug(tmp_path, number, hid=hid, serial=serial)
     opened: list[Path] = []
 
-    def open_link(path: Path, kind: Kind) -> Link:
+    def open_link(path: Path, kind: UsbController) -> UsbLink:
         opened.append(path)
-        return Link(Cable(engine).host, "light engine", kind)
+        return UsbLink(Cable(engine).host, "light engine", kind)
 
-    monkeypatch.setattr("drivers.pattern_engine.finding.engines", partial(engines, sysfs=tmp_path))
-    monkeypatch.setattr("drivers.pattern_engine.link.open_link", open_link)
+    monkeypatch.setattr("drivers.pattern_engine.usb.find_engines", partial(find_engines, sysfs=tmp_path))
+    monkeypatch.setattr("drivers.pattern_engine.usb.open_link", open_link)
     projector = driver.open_projector({"device": "B", **options}, tmp_path)
     assert (projector.info.serial, opened) == ("B", [Path("/dev/hidraw1")])
     projector.close()

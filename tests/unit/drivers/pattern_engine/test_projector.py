@@ -93,7 +93,13 @@ def test_a_sequence_is_played_once_with_a_pulse_each(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("made", "exposure_s", "period_s", "options", "rule"),
     [
-        ("dlpc347x", 0.01, 0.02, {}, "asked for 11000 µs of blue light, the engine has none; .* cameras by software"),
+        (
+            "dlpc347x",
+            0.01,
+            0.02,
+            {},
+            "requested 11000 µs of blue light, .* cameras by software",
+        ),
         ("dlpc347x", 0.005, 0.006, {}, "the dark after it 202 µs, the period is 6000 µs; lengthen the period"),
         ("dlpc347x", 0.005, 0.01, {"duty_limit": 0.5}, "duty_limit of the rig file allows 50%"),
         ("dlpc350", 0.01, 0.02, {"duty_limit": 0.3}, "duty_limit"),
@@ -245,15 +251,15 @@ def test_the_trigger_output_is_set(usb_bench: UsbBench, options: dict[str, Any],
 @pytest.mark.parametrize(
     ("command", "got", "words"),
     [
-        (0x0B01, bytes(3), r"asked for led current .. .. .., the engine gives 00 00 00"),
-        (0x1A1B, b"\0", r"asked for display mode 0., the engine gives 00"),
-        (0x1008, b"\1", "asked for flip long 00, the engine gives 01"),
+        (0x0B01, bytes(3), r"requested led current .. .. .., the engine gives 00 00 00"),
+        (0x1A1B, b"\0", r"requested display mode 0., the engine gives 00"),
+        (0x1008, b"\1", "requested flip long 00, the engine gives 01"),
     ],
 )
 def test_a_setting_that_the_engine_bends_is_refused_and_it_is_dark(
     usb_bench: UsbBench, command: int, got: bytes, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers.dlpc900.projector.MODE_S", 0.02)
+    monkeypatch.setattr("drivers.dlpc900.projector.MODE_CHANGE_S", 0.02)
     usb_bench.engine.registers[0x0B01] = b"\1\1\1"
     usb_bench.engine.faults.bent = {command: got}
     with pytest.raises(UnsupportedByDeviceError, match=words):
@@ -288,7 +294,7 @@ def test_until_the_sense_of_the_current_is_known_light_is_a_twentieth(made: Make
     assert isinstance(projector, UnknownPolarityProjector)
     assert (projector.is_polarity_unknown, projector.info.plays) == (True, False)
     projector.load(bench.sequence)
-    with pytest.raises(UnsupportedByDeviceError, match="slrig doctor finds it out"):
+    with pytest.raises(UnsupportedByDeviceError, match="run slrig doctor"):
         projector.play(0.01, 0.02)
     most = {}
     for share in (None, 0.5, 0.4, 0.6):
@@ -314,5 +320,5 @@ def test_until_the_sense_of_the_current_is_known_light_is_a_twentieth(made: Make
 def test_a_current_whose_sense_is_known_is_not_tried(usb_bench: UsbBench) -> None:
     projector = usb_bench.open()
     assert not projector.is_polarity_unknown
-    with pytest.raises(UnsupportedByDeviceError, match="asked to try"):
+    with pytest.raises(UnsupportedByDeviceError, match="cannot try"):
         projector.set_trial_current(0.5)

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from drivers.serial_projector.client import pattern_checksums
 from drivers.serial_projector.options import SerialProjectorOptions
-from drivers.serial_projector.pattern_set import crc32_of_each
 from drivers.serial_projector.projector import SerialProjector
 from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
@@ -28,7 +28,7 @@ def whole_sequence(size: Size = SIZE, *, line_width_px: int = 1) -> PatternSeque
 
 
 SEQUENCE = whole_sequence()
-CRC32 = crc32_of_each(SEQUENCE)
+CRC32 = pattern_checksums(SEQUENCE)
 
 
 class Bench:

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from drivers.serial_projector.device.box import Description, Hardware, HardwareError
-from drivers.serial_projector.device.protocol import Device
+from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError
+from drivers.serial_projector.device.protocol import TriggerBox
 
 LIGHT_US, GAP_US, HOLD_US, LEAST_US = 3000, 2000, 500, 100
 
@@ -60,7 +60,7 @@ class Scene:
         return [(change.pattern, change.boot) for change in self.changes if change.pattern is not None]
 
 
-class FakeLight(Hardware):
+class FakeLight(BoxHardware):
     """A light engine in memory. drift : of its clock, a fraction. `broken` : the calls that fail."""
 
     def __init__(self, scene: Scene, boot: int, *, drift: float = 0.0, broken: Sequence[str] = ()) -> None:
@@ -83,7 +83,7 @@ class FakeLight(Hardware):
         self._maybe("light")
         self._scene.change(self._selected, self._boot)
 
-    def dark(self) -> None:
+    def switch_off(self) -> None:
         self._maybe("dark")
         self._scene.change(None, self._boot)
 
@@ -91,7 +91,7 @@ class FakeLight(Hardware):
         self._maybe("pulse")
         self._scene.pulse()
 
-    def dim(self, permille: int) -> int:
+    def set_brightness(self, permille: int) -> int:
         self.bright = permille if self.dims else 1000
         return self.bright
 
@@ -101,8 +101,8 @@ class FakeLight(Hardware):
             raise HardwareError(message)
 
 
-def description(crc32: Sequence[int], *, width_px: int = 400, height_px: int = 300) -> Description:
-    return Description(
+def description(crc32: Sequence[int], *, width_px: int = 400, height_px: int = 300) -> BoxDescription:
+    return BoxDescription(
         "test-box",
         "1.0.0",
         width_px,
@@ -119,7 +119,7 @@ def description(crc32: Sequence[int], *, width_px: int = 400, height_px: int = 3
 class CoreEngine:
     """The core in this process. After `restart`, `device` and `light` are others."""
 
-    def __init__(self, scene: Scene, about: Description, *, drift: float = 0.0) -> None:
+    def __init__(self, scene: Scene, about: BoxDescription, *, drift: float = 0.0) -> None:
         self.scene, self.about, self._drift = scene, about, drift
         self._boots = itertools.count(1)
         self.restart()
@@ -128,7 +128,7 @@ class CoreEngine:
         """Power it off and on: dark, with another boot id, and its clock at 0."""
         boot = next(self._boots)
         self.light = FakeLight(self.scene, boot, drift=self._drift)
-        self.device = Device(self.light, self.about, boot)
+        self.device = TriggerBox(self.light, self.about, boot)
 
     def feed(self, data: bytes) -> bytes:
         return self.device.feed(data)

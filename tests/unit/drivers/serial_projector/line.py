@@ -114,7 +114,7 @@ class Line(ABC):
 
 
 class MemoryLine(Line):
-    """A line in memory, on a clock of tests. Implements `drivers.serial_port.Port`.
+    """A line in memory, on a clock of tests. Implements `drivers.serial_port.BytePort`.
 
     The box catches up with the clock whenever anybody looks: what was due meanwhile is done at the time when it was.
     """
@@ -128,7 +128,7 @@ class MemoryLine(Line):
 
     def opened(self) -> MemoryLine:
         if self._cut:
-            message = "asked to open the line, there is none such"
+            message = "the line does not exist"
             raise DeviceGoneError(message)
         self._waiting = b""
         return self
@@ -168,7 +168,7 @@ class MemoryLine(Line):
             self._take(data)
 
     def close(self) -> None:
-        """See `Port`."""
+        """See `BytePort`."""
 
     def _due_ns(self) -> int | None:
         wait_s, at_ns = self.engine.wait_s(), self.engine.scene.at_ns
@@ -179,7 +179,7 @@ class MemoryLine(Line):
 
     def _require_plugged(self) -> None:
         if self._cut:
-            message = "asked to use the line, found it gone: it was unplugged"
+            message = "cannot use the line, it is gone: it was unplugged"
             raise DeviceGoneError(message)
 
 

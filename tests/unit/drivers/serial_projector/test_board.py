@@ -14,8 +14,8 @@ import pytest
 
 from drivers.serial_projector.device import main
 from drivers.serial_projector.device.box import HardwareError
-from drivers.serial_projector.device.protocol import Device
-from drivers.serial_projector.frames import framed
+from drivers.serial_projector.device.protocol import TriggerBox
+from drivers.serial_projector.link import encode_line
 
 
 class Pico:
@@ -143,15 +143,15 @@ def pico() -> Pico:
 
 
 @pytest.fixture
-def board(pico: Pico) -> main.Board:
-    return main.Board(pico.machine, pico.rp2, pico.time)
+def board(pico: Pico) -> main.PicoBoard:
+    return main.PicoBoard(pico.machine, pico.rp2, pico.time)
 
 
 def pulses(pico: Pico, pin: int) -> int:
     return sum(what == f"{pin}=1" for _, what in pico.did)
 
 
-def test_it_starts_dark_and_a_pattern_is_reached_by_steps_from_home(pico: Pico, board: main.Board) -> None:
+def test_it_starts_dark_and_a_pattern_is_reached_by_steps_from_home(pico: Pico, board: main.PicoBoard) -> None:
     assert pico.levels[main.LAMP_PIN] == 0
     assert board.time_us() == 0
     for pattern, homed, stepped in ((3, 1, 3), (5, 1, 5), (5, 1, 5), (1, 2, 6)):
@@ -163,7 +163,7 @@ def test_it_starts_dark_and_a_pattern_is_reached_by_steps_from_home(pico: Pico, 
 def test_an_engine_whose_home_is_a_low_level_runs_in_between(pico: Pico, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(main, "HOME_LEVEL", 0)
     monkeypatch.setattr(main, "STEPS_TO_FIRST", 1)
-    board = main.Board(pico.machine, pico.rp2, pico.time)
+    board = main.PicoBoard(pico.machine, pico.rp2, pico.time)
     assert pico.levels[main.HOME_PIN] == 1
     board.select(2)
     assert pico.levels[main.HOME_PIN] == 1
@@ -171,7 +171,7 @@ def test_an_engine_whose_home_is_a_low_level_runs_in_between(pico: Pico, monkeyp
     assert pulses(pico, main.STEP_PIN) == 3
 
 
-def test_an_engine_that_is_not_ready_is_a_failure_and_homed_next_time(pico: Pico, board: main.Board) -> None:
+def test_an_engine_that_is_not_ready_is_a_failure_and_homed_next_time(pico: Pico, board: main.PicoBoard) -> None:
     board.select(2)
     pico.levels[main.READY_PIN] = 0
 
@@ -189,18 +189,18 @@ def test_an_engine_that_is_not_ready_is_a_failure_and_homed_next_time(pico: Pico
     assert pulses(pico, main.HOME_PIN) == 2
 
 
-def test_light_follows_the_lamp_and_its_brightness(pico: Pico, board: main.Board) -> None:
+def test_light_follows_the_lamp_and_its_brightness(pico: Pico, board: main.PicoBoard) -> None:
     board.light()
     assert pico.levels[main.LAMP_PIN] == FULL
-    board.dark()
+    board.switch_off()
     assert pico.levels[main.LAMP_PIN] == 0
-    assert board.dim(250) == 250
+    assert board.set_brightness(250) == 250
     assert pico.levels[main.LAMP_PIN] == 0
     board.light()
     assert pico.levels[main.LAMP_PIN] == FULL // 4
 
 
-def test_the_cameras_get_a_pulse_of_its_length(pico: Pico, board: main.Board) -> None:
+def test_the_cameras_get_a_pulse_of_its_length(pico: Pico, board: main.PicoBoard) -> None:
     for _ in range(2):
         pico.did.clear()
         board.pulse()
@@ -210,16 +210,16 @@ def test_the_cameras_get_a_pulse_of_its_length(pico: Pico, board: main.Board) ->
         assert down_us - up_us == pytest.approx(main.PULSE_US, abs=2)
 
 
-def test_its_time_never_wraps(pico: Pico, board: main.Board) -> None:
+def test_its_time_never_wraps(pico: Pico, board: main.PicoBoard) -> None:
     for step in range(1, 41):
         pico.now_us += 200_000_000
         assert board.time_us() == 200_000_000 * step
 
 
 def test_only_patterns_of_the_engines_extent_are_offered() -> None:
-    assert main.described(PATTERNS).count == 26
-    assert main.described({"size_px": [1, 1], "crc32": ["00000000"]}).count == 0
-    assert main.described({}).count == 0
+    assert main.describe_box(PATTERNS).count == 26
+    assert main.describe_box({"size_px": [1, 1], "crc32": ["00000000"]}).count == 0
+    assert main.describe_box({}).count == 0
 
 
 class Ended(Exception):  # noqa: N818 - not a failure
@@ -242,13 +242,13 @@ class Usb:
         self.sent += data
 
 
-def test_the_program_answers_feeds_its_watchdog_and_tidies_in_the_dark(board: main.Board) -> None:
+def test_the_program_answers_feeds_its_watchdog_and_tidies_in_the_dark(board: main.PicoBoard) -> None:
     alive: list[int] = []
     tidied: list[int] = []
-    hello = framed("1A2B 1 HELLO 1 1000 5000 1000 1000")
-    pings = [framed(f"1A2B {2 + number} PING") for number in range(2 * main.TIDY_AFTER)]
+    hello = encode_line("1A2B 1 HELLO 1 1000 5000 1000 1000")
+    pings = [encode_line(f"1A2B {2 + number} PING") for number in range(2 * main.TIDY_AFTER)]
     usb = Usb(b"", hello[:9], hello[9:], *pings, b"")
-    box = Device(board, main.described(PATTERNS), 1)
+    box = TriggerBox(board, main.describe_box(PATTERNS), 1)
     with pytest.raises(Ended):
         main.serve(box, usb, lambda: alive.append(1), lambda: tidied.append(len(alive)))  # type: ignore[arg-type]
     assert usb.sent.count(b" OK ") == 1 + 2 * main.TIDY_AFTER
@@ -258,7 +258,7 @@ def test_the_program_answers_feeds_its_watchdog_and_tidies_in_the_dark(board: ma
 
 
 def test_the_usb_port_gives_what_is_there_and_does_not_wait() -> None:
-    sent, waiting = framed("1A2B 1 PING") * 10, io.BytesIO(framed("1A2B 1 PING") * 10)
+    sent, waiting = encode_line("1A2B 1 PING") * 10, io.BytesIO(encode_line("1A2B 1 PING") * 10)
     poll = mock.Mock(poll=lambda _: [1] if waiting.tell() < len(sent) else [])
     system = mock.Mock()
     system.stdin.buffer = waiting
@@ -308,7 +308,7 @@ def test_the_program_leaves_the_light_out_however_it_ends(
     pico: Pico, on_the_board: Callable[..., list[str]], tmp_path: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(str(tmp_path))
-    did = on_the_board(framed("1A2B 1 HELLO 1 1000 5000 1000 1000"))
+    did = on_the_board(encode_line("1A2B 1 HELLO 1 1000 5000 1000 1000"))
     assert did[:3] == ["key -1", f"watchdog {main.RESTART_MS}", "ended"]
     assert "model=slrig-pico" in did[3]
     assert "max=0" in did[3], "there is no patterns.json here"

@@ -12,76 +12,80 @@ from types import SimpleNamespace
 
 import pytest
 
-from drivers.serial_port import resolved
-from drivers.serial_projector import find_devices, finding, open_projector
-from drivers.serial_projector.clock import MOST_DRIFT, DeviceClock
+from drivers.serial_port import resolve_port
+from drivers.serial_projector import find_devices, open_projector
+from drivers.serial_projector.client import MAX_DRIFT, BoxClock
 from drivers.serial_projector.device import wire
-from drivers.serial_projector.frames import (
-    MOST_LINE_BYTES,
+from drivers.serial_projector.link import (
+    MAX_LINE_BYTES,
+    MAX_TRIES,
     NUMBERS,
-    Answer,
-    Event,
-    Fault,
-    Mode,
-    Refused,
-    Splitter,
-    Unread,
-    framed,
-    parsed,
+    BoxAnswer,
+    BoxEvent,
+    BoxFault,
+    BoxLink,
+    BoxRefusedError,
+    LineSplitter,
+    NoAnswerError,
+    RefusalCode,
+    SequenceMode,
+    UnreadableLine,
+    encode_line,
+    find_ports,
+    parse_line,
 )
-from drivers.serial_projector.link import MOST_TRIES, Link, RefusedError, SilentError
 from slrig.errors import DeviceGoneError, DeviceStateError, LibraryMissingError
 from tests.unit.drivers.serial_projector.line import Noise
 from tests.virtual_clock import VirtualClock
 
-SHOW_3 = framed("1A2B 7 SHOW 3")
+SHOW_3 = encode_line("1A2B 7 SHOW 3")
 
 # Lines.
 
 
 def test_the_checksum_is_the_one_with_the_published_check_value() -> None:
     assert wire.crc16(b"123456789") == 0x29B1
-    assert framed("123456789") == b"123456789*29B1\n"
+    assert encode_line("123456789") == b"123456789*29B1\n"
 
 
 def test_host_and_box_write_the_same_lines_and_have_the_same_numbers() -> None:
     for text in ("1A2B 7 SHOW 3", "! DONE 26", "x", "a b " * 50):
-        assert wire.framed(text) == framed(text)
-        assert wire.unframed(framed(text)[:-1]) == text
-    for kind in (Refused, Fault, Mode):
+        assert wire.encode_line(text) == encode_line(text)
+        assert wire.decode_line(encode_line(text)[:-1]) == text
+    for kind in (RefusalCode, BoxFault, SequenceMode):
         assert {each.name: each.value for each in kind} == {each.name: getattr(wire, each.name) for each in kind}
-    assert (wire.NUMBERS, wire.MOST_LINE_BYTES) == (NUMBERS, MOST_LINE_BYTES)
+    assert (wire.NUMBERS, wire.MAX_LINE_BYTES) == (NUMBERS, MAX_LINE_BYTES)
 
 
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("1A2B 7 OK 3 120", Answer("1A2B", 7, None, ("3", "120"))),
-        ("1A2B 7 OK", Answer("1A2B", 7, None, ())),
-        ("1A2B 7 ERR 4 26 of 26", Answer("1A2B", 7, 4, ("26", "of", "26"))),
-        ("! FRAME 3 120", Event("FRAME", ("3", "120"))),
-        ("? ERR 1 bad frame", Unread()),
+        ("1A2B 7 OK 3 120", BoxAnswer("1A2B", 7, None, ("3", "120"))),
+        ("1A2B 7 OK", BoxAnswer("1A2B", 7, None, ())),
+        ("1A2B 7 ERR 4 26 of 26", BoxAnswer("1A2B", 7, 4, ("26", "of", "26"))),
+        ("! FRAME 3 120", BoxEvent("FRAME", ("3", "120"))),
+        ("? ERR 1 bad frame", UnreadableLine()),
         ("1A2B seven OK", None),
         ("1A2B 7 MAYBE", None),
         ("hello", None),
     ],
 )
 def test_lines_are_distinguished(text: str, line: object) -> None:
-    assert parsed(framed(text)) == line
-    assert parsed(framed(text)[:-1] + b"\r\n") == line
+    assert parse_line(encode_line(text)) == line
+    assert parse_line(encode_line(text)[:-1] + b"\r\n") == line
 
 
 def test_a_damaged_line_is_never_taken_for_another_one() -> None:
     for at in range(len(SHOW_3) - 1):
         for bit in range(8):
             flipped = SHOW_3[:at] + bytes([SHOW_3[at] ^ 1 << bit]) + SHOW_3[at + 1 : -1]
-            assert parsed(flipped) is None
-            assert wire.unframed(flipped) is None
+            assert parse_line(flipped) is None
+            assert wire.decode_line(flipped) is None
     # Bursts of up to 16 bits are always found; what is longer slips through once in 65 536.
     noise, survived = Noise(corruption=1.0, seed=3), 0
     for _ in range(5_000):
-        for each in Splitter().lines(noise.through(SHOW_3) + b"\n"):
-            answer = wire.unframed(each)
+        for each in LineSplitter().lines(noise.through(SHOW_3) + b"\n"):
+            answer = wire.decode_line(each)
             survived += answer is not None
             assert answer in {None, "1A2B 7 SHOW 3"}
     # A line that lost its end, or has noise before it, may still be whole.
@@ -89,15 +93,15 @@ def test_a_damaged_line_is_never_taken_for_another_one() -> None:
 
 
 def test_bytes_come_in_pieces_of_any_size_and_need_no_end() -> None:
-    text = b"".join(framed(f"1A2B {number} PING") for number in range(50))
+    text = b"".join(encode_line(f"1A2B {number} PING") for number in range(50))
     rng = random.Random(1)
-    splitter, lines = Splitter(), []
+    splitter, lines = LineSplitter(), []
     while text:
         size = rng.randrange(1, 40)
         lines += splitter.lines(text[:size])
         text = text[size:]
     assert len(lines) == 50
-    assert all(isinstance(wire.unframed(line), str) for line in lines)
+    assert all(isinstance(wire.decode_line(line), str) for line in lines)
     # A line without end does not fill the memory.
     for _ in range(1_000):
         assert splitter.lines(b"x" * 100) == []
@@ -131,24 +135,24 @@ class ScriptedPort:
 
 def answer(data: bytes, text: str) -> bytes:
     session, number = data.decode().split()[:2]
-    return framed(f"{session} {number} {text}")
+    return encode_line(f"{session} {number} {text}")
 
 
 def silence(_data: bytes, _count: int) -> bytes:
     return b""
 
 
-def link(answers: Callable[[bytes, int], bytes], *, reply_s: float = 0.05, deadline_s: float = 5.0) -> Link:
+def link(answers: Callable[[bytes, int], bytes], *, reply_s: float = 0.05, deadline_s: float = 5.0) -> BoxLink:
     clock = VirtualClock()
-    return Link(ScriptedPort(answers, clock), reply_s, deadline_s, clock=clock)
+    return BoxLink(ScriptedPort(answers, clock), reply_s, deadline_s, clock=clock)
 
 
-def written(of: Link) -> list[bytes]:
+def written(of: BoxLink) -> list[bytes]:
     assert isinstance(of.port, ScriptedPort)
     return of.port.written
 
 
-def took_s(of: Link) -> float:
+def took_s(of: BoxLink) -> float:
     return of.clock.now_ns() / 1e9 - 1
 
 
@@ -161,10 +165,10 @@ def test_a_command_is_sent_again_as_it_was_until_it_is_answered() -> None:
     assert asked.tally.again == 3
 
 
-@pytest.mark.parametrize(("deadline_s", "tries"), [(5.0, MOST_TRIES), (0.12, 3)])
+@pytest.mark.parametrize(("deadline_s", "tries"), [(5.0, MAX_TRIES), (0.12, 3)])
 def test_tries_end_by_their_number_or_a_deadline(deadline_s: float, tries: int) -> None:
     asked = link(silence, deadline_s=deadline_s)
-    with pytest.raises(SilentError, match=f"SHOW {tries} times in {tries * 0.05:.2f} s"):
+    with pytest.raises(NoAnswerError, match=f"SHOW, sent {tries} times in {tries * 0.05:.2f} s"):
         asked.ask("SHOW", 3)
     assert len(written(asked)) == tries <= 12
 
@@ -172,7 +176,7 @@ def test_tries_end_by_their_number_or_a_deadline(deadline_s: float, tries: int) 
 @pytest.mark.parametrize(
     ("early", "again", "most_s", "damaged"),
     [
-        (lambda _data: framed("? ERR 1 bad frame"), 9, 0.0, 0),
+        (lambda _data: encode_line("? ERR 1 bad frame"), 9, 0.0, 0),
         (lambda data: answer(data, "OK 1").replace(b"OK 1", b"OK 2"), 9, 9 * 0.021, 9),
     ],
     ids=["that the box could not read", "whose answer was damaged"],
@@ -187,14 +191,14 @@ def test_a_line_is_sent_again_soon(early: Callable[[bytes], bytes], again: int, 
 def test_stale_and_foreign_answers_are_passed_over() -> None:
     def answers(data: bytes, count: int) -> bytes:
         session, number = data.decode().split()[:2]
-        stale = framed(f"{session} {(int(number) - 1) % 10_000} OK stale")
-        return framed("ZZZZ 1 OK foreign") + stale + framed("! FRAME 3 120") + answer(data, f"OK {count}")
+        stale = encode_line(f"{session} {(int(number) - 1) % 10_000} OK stale")
+        return encode_line("ZZZZ 1 OK foreign") + stale + encode_line("! FRAME 3 120") + answer(data, f"OK {count}")
 
     asked = link(answers)
     assert asked.ask("PING").words == ("1",)
     assert asked.ask("PING").words == ("2",)
     assert asked.tally.others == 2
-    assert list(asked.events) == [Event("FRAME", ("3", "120"))] * 2
+    assert list(asked.events) == [BoxEvent("FRAME", ("3", "120"))] * 2
 
 
 def test_each_command_has_its_number_and_each_link_its_session() -> None:
@@ -209,10 +213,10 @@ def test_each_command_has_its_number_and_each_link_its_session() -> None:
 
 def test_a_refusal_keeps_its_code_and_words() -> None:
     asked = link(lambda data, _count: answer(data, "ERR 4 26 of 26"))
-    with pytest.raises(RefusedError, match=r"refused SHOW: error 4 \(range\) 26 of 26") as refusal:
+    with pytest.raises(BoxRefusedError, match=r"refused SHOW: error 4 \(range\) 26 of 26") as refusal:
         asked.ask("SHOW", 26)
     assert (refusal.value.number, refusal.value.words) == (4, ("26", "of", "26"))
-    with pytest.raises(RefusedError, match=r"error 77 \(unknown\)"):
+    with pytest.raises(BoxRefusedError, match=r"error 77 \(unknown\)"):
         link(lambda data, _count: answer(data, "ERR 77 new")).ask("SHOW", 1)
 
 
@@ -245,13 +249,13 @@ class Truth:
     def device_us(self, host_ns: float) -> int:
         return round((host_ns - BEGUN_NS) * (1 + self.drift) / 1000)
 
-    def exchange(self, clock: DeviceClock, sent_ns: int, there_ns: int, back_ns: int) -> None:
+    def exchange(self, clock: BoxClock, sent_ns: int, there_ns: int, back_ns: int) -> None:
         clock.note(self.device_us(sent_ns + there_ns), sent_ns, sent_ns + there_ns + back_ns)
 
 
-@pytest.mark.parametrize("drift", [0.0, 30e-6, -30e-6, 0.9 * MOST_DRIFT, -0.9 * MOST_DRIFT])
+@pytest.mark.parametrize("drift", [0.0, 30e-6, -30e-6, 0.9 * MAX_DRIFT, -0.9 * MAX_DRIFT])
 def test_the_error_that_is_stated_holds(drift: float) -> None:
-    rng, truth, clock = random.Random(drift), Truth(drift), DeviceClock()
+    rng, truth, clock = random.Random(drift), Truth(drift), BoxClock()
     now_ns = BEGUN_NS + 10**9
     for _ in range(400):
         now_ns += round(rng.uniform(0.01e9, 0.6e9))
@@ -264,7 +268,7 @@ def test_the_error_that_is_stated_holds(drift: float) -> None:
 
 
 def test_drift_falls_out_with_time() -> None:
-    truth, clock = Truth(200e-6), DeviceClock()
+    truth, clock = Truth(200e-6), BoxClock()
     errors_ns = []
     for step in range(240):
         now_ns = BEGUN_NS + step * 250_000_000
@@ -279,7 +283,7 @@ def test_drift_falls_out_with_time() -> None:
 
 
 def test_the_shortest_exchange_counts_and_a_retry_widens_and_does_not_mislead() -> None:
-    truth, clock = Truth(0.0), DeviceClock()
+    truth, clock = Truth(0.0), BoxClock()
     # Obeyed at once, answered 300 ms later: the answer was lost twice.
     truth.exchange(clock, BEGUN_NS, 50_000, 300_000_000)
     t_ns, error_ns = clock.host_ns(truth.device_us(BEGUN_NS + 50_000))
@@ -290,7 +294,7 @@ def test_the_shortest_exchange_counts_and_a_retry_widens_and_does_not_mislead() 
 
 
 def test_a_clock_that_jumps_is_learnt_again_and_one_that_was_never_read_is_not_known() -> None:
-    clock = DeviceClock()
+    clock = BoxClock()
     with pytest.raises(ValueError, match="no exchange"):
         clock.host_ns(0)
     Truth(0.0).exchange(clock, BEGUN_NS, 50_000, 50_000)
@@ -330,16 +334,16 @@ def ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def test_usb_ports_are_found_by_lasting_names_and_not_opened(ports: Path) -> None:
-    pico, bridge = finding.found_ports(ports / "by-id")
+    pico, bridge = find_ports(ports / "by-id")
     assert pico.driver == bridge.driver == "serial_projector"
     assert pico.device == str(ports / "by-id" / "usb-MicroPython_Board_in_FS_mode_e66-if00")
     assert pico.label.startswith("MicroPython on an RP2040: MicroPython Board (")
     assert "2E8A:0005, serial number e66" in pico.label
     assert bridge.device == str(ports / "dev" / "ttyUSB1")
     assert "USB Serial" in bridge.label
-    assert "not asked" in bridge.label
+    assert "may be a trigger box" in bridge.label
     # Without lasting names, the ports' own are used.
-    assert [each.device for each in finding.found_ports(ports / "none")] == [
+    assert [each.device for each in find_ports(ports / "none")] == [
         str(ports / "dev" / "ttyACM0"),
         str(ports / "dev" / "ttyUSB1"),
     ]
@@ -347,7 +351,7 @@ def test_usb_ports_are_found_by_lasting_names_and_not_opened(ports: Path) -> Non
 
 def test_names_that_are_no_link_are_left_as_they_are() -> None:
     for name in ("/dev/ttyACM0", "COM3", "socket://localhost:4000", "usb-none"):
-        assert resolved(name) == name
+        assert resolve_port(name) == name
 
 
 def test_without_pyserial_the_driver_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 import tests.unit.drivers.serial_projector
+from drivers.serial_projector.client import sequence_checksum
 from drivers.serial_projector.device import box, main, protocol, wire
-from drivers.serial_projector.frames import framed
-from drivers.serial_projector.pattern_set import crc32_of_all
+from drivers.serial_projector.link import encode_line
 from tests.npm import npm_package
 
 pytestmark = pytest.mark.slow
@@ -97,9 +97,9 @@ def random_lines(seed: int, count: int) -> list[tuple[int, str]]:
                 f"LOAD {size} 00C0FFEE",
                 f"PICK 0 {CRC32[first]:08X} {CRC32[first - 7]:08X}",
                 f"PICK {size} 00C0FFEE {CRC32[first]:08X}",
-                f"LOAD 2 {crc32_of_all([CRC32[first], CRC32[first - 7]]):08X}",
-                f"LOAD {size} {crc32_of_all(CRC32[first : first + size]):08X}",
-                *(f"LOAD 26 {crc32_of_all(CRC32):08X}" for _ in range(4)),
+                f"LOAD 2 {sequence_checksum([CRC32[first], CRC32[first - 7]]):08X}",
+                f"LOAD {size} {sequence_checksum(CRC32[first : first + size]):08X}",
+                *(f"LOAD 26 {sequence_checksum(CRC32):08X}" for _ in range(4)),
                 *(f"SHOW {rng.randrange(26)}" for _ in range(8)),
                 f"SEQ {rng.randrange(3)} {size} {rng.choice([50, 4000, 9000])} {rng.choice([6400, 50000])} 0",
                 f"SEQ 0 {size} 4000 10000 1",
@@ -110,7 +110,7 @@ def random_lines(seed: int, count: int) -> list[tuple[int, str]]:
         chance = rng.random()
         if chance < 0.8 or not data:
             number = (number + 1) % 10_000
-            data = framed(f"{session} {number} {text}")
+            data = encode_line(f"{session} {number} {text}")
         sent = data
         if chance > 0.95:
             at = rng.randrange(len(data))

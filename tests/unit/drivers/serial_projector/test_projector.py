@@ -15,11 +15,9 @@ import pytest
 
 from drivers.serial_port import SerialPort
 from drivers.serial_projector import open_projector
-from drivers.serial_projector.client import Client, Limits
+from drivers.serial_projector.client import BoxClient, BoxLimits, pattern_checksums, sequence_checksum
 from drivers.serial_projector.device import protocol
-from drivers.serial_projector.frames import Mode
-from drivers.serial_projector.link import Link
-from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each
+from drivers.serial_projector.link import BoxLink, SequenceMode
 from drivers.serial_projector.projector import SerialProjector
 from slrig.devices import StoredPatternProjector
 from slrig.errors import (
@@ -93,8 +91,8 @@ def test_a_play_lights_every_pattern_once_and_pulses_the_cameras(bench: Bench) -
     assert np.diff([on.t_ns for on in lights]) == pytest.approx(8_000_000, abs=10_000)
     assert (projector.client.status().state, projector.client.status().index) == ("ready", 25)
     projector.stop()
-    assert [each.index for each in projector.played] == ALL
-    for each, on in zip(projector.played, lights, strict=True):
+    assert [each.index for each in projector.played_patterns] == ALL
+    for each, on in zip(projector.played_patterns, lights, strict=True):
         assert abs(each.t_visible_ns - on.t_ns) <= each.t_err_ns + 1_000
     # Another one that is stopped, and one more, which begins at the beginning.
     projector.play(0.004, 0.04)
@@ -111,7 +109,7 @@ def test_a_play_lights_every_pattern_once_and_pulses_the_cameras(bench: Bench) -
 def test_patterns_can_be_stepped_by_trigger(bench: Bench) -> None:
     client = bench.open().client
     assert client.load(CRC32[8:11]) == ()
-    client.sequence(0, 3, 4_000, 8_000, Mode.STEP)
+    client.sequence(0, 3, 4_000, 8_000, SequenceMode.STEP)
     for index in range(3):
         t_ns, error_ns = client.trigger(index)
         assert abs(t_ns - bench.scene.changes[-1].t_ns) <= error_ns + 1_000
@@ -141,13 +139,13 @@ def test_what_is_flashed_is_shown_in_any_order_and_as_often_as_wanted(
 
 
 def test_a_box_of_old_firmware_takes_runs_and_nothing_else(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(protocol, "MOST_PICKED", 0)
+    monkeypatch.setattr(protocol, "MAX_PICKED", 0)
     projector = bench.open()
     assert projector.client.box.pick == 0
     projector.load(part(2, 14))
     projector.show(0)
     assert bench.lit == 2
-    with pytest.raises(UnsupportedByDeviceError, match=r"runs of its flash only.*slrig patterns"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"supports only runs of its flash.*slrig patterns"):
         projector.load(BACKWARDS)
 
 
@@ -156,7 +154,7 @@ def test_patterns_that_are_not_flashed_are_refused_dark_and_nothing_is_written(b
     projector.load(SEQUENCE)
     projector.show(0)
     wider = whole_sequence(SIZE, line_width_px=2)
-    with pytest.raises(UnsupportedByDeviceError, match=r"it lacks 8 of them, pattern 12 the first\..*slrig patterns"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"it lacks 8 of them, pattern 12 first\..*slrig patterns"):
         projector.load(wider)
     assert bench.lit is None
     with pytest.raises(DeviceStateError, match="no sequence is loaded"):
@@ -168,13 +166,13 @@ def test_each_set_of_patterns_is_written_into_a_folder_of_its_own(bench: Bench, 
     projector = bench.open(tmp_path)
     assert isinstance(projector, StoredPatternProjector)
     told = [projector.write_patterns(each) for each in (SEQUENCE, BACKWARDS, SEQUENCE)]
-    first, second = (crc32_of_all(crc32_of_each(each)) for each in (SEQUENCE, BACKWARDS))
+    first, second = (sequence_checksum(pattern_checksums(each)) for each in (SEQUENCE, BACKWARDS))
     assert {folder.name for folder in (tmp_path / "patterns").iterdir()} == {f"{first:08X}", f"{second:08X}"}
     folder = tmp_path / "patterns" / f"{second:08X}"
     assert str(folder) in told[1]
     listed = json.loads((folder / "patterns.json").read_text())
     assert listed["size_px"] == [400, 300]
-    assert [int(each, 16) for each in listed["crc32"]] == list(crc32_of_each(BACKWARDS))
+    assert [int(each, 16) for each in listed["crc32"]] == list(pattern_checksums(BACKWARDS))
     for index in (0, 7, 25):
         image = cv2.imread(str(folder / f"{index:03d}.png"), cv2.IMREAD_UNCHANGED)
         assert image is not None
@@ -221,7 +219,7 @@ def test_the_light_stays_for_as_long_as_the_host_gives_signs_of_life(bench: Benc
     bench.advance(30)
     assert [change.pattern for change in bench.scene.changes] == [1]
     # The host is too busy: its thread does not come to it.
-    projector._keeping.stop()
+    projector._keep_alive.stop()
     stopped_ns = bench.clock.now_ns()
     bench.advance(1)
     _, dark = bench.scene.changes
@@ -251,7 +249,7 @@ def plays(_bench: Bench, projector: SerialProjector) -> None:
     [
         (stays_on, DeviceError, "max_on_s"),
         (fails, DeviceError, "select failed"),
-        (plays, DeviceStateError, "stop what it does first"),
+        (plays, DeviceStateError, "stop its current action first"),
     ],
 )
 def test_a_pattern_that_the_box_cannot_show_is_an_error_and_dark(
@@ -305,7 +303,7 @@ def test_a_box_that_takes_time_to_start_is_waited_for(make_bench: Callable[..., 
     bench.loaded(open_s=5.0).show(0)
     bench.close()
     bench.line.restart()
-    with pytest.raises(DeviceError, match=r"nothing on .* answered as a trigger box that speaks SLTP/1"):
+    with pytest.raises(DeviceError, match=r"no trigger box that speaks SLTP/1 answered on"):
         bench.open(open_s=3.0)
 
 
@@ -328,7 +326,7 @@ def test_a_cable_that_is_pulled_ends_in_darkness(bench: Bench, doing: str) -> No
     pulled_ns = bench.clock.now_ns()
     bench.line.cut()
     for call in ("show", "blank"):
-        with pytest.raises(DeviceGoneError, match=r"unplugged|there is none such"):
+        with pytest.raises(DeviceGoneError, match=r"unplugged|does not exist"):
             calls(projector)[call]()
     bench.advance(1)
     assert bench.lit is None
@@ -345,7 +343,7 @@ def test_a_box_that_was_plugged_in_again_in_the_dark_goes_on(bench: Bench) -> No
     projector.show(3)
     projector.blank()
     bench.line.cut()
-    with pytest.raises(DeviceGoneError, match="there is none such"):
+    with pytest.raises(DeviceGoneError, match="does not exist"):
         projector.load(SEQUENCE)
     bench.line.plug_in()
     projector.load(SEQUENCE)
@@ -358,7 +356,7 @@ def test_a_line_that_falls_silent_is_left_to_the_watchdog(bench: Bench) -> None:
     projector = bench.loaded(watchdog_s=0.2, reply_s=0.01, deadline_s=0.1)
     projector.show(3)
     bench.line.on_command = lambda _line, _count, _data: False
-    with pytest.raises(DeviceError, match="found no answer"):
+    with pytest.raises(DeviceError, match="did not answer"):
         projector.show(4)
     bench.advance(0.2)
     assert bench.lit is None
@@ -399,10 +397,10 @@ def test_close_from_another_thread_ends_a_wait(bench: Bench) -> None:
 def test_a_second_host_that_gets_in_anyway_is_turned_away(bench: Bench) -> None:
     projector = bench.loaded()
     projector.show(0)
-    second = Link(bench.line, 0.05, 1.0, clock=bench.clock)
+    second = BoxLink(bench.line, 0.05, 1.0, clock=bench.clock)
     begun_ns = bench.clock.now_ns()
     with pytest.raises(DeviceBusyError, match="in a session with another host"):
-        Client(second, Limits(1000, 1000, 1000, 1000), label="x", open_s=0.5)
+        BoxClient(second, BoxLimits(1000, 1000, 1000, 1000), label="x", open_s=0.5)
     assert 0.5e9 <= bench.clock.now_ns() - begun_ns <= 0.7e9
     projector.show(1)
     assert bench.patterns == [0, 1]
@@ -412,7 +410,7 @@ def test_the_session_of_a_host_that_died_is_taken_over(bench: Bench) -> None:
     dead = bench.loaded(watchdog_s=0.3)
     dead.show(1)
     # Killed: no farewell.
-    dead._keeping.stop()
+    dead._keep_alive.stop()
     begun_ns = bench.clock.now_ns()
     projector = bench.open()
     assert 0.1e9 <= bench.clock.now_ns() - begun_ns <= 0.5e9
@@ -461,8 +459,8 @@ def test_bytes_that_another_program_took_first_are_no_unplug(terminal: SerialLin
 @pytest.mark.parametrize(
     ("port", "error", "words"),
     [
-        ("/dev/serial/by-id/usb-none", DeviceGoneError, "there is none such"),
-        ("ttyNONE", DeviceGoneError, "there is none such"),
+        ("/dev/serial/by-id/usb-none", DeviceGoneError, "does not exist"),
+        ("ttyNONE", DeviceGoneError, "does not exist"),
         (__file__, DeviceError, "does not open"),
         ("nonsense://x", DeviceError, "does not open"),
     ],

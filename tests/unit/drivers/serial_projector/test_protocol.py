@@ -11,12 +11,20 @@ from itertools import pairwise
 import pytest
 
 import drivers.serial_projector
-from drivers.serial_projector.client import Box, Status
+from drivers.serial_projector.client import BoxInfo, BoxStatus, sequence_checksum
 from drivers.serial_projector.device import wire
-from drivers.serial_projector.device.box import Description, Hardware, HardwareError, LightTime
-from drivers.serial_projector.device.protocol import Device
-from drivers.serial_projector.frames import Answer, Event, Fault, Refused, Splitter, Unread, framed, parsed
-from drivers.serial_projector.pattern_set import crc32_of_all
+from drivers.serial_projector.device.box import BoxDescription, BoxHardware, HardwareError, LightTime
+from drivers.serial_projector.device.protocol import TriggerBox
+from drivers.serial_projector.link import (
+    BoxAnswer,
+    BoxEvent,
+    BoxFault,
+    LineSplitter,
+    RefusalCode,
+    UnreadableLine,
+    encode_line,
+    parse_line,
+)
 
 CRC32 = [zlib.crc32(bytes([number])) for number in range(26)]
 WATCHDOG_US, ON_US = 1_000_000, 5_000_000
@@ -24,7 +32,7 @@ HELLO = "HELLO 1 1000 5000 1000 1000"
 
 
 @dataclass
-class Light(Hardware):
+class Light(BoxHardware):
     """A light engine whose clock stands still; `did` : the calls that it got."""
 
     now_us: int = 1_000
@@ -44,13 +52,13 @@ class Light(Hardware):
         self._do("light")
         self.now_us += self.takes_us
 
-    def dark(self) -> None:
+    def switch_off(self) -> None:
         self._do("dark")
 
     def pulse(self) -> None:
         self._do("pulse")
 
-    def dim(self, permille: int) -> int:
+    def set_brightness(self, permille: int) -> int:
         return permille if self.dims else 1000
 
     def _do(self, *what: str) -> None:
@@ -79,21 +87,21 @@ class Host:
     def __init__(self, *, crc32: list[int] | None = None, **about: int) -> None:
         self.light = Light()
         limits = {"light_us": 2_000, "error_us": 50, "gap_us": 3_000, "hold_us": 500, "least_us": 200, **about}
-        self.box = Device(self.light, Description("test", "1", 4, 2, crc32 or CRC32, **limits), 0xB007)
+        self.box = TriggerBox(self.light, BoxDescription("test", "1", 4, 2, crc32 or CRC32, **limits), 0xB007)
         self.number = 0
-        self.events: list[Event] = []
+        self.events: list[BoxEvent] = []
 
-    def send(self, data: bytes) -> list[Answer | Unread]:
-        answers: list[Answer | Unread] = []
-        for line in Splitter().lines(self.box.feed(data)):
+    def send(self, data: bytes) -> list[BoxAnswer | UnreadableLine]:
+        answers: list[BoxAnswer | UnreadableLine] = []
+        for line in LineSplitter().lines(self.box.feed(data)):
             self._sort(line, answers)
         return answers
 
-    def ask(self, text: str, *, session: str = "1A2B", number: int | None = None) -> Answer:
+    def ask(self, text: str, *, session: str = "1A2B", number: int | None = None) -> BoxAnswer:
         if number is None:
             self.number = number = (self.number + 1) % 10_000
-        (answer,) = self.send(framed(f"{session} {number} {text}"))
-        assert isinstance(answer, Answer)
+        (answer,) = self.send(encode_line(f"{session} {number} {text}"))
+        assert isinstance(answer, BoxAnswer)
         assert (answer.session, answer.number) == (session, number)
         return answer
 
@@ -107,7 +115,7 @@ class Host:
 
     def ready(self, hello: str = HELLO, count: int = 26) -> Host:
         self.ok(hello)
-        self.ok(f"LOAD {count} {crc32_of_all(CRC32[:count]):08X}")
+        self.ok(f"LOAD {count} {sequence_checksum(CRC32[:count]):08X}")
         return self
 
     def pass_us(self, us: int) -> None:
@@ -115,21 +123,21 @@ class Host:
         until_us = self.light.now_us + us
         while self.light.now_us < until_us and 0 <= (due_us := self.box.wait_us()) <= until_us - self.light.now_us:
             self.light.now_us += max(due_us, 1)
-            for line in Splitter().lines(self.box.poll()):
+            for line in LineSplitter().lines(self.box.poll()):
                 self._sort(line, [])
         self.light.now_us = max(until_us, self.light.now_us)
-        for line in Splitter().lines(self.box.poll()):
+        for line in LineSplitter().lines(self.box.poll()):
             self._sort(line, [])
 
     def state(self) -> str:
         """The state, as PING tells it; a sign of life."""
         return self.ok("PING")[1]
 
-    def _sort(self, line: bytes, answers: list[Answer | Unread]) -> None:
-        found = parsed(line)
+    def _sort(self, line: bytes, answers: list[BoxAnswer | UnreadableLine]) -> None:
+        found = parse_line(line)
         assert found is not None, line
         assert len(line) <= 240
-        if isinstance(found, Event):
+        if isinstance(found, BoxEvent):
             self.events.append(found)
         else:
             answers.append(found)
@@ -145,7 +153,7 @@ def test_a_box_starts_dark_and_without_a_session() -> None:
     host = Host()
     assert host.light.did == ["dark"]
     for verb in ("PING", "SHOW 0", "BLANK", "STATUS", "TRIG", "STOP", "BYE", "LOAD 1 00000000", "SEQ 0 1 200 9999 0"):
-        assert host.refused(verb) == Refused.SESSION
+        assert host.refused(verb) == RefusalCode.SESSION
 
 
 @pytest.mark.parametrize("text", ["SHOW 3", "SHOW 26", "BYE", "DANCE"])
@@ -161,7 +169,7 @@ def test_a_command_that_comes_again_is_answered_again_and_obeyed_once(host: Host
 def test_an_old_number_is_not_obeyed_and_numbers_wrap(host: Host) -> None:
     host.ok("SHOW 3")
     host.ok("SHOW 4")
-    assert host.ask("SHOW 3", number=host.number - 1).code == Refused.STATE
+    assert host.ask("SHOW 3", number=host.number - 1).code == RefusalCode.STATE
     host.number = 4_990
     host.ok("SHOW 5")
     host.number = 9_980
@@ -172,21 +180,21 @@ def test_an_old_number_is_not_obeyed_and_numbers_wrap(host: Host) -> None:
 
 
 def test_damaged_and_strange_lines_are_reported(host: Host) -> None:
-    whole = framed("1A2B 9 SHOW 1")
+    whole = encode_line("1A2B 9 SHOW 1")
     strange = ("1A2B", "1A2B 9", "1A2B nine PING", "1A2B 10000 PING", "A 9 PING")
-    for data in (whole.replace(b"1*", b"2*"), b"rubbish\n", b"\xff\xfe\n", *map(framed, strange)):
-        assert host.send(data) == [Unread()]
-    assert host.send(b"\n\r\n") in ([], [Unread()])
+    for data in (whole.replace(b"1*", b"2*"), b"rubbish\n", b"\xff\xfe\n", *map(encode_line, strange)):
+        assert host.send(data) == [UnreadableLine()]
+    assert host.send(b"\n\r\n") in ([], [UnreadableLine()])
     # Nor does a flood without end of line fill its memory.
     host.send(b"x" * 10_000)
-    assert host.send(b"\n") == [Unread()] or host.send(b"\n") == []
+    assert host.send(b"\n") == [UnreadableLine()] or host.send(b"\n") == []
     assert host.light.shown == []
     assert host.send(whole[:5]) == []
     (answer,) = host.send(whole[5:])
-    assert isinstance(answer, Answer)
+    assert isinstance(answer, BoxAnswer)
     assert answer.code is None
     host.number = 9
-    assert host.refused("DANCE") == Refused.VERB
+    assert host.refused("DANCE") == RefusalCode.VERB
 
 
 @pytest.mark.parametrize(
@@ -200,7 +208,7 @@ def test_damaged_and_strange_lines_are_reported(host: Host) -> None:
     ],
 )
 def test_numbers_out_of_range_are_refused(host: Host, words: str) -> None:
-    assert host.refused(words) == Refused.RANGE
+    assert host.refused(words) == RefusalCode.RANGE
     if words.startswith("SEQ"):
         assert host.state() == "ready"
     assert not host.light.is_lit()
@@ -208,16 +216,16 @@ def test_numbers_out_of_range_are_refused(host: Host, words: str) -> None:
 
 def test_a_second_session_waits_for_the_first_to_die_or_leave(host: Host) -> None:
     host.ok("SHOW 1")
-    assert host.refused(HELLO, session="77F0") == Refused.BUSY
-    assert host.refused("BLANK", session="77F0") == Refused.BUSY
+    assert host.refused(HELLO, session="77F0") == RefusalCode.BUSY
+    assert host.refused("BLANK", session="77F0") == RefusalCode.BUSY
     assert host.light.is_lit()
     host.pass_us(WATCHDOG_US + 1)
-    assert host.refused("BLANK", session="77F0") == Refused.SESSION
+    assert host.refused("BLANK", session="77F0") == RefusalCode.SESSION
     assert host.ask(HELLO, session="77F0", number=1).code is None
-    assert host.refused("SHOW 1") == Refused.BUSY
+    assert host.refused("SHOW 1") == RefusalCode.BUSY
     assert host.ask("BYE", session="77F0", number=2).code is None
-    assert host.refused("SHOW 1") == Refused.SESSION
-    assert host.refused("PING", session="77F0") == Refused.SESSION
+    assert host.refused("SHOW 1") == RefusalCode.SESSION
+    assert host.refused("PING", session="77F0") == RefusalCode.SESSION
     host.ready()
 
 
@@ -232,15 +240,15 @@ def test_the_watchdog_puts_the_light_out_and_the_host_must_see_it(host: Host) ->
     assert host.light.is_lit()
     host.pass_us(1)
     assert not host.light.is_lit()
-    assert host.events == [Event("FAULT", (str(Fault.WATCHDOG.value),))]
+    assert host.events == [BoxEvent("FAULT", (str(BoxFault.WATCHDOG.value),))]
     assert host.ok("PING")[1:] == ("ready", "1")
     for verb in ("SHOW 1", "SEQ 0 26 5000 10000 0", "TRIG"):
-        assert host.refused(verb) == Refused.FAULT
+        assert host.refused(verb) == RefusalCode.FAULT
     assert not host.light.is_lit()
     host.ok("BLANK")
     host.ok("SEQ 0 26 40000 100000 0")
     host.pass_us(WATCHDOG_US + 1)
-    assert host.events[-1] == Event("FAULT", ("1",))
+    assert host.events[-1] == BoxEvent("FAULT", ("1",))
     shown = len(host.light.shown)
     host.pass_us(2_000_000)
     assert len(host.light.shown) == shown <= 12
@@ -250,10 +258,10 @@ def test_the_watchdog_puts_the_light_out_and_the_host_must_see_it(host: Host) ->
 @pytest.mark.parametrize(
     ("line", "stays"),
     [
-        (framed("77F0 1 PING"), False),
+        (encode_line("77F0 1 PING"), False),
         (b"rubbish\n", False),
-        (framed("1A2B 9").replace(b"9", b"8"), False),
-        (framed("1A2B 3 SHOW 1"), True),
+        (encode_line("1A2B 9").replace(b"9", b"8"), False),
+        (encode_line("1A2B 3 SHOW 1"), True),
     ],
     ids=["another host", "no line", "a damaged line", "a command sent again"],
 )
@@ -274,7 +282,7 @@ def test_a_pattern_is_not_lit_for_longer_than_allowed(host: Host) -> None:
         host.state()
     host.pass_us(1)
     assert not host.light.is_lit()
-    assert host.events == [Event("FAULT", (str(Fault.ON_TIME.value),))]
+    assert host.events == [BoxEvent("FAULT", (str(BoxFault.ON_TIME.value),))]
     host.ok("STOP")
     for index in range(20):
         host.ok(f"SHOW {index}")
@@ -289,17 +297,17 @@ def test_light_is_rationed_by_duty() -> None:
     while not host.events:
         host.pass_us(1_000)
         host.state()
-    assert host.events == [Event("FAULT", (str(Fault.DUTY.value),))]
+    assert host.events == [BoxEvent("FAULT", (str(BoxFault.DUTY.value),))]
     assert host.light.now_us - begun_us == pytest.approx(3_200_000, abs=2_000)
     host.ok("BLANK")
-    assert host.refused("SHOW 1") == Refused.LIMIT
+    assert host.refused("SHOW 1") == RefusalCode.LIMIT
     host.pass_us(6_800_000)
     # The light is ten seconds back only in part.
     host.ok("SHOW 1")
     host.pass_us(700_000)
-    assert host.refused("SHOW 2") in {Refused.LIMIT, Refused.FAULT}
+    assert host.refused("SHOW 2") in {RefusalCode.LIMIT, RefusalCode.FAULT}
     host.ok("BLANK")
-    assert host.refused("SEQ 0 26 5000 10000 0") == Refused.LIMIT, "more light than duty in the long run"
+    assert host.refused("SEQ 0 26 5000 10000 0") == RefusalCode.LIMIT, "more light than duty in the long run"
     host.pass_us(10_000_001)
     host.ok("SEQ 0 26 5000 20000 0")
 
@@ -337,15 +345,15 @@ def test_every_verb_that_is_dark_is(host: Host, lit: str, dark: str) -> None:
 def test_an_engine_that_fails_is_dark_and_says_so(host: Host, broken: str) -> None:
     host.light.broken = {broken}
     if broken != "pulse":
-        assert host.refused("SHOW 1") == Refused.HARDWARE
+        assert host.refused("SHOW 1") == RefusalCode.HARDWARE
         assert not host.light.is_lit()
-        assert host.refused("SHOW 1") == Refused.FAULT
+        assert host.refused("SHOW 1") == RefusalCode.FAULT
         host.ok("BLANK")
     host.light.broken = set()
     host.ok("SEQ 0 26 4000 10000 0")
     host.light.broken = {broken}
     host.pass_us(200_000)
-    assert host.events[-1] == Event("FAULT", (str(Fault.LIGHT.value),))
+    assert host.events[-1] == BoxEvent("FAULT", (str(BoxFault.LIGHT.value),))
     assert host.light.did[-1] == "dark"
     assert host.state() == "ready"
 
@@ -353,13 +361,13 @@ def test_an_engine_that_fails_is_dark_and_says_so(host: Host, broken: str) -> No
 def test_a_light_that_does_not_go_out_is_switched_off_again_and_again(host: Host) -> None:
     host.ok("SHOW 1")
     host.light.broken = {"dark"}
-    assert host.refused("BLANK") == Refused.HARDWARE
+    assert host.refused("BLANK") == RefusalCode.HARDWARE
     for broken, least, most in (({"dark"}, 21, 1_000), (set[str](), 0, 3), (set[str](), 0, 0)):
         host.light.broken = broken
         tried = host.light.did.count("dark")
         host.pass_us(50_000)
         assert least <= host.light.did.count("dark") - tried <= most
-    assert host.ok("PING")[2] == str(Fault.LIGHT.value)
+    assert host.ok("PING")[2] == str(BoxFault.LIGHT.value)
 
 
 # Sequences.
@@ -373,7 +381,7 @@ def test_a_sequence_runs_on_its_own_clock_and_can_be_stopped(host: Host) -> None
     frames = [event.words for event in host.events if event.name == "FRAME"]
     assert [int(index) for index, _ in frames] == [2, 3, 4, 5, 6]
     assert [int(t_us) - int(first_us) for _, t_us in frames] == [0, 10_000, 20_000, 30_000, 40_000]
-    assert host.events[-1] == Event("DONE", ("5",))
+    assert host.events[-1] == BoxEvent("DONE", ("5",))
     done = [each.split()[0] for each in host.light.did]
     assert done == [*["light", "pulse", "dark", "select"] * 4, "light", "pulse", "dark"]
     assert host.state() == "ready"
@@ -407,21 +415,21 @@ def test_a_pattern_is_lit_for_its_exposure_and_a_box_that_is_late_does_not_hurry
 
 
 def test_a_sequence_waits_for_triggers(host: Host) -> None:
-    assert host.refused("TRIG") == Refused.STATE
+    assert host.refused("TRIG") == RefusalCode.STATE
     host.ok("SEQ 4 3 4000 10000 1")
     host.pass_us(500_000)
     assert host.light.shown == []
     # Nothing else is shown while it goes on.
-    assert host.refused("SHOW 1") == Refused.STATE
-    assert host.refused("SEQ 0 1 4000 10000 0") == Refused.STATE
+    assert host.refused("SHOW 1") == RefusalCode.STATE
+    assert host.refused("SEQ 0 1 4000 10000 0") == RefusalCode.STATE
     for index in (4, 5, 6):
         shown = host.ok("TRIG")
         assert shown == (str(index), str(host.light.now_us))
-        assert host.refused("TRIG") == Refused.STATE, "it is lit"
+        assert host.refused("TRIG") == RefusalCode.STATE, "it is lit"
         host.pass_us(4_500)
         assert not host.light.is_lit()
-    assert host.events[-1] == Event("DONE", ("3",))
-    assert host.refused("TRIG") == Refused.STATE
+    assert host.events[-1] == BoxEvent("DONE", ("3",))
+    assert host.refused("TRIG") == RefusalCode.STATE
     assert host.light.shown == [4, 5, 6]
     assert host.light.did.count("pulse") == 3
 
@@ -430,13 +438,13 @@ def test_a_sequence_waits_for_triggers(host: Host) -> None:
 
 
 def test_any_run_of_the_flash_can_be_loaded_and_nothing_else(host: Host) -> None:
-    assert host.ok(f"LOAD 3 {crc32_of_all(CRC32[7:10]):08X}") == ("3", "7", "3000")
+    assert host.ok(f"LOAD 3 {sequence_checksum(CRC32[7:10]):08X}") == ("3", "7", "3000")
     host.ok("SHOW 2")
     assert host.light.shown == [9]
-    assert host.refused("SHOW 3") == Refused.RANGE
-    assert host.refused(f"LOAD 2 {crc32_of_all([CRC32[0], CRC32[2]]):08X}") == Refused.PATTERNS
+    assert host.refused("SHOW 3") == RefusalCode.RANGE
+    assert host.refused(f"LOAD 2 {sequence_checksum([CRC32[0], CRC32[2]]):08X}") == RefusalCode.PATTERNS
     assert not host.light.is_lit()
-    assert host.refused("SHOW 0") == Refused.STATE, "what does not fit leaves nothing loaded"
+    assert host.refused("SHOW 0") == RefusalCode.STATE, "what does not fit leaves nothing loaded"
 
 
 def picked(order: list[int]) -> list[str]:
@@ -445,7 +453,7 @@ def picked(order: list[int]) -> list[str]:
     lines = (" ".join(f"{each:08X}" for each in crc32[at : at + 16]) for at in range(0, len(crc32), 16))
     return [
         *(f"PICK {16 * at} {line}" for at, line in enumerate(lines)),
-        f"LOAD {len(order)} {crc32_of_all(crc32):08X}",
+        f"LOAD {len(order)} {sequence_checksum(crc32):08X}",
     ]
 
 
@@ -461,26 +469,26 @@ def test_patterns_are_picked_from_anywhere_in_the_flash() -> None:
     for index in range(len(order)):
         host.ok(f"SHOW {index}")
     assert host.light.shown == order
-    assert host.refused("SHOW 22") == Refused.RANGE
-    assert host.refused("SEQ 0 22 4000 9399 0") == Refused.RANGE
+    assert host.refused("SHOW 22") == RefusalCode.RANGE
+    assert host.refused("SEQ 0 22 4000 9399 0") == RefusalCode.RANGE
     host.ok("SEQ 2 3 4000 9400 0")
     host.pass_us(100_000)
     assert host.light.shown[22:] == [25, 24, 3]
-    run = host.ok(f"LOAD 2 {crc32_of_all(CRC32[:2]):08X}")
+    run = host.ok(f"LOAD 2 {sequence_checksum(CRC32[:2]):08X}")
     assert run == ("2", "0", "3000"), "what was picked is used up"
 
 
 def test_patterns_that_the_flash_lacks_are_reported_and_picking_ends_with_its_session(host: Host) -> None:
     assert host.ok(f"PICK 0 {CRC32[4]:08X} 12345678 {CRC32[2]:08X} 0") == ("4", "1", "3")
     assert host.ok(f"PICK 4 {CRC32[0]:08X} 1") == ("6", "5")
-    assert host.refused("LOAD 6 00000000") == Refused.PATTERNS
+    assert host.refused("LOAD 6 00000000") == RefusalCode.PATTERNS
     pick, load = picked([5, 4])
     host.ok(pick)
-    assert host.refused(f"LOAD 2 {crc32_of_all([CRC32[2], CRC32[4]]):08X}") == Refused.PATTERNS
+    assert host.refused(f"LOAD 2 {sequence_checksum([CRC32[2], CRC32[4]]):08X}") == RefusalCode.PATTERNS
     host.ok(pick)
     assert host.ask(pick, number=host.number).words == ("2",)
     host.ok(HELLO)
-    assert host.refused(load) == Refused.PATTERNS
+    assert host.refused(load) == RefusalCode.PATTERNS
     host.ok(pick)
     assert host.ok(load)[:2] == ("2", "5")
 
@@ -490,10 +498,10 @@ def test_limits_are_granted_in_part_and_never_exceeded() -> None:
     words = dict(word.split("=") for word in host.ok("HELLO 1 5000 60000 1000 250"))
     assert [words[key] for key in ("watchdog_ms", "on_ms", "duty", "bright")] == ["800", "2000", "400", "250"]
     for limits in ("49 5000 1000 1000", "1000 0 1000 1000", "1000 5000 0 1000", "1000 5000 1001 1000"):
-        assert host.refused(f"HELLO 1 {limits}") == Refused.RANGE
-    assert host.refused("PING") == Refused.SESSION, "a HELLO that is refused leaves no session"
+        assert host.refused(f"HELLO 1 {limits}") == RefusalCode.RANGE
+    assert host.refused("PING") == RefusalCode.SESSION, "a HELLO that is refused leaves no session"
     host.light.dims = False
-    assert host.refused("HELLO 1 1000 5000 1000 999") == Refused.RANGE
+    assert host.refused("HELLO 1 1000 5000 1000 999") == RefusalCode.RANGE
     host.ok(HELLO)
 
 
@@ -526,11 +534,11 @@ def example() -> list[tuple[int | None, str, str]]:
 
 def test_the_pages_example_is_what_the_reference_box_answers() -> None:
     crc32 = [zlib.crc32(image) for image in IMAGES]
-    about = Description(
+    about = BoxDescription(
         "example", "1.0", 4, 2, crc32, light_us=2000, error_us=50, gap_us=3000, hold_us=500, least_us=200
     )
     light = Light(now_us=0, takes_us=20)
-    box = Device(light, about, 0xC0FFEE)
+    box = TriggerBox(light, about, 0xC0FFEE)
     waiting: list[str] = []
     for time_us, direction, text in example():
         if time_us is not None:
@@ -546,16 +554,18 @@ def test_the_pages_example_is_what_the_reference_box_answers() -> None:
     assert not waiting
     assert sum(direction == ">" for _, direction, _ in example()) >= 10
     assert all(f"({value:08X})" in PAGE for value in crc32)
-    assert f"LOAD 3 {crc32_of_all(crc32):08X}*" in PAGE
-    faulty = [text for _, _, text in example() if wire.unframed(text.encode()) is None]
+    assert f"LOAD 3 {sequence_checksum(crc32):08X}*" in PAGE
+    faulty = [text for _, _, text in example() if wire.decode_line(text.encode()) is None]
     assert len(faulty) == 1, "one line of the example is damaged, as it says"
 
 
 def test_the_page_names_everything_that_goes_over_the_wire() -> None:
     verbs = {"HELLO", "PING", "PICK", "LOAD", "SHOW", "SEQ", "TRIG", "STOP", "BLANK", "STATUS", "BYE"}
     assert {verb for verb in verbs if re.search(rf"^    {verb}\b", PAGE, re.MULTILINE)} == verbs
-    assert all(f"{name}=" in PAGE for name in (*Box.__dataclass_fields__, *Status.__dataclass_fields__))
+    assert all(f"{name}=" in PAGE for name in (*BoxInfo.__dataclass_fields__, *BoxStatus.__dataclass_fields__))
     errors = PAGE.partition("Errors: ")[2].partition("\n\n")[0]
-    assert {int(code) for code in re.findall(r"(?:^|[.\n] ?)(\d+) [a-z<]", errors)} == {each.value for each in Refused}
+    assert {int(code) for code in re.findall(r"(?:^|[.\n] ?)(\d+) [a-z<]", errors)} == {
+        each.value for each in RefusalCode
+    }
     faults = PAGE.partition("cannot miss it. ")[2].partition("\n\n")[0]
-    assert {int(code) for code in re.findall(r"(\d): ", faults)} == {each.value for each in Fault}
+    assert {int(code) for code in re.findall(r"(\d): ", faults)} == {each.value for each in BoxFault}

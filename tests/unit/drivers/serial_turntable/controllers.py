@@ -18,7 +18,7 @@ from tests.virtual_clock import VirtualClock
 
 @dataclass
 class Board(ABC):
-    """What sits at the end of the line. Implements `drivers.serial_port.Port`.
+    """What sits at the end of the line. Implements `drivers.serial_port.BytePort`.
 
     heard : all lines and realtime bytes.
     """
@@ -47,7 +47,7 @@ class Board(ABC):
         self._unplugged = True
 
     def close(self) -> None:
-        """See `Port`. The board goes on, and may be opened again."""
+        """See `BytePort`. The board goes on, and may be opened again."""
         self._sent = b""
 
     def read(self, timeout_s: float) -> bytes:
