@@ -29,6 +29,10 @@ MIN_RATE_HZ = 15.0
 
 _RATE_TOLERANCE = 0.01
 
+_BROKEN = select.POLLERR | select.POLLHUP | select.POLLNVAL
+_SEQUENCE_MODULUS = 2**32
+_MAX_STEP = 2**31
+
 
 @dataclass(frozen=True, slots=True)
 class NegotiatedFormat:
@@ -259,9 +263,6 @@ def _join_codes(codes: tuple[str, ...]) -> str:
     return ", ".join(code.strip() for code in codes) or "none"
 
 
-_BROKEN = select.POLLERR | select.POLLHUP | select.POLLNVAL
-
-
 @dataclass(frozen=True, slots=True)
 class FilledBuffer:
     """A filled buffer, to be queued again after use. corrupt : the driver reports damaged data."""
@@ -432,10 +433,6 @@ def _stamp_source(flags: int) -> StampSource:
     if flags & kernel.STAMP_SOURCE_MASK == kernel.STAMP_SOURCE_START:
         return StampSource.EXPOSURE_START
     return StampSource.FRAME_END
-
-
-_SEQUENCE_MODULUS = 2**32
-_MAX_STEP = 2**31
 
 
 @dataclass(slots=True)
