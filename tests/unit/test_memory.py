@@ -24,11 +24,11 @@ def test_memory_goes_back_where_much_is_held(
     monkeypatch.setattr(memory, "_MUCH_BYTES", much)
     monkeypatch.setattr(memory, "_STATM", statm)
     monkeypatch.setattr(memory, "_trim", lambda: called.append)
-    memory.requeue()
+    memory.give_back()
     assert called == calls
     # A C library without the call is left alone.
     monkeypatch.setattr(memory, "_trim", lambda: None)
-    memory.requeue()
+    memory.give_back()
 
 
 @LINUX
