@@ -21,6 +21,9 @@ from slrig.model import Size
 _RATE_TOLERANCE_HZ = 0.5
 _MAX_LISTED = 12
 
+PropertyChange = tuple[int, int, int]
+"""An object, one of its properties, and the new value."""
+
 
 @dataclass(frozen=True, slots=True)
 class KmsMode:
@@ -90,10 +93,6 @@ def choose_mode(output: str, modes: Sequence[KmsMode], *, native: Size | None, r
         raise UnsupportedByDeviceError(message)
     # Of equal modes, the one that the display prefers.
     return next((mode for mode in fitting if mode.preferred), fitting[0])
-
-
-PropertyChange = tuple[int, int, int]
-"""An object, one of its properties, and the new value."""
 
 
 @dataclass(frozen=True, slots=True)

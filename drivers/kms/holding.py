@@ -29,6 +29,11 @@ _DESKTOPS = frozenset(
 )
 """Programs that use graphics cards, by their process names."""
 
+_ANSWER_TIMEOUT_S = 2.0
+_MAX_ANSWER_BYTES = 4096
+_held_cards: dict[Path, HeldCard] = {}
+_held_cards_lock = threading.Lock()
+
 
 def card_busy_error(path: Path, output: str) -> DeviceBusyError:
     """Return the error for a card that other programs use, with their names and what to do."""
@@ -65,13 +70,6 @@ def _leads_to(link: Path, path: Path) -> bool:
         return link.readlink() == path
     except OSError:
         return False
-
-
-_ANSWER_TIMEOUT_S = 2.0
-_MAX_ANSWER_BYTES = 4096
-
-_held_cards: dict[Path, HeldCard] = {}
-_held_cards_lock = threading.Lock()
 
 
 class HeldCard:

@@ -41,6 +41,13 @@ _CONTROLLER_OFF = ("GAMMA_LUT", "DEGAMMA_LUT", "CTM", "VRR_ENABLED")
 """Properties of a controller to set to 0: the identity (kernel documentation, "Color Management"), fixed refresh."""
 _PLANE_VALUES = {"rotation": 1, "alpha": 0xFFFF}
 
+Result = TypeVar("Result")
+_FLIP_TIMEOUT_S = 1.0
+_BLACK = 0
+_NEXT_BUFFER = (1, 2, 1)
+"""Index of the buffer to draw in after each: of the black one, and the two that patterns alternate between."""
+_PIXEL_REMEDY = "another program or the graphics driver writes there; please report it, with the output of dmesg"
+
 
 @dataclass(frozen=True, slots=True)
 class OutputRoute:
@@ -165,15 +172,6 @@ def _connector_changes(number: int, properties: Mapping[str, Property]) -> Itera
     for name, value in _CONNECTOR_VALUES.items():
         if name in properties and value in properties[name].enum_values:
             yield number, properties[name].number, properties[name].enum_values[value]
-
-
-Result = TypeVar("Result")
-
-_FLIP_TIMEOUT_S = 1.0
-_BLACK = 0
-_NEXT_BUFFER = (1, 2, 1)
-"""Index of the buffer to draw in after each: of the black one, and the two that patterns alternate between."""
-_PIXEL_REMEDY = "another program or the graphics driver writes there; please report it, with the output of dmesg"
 
 
 class KmsOutput:

@@ -20,6 +20,13 @@ from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraSta
 from slrig.errors import DeviceError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Pixels, Size
 
+_Feed = DeviceFeed | LiveFeed | FilmFeed
+_TOLERANCE = 0.01
+_START_TOLERANCE_S = 2.0
+_MAX_SILENCE_S = 5.0
+_FIRST_FRAMES = 10
+_USUAL_PERIOD_S = 1 / 30
+
 
 @dataclass(frozen=True, slots=True)
 class FrameDecoder:
@@ -91,14 +98,7 @@ def image_decoder(data: NDArray[Any], bit_depth: int | None) -> FrameDecoder:
     return FrameDecoder(None, CameraFormat(Size(columns, rows), depth), data.shape[2:] == (3,))
 
 
-_Feed = DeviceFeed | LiveFeed | FilmFeed
 _Open = tuple[_Feed, FrameDecoder, CaptureControls | None]
-
-_TOLERANCE = 0.01
-_START_TOLERANCE_S = 2.0
-_MAX_SILENCE_S = 5.0
-_FIRST_FRAMES = 10
-_USUAL_PERIOD_S = 1 / 30
 
 
 @dataclass(slots=True)

@@ -25,6 +25,21 @@ from slrig.devices import AppliedSettings, CameraSettings
 from slrig.errors import DeviceGoneError, SlrigError, UnsupportedByDeviceError
 from slrig.model import Size
 
+EXPOSURE_UNIT_S = 1e-4
+_ABSENT = -1.0
+_MANUAL = 1
+_MIN_UNITS, _MAX_UNITS = 1, 600_000
+_TOLERANCE = 0.01
+_KERNEL_CONTROLS = {
+    cv2.CAP_PROP_AUTO_EXPOSURE: v4l2.EXPOSURE_AUTO,
+    cv2.CAP_PROP_EXPOSURE: v4l2.EXPOSURE_ABSOLUTE,
+    cv2.CAP_PROP_GAIN: v4l2.GAIN,
+    cv2.CAP_PROP_AUTOFOCUS: v4l2.FOCUS_AUTO,
+    cv2.CAP_PROP_FOCUS: v4l2.FOCUS_ABSOLUTE,
+    cv2.CAP_PROP_AUTO_WB: v4l2.AUTO_WHITE_BALANCE,
+}
+"""The kernel's control of each of OpenCV's properties."""
+
 
 def require_free(path: str) -> None:
     """Raise unless a camera is connected and no program streams from it: only a program that does may free its buffers.
@@ -83,23 +98,6 @@ def _request_once(path: str, action: str, request: int, argument: Structure) -> 
             os.close(handle)
     except OSError as error:
         raise kernel.device_error(Path(path), action, error) from error
-
-
-EXPOSURE_UNIT_S = 1e-4
-_ABSENT = -1.0
-_MANUAL = 1
-_MIN_UNITS, _MAX_UNITS = 1, 600_000
-_TOLERANCE = 0.01
-
-_KERNEL_CONTROLS = {
-    cv2.CAP_PROP_AUTO_EXPOSURE: v4l2.EXPOSURE_AUTO,
-    cv2.CAP_PROP_EXPOSURE: v4l2.EXPOSURE_ABSOLUTE,
-    cv2.CAP_PROP_GAIN: v4l2.GAIN,
-    cv2.CAP_PROP_AUTOFOCUS: v4l2.FOCUS_AUTO,
-    cv2.CAP_PROP_FOCUS: v4l2.FOCUS_ABSOLUTE,
-    cv2.CAP_PROP_AUTO_WB: v4l2.AUTO_WHITE_BALANCE,
-}
-"""The kernel's control of each of OpenCV's properties."""
 
 
 def read_fourcc(capture: cv2.VideoCapture) -> str:

@@ -25,6 +25,14 @@ from slrig.errors import DeviceError, DeviceGoneError, FrameTimeoutError, Unsupp
 
 _OTHER_CLOCK_NS = 10_000_000_000
 
+OPEN_LIMIT_S = 10.0
+_FEW_BUFFERS = 4
+_RETRY_S = 0.01
+_AT_ONCE_NS = 500_000_000
+_DEAD_NS = 2_000_000_000  # of grabs that fail at once, one after the other
+_MAX_FRAMES = 8
+_JOIN_S = 1.0
+
 
 @dataclass(frozen=True, slots=True)
 class GrabTimes:
@@ -101,13 +109,6 @@ class SleepMeter:
         if self._file is not None:
             os.close(self._file)
             self._file = None
-
-
-OPEN_LIMIT_S = 10.0
-_FEW_BUFFERS = 4
-_RETRY_S = 0.01
-_AT_ONCE_NS = 500_000_000
-_DEAD_NS = 2_000_000_000  # of grabs that fail at once, one after the other
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,10 +372,6 @@ def open_capture(source: CaptureSource, parameters: Sequence[int] = ()) -> cv2.V
         )
         raise DeviceError(message)
     return capture
-
-
-_MAX_FRAMES = 8
-_JOIN_S = 1.0
 
 
 class FeedReader:

@@ -47,6 +47,32 @@ from slrig.model import CameraFormat, Frame, Pixels, Size
 
 INSTALL = "sudo apt install python3-libcamera && pip install 'slrig[picamera2]'"
 
+_UNPACKED = re.compile(r"^(S(?P<bayer>[RGB]{4})|R)(?P<depth>8|10|12|14|16)$")
+_MIN_MAIN_SIZE = (64, 64)
+"""Size of the main stream that picamera2 always makes, where only the raw one is read."""
+FIXED: Mapping[str, object] = {
+    "AeEnable": False,
+    "AwbEnable": False,
+    "ColourGains": (1.0, 1.0),
+    "NoiseReductionMode": 0,
+    "HdrMode": 0,
+    "Sharpness": 0.0,
+    "Contrast": 1.0,
+    "Brightness": 0.0,
+}
+"""Values that switch automatic and image processing controls off; set where the camera has the control."""
+MAX_EXPOSURE_S = 1.0
+"""Longest exposure declared: some sensors allow minutes, too long for any check to wait."""
+_BLANK_US = 5_000
+"""Frame duration allowed beyond the exposure; libcamera uses no more of it than the sensor needs."""
+_ERROR_NS = 1_000_000
+"""Delay with which the kernel may notice the start of a frame on the wire."""
+_SETTING_TOLERANCE = 0.01
+_SETTLING_FRAMES = 12
+_WAIT_SLICE_S = 0.05
+_FRAME_TIMEOUT_S = 3.0
+_SUSPENDED_NS = 1_000_000
+
 
 def load_library() -> Any:
     """Return the class `Picamera2`.
@@ -101,11 +127,6 @@ def find_devices() -> tuple[FoundDevice, ...]:
         picamera2 is not installed.
     """
     return tuple(FoundDevice("picamera2", each["Id"], f"{each['Model']} (libcamera)") for each in list_cameras())
-
-
-_UNPACKED = re.compile(r"^(S(?P<bayer>[RGB]{4})|R)(?P<depth>8|10|12|14|16)$")
-_MIN_MAIN_SIZE = (64, 64)
-"""Size of the main stream that picamera2 always makes, where only the raw one is read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,34 +197,6 @@ def _layout(form: str) -> PixelLayout | None:
         return None
     depth = int(found["depth"])
     return PixelLayout(depth, SamplePacking.BYTES if depth == 8 else SamplePacking.WORDS, found["bayer"])
-
-
-FIXED: Mapping[str, object] = {
-    "AeEnable": False,
-    "AwbEnable": False,
-    "ColourGains": (1.0, 1.0),
-    "NoiseReductionMode": 0,
-    "HdrMode": 0,
-    "Sharpness": 0.0,
-    "Contrast": 1.0,
-    "Brightness": 0.0,
-}
-"""Values that switch automatic and image processing controls off; set where the camera has the control."""
-
-MAX_EXPOSURE_S = 1.0
-"""Longest exposure declared: some sensors allow minutes, too long for any check to wait."""
-
-_BLANK_US = 5_000
-"""Frame duration allowed beyond the exposure; libcamera uses no more of it than the sensor needs."""
-
-_ERROR_NS = 1_000_000
-"""Delay with which the kernel may notice the start of a frame on the wire."""
-
-_SETTING_TOLERANCE = 0.01
-_SETTLING_FRAMES = 12
-_WAIT_SLICE_S = 0.05
-_FRAME_TIMEOUT_S = 3.0
-_SUSPENDED_NS = 1_000_000
 
 
 class PiCamera:

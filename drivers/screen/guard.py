@@ -43,6 +43,10 @@ _OUTPUT_OFF_TIMEOUT_S = 3.0
 _SUCCESSOR_TIMEOUT_S = 0.5
 _FULLY_OBSCURED = 2
 
+_guards: dict[tuple[str | None, str], tuple[ScreenGuardTask, GuardProcess]] = {}
+"""The guards that this process has started: one per display and output, kept until the process ends."""
+_guards_lock = threading.Lock()
+
 
 @dataclass(frozen=True, slots=True)
 class ScreenGuardTask:
@@ -56,11 +60,6 @@ class ScreenGuardTask:
     height_px: int
     process: int
     dark_after_s: float
-
-
-_guards: dict[tuple[str | None, str], tuple[ScreenGuardTask, GuardProcess]] = {}
-"""The guards that this process has started: one per display and output, kept until the process ends."""
-_guards_lock = threading.Lock()
 
 
 def start_guard(task: ScreenGuardTask) -> GuardProcess:

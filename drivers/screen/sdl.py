@@ -34,6 +34,9 @@ _POLL_INTERVAL_S = 0.02
 _CENTRED = 0x2FFF0000
 _OPAQUE = np.uint32(0xFF000000)
 
+_IGNORE_IO_ERROR = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _data: None)
+_IGNORE_ERROR = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _error: 0)
+
 
 class SdlOutput:
     """A full-screen window on a display that SDL knows, without an X server. Implements `PatternOutput`."""
@@ -264,7 +267,3 @@ def _survive_server_end(display: int) -> None:
         xlib.XSetIOErrorExitHandler(display, _IGNORE_IO_ERROR, None)
         xlib.XSetErrorHandler.argtypes, xlib.XSetErrorHandler.restype = [ctypes.c_void_p], ctypes.c_void_p
         xlib.XSetErrorHandler(_IGNORE_ERROR)
-
-
-_IGNORE_IO_ERROR = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _data: None)
-_IGNORE_ERROR = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _error: 0)

@@ -70,12 +70,10 @@ class RequestRefusedError(DeviceError):
 
 @dataclass(frozen=True, slots=True)
 class XScreen:
-    """The X server's screen: its root window, extent and pixel format."""
+    """The X server's screen: its root window and pixel format."""
 
     root: int
     depth: int
-    width_px: int
-    height_px: int
     colour_masks: tuple[int, int, int]
     bits_per_pixel: int
     little_endian: bool
@@ -247,8 +245,6 @@ def _describe_screen(connection: Any) -> XScreen:
     return XScreen(
         root=root.root,
         depth=root.root_depth,
-        width_px=root.width_in_pixels,
-        height_px=root.height_in_pixels,
         colour_masks=masks,
         bits_per_pixel=bits.get(root.root_depth, 0),
         little_endian=setup.image_byte_order == 0,

@@ -25,6 +25,21 @@ from slrig.model import Pixels, Size
 Bytes = NDArray[np.uint8]
 
 
+# OpenCV names a mosaic by the second row's second and third sample; these names are by the first pixel's.
+_DEMOSAIC = {
+    "BGGR": cv2.COLOR_BayerBGGR2GRAY,
+    "GBRG": cv2.COLOR_BayerGBRG2GRAY,
+    "GRBG": cv2.COLOR_BayerGRBG2GRAY,
+    "RGGB": cv2.COLOR_BayerRGGB2GRAY,
+}
+_FULL_RANGE: NDArray[np.uint8] = np.clip(np.rint((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
+"""Luma of 16..235 as 0..255."""
+_NO_END = "Premature end of JPEG file"
+_STRAY_BYTES = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
+_MAX_STRAY_BYTES = 16
+"""Bytes allowed between the last block of a JPEG and its end marker: some cameras leave a few there."""
+
+
 class CorruptFrameError(ValueError):
     """A buffer does not hold a whole frame, for the cause in the message; the frame is skipped."""
 
@@ -120,22 +135,8 @@ PREFERRED = (
 Y16 comes late: most sensors fill only some of its bits, and drivers do not report which (option `bit_depth`).
 """
 
-# OpenCV names a mosaic by the second row's second and third sample; these names are by the first pixel's.
-_DEMOSAIC = {
-    "BGGR": cv2.COLOR_BayerBGGR2GRAY,
-    "GBRG": cv2.COLOR_BayerGBRG2GRAY,
-    "GRBG": cv2.COLOR_BayerGRBG2GRAY,
-    "RGGB": cv2.COLOR_BayerRGGB2GRAY,
-}
-
-_FULL_RANGE: NDArray[np.uint8] = np.clip(np.rint((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
-"""Luma of 16..235 as 0..255."""
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_NO_END = "Premature end of JPEG file"
-_STRAY_BYTES = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
-_MAX_STRAY_BYTES = 16
-"""Bytes allowed between the last block of a JPEG and its end marker: some cameras leave a few there."""
 
 
 def min_stride_bytes(layout: PixelLayout, size: Size) -> int:

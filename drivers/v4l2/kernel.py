@@ -41,6 +41,11 @@ CONTROL_NEXT = 0x8000_0000
 CONTROL_MENUS = (3, 9)
 """Types of controls whose numbers are menu entries."""
 
+GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.ENOENT})
+"""Errors of a device that is no longer connected."""
+REFUSED = frozenset({errno.EINVAL, errno.ERANGE, errno.ENOTTY, errno.EOPNOTSUPP})
+"""Errors of a request that the device does not support."""
+
 
 def _u32(*names: str) -> tuple[tuple[str, type[ctypes.c_uint32]], ...]:
     return tuple((name, ctypes.c_uint32) for name in names)
@@ -267,11 +272,6 @@ QUERYCTRL = _request(_BOTH, 36, ControlDescription)
 G_EXT_CTRLS = _request(_BOTH, 71, LongControlValues)
 ENUM_FRAMESIZES = _request(_BOTH, 74, FrameSize)
 ENUM_FRAMEINTERVALS = _request(_BOTH, 75, FrameInterval)
-
-GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.ENOENT})
-"""Errors of a device that is no longer connected."""
-REFUSED = frozenset({errno.EINVAL, errno.ERANGE, errno.ENOTTY, errno.EOPNOTSUPP})
-"""Errors of a request that the device does not support."""
 
 
 def open_node(node: Path) -> int:

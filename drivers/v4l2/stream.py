@@ -9,10 +9,14 @@ import os
 import select
 import statistics
 import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
+from itertools import count
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +28,16 @@ from drivers.v4l2.timing import OTHER_CLOCK_NS, BufferStamp, StampSource
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Size
 
+Answer = TypeVar("Answer", bound=ctypes.Structure)
+
 MIN_RATE_HZ = 15.0
 """Frames per second below which scanning is slow: every pattern waits for a frame or two."""
 
 _RATE_TOLERANCE = 0.01
+
+_BROKEN = select.POLLERR | select.POLLHUP | select.POLLNVAL
+_SEQUENCE_MODULUS = 2**32
+_MAX_STEP = 2**31
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,52 +169,46 @@ def _require_format(handle: int, node: Path, code: str, size: Size, pix: kernel.
 
 
 def _offered_formats(handle: int) -> tuple[str, ...]:
-    found: list[str] = []
-    while True:
-        answer = kernel.FormatDescription(index=len(found), type=kernel.CAPTURE)
-        try:
-            kernel.ioctl(handle, kernel.ENUM_FMT, answer)
-        except OSError as error:
-            if error.errno in kernel.REFUSED:
-                return tuple(found)
-            raise
-        found.append(kernel.fourcc_text(answer.pixelformat))
+    answers = _enumerate(handle, kernel.ENUM_FMT, partial(kernel.FormatDescription, type=kernel.CAPTURE))
+    return tuple(kernel.fourcc_text(answer.pixelformat) for answer in answers)
 
 
 def _sizes(handle: int, code: str) -> tuple[Size, ...]:
     """List the sizes of a format; of a range, its largest. Empty where the driver does not report them."""
     found: list[Size] = []
-    while True:
-        answer = kernel.FrameSize(index=len(found), pixel_format=kernel.fourcc_code(code))
-        try:
-            kernel.ioctl(handle, kernel.ENUM_FRAMESIZES, answer)
-        except OSError as error:
-            if error.errno in kernel.REFUSED:
-                return tuple(found)
-            raise
+    request = partial(kernel.FrameSize, pixel_format=kernel.fourcc_code(code))
+    for answer in _enumerate(handle, kernel.ENUM_FRAMESIZES, request):
         if answer.type != kernel.SIZES_DISCRETE:
             return (Size(answer.size.stepwise.max_width, answer.size.stepwise.max_height),)
         found.append(Size(answer.size.discrete.width, answer.size.discrete.height))
+    return tuple(found)
 
 
 def _rates_hz(handle: int, code: str, size: Size) -> tuple[float, ...]:
     """List the frame rates of a format and size; of a range, its fastest. Empty where the driver reports none."""
     found: list[float] = []
-    while True:
-        answer = kernel.FrameInterval(
-            index=len(found), pixel_format=kernel.fourcc_code(code), width=size.width_px, height=size.height_px
-        )
-        try:
-            kernel.ioctl(handle, kernel.ENUM_FRAMEINTERVALS, answer)
-        except OSError as error:
-            if error.errno in kernel.REFUSED:
-                return tuple(found)
-            raise
+    extent = {"width": size.width_px, "height": size.height_px}
+    request = partial(kernel.FrameInterval, pixel_format=kernel.fourcc_code(code), **extent)
+    for answer in _enumerate(handle, kernel.ENUM_FRAMEINTERVALS, request):
         is_discrete = answer.type == kernel.SIZES_DISCRETE
         period = answer.interval.discrete if is_discrete else answer.interval.stepwise.min
         found.append(float("inf") if not period.numerator else period.denominator / period.numerator)
         if not is_discrete:
-            return tuple(found)
+            break
+    return tuple(found)
+
+
+def _enumerate(handle: int, request: int, structure: Callable[..., Answer]) -> Iterator[Answer]:
+    """Send a request with rising index until the driver refuses it, and yield the answers."""
+    for index in count():
+        answer = structure(index=index)
+        try:
+            kernel.ioctl(handle, request, answer)
+        except OSError as error:
+            if error.errno in kernel.REFUSED:
+                return
+            raise
+        yield answer
 
 
 def _period_ns(handle: int, node: Path, options: V4L2Options, offered_hz: tuple[float, ...]) -> int:
@@ -257,9 +261,6 @@ def _request_if_supported(handle: int, request: int, answer: kernel.StreamParame
 
 def _join_codes(codes: tuple[str, ...]) -> str:
     return ", ".join(code.strip() for code in codes) or "none"
-
-
-_BROKEN = select.POLLERR | select.POLLHUP | select.POLLNVAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -432,10 +433,6 @@ def _stamp_source(flags: int) -> StampSource:
     if flags & kernel.STAMP_SOURCE_MASK == kernel.STAMP_SOURCE_START:
         return StampSource.EXPOSURE_START
     return StampSource.FRAME_END
-
-
-_SEQUENCE_MODULUS = 2**32
-_MAX_STEP = 2**31
 
 
 @dataclass(slots=True)

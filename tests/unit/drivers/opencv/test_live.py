@@ -1,4 +1,4 @@
-"""A network camera on loopback, and a pipe. What was in a queue is never given for new: test_reader."""
+"""A network camera on loopback, and a pipe. What was in a queue is never taken for new: test_feeds."""
 
 from __future__ import annotations
 

@@ -147,7 +147,7 @@ def test_an_output_is_chosen_by_its_name_alone() -> None:
     "changes", [{"depth": 30, "colour_masks": (0x3FF00000, 0xFFC00, 0x3FF)}, {"depth": 16, "bits_per_pixel": 16}]
 )
 def test_a_screen_without_8_bits_per_colour_is_refused(changes: dict[str, Any]) -> None:
-    usual = XScreen(1, 24, 100, 100, (0xFF0000, 0xFF00, 0xFF), 32, True)
+    usual = XScreen(1, 24, (0xFF0000, 0xFF00, 0xFF), 32, True)
     require_true_colour(usual)
     with pytest.raises(UnsupportedByDeviceError, match="DefaultDepth 24"):
         require_true_colour(replace(usual, **changes))
