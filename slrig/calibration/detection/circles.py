@@ -28,7 +28,7 @@ from slrig.calibration.detection.diagnosis import (
     MIRROR_REMEDY,
     explain_other_board,
     explain_partial_board,
-    explain_unclear_board,
+    require_most_corners,
 )
 from slrig.calibration.detection.lattice import (
     Blobs,
@@ -46,7 +46,6 @@ from slrig.model import FloatArray
 _CENTRE_ITERATIONS = 3
 _RING_PX, _RING_BLURS = 4.0, 3.2
 _OUTLINE_POINTS = 48
-_MIN_FOUND_FRACTION = 0.8
 _MIN_RADIUS_PX = 4.0
 _MAX_SPOT_RATIO = 2
 
@@ -61,10 +60,7 @@ def find_circles(grey: GreyImage, board: Board) -> BoardView:
     if lattice is None or rough_px is None:
         raise PoseRefusedError(_explain_circles(grey, board, blobs, lattice))
     view = refine_circles(grey.level, board, rough_px, blobs)
-    found = 0 if view is None else len(view.corner)
-    if view is None or found < _MIN_FOUND_FRACTION * board.corner_count:
-        raise PoseRefusedError(explain_unclear_board(grey, board, found, "circles"))
-    return view
+    return require_most_corners(grey, board, view, "circles")
 
 
 def refine_circles(level: FloatArray, board: Board, rough_px: FloatArray, blobs: Blobs) -> BoardView | None:
