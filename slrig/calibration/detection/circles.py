@@ -224,7 +224,7 @@ def _explain_other_circles(board: Board, lattice: Lattice) -> str:
     return (
         f"another board: expected circles in {board.rows} rows of {board.columns} ({expected[1]} by {expected[0]} half "
         f"distances), found a grid of {found[1]} by {found[0]} half distances: use the other board, give the circles "
-        f"of this one as {setting('corners')} (circles in a row, then rows), or uncover its covered part"
+        f"of this one as {setting('corners')} (circles in a row, then rows), or remove what covers a part of it"
     )
 
 

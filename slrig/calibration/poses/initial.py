@@ -21,8 +21,7 @@ _MAX_SAMPLES = 2500
 _MIN_SAMPLES = 40
 _MAP_ITERATIONS = 3
 _MAX_DEVIATIONS = 3.0
-"""Correspondences with more robust standard deviations from the homography are left out."""
-
+"""Correspondences farther from the homography, in robust standard deviations, are left out."""
 _MIN_SPREAD_PX = 0.5
 MIN_SIGMA_PX = 0.03
 """Least standard deviation of a corner, even if the detector states less."""
