@@ -224,7 +224,8 @@ class BoardView:
     def __post_init__(self) -> None:
         count = len(self.corner)
         if self.points_px.shape != (count, 2) or self.sigma_px.shape != (count,):
-            message = f"a view of {count} corners, {self.points_px.shape} points and {self.sigma_px.shape} deviations"
+            shapes = f"{self.points_px.shape} and {self.sigma_px.shape}"
+            message = f"expected points_px ({count}, 2) and sigma_px ({count},) for {count} corners, found {shapes}"
             raise ValueError(message)
 
 
@@ -245,9 +246,8 @@ class Correspondences:
     def __post_init__(self) -> None:
         count = len(self.axis)
         if self.pixels_px.shape != (count, 2) or self.position_px.shape != (count,) or self.sigma_px.shape != (count,):
-            message = (
-                f"correspondences: {count} axes, {self.pixels_px.shape} pixels, {self.position_px.shape} positions"
-            )
+            shapes = f"{self.pixels_px.shape}, {self.position_px.shape} and {self.sigma_px.shape}"
+            message = f"expected pixels_px, position_px and sigma_px of length {count}, found {shapes}"
             raise ValueError(message)
 
 

@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 from slrig.calibration.board import Board, BoardView
 from slrig.calibration.detection.corners import GreyImage, RefinedCorners, fit_board_map, refine_corners
 from slrig.calibration.detection.diagnosis import (
+    MIN_FOUND_FRACTION,
     MIRROR_REMEDY,
     detect_light_first,
     detect_markers,
     explain_missing_board,
     explain_partial_board,
-    explain_unclear_board,
     homography_residual_px,
     identify_markers,
     marker_side_px,
     matching_columns,
+    require_most_corners,
 )
 from slrig.calibration.detection.lattice import (
     Lattice,
@@ -37,7 +38,6 @@ from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray, IntArray
 
 _QUICK_PX = 800
-_MIN_FOUND_FRACTION = 0.8
 _MIN_CHARUCO_CORNERS = 8
 """Fewest corners of a ChArUco board in view, over two rows and two columns at least."""
 _MIN_MARKERS, _MIN_LAYOUT_MARKERS = 3, 8
@@ -53,10 +53,7 @@ def find_chessboard(grey: GreyImage, board: Board) -> BoardView:
         raise PoseRefusedError(_explain_markers(grey, board))
     rough_px = _order_corners(grey.level, board, lattice)
     refined = refine_corners(grey.level, board, np.arange(board.corner_count, dtype=np.int32), rough_px)
-    found = 0 if refined is None else len(refined.view.corner)
-    if refined is None or found < _MIN_FOUND_FRACTION * board.corner_count:
-        raise PoseRefusedError(explain_unclear_board(grey, board, found, "corners"))
-    return refined.view
+    return require_most_corners(grey, board, None if refined is None else refined.view, "corners")
 
 
 def _find_lattice(grey: GreyImage, board: Board) -> Lattice | None:
@@ -94,7 +91,7 @@ def _is_identified(grey: GreyImage, board: Board, lattice: Lattice) -> bool:
 def _is_whole_board(lattice: Lattice, board: Board) -> bool:
     """True if the lattice is the whole board, apart from a few corners inside it."""
     size = {lattice.columns, lattice.rows}
-    return size == {board.columns, board.rows} and len(lattice.positions) >= _MIN_FOUND_FRACTION * board.corner_count
+    return size == {board.columns, board.rows} and len(lattice.positions) >= MIN_FOUND_FRACTION * board.corner_count
 
 
 def _order_corners(level: FloatArray, board: Board, lattice: Lattice) -> FloatArray:

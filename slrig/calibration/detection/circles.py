@@ -28,7 +28,7 @@ from slrig.calibration.detection.diagnosis import (
     MIRROR_REMEDY,
     explain_other_board,
     explain_partial_board,
-    explain_unclear_board,
+    require_most_corners,
 )
 from slrig.calibration.detection.lattice import (
     Blobs,
@@ -46,7 +46,6 @@ from slrig.model import FloatArray
 _CENTRE_ITERATIONS = 3
 _RING_PX, _RING_BLURS = 4.0, 3.2
 _OUTLINE_POINTS = 48
-_MIN_FOUND_FRACTION = 0.8
 _MIN_RADIUS_PX = 4.0
 _MAX_SPOT_RATIO = 2
 
@@ -61,10 +60,7 @@ def find_circles(grey: GreyImage, board: Board) -> BoardView:
     if lattice is None or rough_px is None:
         raise PoseRefusedError(_explain_circles(grey, board, blobs, lattice))
     view = refine_circles(grey.level, board, rough_px, blobs)
-    found = 0 if view is None else len(view.corner)
-    if view is None or found < _MIN_FOUND_FRACTION * board.corner_count:
-        raise PoseRefusedError(explain_unclear_board(grey, board, found, "circles"))
-    return view
+    return require_most_corners(grey, board, view, "circles")
 
 
 def refine_circles(level: FloatArray, board: Board, rough_px: FloatArray, blobs: Blobs) -> BoardView | None:
@@ -228,7 +224,7 @@ def _explain_other_circles(board: Board, lattice: Lattice) -> str:
     return (
         f"another board: expected circles in {board.rows} rows of {board.columns} ({expected[1]} by {expected[0]} half "
         f"distances), found a grid of {found[1]} by {found[0]} half distances: use the other board, give the circles "
-        f"of this one as {setting('corners')} (circles in a row, then rows), or uncover its covered part"
+        f"of this one as {setting('corners')} (circles in a row, then rows), or remove what covers a part of it"
     )
 
 

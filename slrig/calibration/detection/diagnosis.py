@@ -8,11 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import Board, BoardKind, BoardView
 from slrig.calibration.detection.corners import GreyImage
 from slrig.calibration.detection.lattice import find_chessboard_lattice, find_circle_lattice, has_markers
 from slrig.calibration.printing import charuco_board, marker_dictionary
-from slrig.errors import setting
+from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray, IntArray
 
 _LARGEST_DICTIONARIES = (
@@ -26,6 +26,8 @@ _LARGEST_DICTIONARIES = (
 """One dictionary of each usual family, the most usual first. The smaller dictionaries of a family begin with the same
 markers. Detection time grows with the size."""
 _FAMILY_PREFIXES = tuple(f"DICT_{n}X{n}_" for n in (4, 5, 6, 7))
+MIN_FOUND_FRACTION = 0.8
+"""Least fraction of the corners of a chessboard or of the circles that must be found."""
 _MIN_MARKERS, _MIN_UNORDERED_MARKERS = 4, 12
 _SEARCH_PX = 1280
 _COLUMN_RANGE = range(3, 31)
@@ -136,12 +138,16 @@ def explain_partial_board(part: str, clipped_sides: list[str], *, is_dark: bool 
     )
 
 
-def explain_unclear_board(grey: GreyImage, board: Board, found: int, what: str) -> str:
-    """Describe that the board is in view, but too few of its corners or circles can be measured."""
-    return (
-        f"{board.title}: its grid is in view, but only {found} of its {board.corner_count} {what} are clear enough to "
-        f"be measured: {grey.likely_cause()}"
-    )
+def require_most_corners(grey: GreyImage, board: Board, view: BoardView | None, what: str) -> BoardView:
+    """Return the view. Raises PoseRefusedError if it has too few of the board's corners or circles."""
+    count = 0 if view is None else len(view.corner)
+    if view is None or count < MIN_FOUND_FRACTION * board.corner_count:
+        message = (
+            f"{board.title}: its grid is in view, but only {count} of its {board.corner_count} {what} are clear "
+            f"enough to be measured: {grey.likely_cause()}"
+        )
+        raise PoseRefusedError(message)
+    return view
 
 
 def homography_residual_px(positions: FloatArray, points_px: FloatArray, *, median: bool = True) -> float:

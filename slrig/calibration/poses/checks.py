@@ -41,11 +41,7 @@ _MAX_POINTS = 250
 
 
 def draw_coverage(
-    covered: DeviceCoverage,
-    points_px: Sequence[FloatArray],
-    size: Size,
-    *,
-    outline_px: FloatArray | None = None,
+    covered: DeviceCoverage, points_px: Sequence[FloatArray], size: Size, *, outline_px: FloatArray | None = None
 ) -> RgbImage:
     """Draw the image's cells, darker with the number of poses, and the corners of every pose in its own colour.
 
@@ -55,16 +51,20 @@ def draw_coverage(
     width_px, height_px = _scaled_extent(size, WIDTH_PX)
     picture, scale = np.full((height_px, width_px, 3), _PAPER, dtype=np.uint8), width_px / size.width_px
     for row, column, box in _cell_boxes(picture):
-        count = int(covered.cells[row, column])
-        if count:
-            colour = _mix_colours(*_COVERED, min(count, _MAX_SHADED_POSES) / _MAX_SHADED_POSES)
-        else:
-            colour = _PAPER if covered.reachable[row, column] else _UNREACHABLE
+        colour: tuple[int, ...] = _PAPER if covered.reachable[row, column] else _UNREACHABLE
+        if covered.cells[row, column]:
+            fraction = min(int(covered.cells[row, column]), _MAX_SHADED_POSES) / _MAX_SHADED_POSES
+            colour = tuple(round(a + (b - a) * fraction) for a, b in zip(*_COVERED, strict=True))
         cv2.rectangle(picture, *box, colour, -1)
     for _, _, (start, end) in _cell_boxes(picture):
         cv2.rectangle(picture, start, (end[0] + 1, end[1] + 1), _LINE, 1)
     for row, column, (corner, _) in _cell_boxes(picture):
-        _write_label(picture, str(int(covered.cells[row, column])), (corner[0] + 4, corner[1] + 13))
+        # Light on dark cells.
+        position = (corner[0] + 4, corner[1] + 13)
+        background = picture[max(position[1] - 6, 0), min(position[0], picture.shape[1] - 1)]
+        colour = _PAPER if int(background.sum()) < _MAX_DARK_SUM else _INK
+        label = str(int(covered.cells[row, column]))
+        cv2.putText(picture, label, position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
     for index, points in enumerate(points_px):
         colour = _pose_colour(index)
         visible_px = points[is_in_image(points, size)]
@@ -91,8 +91,7 @@ def draw_pose(image: Pixels, view: BoardView | None, board: Board, *, width_px: 
     picture = np.ascontiguousarray(np.repeat(stretched[:, :, None], 3, axis=2))
     if view is None or not len(view.corner):
         return picture
-    row = view.corner // board.columns
-    points = _scale_points(view.points_px, scale)
+    row, points = view.corner // board.columns, _scale_points(view.points_px, scale)
     for index, point in enumerate(points):
         colour = _pose_colour(int(row[index]))
         if index and row[index] == row[index - 1]:
@@ -124,23 +123,11 @@ def _scale_points(points_px: FloatArray, scale: float) -> list[tuple[int, int]]:
     return [(round(float(x)), round(float(y))) for x, y in scaled]
 
 
-def _mix_colours(low: tuple[int, int, int], high: tuple[int, int, int], fraction: float) -> tuple[int, int, int]:
-    red, green, blue = (round(a + (b - a) * fraction) for a, b in zip(low, high, strict=True))
-    return red, green, blue
-
-
 def _pose_colour(index: int) -> tuple[int, int, int]:
     """Colour of a pose or row: hues a golden angle apart, so that neighbours differ."""
     hue = np.array([[[round(index * 137.5) % 360 / 2, 200, 190]]], dtype=np.uint8)
     red, green, blue = cv2.cvtColor(hue, cv2.COLOR_HSV2RGB)[0, 0].tolist()
     return red, green, blue
-
-
-def _write_label(picture: RgbImage, label: str, position: tuple[int, int]) -> None:
-    """Write a label, light on dark parts of the picture."""
-    background = picture[max(position[1] - 6, 0), min(position[0], picture.shape[1] - 1)]
-    colour = _PAPER if int(background.sum()) < _MAX_DARK_SUM else _INK
-    cv2.putText(picture, label, position, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
 
 
 @dataclass(frozen=True, slots=True)

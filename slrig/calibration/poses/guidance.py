@@ -318,7 +318,7 @@ class PoseCandidate:
     outline_px: FloatArray
 
 
-def pose_candidates(
+def _pose_candidates(
     device: DeviceEstimate, board: Board, *, distance_mm: float, upright_deg: float
 ) -> list[PoseCandidate]:
     """Return all poses of a small grid that the camera sees; boards other than ChArUco are seen as a whole.
@@ -332,7 +332,7 @@ def pose_candidates(
     return []
 
 
-def initial_distance_mm(device: DeviceEstimate, board: Board) -> float:
+def _initial_distance_mm(device: DeviceEstimate, board: Board) -> float:
     """Return the distance at which the board fills about half of the image."""
     width_mm, height_mm, _ = np.ptp(board.points_mm, axis=0)
     across = width_mm * device.matrix[0, 0] / device.size.width_px
@@ -350,7 +350,7 @@ def board_rotation(tilt_deg: tuple[float, float], turn_deg: float) -> FloatArray
     return np.asarray(rotation, dtype=np.float64)
 
 
-def project_points(device: DeviceEstimate, points_mm: FloatArray) -> FloatArray:
+def _project_points(device: DeviceEstimate, points_mm: FloatArray) -> FloatArray:
     """Return (..., 2) float64: image of points (..., 3) in a device's frame; NaN behind the device.
 
     Projects all candidates at once, where OpenCV takes one call each.
@@ -362,7 +362,7 @@ def project_points(device: DeviceEstimate, points_mm: FloatArray) -> FloatArray:
     return np.stack([matrix[0, 0] * across + matrix[0, 2], matrix[1, 1] * down + matrix[1, 2]], axis=-1)
 
 
-def sample_corners(board: Board, max_count: int) -> FloatArray:
+def _sample_corners(board: Board, max_count: int) -> FloatArray:
     """(n, 3) float64: some of the board's corners, evenly in both directions, the outer four included."""
     grid = board.points_mm.reshape(board.rows, board.columns, 3)
     across = max(2, min(board.columns, round(float(np.sqrt(max_count * board.columns / board.rows)))))
@@ -388,16 +388,16 @@ def _place_candidates(
     extent = np.array([device.size.width_px, device.size.height_px], dtype=np.float64)
     focal = np.array([device.matrix[0, 0], device.matrix[1, 1]])
     least, greatest = _MARGIN * extent, (1 - _MARGIN) * extent
-    outline = project_points(device, rotated + centre[:, None, :])
+    outline = _project_points(device, rotated + centre[:, None, :])
     for _ in range(_CENTRING_ITERATIONS):
         low, high = outline.min(axis=1), outline.max(axis=1)
         offset_px = np.where(place < 0, least - low, np.where(place > 0, greatest - high, (extent - low - high) / 2))
         centre[:, :2] += offset_px * depth[:, None] / focal
-        outline = project_points(device, rotated + centre[:, None, :])
+        outline = _project_points(device, rotated + centre[:, None, :])
     low, high = outline.min(axis=1), outline.max(axis=1)
     slack = 0.5 * _MARGIN * extent
     is_whole = ((low >= least - slack) & (high <= greatest + slack)).all(axis=1)
-    middle_px = project_points(device, centre[:, None, :])[:, 0]
+    middle_px = _project_points(device, centre[:, None, :])[:, 0]
     fits = is_whole if board.kind is not BoardKind.CHARUCO else is_in_image(middle_px, device.size)
     shift = centre - rotation @ board.points_mm.mean(axis=0)
     return [
@@ -409,7 +409,7 @@ def _place_candidates(
     ]
 
 
-def goals_advanced(
+def _goals_advanced(
     candidate: PoseCandidate,
     rig: RigEstimate,
     covered: Coverage,
@@ -446,7 +446,7 @@ def goals_advanced(
     return advanced
 
 
-def describe_move(candidate: PoseCandidate, camera: str, last: Attitude, upright_deg: float, period_deg: float) -> str:
+def _describe_move(candidate: PoseCandidate, camera: str, last: Attitude, upright_deg: float, period_deg: float) -> str:
     """Describe a move of the board in one clause.
 
     last : attitude of the board now; upright_deg : its usual angle; period_deg : angle after which it looks the same.
@@ -470,11 +470,11 @@ def describe_move(candidate: PoseCandidate, camera: str, last: Attitude, upright
     return ", ".join(parts)
 
 
-def describe_reasons(
+def _describe_reasons(
     camera: str, advanced: Mapping[str, Sequence[str]], worst: Mapping[str, float], expected: Mapping[str, float],
     worst_place: tuple[str, tuple[int, int]],
 ) -> str:  # fmt: skip
-    """Describe why. advanced : of `goals_advanced`; worst_place : least certain device, and the place in its image."""
+    """Describe why. advanced : of `_goals_advanced`; worst_place : least certain device, and the place in its image."""
     parts = ["parts of the image there are not covered yet"] if "cells" in advanced.get(camera, []) else []
     for name in (name for name, goals in advanced.items() if "cells" in goals and name != camera):
         image = "the projector's image" if name == PROJECTOR else f"the image of camera '{name}'"
@@ -535,7 +535,8 @@ def advise_pose(
     devices = {name: device for name, device in rig.devices.items() if device.poses}
     sensitivity = {name: _lens_sensitivity(device) for name, device in devices.items()}
     worst = {
-        name: float(_worst_sigma_px(device.information[None], sensitivity[name])[0]) for name, device in devices.items()
+        name: float(_cell_sigma_px(device.information[None], sensitivity[name]).max())
+        for name, device in devices.items()
     }
     is_certain = not covered.missing and max(worst.values()) <= GOALS.max_sigma_px
     if is_certain or len(poses) >= GOALS.max_poses:
@@ -545,16 +546,16 @@ def advise_pose(
     distance_mm = float(np.median([each.distance_mm for each in attitudes]))
     upright_deg = 90.0 * round(attitudes[0].turn_deg / 90.0)
     candidates: list[PoseCandidate] = []
-    for distance in (distance_mm, initial_distance_mm(devices[camera], board)):
-        candidates = candidates or pose_candidates(
+    for distance in (distance_mm, _initial_distance_mm(devices[camera], board)):
+        candidates = candidates or _pose_candidates(
             devices[camera], board, distance_mm=distance, upright_deg=upright_deg
         )
     if not candidates:
         return _completion_advice(covered, worst)
     added = _add_candidates(candidates, camera, rig, board)
-    after = {name: _worst_sigma_px(added.information[name], sensitivity[name]) for name in devices}
+    after = {name: _cell_sigma_px(added.information[name], sensitivity[name]).max(axis=1) for name in devices}
     advanced = [
-        goals_advanced(candidate, rig, covered, added.transforms, added.visible_px(index))
+        _goals_advanced(candidate, rig, covered, added.transforms, added.visible_px(index))
         for index, candidate in enumerate(candidates)
     ]
     total = np.sum([(after[name] / device.matrix[0, 0]) ** 2 for name, device in devices.items()], axis=0)
@@ -563,8 +564,8 @@ def advise_pose(
     if not covered.missing and float(np.sqrt(total[best] / now)) > 1 - _MIN_GAIN:
         return _completion_advice(covered, worst)
     expected = {name: float(after[name][best]) for name in devices}
-    move = describe_move(candidates[best], camera, attitudes[-1], upright_deg, symmetry_angle_deg(board))
-    reasons = describe_reasons(camera, advanced[best], worst, expected, _worst_place(devices, sensitivity, worst))
+    move = _describe_move(candidates[best], camera, attitudes[-1], upright_deg, symmetry_angle_deg(board))
+    reasons = _describe_reasons(camera, advanced[best], worst, expected, _worst_place(devices, sensitivity, worst))
     candidate = candidates[best]
     return Advice(f"{move}: {reasons}", False, camera, candidate.outline_px, candidate, worst, expected)
 
@@ -615,15 +616,11 @@ def _cell_sigma_px(information: FloatArray, sensitivity: FloatArray) -> FloatArr
     return np.asarray(np.sqrt(variance.reshape(len(information), -1, CELLS * CELLS).mean(axis=1)), dtype=np.float64)
 
 
-def _worst_sigma_px(information: FloatArray, sensitivity: FloatArray) -> FloatArray:
-    return np.asarray(_cell_sigma_px(information, sensitivity).max(axis=1), dtype=np.float64)
-
-
 def _add_candidates(
     candidates: Sequence[PoseCandidate], camera: str, rig: RigEstimate, board: Board
 ) -> _CandidateInformation:
     """Add the information of each candidate to that of each device."""
-    points_mm = sample_corners(board, _MAX_CANDIDATE_CORNERS)
+    points_mm = _sample_corners(board, _MAX_CANDIDATE_CORNERS)
     rotation = np.stack([candidate.board_pose.rotation for candidate in candidates])
     shift = np.stack([candidate.board_pose.translation_mm for candidate in candidates])
     information, transforms, points, is_visible = {}, {}, {}, {}
@@ -637,7 +634,7 @@ def _add_candidates(
             continue
         rotations = transform.rotation @ rotation
         shifts = shift @ transform.rotation.T + transform.translation_mm
-        points_px = project_points(device, points_mm @ rotations.transpose(0, 2, 1) + shifts[:, None, :])
+        points_px = _project_points(device, points_mm @ rotations.transpose(0, 2, 1) + shifts[:, None, :])
         flat = is_in_image(np.nan_to_num(points_px.reshape(-1, 2), nan=-1e9), device.size)
         visible = flat.reshape(points_px.shape[:2])
         if name != PROJECTOR and board.kind is not BoardKind.CHARUCO:

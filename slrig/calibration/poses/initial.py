@@ -21,8 +21,7 @@ _MAX_SAMPLES = 2500
 _MIN_SAMPLES = 40
 _MAP_ITERATIONS = 3
 _MAX_DEVIATIONS = 3.0
-"""Correspondences with more robust standard deviations from the homography are left out."""
-
+"""Correspondences farther from the homography, in robust standard deviations, are left out."""
 _MIN_SPREAD_PX = 0.5
 MIN_SIGMA_PX = 0.03
 """Least standard deviation of a corner, even if the detector states less."""
@@ -70,8 +69,10 @@ def projector_view(pose: PoseObservation, size: Size) -> ProjectorView:
             continue
         points_px = apply_homography(to_projector, view.points_px)
         inside = is_in_image(points_px, size)
-        sigma_px = np.full(int(inside.sum()), _projected_sigma_px(light, len(view.corner)))
-        mapped = BoardView(view.corner[inside], points_px[inside], sigma_px)
+        # The deviation of the light, averaged over the pixels per corner.
+        pixels_per_corner = max(1.0, len(light.axis) / (2 * max(len(view.corner), 1)))
+        sigma_px = max(MIN_SIGMA_PX, float(np.median(light.sigma_px)) / float(np.sqrt(pixels_per_corner)))
+        mapped = BoardView(view.corner[inside], points_px[inside], np.full(int(inside.sum()), sigma_px))
         if best is None or len(mapped.corner) > len(best.corner):
             best = mapped
     return ProjectorView(best, np.concatenate(positions))
@@ -134,12 +135,6 @@ def _subsample(light: Correspondences) -> Correspondences:
     return Correspondences(
         light.pixels_px[selected], light.axis[selected], light.position_px[selected], light.sigma_px[selected]
     )
-
-
-def _projected_sigma_px(light: Correspondences, corner_count: int) -> float:
-    """Standard deviation of a corner in the projector: that of its light, averaged over the pixels per corner."""
-    pixels_per_corner = max(1.0, len(light.axis) / (2 * max(corner_count, 1)))
-    return max(MIN_SIGMA_PX, float(np.median(light.sigma_px)) / float(np.sqrt(pixels_per_corner)))
 
 
 def _normalisation(centre: FloatArray, spread: float) -> FloatArray:
@@ -364,11 +359,6 @@ def _lens(device: DeviceEstimate) -> FloatArray:
     return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *device.distortion[:4]])
 
 
-def _with_lens(device: DeviceEstimate, lens: FloatArray) -> DeviceEstimate:
-    matrix = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1]])
-    return replace(device, matrix=matrix, distortion=np.append(lens[4:8], 0.0))
-
-
 def _prior(device: DeviceEstimate, *, free_centre: bool) -> tuple[float, FloatArray, FloatArray]:
     """Return the cost of a lens before any pose, its (8,) gradient towards the nominal lens, and the (8, 8)
     information.
@@ -433,7 +423,9 @@ def _step(device: DeviceEstimate, damping: float, *, free_centre: bool) -> tuple
         vector = cv2.Rodrigues(pose.rotation)[0].reshape(3) + step[:3]
         rotation = np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
         poses[name] = BoardPose(rotation, pose.translation_mm + step[3:])
-    return _with_lens(replace(device, poses=poses), lens + lens_step), information
+    lens = lens + lens_step
+    matrix = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1]])
+    return replace(device, matrix=matrix, distortion=np.append(lens[4:8], 0.0), poses=poses), information
 
 
 def _cost(device: DeviceEstimate, *, free_centre: bool) -> float:

@@ -1,4 +1,4 @@
-"""Spheres and planes: fits against truth that a test made, VDI/VDE 2634-2, and finding both in a scan."""
+"""Spheres and planes: fits against known truth, VDI/VDE 2634-2, and detection of both in a scan."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_too_few_points_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("error_mm", "uncertainty_mm", "told"),
+    ("error_mm", "uncertainty_mm", "expected"),
     [
         (0.01, 0.005, Decision.PASSES),
         (-0.015, 0.005, Decision.PASSES),
@@ -93,8 +93,8 @@ def test_too_few_points_are_refused() -> None:
         (0.0, 0.03, Decision.UNDECIDED),
     ],
 )
-def test_the_rule_of_decision(error_mm: float, uncertainty_mm: float, told: Decision) -> None:
-    assert decide(error_mm, 0.02, uncertainty_mm) is told
+def test_the_rule_of_decision(error_mm: float, uncertainty_mm: float, expected: Decision) -> None:
+    assert decide(error_mm, 0.02, uncertainty_mm) is expected
 
 
 def ball(count: int, x_mm: float, seed: int) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""Printed pages, measured back: on the page as a reader of PDF paints it, and in the SVG's own numbers."""
+"""Printed pages, measured in the rendered PDF and in the SVG's own numbers; boards and their numberings."""
 
 from __future__ import annotations
 

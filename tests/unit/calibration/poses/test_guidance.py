@@ -1,4 +1,4 @@
-"""What poses cover, and what to move next: the advice is measured against what a solve makes of it."""
+"""Coverage by poses and advice on the next one, measured against the result of a solve; acceptance of a pose."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def shots(shooter: Shooting, poses: Sequence[BoardPose]) -> list[PoseObservation
     return [shooter.shot(f"pose_{index:02d}", pose) for index, pose in enumerate(poses)]
 
 
-def _first(shooter: Shooting) -> list[PoseObservation]:
+def _first_observations(shooter: Shooting) -> list[PoseObservation]:
     return shots(shooter, first_poses(shooter.board))
 
 
-def _followed(shooting: Shooting, advice: Advice) -> BoardPose:
-    """The pose in the world of a person who does exactly what the outline in the picture shows."""
+def _advised_pose(shooting: Shooting, advice: Advice) -> BoardPose:
+    """The pose in the world that follows the advice exactly."""
     assert advice.camera is not None
     assert advice.candidate is not None
     camera, board_pose = shooting.devices[advice.camera], advice.candidate.board_pose
@@ -112,16 +112,16 @@ def test_a_half_turn_does_not_count_for_a_symmetric_board() -> None:
 
 def test_devices_are_estimated_from_a_few_poses() -> None:
     shooting = rig_of()
-    poses = _first(shooting)
+    poses = _first_observations(shooting)
     poses.append(shooting.shot("pose_03", held(CHESSBOARD, tilt=(-30.0, 15.0), middle_mm=(60.0, 40.0, 540.0))))
-    guess = estimate_rig(poses, CHESSBOARD, shooting.sizes)
-    for name, guessed in guess.devices.items():
+    rig = estimate_rig(poses, CHESSBOARD, shooting.sizes)
+    for name, guessed in rig.devices.items():
         truth = shooting.devices[name]
         assert guessed.matrix[0, 0] == pytest.approx(truth.matrix[0, 0], rel=0.03), name
         assert guessed.poses.keys() == {"pose_00", "pose_01", "pose_02", "pose_03"}
     # A lens shift beyond the image's edge is seen from the first poses on.
-    assert guess.devices[PROJECTOR].matrix[1, 2] == pytest.approx(860, abs=40)
-    way = guess.relative_pose("left", "right")
+    assert rig.devices[PROJECTOR].matrix[1, 2] == pytest.approx(860, abs=40)
+    way = rig.relative_pose("left", "right")
     assert way is not None
     assert way.translation_mm == pytest.approx(shooting.devices["right"].translation_mm, abs=3.0)
 
@@ -140,9 +140,9 @@ def test_a_wide_lens_is_estimated() -> None:
 def test_an_estimate_exists_for_parallel_poses_and_for_none(count: int) -> None:
     shooting = rig_of("left")
     poses = shots(shooting, [held(CHESSBOARD, middle_mm=(20.0 * index, 0.0, 600.0)) for index in range(count)])
-    guess = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
-    assert np.isfinite(guess.information).all()
-    assert guess.focal_sigma > 0.15
+    rig = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    assert np.isfinite(rig.information).all()
+    assert rig.focal_sigma > 0.15
     found = coverage(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert np.isnan(found.distance_mm).all()
     assert advise_pose(poses, CHESSBOARD, shooting.sizes).text
@@ -175,14 +175,14 @@ def test_coverage_of_a_projector_counts_only_what_a_camera_sees() -> None:
     matrix = whole.matrix + np.array([[0, 0, 512], [0, 0, 384], [0, 0, 0]])
     wide = Pinhole(Size(2048, 1536), matrix, whole.distortion, whole.rotation, whole.translation_mm)
     shooting = Shooting(CHESSBOARD, {"left": devices["left"], PROJECTOR: wide})
-    found = coverage(_first(shooting), CHESSBOARD, shooting.sizes).devices[PROJECTOR]
+    found = coverage(_first_observations(shooting), CHESSBOARD, shooting.sizes).devices[PROJECTOR]
     assert 6 <= found.reachable.sum() <= 24
     assert found.share == pytest.approx((found.cells > 0).sum() / found.reachable.sum())
 
 
 def test_open_goals_are_named() -> None:
     shooting = rig_of()
-    found = coverage(_first(shooting), CHESSBOARD, shooting.sizes)
+    found = coverage(_first_observations(shooting), CHESSBOARD, shooting.sizes)
     text = "\n".join(found.missing)
     assert "3 of at least 12 poses" in text
     assert "camera 'left': 1 of 3 distances" in text
@@ -200,13 +200,13 @@ def test_advice_before_the_first_pose() -> None:
 
 def test_advice_names_place_tilt_and_reason_with_an_outline() -> None:
     shooting = rig_of()
-    poses = _first(shooting)
+    poses = _first_observations(shooting)
     advice = advise_pose(poses, CHESSBOARD, shooting.sizes)
     assert "move the board to the" in advice.text
     assert "edge 30° towards the camera" in advice.text
     assert "not covered yet" in advice.text
     assert advice.camera is not None
-    then = shooting.shot("pose_03", _followed(shooting, advice))
+    then = shooting.shot("pose_03", _advised_pose(shooting, advice))
     outer = then.views[advice.camera].points_px[[0, 10, 87, 77]]
     assert np.abs(outer - advice.outline_px).max() < 40  # the guess from three poses is rough
     assert (advice.outline_px > 0).all()
@@ -257,7 +257,7 @@ def test_the_advised_pose_lowers_the_real_error_of_the_worst_cell_more_than_one_
     without = np.sqrt((_errors_px(shooting, board_pose, seeds) ** 2).mean())
     lazy = held(CHESSBOARD, tilt=(15.0, -10.0), middle_mm=(-10.0, 15.0, 600.0))
     with_another = np.sqrt((_errors_px(shooting, [*board_pose, lazy], seeds) ** 2).mean())
-    with_advice = np.sqrt((_errors_px(shooting, [*board_pose, _followed(shooting, advice)], seeds) ** 2).mean())
+    with_advice = np.sqrt((_errors_px(shooting, [*board_pose, _advised_pose(shooting, advice)], seeds) ** 2).mean())
     assert with_advice < 0.6 * without
     assert with_advice < 0.7 * with_another
     # What it promised: the worst cell's own figure, both coordinates of it, within a factor of two of the truth.
@@ -278,8 +278,8 @@ def test_the_stated_uncertainty_is_that_of_repeated_solves() -> None:
     ]
     poses = shots(shooting, board_pose)
     poses = [pose for pose in poses if pose.views]
-    guess = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
-    stated = np.sqrt(2) * _cell_sigma_px(guess.information[None], _lens_sensitivity(guess)).max()
+    rig = estimate_rig(poses, CHESSBOARD, shooting.sizes).devices["left"]
+    stated = np.sqrt(2) * _cell_sigma_px(rig.information[None], _lens_sensitivity(rig)).max()
     found = np.sqrt(
         (
             _errors_px(shooting, [each for each in board_pose if shooting.shot("x", each).views], range(200, 210)) ** 2
@@ -304,18 +304,18 @@ def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Bo
     shooting = rig_of(*only, board=board)
     figures = {name: SHARP for name in only if name != PROJECTOR}
     random = np.random.default_rng(7)
-    poses = _first(shooting)
+    poses = _first_observations(shooting)
     advice = advise_pose(poses, board, shooting.sizes)
     worst = [max(advice.worst_px.values())]
     while not advice.enough:
         assert len(poses) < 25
         assert sum(advice.expected_px.values()) < sum(advice.worst_px.values())
-        exact = _followed(shooting, advice)
+        exact = _advised_pose(shooting, advice)
         # A hand is off by some millimetres and degrees; a little farther away, the board is still seen whole.
         loose = turned(*random.uniform(-3, 3, 3)) @ exact.rotation
         middle = exact.rotation @ board.points_mm.mean(axis=0) + exact.translation_mm
-        by_hand = BoardPose(loose, middle * 1.03 - loose @ board.points_mm.mean(axis=0))
-        pose = shooting.shot(f"pose_{len(poses):02d}", by_hand)
+        held_pose = BoardPose(loose, middle * 1.03 - loose @ board.points_mm.mean(axis=0))
+        pose = shooting.shot(f"pose_{len(poses):02d}", held_pose)
         answer = check_pose(pose, figures, poses, board, shooting.sizes)
         assert answer.accepted, answer.refusals  # what is advised is never refused
         poses.append(pose)
@@ -330,7 +330,7 @@ def test_following_the_advice_from_three_poses_leads_to_a_complete_set(board: Bo
     assert worst[-1] <= GOALS.max_sigma_px < worst[0]
 
 
-# ---- What a person reads after a pose: each bad one is refused or warned of, with its cause and the cure
+# ---- Checks of a pose: a bad one is refused or warned of, with cause and remedy
 
 
 GOOD = held(CHESSBOARD, tilt=(-30.0, 10.0), middle_mm=(-60.0, -40.0, 570.0))
@@ -340,20 +340,20 @@ NAN = float("nan")
 
 @pytest.fixture
 def without_advice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is said of the next pose, which takes longer than all checks."""
+    """No advice, which takes longer than all checks."""
     monkeypatch.setattr(checks, "advise_pose", lambda *_, **__: None)
 
 
 def check(
     pose: PoseObservation, shooter: Shooting, earlier: list[PoseObservation], figures: ViewQuality = SHARP
 ) -> PoseAssessment:
-    """The answer to a pose; figures : of the left camera."""
+    """Check a pose; figures : of the left camera."""
     return check_pose(pose, {"left": figures, "right": SHARP}, earlier, shooter.board, shooter.sizes)
 
 
 def test_a_good_pose_is_accepted_and_measured() -> None:
     shooter = rig_of("left", "right", PROJECTOR)
-    answer = check(shooter.shot("pose_03", GOOD), shooter, _first(shooter))
+    answer = check(shooter.shot("pose_03", GOOD), shooter, _first_observations(shooter))
     assert answer.accepted
     assert answer.refusals == answer.warnings == ()
     assert answer.corners_found == {"left": 88, "right": 88}
@@ -399,7 +399,7 @@ def test_image_quality_refuses_or_warns_with_cause_and_remedy(
     figures: ViewQuality, refusals: list[str], warnings: list[str]
 ) -> None:
     shooter = rig_of("left")
-    answer = check(shooter.shot("pose_03", GOOD), shooter, _first(shooter), figures)
+    answer = check(shooter.shot("pose_03", GOOD), shooter, _first_observations(shooter), figures)
     assert answer.accepted is not bool(refusals)
     for found, expected in ((answer.refusals, refusals), (answer.warnings, warnings)):
         assert len(found) == bool(expected)
@@ -432,7 +432,7 @@ def test_the_board_s_attitude_refuses_or_warns(pose: BoardPose, corners: int, ac
     shot = shooter.shot("pose_03", pose)
     whole = shot.views["left"]
     view = BoardView(whole.corner[:corners], whole.points_px[:corners], whole.sigma_px[:corners])
-    answer = check(replace(shot, views={"left": view}), shooter, _first(shooter))
+    answer = check(replace(shot, views={"left": view}), shooter, _first_observations(shooter))
     assert answer.accepted is accepted
     messages = answer.warnings if accepted else answer.refusals
     assert any(all(part in each for part in parts) for each in messages), messages
@@ -441,7 +441,7 @@ def test_the_board_s_attitude_refuses_or_warns(pose: BoardPose, corners: int, ac
 @pytest.mark.usefixtures("without_advice")
 def test_a_board_that_not_every_device_sees_is_warned_of_or_refused() -> None:
     shooter = rig_of("left", "right", PROJECTOR)
-    pose, earlier = shooter.shot("pose_03", GOOD), _first(shooter)
+    pose, earlier = shooter.shot("pose_03", GOOD), _first_observations(shooter)
     missed = check(replace(pose, views={"left": pose.views["left"]}), shooter, earlier)
     assert missed.accepted
     assert any("camera 'right' does not see the board" in text for text in missed.warnings)
