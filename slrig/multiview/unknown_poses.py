@@ -275,7 +275,7 @@ def find_start_poses(views: Sequence[Mesh], *, names: Sequence[str] | None = Non
     """
     names = names or [f"view {number}" for number in range(len(views))]
     if len(views) < 2:
-        message = f"expected two views or more to put into one frame, found {len(views)}; scan the object turned"
+        message = f"expected two views or more, found {len(views)}; scan the object from another side"
         raise RegistrationRefusedError(message)
     search = _build_search([prepare_with_depth(view) for view in views], views, names)
     poses = search.assemble()
