@@ -23,7 +23,7 @@ def axis_of_poses(
     CalibrationError
         The calibration is of other cameras than saw the board.
     StageRefusedError
-        As `board_axis` does.
+        As `axis_from_board` does.
     """
     known = estimate_board_poses(poses, board, calibration)
     return axis_from_board(known.names, known.poses, known.covariance, board.points_mm, angles_deg)

@@ -177,7 +177,7 @@ def _registered(
     start_error_mm: float,
     begun: Callable[[int], None],
 ) -> tuple[Registration, TurntableAxis | None]:
-    """Where the views belong, and of a turntable the axis that they tell. Raises ConfigError; as `registered`."""
+    """Where the views belong, and of a turntable the axis that they tell. Raises ConfigError; as `register_views`."""
     if marked is not None:
         found = register_views(
             views, marked.poses, names=names, start_error_mm=start_error_mm, start_covariance=marked.covariance

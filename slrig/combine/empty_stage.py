@@ -10,5 +10,5 @@ from slrig.multiview import find_turntable_planes
 
 
 def planes_in(mesh: Path, axis: StageAxis | None) -> tuple[StagePlane, ...]:
-    """The planes in a mesh.ply; see `stage_planes`. Raises as that does, InvalidInputError, and StorageError."""
+    """The planes in a mesh.ply. Raises as `find_turntable_planes`, InvalidInputError, and StorageError."""
     return find_turntable_planes(read_mesh(mesh), axis)

@@ -380,10 +380,7 @@ def shrink_boundary(
     at each vertex. An edge takes the smaller λ of its two ends: a fan of long triangles increases the spacing at its
     apex, not at its rim. adjacency : (F, 3) int32, result of `neighbours`, if available.
 
-    Raises
-    ------
-    ValueError
-        The faces are not an edge-manifold mesh (see `neighbours`).
+    Raises ValueError: the faces are not an edge-manifold mesh (see `neighbours`).
     """
     points, longest = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(longest_mm, np.float64)
     faces = np.ascontiguousarray(faces)
@@ -426,10 +423,7 @@ def smooth_boundary(
     length beyond which an edge at each vertex crosses a depth edge. adjacency : (F, 3) int32, result of `neighbours`,
     if available.
 
-    Raises
-    ------
-    ValueError
-        The faces are not an edge-manifold mesh (see `neighbours`), or psi_rad is not between 0 and π.
+    Raises ValueError: the faces are not an edge-manifold mesh (see `neighbours`), or psi_rad is not between 0 and π.
     """
     if not 0.0 < psi_rad < math.pi:
         message = f"psi_rad: expected an angle between 0 and π, found {psi_rad:g}; π/2 is usual"

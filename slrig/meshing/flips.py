@@ -62,13 +62,7 @@ class Constraint(NamedTuple):
 
 
 def constraint(rule: FlipRule, gamma: float = GAMMA) -> Constraint:
-    """γ of the constrained rule, radians; the Delaunay rule ignores `gamma`.
-
-    Raises
-    ------
-    ValueError
-        gamma is not in [0, π].
-    """
+    """γ of the constrained rule, radians; the Delaunay rule ignores it. Raises ValueError: gamma is not in [0, π]."""
     if not 0 <= gamma <= math.pi:
         message = f"gamma: expected an angle from 0 to π radians, found {gamma:g}; π/6 is the paper's"
         raise ValueError(message)
@@ -193,18 +187,12 @@ def optimise_edges(
 ) -> EdgeOptimisation:
     """Flip edges until the rule keeps all of them.
 
-    Parameters
-    ----------
-    points_mm : (n, 3) float64.
-    faces : (F, 3) int32, a consistently wound manifold; vertices may be pinched.
-    gamma : radians; the Delaunay rule ignores it.
-    among : (F,) bool, the first round tests the edges of these triangles only; later rounds test around the flips.
-    adjacency : (F, 3) int32, result of `neighbours`, if available.
+    points_mm : (n, 3) float64; faces : (F, 3) int32, a consistently wound manifold; vertices may be pinched. gamma :
+    radians; the Delaunay rule ignores it. among : (F,) bool, the first turn tests the edges of these triangles only;
+    later turns test around the flips. adjacency : (F, 3) int32, result of `neighbours`, if available.
 
-    Raises
-    ------
-    ValueError
-        gamma is not in [0, π], the shapes do not fit, or the faces are not a manifold (see `neighbours`).
+    Raises ValueError: gamma is not in [0, π], the shapes do not fit, or the faces are not a manifold (see
+    `neighbours`).
     """
     points = np.ascontiguousarray(points_mm, dtype=np.float64)
     for name, array, shape in (("among", among, faces.shape[:1]), ("adjacency", adjacency, faces.shape)):

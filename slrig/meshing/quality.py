@@ -81,13 +81,7 @@ class SearchTree:
 
     @classmethod
     def build(cls, vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> SearchTree:
-        """The tree of a mesh: vertices (V, 3), faces (F, 3).
-
-        Raises
-        ------
-        ValueError
-            A vertex that a face uses is not finite.
-        """
+        """The tree of a mesh: vertices (V, 3), faces (F, 3). Raises ValueError: a vertex of a face is not finite."""
         points = np.asarray(vertices_mm, dtype=np.float64)
         centroids = (points[faces[:, 0]] + points[faces[:, 1]] + points[faces[:, 2]]) / 3
         if not np.isfinite(centroids).all():
@@ -405,10 +399,8 @@ def score(
 
     Errors are taken over points spread evenly on the mesh's area, so that extra vertices or dust cannot dilute them.
 
-    Parameters
-    ----------
-    visible_points_mm : (n, 3), points of the true surface that the camera sees and the projector lights.
-    eye_mm : (3,), the camera's centre of projection.
+    visible_points_mm : (n, 3), points of the true surface that the camera sees and the projector lights. eye_mm : (3,),
+    the camera's centre of projection.
     """
     vertices, faces = _weld_vertices(np.asarray(mesh.vertices_mm, dtype=np.float64), mesh.faces)
     collapsed = degenerate_faces(faces)

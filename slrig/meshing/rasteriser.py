@@ -59,15 +59,9 @@ def rasterise_normals(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Normal of the visible side at every pixel, and a mask of pixels that show a front.
 
-    Parameters
-    ----------
-    placed, faces : the arguments of `rasterise`.
-    normals : (V, 3) float32 of the vertices, in any frame; NaN counts as 0.
-
-    Returns
-    -------
-    normals : (H, W, 3) float32, in that frame, unit, reversed for backs; 0 without a triangle.
-    front : (H, W) bool, the triangle is counter-clockwise in the image.
+    placed, faces : the arguments of `rasterise`. normals : (V, 3) float32 of the vertices, in any frame; NaN counts as
+    0. Returns (H, W, 3) float32 normals in that frame, unit, reversed for backs, 0 without a triangle; and (H, W) bool,
+    True if the triangle is counter-clockwise in the image.
     """
     out, front = np.zeros((*view.face.shape, 3), dtype=np.float32), np.zeros(view.face.shape, dtype=np.bool_)
     given = np.ascontiguousarray(placed), np.ascontiguousarray(normals), np.ascontiguousarray(faces)

@@ -44,11 +44,8 @@ def neighbours(faces: IntArray, *, vertex_count: int) -> IntArray:
 
     Linear in F as long as no vertex has very many triangles. Faces that share only a vertex are not neighbours.
 
-    Raises
-    ------
-    ValueError
-        A face has a missing vertex or the same one twice, or two faces run along an edge in the same direction, as on
-        every edge of more than two faces.
+    Raises ValueError: a face has a missing vertex or the same one twice, or two faces run along an edge in the same
+    direction, as on every edge of more than two faces.
     """
     faces = np.ascontiguousarray(faces)
     if faces.size and (faces.min() < 0 or faces.max() >= vertex_count):

@@ -300,24 +300,24 @@ def _blend_colour(stack: Any, rows: Any, order: Any, count: int, light: Any, mar
 
     The mark is that of the heaviest of them.
     """
-    total, heaviest, worst = 0.0, -1.0, 0
+    total, heaviest, heaviest_mark = 0.0, -1.0, 0
     for allowed in range(3):
         for place in range(count):
             row = order[place]
             for corner in range(3):
                 vertex = stack.faces[int(rows[row, _FACE]), corner]
                 w = rows[row, _WEIGHT] * rows[row, _B0 + corner]
-                because = stack.mark[vertex]
-                if (allowed == 0 and because != _UNMARKED) or (allowed == 1 and because == _UNKNOWN):
+                vertex_mark = stack.mark[vertex]
+                if (allowed == 0 and vertex_mark != _UNMARKED) or (allowed == 1 and vertex_mark == _UNKNOWN):
                     continue
                 total += w
                 if w > heaviest:
-                    heaviest, worst = w, because
+                    heaviest, heaviest_mark = w, vertex_mark
                 for channel in range(3):
                     light[channel] += w * _LIGHT[stack.colour[vertex, channel]]
         if total > 0.0:
             break
-    mark[at] = worst
+    mark[at] = heaviest_mark
     for channel in range(3):
         light[channel] /= total
 
@@ -335,7 +335,7 @@ def _view_differences(
     for place in range(first, last):
         at, known = sample[place], 0
         for step in range(len(nearest)):
-            # Start with another view each time, to compare all pairs.
+            # Start with another view each time, so that all pairs are compared.
             view = (place + step) % len(nearest)
             face = nearest[view, at]
             if face < 0 or not _evaluate_view(
@@ -533,13 +533,13 @@ def _split_quads(first: int, last: int, quads: Any, points: Any, normals: Any, f
             ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
             vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
             nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            seen, outward = True, False
+            measured, outward = True, False
             for corner in range(3):
                 normal = faces[face, corner]
                 along = nx * normals[normal, 0] + ny * normals[normal, 1] + nz * normals[normal, 2]
-                seen &= not np.isnan(along)
+                measured &= not np.isnan(along)
                 outward |= along > 0.0
-            facing[face] = 0 if not seen else _OUTWARD if outward else _FOLDED
+            facing[face] = 0 if not measured else _OUTWARD if outward else _FOLDED
 
 
 def _clean_mesh(points: FloatArray, faces: IntArray, voxel_mm: float) -> IntArray:

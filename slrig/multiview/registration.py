@@ -147,7 +147,7 @@ def register_views(
     """
     names = names or [f"view {number}" for number in range(len(views))]
     if len(views) < 2:
-        message = f"expected two views or more to put into one frame, found {len(views)}; scan the object turned"
+        message = f"expected two views or more, found {len(views)}; scan the object from another side"
         raise RegistrationRefusedError(message)
     prepared = [prepare_view(view) for view in views]
     problem = _RegistrationProblem.from_starts(prepared, np.asarray(starts, dtype=np.float64), names)
@@ -173,8 +173,8 @@ class _RegistrationProblem:
         for name, view in zip(names, views, strict=True):
             if not len(view.order):
                 raise RegistrationRefusedError(
-                    f"{name}: none of its {len(view.points_mm)} vertices can be used: all lie at the mesh's boundary "
-                    "or are marked as clipped or grazed by light; scan it again."
+                    f"{name}: expected usable vertices, found none of its {len(view.points_mm)}: all are at the mesh's "
+                    "boundary or are marked as clipped or grazed by light; scan it again"
                 )
         starts = np.linalg.inv(starts[0]) @ starts
         samples = [view.points_mm[view.order[:_FIRST_SAMPLE]] for view in views]
@@ -244,8 +244,8 @@ def _iterate(problem: _RegistrationProblem, reach_mm: float) -> tuple[FloatArray
     worst = int(np.argmax(moves)) + 1
     shared = sum(len(each.sigma_mm) for pair, each in matches.items() if worst in pair)
     raise RegistrationRefusedError(
-        f"{problem.names[worst]}: expected poses that come to rest, found that it still moves by {moves.max():.3f} mm "
-        f"after {_MAX_STEPS} steps, held by {shared} matches. Scan more of what it shares with others, or leave it out"
+        f"{problem.names[worst]}: expected poses that converge, found that it still moves by {moves.max():.3f} mm "
+        f"after {_MAX_STEPS} steps, with {shared} matches. Scan more surface that others share, or leave it out"
     )
 
 
@@ -299,11 +299,10 @@ def _require_overlap(matches: Mapping[Pair, PointMatches], names: Sequence[str])
     group = connected_components(graph, directed=False)[1]
     apart = [name for name, own in zip(names, group, strict=True) if own != group[0]]
     if apart:
-        others = "any other" if len(apart) == len(names) - 1 else f"those that overlap {names[0]}"
+        others = "another view" if len(apart) == len(names) - 1 else f"a view that overlaps {names[0]}"
         message = (
-            f"{', '.join(apart)}: expected to share more than {_MIN_OVERLAP:.0%} of the surface with other views, "
-            f"found no view among {others} that it does. Check the angle, its sign and the axis, allow for a larger "
-            "error of the start, or scan between them"
+            f"{', '.join(apart)}: expected to share more than {_MIN_OVERLAP:.0%} of the surface with {others}, found "
+            "less. Check the angle, its sign and the axis, allow for a larger error of the start, or scan between them"
         )
         raise RegistrationRefusedError(message)
 

@@ -248,7 +248,7 @@ _ADVICE = (
 )
 
 
-class _Candidate(NamedTuple):
+class _CandidatePose(NamedTuple):
     """A pose (4, 4) of view `first` in the frame of view `second`, and its score."""
 
     first: int
@@ -275,7 +275,7 @@ def find_start_poses(views: Sequence[Mesh], *, names: Sequence[str] | None = Non
     """
     names = names or [f"view {number}" for number in range(len(views))]
     if len(views) < 2:
-        message = f"expected two views or more to put into one frame, found {len(views)}; scan the object turned"
+        message = f"expected two views or more, found {len(views)}; scan the object from another side"
         raise RegistrationRefusedError(message)
     search = _build_search([prepare_with_depth(view) for view in views], views, names)
     poses = search.assemble()
@@ -313,7 +313,7 @@ class _Search:
     views: Sequence[ViewWithDepth]
     names: Sequence[str]
     reach_mm: float
-    candidates: Sequence[_Candidate]
+    candidates: Sequence[_CandidatePose]
 
     def assemble(self) -> FloatArray:
         """Poses (N, 4, 4) of all views in the frame of the first.
@@ -421,13 +421,13 @@ def _build_search(prepared: Sequence[ViewWithDepth], views: Sequence[Mesh], name
     reach_mm = _REACH_SPACINGS * spacing
     candidates = []
     for i, j in combinations(range(len(prepared)), 2):
-        of_pair: list[_Candidate] = []
+        of_pair: list[_CandidatePose] = []
         for start in candidate_poses(keypoints[i], keypoints[j], within_mm=spacing, max_count=_MAX_FITTED):
             pose = align_views([ViewPair(prepared[i].view, prepared[j].view, np.eye(4), np.eye(4))], start, reach_mm)
             if all(pose_distance_mm(pose, other.pose, keypoints[i].points_mm) > spacing for other in of_pair):
                 found = compare_views(prepared[i], prepared[j], pose, reach_mm)
                 if found.agree > _MIN_AGREE * 2 * SAMPLE:
-                    of_pair.append(_Candidate(i, j, pose, _score(found)))
+                    of_pair.append(_CandidatePose(i, j, pose, _score(found)))
         candidates += sorted(of_pair, key=lambda each: -each.score)[:_MAX_CANDIDATES]
     return _Search(prepared, names, reach_mm, sorted(candidates, key=lambda each: -each.score))
 
@@ -436,7 +436,7 @@ def _score(found: PoseEvidence) -> float:
     return found.agree - _CONTRADICTION_WEIGHT * found.contradict
 
 
-def _candidate_change(each: _Candidate, poses: FloatArray) -> FloatArray:
+def _candidate_change(each: _CandidatePose, poses: FloatArray) -> FloatArray:
     """(4, 4): motion of the first view, and of all placed with it, that gives the pair its candidate pose."""
     return np.asarray(poses[each.second] @ each.pose @ np.linalg.inv(poses[each.first]))
 

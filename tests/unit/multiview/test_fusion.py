@@ -55,27 +55,27 @@ def sheet(
     )  # fmt: skip
 
 
-def test_it_is_open_where_nothing_was_seen() -> None:
+def test_the_mesh_is_open_where_no_view_has_a_surface() -> None:
     model = model_of(views_of(star(subdivisions=5), around(8)[:1], 0.3, QUIET))
     counts = topology_counts(model.mesh.faces)
     assert counts.boundary_edges > 100
     assert (counts.nonmanifold_edges, counts.components) == (0, 1)
     seen = views_of(star(subdivisions=5), around(8)[:1], 0.3, QUIET)[0]
     tree_of_view = SearchTree.build(seen.mesh.vertices_mm @ seen.pose[:3, :3].T + seen.pose[:3, 3], seen.mesh.faces)
-    # Not further beyond the view's border than half a voxel, and its own noise.
+    # At most half a voxel beyond the view's border, and its noise.
     assert tree_of_view.distances_mm(model.mesh.vertices_mm).max() < 0.8 * model.voxel_mm
 
 
-def test_the_heavier_of_two_views_that_contradict_each_other_is_right() -> None:
+def test_two_views_that_agree_outweigh_one_that_contradicts_them() -> None:
     pose = np.eye(4)
     model = fuse_views([sheet(0.0), sheet(0.15, half_mm=1.6), sheet(0.002)], [pose] * 3, voxel_mm=0.5)
     inside = np.abs(model.mesh.vertices_mm[:, :2]).max(axis=1) < 1.5
-    # The mean of the two that agree; the third one, 10 σ away, has no part in it and makes no surface of its own.
+    # The mean of the two that agree; the third, 10 σ away, does not count and adds no surface.
     assert inside.sum() > 20
     assert model.mesh.vertices_mm[inside, 2] == pytest.approx(0.001, abs=1e-4)
     assert topology_counts(model.mesh.faces).components == 1
     assert (model.views[inside] == 2).all()
-    # Two of equal σ: 10 µm between three corners, once or twice; what all views share does not shrink.
+    # Two of equal σ: 10 µm between three corners, once or twice; the error that all views share does not shrink.
     fewer = fuse_views([sheet(0.0)], [pose], voxel_mm=0.5, shared_mm=0.02)
     assert model.mesh.sigma_mm[inside].mean() == pytest.approx(0.0075 / np.sqrt(2), rel=0.2)
     assert 0.02 < fewer.mesh.sigma_mm.min() < 0.022
@@ -88,11 +88,11 @@ def test_the_two_sides_of_a_wall_do_not_cancel() -> None:
     assert (model.mesh.normals[:, 2] * np.where(model.mesh.vertices_mm[:, 2] > -0.3, 1, -1) > 0.9).all()
 
 
-def test_colours_are_mixed_as_light_and_marked_ones_only_where_there_is_no_other() -> None:
+def test_colours_are_mixed_as_light_and_marked_ones_only_if_there_are_no_others() -> None:
     pose = np.eye(4)
     light = srgb_to_linear(np.array([50, 200], np.uint8)).astype(float)
     views = [sheet(0, colour=50), sheet(0, colour=200, sigma_mm=0.02)]
-    for view in views:  # most of the surface looks alike to both: they have one scale
+    for view in views:  # most of the surface is equal in both: they have one scale
         view.colour[np.abs(view.vertices_mm[:, 0]) > 1.9] = 100
     mixed = fuse_views(views, [pose] * 2, voxel_mm=0.5)
     inner = np.abs(mixed.mesh.vertices_mm[:, :2]).max(axis=1) < 1.2
@@ -105,7 +105,7 @@ def test_colours_are_mixed_as_light_and_marked_ones_only_where_there_is_no_other
     assert (marked.mesh.colour[inner] == 50).all()
     assert not marked.mesh.mark[inner].any()
     assert (fuse_views([sheet(0, mark=2)], [pose], voxel_mm=0.5).mesh.mark == 2).all()
-    # A vertex without a normal has a neutral colour, which is none: a clipped one tells more.
+    # A vertex without a normal has a placeholder colour: that of a clipped one is better.
     bad = fuse_views([sheet(0, colour=60, mark=AlbedoMark.SATURATED), sheet(0, colour=128, mark=AlbedoMark.UNKNOWN)],
                 [pose] * 2, voxel_mm=0.5).mesh  # fmt: skip
     inner = np.abs(bad.vertices_mm[:, :2]).max(axis=1) < 3
@@ -124,7 +124,7 @@ def test_a_painted_ball_has_one_scale_its_own_colours_and_no_seams() -> None:
     for view, scale in zip(views_of(star(), around(8), 0.2), scales, strict=True):
         placed = view.mesh.vertices_mm @ view.pose[:3, :3].T + view.pose[:3, 3]
         colour, mark = linear_to_srgb(scale * paint(placed)), np.zeros(len(placed), np.uint8)
-        # A lobe that every camera sees clipped somewhere else, and a band that all see clipped.
+        # A lobe that each camera clips elsewhere, and a band that all clip.
         lobe = random.uniform(size=3) - 0.5
         clipped = placed @ (lobe / np.linalg.norm(lobe)) > 7
         mark[clipped | (np.abs(placed[:, 1] - 3) < 0.8)] = AlbedoMark.SATURATED
@@ -133,17 +133,17 @@ def test_a_painted_ball_has_one_scale_its_own_colours_and_no_seams() -> None:
     mesh = model_of(views).mesh
     clean = mesh.mark == AlbedoMark.NONE
     band = np.abs(mesh.vertices_mm[:, 1] - 3)
-    # An edge that a camera sees steeply may reach into the band from outside.
+    # A steep edge may reach into the band from outside.
     assert (mesh.mark[band < 0.5] == AlbedoMark.SATURATED).mean() > 0.95
-    assert clean[band > 1.2].mean() > 0.97  # the rest one view alone has seen, and clipped
+    assert clean[band > 1.2].mean() > 0.97  # the rest is in one view only, and clipped
     true = paint(mesh.vertices_mm.astype(float))[clean]
     off = srgb_to_linear(mesh.colour[clean]) / 65535 / true
     assert np.median(off) == pytest.approx(scales.min(), rel=0.02)
-    # Where views end there is no step: all vertices have the colour, not most of them.
+    # No step at the ends of views: all vertices have the colour, not most of them.
     assert np.quantile(np.abs(off / np.median(off) - 1), (0.5, 0.99)) == pytest.approx((0, 0), abs=0.03)
 
 
-def test_what_cannot_be_fused_is_refused() -> None:
+def test_views_that_cannot_be_fused_are_refused() -> None:
     view, pose = sheet(0.0), np.eye(4)
     with pytest.raises(ValueError, match="one pose for each of the 1 views, found 2"):
         fuse_views([view], [pose, pose])
@@ -162,11 +162,11 @@ def test_what_cannot_be_fused_is_refused() -> None:
         fuse_views([replace(view, sigma_mm=np.full_like(view.sigma_mm, np.nan))], [pose])
 
 
-def test_the_poses_part_of_a_variance_is_that_of_all_pairs_by_matrices() -> None:
+def test_the_variance_by_poses_equals_that_of_all_pairs_by_matrices() -> None:
     random = np.random.default_rng(4)
     views = [sheet(0.001 * k) for k in range(4)]
     root, middle = random.normal(size=(24, 24)) * 1e-3, np.array([1.0, -2.0, 0.5])
-    seen = stack_views(views, [np.eye(4)] * 4, border_limit_mm=0.5)
+    stack = stack_views(views, [np.eye(4)] * 4, border_limit_mm=0.5)
     points = np.array([[0.1, 0.2, 0.0], [1.3, -0.7, 0.01], [-2.1, 1.9, -0.01]])
     nearest = np.array(
         [
@@ -174,14 +174,14 @@ def test_the_poses_part_of_a_variance_is_that_of_all_pairs_by_matrices() -> None
                 first + np.argmin(((view.vertices_mm[view.faces].mean(axis=1) - point) ** 2).sum(axis=1))
                 for point in points
             ]
-            for first, view in zip(seen.first_face[:-1], views, strict=True)
+            for first, view in zip(stack.first_face[:-1], views, strict=True)
         ],
         dtype=np.int32,
     )
 
     def variance(covariance: FloatArray) -> FloatArray:
         rule = FusionSettings(0.001, 0.001, 0.0, 1.0, 0.5, PoseErrors(covariance, middle))
-        return np.asarray(average_views(seen, points, nearest, rule, values_only=False).sigma_mm ** 2)
+        return np.asarray(average_views(stack, points, nearest, rule, values_only=False).sigma_mm ** 2)
 
     normal = np.array([0.0, 0.0, 1.0])
     g = np.hstack([np.cross(points - middle, normal), np.tile(normal, (3, 1))])
@@ -191,7 +191,7 @@ def test_the_poses_part_of_a_variance_is_that_of_all_pairs_by_matrices() -> None
     np.testing.assert_allclose(variance(root @ root.T) - variance(np.zeros((24, 24))), expected, rtol=1e-9)
 
 
-def test_quadrangles_are_halved_and_judged_as_by_arrays() -> None:
+def test_split_quadrangles_equal_those_by_arrays() -> None:
     random = np.random.default_rng(5)
     points, normals = random.normal(size=(2, 60, 3))
     points[7], normals[11] = np.nan, np.nan

@@ -31,7 +31,7 @@ RULE = FusionSettings(
 
 
 @pytest.fixture(scope="module")
-def seen() -> StackedViews:
+def stack() -> StackedViews:
     views = views_of(plate_on_box(), around(VIEWS), 0.9)
     return stack_views(
         [view.mesh for view in views], [view.pose for view in views], border_limit_mm=RULE.full_weight_mm
@@ -51,22 +51,22 @@ def plain_nearest(point: FloatArray, triangle: FloatArray) -> tuple[float, Float
     return min(found, key=lambda each: each[0])
 
 
-def plain_value(seen: StackedViews, point: FloatArray, nearest: list[int]) -> tuple[float, float, int]:
-    """Mean value, σ and number of views, by the rules of the module's docstring."""
+def plain_value(stack: StackedViews, point: FloatArray, nearest: list[int]) -> tuple[float, float, int]:
+    """Mean value, σ and number of views."""
     rows = []
     for view, face in ((view, face) for view, face in enumerate(nearest) if face >= 0):
-        corners = seen.faces[face]
-        gap, weights = plain_nearest(point, seen.points_mm[corners])
-        normal = weights @ seen.normals[corners].astype(float)
+        corners = stack.faces[face]
+        gap, weights = plain_nearest(point, stack.points_mm[corners])
+        normal = weights @ stack.normals[corners].astype(float)
         normal /= np.linalg.norm(normal)
-        offset = point - weights @ seen.points_mm[corners]
-        inset = weights @ seen.border_distance_mm[corners].astype(float)
+        offset = point - weights @ stack.points_mm[corners]
+        inset = weights @ stack.border_distance_mm[corners].astype(float)
         zero = weights == 0
-        border = any(zero[k] and seen.open_edges[face] >> k & 1 for k in range(3)) or (zero.sum() == 2 and inset == 0)
+        border = any(zero[k] and stack.open_edges[face] >> k & 1 for k in range(3)) or (zero.sum() == 2 and inset == 0)
         along = float(normal @ offset)
         beyond = np.sqrt(max(gap**2 - along**2, 0)) if border else 0.0
         if beyond <= RULE.border_reach_mm:
-            sigma = weights * seen.sigma_mm[corners]
+            sigma = weights * stack.sigma_mm[corners]
             share = max(min(inset / RULE.full_weight_mm, 1), 0.01)
             w = share / (sigma.sum() ** 2 + RULE.correlated_mm**2)
             value = along if border else np.copysign(gap, along)
@@ -83,7 +83,7 @@ def plain_value(seen: StackedViews, point: FloatArray, nearest: list[int]) -> tu
     variance = (w**2 * [row[3] + RULE.own_mm**2 for row in rows]).sum() / w.sum() ** 2 + RULE.shared_mm**2
     mean = np.sum([each * row[4] for each, row in zip(w, rows, strict=True)], axis=0)
     mean /= np.linalg.norm(mean)
-    moves = np.zeros(6 * VIEWS)  # how the mean moves along its normal with turns and shifts of the views
+    moves = np.zeros(6 * VIEWS)  # gradient of the mean's displacement along its normal
     for each, row in zip(w / w.sum(), rows, strict=True):
         moves[6 * row[6] : 6 * row[6] + 6] = each * np.append(np.cross(point - POSES.middle_mm, mean), mean)
     variance += moves @ POSES.covariance @ moves
@@ -91,50 +91,50 @@ def plain_value(seen: StackedViews, point: FloatArray, nearest: list[int]) -> tu
     return value, float(np.sqrt(variance)), max(1, sum(row[5] == 0 for row in rows))
 
 
-def distances(seen: StackedViews, view: int, points: FloatArray) -> FloatArray:
-    faces = seen.faces[seen.first_face[view] : seen.first_face[view + 1]]
-    return SearchTree.build(seen.points_mm, faces).distances_mm(points)
+def distances(stack: StackedViews, view: int, points: FloatArray) -> FloatArray:
+    faces = stack.faces[stack.first_face[view] : stack.first_face[view + 1]]
+    return SearchTree.build(stack.points_mm, faces).distances_mm(points)
 
 
-def told(seen: StackedViews, points: FloatArray, nearest: np.ndarray) -> FloatArray:
-    """Distance to the triangle that is said to be nearest, infinite for none."""
+def stated_distances(stack: StackedViews, points: FloatArray, nearest: np.ndarray) -> FloatArray:
+    """Distance to the stated nearest triangle, infinite for none."""
     return np.array(
         [
-            plain_nearest(point, seen.points_mm[seen.faces[face]])[0] if face >= 0 else np.inf
+            plain_nearest(point, stack.points_mm[stack.faces[face]])[0] if face >= 0 else np.inf
             for point, face in zip(points, nearest, strict=True)
         ]
     )
 
 
-def test_the_nearest_triangle_is_that_of_the_search_tree(seen: StackedViews) -> None:
-    grid = build_grid(seen, VOXEL_MM)
-    cells = corners_near_surface(seen, grid)
+def test_nearest_triangles_equal_those_of_the_search_tree(stack: StackedViews) -> None:
+    grid = build_grid(stack, VOXEL_MM)
+    cells = corners_near_surface(stack, grid)
     corners = corner_positions_mm(grid, cells)
-    nearest = nearest_triangles_to_corners(seen, grid, corners, cells)
+    nearest = nearest_triangles_to_corners(stack, grid, corners, cells)
     random = np.random.default_rng(0)
     inside = corners + VOXEL_MM * random.uniform(0, 1, corners.shape)
-    within = nearest_triangles(seen, grid, inside, cells, reach_mm=VOXEL_MM)
+    within = nearest_triangles(stack, grid, inside, cells, reach_mm=VOXEL_MM)
     some = random.choice(len(cells), 400, replace=False)
     for view in range(len(nearest)):
-        true = distances(seen, view, corners[some])
+        true = distances(stack, view, corners[some])
         near = true < 0.86 * VOXEL_MM
         assert near.sum() > 50
-        got = told(seen, corners[some], nearest[view, some])
+        got = stated_distances(stack, corners[some], nearest[view, some])
         assert got[near] == pytest.approx(true[near], abs=1e-9)
-        # Further off it is one of those about, and never one that is nearer than the nearest.
+        # Further off it is any of those around, and never nearer than the nearest.
         assert (got[~near] >= true[~near] - 1e-9).all()
-        true, got = distances(seen, view, inside[some]), told(seen, inside[some], within[view, some])
+        true, got = distances(stack, view, inside[some]), stated_distances(stack, inside[some], within[view, some])
         assert got == pytest.approx(np.where(true < VOXEL_MM, true, np.inf), abs=1e-9)
 
 
-def test_every_cell_that_a_triangle_passes_through_is_known_in_full(seen: StackedViews) -> None:
-    grid = build_grid(seen, VOXEL_MM)
-    cells = corners_near_surface(seen, grid)
-    nearest = nearest_triangles_to_corners(seen, grid, corner_positions_mm(grid, cells), cells)
+def test_every_cell_that_a_triangle_passes_through_has_all_corners(stack: StackedViews) -> None:
+    grid = build_grid(stack, VOXEL_MM)
+    cells = corners_near_surface(stack, grid)
+    nearest = nearest_triangles_to_corners(stack, grid, corner_positions_mm(grid, cells), cells)
     random = np.random.default_rng(1)
-    weights = random.dirichlet(np.ones(3), len(seen.faces))
+    weights = random.dirichlet(np.ones(3), len(stack.faces))
     steps = np.floor(
-        (np.einsum("fk,fkd->fd", weights, seen.points_mm[seen.faces]) - grid.origin_mm) / VOXEL_MM
+        (np.einsum("fk,fkd->fd", weights, stack.points_mm[stack.faces]) - grid.origin_mm) / VOXEL_MM
     ) + np.argwhere(np.ones((2, 2, 2))).reshape(8, 1, 3)
     place = {
         tuple(step): at
@@ -143,18 +143,18 @@ def test_every_cell_that_a_triangle_passes_through_is_known_in_full(seen: Stacke
         )
     }
     for view in range(len(nearest)):
-        for face in range(seen.first_face[view], seen.first_face[view + 1]):
+        for face in range(stack.first_face[view], stack.first_face[view + 1]):
             assert all(nearest[view, place[tuple(steps[corner, face].astype(int))]] >= 0 for corner in range(8))
 
 
-def test_the_mean_is_that_of_plain_numpy(seen: StackedViews) -> None:
-    grid = build_grid(seen, VOXEL_MM)
-    cells = corners_near_surface(seen, grid)
+def test_the_mean_equals_that_by_plain_numpy(stack: StackedViews) -> None:
+    grid = build_grid(stack, VOXEL_MM)
+    cells = corners_near_surface(stack, grid)
     corners = corner_positions_mm(grid, cells)
-    nearest = nearest_triangles_to_corners(seen, grid, corners, cells)
-    means = average_views(seen, corners, nearest, RULE, values_only=False)
+    nearest = nearest_triangles_to_corners(stack, grid, corners, cells)
+    means = average_views(stack, corners, nearest, RULE, values_only=False)
     some = np.random.default_rng(2).choice(len(cells), 500, replace=False)
-    expected = [plain_value(seen, corners[at], nearest[:, at].tolist()) for at in some]
+    expected = [plain_value(stack, corners[at], nearest[:, at].tolist()) for at in some]
     value, sigma, views = (np.array(each) for each in zip(*expected, strict=True))
     assert 5 < np.isnan(value).sum() < 400
     assert (views > 1).sum() > 50

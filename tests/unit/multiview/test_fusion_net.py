@@ -1,4 +1,4 @@
-"""The dual mesh of fields that cross cells in every way there is."""
+"""The surface net of fields that cross cells in every possible way."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def block() -> Grid:
 
 
 def flat(field: FloatArray) -> FloatArray:
-    """A (24, 24, 24) field by flat index."""
+    """A (24, 24, 24) field by cell index."""
     return np.ascontiguousarray(field.reshape(3, 8, 3, 8, 3, 8).transpose(0, 2, 4, 1, 3, 5)).ravel()
 
 
@@ -37,7 +37,7 @@ def triangles(made: SurfaceNet) -> IntArray:
 
 
 def fans(faces: IntArray, vertex: int) -> int:
-    """How many fans of triangles meet in a vertex: triangles that share an edge at it are of one."""
+    """Number of fans of triangles at a vertex: triangles that share an edge at it belong to one fan."""
     ends = [set(face) - {vertex} for face in faces[(faces == vertex).any(axis=1)].tolist()]
     count = 0
     while ends:
@@ -52,7 +52,7 @@ def fans(faces: IntArray, vertex: int) -> int:
 def test_a_random_field_gives_a_closed_manifold(density: float) -> None:
     random = np.random.default_rng(0)
     field = random.uniform(0.1, 1, (24, 24, 24)) * np.where(random.uniform(size=(24, 24, 24)) < density, -1, 1)
-    # Outside all about: nothing can be open.
+    # Outside all around: nothing can be open.
     field[[0, -1]] = field[:, [0, -1]] = field[:, :, [0, -1]] = 1.0
     made = extract_net(block(), flat(field))
     counts = topology_counts(triangles(made))
@@ -65,7 +65,7 @@ def test_a_random_field_gives_a_closed_manifold(density: float) -> None:
     assert (np.diff(made.cells) >= 0).all()
 
 
-def test_a_ball_is_where_it_is_and_faces_outward() -> None:
+def test_a_ball_has_its_place_and_volume_and_faces_outward() -> None:
     place = 0.5 * np.argwhere(np.ones((24, 24, 24))).reshape(24, 24, 24, 3)
     # The first brick is (1, 1, 1), four millimetres from the origin.
     middle = np.array([6.1, 5.8, 6.3])

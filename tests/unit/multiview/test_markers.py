@@ -20,7 +20,7 @@ UP = Rotation.align_vectors([AXIS, [1.0, 0.0, 0.03]], [[0, 0, 1], [1, 0, 0]], we
 
 
 def plate(side_mm: float = 12.0) -> FloatArray:
-    """(12, 4, 3): markers in a ring of 45 mm on the stage, in the frame of the first view."""
+    """(12, 4, 3): markers in a ring of 45 mm on the turntable, in the frame of the first view."""
     angles = np.deg2rad(30.0 * np.arange(12))
     middles = 45 * np.stack([np.cos(angles), np.sin(angles), np.zeros(12)], axis=1)
     square = side_mm / 2 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
@@ -30,7 +30,7 @@ def plate(side_mm: float = 12.0) -> FloatArray:
 def seen(
     markers: FloatArray, noise_mm: float = 0.0, *, stated_mm: float = 0.05, seed: int = 0
 ) -> list[MarkerObservations]:
-    """Each view has the seven markers before the object, in its own frame."""
+    """Each view sees the seven markers in front of the object, in its own frame."""
     random = np.random.default_rng(seed)
     views: list[MarkerObservations] = []
     for pose in POSES:
@@ -66,16 +66,16 @@ def test_poses_are_exact_without_noise_and_within_their_covariance_with_it() -> 
     assert 0.7 < np.mean(over) < 1.3, over
     assert 0.01 < found.sigma_mm[1:].max() < 0.2
     assert found.sigma_mm[0] == 0
-    # Corners that are three times as far off as they say make poses known so much less well.
+    # Corners with three times the stated error triple the uncertainty of the poses.
     optimistic = [solved(seen(plate(), 0.15, seed=seed)).sigma_mm.max() for seed in range(3)]
     assert np.mean(optimistic) == pytest.approx(3 * found.sigma_mm.max(), rel=0.3)
 
 
-def test_what_moved_is_found_and_named_and_the_poses_are_right_without_it() -> None:
+def test_moved_markers_are_rejected_and_named_and_the_poses_are_right_without_them() -> None:
     views = [dict(view) for view in seen(plate(), 0.05, seed=3)]
     shared = [m for m in views[2] if m in views[3]]
     shift = np.array([0.8, 0.0, 0.0])
-    # One that slid in one view, and two that were taken for one another.
+    # One slid in one view, and two were exchanged.
     slid, (a, b) = shared[0], [m for m in views[5] if sum(m in view for view in views) > 3][:2]
     views[2][slid] = views[2][slid]._replace(corners_mm=views[2][slid].corners_mm + shift)
     views[5][a], views[5][b] = views[5][b], views[5][a]
@@ -85,7 +85,7 @@ def test_what_moved_is_found_and_named_and_the_poses_are_right_without_it() -> N
     assert slid not in found.used[2]
     wrong = motions(found)
     assert wrong @ np.linalg.solve(found.covariance, wrong) / len(wrong) < 2
-    # Of two views neither is known to be the one that is right.
+    # With two views it is unknown which of them is right.
     found = solved(views[2:4], first=2)
     assert {(each.view, each.marker) for each in found.rejected} == {(0, slid), (1, slid)}
 
@@ -95,7 +95,7 @@ def test_views_that_share_too_little_are_named() -> None:
     views[2] = {m + 100: each for m, each in views[2].items()}
     with pytest.raises(RegistrationRefusedError, match=r"^view 2: .* view 0 sees markers .*; view 2 sees markers 10"):
         solved(views)
-    # One marker of 12 mm beside the object does, for what it is worth; one of 2 mm does not.
+    # One marker of 12 mm next to the object is enough, with a large uncertainty; one of 2 mm is not.
     for side_mm, does in ((12.0, True), (2.0, False)):
         pair = seen(plate(side_mm), 0.02)[:2]
         one = next(iter(pair[0].keys() & pair[1].keys()))

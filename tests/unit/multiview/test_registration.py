@@ -25,21 +25,21 @@ def three() -> Turned:
     return seen(bumpy, ANGLES, pitch_mm=1.0)
 
 
-def test_three_views_come_to_where_they_belong_from_a_wrong_axis(three: Turned) -> None:
+def test_three_views_are_registered_from_a_wrong_axis(three: Turned) -> None:
     views, starts = three.noisy(1, length_mm=2.0), wrong_axis(ANGLES)
     found = register_views(views, starts)
     wrong = [displacement_mm(*each) for each in zip(views, found.poses, three.poses, strict=True)]
     assert displacement_mm(views[2], starts[2], three.poses[2]) > 1.0
     assert wrong[0] == 0.0
     assert max(wrong) < 0.012
-    # What is stated is what is there, and each pair is told with figures of its own.
+    # The stated uncertainty is right, and each pair has its own figures.
     assert max(wrong) < 3 * found.sigma_mm.max()
     assert found.free == ()
     by_pair = {(each.first, each.second): each for each in found.pairs}
     assert set(by_pair) == {(0, 1), (0, 2), (1, 2)}
     assert by_pair[0, 1].overlap > by_pair[0, 2].overlap > 0.19
     assert all(0.9 < each.rms_over_sigma < 1.2 and each.closure_mm < 0.02 for each in found.pairs)
-    # The stage's axis is found from the object itself.
+    # The turntable's axis is found from the object itself.
     axis = axis_from_registration(found, AXIS)
     assert axis is not None
     aside = np.cross(axis.point_mm - AXIS_POINT_MM, AXIS)
@@ -48,7 +48,7 @@ def test_three_views_come_to_where_they_belong_from_a_wrong_axis(three: Turned) 
     assert np.rad2deg(axis.angles_rad) == pytest.approx(ANGLES, abs=0.02)
 
 
-def test_a_vase_may_turn_about_its_axis_and_is_held_at_the_angle_told() -> None:
+def test_a_vase_is_free_to_turn_about_its_axis_and_keeps_the_starting_angle() -> None:
     turned = seen(vase, ANGLES, pitch_mm=1.0)
     views, starts = turned.noisy(1, length_mm=2.0), wrong_axis(ANGLES)
     found = register_views(views, starts)
@@ -56,7 +56,7 @@ def test_a_vase_may_turn_about_its_axis_and_is_held_at_the_angle_told() -> None:
     for each in found.free:
         assert np.linalg.norm(np.cross(each.direction, AXIS)) < 0.01
         assert each.free_mm > 1.0
-    # The turn is the start's, to the second order of the axis's error, and all else is found.
+    # The angle is the start's, to the second order of the axis's error, and all else is found.
     for pose, start, true in zip(found.poses[1:], starts[1:], turned.poses[1:], strict=True):
         change, left = pose[:3, :3] @ start[:3, :3].T, pose[:3, :3] @ true[:3, :3].T
         assert abs(_turn_about(AXIS, change)) < np.deg2rad(0.005)
@@ -88,7 +88,7 @@ def test_a_view_of_another_shape_is_named(three: Turned) -> None:
         register_views(views, three.poses, names=["front", "side", "other side"])
 
 
-def test_what_is_marked_or_lies_at_the_boundary_is_no_source(three: Turned) -> None:
+def test_marked_and_boundary_vertices_are_not_matched(three: Turned) -> None:
     mesh = three.exact[0]
     usable = prepare_view(mesh).usable
     assert 0 < (~usable).sum() < len(usable) / 2
@@ -108,7 +108,7 @@ def sheet(high: int, *, folded: bool = False) -> Mesh:
 
 
 @pytest.mark.parametrize(("high", "rows"), [(40, 5), (20, 3), (10, 2), (6, 1)])
-def test_what_lies_beside_a_border_is_no_source_but_half_of_a_narrow_surface_is(high: int, rows: int) -> None:
+def test_rows_next_to_a_border_are_not_matched_but_half_of_a_narrow_surface_is(high: int, rows: int) -> None:
     usable = prepare_view(sheet(high)).usable.reshape(high, 400)
     middle = np.zeros_like(usable)
     middle[rows:-rows, rows:-rows] = True
@@ -116,7 +116,7 @@ def test_what_lies_beside_a_border_is_no_source_but_half_of_a_narrow_surface_is(
 
 
 @pytest.mark.parametrize(("high", "left"), [(40, [*range(5, 194), *range(205, 395)]), (10, list(range(2, 398)))])
-def test_what_lies_beside_a_sharp_bend_is_no_source_unless_there_is_little(high: int, left: list[int]) -> None:
+def test_rows_next_to_a_sharp_bend_are_not_matched_unless_few_vertices_remain(high: int, left: list[int]) -> None:
     assert np.flatnonzero(prepare_view(sheet(high, folded=True)).usable.reshape(high, 400)[high // 2]).tolist() == left
     assert prepare_view(sheet(high, folded=True), whole=True).usable.reshape(high, 400)[high // 2, 1:-1].all()
 
@@ -127,10 +127,10 @@ def _turn_about(axis: FloatArray, turn: FloatArray) -> float:
     return float(axis @ np.array([skew[2, 1], skew[0, 2], skew[1, 0]]))
 
 
-def test_a_turntable_takes_views_back_to_the_first() -> None:
+def test_turntable_poses_turn_views_back_to_the_first() -> None:
     point = np.array([1.0, 2.0, 3.0])
     first, second = turntable_poses(point, np.array([0.0, 0.0, 2.0]), np.deg2rad([10.0, 100.0]))
     assert first == pytest.approx(np.eye(4))
-    # What the stage turned from x to y comes back to x; the axis stays.
+    # A point that the turntable took from x to y comes back to x; the axis is fixed.
     assert second @ np.array([1.0, 3.0, 3.0, 1.0]) == pytest.approx([2.0, 2.0, 3.0, 1.0])
     assert second[:3, :3] @ point + second[:3, 3] == pytest.approx(point)

@@ -1,4 +1,4 @@
-"""The axis of a stage from made poses of a board, whose noise is known, and as models improve it."""
+"""The axis of a turntable from synthetic poses of a board with known noise, and its updates by models."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOISE = np.repeat([2e-4, 0.03], 3)
 def shot(
     angles_deg: FloatArray, seed: int = 0, slipped: tuple[slice, float] = (slice(0), 0.0)
 ) -> tuple[list[str], FloatArray, FloatArray]:
-    """Poses of the board on a stage, off by noise, some slipped by mm along the board; and the noise's covariance."""
+    """Poses of the board on a turntable with noise, some slipped by mm along the board; and their covariance."""
     rng = np.random.default_rng(seed)
     first = np.eye(4)
     first[:3, :3] = Rotation.from_euler("xyz", [70, 10, 4], degrees=True).as_matrix()
@@ -43,8 +43,8 @@ def shot(
     return [f"pose {number}" for number in range(1, len(angles_deg) + 1)], poses, covariance
 
 
-def axis_found(angles_deg: FloatArray, seed: int = 0, told: FloatArray | None = None) -> BoardAxis:
-    return axis_from_board(*shot(angles_deg, seed), DEFAULT_BOARD.points_mm, told)
+def axis_found(angles_deg: FloatArray, seed: int = 0, stated: FloatArray | None = None) -> BoardAxis:
+    return axis_from_board(*shot(angles_deg, seed), DEFAULT_BOARD.points_mm, stated)
 
 
 def off(found: MeasuredAxis, covariance: FloatArray) -> float:
@@ -58,7 +58,7 @@ def off(found: MeasuredAxis, covariance: FloatArray) -> float:
     return float(errors @ np.linalg.solve(known @ covariance @ known.T, errors)) / 4
 
 
-def test_the_axis_is_off_by_what_is_stated() -> None:
+def test_the_error_of_the_axis_is_as_stated() -> None:
     squares = []
     for seed in range(20):
         found = axis_found(SIX_DEG, seed).axis
@@ -66,16 +66,16 @@ def test_the_axis_is_off_by_what_is_stated() -> None:
     assert 0.7 < np.mean(squares) < 1.5
 
 
-def test_what_is_left_of_each_pose_is_its_noise_and_the_angles_are_the_stages() -> None:
-    found = axis_found(SIX_DEG, told=SIX_DEG + np.array([0, 0.5, 0, 0, 0, 0]))
+def test_residuals_are_the_noise_and_errors_those_of_the_stated_angles() -> None:
+    found = axis_found(SIX_DEG, stated=SIX_DEG + np.array([0, 0.5, 0, 0, 0, 0]))
     assert max(found.residual_mm.values()) < 0.1
     assert list(found.angles_deg.values()) == pytest.approx((SIX_DEG + 180) % 360 - 180, abs=0.1)
     assert found.errors_deg["pose 2"] == pytest.approx(-0.5 * 5 / 6, abs=0.1)
 
 
-def test_the_sense_of_told_angles_is_that_of_the_axis() -> None:
+def test_the_sense_of_stated_angles_is_that_of_the_axis() -> None:
     assert axis_found(SIX_DEG).axis.direction @ DIRECTION > 0.99
-    assert axis_found(SIX_DEG, told=-SIX_DEG).axis.direction @ DIRECTION < -0.99
+    assert axis_found(SIX_DEG, stated=-SIX_DEG).axis.direction @ DIRECTION < -0.99
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,9 @@ def test_the_sense_of_told_angles_is_that_of_the_axis() -> None:
         (SIX_DEG, (slice(1, None, 2), 3.0), "off by .* mm rms, 'pose"),
     ],
 )
-def test_what_tells_no_axis_is_refused(angles_deg: FloatArray, slipped: tuple[slice, float], words: str) -> None:
+def test_poses_that_determine_no_axis_are_refused(
+    angles_deg: FloatArray, slipped: tuple[slice, float], words: str
+) -> None:
     with pytest.raises(StageRefusedError, match=words):
         axis_from_board(*shot(angles_deg, 1, slipped), DEFAULT_BOARD.points_mm)
 
@@ -96,7 +98,7 @@ def test_what_tells_no_axis_is_refused(angles_deg: FloatArray, slipped: tuple[sl
 def measured(
     offset_mm: float, tilt_rad: float, sigma_mm: float, sigma_rad: float, along_mm: float = 0.0
 ) -> MeasuredAxis:
-    """An axis that is off the truth, known that well at a point along it."""
+    """An axis with an error, and its uncertainty at a point along it."""
     across = np.linalg.svd(DIRECTION[None])[2][1:]
     direction = DIRECTION + tilt_rad * across[0]
     direction /= np.linalg.norm(direction)
@@ -105,7 +107,7 @@ def measured(
     return MeasuredAxis(POINT_MM + offset_mm * across[0] + along_mm * direction, direction, covariance)
 
 
-def test_models_improve_the_axis_by_what_they_know() -> None:
+def test_models_improve_the_axis_by_their_covariance() -> None:
     found = update_axis(measured(0.1, 0.0, 0.1, 1e-3), measured(-0.01, 1e-4, 0.01, 1e-4, along_mm=80.0))
     assert found.agrees
     # At its point the new axis is off by -0.002 mm, and 50 mm on by 0.005 mm more.
@@ -116,7 +118,7 @@ def test_models_improve_the_axis_by_what_they_know() -> None:
     assert np.sqrt(np.trace(found.axis.covariance[:3, :3]) / 2) == pytest.approx(0.01, rel=0.1)
 
 
-def test_an_axis_elsewhere_leaves_the_record_as_it_was() -> None:
+def test_an_axis_elsewhere_leaves_the_record_unchanged() -> None:
     record = measured(0.0, 0.0, 0.02, 1e-4)
     found = update_axis(record, measured(0.5, 0.0, 0.01, 1e-4))
     assert not found.agrees
@@ -124,7 +126,7 @@ def test_an_axis_elsewhere_leaves_the_record_as_it_was() -> None:
     assert found.sigmas > 10
 
 
-def test_a_record_follows_a_stage_that_drifts() -> None:
+def test_a_record_follows_a_turntable_that_drifts() -> None:
     record = measured(0.0, 0.0, 0.005, 5e-5)
     for number in range(60):
         found = update_axis(record, measured(0.004 * number, 0.0, 0.005, 5e-5))

@@ -1,4 +1,4 @@
-"""The planes of an empty stage in made scans, and views that are cut by them."""
+"""The planes of an empty turntable in synthetic scans, and views that are cut by them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PLATE = patch(STAGE_MM, UP, 120.0, 0.03)
 WALL = patch(STAGE_MM + np.array([0.0, -60.0, 90.0]), BACK, 150.0, 0.05, 1)
 
 
-def test_plate_and_backdrop_are_found_and_told_apart() -> None:
+def test_plate_and_backdrop_are_found_and_distinguished() -> None:
     wall, plate = find_turntable_planes(joined(PLATE, WALL), AXIS)
     assert (wall.kind, plate.kind) == (PlaneKind.BACKDROP, PlaneKind.PLATE)
     for plane, normal, sigma_mm, through in ((wall, BACK, 0.05, WALL), (plate, UP, 0.03, PLATE)):
@@ -54,7 +54,7 @@ def test_plate_and_backdrop_are_found_and_told_apart() -> None:
     assert {plane.kind for plane in find_turntable_planes(joined(PLATE, WALL))} == {PlaneKind.BACKDROP}
 
 
-def test_a_cut_leaves_the_object_and_says_what_went() -> None:
+def test_a_cut_leaves_the_object_and_reports_the_removed_share() -> None:
     planes = find_turntable_planes(joined(PLATE, WALL), AXIS)
     thing = ball(STAGE_MM + 15 * UP, 12.0)
     found = cut_view(joined(PLATE, thing, WALL), planes)
@@ -63,7 +63,7 @@ def test_a_cut_leaves_the_object_and_says_what_went() -> None:
     assert sum(found.removed) == pytest.approx(1 - len(thing.vertices_mm) / sum(map(_count, (PLATE, thing, WALL))))
 
 
-def test_of_what_stands_on_the_plate_the_margin_alone_is_lost() -> None:
+def test_an_object_on_the_plate_loses_only_the_margin() -> None:
     (plate,) = find_turntable_planes(PLATE, AXIS)
     box_side = patch(STAGE_MM + 20 * UP, np.array([0.0, 0.6, -0.8]), 40.0, 0.0)
     height = (cut_view(box_side, [plate]).mesh.vertices_mm - STAGE_MM) @ UP
@@ -71,7 +71,7 @@ def test_of_what_stands_on_the_plate_the_margin_alone_is_lost() -> None:
     assert height.max() == pytest.approx(((box_side.vertices_mm - STAGE_MM) @ UP).max())
 
 
-def test_a_plate_that_leans_is_cut_as_high_as_it_rises() -> None:
+def test_a_tilted_plate_is_cut_as_high_as_it_rises() -> None:
     leaning = UP + np.array([0.01, 0.0, 0.0])
     (plate,) = find_turntable_planes(patch(STAGE_MM, leaning / np.linalg.norm(leaning), 120.0, 0.03), AXIS)
     assert plate.kind is PlaneKind.PLATE
@@ -83,7 +83,7 @@ def test_a_scan_without_a_plane_is_refused() -> None:
         find_turntable_planes(ball(STAGE_MM, 40.0), AXIS)
 
 
-def test_a_view_of_nothing_but_the_stage_is_refused_by_name() -> None:
+def test_a_view_of_the_empty_turntable_is_refused_by_name() -> None:
     with pytest.raises(StageRefusedError, match=r"side: .* leave 0\.0% of the view \(backdrop 61%, plate 39%\)"):
         cut_view(joined(PLATE, WALL), find_turntable_planes(joined(PLATE, WALL), AXIS), name="side")
 

@@ -24,7 +24,7 @@ def three() -> list[View]:
 
 
 @pytest.mark.slow
-def test_views_come_to_where_they_belong_without_a_start(three: list[View]) -> None:
+def test_views_are_registered_without_a_start(three: list[View]) -> None:
     found = find_start_poses([view.mesh for view in three])
     for view, pose in zip(three, found, strict=True):
         assert displacement_mm(view.mesh, pose, np.linalg.inv(three[0].pose) @ view.pose) < 0.03
@@ -41,19 +41,19 @@ def test_a_vase_is_refused_with_what_to_do(three: list[View]) -> None:
         find_start_poses([three[0].mesh, views[0].mesh])
 
 
-def test_a_surface_before_what_a_camera_saw_is_told(three: list[View]) -> None:
+def test_a_surface_in_front_of_the_depth_buffer_contradicts_a_pose(three: list[View]) -> None:
     one, two = (prepare_with_depth(view.mesh) for view in three[:2])
     true = np.linalg.inv(three[1].pose) @ three[0].pose
     right = compare_views(one, two, true, 3.0)
     assert right.agree > 300
     assert right.contradict < right.agree / 20
     nearer = true.copy()
-    nearer[2, 3] -= 60.0  # towards the second camera: nothing is near enough to be compared, and all stands before it
+    nearer[2, 3] -= 60.0  # towards the second camera: no surface is near, and all of it is in front of the other
     wrong = compare_views(one, two, nearer, 3.0)
     assert wrong.contradict > 200 > 20 * wrong.agree
 
 
-def test_a_pose_from_points_is_no_mirror() -> None:
+def test_a_pose_from_points_is_never_a_reflection() -> None:
     random = np.random.default_rng(1)
     points = random.normal(size=(5, 4, 3))
     turn, shift = Rotation.random(rng=random).as_matrix(), random.normal(size=3)
