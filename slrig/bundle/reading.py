@@ -93,7 +93,6 @@ class BundleFiles:
 
 def read_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle:
     """Return the bundle in `folder`; `calibration_file` replaces its calibration.json.
-
     Raises BundleError: bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key;
     CalibrationError: the calibration is malformed, not finite, or made for devices of another size.
     """
@@ -116,7 +115,6 @@ def open_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle
 
 def read_capture(folder: Path) -> Capture:
     """Return the frames of the bundle in `folder`, without its calibration, for solving one.
-
     Raises BundleError: bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key.
     """
     description = read_description(folder)
