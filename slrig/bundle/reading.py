@@ -21,7 +21,7 @@ CALIBRATION = "calibration.json"
 MAX_READERS = 4  # threads that decode files at the same time
 
 _Pages = tuple[dict[int, Pixels], dict[int | str, Pixels]]
-"""Grey by page; colour by page, or by the name of a file of its own."""
+"""Grey by page; colour by page, or by the name of a separate file."""
 
 
 @dataclass(frozen=True, slots=True)
