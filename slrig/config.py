@@ -180,7 +180,6 @@ class RigConfig:
 
 def read_rig(path: Path) -> RigConfig:
     """Return the rig that a TOML file describes.
-
     Raises ConfigError: the file is missing or not TOML, or any of its keys is unknown or wrong; all faults in one
     message.
     """
@@ -196,7 +195,6 @@ def read_rig(path: Path) -> RigConfig:
 
 def parse_rig(data: Mapping[str, Any], path: Path) -> RigConfig:
     """Return the rig that the data of a TOML file describe. path : of the file, which need not exist.
-
     Raises ConfigError: any key is unknown or wrong; all faults in one message.
     """
     table = validate(RigTable, data, f"the rig file {path}")

@@ -147,7 +147,6 @@ def open_rig(config: RigConfig) -> Rig:
 
     Faults of the rig file are reported for all devices together. The calibration is that of the rig file or, without
     one, that of the head.
-
     Raises DriverNotFoundError: no installed package provides a driver of that name; DriverBrokenError: a driver cannot
     be loaded, or fails with an error that is not of slrig; ConfigError: a driver refuses the options of the rig file
     (several faults, unknown drivers among them, are one message); CalibrationError: the calibration is malformed, or
@@ -361,7 +360,6 @@ def _package_version(entry: importlib.metadata.EntryPoint) -> tuple[str, str]:
 
 def driver_kinds(driver: str) -> tuple[str, ...]:
     """Return the kinds of device that a driver of that name opens: "camera", "projector", "head", "positioner".
-
     Raises DriverNotFoundError: no installed package provides a driver of that name.
     """
     names = {
@@ -382,7 +380,6 @@ def driver_kinds(driver: str) -> tuple[str, ...]:
 
 def option_model(driver: str) -> type[BaseModel] | None:
     """Return the model of a driver's options; None if its package declares none.
-
     Raises DriverBrokenError: it cannot be loaded, is not a pydantic model, or several packages declare one.
     """
     entries = list(importlib.metadata.entry_points(group=OPTIONS_GROUP, name=driver))

@@ -77,7 +77,7 @@ class NothingToReconstructError(SlrigError, code="nothing-to-reconstruct"):
 
 
 class DeviceError(SlrigError, code="device"):
-    """A camera or projector did not do what it was told to do. Raise a child if one fits.
+    """A camera or projector did not do what the caller requested. Raise a child if one fits.
 
     place : the device and the call, added to the message; None if the message names them.
     """
@@ -248,7 +248,7 @@ class OutOfMemoryError(SlrigError, code="out-of-memory"):
 
 
 class ScanInterruptedError(SlrigError, code="scan-interrupted"):
-    """The service ended during this scan: stopped, killed, or without power. Nobody cancelled the scan; a cancelled one
+    """The service ended during this scan: stopped, killed, or without power. It was not cancelled: a cancelled one
     is a ScanCancelledError.
     """
 

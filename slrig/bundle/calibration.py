@@ -71,7 +71,6 @@ MAX_DEVICES = 16
 
 def read_file_storage(text: str, path: Path) -> dict[str, Value]:
     """Return the maps, numbers, texts and matrices (float64) of a FileStorage text; `path` is for messages.
-
     Raises CalibrationError, with the line: the text is cut, of another layout, or beyond a limit.
     """
     builder = _TreeBuilder(path)
@@ -321,7 +320,6 @@ def read_opencv_calibration(path: Path) -> Calibration:
 
 def write_opencv_calibration(path: Path, calibration: Calibration) -> None:
     """Write a calibration as OpenCV FileStorage, completely or not at all; the name ends in yml, yaml or xml.
-
     Raises CalibrationError: the ending is another one, or FileStorage or this layout cannot hold the name of a camera;
     StorageError: the disk refused.
     """
@@ -381,7 +379,6 @@ def _read_device(value: Value, path: Path, name: str) -> Pinhole:
 
 def five_distortion_terms(distortion: FloatArray, path: Path, name: str) -> FloatArray:
     """(5,) float64: k1, k2, p1, p2 and k3 of OpenCV's coefficients, 4 or more.
-
     Raises CalibrationError: there are fewer, or one beyond k3 is not 0.
     """
     terms = distortion.ravel()
@@ -516,7 +513,6 @@ class CalibrationEntry(Strict):
 
 def read_calibration(path: Path) -> Calibration:
     """Return the calibration in a file: slrig's JSON, or OpenCV FileStorage if the name ends in yml, yaml or xml.
-
     Raises CalibrationError: the file is missing, cut, has an unknown key or a number that is not finite; all faults in
     one message.
     """
@@ -550,7 +546,6 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
 def check_calibration(calibration: Calibration, projector: Size, cameras: Mapping[str, Size], source: str) -> None:
     """Compare a calibration with the devices that it will be used for. source : its origin, for messages.
-
     Raises CalibrationError: it was made for devices of another size, or has none of the cameras.
     """
     faults = [
@@ -570,7 +565,6 @@ def check_calibration(calibration: Calibration, projector: Size, cameras: Mappin
 
 def require_two_rays(calibration: Calibration, cameras: Collection[str], source: str) -> None:
     """Check that with these cameras the calibration has two rays for each point. source : its origin, for messages.
-
     Raises CalibrationError: it has no projector, and only one of the cameras.
     """
     known = [name for name in cameras if name in calibration.cameras]

@@ -129,7 +129,6 @@ class Description(Strict):
 
 def read_description(folder: Path) -> Description:
     """Return the validated description of the bundle in `folder`.
-
     Raises BundleError: every fault of bundle.json in one message.
     """
     path = folder / DESCRIPTION

@@ -75,7 +75,6 @@ TIFF_FAULTS = (
 
 def count_tiff_pages(data: bytes) -> int:
     """Return the number of pages of a TIFF, by following the chain of its directories before any of them is read.
-
     Raises ValueError with a description of a chain that leads out of the file, is circular or does not end.
     """
     order = "<" if data.startswith(b"II") else ">"
@@ -221,7 +220,6 @@ def _table_numbers(segment: bytes) -> set[int]:
 
 def encode_frame(image: Pixels, name: str) -> bytes:
     """Encode a frame, (H, W) or, blue, green and red, (H, W, 3) uint8 or uint16, as PNG. name : for messages.
-
     Raises BundleError: the image has another shape or type.
     """
     kind = {(): PNG_GREY, (3,): PNG_COLOUR}.get(image.shape[2:])
@@ -275,7 +273,6 @@ def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[i
 
 def read_colour(path: Path, camera: CameraFormat) -> Pixels:
     """Return the colour picture in a file, (H, W, 3) of blue, green and red.
-
     Raises BundleError: see `read_pages`; or the picture is grey, or a sample is above the camera's full scale.
     """
     found = read_with_colour(path, (0,), camera, colour_pages=(0,))[1]
@@ -315,7 +312,6 @@ def read_with_colour(
 
 def read_frame_format(path: Path) -> CameraFormat:
     """Return extent and bits of the samples, 8 or 16, of the first page of a frame file, from its header alone.
-
     Raises BundleError: the file is missing or cut, or `read_pages` does not read it.
     """
     data = _read_bytes(path)

@@ -323,7 +323,6 @@ class RegionTable(Strict):
 
 def read_region(path: Path) -> RegionTable:
     """Return the region in a TOML file with the same keys. A mask may be the path of a PNG, relative to the file.
-
     Raises ConfigError: the file cannot be read or is not a region, with every fault in one message.
     """
     return validate(RegionTable, embed_masks(read_toml(path, MAX_REGION_BYTES), path.parent), str(path))
@@ -331,7 +330,6 @@ def read_region(path: Path) -> RegionTable:
 
 def embed_masks(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return a region table with the contents of the masks that it names by paths relative to `folder`.
-
     Raises ConfigError: a mask cannot be read.
     """
     masks = table.get("masks")

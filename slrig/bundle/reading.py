@@ -21,7 +21,7 @@ CALIBRATION = "calibration.json"
 MAX_READERS = 4  # threads that decode files at the same time
 
 _Pages = tuple[dict[int, Pixels], dict[int | str, Pixels]]
-"""Grey by page; colour by page, or by the name of a file of its own."""
+"""Grey by page; colour by page, or by the name of a separate file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,6 @@ class BundleFiles:
 
 def read_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle:
     """Return the bundle in `folder`; `calibration_file` replaces its calibration.json.
-
     Raises BundleError: bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key;
     CalibrationError: the calibration is malformed, not finite, or made for devices of another size.
     """
@@ -116,7 +115,6 @@ def open_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle
 
 def read_capture(folder: Path) -> Capture:
     """Return the frames of the bundle in `folder`, without its calibration, for solving one.
-
     Raises BundleError: bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key.
     """
     description = read_description(folder)

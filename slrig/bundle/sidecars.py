@@ -48,7 +48,6 @@ def write_health(folder: Path, stamp: Mapping[str, Any]) -> None:
 
 def read_health(folder: Path) -> dict[str, Any] | None:
     """Return the health stamp of a bundle, None if it has none.
-
     Raises BundleError: the file cannot be read, or is not a JSON object.
     """
     path = folder / HEALTH_FILE
@@ -120,7 +119,6 @@ class RefusedList(Strict):
 
 def read_refused(folder: Path) -> tuple[RefusedFrame, ...]:
     """Return the frames that were refused during the capture, without their images.
-
     Raises BundleError: the list exists but is not as slrig wrote it.
     """
     path = folder / REFUSED_FOLDER / REFUSED_LIST
@@ -201,7 +199,6 @@ def write_truth(folder: Path, truth: Truth) -> None:
 
 def read_truth(folder: Path) -> BundleTruth | None:
     """Return the truth of a bundle, or None if there is none.
-
     Raises BundleError: one of its files is missing, cut, or of another shape.
     """
     if not (folder / SURFACE_FILE).exists() and not (folder / VISIBLE_POINTS_FILE).exists():

@@ -70,7 +70,6 @@ def sync_tree(folder: Path, *, except_folder: str = "") -> None:
 
 def write_file(path: Path, data: bytes | bytearray, *, durable: bool = True) -> None:
     """Replace the file `path` by `data`, completely or not at all.
-
     Raises StorageError: the disk refused; the old file is unchanged. durable : False in a folder that `sync_tree`
     flushes later.
     """

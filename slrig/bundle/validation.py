@@ -75,7 +75,6 @@ Described = TypeVar("Described", bound=BaseModel)
 
 def read_text(path: Path, max_bytes: int, error: type[InvalidInputError]) -> str:
     """Return the text of a small UTF-8 file.
-
     Raises InvalidInputError, of the class `error`: the file is missing, larger than `max_bytes`, or not text.
     """
     try:
@@ -97,7 +96,6 @@ def read_text(path: Path, max_bytes: int, error: type[InvalidInputError]) -> str
 
 def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
     """Return the data of a strict JSON text: no NaN, no infinity, no duplicate key.
-
     Raises InvalidInputError, of the class `error`, with the line of the fault.
     """
 
@@ -143,7 +141,6 @@ def validate(
     model: type[Described], data: object, name: str, *, hint: str = "", error: type[InvalidInputError] = ConfigError
 ) -> Described:
     """Return `data` as a `model`.
-
     Raises InvalidInputError, of the class `error`: says that `name` is wrong, lists every fault, and ends with `hint`.
     """
     try:
@@ -156,7 +153,6 @@ def read_json_model(
     path: Path, model: type[Described], name: str, *, max_bytes: int, error: type[InvalidInputError]
 ) -> Described:
     """Return the contents of a JSON file as a `model`.
-
     Raises InvalidInputError, of the class `error`: see `read_text` and `read_json`; or the file is not a valid `name`,
     with every fault in one message.
     """

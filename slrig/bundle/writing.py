@@ -39,7 +39,6 @@ class BundleWriter:
     The bundle grows in a hidden folder next to `folder`, which is renamed when the block ends without an error. Any
     error, in the block or on the disk, removes it: the folder is complete or absent. Only `keep` leaves the bundle of
     an aborted capture, with a statement of that. captured_at : start of the capture, with the offset from UTC.
-
     Raises BundleError: `folder` exists already, a camera's name cannot be a file's name, or no frame was added;
     StorageError: the disk refused.
     """
@@ -90,7 +89,6 @@ class BundleWriter:
 
     def add(self, shot: Shot) -> None:
         """Write one frame to disk. A frame that replaces a refused one takes its entry in the list.
-
         Raises BundleError: the frame names an unknown pattern or camera, or does not have the format of that camera;
         StorageError: the disk refused.
         """
@@ -112,7 +110,6 @@ class BundleWriter:
 
     def refuse(self, refused: RefusedFrame) -> None:
         """Store a refused frame separately: the one given, or the one that was added before, withdrawn.
-
         Raises StorageError: the disk refused.
         """
         file = f"{REFUSED_FOLDER}/{len(self._refused):03d}.png"

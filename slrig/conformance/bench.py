@@ -381,7 +381,6 @@ def default_settings(camera: Camera) -> CameraSettings:
 
 def measure_reference_levels(white: list[Pixels], black: list[Pixels], *, full_scale: int) -> ReferenceLevels:
     """Find the pixels that the projector lights, from two or more frames of each; the last ones count.
-
     Raises ExpectationError: white is not brighter than black anywhere.
     """
     shapes = {image.shape for image in (*white, *black)}

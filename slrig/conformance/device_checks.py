@@ -167,7 +167,7 @@ def calibration_and_truth_fit_the_devices(bench: RigBench) -> None:
         )
     truth = rig.truth()
     if truth is not None:
-        shapes = {name: seen.depth_mm.shape for name, seen in truth.cameras.items()}
+        shapes = {name: camera.depth_mm.shape for name, camera in truth.cameras.items()}
         expect(
             shapes == {name: size.shape for name, size in sizes.items()},
             expected=f"the truth is for {_list_sizes(sizes)}",

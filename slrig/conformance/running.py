@@ -122,7 +122,6 @@ def run_checks(
     projector can show, white and black first. progress : called with the check, the fraction done and a detail before
     and after each check, in the caller's thread. limit_s : time limit of a check; None is a minute, and more for long
     exposures.
-
     Raises the errors of opening the rig for the first time.
     """
     start_s = time.monotonic()

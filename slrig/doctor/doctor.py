@@ -66,7 +66,7 @@ class Diagnosis:
 
     @property
     def healthy(self) -> bool:
-        """True if there is no fault."""
+        """True if there are no faults."""
         return not self.with_severity(Severity.FAULT)
 
     def with_severity(self, severity: Severity) -> tuple[Finding, ...]:

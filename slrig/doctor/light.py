@@ -248,7 +248,6 @@ def measure_light(
     session: CameraSession, sequence: PatternSequence, *, displays: str
 ) -> tuple[LightMeasurement | None, list[Finding]]:
     """Measure white and black at a suitable exposure, and check that the camera sees the patterns' structure.
-
     Returns the measurement, None if the camera does not see the projector, and the findings.
 
     sequence : with white, black, and Gray patterns with their inverses. displays : sentence about the displays that

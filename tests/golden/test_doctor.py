@@ -118,7 +118,7 @@ DEFECTS = {
 }
 
 
-def written(folder: Path, defect: Planted) -> Path:
+def write_rig_file(folder: Path, defect: Planted) -> Path:
     """A rig file with the defect; an option that is there already is replaced."""
     (folder / "board.toml").write_text(BOARD)
     text = RIG
@@ -145,7 +145,7 @@ def own_sequence(rig: Rig) -> PatternSequence:
     return encode(patterns, size)
 
 
-def examined(path: Path) -> Diagnosis:
+def run_doctor(path: Path) -> Diagnosis:
     """Examine a rig, and see that its projector is dark afterwards."""
     displays = (FoundDevice("screen", "DP-2", "a projector (1280 x 800)"),)
     with open_rig(read_rig(path)) as rig:
@@ -158,23 +158,23 @@ def examined(path: Path) -> Diagnosis:
 
 @pytest.mark.parametrize("name", DEFECTS)
 def test_a_planted_defect_is_named_and_none_is_invented(tmp_path: Path, name: str) -> None:
-    diagnosis = examined(written(tmp_path, DEFECTS[name]))
-    told = [each for each in diagnosis.findings if each.severity is not Severity.OK]
-    words = "; ".join(f"{each.severity} {each.name}: {each.found}" for each in told) or "nothing"
+    diagnosis = run_doctor(write_rig_file(tmp_path, DEFECTS[name]))
+    findings = [each for each in diagnosis.findings if each.severity is not Severity.OK]
+    words = "; ".join(f"{each.severity} {each.name}: {each.found}" for each in findings) or "nothing"
     sys.stdout.write(f"{name:32} {words[:150]}\n")
-    assert {each.name for each in told} == DEFECTS[name].named
-    assert all(each.remedy for each in told)
+    assert {each.name for each in findings} == DEFECTS[name].named
+    assert all(each.remedy for each in findings)
     if name == "second display swapped":
-        assert "DP-2 (a projector (1280 x 800))" in told[0].remedy
+        assert "DP-2 (a projector (1280 x 800))" in findings[0].remedy
 
 
-def test_what_is_measured_is_what_was_planted(tmp_path: Path) -> None:
+def test_the_planted_values_are_measured(tmp_path: Path) -> None:
     defect = planted(
         projector="gamma = 2.2\nrefresh_hz = 60.0",
         faults="light_delay_s = 0.04",
         head=MAINS.format(hz=100.0),
     )
-    found = examined(written(tmp_path, defect))
+    found = run_doctor(write_rig_file(tmp_path, defect))
     assert found.response is not None
     assert found.response.gamma == pytest.approx(2.2, abs=0.06)
     assert found.refresh_hz == pytest.approx(60.0, abs=0.02)
@@ -190,15 +190,15 @@ def test_what_is_measured_is_what_was_planted(tmp_path: Path) -> None:
 
 def test_the_rig_file_that_it_writes_scans_where_the_old_one_did_not(tmp_path: Path) -> None:
     defect = planted(faults="light_delay_s = 0.04", head="exposure_s = 0.08")
-    path = written(tmp_path, defect)
+    path = write_rig_file(tmp_path, defect)
     (tmp_path / "new").mkdir()
     better = tmp_path / "new" / "better.toml"
     shown = CliRunner().invoke(app, ["doctor", str(path), "--output", str(better)])
     assert shown.exit_code == 1, shown.output
-    told = " ".join(shown.stdout.split())
-    assert "2 faults, no notes" in told
-    assert "white is saturated on" in told
-    assert "do use the table [synchronisation] of the rig file" in told
+    output = " ".join(shown.stdout.split())
+    assert "2 faults, no notes" in output
+    assert "white is saturated on" in output
+    assert "do use the table [synchronisation] of the rig file" in output
     with open_rig(read_rig(path)) as rig, pytest.raises(ScanEvidenceError):
         list(capture(rig, own_sequence(rig)))
     with open_rig(read_rig(better)) as rig:
@@ -214,11 +214,11 @@ def test_the_rig_file_that_it_writes_scans_where_the_old_one_did_not(tmp_path: P
 
 
 def test_a_projector_that_is_unplugged_is_a_finding(tmp_path: Path) -> None:
-    path = written(tmp_path, planted(faults="unplug_projector_at_show = 60"))
+    path = write_rig_file(tmp_path, planted(faults="unplug_projector_at_show = 60"))
     with open_rig(read_rig(path)) as rig:
         diagnosis = examine(rig, own_sequence=own_sequence(rig))
-    [told] = diagnosis.with_severity(Severity.FAULT)
-    assert told.name == "device.failed"
-    assert "the projector is gone" in told.found
-    # What was found before that is told all the same.
+    [finding] = diagnosis.with_severity(Severity.FAULT)
+    assert finding.name == "device.failed"
+    assert "the projector is gone" in finding.found
+    # Earlier findings are reported too.
     assert any(each.name == "exposure.range" for each in diagnosis.findings)

@@ -110,7 +110,7 @@ def test_a_camera_must_have_a_name_fit_for_files(tmp_path: Path, name: str) -> N
         BundleWriter(tmp_path / "scan", capture.projector, capture.patterns, {name: CameraFormat(CAMERA, 8)})
 
 
-def _described(folder: Path, frames: list[dict[str, object]], bit_depth: int = 8) -> None:
+def _describe(folder: Path, frames: list[dict[str, object]], bit_depth: int = 8) -> None:
     folder.mkdir()
     (folder / "bundle.json").write_text(
         json.dumps(
@@ -131,7 +131,7 @@ def _described(folder: Path, frames: list[dict[str, object]], bit_depth: int = 8
 
 
 def test_optional_keys_may_be_absent(tmp_path: Path) -> None:
-    _described(tmp_path / "scan", [{"pattern": 0, "camera": "cam0", "file": "a.png"}] * 2)
+    _describe(tmp_path / "scan", [{"pattern": 0, "camera": "cam0", "file": "a.png"}] * 2)
     assert cv2.imwrite(str(tmp_path / "scan/a.png"), np.full(CAMERA.shape, 7, np.uint8))
     capture = read_bundle(tmp_path / "scan").capture
     gray, line = capture.patterns[1:]
@@ -146,7 +146,7 @@ def test_pages_of_a_tiff_are_frames(tmp_path: Path) -> None:
     frames: list[dict[str, object]] = [
         {"pattern": 0, "camera": "cam0", "file": "all.tif", "page": page} for page in (3, 0, 4, 0)
     ]
-    _described(tmp_path / "scan", frames, bit_depth=12)
+    _describe(tmp_path / "scan", frames, bit_depth=12)
     images = [noise(CameraFormat(CAMERA, 12), seed) for seed in range(5)]
     with tifffile.TiffWriter(tmp_path / "scan/all.tif", bigtiff=True, byteorder=">") as tiff:
         for image in images:
@@ -160,7 +160,7 @@ def test_pages_of_a_tiff_are_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize("ending", ["png", "tif"])
 def test_colour_becomes_grey(tmp_path: Path, kind: type[np.unsignedinteger], ending: str) -> None:
     bits = 8 * np.dtype(kind).itemsize
-    _described(tmp_path / "scan", [{"pattern": 0, "camera": "cam0", "file": f"a.{ending}"}], bit_depth=bits)
+    _describe(tmp_path / "scan", [{"pattern": 0, "camera": "cam0", "file": f"a.{ending}"}], bit_depth=bits)
     rng = np.random.default_rng(3)
     bgr = rng.integers(0, 2**bits, (*CAMERA.shape, 3)).astype(kind)
     assert cv2.imwrite(str(tmp_path / f"scan/a.{ending}"), bgr)
@@ -298,7 +298,7 @@ def test_a_frame_that_failed_first_keeps_its_place(tmp_path: Path) -> None:
     assert [path.name for path in sorted((folder / "refused").iterdir())] == ["000.png", "refused.json"]
 
 
-def test_only_what_is_taken_back_is_taken_back(tmp_path: Path) -> None:
+def test_only_the_withdrawn_frame_is_withdrawn(tmp_path: Path) -> None:
     # The same pattern at two exposures, as a bracket has it: a frame that did not come leaves the other one alone.
     folder = tmp_path / "bundle"
     with writer(folder) as bundle:
@@ -378,7 +378,7 @@ def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cause", [errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EIO])
-def test_a_disk_that_refuses_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: int) -> None:
+def test_a_disk_that_refuses_leaves_the_old_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: int) -> None:
     path = tmp_path / "mesh.ply"
     path.write_bytes(b"before")
 

@@ -81,11 +81,11 @@ def test_an_enormous_png_is_refused_from_its_header(folder: Path, monkeypatch: p
     unpacked = []
     real = images._inflate
 
-    def inflated(packed: bytearray | memoryview, most_bytes: int) -> bytes | None:
+    def inflate(packed: bytearray | memoryview, most_bytes: int) -> bytes | None:
         unpacked.append(most_bytes)
         return real(packed, most_bytes)
 
-    monkeypatch.setattr(images, "_inflate", inflated)
+    monkeypatch.setattr(images, "_inflate", inflate)
     before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     _fault(folder, "frames/left/002.png", "expected 40 x 30", "found 20000 x 20000", "replace the frame")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 64 * 1024
@@ -357,7 +357,7 @@ def test_very_many_faults_are_counted(folder: Path) -> None:
     ],
     ids=["empty", "text", "cut", "nan", "infinity", "overflow", "twice", "deep", "list", "long number"],
 )
-def test_what_is_no_description_is_refused(folder: Path, text: str, parts: tuple[str, ...]) -> None:
+def test_a_text_that_is_not_a_description_is_refused(folder: Path, text: str, parts: tuple[str, ...]) -> None:
     (folder / "bundle.json").write_text(text)
     _fault(folder, "bundle.json", *parts)
 
@@ -392,7 +392,7 @@ def test_frames_are_read_without_a_bad_calibration(folder: Path) -> None:
         read_bundle(folder)
 
 
-def test_what_opencv_refuses_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_opencv_refuses_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # libtiff is stricter than our check of the header in a tag or two; harmed files of the campaign met it.
     def refuse(*_: object) -> None:
         message = "OpenCV TIFF: failed TIFFGetField(tif, TIFFTAG_PHOTOMETRIC, &photometric)"
@@ -453,7 +453,7 @@ def test_a_tiff_with_a_circle_of_pages_is_refused(tmp_path: Path) -> None:
         read_pages(tmp_path / "frame.tif", [0], CameraFormat(CAMERA, 8))
 
 
-def test_what_a_jpeg_remarks_is_not_for_the_decoder(tmp_path: Path) -> None:
+def test_the_decoder_gets_no_metadata_of_a_jpeg(tmp_path: Path) -> None:
     data = next(each for each in good_frames() if each.startswith(b"\xff\xd8"))
     (tmp_path / "frame.jpg").write_bytes(data)
     plain = read_pages(tmp_path / "frame.jpg", [0], CameraFormat(CAMERA, 8))[0]

@@ -34,14 +34,14 @@ def smooth() -> Pixels:
     return np.asarray(120 + 60 * np.sin(x / 5) * np.cos(y / 7), dtype=np.uint8)
 
 
-def encoded(ending: str, image: Pixels, *options: int) -> bytes:
+def encode(ending: str, image: Pixels, *options: int) -> bytes:
     done, data = cv2.imencode(ending, image, options)
     assert done
     return data.tobytes()
 
 
 def jpeg(image: Pixels, *options: int) -> bytes:
-    return encoded(".jpg", image, cv2.IMWRITE_JPEG_QUALITY, 90, *options)
+    return encode(".jpg", image, cv2.IMWRITE_JPEG_QUALITY, 90, *options)
 
 
 def read(folder: Path, data: bytes | bytearray, camera: CameraFormat = CAMERA) -> Pixels:
@@ -75,7 +75,7 @@ def test_opencv_reads_the_png_that_we_write(shape: tuple[int, int], bits: int) -
 )
 def test_png_that_opencv_writes_is_read(tmp_path: Path, shape: tuple[int, int], bits: int, filtered: int) -> None:
     image = noise(shape, bits)
-    found = read(tmp_path, encoded(".png", image, cv2.IMWRITE_PNG_FILTER, filtered), camera_of(image))
+    found = read(tmp_path, encode(".png", image, cv2.IMWRITE_PNG_FILTER, filtered), camera_of(image))
     assert found.dtype == image.dtype
     assert np.array_equal(found, image)
 
@@ -108,19 +108,19 @@ def test_png_of_our_own_is_at_most_a_quarter_larger_than_by_zlib() -> None:
 @pytest.mark.parametrize(
     "image", [np.zeros((4, 5, 4), np.uint8), np.zeros((4, 5), np.float32), np.zeros((0, 5, 3), np.uint8)]
 )
-def test_what_is_no_frame_is_not_written(image: Pixels) -> None:
+def test_an_array_that_is_not_a_frame_is_not_written(image: Pixels) -> None:
     with pytest.raises(BundleError, match="an image of 8 or 16 bits"):
         encode_frame(image, "frame.png")
 
 
 def test_bmp_is_read_in_grey_in_colour_upside_down_and_by_its_palette(tmp_path: Path) -> None:
     grey, colour = noise(SIZE.shape), noise((*SIZE.shape, 3))
-    np.testing.assert_array_equal(read(tmp_path, encoded(".bmp", grey)), grey)
-    np.testing.assert_array_equal(read(tmp_path, encoded(".bmp", colour)), cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY))
-    data = bytearray(encoded(".bmp", grey))
+    np.testing.assert_array_equal(read(tmp_path, encode(".bmp", grey)), grey)
+    np.testing.assert_array_equal(read(tmp_path, encode(".bmp", colour)), cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY))
+    data = bytearray(encode(".bmp", grey))
     struct.pack_into("<i", data, 22, -SIZE.height_px)
     np.testing.assert_array_equal(read(tmp_path, data), grey[::-1])
-    data = bytearray(encoded(".bmp", grey))
+    data = bytearray(encode(".bmp", grey))
     (first,) = struct.unpack_from("<I", data, 10)
     ramp = np.frombuffer(bytes(data[54:first]), np.uint8).reshape(256, 4)
     data[54:first] = (255 - ramp).tobytes()
@@ -135,7 +135,7 @@ def test_jpeg_is_read_within_its_compression(tmp_path: Path, options: tuple[int,
     assert np.abs(seen.astype(float) - smooth()).max() < 12
 
 
-def test_what_earlier_versions_noted_of_a_compression_is_no_fault(tmp_path: Path) -> None:
+def test_a_compression_noted_by_earlier_versions_is_accepted(tmp_path: Path) -> None:
     capture = Capture(Size(16, 8), (White(),), {"eye": CAMERA}, (Shot(0, "eye", smooth(), 0.01, 0.0),))
     write_bundle(tmp_path / "b", capture)
     description = tmp_path / "b" / DESCRIPTION
@@ -145,7 +145,7 @@ def test_what_earlier_versions_noted_of_a_compression_is_no_fault(tmp_path: Path
     assert read_bundle(tmp_path / "b").capture.cameras == {"eye": CAMERA}
 
 
-def packed(form: str, at: int, *values: int) -> Callable[[bytes], bytes]:
+def overwrite(form: str, at: int, *values: int) -> Callable[[bytes], bytes]:
     """Writes numbers into a header."""
 
     def spoil(data: bytes) -> bytes:
@@ -168,28 +168,28 @@ START = jpeg(smooth()).index(b"\xff\xc0")
 @pytest.mark.parametrize(
     ("ending", "spoil", "words"),
     [
-        (".bmp", packed("<I", 30, 1), "8 bits, compressed"),
-        (".bmp", packed("<H", 28, 4), "4 bits"),
-        (".bmp", packed("<i", 18, -45), "-45 x 27"),
-        (".bmp", packed("<i", 18, 44), "45 x 27 pixels as bundle.json declares"),
-        (".bmp", packed("<I", 46, 16), "a palette of 16"),
-        (".bmp", packed("<I", 46, 2**31 - 1), "a palette that overlaps"),
-        (".bmp", packed("<I", 10, 60), "a palette that overlaps"),
-        (".bmp", packed("<I", 10, 2**32 - 1), "cut after"),
+        (".bmp", overwrite("<I", 30, 1), "8 bits, compressed"),
+        (".bmp", overwrite("<H", 28, 4), "4 bits"),
+        (".bmp", overwrite("<i", 18, -45), "-45 x 27"),
+        (".bmp", overwrite("<i", 18, 44), "45 x 27 pixels as bundle.json declares"),
+        (".bmp", overwrite("<I", 46, 16), "a palette of 16"),
+        (".bmp", overwrite("<I", 46, 2**31 - 1), "a palette that overlaps"),
+        (".bmp", overwrite("<I", 10, 60), "a palette that overlaps"),
+        (".bmp", overwrite("<I", 10, 2**32 - 1), "cut after"),
         (".bmp", lambda data: data[:40], "without a header"),
         (".bmp", lambda data: data[:-5], "cut after"),
         (".jpg", lambda data: data[:-40], "cut after"),
         (".jpg", lambda data: data[:30], "breaks off"),
-        (".jpg", packed("B", START + 4, 12), "12 bits"),
-        (".jpg", packed("B", START + 1, 0xC9), "arithmetic"),
+        (".jpg", overwrite("B", START + 4, 12), "12 bits"),
+        (".jpg", overwrite("B", START + 1, 0xC9), "arithmetic"),
         (".jpg", without_quantisers, "quantisers"),
-        (".jpg", packed(">HH", START + 5, 60_000, 60_000), "60000 x 60000"),
+        (".jpg", overwrite(">HH", START + 5, 60_000, 60_000), "60000 x 60000"),
     ],
 )
 def test_a_damaged_or_strange_file_is_refused(
     tmp_path: Path, ending: str, spoil: Callable[[bytes], bytes], words: str
 ) -> None:
-    data = jpeg(smooth()) if ending == ".jpg" else encoded(ending, smooth())
+    data = jpeg(smooth()) if ending == ".jpg" else encode(ending, smooth())
     with pytest.raises(BundleError, match=words):
         read(tmp_path, spoil(data))
 

@@ -228,7 +228,7 @@ def test_the_usual_kits_have_a_rig_file_with_comments(name: str) -> None:
             assert abs(periods - round(periods)) < 0.01
 
 
-def test_what_is_commented_out_in_a_rig_file_could_be_used(tmp_path: Path) -> None:
+def test_commented_lines_of_a_rig_file_are_valid(tmp_path: Path) -> None:
     for name in LIVE:
         text = (CONFIG / "rigs" / f"{name}.toml").read_text(encoding="utf-8")
         used = re.sub(r"^# ((?:\[\w+\]|\w+ = ).*)$", r"\1", text, flags=re.MULTILINE)

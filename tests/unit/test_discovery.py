@@ -274,10 +274,10 @@ def test_faults_of_several_tables_are_reported_together_and_all_is_closed(tmp_pa
             STAGE.replace("fake", "tabel"),
             projector="skreen",
         )
-    told = str(caught.value)
-    assert told.startswith("rig 'bench': 4 of its tables are wrong; correct each and try again:\n")
-    assert re.search(r"camera driver 'fkae'.*broken, constant, crashing.*, fake, .*lost", told)
-    assert "  port: " in told
+    message = str(caught.value)
+    assert message.startswith("rig 'bench': 4 of its tables are wrong; correct each and try again:\n")
+    assert re.search(r"camera driver 'fkae'.*broken, constant, crashing.*, fake, .*lost", message)
+    assert "  port: " in message
     order = [
         "projector driver 'skreen'",
         "camera driver 'fkae'",
@@ -285,9 +285,9 @@ def test_faults_of_several_tables_are_reported_together_and_all_is_closed(tmp_pa
         "  speed: unknown key; remove it",
         "positioner driver 'tabel'",
     ]
-    places = [told.index(part) for part in order]
+    places = [message.index(part) for part in order]
     assert places == sorted(places)
-    assert "is not there" not in told
+    assert "is not there" not in message
     assert [(device.name, device.closings) for device in OPENED] == [("top", 1)]
 
 
@@ -338,7 +338,7 @@ def test_a_broken_driver_does_not_hide_the_others_and_one_of_two_packages_is_ref
         _open(tmp_path, _camera("left"))
 
 
-def test_a_failing_finder_does_not_hide_what_others_found() -> None:
+def test_a_failing_finder_does_not_hide_the_devices_of_others() -> None:
     findings = discover_devices()
     assert FoundDevice("fake", "usb-1", "a fake camera") in findings.devices
     assert ["finder driver 'lost' failed: OSError: no bus" in str(fault) for fault in findings.faults] == [True]

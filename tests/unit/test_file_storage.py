@@ -62,7 +62,7 @@ def _matrix(dt: str = "d", data: str = "1., 2.", rows: str = "1", kind: str = "o
         (_in_xml('<m type_id="opencv-nd-matrix"><sizes>\n 1</sizes><dt>d</dt><data>\n 7.</data></m>'), {"m": [7]}),
     ],
 )  # fmt: skip
-def test_what_others_write_is_read(text: str, wanted: dict[str, object]) -> None:
+def test_files_of_other_programs_are_read(text: str, wanted: dict[str, object]) -> None:
     found = read_file_storage(text, PATH)
     assert list(found) == list(wanted)
     for key, value in wanted.items():
@@ -224,7 +224,7 @@ def test_every_device_of_another_size_is_named() -> None:
 
 
 @pytest.mark.parametrize("ending", ["yml", "yaml", "xml"])
-def test_opencv_itself_reads_what_we_export(tmp_path: Path, ending: str) -> None:
+def test_opencv_reads_our_exports(tmp_path: Path, ending: str) -> None:
     calibration = solved_calibration()
     write_opencv_calibration(tmp_path / f"rig.{ending}", calibration)
     storage = cv2.FileStorage(str(tmp_path / f"rig.{ending}"), cv2.FileStorage_READ)
@@ -271,7 +271,7 @@ def test_a_bad_opencv_file_is_refused(tmp_path: Path, text: str, part: str) -> N
 
 
 @pytest.mark.parametrize(("name", "file"), [("projector", "rig.yml"), ("0left", "rig.yml"), ("left", "rig.json")])
-def test_what_opencv_cannot_hold_is_refused(tmp_path: Path, name: str, file: str) -> None:
+def test_names_that_opencv_cannot_hold_are_refused(tmp_path: Path, name: str, file: str) -> None:
     with pytest.raises(CalibrationError, match=r"rig.*expected"):
         write_opencv_calibration(tmp_path / file, Calibration({name: pinhole()}, None))
     assert list(tmp_path.iterdir()) == []
@@ -344,7 +344,7 @@ def test_by_way_of_opencv_it_is_the_same_as_json(tmp_path: Path, ending: str) ->
         ("id: a1b2", "id: [ 1 ]", "text as id and solved_at"),
     ],
 )
-def test_a_fault_of_what_is_solved_is_named_with_its_place(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_a_fault_of_the_map_solved_is_reported_with_its_place(tmp_path: Path, old: str, new: str, words: str) -> None:
     path = tmp_path / "bench.yml"
     write_opencv_calibration(path, solved_calibration())
     text = path.read_text()

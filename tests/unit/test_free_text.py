@@ -21,7 +21,7 @@ ACTING = [
 """By Unicode's own tables: NUL, ESC, DEL, C1, ends of lines and paragraphs, overrides and isolates of direction."""
 
 
-def test_what_acts_on_a_terminal_is_refused_as_a_label_and_printed_as_an_escape() -> None:
+def test_control_characters_are_refused_in_labels_and_printed_as_escapes() -> None:
     assert len(ACTING) == 65 + 2 + 9
     for character in ACTING:
         with pytest.raises(ValidationError, match=f"U\\+{ord(character):04X} at character 3; leave it out"):

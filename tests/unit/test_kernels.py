@@ -83,7 +83,7 @@ def test_bands_cover_every_row_once(
     np.testing.assert_array_equal(out, values**2)
 
 
-def test_what_a_kernel_raises_in_a_band_reaches_the_caller() -> None:
+def test_an_error_of_a_kernel_in_a_band_reaches_the_caller() -> None:
     def failing(first: int, last: int) -> None:
         message = f"rows {first} to {last}"
         raise ValueError(message)
@@ -100,7 +100,7 @@ def test_dividing_by_zero_is_infinite_as_in_numpy() -> None:
     assert ratio(1.0, 0.0) == np.inf
 
 
-def test_a_compiled_kernel_is_kept_and_a_changed_one_is_compiled_anew(tmp_path: Path) -> None:
+def test_a_compiled_kernel_is_cached_and_a_changed_one_is_compiled_again(tmp_path: Path) -> None:
     values = np.array([1.0, 2.0])
     first = made(tmp_path, added=1)
     assert compiled_by(lambda: first.sums(values)) == ["sums", "more"]
@@ -112,21 +112,21 @@ def test_a_compiled_kernel_is_kept_and_a_changed_one_is_compiled_anew(tmp_path: 
     assert changed.sums(values) == 23
 
 
-def test_nothing_is_prepared_ahead_once_every_kernel_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def kept(added: int) -> bool:
-        monkeypatch.setattr(kernels, "_entries", [(made(tmp_path, added=added).sums, True)])
+def test_nothing_is_prepared_ahead_once_every_kernel_is_cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def is_cached(added: int) -> bool:
+        monkeypatch.setattr(kernels, "_kernels", [(made(tmp_path, added=added).sums, True)])
         return are_all_cached()
 
-    assert not kept(1)
+    assert not is_cached(1)
     made(tmp_path, added=1).sums(np.arange(3.0))
-    assert kept(1)
+    assert is_cached(1)
     # Its source changed: what lies there is of another kernel.
-    assert not kept(2)
-    monkeypatch.setattr(kernels, "_entries", [(made(tmp_path, added=2).sums, False)])
+    assert not is_cached(2)
+    monkeypatch.setattr(kernels, "_kernels", [(made(tmp_path, added=2).sums, False)])
     assert are_all_cached()
 
 
-def test_a_kernel_is_compiled_anew_where_only_a_part_in_another_file_changed(tmp_path: Path) -> None:
+def test_a_kernel_is_compiled_again_if_only_a_part_in_another_file_changed(tmp_path: Path) -> None:
     (tmp_path / "caller.py").write_text(
         "from slrig.kernels import kernel\n\ndef of(more):\n    globals()['more'] = more\n\n"
         "@kernel(in_every_scan=False)\ndef sums(values):\n    return more(values[0])\n"
@@ -138,7 +138,7 @@ def test_a_kernel_is_compiled_anew_where_only_a_part_in_another_file_changed(tmp
         assert caller.sums(np.array([1.0])) == 1 + added
 
 
-def test_a_file_that_was_cut_short_is_compiled_anew(tmp_path: Path) -> None:
+def test_a_kernel_is_compiled_again_if_its_file_was_cut(tmp_path: Path) -> None:
     values = np.array([1.0, 2.0])
     made(tmp_path, added=1).sums(values)
     kept = [*tmp_path.rglob("adding.sums*.nbc")]

@@ -87,7 +87,7 @@ class ModelCamera(CameraState):
         self.made = 0
         self.next_free_ns = 0
         self.busy_ns = 0
-        world.on_wire.append(self.pulsed)
+        world.on_wire.append(self.receive_pulse)
 
     @property
     def info(self) -> CameraInfo:
@@ -109,7 +109,7 @@ class ModelCamera(CameraState):
         self.require_armed(Trigger.SOFTWARE)
         self.start(self.world.at_ns + 1_000)
 
-    def pulsed(self, at_ns: int) -> None:
+    def receive_pulse(self, at_ns: int) -> None:
         if self.armed is Trigger.HARDWARE:
             self.start(at_ns)
 
@@ -272,17 +272,17 @@ Device = type[ModelCamera] | type[ModelProjector]
 DeviceT = TypeVar("DeviceT", bound=Device)
 
 BROKEN: list[tuple[Device, str, str]] = []
-"""A broken driver, the check that finds it, and words of the failure."""
+"""A broken driver, the check that finds it, and text of the failure."""
 
 
-def breaks(check: str, words: str = "no error") -> Callable[[DeviceT], DeviceT]:
+def breaks(check: str, text: str = "no error") -> Callable[[DeviceT], DeviceT]:
     """Note what a driver breaks; "no error" is of a call that should have been refused."""
 
-    def noted(device: DeviceT) -> DeviceT:
-        BROKEN.append((device, check, words))
+    def register(device: DeviceT) -> DeviceT:
+        BROKEN.append((device, check, text))
         return device
 
-    return noted
+    return register
 
 
 class RunsFreely(ModelCamera):
@@ -346,12 +346,12 @@ class NeverGivesUp(ModelCamera):
 
 
 class Hangs(ModelCamera):
-    """Does not return from a read until it is let go."""
+    """Does not return from a read until it is released."""
 
-    let_go = threading.Event()
+    released = threading.Event()
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        self.let_go.wait()
+        self.released.wait()
         return super().read(after_ns, timeout_s)
 
 
@@ -534,10 +534,10 @@ class MissesAPulse(ModelCamera):
 
     pulses = 0
 
-    def pulsed(self, at_ns: int) -> None:
+    def receive_pulse(self, at_ns: int) -> None:
         self.pulses += 1
         if self.pulses % 5:
-            super().pulsed(at_ns)
+            super().receive_pulse(at_ns)
         elif self.armed is Trigger.HARDWARE:
             self.made += 1
 

@@ -58,7 +58,7 @@ def with_every_pose(rig: Rig) -> Rig:
     return replace(rig, positioner=positioner)
 
 
-def changed(**how: Callable[[Frame], object]) -> type[ModelCamera]:
+def camera_with(**how: Callable[[Frame], object]) -> type[ModelCamera]:
     """A camera with something else in each of its frames."""
 
     class Delivers(ModelCamera):
@@ -89,12 +89,12 @@ BROKEN: list[tuple[Maker, str, str]] = [
     (Maker(declaring(name="camera0")), "devices_implement_the_protocols", "'camera0'"),
     (Maker(declaring(format=CameraFormat(Size(1920, 1080), 8))), "frames_are_as_declared", "(80, 110)"),
     *(
-        (Maker(device) if issubclass(device, ModelCamera) else Maker(projector=device), check, words)
-        for device, check, words in drivers.BROKEN
+        (Maker(device) if issubclass(device, ModelCamera) else Maker(projector=device), check, text)
+        for device, check, text in drivers.BROKEN
     ),
     *(
-        (Maker(changed(**how)), check, words)
-        for how, check, words in (
+        (Maker(camera_with(**how)), check, text)
+        for how, check, text in (
             ({"image": lambda frame: frame.image.T}, "frames_are_as_declared", "(110, 80)"),
             ({"image": lambda frame: frame.image.astype(np.uint16)}, "frames_are_as_declared", "uint16"),
             ({"camera": lambda _: "right"}, "frames_are_as_declared", "'right'"),
@@ -125,8 +125,8 @@ BROKEN: list[tuple[Maker, str, str]] = [
         )
     ),
     *(
-        (Maker(calibration=Calibration({"left": pinhole(camera)}, projector)), CALIBRATED, words)
-        for camera, projector, words in ((Size(640, 480), None, "640 x 480"), (CAMERA, pinhole(CAMERA), "110 x 80"))
+        (Maker(calibration=Calibration({"left": pinhole(camera)}, projector)), CALIBRATED, text)
+        for camera, projector, text in ((Size(640, 480), None, "640 x 480"), (CAMERA, pinhole(CAMERA), "110 x 80"))
     ),
     (Maker(change=without_stop), "devices_implement_the_protocols", "without stop"),
     (Maker(change=with_every_pose), "a_positioner_takes_its_poses_and_no_others", "pose -1 of 1 is refused"),
@@ -134,13 +134,13 @@ BROKEN: list[tuple[Maker, str, str]] = [
 ]
 
 
-def examined(maker: Maker, check: Check) -> CheckResult:
+def run_check(maker: Maker, check: Check) -> CheckResult:
     maker.rigs.clear()
     with ConformanceRun(maker, sequence(), limit_s=20) as examination:
         return examination.run_check(check)
 
 
-def named(name: str) -> Check:
+def find_check(name: str) -> Check:
     return next(check for check in CHECKS if check.name == name)
 
 
@@ -151,11 +151,11 @@ def identity(value: object) -> str | None:
     return "-".join(kind for kind in kinds if not kind.startswith(("Model", "Maker"))) or None
 
 
-@pytest.mark.parametrize(("maker", "name", "words"), BROKEN, ids=identity)
-def test_a_broken_driver_is_found(maker: Maker, name: str, words: str) -> None:
-    result = examined(maker, named(name))
+@pytest.mark.parametrize(("maker", "name", "text"), BROKEN, ids=identity)
+def test_a_broken_driver_is_found(maker: Maker, name: str, text: str) -> None:
+    result = run_check(maker, find_check(name))
     assert result.outcome is CheckOutcome.FAILED
-    assert words in str(result.failure)
+    assert text in str(result.failure)
     assert result.failure is not None
     assert result.failure.remedy
 
@@ -189,12 +189,12 @@ def test_a_rig_that_keeps_the_contract_has_a_full_score(
 
 
 def test_a_display_whose_latency_was_measured_is_waited_for() -> None:
-    def measured(rig: Rig) -> Rig:
+    def with_latency(rig: Rig) -> Rig:
         return replace(rig, synchronisation=Synchronisation(0.04, 0.001))
 
     camera = type("Camera", (ModelCamera,), {"triggers": frozenset({Trigger.SOFTWARE, Trigger.FREE})})
     projector = type("Projector", (drivers.LightsLate,), {"plays": False})
-    report = run_checks(Maker(camera, projector, change=measured), sequence())
+    report = run_checks(Maker(camera, projector, change=with_latency), sequence())
     assert [str(result.failure) for result in report.results if result.outcome is CheckOutcome.FAILED] == []
 
 
@@ -213,7 +213,7 @@ def test_a_frame_that_a_busy_host_gets_late_was_not_passed_over() -> None:
             self.world.at_ns = max(self.world.at_ns, frame.t_end_ns + self.late_ns)
             return frame
 
-    result = examined(Maker(ArrivesLate), named("stale_frames_never_come_back"))
+    result = run_check(Maker(ArrivesLate), find_check("stale_frames_never_come_back"))
     assert (result.outcome, str(result.failure)) == (CheckOutcome.PASSED, "None")
 
 
@@ -228,8 +228,9 @@ def test_a_frame_that_has_to_be_shot_again_is_reported() -> None:
             if self.made % 20 == 0:
                 self.pending.pop()
 
-    result = examined(
-        Maker(LosesOne, type("Projector", (ModelProjector,), {"plays": False})), named("a_whole_sequence_is_proven")
+    result = run_check(
+        Maker(LosesOne, type("Projector", (ModelProjector,), {"plays": False})),
+        find_check("a_whole_sequence_is_proven"),
     )
     assert result.outcome is CheckOutcome.FAILED
     assert "1 shot again: " in str(result.failure)

@@ -38,9 +38,9 @@ def owners() -> set[threading.Thread]:
 @pytest.fixture
 def hanging() -> Iterator[type[Hangs]]:
     """A camera whose reads hang until the test is over."""
-    let_go, before = threading.Event(), owners()
-    yield type("HangsForATest", (Hangs,), {"let_go": let_go})
-    let_go.set()
+    release, before = threading.Event(), owners()
+    yield type("HangsForATest", (Hangs,), {"released": release})
+    release.set()
     for thread in owners() - before:
         thread.join(10)
 
@@ -60,7 +60,7 @@ def test_a_device_that_never_answers_ends_the_examination_and_not_the_program(ha
     # What was not run counts: a rig that hangs does not have a good score for it.
     assert report.score == pytest.approx(report.count(CheckOutcome.PASSED) / len(CHECKS))
     # Should it answer after all, the rig is closed then.
-    hanging.let_go.set()
+    hanging.released.set()
     for owner in owners() - before:
         owner.join(10)
         assert not owner.is_alive()
@@ -72,10 +72,10 @@ def test_a_rig_that_does_not_open_is_not_examined() -> None:
         message = "the camera is held by process 4711"
         raise DeviceBusyError(message)
 
-    told: list[str] = []
+    calls: list[str] = []
     with pytest.raises(DeviceBusyError, match="4711"):
-        run_checks(refuse, sequence(), progress=lambda stage, _fraction, _detail: told.append(stage))
-    assert told == []
+        run_checks(refuse, sequence(), progress=lambda stage, _fraction, _detail: calls.append(stage))
+    assert calls == []
 
 
 def test_a_rig_that_goes_away_ends_the_examination() -> None:
@@ -108,11 +108,11 @@ def test_an_examination_that_is_interrupted_closes_the_rig() -> None:
 
 
 def test_checks_have_names_and_progress_is_reported_before_and_after_each() -> None:
-    told: list[tuple[str, float, str]] = []
+    calls: list[tuple[str, float, str]] = []
     assert len({each.name for each in CHECKS}) == len({each.title for each in CHECKS}) == len(CHECKS)
     first, second = CHECKS[:2]
-    run_checks(Maker(), sequence(), checks=(first, second), progress=lambda *what: told.append(what))
-    assert told == [
+    run_checks(Maker(), sequence(), checks=(first, second), progress=lambda *what: calls.append(what))
+    assert calls == [
         *((first.title, 0.0, ""), (first.title, 0.5, "passed")),
         *((second.title, 0.5, ""), (second.title, 1.0, "passed")),
     ]
@@ -129,11 +129,11 @@ def test_one_thread_owns_the_devices() -> None:
 
     maker = Maker()
 
-    def opened() -> Rig:
+    def open_rig() -> Rig:
         owners.add(threading.get_ident())
         return maker()
 
-    with ConformanceRun(opened, sequence()) as examination:
+    with ConformanceRun(open_rig, sequence()) as examination:
         examination.run_check(remember_the_thread)
         examination.run_check(CHECKS[1])
     assert len(owners) == 1
@@ -156,7 +156,7 @@ def test_checks_share_a_rig_unless_they_want_a_fresh_one_or_the_last_one_failed(
     assert len(broken.rigs) == 1 + failed > 1
 
 
-def test_what_a_driver_raises_is_a_failure_that_names_the_device() -> None:
+def test_an_error_of_a_driver_is_a_failure_that_names_the_device() -> None:
     @check()
     def raises(bench: RigBench) -> None:
         """A driver fails."""
@@ -174,14 +174,14 @@ def test_what_a_driver_raises_is_a_failure_that_names_the_device() -> None:
     )
 
 
-def test_a_check_may_find_out_that_it_has_nothing_to_ask() -> None:
+def test_a_check_may_find_that_it_does_not_apply() -> None:
     @check()
-    def has_nothing_to_ask(_stand: RigBench) -> None:
+    def does_not_apply(_stand: RigBench) -> None:
         """Nothing to ask."""
         message = "it has one exposure"
         raise NotApplicableError(message)
 
-    report = run_checks(Maker(), sequence(), checks=(has_nothing_to_ask, CHECKS[0]))
+    report = run_checks(Maker(), sequence(), checks=(does_not_apply, CHECKS[0]))
     assert [result.outcome for result in report.results] == [CheckOutcome.NOT_APPLICABLE, CheckOutcome.PASSED]
     assert (report.applicable, report.percent, report.conforms) == (1, 100, True)
     assert report.results[0].reason == "it has one exposure"
@@ -225,7 +225,7 @@ def images(*levels: float, noise_dn: float = 0.0) -> list[Pixels]:
     return made
 
 
-def test_the_level_of_light_is_that_of_the_lit_pixels_whatever_the_room_and_the_noise_are() -> None:
+def test_the_level_is_that_of_the_lit_pixels_in_any_room_light_and_noise() -> None:
     light = measure_reference_levels(images(90, 90, noise_dn=4), images(30, 30, noise_dn=4), full_scale=255)
     assert light.lit[:, :32].mean() > 0.95
     assert light.lit[:, 32:].mean() < 0.01
@@ -250,7 +250,7 @@ def rig(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("projector", "passed"), [(ModelProjector, 2), (LightsLate, 1)])
-def test_conform_says_what_is_wrong_and_what_to_do(
+def test_conform_prints_faults_and_remedies(
     rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, projector: type[ModelProjector], passed: int
 ) -> None:
     # Two checks of all: what comes of them is tested by `test_broken_drivers`.
@@ -265,9 +265,9 @@ def test_conform_says_what_is_wrong_and_what_to_do(
     kept = last_examination(data, "conform", "model")
     assert kept is not None
     assert f"{kept.found['passed']} of {kept.found['applicable']} checks" in shown.stdout
-    told = " ".join(shown.stdout.split())
-    assert (f"({LATE})" in told) == (passed == 1)
-    assert ("remedy read returns frames whose whole exposure, all rows, lies after after_ns" in told) == (passed == 1)
+    calls = " ".join(shown.stdout.split())
+    assert (f"({LATE})" in calls) == (passed == 1)
+    assert ("remedy read returns frames whose whole exposure, all rows, lies after after_ns" in calls) == (passed == 1)
     # As JSON, and into a folder that is none of the service's.
     shown = CliRunner().invoke(app, ["conform", str(rig), "--json", "--data", str(tmp_path)])
     document = json.loads(shown.stdout)

@@ -127,8 +127,8 @@ def own(rig: Rig) -> PatternSequence:
     return encode(patterns, size)
 
 
-def examined(rig: Rig, **asked: Any) -> Diagnosis:
-    return examine(rig, own_sequence=own(rig), **asked)
+def run_doctor(rig: Rig, **options: Any) -> Diagnosis:
+    return examine(rig, own_sequence=own(rig), **options)
 
 
 def names(diagnosis: Diagnosis, severity: Severity) -> set[str]:
@@ -143,7 +143,7 @@ def holding(rig: Rig, held: PatternSequence, *, greys: bool = False) -> Rig:
 @pytest.mark.parametrize("trigger", [Trigger.FREE, Trigger.SOFTWARE])
 def test_sound_rig_is_sound_by_any_trigger_though_frames_are_lost(rig: Rig, trigger: Trigger) -> None:
     steps: list[str] = []
-    diagnosis = examined(
+    diagnosis = run_doctor(
         with_camera(rig, triggers=frozenset({trigger}), lose=range(5, 400, 31)),
         progress=lambda step, _fraction, _detail: steps.append(step),
     )
@@ -172,15 +172,15 @@ def test_triggered_camera_that_sees_no_flash_happen_still_shows_late_light(tmp_p
     assert "no flash was seen as it happened" in found.found
 
 
-@pytest.mark.parametrize(("says_so", "name"), [(True, "timing.stamps"), (False, "timing.jitter")])
-def test_vague_time_stamps_are_not_put_down_to_the_projector(rig: Rig, says_so: bool, name: str) -> None:
+@pytest.mark.parametrize(("is_stated", "name"), [(True, "timing.stamps"), (False, "timing.jitter")])
+def test_vague_time_stamps_are_not_blamed_on_the_projector(rig: Rig, is_stated: bool, name: str) -> None:
     """Stamps are off by 10 ms either way, at random, and the camera states that or does not."""
     rng = np.random.default_rng(5)
 
     def vague(frame: Frame) -> Frame:
         off_ns = int(rng.integers(-10_000_000, 10_000_000))
         start_ns, end_ns = frame.t_start_ns + off_ns, frame.t_end_ns + off_ns
-        return replace(frame, t_start_ns=start_ns, t_end_ns=end_ns, t_err_ns=10_000_000 if says_so else 0)
+        return replace(frame, t_start_ns=start_ns, t_end_ns=end_ns, t_err_ns=10_000_000 if is_stated else 0)
 
     rig = with_camera(rig, triggers=frozenset({Trigger.FREE}), change=vague)
     light, _ = measure_light(
@@ -190,13 +190,13 @@ def test_vague_time_stamps_are_not_put_down_to_the_projector(rig: Rig, says_so: 
     _, findings = timing.measure_light_latency(rig, {"eye": light}, search_s=0.1, progress=lambda *_: None)
     [found] = [each for each in findings if each.name in {"timing.stamps", "timing.jitter"}]
     assert found.name == name
-    assert found.subject == ("camera 'eye'" if says_so else "projector")
-    assert ("they limit the measurement" in found.found) is says_so
+    assert found.subject == ("camera 'eye'" if is_stated else "projector")
+    assert ("they limit the measurement" in found.found) is is_stated
 
 
-def test_rig_without_calibration_has_its_picture_judged_and_its_drivers_notes_passed_on(rig: Rig) -> None:
+def test_rig_without_calibration_has_its_picture_checked_and_its_drivers_notes_reported(rig: Rig) -> None:
     slow = with_camera(rig, triggers=frozenset({Trigger.FREE}), notes=("gives 5 frames per second",))
-    diagnosis = examined(replace(slow, calibration=None))
+    diagnosis = run_doctor(replace(slow, calibration=None))
     assert names(diagnosis, Severity.NOTE) == {"device.uncalibrated", "device.note"}
     [note] = [each for each in diagnosis.findings if each.name == "device.note"]
     assert note.subject == "camera 'eye'"
@@ -204,8 +204,8 @@ def test_rig_without_calibration_has_its_picture_judged_and_its_drivers_notes_pa
     assert "picture.upright" in names(diagnosis, Severity.OK)
 
 
-def test_camera_on_a_wire_is_left_alone_and_named(rig: Rig) -> None:
-    diagnosis = examined(with_camera(rig, triggers=frozenset({Trigger.HARDWARE})))
+def test_camera_triggered_by_wire_is_skipped_and_named(rig: Rig) -> None:
+    diagnosis = run_doctor(with_camera(rig, triggers=frozenset({Trigger.HARDWARE})))
     [note] = diagnosis.with_severity(Severity.NOTE)
     assert note.name == "device.unexamined"
     assert "can be triggered by wire only (hardware)" in note.found
@@ -214,7 +214,7 @@ def test_camera_on_a_wire_is_left_alone_and_named(rig: Rig) -> None:
 
 
 def test_projector_that_holds_its_patterns_is_examined_with_them(rig: Rig) -> None:
-    diagnosis = examined(holding(rig, own(rig)))
+    diagnosis = run_doctor(holding(rig, own(rig)))
     assert diagnosis.with_severity(Severity.FAULT) == ()
     assert {"patterns.own", "response.binary", "picture.unmeasured", "focus.unmeasured"} <= names(
         diagnosis, Severity.OK
@@ -224,7 +224,7 @@ def test_projector_that_holds_its_patterns_is_examined_with_them(rig: Rig) -> No
 
 
 def test_projector_of_one_bit_has_no_response(rig: Rig) -> None:
-    diagnosis = examined(holding(rig, doctor_sequence(rig.projector.info.size), greys=True))
+    diagnosis = run_doctor(holding(rig, doctor_sequence(rig.projector.info.size), greys=True))
     assert diagnosis.healthy
     assert "response.binary" in names(diagnosis, Severity.OK)
     assert "patterns.own" not in names(diagnosis, Severity.OK)
@@ -246,7 +246,7 @@ def gamma(image: Pixels) -> Pixels:
     return grey(255 * (image / 255) ** (1 / 2.2))
 
 
-def blurred(image: Pixels) -> Pixels:
+def blur(image: Pixels) -> Pixels:
     return grey(cv2.GaussianBlur(image.astype(np.float64), (0, 0), 2.0))
 
 
@@ -284,7 +284,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
         yield opened
 
 
-def judged(rig: Rig, process: Process, *, calibrated: bool = True) -> Finding:
+def check_processed(rig: Rig, process: Process, *, calibrated: bool = True) -> Finding:
     """The finding on a camera that processes its pictures so."""
     session = CameraSession(
         with_camera(rig, change=lambda frame: replace(frame, image=process(frame.image))), "eye", wait_s=0.1
@@ -298,24 +298,24 @@ def judged(rig: Rig, process: Process, *, calibrated: bool = True) -> Finding:
 
 
 def test_an_unsharp_mask_is_named_with_its_cost(printed: Rig) -> None:
-    found = judged(printed, unsharp(1.5))
+    found = check_processed(printed, unsharp(1.5))
     assert (found.name, found.severity) == ("sharpening.halo", Severity.FAULT)
     assert "the camera sharpens: next to edges its pictures exceed white and black by" in found.found
     assert "mm of depth where the optical axes meet" in found.found
     assert "control sharpness" in found.remedy
-    assert "mm of depth" not in judged(printed, unsharp(1.5), calibrated=False).found
+    assert "mm of depth" not in check_processed(printed, unsharp(1.5), calibrated=False).found
 
 
 LESS = [unsharp(0.5), after(gamma, unsharp(1.0), jpeg(80)), unsharp(1.5, 1.0)]
-OTHERS = [after(), blurred, gamma, noisy, jpeg(90), jpeg(50), after(gamma, jpeg(75)), after(blurred, noisy)]
+OTHERS = [after(), blur, gamma, noisy, jpeg(90), jpeg(50), after(gamma, jpeg(75)), after(blur, noisy)]
 
 
 @pytest.mark.parametrize(
     ("process", "name"), [*product(LESS, ["sharpening.halo"]), *product(OTHERS, ["sharpening.none"])]
 )
 @pytest.mark.slow
-def test_less_of_it_is_named_too_and_nothing_else_is_taken_for_it(printed: Rig, process: Process, name: str) -> None:
-    found = judged(printed, process)
+def test_weak_sharpening_is_found_and_nothing_else_is_taken_for_it(printed: Rig, process: Process, name: str) -> None:
+    found = check_processed(printed, process)
     assert found.name == name
     assert (found.severity is Severity.OK) is (name == "sharpening.none")
 
@@ -343,7 +343,7 @@ def pinhole(rotation: FloatArray, centre_mm: tuple[float, ...]) -> Pinhole:
 
 # The fake engine is a thread: a busy machine may hold it for longer than `image_load_s`.
 @pytest.mark.realtime
-def test_the_sense_of_the_current_is_found_and_all_else_waits_for_it(tmp_path: Path) -> None:
+def test_the_direction_of_the_current_is_found_before_all_other_checks(tmp_path: Path) -> None:
     from drivers.dlpc350.flash import MIRRORS
     from tests.contract.dlpc350_bench import Table
     from tests.contract.suite import rig_of

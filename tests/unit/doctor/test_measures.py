@@ -71,7 +71,7 @@ def test_levels_are_those_of_the_lit_part() -> None:
     assert levels.shortest_exposure_s(0.01) == pytest.approx(0.01 * 10 / (100 / 1.5), rel=0.1)
 
 
-def test_saturation_is_counted_among_what_is_lit() -> None:
+def test_saturation_is_counted_among_lit_pixels() -> None:
     white, black = lit_part(120.0, 20.0)
     white[10:20, 20:60] = 400.0
     levels = light_levels(frames(white, noise_dn=1.0), frames(black, noise_dn=1.0, seed=1), full_scale=255)
@@ -104,7 +104,7 @@ def test_response_is_found_by_its_gamma_and_its_knees(gamma: float, black_knee: 
     assert fit_camera_exponent(exposures_s, [e**0.45 for e in exposures_s]) == pytest.approx(0.45)
 
 
-def sampled(t_s: FloatArray, exposure_s: float, *parts: tuple[float, float], noise: float = 0.2) -> FloatArray:
+def sample_light(t_s: FloatArray, exposure_s: float, *parts: tuple[float, float], noise: float = 0.2) -> FloatArray:
     """Light of mean 100 that swings by (hertz, amplitude), averaged over exposures about the instants."""
     light = 100 + noise * np.random.default_rng(1).standard_normal(len(t_s))
     for frequency_hz, amplitude in parts:
@@ -113,13 +113,13 @@ def sampled(t_s: FloatArray, exposure_s: float, *parts: tuple[float, float], noi
     return np.asarray(light)
 
 
-def test_swings_are_found_in_uneven_samples_whatever_the_mean_rate() -> None:
+def test_oscillations_are_found_in_uneven_samples_at_any_mean_rate() -> None:
     t_s = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.05, 128))
-    found = find_oscillations(t_s, sampled(t_s, 0.002, (100.0, 5.0), (180.0, 2.0)), exposure_s=0.002)
+    found = find_oscillations(t_s, sample_light(t_s, 0.002, (100.0, 5.0), (180.0, 2.0)), exposure_s=0.002)
     assert [swing.frequency_hz for swing in found] == pytest.approx([100.0, 180.0], abs=0.02)
     assert [swing.amplitude for swing in found] == pytest.approx([5.0, 2.0], abs=0.2)
     assert all(not swing.aliases_hz for swing in found)
-    assert find_oscillations(t_s, sampled(t_s, 0.002), exposure_s=0.002) == (), "noise alone"
+    assert find_oscillations(t_s, sample_light(t_s, 0.002), exposure_s=0.002) == (), "noise alone"
     assert find_oscillations(t_s, np.full(128, 7.0), exposure_s=0.002) == ()
     assert exposure_attenuation(120.0, 1 / 60) == pytest.approx(0.0, abs=1e-12), "whole periods"
     assert found[0].amplitude * exposure_attenuation(found[0].frequency_hz, 0.01) == pytest.approx(0.0, abs=0.01)
@@ -131,7 +131,7 @@ def test_swings_are_found_in_uneven_samples_whatever_the_mean_rate() -> None:
 def test_even_samples_list_the_aliases() -> None:
     # 30 frames per second show 100 Hz as 10 Hz, as they show 20, 40, 50, 70, 80 … Hz.
     t_s = np.arange(128) / 30
-    [swing] = find_oscillations(t_s, sampled(t_s, 0.002, (100.0, 5.0)), exposure_s=0.002)
+    [swing] = find_oscillations(t_s, sample_light(t_s, 0.002, (100.0, 5.0)), exposure_s=0.002)
     told_hz = (swing.frequency_hz, *swing.aliases_hz)
     for candidate_hz in (50.0, 80.0, 100.0, 130.0):
         assert min(abs(each - candidate_hz) for each in told_hz) < 0.1
@@ -277,7 +277,7 @@ def levels() -> LightLevels:
     return light_levels(images[0], images[1], full_scale=255)
 
 
-def seen(own_exposure_s: float, *, shortest_s: float = 0.002, longest_s: float = 0.04) -> LightMeasurement:
+def measurement(own_exposure_s: float, *, shortest_s: float = 0.002, longest_s: float = 0.04) -> LightMeasurement:
     return LightMeasurement("left", own_exposure_s, levels(), 0.02, levels(), shortest_s, longest_s, 0.0)
 
 
@@ -307,39 +307,37 @@ WHEEL = LightFlicker("projector", 180.0, 0.4)
 def test_an_exposure_is_kept_or_snapped(
     own_s: float, refresh_hz: float | None, flickers: tuple[LightFlicker, ...], expected_s: float
 ) -> None:
-    advice = advise_exposure(seen(own_s), LIMITS_S, refresh_hz=refresh_hz, flickers=flickers)
+    advice = advise_exposure(measurement(own_s), LIMITS_S, refresh_hz=refresh_hz, flickers=flickers)
     assert advice.exposure_s == pytest.approx(expected_s, rel=1e-6)
     assert ("unchanged" in advice.reason) is (expected_s == own_s)
 
 
 def test_advice_gives_its_reason_and_keeps_to_the_limits() -> None:
-    def advised(
-        own_s: float, longest_s: float, limits_s: tuple[float, float] = LIMITS_S, **more: Any
-    ) -> ExposureAdvice:
+    def advise(own_s: float, longest_s: float, limits_s: tuple[float, float] = LIMITS_S, **more: Any) -> ExposureAdvice:
         return advise_exposure(
-            seen(own_s, longest_s=longest_s), limits_s, **{"refresh_hz": 60.0, "flickers": (), **more}
+            measurement(own_s, longest_s=longest_s), limits_s, **{"refresh_hz": 60.0, "flickers": (), **more}
         )
 
     # Three refreshes serve the mains, too.
-    advice = advised(0.02, 0.06, flickers=(MAINS,))
+    advice = advise(0.02, 0.06, flickers=(MAINS,))
     assert advice.exposure_s == pytest.approx(0.05)
     assert advice.reason == "3 × the refresh period (16.7 ms)"
     # Light is too bright for one period.
-    advice = advised(0.02, 0.01)
+    advice = advise(0.02, 0.01)
     assert advice.exposure_s == 0.01
     assert "less than the refresh period (16.7 ms)" in advice.reason
-    advice = advised(0.08, 0.04, (1e-3, 0.03), refresh_hz=None)
+    advice = advise(0.08, 0.04, (1e-3, 0.03), refresh_hz=None)
     assert (advice.exposure_s, advice.usable_s) == (0.03, (0.002, 0.03))
 
 
 def test_exposure_that_misses_the_refresh_is_noted() -> None:
-    assert check_refresh_multiple(seen(0.02), None) == []
-    assert check_refresh_multiple(seen(1 / 30), 60.0) == []
-    [told] = check_refresh_multiple(seen(0.02), 60.0)
-    assert (told.name, told.severity) == ("exposure.refresh", Severity.NOTE)
+    assert check_refresh_multiple(measurement(0.02), None) == []
+    assert check_refresh_multiple(measurement(1 / 30), 60.0) == []
+    [finding] = check_refresh_multiple(measurement(0.02), 60.0)
+    assert (finding.name, finding.severity) == ("exposure.refresh", Severity.NOTE)
 
 
-def test_a_fault_needs_a_remedy_and_what_is_well_has_none() -> None:
+def test_a_remedy_belongs_to_faults_and_notes_only() -> None:
     assert ok("light.part", "camera 'left'", "all is lit").remedy == ""
     with pytest.raises(ValueError, match="a remedy belongs to every note and fault"):
         fault("light.none", "camera 'left'", "nothing is lit", "")
@@ -420,7 +418,7 @@ def old(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_new_file_is_the_old_one_with_what_was_measured(old: Path) -> None:
+def test_the_new_file_is_the_old_one_with_the_measured_values(old: Path) -> None:
     new = old.with_name("new.toml")
     measured = Synchronisation(0.0412345678, 0.0031, {"left": 3.0004e-5})
     write_rig_file(diagnosis(synchronisation=measured), old, new, force=False)
