@@ -57,7 +57,8 @@ def capture(
         with ExitStack() as lit:
             # Switch the light off first.
             lit.callback(_suppress_errors, rig.projector.blank)
-            session = CaptureSession(rig, sequence, _configure_cameras(rig), triggers, timeout_s, cancelled)
+            applied = {name: _configure_camera(rig.cameras[name], name, each) for name, each in rig.settings.items()}
+            session = CaptureSession(rig, sequence, applied, triggers, timeout_s, cancelled)
             retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns, colour=colour)
             if Trigger.HARDWARE in triggers.values():
                 lit.callback(_suppress_errors, rig.projector.stop)
@@ -98,12 +99,8 @@ def choose_triggers(rig: Rig) -> dict[str, Trigger]:
     return chosen
 
 
-def _configure_cameras(rig: Rig) -> dict[str, AppliedSettings]:
-    """Configure every camera that has settings, and compare the values read back."""
-    return {name: _configure_camera(rig.cameras[name], name, settings) for name, settings in rig.settings.items()}
-
-
 def _configure_camera(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettings:
+    """Configure a camera, and compare the values read back."""
     applied = camera.configure(settings)
     for setting, requested, actual, unit in (
         ("exposure", settings.exposure_s, applied.exposure_s, " s"),

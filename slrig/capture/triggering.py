@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -59,12 +60,6 @@ class CaptureSession:
             raise ScanCancelledError(
                 f"the scan was cancelled at {self.describe_pattern(index)} of {len(self.sequence)}"
             )
-
-    def wait_until_stable(self, displayed: DisplayedPattern) -> int:
-        """Wait until a pattern's light is the only one, and return the instant from which it is."""
-        stable_ns = stable_from_ns(displayed, self.rig.synchronisation)
-        self.rig.clock.wait_until(stable_ns, threading.Event())
-        return stable_ns
 
     def read(self, name: str, after_ns: int, timeout_s: float) -> Frame:
         """Return the next frame with the camera's name in the rig. Raises as `Camera.read` does."""
@@ -128,7 +123,8 @@ def capture_by_software(session: CaptureSession, retries: RetryPolicy) -> Iterat
             return
         session.stop_if_cancelled(index)
         displayed = rig.projector.show(index)
-        stable_ns = session.wait_until_stable(displayed)
+        stable_ns = stable_from_ns(displayed, rig.synchronisation)
+        rig.clock.wait_until(stable_ns, threading.Event())
         for name in names:
             retries.start_exposure(name, index)
             if session.triggers[name] is Trigger.SOFTWARE:
@@ -307,21 +303,14 @@ def _read_play(session: CaptureSession, retries: RetryPolicy, play: _Play, last:
                 play.delivered.append((index, name))
                 yield shot
     for name in active:
-        extra = _read_extra_frame(session, name, last[name], period_s)
-        if extra is not None:
+        # A frame too many would come within one period.
+        with suppress(FrameTimeoutError):
+            extra = session.read(name, last[name].t_end_ns, 1.5 * period_s)
             play.levels[name].append(float(extra.image.mean()))
             play.faults.append(
                 f"camera '{name}' gave more than the {count} frames of the sequence: something else triggers it; check "
                 "the trigger cable and its polarity, and shield it from the projector's other outputs"
             )
-
-
-def _read_extra_frame(session: CaptureSession, name: str, last: Frame, period_s: float) -> Frame | None:
-    """Return a frame after the last one, which would come within one period; None if there is none."""
-    try:
-        return session.read(name, last.t_end_ns, 1.5 * period_s)
-    except FrameTimeoutError:
-        return None
 
 
 def _numbering_fault(frame: Frame, previous: Frame | None) -> str | None:

@@ -454,9 +454,7 @@ class FrameVerifier:
     ) -> tuple[list[Contradiction], SampleMask]:
         """Compare the code with the lines, which verifies its bits. Also return the mask of pixels that contradict."""
         first_index, axis = self.findings.first_seen_index, gray.axis
-        agreement = frame_checks.compare_with_lines(
-            code, lines, ref, cell_px=gray.cell_px, offset_px=gray.offset_px, noise=self._noise
-        )  # fmt: skip
+        agreement = frame_checks.compare_with_lines(code, gray, lines, ref, noise=self._noise)
         members = [first_index[line] for line, _ in lines]
         if agreement.is_reversed:
             fault = (
@@ -527,30 +525,17 @@ class FrameVerifier:
             self.findings.pending_lines.append(index)
             return []
         code, gray = known
-        expected = frame_checks.predict_lines(
-            code,
-            ref,
-            cell_px=gray.cell_px,
-            offset_px=gray.offset_px,
-            shift=pattern.shift,
-            period_px=pattern.period_px,
-            width_px=pattern.line_width_px,
-        )
-        others = [
-            self._samples[i]
-            for p, i in self.findings.first_seen_index.items()
-            if isinstance(p, LineShift) and p.axis is pattern.axis and i != index
-        ]
+        first_index = self.findings.first_seen_index
+        expected = frame_checks.predict_lines(code, gray, pattern, ref)
+        lines = (i for p, i in first_index.items() if isinstance(p, LineShift) and p.axis is pattern.axis)
+        others = [self._samples[i] for i in lines if i != index]
         duty = pattern.line_width_px / pattern.period_px
         compared, fault = frame_checks.line_fault(
             self._samples[index], others, ref, expected, noise=self._noise, duty=duty
         )
         if fault is not None:
-            code_frames = (
-                []
-                if pattern.axis in self.findings.verified_axes
-                else [self.findings.first_seen_index[p] for p in self._code_bits(gray)]
-            )
+            is_code_verified = pattern.axis in self.findings.verified_axes
+            code_frames = [] if is_code_verified else [first_index[p] for p in self._code_bits(gray)]
             return [self._contradiction(index, fault, [index], code_frames)]
         if compared:
             self.findings.verified.add(index)

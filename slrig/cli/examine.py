@@ -70,7 +70,7 @@ def doctor(
                 period_px=lines.period_px,
                 steps=lines.steps or lines.period_px,
                 search_s=search_s,
-                on_progress=display,
+                told=display,
             )
     if output is not None:
         write_rig_file(diagnosis, rig_file, output, force=force)
