@@ -305,8 +305,8 @@ def find_repeated(
     distance = [float(np.mean((here - other[ref.tested]) ** 2)) for other in earlier]
     nearest = int(np.argmin(distance))
     # The noise is that of bright pixels; a camera with a display gamma has several times as much in dark ones.
-    alike = max(6 * noise**2, _REPEAT_TOLERANCE * variation(frame, ref))
-    return nearest if distance[nearest] < alike else None
+    limit = max(6 * noise**2, _REPEAT_TOLERANCE * variation(frame, ref))
+    return nearest if distance[nearest] < limit else None
 
 
 @dataclass(frozen=True, slots=True)

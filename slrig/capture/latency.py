@@ -312,10 +312,10 @@ def _settling_time_s(
 def _too_few_flashes_message(camera: str, flashes: Sequence[LightChange], used: int) -> str:
     """Explain why too few flashes are usable."""
     bounds = [bound for flash in flashes if (bound := _change_interval_s(flash)) is not None]
-    head = f"camera '{camera}': {used} of {len(flashes)} flashes were seen as they happened, {MIN_FLASHES} are needed"
+    head = f"camera '{camera}': {used} of {len(flashes)} flashes happened during an exposure, {MIN_FLASHES} are needed"
     if len(bounds) < len(flashes) / 2:
         return (
-            f"{head}; in {len(flashes) - len(bounds)} the light did not change while it was watched: search "
+            f"{head}; in {len(flashes) - len(bounds)} the light did not change within the search time: search "
             "longer, and check that nothing else drives the projector (screen saver, desktop, another input)"
         )
     low_s, high_s = np.median(np.array(bounds), axis=0)

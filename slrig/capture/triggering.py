@@ -80,10 +80,10 @@ class CaptureSession:
                 f"frame number {frame.sequence_number} came after number {previous.sequence_number}: a frame was "
                 "delivered twice, or the camera restarted; scan again"
             )
-        asked = self.applied.get(frame.camera)
-        if asked is not None and differs_from_request(frame.exposure_s, asked.exposure_s):
+        applied = self.applied.get(frame.camera)
+        if applied is not None and differs_from_request(frame.exposure_s, applied.exposure_s):
             return (
-                f"exposed for {frame.exposure_s:.6g} s, set to {asked.exposure_s:.6g} s: switch off automatic "
+                f"exposed for {frame.exposure_s:.6g} s, set to {applied.exposure_s:.6g} s: switch off automatic "
                 "exposure, and scan again"
             )
         return None
@@ -236,15 +236,15 @@ def play_times_s(session: CaptureSession) -> tuple[float, float]:
     """
     rig, applied = session.rig, session.applied
     known = rig.synchronisation
-    asked_s = None if known is None else known.trigger_period_s
+    requested_s = None if known is None else known.trigger_period_s
     exposure_s = max(each.exposure_s for each in applied.values())
     skew_s = max(shutter_skew_s(camera, name, known) for name, camera in rig.cameras.items())
     # The last row of a rolling shutter needs the pattern's light as long as the first.
     lit_s = exposure_s + skew_s
-    unknown_s = lit_s + exposure_s if asked_s is None else asked_s
+    unknown_s = lit_s + exposure_s if requested_s is None else requested_s
     needed_s = [unknown_s if each.min_period_s is None else each.min_period_s for each in applied.values()]
     projector = rig.projector.info
-    return lit_s, max((lit_s + projector.gap_s) / projector.duty, asked_s or 0.0, *needed_s)
+    return lit_s, max((lit_s + projector.gap_s) / projector.duty, requested_s or 0.0, *needed_s)
 
 
 def _missing_frame_fault(session: CaptureSession, play: _Play, name: str, index: int, error: FrameTimeoutError) -> str:

@@ -472,8 +472,8 @@ class FrameVerifier:
         before = self._disputed.get(axis)
         self._disputed[axis] = agreement.wrong
         if before is not None and len(before) == len(agreement.wrong):
-            alike = np.count_nonzero(before & agreement.wrong) / np.count_nonzero(before | agreement.wrong)
-            if alike > _SAME_PIXELS_FRACTION and np.mean(agreement.wrong[agreement.compared]) < _MAX_SCENE_FRACTION:
+            common = np.count_nonzero(before & agreement.wrong) / np.count_nonzero(before | agreement.wrong)
+            if common > _SAME_PIXELS_FRACTION and np.mean(agreement.wrong[agreement.compared]) < _MAX_SCENE_FRACTION:
                 # Unchanged in a second exposure, so the scene causes it, for example by interreflections in a hollow.
                 # No frame is suspect, and none is verified.
                 return [], agreement.wrong
