@@ -174,8 +174,8 @@ class AxisPatterns:
 
     @property
     def showing_noise(self) -> frozenset[Pattern]:
-        """The patterns that tell the camera's noise and response: with inverses and ends `telling_bits`; without
-        inverses `telling_lines`, or else lines of half their period and some bits; otherwise all of the code.
+        """The patterns that tell the camera's noise and response: with inverses and ends `diagnostic_bits`; without
+        inverses `diagnostic_line_pairs`, or else lines of half their period and some bits; otherwise all of the code.
         """
         if len(self.ends) == 2:
             told = diagnostic_line_pairs(self.lines)

@@ -394,7 +394,7 @@ def test_levels_leave_out_unusable_rows() -> None:
         ({"white_dn": 3000.0}, r"saturated.*expose shorter"),
         ({"white_dn": 60.0, "noise_dn": 15.0}, "rows distinguish white from black"),
         ({"exposure_s": 5e-4, "period_s": 0.1}, r"between two exposures .* raise its frame rate"),
-        ({"light": both_ways(step(0.35))}, "did not change while it was watched"),
+        ({"light": both_ways(step(0.35))}, "did not change within the search time"),
     ],
     ids=["lamp off", "too much light", "too noisy", "flashes between exposures", "light too late"],
 )
