@@ -33,8 +33,8 @@ def capture(
 
     This is a generator: nothing starts before the first frame is requested, and the next frame is exposed while the
     consumer processes one. At the end, including errors, cancellation and an early stop of the consumer, the projector
-    is dark and the cameras are disarmed. All cameras use hardware triggers if possible, otherwise software triggers,
-    otherwise they run freely; with a measured latency these are read in parallel, see `slrig.capture.streaming`.
+    is dark and the cameras are disarmed. See `choose_triggers` for the triggers; if all cameras run freely and the
+    latency was measured, they are read in parallel, see `slrig.capture.streaming`.
 
     rig : open devices; cameras without settings keep theirs. cancelled : called before each pattern and frame.
     timeout_s : time that a frame may take beyond its exposure. evidence : verifies the frames; pass one to read its
