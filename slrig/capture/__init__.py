@@ -12,12 +12,7 @@ from slrig.capture.exposure import (
     judge_exposure,
     round_to_refresh_s,
 )
-from slrig.capture.frame_checks import (
-    NEAR_SATURATION,
-    NOISE_FLOOR_DN,
-    SampleMask,
-    Samples,
-)
+from slrig.capture.frame_checks import NEAR_SATURATION, NOISE_FLOOR_DN, SampleMask, Samples
 from slrig.capture.latency import (
     DEFAULT_SEARCH_S,
     STEADY_TOLERANCE,
@@ -26,23 +21,10 @@ from slrig.capture.latency import (
     measure_latency,
     stable_from_ns,
 )
-from slrig.capture.sequencer import (
-    capture,
-    choose_triggers,
-)
-from slrig.capture.streaming import (
-    earliest_change_s,
-)
-from slrig.capture.triggering import (
-    SETTINGS_TOLERANCE,
-    differs_from_request,
-)
-from slrig.capture.verifier import (
-    Evidence,
-    EvidenceSummary,
-    Sampler,
-    checked_frames,
-)
+from slrig.capture.sequencer import capture, choose_triggers
+from slrig.capture.streaming import earliest_change_s
+from slrig.capture.triggering import SETTINGS_TOLERANCE, differs_from_request
+from slrig.capture.verifier import Evidence, EvidenceSummary, Sampler, checked_frames
 
 __all__ = [
     "DEFAULT_SEARCH_S",

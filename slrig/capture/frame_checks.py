@@ -305,8 +305,8 @@ def find_repeated(
     distance = [float(np.mean((here - other[ref.tested]) ** 2)) for other in earlier]
     nearest = int(np.argmin(distance))
     # The noise is that of bright pixels; a camera with a display gamma has several times as much in dark ones.
-    alike = max(6 * noise**2, _REPEAT_TOLERANCE * variation(frame, ref))
-    return nearest if distance[nearest] < alike else None
+    limit = max(6 * noise**2, _REPEAT_TOLERANCE * variation(frame, ref))
+    return nearest if distance[nearest] < limit else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -602,10 +602,6 @@ class LineExpectation:
         # A line that straddles two cells of half a period lights all cells equally.
         return bool(high - low >= _MIN_SPAN_PERIODS and np.ptp(self.light[mask]) > 0)
 
-    def count_periods(self, mask: SampleMask) -> int:
-        """Return the number of periods with pixels of a mask, all of them certain."""
-        return len(np.unique(np.floor(self.position[mask])))
-
 
 def find_exchanged_bits(code: DecodedCode) -> tuple[int, int] | None:
     """Return two bits that were exchanged with each other; None if there are none.
@@ -651,26 +647,21 @@ class LineAgreement:
 
 
 def compare_with_lines(
-    code: DecodedCode,
-    lines: Sequence[tuple[LineShift, Samples]],
-    ref: ReferenceFrames,
-    *,
-    cell_px: int,
-    offset_px: int,
-    noise: float,
+    code: DecodedCode, gray: Gray, lines: Sequence[tuple[LineShift, Samples]], ref: ReferenceFrames, *, noise: float
 ) -> LineAgreement:
     """Compare the phase of the lines at each pixel with its decoded cell.
 
     A single wrong bit moves the index by an odd number of cells, which is half a period for cells of that width. So a
     wrong frame of the code is visible at every pixel whose bit it changed.
 
-    lines : frames of one axis with evenly spaced shifts.
+    gray : any bit of the code. lines : frames of one axis with evenly spaced shifts.
     """
+    cell_px = gray.cell_px
     period_px, count = lines[0][0].period_px, len(lines)
     turn = 2j * np.pi / period_px
     waves = np.sum([frame * np.exp(turn * line.centre_px) for line, frame in lines], axis=0)
     clear = np.abs(waves) > np.maximum(_MIN_WAVE_SIGMAS * noise * (count / 2) ** 0.5, _MIN_WAVE * count * ref.contrast)
-    centre_px = cell_px * code.index - offset_px + (cell_px - 1) / 2
+    centre_px = cell_px * code.index - gray.offset_px + (cell_px - 1) / 2
     off_px = (np.angle(waves) / abs(turn) - centre_px + period_px / 2) % period_px - period_px / 2
     compared = code.certain & clear
     wrong = compared & (np.abs(off_px) > cell_px / 2 + period_px / 16)
@@ -759,15 +750,13 @@ def reference_level_fault(
     )
 
 
-def predict_lines(
-    code: DecodedCode, ref: ReferenceFrames, *, cell_px: int, offset_px: int, shift: int, period_px: int, width_px: int
-) -> LineExpectation:
-    """Predict the light of one line frame from the decoded cells."""
-    first_px = cell_px * code.index - offset_px
-    inside_px = np.arange(cell_px)[:, np.newaxis]
-    lit = (first_px + inside_px - shift) % period_px < width_px
-    light = (np.count_nonzero(lit, axis=0) / cell_px).astype(np.float32)
-    position = (first_px / period_px).astype(np.float32)
+def predict_lines(code: DecodedCode, gray: Gray, line: LineShift, ref: ReferenceFrames) -> LineExpectation:
+    """Predict the light of one line frame from the decoded cells. gray : any bit of the code."""
+    first_px = gray.cell_px * code.index - gray.offset_px
+    inside_px = np.arange(gray.cell_px)[:, np.newaxis]
+    lit = (first_px + inside_px - line.shift) % line.period_px < line.line_width_px
+    light = (np.count_nonzero(lit, axis=0) / gray.cell_px).astype(np.float32)
+    position = (first_px / line.period_px).astype(np.float32)
     position[~(code.certain & ref.tested)] = np.nan
     return LineExpectation(position, light)
 
@@ -822,7 +811,7 @@ def line_fault(
         inside = tested & (ref.band == band)
         # A line at the border of its cell lights the next cell almost equally; only over several lines is the ratio
         # independent of the positions of pixels.
-        if not expected.is_testable(inside) or expected.count_periods(inside) < _MIN_BAND_LINES:
+        if not expected.is_testable(inside) or len(np.unique(np.floor(expected.position[inside]))) < _MIN_BAND_LINES:
             continue
         band_correlation = _correlation(frame, ref, expected.light, inside)
         # Half of the samples are neighbours of the others and add little information.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slrig.devices import Camera, CameraSettings, DisplayedPattern, Rig, Synchronisation, Trigger
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
-from slrig.model import Black, FloatArray, Frame, PatternSequence, Pixels, Size, White
+from slrig.model import Black, FloatArray, Frame, PatternSequence, Pixels, White
 
 DEFAULT_TRIALS = 40
 DEFAULT_SEARCH_S = 0.5
@@ -312,10 +312,10 @@ def _settling_time_s(
 def _too_few_flashes_message(camera: str, flashes: Sequence[LightChange], used: int) -> str:
     """Explain why too few flashes are usable."""
     bounds = [bound for flash in flashes if (bound := _change_interval_s(flash)) is not None]
-    head = f"camera '{camera}': {used} of {len(flashes)} flashes were seen as they happened, {MIN_FLASHES} are needed"
+    head = f"camera '{camera}': {used} of {len(flashes)} flashes happened during an exposure, {MIN_FLASHES} are needed"
     if len(bounds) < len(flashes) / 2:
         return (
-            f"{head}; in {len(flashes) - len(bounds)} the light did not change while it was watched: search "
+            f"{head}; in {len(flashes) - len(bounds)} the light did not change within the search time: search "
             "longer, and check that nothing else drives the projector (screen saver, desktop, another input)"
         )
     low_s, high_s = np.median(np.array(bounds), axis=0)
@@ -412,7 +412,8 @@ def measure_latency(
     errors_s: list[float] = []
     projector = rig.projector
     try:
-        projector.load(_white_and_black(projector.info.size))
+        profiles = tuple(np.full((1, 1), level, np.uint8) for level in (255, 0))
+        projector.load(PatternSequence(projector.info.size, (White(), Black()), profiles))
         for index, (name, camera) in enumerate(rig.cameras.items()):
             settings = rig.settings.get(name)
             if settings is not None:
@@ -432,11 +433,6 @@ def measure_latency(
             projector.blank()
     projector.blank()
     return LatencyMeasurement(measured, min(errors_s))
-
-
-def _white_and_black(size: Size) -> PatternSequence:
-    levels = (255, 0)
-    return PatternSequence(size, (White(), Black()), tuple(np.full((1, 1), level, np.uint8) for level in levels))
 
 
 def _choose_trigger(name: str, camera: Camera, requested: Trigger | None) -> Trigger:
@@ -477,7 +473,8 @@ class _FlashTest:
         levels = row_levels(self.name, black, white, full_scale=full_scale)
         flashes: list[LightChange] = []
         used = 0
-        while used < trials and len(flashes) < max_flashes and not self._is_hopeless(flashes, used, trials):
+        # Stop early if no flash is usable.
+        while used < trials and len(flashes) < (max_flashes if used else min(max_flashes, max(2 * trials, 16))):
             flash = self._flash(levels, rng, to_white=len(flashes) % 2 == 1)
             flashes.append(flash)
             used += find_transition_rows(flash, levels) is not None
@@ -486,10 +483,6 @@ class _FlashTest:
                 self.camera.arm(frames, self.trigger)
             on_progress(stage, used / trials, f"{used} of {trials} flashes")
         return fit_latency(self.name, flashes, levels)
-
-    def _is_hopeless(self, flashes: list[LightChange], used: int, trials: int) -> bool:
-        """True if no flash was usable so far and more flashes would not help."""
-        return used == 0 and len(flashes) >= max(2 * trials, 16)
 
     def _read_steady_frames(self, index: int) -> list[Pixels]:
         """Return frames of a light after the time that a change may take."""

@@ -33,8 +33,8 @@ def capture(
 
     This is a generator: nothing starts before the first frame is requested, and the next frame is exposed while the
     consumer processes one. At the end, including errors, cancellation and an early stop of the consumer, the projector
-    is dark and the cameras are disarmed. All cameras use hardware triggers if possible, otherwise software triggers,
-    otherwise they run freely; with a measured latency these are read in parallel, see `slrig.capture.streaming`.
+    is dark and the cameras are disarmed. See `choose_triggers` for the triggers; if all cameras run freely and the
+    latency was measured, they are read in parallel, see `slrig.capture.streaming`.
 
     rig : open devices; cameras without settings keep theirs. cancelled : called before each pattern and frame.
     timeout_s : time that a frame may take beyond its exposure. evidence : verifies the frames; pass one to read its
@@ -57,7 +57,8 @@ def capture(
         with ExitStack() as lit:
             # Switch the light off first.
             lit.callback(_suppress_errors, rig.projector.blank)
-            session = CaptureSession(rig, sequence, _configure_cameras(rig), triggers, timeout_s, cancelled)
+            applied = {name: _configure_camera(rig.cameras[name], name, each) for name, each in rig.settings.items()}
+            session = CaptureSession(rig, sequence, applied, triggers, timeout_s, cancelled)
             retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns, colour=colour)
             if Trigger.HARDWARE in triggers.values():
                 lit.callback(_suppress_errors, rig.projector.stop)
@@ -98,12 +99,8 @@ def choose_triggers(rig: Rig) -> dict[str, Trigger]:
     return chosen
 
 
-def _configure_cameras(rig: Rig) -> dict[str, AppliedSettings]:
-    """Configure every camera that has settings, and compare the values read back."""
-    return {name: _configure_camera(rig.cameras[name], name, settings) for name, settings in rig.settings.items()}
-
-
 def _configure_camera(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettings:
+    """Configure a camera, and compare the values read back."""
     applied = camera.configure(settings)
     for setting, requested, actual, unit in (
         ("exposure", settings.exposure_s, applied.exposure_s, " s"),

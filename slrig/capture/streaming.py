@@ -286,7 +286,9 @@ class _StreamingCapture:
             due_ns = self._due_ns(last=last)
             left_s = _POLL_S if due_ns is None else (due_ns - self._clock.now_ns()) / 1e9
             if self._paired and (left_s > _CHECK_TIME_S or len(self._paired) > _MAX_PAIRED):
-                yield from self._submit_next()
+                shot = self._retries.submit(*self._paired.popleft())
+                if shot is not None:
+                    yield shot
             elif left_s <= 0:
                 return
             else:
@@ -299,8 +301,8 @@ class _StreamingCapture:
         checked.
         """
         if last:
-            ended = not self._displays and not self._paired
-            return 0 if ended or self._has_failed_and_idle() else None
+            is_idle = self._current is None or not self._current.missing
+            return 0 if not self._paired and (not self._displays or (self._retries.pending and is_idle)) else None
         if len(self._displays) > MAX_UNPAIRED:
             return None
         display = self._current
@@ -310,10 +312,6 @@ class _StreamingCapture:
             # Check the repeated frames before anything else is displayed.
             return None if display.missing or self._paired else 0
         return self._predict_due_ns(display)
-
-    def _has_failed_and_idle(self) -> bool:
-        """True if a frame failed and no frame of the displayed pattern is missing."""
-        return bool(self._retries.pending) and (self._current is None or not self._current.missing) and not self._paired
 
     def _predict_due_ns(self, display: _Display) -> int | None:
         """Return when to request the next pattern so that its light begins after a frame of each camera that lacks
@@ -330,12 +328,6 @@ class _StreamingCapture:
             due_ns = max(due_ns, start_ns + spare_ns + span_ns - self._lead.ns)
         return due_ns
 
-    def _submit_next(self) -> Iterator[Shot]:
-        index, frame, fault = self._paired.popleft()
-        shot = self._retries.submit(index, frame, fault)
-        if shot is not None:
-            yield shot
-
     def _receive(self, name: str, arrival: Frame | Exception) -> None:
         if isinstance(arrival, Exception):
             raise arrival
@@ -351,7 +343,8 @@ class _StreamingCapture:
         for name, state in self._camera_states.items():
             remaining: list[tuple[Frame, str | None]] = []
             for frame, fault in state.waiting:
-                display = self._display_of(frame)
+                # The last pattern whose light was complete when the frame began.
+                display = next((each for each in reversed(self._displays) if frame.t_start_ns >= each.stable_ns), None)
                 if display is None:
                     continue
                 end_ns = display.end_ns
@@ -369,13 +362,6 @@ class _StreamingCapture:
             self._report_missing(display, now_ns)
             if not display.missing:
                 self._displays.remove(display)
-
-    def _display_of(self, frame: Frame) -> _Display | None:
-        """Return the last pattern whose light was complete when a frame began."""
-        for display in reversed(self._displays):
-            if frame.t_start_ns >= display.stable_ns:
-                return display
-        return None
 
     def _report_missing(self, display: _Display, now_ns: int) -> None:
         """Request a pattern again for the cameras whose frame was lost or is overdue."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -60,12 +61,6 @@ class CaptureSession:
                 f"the scan was cancelled at {self.describe_pattern(index)} of {len(self.sequence)}"
             )
 
-    def wait_until_stable(self, displayed: DisplayedPattern) -> int:
-        """Wait until a pattern's light is the only one, and return the instant from which it is."""
-        stable_ns = stable_from_ns(displayed, self.rig.synchronisation)
-        self.rig.clock.wait_until(stable_ns, threading.Event())
-        return stable_ns
-
     def read(self, name: str, after_ns: int, timeout_s: float) -> Frame:
         """Return the next frame with the camera's name in the rig. Raises as `Camera.read` does."""
         return with_camera_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
@@ -85,10 +80,10 @@ class CaptureSession:
                 f"frame number {frame.sequence_number} came after number {previous.sequence_number}: a frame was "
                 "delivered twice, or the camera restarted; scan again"
             )
-        asked = self.applied.get(frame.camera)
-        if asked is not None and differs_from_request(frame.exposure_s, asked.exposure_s):
+        applied = self.applied.get(frame.camera)
+        if applied is not None and differs_from_request(frame.exposure_s, applied.exposure_s):
             return (
-                f"exposed for {frame.exposure_s:.6g} s, set to {asked.exposure_s:.6g} s: switch off automatic "
+                f"exposed for {frame.exposure_s:.6g} s, set to {applied.exposure_s:.6g} s: switch off automatic "
                 "exposure, and scan again"
             )
         return None
@@ -128,7 +123,8 @@ def capture_by_software(session: CaptureSession, retries: RetryPolicy) -> Iterat
             return
         session.stop_if_cancelled(index)
         displayed = rig.projector.show(index)
-        stable_ns = session.wait_until_stable(displayed)
+        stable_ns = stable_from_ns(displayed, rig.synchronisation)
+        rig.clock.wait_until(stable_ns, threading.Event())
         for name in names:
             retries.start_exposure(name, index)
             if session.triggers[name] is Trigger.SOFTWARE:
@@ -240,15 +236,15 @@ def play_times_s(session: CaptureSession) -> tuple[float, float]:
     """
     rig, applied = session.rig, session.applied
     known = rig.synchronisation
-    asked_s = None if known is None else known.trigger_period_s
+    requested_s = None if known is None else known.trigger_period_s
     exposure_s = max(each.exposure_s for each in applied.values())
     skew_s = max(shutter_skew_s(camera, name, known) for name, camera in rig.cameras.items())
     # The last row of a rolling shutter needs the pattern's light as long as the first.
     lit_s = exposure_s + skew_s
-    unknown_s = lit_s + exposure_s if asked_s is None else asked_s
+    unknown_s = lit_s + exposure_s if requested_s is None else requested_s
     needed_s = [unknown_s if each.min_period_s is None else each.min_period_s for each in applied.values()]
     projector = rig.projector.info
-    return lit_s, max((lit_s + projector.gap_s) / projector.duty, asked_s or 0.0, *needed_s)
+    return lit_s, max((lit_s + projector.gap_s) / projector.duty, requested_s or 0.0, *needed_s)
 
 
 def _missing_frame_fault(session: CaptureSession, play: _Play, name: str, index: int, error: FrameTimeoutError) -> str:
@@ -307,21 +303,14 @@ def _read_play(session: CaptureSession, retries: RetryPolicy, play: _Play, last:
                 play.delivered.append((index, name))
                 yield shot
     for name in active:
-        extra = _read_extra_frame(session, name, last[name], period_s)
-        if extra is not None:
+        # A frame too many would come within one period.
+        with suppress(FrameTimeoutError):
+            extra = session.read(name, last[name].t_end_ns, 1.5 * period_s)
             play.levels[name].append(float(extra.image.mean()))
             play.faults.append(
                 f"camera '{name}' gave more than the {count} frames of the sequence: something else triggers it; check "
                 "the trigger cable and its polarity, and shield it from the projector's other outputs"
             )
-
-
-def _read_extra_frame(session: CaptureSession, name: str, last: Frame, period_s: float) -> Frame | None:
-    """Return a frame after the last one, which would come within one period; None if there is none."""
-    try:
-        return session.read(name, last.t_end_ns, 1.5 * period_s)
-    except FrameTimeoutError:
-        return None
 
 
 def _numbering_fault(frame: Frame, previous: Frame | None) -> str | None:

@@ -131,7 +131,7 @@ class FrameVerifier:
         self._whole_image = Sampler.from_size(form.size)
         self.findings = CameraFindings()
         self._pending: dict[int, Pixels] = {}
-        self._overview_samples: dict[int, Samples] = {}
+        self._overview: dict[int, Samples] = {}
         self._samples: dict[int, Samples] = {}
         self._sampler: Sampler | None = None
         self._reference: ReferenceFrames | None = None
@@ -167,7 +167,7 @@ class FrameVerifier:
         self.pattern_indices -= set(removed)
         for each in removed:
             self._pending.pop(each, None)
-            self._overview_samples.pop(each, None)
+            self._overview.pop(each, None)
             self._samples.pop(each, None)
         if removes_reference:
             self._sampler, self._reference, self._references, self.lighting = None, None, (), None
@@ -197,7 +197,7 @@ class FrameVerifier:
         pattern = self._patterns[index]
         self.findings.first_seen_index.setdefault(pattern, index)
         if isinstance(pattern, White | Black) or (isinstance(pattern, LineShift) and pattern.is_half_lit):
-            self._overview_samples[index] = self._whole_image.take(image)
+            self._overview[index] = self._whole_image.take(image)
         if self._sampler is None:
             self._pending[index] = image
             return [] if self._reference_rejected else self._set_reference()
@@ -220,9 +220,9 @@ class FrameVerifier:
         return None
 
     def _contradiction(
-        self, index: int, fault: str, suspects: Iterable[int], further_suspects: Iterable[int] = ()
+        self, index: int, fault: str, suspects: Iterable[int], further: Iterable[int] = ()
     ) -> Contradiction:
-        where, rest = describe_frame(self.name, index, self._patterns[index]), set(further_suspects) - set(suspects)
+        where, rest = describe_frame(self.name, index, self._patterns[index]), set(further) - set(suspects)
         return Contradiction(self.name, where, fault, tuple(sorted(set(suspects))), tuple(sorted(rest)))
 
     @property
@@ -238,10 +238,7 @@ class FrameVerifier:
         white, black = self._pending[white_index], self._pending[black_index]
         full_scale = self._format.full_scale
         lighting = frame_checks.measure_lighting(
-            self._overview_samples[white_index],
-            self._overview_samples[black_index],
-            full_scale=full_scale,
-            row=self._whole_image.row,
+            self._overview[white_index], self._overview[black_index], full_scale=full_scale, row=self._whole_image.row
         )
         if isinstance(lighting, str):
             self._reference_rejected = True
@@ -293,28 +290,19 @@ class FrameVerifier:
         return []
 
     def _reference_change(self, index: int, first: int) -> str | None:
-        if index not in self._overview_samples or self.lighting is None:
+        if index not in self._overview or self.lighting is None:
             return None
-        white, black = (self._overview_samples[referee] for referee in self._references)
-        repeat = self._overview_samples[index]
-        contrast = repeat - black if first == self._references[0] else white - repeat
+        white, black = (self._overview[i] for i in self._references)
+        repeat, noise, row = self._overview[index], self.findings.noise_dn, self._whole_image.row
+        contrasts = (white - black, repeat - black if first == self._references[0] else white - repeat)
         return frame_checks.reference_change_fault(
-            self._overview_samples[first],
-            repeat,
-            (white - black, contrast),
-            threshold_dn=self.lighting.threshold_dn,
-            noise=self.findings.noise_dn,
-            row=self._whole_image.row,
+            self._overview[first], repeat, contrasts, threshold_dn=self.lighting.threshold_dn, noise=noise, row=row
         )
 
     def _check_range(self, indices: Sequence[int], ref: ReferenceFrames) -> list[Contradiction]:
-        noise, further_suspects = self.findings.noise_dn, self._unconfirmed_references
-        checked = ((index, frame_checks.range_fault(self._samples[index], ref, noise=noise)) for index in indices)
-        return [
-            self._contradiction(index, fault, [index], further_suspects)
-            for index, fault in checked
-            if fault is not None
-        ]
+        noise, further = self.findings.noise_dn, self._unconfirmed_references
+        faults = ((i, frame_checks.range_fault(self._samples[i], ref, noise=noise)) for i in indices)
+        return [self._contradiction(i, fault, [i], further) for i, fault in faults if fault is not None]
 
     def _check_pair_or_single(self, index: int, pattern: Pattern, ref: ReferenceFrames) -> list[Contradiction]:
         """Check a frame together with its inverse, or alone if its pattern has none."""
@@ -397,9 +385,8 @@ class FrameVerifier:
         code = frame_checks.decode_samples(differences, ref)
         found = self._check_bit_order(code, family, single=single)
         if not found and line_samples:
-            found, wrong = self._check_against_lines(
-                code, gray, family, list(zip(proving_lines, line_samples, strict=True)), ref
-            )
+            pairs = list(zip(proving_lines, line_samples, strict=True))
+            found, wrong = self._check_against_lines(code, family, pairs, ref)
             code = replace(code, certain=code.certain & ~wrong)
         if found:
             return found
@@ -414,11 +401,11 @@ class FrameVerifier:
         return found
 
     def _reference_level_fault(self, lines: Sequence[int]) -> str | None:
-        if self.lighting is None or any(index not in self._overview_samples for index in (*self._references, *lines)):
+        if self.lighting is None or any(index not in self._overview for index in (*self._references, *lines)):
             return None
-        white, black = (self._overview_samples[index] for index in self._references)
+        white, black = (self._overview[index] for index in self._references)
         return frame_checks.reference_level_fault(
-            white, black, [self._overview_samples[index] for index in lines], threshold_dn=self.lighting.threshold_dn,
+            white, black, [self._overview[index] for index in lines], threshold_dn=self.lighting.threshold_dn,
             full_scale=self._format.full_scale, row=self._whole_image.row,
         )  # fmt: skip
 
@@ -445,18 +432,11 @@ class FrameVerifier:
         return [self._contradiction(pair[0], fault, pair, [first_index[p] for p in family])]
 
     def _check_against_lines(
-        self,
-        code: DecodedCode,
-        gray: Gray,
-        family: Sequence[Gray],
-        lines: list[tuple[LineShift, Samples]],
-        ref: ReferenceFrames,
+        self, code: DecodedCode, family: Sequence[Gray], lines: list[tuple[LineShift, Samples]], ref: ReferenceFrames
     ) -> tuple[list[Contradiction], SampleMask]:
         """Compare the code with the lines, which verifies its bits. Also return the mask of pixels that contradict."""
-        first_index, axis = self.findings.first_seen_index, gray.axis
-        agreement = frame_checks.compare_with_lines(
-            code, lines, ref, cell_px=gray.cell_px, offset_px=gray.offset_px, noise=self._noise
-        )  # fmt: skip
+        first_index, axis = self.findings.first_seen_index, family[0].axis
+        agreement = frame_checks.compare_with_lines(code, family[0], lines, ref, noise=self._noise)
         members = [first_index[line] for line, _ in lines]
         if agreement.is_reversed:
             fault = (
@@ -474,19 +454,15 @@ class FrameVerifier:
         before = self._disputed.get(axis)
         self._disputed[axis] = agreement.wrong
         if before is not None and len(before) == len(agreement.wrong):
-            alike = np.count_nonzero(before & agreement.wrong) / np.count_nonzero(before | agreement.wrong)
-            if alike > _SAME_PIXELS_FRACTION and np.mean(agreement.wrong[agreement.compared]) < _MAX_SCENE_FRACTION:
+            common = np.count_nonzero(before & agreement.wrong) / np.count_nonzero(before | agreement.wrong)
+            if common > _SAME_PIXELS_FRACTION and np.mean(agreement.wrong[agreement.compared]) < _MAX_SCENE_FRACTION:
                 # Unchanged in a second exposure, so the scene causes it, for example by interreflections in a hollow.
                 # No frame is suspect, and none is verified.
                 return [], agreement.wrong
         bits = frame_checks.find_faulty_bits(code, agreement.wrong)
         suspects = [first_index[p] for p in family if p.bit in bits]
-        few = len(suspects) <= _MAX_NAMED_SUSPECTS
-        which = (
-            " or ".join(describe_pattern(each, self._patterns[each]) for each in suspects)
-            if few
-            else "the frame of a bit"
-        )
+        names = " or ".join(describe_pattern(each, self._patterns[each]) for each in suspects)
+        which = names if len(suspects) <= _MAX_NAMED_SUSPECTS else "the frame of a bit"
         fault = (
             f"{where} have a code that their lines contradict: {which} was not shown or was damaged, or something "
             "moved; check the cable and the projector's latency, and scan again; if it stays, light comes from "
@@ -527,30 +503,17 @@ class FrameVerifier:
             self.findings.pending_lines.append(index)
             return []
         code, gray = known
-        expected = frame_checks.predict_lines(
-            code,
-            ref,
-            cell_px=gray.cell_px,
-            offset_px=gray.offset_px,
-            shift=pattern.shift,
-            period_px=pattern.period_px,
-            width_px=pattern.line_width_px,
-        )
-        others = [
-            self._samples[i]
-            for p, i in self.findings.first_seen_index.items()
-            if isinstance(p, LineShift) and p.axis is pattern.axis and i != index
-        ]
+        first_index = self.findings.first_seen_index
+        expected = frame_checks.predict_lines(code, gray, pattern, ref)
+        lines = (i for p, i in first_index.items() if isinstance(p, LineShift) and p.axis is pattern.axis)
+        others = [self._samples[i] for i in lines if i != index]
         duty = pattern.line_width_px / pattern.period_px
         compared, fault = frame_checks.line_fault(
             self._samples[index], others, ref, expected, noise=self._noise, duty=duty
         )
         if fault is not None:
-            code_frames = (
-                []
-                if pattern.axis in self.findings.verified_axes
-                else [self.findings.first_seen_index[p] for p in self._code_bits(gray)]
-            )
+            is_code_verified = pattern.axis in self.findings.verified_axes
+            code_frames = [] if is_code_verified else [first_index[p] for p in self._code_bits(gray)]
             return [self._contradiction(index, fault, [index], code_frames)]
         if compared:
             self.findings.verified.add(index)

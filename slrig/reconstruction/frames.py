@@ -177,7 +177,7 @@ class AxisPatterns:
     def noise_patterns(self) -> frozenset[Pattern]:
         """Patterns to estimate noise and response of the camera from.
 
-        With inverses, white and black these are `telling_bits`; without inverses `telling_lines`, or else lines of half
+        With inverses, white and black these are `diagnostic_bits`; without inverses `diagnostic_line_pairs`, or else lines of half
         their period and some bits; otherwise the whole code.
         """
         if len(self.reference) == 2:

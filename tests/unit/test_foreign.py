@@ -203,7 +203,7 @@ def test_a_folder_of_ros_that_is_wrong_is_refused(tmp_path: Path, changed: dict[
     assert words in str(caught.value)
 
 
-def test_yaml_that_would_grow_is_refused_before_it_is_built(tmp_path: Path) -> None:
+def test_expanding_yaml_is_rejected_before_it_is_built(tmp_path: Path) -> None:
     bomb = "a0: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40))
     for text, words in (
         (bomb, "without anchors"),
@@ -273,7 +273,7 @@ CODE = ProjectorCode(Size(1824, 1140), cell_px=2)
         ("row line 0 of 12 width 3", LineShift(Axis.ROW, 0, 12, 3)),
     ],
 )
-def test_words_name_a_pattern(words: str, wanted: Pattern) -> None:
+def test_pattern_texts_are_parsed(words: str, wanted: Pattern) -> None:
     assert CODE.parse_pattern(words) == wanted
 
 
@@ -289,7 +289,7 @@ def test_words_name_a_pattern(words: str, wanted: Pattern) -> None:
         ("column line 9 of 8", PatternError, "found shift 9"),
     ],
 )
-def test_other_words_are_refused(words: str, error: type[SlrigError], said: str) -> None:
+def test_other_pattern_texts_are_rejected(words: str, error: type[SlrigError], said: str) -> None:
     with pytest.raises(error, match=said):
         CODE.parse_pattern(words)
 
@@ -304,7 +304,7 @@ def test_other_words_are_refused(words: str, error: type[SlrigError], said: str)
         ("{camera}/{axis}{power}.bmp", "left/Y0.bmp", Gray(Axis.ROW, 9, 10, 2)),
     ],
 )
-def test_a_name_says_its_bit(template: str, name: str, wanted: Pattern) -> None:
+def test_a_name_contains_its_bit(template: str, name: str, wanted: Pattern) -> None:
     named = compile_name_template(template).fullmatch(name)
     assert named is not None
     assert pattern_from_name(CODE, named) == wanted
@@ -322,7 +322,7 @@ def test_a_name_says_its_bit(template: str, name: str, wanted: Pattern) -> None:
         ("{power}.png", "10.png", "found -1"),
     ],
 )
-def test_a_name_that_says_none_is_refused(template: str, name: str, said: str) -> None:
+def test_a_name_without_a_bit_is_rejected(template: str, name: str, said: str) -> None:
     def read() -> Pattern:
         named = compile_name_template(template).fullmatch(name)
         assert named is not None

@@ -37,7 +37,7 @@ FORMAT = CameraFormat(Size(4, 3), 8)
 SHEARED = np.array([[1.0, 0.1, 0], [0, 1, 0], [0, 0, 1]])
 
 
-def test_values_state_what_follows_from_them() -> None:
+def test_derived_values() -> None:
     size = Size(1280, 800)
     assert (size.shape, size.along(Axis.COLUMN), size.along(Axis.ROW)) == ((800, 1280), 1280, 800)
     assert str(size) == "1280 x 800"
@@ -140,7 +140,7 @@ def capture_of(pattern: int, camera: str, shape: tuple[int, int] = (3, 4)) -> Ca
         (lambda: mesh_of_one_triangle(deviations=2), [()], ValueError, r"Mesh\.sigma_mm"),
     ],
 )
-def test_value_that_cannot_be_is_refused(
+def test_invalid_values_are_rejected(
     make: Callable[..., Any], cases: list[tuple[Any, ...]], error: type[Exception], words: str
 ) -> None:
     for case in cases:
@@ -197,7 +197,7 @@ def test_arrays_are_sent_as_their_points_are_to_the_bit() -> None:
     np.testing.assert_array_equal(np.stack(lens.distort(STRONG, x, y), axis=-1).reshape(-1, 5), one_by_one)
 
 
-def test_the_way_back_ends_where_it_began_and_is_none_from_where_the_lens_sends_nothing() -> None:
+def test_undistort_inverts_distort_and_is_nan_beyond_its_range() -> None:
     for x, y in POINTS:
         xd, yd, *_ = lens.distort(STRONG, float(x), float(y))
         found = lens_kernels.undistort(STRONG, xd, yd, xd, yd, 1e-7)
@@ -232,7 +232,7 @@ def test_light_beyond_white_is_white_and_none_is_black() -> None:
     ]
 
 
-def test_every_value_comes_back_and_dark_ones_stay_apart() -> None:
+def test_srgb_round_trip_keeps_all_values() -> None:
     values = np.arange(256, dtype=np.uint8)
     light = srgb_to_linear(values)
     assert light.dtype == np.uint16

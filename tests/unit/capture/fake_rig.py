@@ -95,9 +95,9 @@ class Scene:
         sent = np.broadcast_to(profile.ravel(), (extent_px,)) if profile.size == 1 else profile.ravel()
         values = sent.astype(np.float64) / 255
         if self.scaler_px:
-            values = _blurred(values, self.scaler_px, reach=round(4 * self.scaler_px)) ** 2.2
+            values = _blur(values, self.scaler_px, reach=round(4 * self.scaler_px)) ** 2.2
         steps = np.repeat(values, fine)
-        blurred = _blurred(steps, self.blur_px * fine, reach=6 * fine)
+        blurred = _blur(steps, self.blur_px * fine, reach=6 * fine)
         centres_px = (np.arange(len(steps)) + 0.5) / fine - 0.5
         seen = np.interp(position_px, centres_px, blurred, left=0.0, right=0.0)
         on_projector = (np.abs(self.column_px - (self.projector.width_px - 1) / 2) <= self.projector.width_px / 2) & (
@@ -122,7 +122,7 @@ class Scene:
         return [Shot(i, camera, self.image(profile)) for i, profile in enumerate(sequence.profiles)]
 
 
-def _blurred(values: NDArray[np.float64], sigma: float, *, reach: int) -> NDArray[np.float64]:
+def _blur(values: NDArray[np.float64], sigma: float, *, reach: int) -> NDArray[np.float64]:
     """Values under a Gaussian, (n,) float64; beyond their ends they go on as they end.
 
     By numpy: an emulated guest takes ten seconds and more to load scipy.ndimage.
@@ -256,7 +256,7 @@ class FakeProjector:
 
 @dataclass
 class FakeTurntable:
-    """Implements `Turntable`. turned_deg : every angle that it was told, in order."""
+    """Implements `Turntable`. turned_deg : every requested angle, in order."""
 
     turned_deg: list[float] = field(default_factory=list)
     error: Exception | None = None
@@ -433,7 +433,7 @@ class FakeRig:
         return not self.projector.lit and all(camera.armed is None for camera in self.cameras.values())
 
 
-def add(evidence: Evidence, shot: Shot) -> None:
+def add_agreeing_shot(evidence: Evidence, shot: Shot) -> None:
     """Feed a frame that must contradict nothing."""
     found = evidence.add_shot(shot)
     if found:

@@ -28,7 +28,7 @@ from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, 
 from slrig.patterns.sequence import encode
 from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence
-from tests.unit.capture.fake_rig import PROJECTOR, Scene, add, patterns_for
+from tests.unit.capture.fake_rig import PROJECTOR, Scene, add_agreeing_shot, patterns_for
 
 PATTERNS = patterns_for()
 COUNT = len(PATTERNS)
@@ -37,18 +37,18 @@ SHOTS = SCENE.shots(PATTERNS)
 FIRST_LINE = next(i for i, pattern in enumerate(PATTERNS) if isinstance(pattern, LineShift))
 
 
-def judged(scene: Scene, shots: Sequence[Shot], patterns: Sequence[Pattern] = PATTERNS) -> Evidence:
+def verify_shots(scene: Scene, shots: Sequence[Shot], patterns: Sequence[Pattern] = PATTERNS) -> Evidence:
     evidence = Evidence(patterns, {"left": scene.format})
     for shot in shots:
-        add(evidence, shot)
+        add_agreeing_shot(evidence, shot)
     return evidence
 
 
-def judged_summary(shots: Sequence[Shot], patterns: Sequence[Pattern]) -> EvidenceSummary:
+def recorded_summary(shots: Sequence[Shot], patterns: Sequence[Pattern]) -> EvidenceSummary:
     return check_capture(Capture(PROJECTOR, tuple(patterns), {"left": SCENE.format}, tuple(shots)))
 
 
-def recorded(shots: Sequence[Shot]) -> Capture:
+def make_capture(shots: Sequence[Shot]) -> Capture:
     return Capture(PROJECTOR, PATTERNS, {"left": SCENE.format}, tuple(shots))
 
 
@@ -89,9 +89,9 @@ PROVEN = {"noise-free", "noisy", "strong ambient light", "sharp", "camera with g
         *(pytest.param(name, shift, True, marks=pytest.mark.slow) for name in SCENES for shift in (True, False)),
     ],
 )
-def test_sound_frames_pass(name: str, line_shift: bool, rows: bool) -> None:
+def test_correct_frames_pass(name: str, line_shift: bool, rows: bool) -> None:
     scene, patterns = SCENES[name], patterns_for(line_shift=line_shift, rows=rows)
-    summary = judged(scene, scene.shots(patterns), patterns).summary()
+    summary = verify_shots(scene, scene.shots(patterns), patterns).summary()
     assert summary.patterns == len(patterns)
     assert summary.faults == ()
     if name in PROVEN:
@@ -102,7 +102,7 @@ def test_sound_frames_pass(name: str, line_shift: bool, rows: bool) -> None:
 
 def test_noise_is_measured() -> None:
     scene = Scene(noise_dn=2.0)
-    assert judged(scene, scene.shots(PATTERNS)).summary().noise_dn["left"] == pytest.approx(2.0, rel=0.2)
+    assert verify_shots(scene, scene.shots(PATTERNS)).summary().noise_dn["left"] == pytest.approx(2.0, rel=0.2)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_bits_may_be_constant_where_the_camera_sees_a_part_of_the_projector(
     size = Size(1024, 96)
     scene = Scene(projector=size, first_column_px=first_column_px, noise_dn=noise_dn)
     patterns = patterns_for(size)
-    assert judged(scene, scene.shots(patterns), patterns).summary().verified == len(patterns)
+    assert verify_shots(scene, scene.shots(patterns), patterns).summary().verified == len(patterns)
 
 
 def lines_first(shots: list[Shot]) -> list[Shot]:
@@ -137,7 +137,7 @@ def test_other_sequences_are_understood(
     patterns: tuple[Pattern, ...], order: Callable[[list[Shot]], list[Shot]]
 ) -> None:
     scene = Scene(noise_dn=1.0, blur_px=0.4)
-    assert judged(scene, order(scene.shots(patterns)), patterns).summary().verified == len(patterns)
+    assert verify_shots(scene, order(scene.shots(patterns)), patterns).summary().verified == len(patterns)
 
 
 @pytest.mark.parametrize(
@@ -151,10 +151,10 @@ def test_other_sequences_are_understood(
     ],
     ids=["without inverses and lines no bit", "without white and black nothing"],
 )
-def test_what_no_frame_speaks_for_is_not_proven(
+def test_patterns_without_evidence_are_not_verified(
     patterns: tuple[Pattern, ...], proven: Callable[[Pattern], bool]
 ) -> None:
-    summary = judged(SCENE, SCENE.shots(patterns), patterns).summary()
+    summary = verify_shots(SCENE, SCENE.shots(patterns), patterns).summary()
     assert (summary.patterns, summary.faults) == (len(patterns), ())
     assert summary.verified == sum(map(proven, patterns))
 
@@ -173,40 +173,40 @@ IN_TURN = [SequenceName.FAST, pytest.param(SequenceName.STANDARD, marks=pytest.m
 
 @pytest.mark.parametrize("sequence", SINGLE)
 @pytest.mark.parametrize("name", SCENES)
-def test_bits_without_inverses_are_proven_by_the_lines(name: str, sequence: SequenceName) -> None:
+def test_bits_without_inverses_are_verified_by_the_lines(name: str, sequence: SequenceName) -> None:
     scene, patterns = SCENES[name], SINGLE[sequence]
-    summary = judged(scene, scene.shots(patterns), patterns).summary()
+    summary = verify_shots(scene, scene.shots(patterns), patterns).summary()
     assert (summary.patterns, summary.faults) == (len(patterns), ())
     if name in PROVEN:
         assert summary.verified == len(patterns)
 
 
-def test_a_bit_that_lights_what_lines_do_is_no_repetition() -> None:
+def test_a_bit_equal_to_a_line_pattern_is_not_a_repetition() -> None:
     """With cells of one pixel the second finest bit but one is lit as lines of period 8 and 4 px are."""
     patterns = pattern_sequence(PatternPlan(gray_cell_px=1), PROJECTOR).patterns
     bits = [each for each in patterns if isinstance(each, Gray) and each.as_lines in patterns]
     assert len(bits) == 1
-    summary = judged(SCENE, SCENE.shots(patterns), patterns).summary()
+    summary = verify_shots(SCENE, SCENE.shots(patterns), patterns).summary()
     assert (summary.faults, summary.verified) == ((), len(patterns))
     whole = encode([bits[0], bits[0].as_lines or bits[0]], PROJECTOR)
     np.testing.assert_array_equal(whole.image(0), whole.image(1))
 
 
 @pytest.mark.parametrize("sequence", IN_TURN)
-def test_a_single_frame_that_is_not_what_it_claims_is_refused(sequence: SequenceName) -> None:
+def test_a_single_wrong_frame_is_rejected(sequence: SequenceName) -> None:
     patterns = SINGLE[sequence]
     shots = SCENE.shots(patterns)
     passed = []
     for index, spoil in product(range(2, len(patterns) - (sequence is SequenceName.STANDARD)), SPOILS):
         image = spoil(shots, index)
         changed = np.mean(np.abs(image.astype(float) - shots[index].image)) > 5
-        if changed and not judged_summary(with_image(shots, index, image), patterns).faults:
+        if changed and not recorded_summary(with_image(shots, index, image), patterns).faults:
             passed.append((index, spoil.__name__))
     assert passed == []
 
 
 @pytest.mark.parametrize("sequence", IN_TURN)
-def test_any_two_frames_in_each_others_place_are_refused(sequence: SequenceName) -> None:
+def test_any_two_exchanged_frames_are_rejected(sequence: SequenceName) -> None:
     patterns = SINGLE[sequence]
     shots = SCENE.shots(patterns)
     passed = []
@@ -214,12 +214,12 @@ def test_any_two_frames_in_each_others_place_are_refused(sequence: SequenceName)
         if patterns[one] == patterns[other]:
             continue
         swapped = with_image(with_image(shots, one, shots[other].image), other, shots[one].image)
-        if not judged_summary(swapped, patterns).faults:
+        if not recorded_summary(swapped, patterns).faults:
             passed.append((patterns[one], patterns[other]))
     assert passed == []
 
 
-def test_of_a_bit_that_lines_contradict_the_bit_is_blamed() -> None:
+def test_a_bit_that_lines_contradict_is_suspect() -> None:
     patterns = SINGLE[SequenceName.STANDARD]
     shots = SCENE.shots(patterns)
     index = patterns.index(Gray(Axis.COLUMN, 3, 5, 4))
@@ -234,7 +234,7 @@ def test_of_a_bit_that_lines_contradict_the_bit_is_blamed() -> None:
     assert evidence.summary().verified == len(patterns)
 
 
-def test_what_the_scene_itself_does_is_no_fault_when_it_comes_again() -> None:
+def test_interreflections_are_no_fault_when_they_repeat() -> None:
     """Light that a wall of a hollow sends to another turns a bit over wherever it falls, in every exposure."""
     patterns = SINGLE[SequenceName.STANDARD]
     shots = SCENE.shots(patterns)
@@ -270,17 +270,17 @@ def test_what_the_scene_itself_does_is_no_fault_when_it_comes_again() -> None:
     ],
     ids=["lamp off in the dark", "lamp off in a lit room", "inverted", "all white", "over-exposed"],
 )
-def test_white_and_black_that_cannot_be_used(scene: Scene, swap: bool, words: str) -> None:
+def test_unusable_white_and_black_are_rejected(scene: Scene, swap: bool, words: str) -> None:
     white, black = scene.shots([White(), Black()])
     if swap:
         white, black = replace(white, image=black.image), replace(black, image=white.image)
     with pytest.raises(ScanEvidenceError, match=words):
-        judged(scene, [white, black])
+        verify_shots(scene, [white, black])
 
 
-def test_an_all_black_recording_is_told_once() -> None:
+def test_an_all_black_recording_is_reported_once() -> None:
     scene = Scene(white=0.0, ambient=0.0)
-    summary = check_capture(recorded(scene.shots(PATTERNS)))
+    summary = check_capture(make_capture(scene.shots(PATTERNS)))
     assert len(summary.faults) == 1
     assert summary.verified == 0
 
@@ -333,14 +333,14 @@ EACH_KIND = {3: SPOILS, 10: (stale, garbled), FIRST_LINE: (stale, cut), FIRST_LI
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("scaler_px", [0.0, pytest.param(0.7, marks=pytest.mark.slow)])
-def test_a_frame_that_is_not_what_it_claims_is_refused(spoil: Spoil, index: int, scaler_px: float) -> None:
+def test_a_wrong_frame_is_rejected(spoil: Spoil, index: int, scaler_px: float) -> None:
     scene = Scene(noise_dn=1.0, scaler_px=scaler_px)
     shots = scene.shots(PATTERNS)
     with pytest.raises(ScanEvidenceError, match=r"camera 'left', pattern \d+ \(column (Gray bit|lines)"):
-        judged(scene, with_image(shots, index, spoil(shots, index)))
+        verify_shots(scene, with_image(shots, index, spoil(shots, index)))
 
 
-def exchanged(one: int, other: int) -> list[Shot]:
+def exchange_frames(one: int, other: int) -> list[Shot]:
     return with_image(with_image(SHOTS, one, SHOTS[other].image), other, SHOTS[one].image)
 
 
@@ -350,9 +350,9 @@ BIT_0, BIT_4 = (PATTERNS.index(Gray(Axis.COLUMN, bit, 5, 4)) for bit in (0, 4))
 @pytest.mark.parametrize(
     ("shots", "words"),
     [
-        (exchanged(BIT_0, BIT_0 + 1), "exchanged with its inverse"),
-        (exchanged(BIT_4, BIT_4 + 1), "exchanged with its inverse"),
-        *((exchanged(FIRST_LINE, FIRST_LINE + other), "lines") for other in (1, 4, 7)),
+        (exchange_frames(BIT_0, BIT_0 + 1), "exchanged with its inverse"),
+        (exchange_frames(BIT_4, BIT_4 + 1), "exchanged with its inverse"),
+        *((exchange_frames(FIRST_LINE, FIRST_LINE + other), "lines") for other in (1, 4, 7)),
         (
             with_image(SHOTS, FIRST_LINE + 3, SHOTS[FIRST_LINE + 2].image),
             rf"lines, shift 3 of 8.*equals that of pattern {FIRST_LINE + 2} ",
@@ -368,24 +368,24 @@ BIT_0, BIT_4 = (PATTERNS.index(Gray(Axis.COLUMN, bit, 5, 4)) for bit in (0, 4))
     ],
     ids=["bit 0", "bit 4", "lines 1", "lines 4", "lines 7", "twin", "light", "moved"],
 )
-def test_frames_that_contradict_one_another_are_refused_in_words(shots: list[Shot], words: str) -> None:
+def test_contradicting_frames_are_rejected_with_a_reason(shots: list[Shot], words: str) -> None:
     with pytest.raises(ScanEvidenceError, match=words):
-        judged(SCENE, shots)
+        verify_shots(SCENE, shots)
 
 
-def test_a_coarse_bit_exchanged_with_its_inverse_is_refused_without_line_frames() -> None:
+def test_an_inverted_coarse_bit_is_rejected_without_line_frames() -> None:
     scene = Scene(noise_dn=1.0, columns_per_px=0.2, first_column_px=40)
     patterns = patterns_for(line_shift=False)
     shots = scene.shots(patterns)
     i = patterns.index(Gray(Axis.COLUMN, 1, 6, 2))
     swapped = with_image(with_image(shots, i, shots[i + 1].image), i + 1, shots[i].image)
     with pytest.raises(ScanEvidenceError, match="bit 1 of the column code is exchanged with its inverse"):
-        judged(scene, swapped, patterns)
+        verify_shots(scene, swapped, patterns)
 
 
 def test_a_small_drift_is_measured_and_passes() -> None:
     closing = replace(SCENE, white=0.6 * 1.05).shots(PATTERNS)[-2]
-    summary = judged(SCENE, [*SHOTS[:-2], closing, SHOTS[-1]]).summary()
+    summary = verify_shots(SCENE, [*SHOTS[:-2], closing, SHOTS[-1]]).summary()
     assert summary.light_drift["left"] == pytest.approx(0.05, abs=0.01)
 
 
@@ -400,22 +400,22 @@ def test_a_small_drift_is_measured_and_passes() -> None:
         (np.full((150, 200), 5000, np.uint16), r"value 5000, 12 bits end at 4095"),
     ],
 )
-def test_a_frame_of_another_format_is_refused(image: Pixels, words: str) -> None:
+def test_a_frame_of_another_format_is_rejected(image: Pixels, words: str) -> None:
     scene = Scene(bit_depth=12)
     with pytest.raises(ScanEvidenceError, match=words):
-        judged(scene, [Shot(0, "left", image)])
+        verify_shots(scene, [Shot(0, "left", image)])
 
 
 # ---- a recorded capture
 
 
-def test_a_recording_with_faults_is_judged_and_not_refused() -> None:
-    summary = check_capture(recorded(with_image(SHOTS, 5, SHOTS[4].image)))
+def test_a_recording_with_faults_is_summarised_without_an_error() -> None:
+    summary = check_capture(make_capture(with_image(SHOTS, 5, SHOTS[4].image)))
     assert any("pattern 5 (column Gray bit 1 of 5, inverse)" in fault for fault in summary.faults)
     assert summary.verified < summary.patterns == len(PATTERNS)
 
 
-def test_cameras_are_judged_apart_and_a_pattern_needs_both() -> None:
+def test_cameras_are_checked_separately_and_a_pattern_needs_all() -> None:
     left, right = Scene(noise_dn=1.0), Scene(noise_dn=1.0, seed=3, first_column_px=20)
     bad = right.shots(PATTERNS, "right")
     bad = with_image(bad, 5, bad[4].image)
@@ -425,27 +425,27 @@ def test_cameras_are_judged_apart_and_a_pattern_needs_both() -> None:
     assert summary.verified < summary.patterns
 
 
-def test_a_bracket_is_judged_at_the_exposure_most_patterns_have() -> None:
+def test_a_bracket_is_checked_at_the_exposure_of_most_patterns() -> None:
     usual = [replace(shot, exposure_s=0.01) for shot in SHOTS]
     long = [replace(shot, exposure_s=0.015) for shot in replace(SCENE, white=0.9).shots(PATTERNS)[:2]]
-    summary = check_capture(recorded([*long, *usual]))
+    summary = check_capture(make_capture([*long, *usual]))
     assert (summary.verified, summary.faults) == (len(PATTERNS), ())
 
 
 # ---- frames that are taken back: what is left stands as if they had never come
 
 
-def evidence_of(patterns: Sequence[Pattern] = PATTERNS) -> Evidence:
+def new_evidence(patterns: Sequence[Pattern] = PATTERNS) -> Evidence:
     return Evidence(patterns, {"left": SCENE.format})
 
 
 @pytest.fixture(scope="module")
 def clean() -> EvidenceSummary:
     """What all frames prove when none was wrong."""
-    return judged(SCENE, SHOTS).summary()
+    return verify_shots(SCENE, SHOTS).summary()
 
 
-def alike(one: EvidenceSummary, other: EvidenceSummary) -> bool:
+def summaries_equal(one: EvidenceSummary, other: EvidenceSummary) -> bool:
     same = [(each.patterns, each.verified, each.lit, each.faults) for each in (one, other)]
     return same[0] == same[1] and bool(one.noise_dn == pytest.approx(other.noise_dn))
 
@@ -453,7 +453,7 @@ def alike(one: EvidenceSummary, other: EvidenceSummary) -> bool:
 # White, black, the first pair, the finest bit, the first line, and the last frame.
 @pytest.mark.parametrize("wrong", [0, 1, 2, 11, 12, COUNT - 1])
 def test_a_wrong_frame_that_is_retracted_and_replaced_leaves_no_trace(wrong: int, clean: EvidenceSummary) -> None:
-    evidence = evidence_of()
+    evidence = new_evidence()
     waiting = list(SHOTS)
     spoilt = replace(SHOTS[wrong], image=garbled(SHOTS, wrong))
     blamed: list[int] = []
@@ -467,71 +467,71 @@ def test_a_wrong_frame_that_is_retracted_and_replaced_leaves_no_trace(wrong: int
             assert suspects <= set(gone)
             waiting = [SHOTS[index] for index in gone] + waiting
     assert wrong in blamed
-    assert alike(evidence.summary(), clean)
+    assert summaries_equal(evidence.summary(), clean)
     assert evidence.summary().light_drift == pytest.approx(clean.light_drift, abs=0.01)
 
 
 @pytest.mark.parametrize("index", [3, 12, COUNT - 1])
-def test_a_right_frame_may_be_retracted_and_taken_again(index: int, clean: EvidenceSummary) -> None:
-    evidence = evidence_of()
+def test_a_correct_frame_may_be_retracted_and_added_again(index: int, clean: EvidenceSummary) -> None:
+    evidence = new_evidence()
     for shot in SHOTS:
-        add(evidence, shot)
+        add_agreeing_shot(evidence, shot)
     assert evidence.retract("left", [index]) == (index,)
     assert evidence.summary().patterns == COUNT - 1
-    add(evidence, SHOTS[index])
-    assert alike(evidence.summary(), clean)
+    add_agreeing_shot(evidence, SHOTS[index])
+    assert summaries_equal(evidence.summary(), clean)
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_everything_rests_on_the_frames_that_tell_what_is_lit(index: int, clean: EvidenceSummary) -> None:
-    evidence = evidence_of()
+def test_retracting_a_reference_frame_removes_all_frames(index: int, clean: EvidenceSummary) -> None:
+    evidence = new_evidence()
     for shot in SHOTS[:6]:
-        add(evidence, shot)
+        add_agreeing_shot(evidence, shot)
     assert evidence.retract("left", [index]) == (0, 1, 2, 3, 4, 5)
     assert evidence.summary().patterns == 0
     for shot in SHOTS:
-        add(evidence, shot)
-    assert alike(evidence.summary(), clean)
+        add_agreeing_shot(evidence, shot)
+    assert summaries_equal(evidence.summary(), clean)
 
 
-def test_what_was_never_there_can_be_retracted() -> None:
-    evidence = evidence_of()
+def test_an_unknown_frame_can_be_retracted() -> None:
+    evidence = new_evidence()
     assert evidence.retract("left", [3]) == ()
-    add(evidence, SHOTS[0])
+    add_agreeing_shot(evidence, SHOTS[0])
     assert evidence.retract("left", [0, 7]) == (0,)
 
 
-def test_frames_that_come_while_white_and_black_are_refused_are_judged_later(clean: EvidenceSummary) -> None:
-    evidence = evidence_of()
-    add(evidence, replace(SHOTS[0], image=SHOTS[1].image))
+def test_frames_wait_while_white_and_black_are_rejected(clean: EvidenceSummary) -> None:
+    evidence = new_evidence()
+    add_agreeing_shot(evidence, replace(SHOTS[0], image=SHOTS[1].image))
     (found,) = evidence.add_shot(SHOTS[1])
     assert found.suspects == (0, 1)
-    add(evidence, SHOTS[2])
+    add_agreeing_shot(evidence, SHOTS[2])
     evidence.retract("left", found.suspects)
     for shot in (*SHOTS[:2], *SHOTS[3:]):
-        add(evidence, shot)
-    assert alike(evidence.summary(), clean)
+        add_agreeing_shot(evidence, shot)
+    assert summaries_equal(evidence.summary(), clean)
 
 
 def test_one_of_two_suspects_may_be_enough() -> None:
-    evidence = evidence_of()
+    evidence = new_evidence()
     for shot in SHOTS[:4]:
-        add(evidence, shot)
-    add(evidence, replace(SHOTS[4], image=garbled(SHOTS, 4)))
+        add_agreeing_shot(evidence, shot)
+    add_agreeing_shot(evidence, replace(SHOTS[4], image=garbled(SHOTS, 4)))
     found = evidence.add_shot(SHOTS[5])
     assert [each.suspects for each in found] == [(4, 5)]
     evidence.retract("left", [4])
-    add(evidence, SHOTS[4])
+    add_agreeing_shot(evidence, SHOTS[4])
     assert evidence.summary().faults == ()
 
 
-def test_what_the_frames_left_contradict_is_told_with_the_next_one() -> None:
+def test_contradictions_of_remaining_frames_are_returned_with_the_next() -> None:
     # Bit 0 is shown twice; of the two frames that do not agree the right one is taken back.
     patterns = (*PATTERNS[:4], PATTERNS[2], *PATTERNS[4:])
-    evidence = evidence_of(patterns)
+    evidence = new_evidence(patterns)
     shots = SCENE.shots(patterns)
     for shot in shots[:4]:
-        add(evidence, shot)
+        add_agreeing_shot(evidence, shot)
     (found,) = evidence.add_shot(replace(shots[4], image=garbled(shots, 4)))
     assert found.suspects == (4,)
     evidence.retract("left", [2])
@@ -541,38 +541,38 @@ def test_what_the_frames_left_contradict_is_told_with_the_next_one() -> None:
     assert evidence.summary().faults == (str(again),)
 
 
-def test_a_contradiction_names_what_it_rests_on_until_something_has_vouched_for_it() -> None:
-    evidence = evidence_of()
+def test_unconfirmed_reference_frames_are_further_suspects() -> None:
+    evidence = new_evidence()
     for shot in SHOTS[:3]:
-        add(evidence, shot)
+        add_agreeing_shot(evidence, shot)
     (early,) = evidence.add_shot(replace(SHOTS[3], image=garbled(SHOTS, 3)))
     assert (early.suspects, early.further_suspects) == ((2, 3), (0, 1))
     assert str(early).startswith("camera 'left', pattern 3 (column Gray bit 0 of 5, inverse): compared with pattern 2 ")
     evidence.retract("left", [3])
     for shot in SHOTS[3:5]:
-        add(evidence, shot)
+        add_agreeing_shot(evidence, shot)
     (late,) = evidence.add_shot(replace(SHOTS[5], image=garbled(SHOTS, 5)))
     assert (late.suspects, late.further_suspects) == ((4, 5), ())
 
 
-def test_lines_accuse_the_code_until_one_of_them_agrees_with_it() -> None:
+def test_lines_make_the_code_suspect_until_one_agrees_with_it() -> None:
     first = 12
-    evidence = evidence_of()
+    evidence = new_evidence()
     for shot in SHOTS[:first]:
-        add(evidence, shot)
+        add_agreeing_shot(evidence, shot)
     # The light is that of a line frame, and not where the code says.
     wrong = replace(SHOTS[first], image=SHOTS[first + 4].image)
     (found,) = evidence.add_shot(wrong)
     assert (found.suspects, found.further_suspects) == ((first,), tuple(range(2, first)))
     evidence.retract("left", [first])
-    add(evidence, SHOTS[first])
+    add_agreeing_shot(evidence, SHOTS[first])
     (found,) = evidence.add_shot(replace(SHOTS[first + 1], image=SHOTS[first + 5].image))
     assert (found.suspects, found.further_suspects) == ((first + 1,), ())
 
 
-def test_what_was_refused_stays_on_record_when_all_frames_are_forgotten() -> None:
-    evidence = evidence_of()
-    add(evidence, SHOTS[0])
+def test_rejected_exposures_stay_recorded_after_clear() -> None:
+    evidence = new_evidence()
+    add_agreeing_shot(evidence, SHOTS[0])
     evidence.record_refused(RefusedFrame(3, "left", 1, "stale", SHOTS[3]))
     evidence.record_refused(RefusedFrame(3, "left", 2, "stale", SHOTS[3]))
     evidence.clear()
@@ -582,9 +582,9 @@ def test_what_was_refused_stays_on_record_when_all_frames_are_forgotten() -> Non
     assert str(summary) == "0/0 patterns verified, 2 frames shot again"
 
 
-def test_a_recording_knows_what_was_shot_again() -> None:
+def test_a_recording_counts_repeated_exposures() -> None:
     summary = check_capture(
-        recorded(SHOTS), [RefusedFrame(3, "left", 1, "stale"), RefusedFrame(99, "left", 1, "of another sequence")]
+        make_capture(SHOTS), [RefusedFrame(3, "left", 1, "stale"), RefusedFrame(99, "left", 1, "of another sequence")]
     )
     assert str(summary) == "22/22 patterns verified, 1 frame shot again"
 
@@ -611,10 +611,10 @@ QUICK = [(0, garbled, 0.6), (1, bright_rows, 0.6), (1, black_rows, 0.6), (COUNT 
 @pytest.mark.parametrize(
     ("index", "damage", "white"), [*QUICK, *(pytest.param(*each, marks=pytest.mark.slow) for each in SLOW)]
 )
-def test_damage_to_white_or_black_shows_by_the_end(index: int, damage: Spoil, white: float) -> None:
+def test_damage_to_white_or_black_is_found_by_the_end(index: int, damage: Spoil, white: float) -> None:
     scene = Scene(noise_dn=1.0, white=white, ambient=0.08)
     shots = scene.shots(PATTERNS)
-    found = check_capture(recorded(with_image(shots, index, damage(shots, index))))
+    found = check_capture(make_capture(with_image(shots, index, damage(shots, index))))
     # Black that is darker still shows nothing: it is as dark as the room in truth.
     assert (found.faults == ()) == (index in {1, COUNT - 1} and damage is black_rows)
 
@@ -623,28 +623,28 @@ def test_damage_to_white_or_black_shows_by_the_end(index: int, damage: Spoil, wh
 @pytest.mark.parametrize(
     ("index", "damage"), [(0, garbled), (0, black_rows), (0, bright_rows), (1, garbled), (1, bright_rows)]
 )
-def test_lines_tell_damage_to_white_and_black(index: int, damage: Spoil, sequence: SequenceName) -> None:
+def test_lines_reveal_damage_to_white_and_black(index: int, damage: Spoil, sequence: SequenceName) -> None:
     """Rows of a white frame that are full look like an exposure that is too long: lines tell that it is not."""
     scene, patterns = Scene(noise_dn=1.0, white=0.6), SINGLE[sequence]
     shots = scene.shots(patterns)
-    assert judged_summary(with_image(shots, index, damage(shots, index)), patterns).faults
+    assert recorded_summary(with_image(shots, index, damage(shots, index)), patterns).faults
 
 
-def test_a_line_frame_with_rows_of_another_is_named_by_the_others() -> None:
+def test_a_line_frame_with_rows_of_another_is_found() -> None:
     """Lines at a quarter of their period light half of every cell: the code says nothing of them."""
     patterns = SINGLE[SequenceName.STANDARD]
     shots = Scene(noise_dn=4.0, white=0.3).shots(patterns)
     index, other = (patterns.index(LineShift(Axis.COLUMN, shift, 8, 4)) for shift in (2, 5))
     image = shots[index].image.copy()
     image[60:110] = shots[other].image[60:110]
-    (fault,) = judged_summary(with_image(shots, index, image), patterns).faults
+    (fault,) = recorded_summary(with_image(shots, index, image), patterns).faults
     assert f"pattern {index} " in fault
     assert "its light does not fit the other line frames" in fault
 
 
 def test_an_opening_frame_that_shows_half_of_white_is_found_by_the_closing_one() -> None:
     # A frame of the scan before: lit where a coarse bit was, and right wherever it is lit.
-    summary = check_capture(recorded(with_image(SHOTS, 0, SHOTS[2].image)))
+    summary = check_capture(make_capture(with_image(SHOTS, 0, SHOTS[2].image)))
     assert any("pattern 20 (white)" in fault for fault in summary.faults)
 
 
@@ -659,13 +659,13 @@ PERIOD = 8
 RANDOM = np.random.default_rng(4)
 
 
-def seen(light: NDArray[np.floating[Any]]) -> Image:
+def camera_image(light: NDArray[np.floating[Any]]) -> Image:
     """(H, W): what the camera sees of light that varies along the columns, 0 to 1, in a room that is not dark."""
     values = 230 * (0.03 + 0.9 * np.broadcast_to(light, SIZE.shape)) ** 0.45
     return np.asarray(values + RANDOM.normal(0, NOISE_DN, SIZE.shape))
 
 
-def sampled(image: Image) -> Samples:
+def sample(image: Image) -> Samples:
     return SAMPLER.take(np.clip(np.rint(image), 0, 255).astype(np.uint8))
 
 
@@ -690,30 +690,30 @@ def noisy_band(
 @pytest.fixture(scope="module")
 def ref() -> ReferenceFrames:
     one = np.ones(SIZE.width_px)
-    white, black = sampled(seen(one)), sampled(seen(0 * one))
+    white, black = sample(camera_image(one)), sample(camera_image(0 * one))
     return build_reference(white, black, threshold_dn=20, full_scale=255, row=SAMPLER.row)
 
 
 @pytest.mark.parametrize("period_px", [2, 4, 16, 64])
 def test_a_garbled_frame_is_rougher_than_its_inverse(ref: ReferenceFrames, period_px: int) -> None:
-    bit = seen(stripes(period_px // 2, period_px=period_px))
-    inverse = sampled(seen(1 - stripes(period_px // 2, period_px=period_px)))
-    assert roughness_fault(sampled(bit), [inverse], ref, noise=NOISE_DN) is None
-    assert roughness_fault(inverse, [sampled(bit)], ref, noise=NOISE_DN) is None
-    told = roughness_fault(sampled(noisy_band(bit)), [inverse], ref, noise=NOISE_DN)
-    assert told is not None
-    assert "damaged in transfer" in told
-    assert roughness_fault(inverse, [sampled(noisy_band(bit))], ref, noise=NOISE_DN) is None
+    bit = camera_image(stripes(period_px // 2, period_px=period_px))
+    inverse = sample(camera_image(1 - stripes(period_px // 2, period_px=period_px)))
+    assert roughness_fault(sample(bit), [inverse], ref, noise=NOISE_DN) is None
+    assert roughness_fault(inverse, [sample(bit)], ref, noise=NOISE_DN) is None
+    fault = roughness_fault(sample(noisy_band(bit)), [inverse], ref, noise=NOISE_DN)
+    assert fault is not None
+    assert "damaged in transfer" in fault
+    assert roughness_fault(inverse, [sample(noisy_band(bit))], ref, noise=NOISE_DN) is None
 
 
-def test_light_that_flickers_from_pixel_to_pixel_is_no_damage(ref: ReferenceFrames) -> None:
+def test_pixel_flicker_is_not_damage(ref: ReferenceFrames) -> None:
     """A projector that dithers: all is lit in one frame of a pair, and nothing in the other."""
-    lit = seen(np.ones(SIZE.width_px)) * (1 + RANDOM.normal(0, 0.13, SIZE.shape))
-    assert roughness_fault(sampled(lit), [sampled(seen(np.zeros(SIZE.width_px)))], ref, noise=NOISE_DN) is None
+    lit = camera_image(np.ones(SIZE.width_px)) * (1 + RANDOM.normal(0, 0.13, SIZE.shape))
+    assert roughness_fault(sample(lit), [sample(camera_image(np.zeros(SIZE.width_px)))], ref, noise=NOISE_DN) is None
 
 
 def lines(width_px: int = 1) -> list[Samples]:
-    return [sampled(seen(stripes(width_px, shift))) for shift in range(PERIOD)]
+    return [sample(camera_image(stripes(width_px, shift))) for shift in range(PERIOD)]
 
 
 @pytest.mark.parametrize("width_px", [1, 3])
@@ -721,9 +721,9 @@ def test_line_frames_add_up_alike_everywhere_whatever_the_response(ref: Referenc
     assert line_sum_fault(lines(width_px), ref, noise=NOISE_DN) is None
 
 
-def test_a_garbled_line_frame_is_blamed_by_the_sum(ref: ReferenceFrames) -> None:
+def test_a_garbled_line_frame_is_found_by_the_sum(ref: ReferenceFrames) -> None:
     frames = lines()
-    frames[3] = sampled(noisy_band(seen(stripes(1, 3))))
+    frames[3] = sample(noisy_band(camera_image(stripes(1, 3))))
     found = line_sum_fault(frames, ref, noise=NOISE_DN)
     assert found is not None
     blamed, words = found
@@ -734,21 +734,24 @@ def test_a_garbled_line_frame_is_blamed_by_the_sum(ref: ReferenceFrames) -> None
 
 def test_a_line_frame_that_shows_its_neighbours_lines_is_a_repetition_in_the_dark_too(ref: ReferenceFrames) -> None:
     """Two exposures of one pattern: in dark such a camera has several times the noise that bright pixels tell."""
-    again = sampled(seen(stripes(1, 2)) + RANDOM.normal(0, 3.0, SIZE.shape))
+    again = sample(camera_image(stripes(1, 2)) + RANDOM.normal(0, 3.0, SIZE.shape))
     assert find_repeated(again, lines(), ref, noise=0.5, factor=40.0) == 2
     assert (
-        find_repeated(sampled(seen(stripes(1, 2))), [sampled(seen(stripes(1, 3)))], ref, noise=0.5, factor=40.0) is None
+        find_repeated(
+            sample(camera_image(stripes(1, 2))), [sample(camera_image(stripes(1, 3)))], ref, noise=0.5, factor=40.0
+        )
+        is None
     )
 
 
-def test_a_damaged_white_frame_does_not_pass_for_noise(ref: ReferenceFrames) -> None:
+def test_a_damaged_white_frame_does_not_count_as_noise(ref: ReferenceFrames) -> None:
     damaged = ReferenceFrames(
         RANDOM.uniform(120, 250, len(ref.white)).astype(np.float32), ref.black, ref.contrast, ref.lit, ref.tested,
         ref.row, ref.band,
     )  # fmt: skip
     first, second = (
-        [sampled(seen(stripes(16, period_px=32))), sampled(seen(1 - stripes(16, period_px=32)))],
-        [sampled(seen(stripes(32, period_px=64))), sampled(seen(1 - stripes(32, period_px=64)))],
+        [sample(camera_image(stripes(16, period_px=32))), sample(camera_image(1 - stripes(16, period_px=32)))],
+        [sample(camera_image(stripes(32, period_px=64))), sample(camera_image(1 - stripes(32, period_px=64)))],
     )
     assert pair_noise_dn(first[0], first[1], damaged) > 10 * NOISE_DN
     by_pairs = pair_noise_dn(second[0], second[1], damaged, sums=[first[0] + first[1]])

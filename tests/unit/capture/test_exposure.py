@@ -44,13 +44,13 @@ def test_two_to_six_different_times_are_a_bracket(exposures_s: Sequence[float]) 
         ((0.01, 0.01), "differ by 10% at least"),
     ],
 )
-def test_anything_else_is_none_and_says_what_to_ask_for(exposures_s: Sequence[float], words: str) -> None:
+def test_other_times_are_not_a_bracket_and_the_message_has_a_remedy(exposures_s: Sequence[float], words: str) -> None:
     fault = bracket_fault(exposures_s)
     assert fault is not None
     assert pytest.RaisesExc(ValueError, match=words).matches(ValueError(fault))
 
 
-def test_what_a_camera_names_a_little_differently_every_time_is_one_exposure() -> None:
+def test_nearly_equal_exposures_are_one_group() -> None:
     groups = exposure_groups([0.0100, 0.0101, 0.0099, 0.0102, 0.0400, 0.0404])
     assert set(groups.values()) == {0.0099, 0.0400}
     assert exposure_groups([]) == {}
@@ -73,12 +73,10 @@ def at_exposure(times: float, **options: float) -> Scene:
         (at_exposure(4.0, ambient=0.7), ExposureFault.TOO_BRIGHT),
     ],
 )
-def test_an_exposure_is_of_use_unless_it_shows_too_little_or_too_much(
-    scene: Scene, expected: ExposureFault | None
-) -> None:
+def test_an_exposure_is_usable_unless_too_dark_or_too_bright(scene: Scene, expected: ExposureFault | None) -> None:
     white, black = scene.image(WHITE), scene.image(BLACK)
-    told = judge_exposure(white, black, scene.format)
-    assert (None if told is None else told.fault) is expected
+    verdict = judge_exposure(white, black, scene.format)
+    assert (None if verdict is None else verdict.fault) is expected
     # White that is darker than black is no matter of exposure.
     assert expected is not None or judge_exposure(black, white, scene.format) is None
 
@@ -104,23 +102,23 @@ def test_one_scene_looks_the_same_at_every_exposure(times: tuple[float, float]) 
 
 
 @pytest.mark.parametrize("moved_px", [1.5, -3.0])
-def test_what_moved_between_two_exposures_is_told(moved_px: float) -> None:
+def test_movement_between_two_exposures_is_detected(moved_px: float) -> None:
     one, other = samples_of(shots_at(0.25)), samples_of(shots_at(1.0, moved_px=moved_px))
-    told = detect_movement(one, other, PATTERNS, 255)
-    assert told is not None
-    assert "looks different at 0.01 s and at 0.0025 s" in told
-    assert "moved between the two exposures" in told
+    fault = detect_movement(one, other, PATTERNS, 255)
+    assert fault is not None
+    assert "looks different at 0.01 s and at 0.0025 s" in fault
+    assert "moved between the two exposures" in fault
 
 
-def test_a_frame_of_another_pattern_is_told_by_the_other_exposure() -> None:
+def test_a_frame_of_another_pattern_differs_from_the_other_exposure() -> None:
     line = next(i for i, pattern in enumerate(PATTERNS) if isinstance(pattern, LineShift))
     swapped = [replace(s, pattern={line: line + 1, line + 1: line}.get(s.pattern, s.pattern)) for s in shots_at(1.0)]
-    told = detect_movement(samples_of(shots_at(0.25)), samples_of(swapped), PATTERNS, 255)
-    assert told is not None
-    assert f"pattern {line} " in told
+    fault = detect_movement(samples_of(shots_at(0.25)), samples_of(swapped), PATTERNS, 255)
+    assert fault is not None
+    assert f"pattern {line} " in fault
 
 
-def test_exposures_that_share_no_clear_pixel_say_nothing_of_one_another() -> None:
+def test_exposures_without_common_clear_pixels_are_not_compared() -> None:
     bright = samples_of(shots_at(9.0, moved_px=5.0))
     assert detect_movement(samples_of(shots_at(0.25)), bright, PATTERNS, 255) is None
     without = ExposureSamples(0.01, {i: s for i, s in bright.frames.items() if PATTERNS[i] != Black()}, 0.8)
@@ -147,12 +145,12 @@ def test_a_bracket_has_verified_what_its_best_exposure_has() -> None:
     assert worse.faults == ("at 0.01 s, bit 3 is stale",)
 
 
-def recorded(*shots: Shot) -> Capture:
+def make_capture(*shots: Shot) -> Capture:
     return Capture(PROJECTOR, PATTERNS, {"left": Scene().format}, shots)
 
 
-def test_a_recorded_bracket_is_judged_exposure_by_exposure() -> None:
-    sound = recorded(*shots_at(0.25), *shots_at(1.0), *shots_at(1.6))
+def test_a_recorded_bracket_is_checked_by_exposures() -> None:
+    sound = make_capture(*shots_at(0.25), *shots_at(1.0), *shots_at(1.6))
     found = check_exposures(sound)
     assert (found.verified, found.patterns, found.faults) == (len(PATTERNS), len(PATTERNS), ())
     # A camera's own word of an exposure varies a little; a frame is in the wrong place at one exposure only.
@@ -162,14 +160,14 @@ def test_a_recorded_bracket_is_judged_exposure_by_exposure() -> None:
         replace(shot, exposure_s=0.01 * (1 + 1e-4 * shot.pattern), pattern=swapped.get(shot.pattern, shot.pattern))
         for shot in shots_at(1.0)
     ]
-    found = check_exposures(recorded(*shots_at(0.25), *wrong))
+    found = check_exposures(make_capture(*shots_at(0.25), *wrong))
     assert any(fault.startswith("at 0.01 s, camera 'left'") for fault in found.faults)
     assert any("moved between the two exposures" in fault for fault in found.faults)
     assert not any(fault.startswith("at 0.0025 s") for fault in found.faults)
 
 
-def test_one_exposure_is_judged_as_ever() -> None:
-    one = recorded(*shots_at(1.0))
+def test_one_exposure_is_checked_like_a_capture() -> None:
+    one = make_capture(*shots_at(1.0))
     refused = [RefusedFrame(3, "left", 1, "it is stale")]
     assert check_exposures(one, refused) == check_capture(one, refused)
     assert np.isfinite(check_exposures(one).noise_dn["left"])

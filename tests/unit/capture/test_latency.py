@@ -39,14 +39,14 @@ def rig(folder: Path, camera: Mapping[str, Any] | None = None, **head: Any) -> R
 
 
 @pytest.mark.parametrize("trigger", [Trigger.FREE, Trigger.SOFTWARE])
-def test_frames_that_are_lost_do_no_harm(tmp_path: Path, trigger: Trigger) -> None:
+def test_lost_frames_are_tolerated(tmp_path: Path, trigger: Trigger) -> None:
     lossy = rig(tmp_path, faults={"light_delay_s": 0.012, "drop_probability": 0.1})
     found = measure_latency(lossy, trigger=trigger).cameras["eye"]
     assert found.latency_s == pytest.approx(0.012, abs=5e-4)
     assert found.line_time_s == pytest.approx(1e-4, rel=0.02)
 
 
-def test_a_camera_in_step_with_the_display_is_started_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_camera_in_phase_with_the_display_is_restarted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One at 120 frames a second before 240 refreshes saw 6 of 160 flashes, in the phase in which it had begun."""
     usual = rig(tmp_path, faults={"light_delay_s": 0.012})
     eye = usual.cameras["eye"]
@@ -71,13 +71,13 @@ def test_the_rig_is_dark_and_usable_after_the_test(tmp_path: Path, interrupted: 
     usual = rig(tmp_path)
     fractions: list[float] = []
 
-    def told(_stage: str, fraction: float, _detail: str) -> None:
+    def on_progress(_stage: str, fraction: float, _detail: str) -> None:
         fractions.append(fraction)
         if interrupted and fraction > 0:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt) if interrupted else nullcontext():
-        measure_latency(usual, trials=8, on_progress=told)
+        measure_latency(usual, trials=8, on_progress=on_progress)
     usual.cameras["eye"].arm(1, Trigger.FREE)
     assert fractions[0] == 0
     assert interrupted or fractions[-1] == 1
@@ -308,7 +308,7 @@ def test_a_constant_error_of_the_time_stamps_is_part_of_the_latency() -> None:
     assert late.line_time_s == pytest.approx(5e-5, rel=0.02)
 
 
-def test_light_that_waits_for_the_refresh_is_told_as_jitter() -> None:
+def test_light_that_waits_for_the_refresh_is_measured_as_jitter() -> None:
     period_s = 1 / 60
 
     def at_next_refresh(to_white: bool, rng: np.random.Generator) -> Light:
@@ -329,13 +329,13 @@ def test_a_ramp_is_timed_at_its_middle_and_waited_for_to_its_end() -> None:
     assert 0.0155 < found.latest_s < 0.019
 
 
-def test_darkening_more_slowly_than_brightening_is_told_and_waited_for() -> None:
+def test_slower_darkening_than_brightening_is_measured_and_waited_for() -> None:
     found = World(lambda to_white, rng: both_ways(step(0.005 if to_white else 0.015))(to_white, rng)).measured()
     assert (found.rise_s, found.fall_s) == pytest.approx((0.005, 0.015), abs=1e-4)
     assert found.latest_s == pytest.approx(0.015, abs=3e-4)
 
 
-def test_a_colour_wheel_is_told_as_flicker_and_hardly_moves_the_latency() -> None:
+def test_a_colour_wheel_is_flicker_and_hardly_changes_the_latency() -> None:
     # Three colours of unlike brightness, each lit for a third of a turn, 120 turns a second, not in step with show.
     turn_s, colours = 1 / 120, np.array([1.5, 1.0, 0.5])
 
@@ -373,7 +373,7 @@ def test_saturated_and_unlit_pixels_do_not_count() -> None:
     assert found.line_time_s == pytest.approx(6e-5, rel=0.02)
 
 
-def test_levels_leave_out_rows_that_tell_nothing() -> None:
+def test_levels_leave_out_unusable_rows() -> None:
     world, rng = World(both_ways(step(0.0))), np.random.default_rng(0)
     shares = np.where(np.arange(ROWS) < 20, 0.0, 1.0)
     black = [world.image(np.zeros(ROWS), rng) for _ in range(8)]
@@ -394,10 +394,10 @@ def test_levels_leave_out_rows_that_tell_nothing() -> None:
         ({"white_dn": 3000.0}, r"saturated.*expose shorter"),
         ({"white_dn": 60.0, "noise_dn": 15.0}, "rows distinguish white from black"),
         ({"exposure_s": 5e-4, "period_s": 0.1}, r"between two exposures .* raise its frame rate"),
-        ({"light": both_ways(step(0.35))}, "did not change while it was watched"),
+        ({"light": both_ways(step(0.35))}, "did not change within the search time"),
     ],
     ids=["lamp off", "too much light", "too noisy", "flashes between exposures", "light too late"],
 )
-def test_what_cannot_be_measured_is_said(world: dict[str, Any], words: str) -> None:
+def test_unmeasurable_light_is_reported(world: dict[str, Any], words: str) -> None:
     with pytest.raises(ScanEvidenceError, match=words):
         World(**{"light": both_ways(step(0.012)), **world}).measured(count=20)

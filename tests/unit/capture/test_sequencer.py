@@ -65,7 +65,7 @@ def assert_refused(fake: FakeRig, kind: type[BaseException], words: str) -> None
 # ---- a sound rig
 
 
-def test_every_camera_gives_every_pattern_in_order_and_the_evidence_tells_what_was_proven() -> None:
+def test_every_camera_gives_every_pattern_in_order_with_a_summary() -> None:
     fake = fake_rig()
     evidence = Evidence(PATTERNS, {name: camera.info.format for name, camera in fake.cameras.items()})
     shots = list(capture(fake.rig, SEQUENCE, evidence=evidence))
@@ -80,7 +80,7 @@ def test_every_camera_gives_every_pattern_in_order_and_the_evidence_tells_what_w
     assert {shot.exposure_s for shot in shots} == {0.01}
 
 
-def test_nothing_moves_before_the_first_frame_is_asked_for() -> None:
+def test_nothing_starts_before_the_first_frame_is_requested() -> None:
     fake = fake_rig()
     frames = capture(fake.rig, SEQUENCE)
     assert fake.world.calls == []
@@ -135,7 +135,7 @@ def test_the_best_trigger_that_all_can_do_is_used(
     ],
     ids=["wires only", "no camera", "camera unplugged", "projector unplugged"],
 )
-def test_a_rig_that_cannot_capture_is_refused(
+def test_a_rig_that_cannot_capture_is_rejected(
     make: Callable[[], FakeRig], kind: type[BaseException], words: str
 ) -> None:
     assert_refused(make(), kind, words)
@@ -180,7 +180,7 @@ def test_a_projector_that_shows_something_else_is_refused(projector: dict[str, o
         assert sum(call.startswith("show") for call in fake.world.calls) == 3 * MAX_FAILURES
 
 
-def test_a_projector_that_is_gone_when_it_should_go_dark_is_no_success() -> None:
+def test_a_projector_that_cannot_go_dark_is_an_error() -> None:
     fake = fake_rig()
     frames = capture(fake.rig, SHORT)
     for _ in range(2 * len(SHORT)):
@@ -192,7 +192,7 @@ def test_a_projector_that_is_gone_when_it_should_go_dark_is_no_success() -> None
 
 
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), ZeroDivisionError()])
-def test_a_driver_that_raises_anything_keeps_no_other_device_from_its_turn(
+def test_an_error_of_a_driver_does_not_prevent_releasing_other_devices(
     monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     fake = faulty("left", unplug_at=9)
@@ -255,11 +255,11 @@ def test_an_interrupt_leaves_the_rig_dark() -> None:
     assert fake.at_rest
 
 
-# ---- frames that are not what they claim are shot again, until they are, or have failed three times
+# ---- wrong frames are captured again, until they are right or have failed three times
 
 
-class Taken:
-    """A capture's frames as a consumer has them at its end, and what was refused on the way."""
+class CaptureRun:
+    """Frames of a capture as its consumer has them at the end, and the rejected exposures."""
 
     def __init__(self, fake: FakeRig) -> None:
         self.fake = fake
@@ -268,7 +268,7 @@ class Taken:
         self.refused: list[RefusedFrame] = []
         self.summary: EvidenceSummary | None = None
 
-    def run(self) -> Taken:
+    def run(self) -> CaptureRun:
         formats = {name: camera.info.format for name, camera in self.fake.cameras.items()}
         evidence = Evidence(PATTERNS, formats)
         try:
@@ -325,53 +325,53 @@ QUICK = {"stale", "too early", "garbled line frame", "garbled white", "exposed o
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in EACH_KIND]
 )
-def test_a_frame_that_fails_is_shot_again_and_all_frames_are_right(name: str) -> None:
-    taken = Taken(faulty(**EACH_KIND[name])).run()
-    taken.assert_right()
-    assert {refused.camera for refused in taken.refused} == {"right"}
-    assert taken.summary is not None
-    assert taken.summary.shot_again == len(taken.refused) > 0
-    assert str(taken.summary).startswith(f"{COUNT}/{COUNT} patterns verified, {len(taken.refused)} frame")
+def test_a_failed_frame_is_repeated_and_all_frames_are_correct(name: str) -> None:
+    run_result = CaptureRun(faulty(**EACH_KIND[name])).run()
+    run_result.assert_right()
+    assert {refused.camera for refused in run_result.refused} == {"right"}
+    assert run_result.summary is not None
+    assert run_result.summary.shot_again == len(run_result.refused) > 0
+    assert str(run_result.summary).startswith(f"{COUNT}/{COUNT} patterns verified, {len(run_result.refused)} frame")
 
 
 def test_only_the_camera_that_failed_is_exposed_again() -> None:
-    taken = Taken(faulty("left", stale=frozenset({15}))).run()
-    assert taken.fake.world.calls.count("show 15") == 2
-    assert taken.fake.cameras["left"].made == COUNT
-    assert taken.fake.cameras["right"].made == COUNT + 1
+    run_result = CaptureRun(faulty("left", stale=frozenset({15}))).run()
+    assert run_result.fake.world.calls.count("show 15") == 2
+    assert run_result.fake.cameras["left"].made == COUNT
+    assert run_result.fake.cameras["right"].made == COUNT + 1
 
 
-def test_a_pair_that_contradicts_itself_is_shot_again_whole() -> None:
-    taken = Taken(faulty(stale=frozenset({5}))).run()
-    assert [(r.pattern, r.attempt, r.delivered, r.shot is None) for r in taken.refused] == [
+def test_both_frames_of_a_contradicting_pair_are_repeated() -> None:
+    run_result = CaptureRun(faulty(stale=frozenset({5}))).run()
+    assert [(r.pattern, r.attempt, r.delivered, r.shot is None) for r in run_result.refused] == [
         (4, 1, True, True),
         (5, 1, False, False),
     ]
-    assert all("show the same" in r.cause for r in taken.refused)
+    assert all("show the same" in r.cause for r in run_result.refused)
     # The first of the pair had been given out; it comes again.
-    assert Counter((s.camera, s.pattern) for s in taken.yielded)["right", 4] == 2
+    assert Counter((s.camera, s.pattern) for s in run_result.yielded)["right", 4] == 2
 
 
-def test_what_the_first_pair_rests_on_is_shot_again_when_the_pair_is_not_to_blame() -> None:
-    taken = Taken(faulty(garbled=frozenset({0}))).run()
+def test_reference_frames_are_repeated_when_the_first_pair_is_not_at_fault() -> None:
+    run_result = CaptureRun(faulty(garbled=frozenset({0}))).run()
     # Pattern 4 was there meanwhile, judged at pixels that the damaged white frame had chosen.
-    assert [r.pattern for r in taken.refused] == [2, 3, 0, 1, 2, 3, 4]
+    assert [r.pattern for r in run_result.refused] == [2, 3, 0, 1, 2, 3, 4]
 
 
-def test_white_and_black_are_not_blamed_once_a_pair_has_vouched_for_them() -> None:
+def test_white_and_black_are_not_suspect_after_a_pair_confirmed_them() -> None:
     # Both frames of the second pair, and then one of them again.
-    taken = Taken(faulty(garbled=frozenset({4, COUNT - 10}), stale=frozenset({8}))).run()
-    taken.assert_right()
-    assert not {0, 1} & {r.pattern for r in taken.refused}
+    run_result = CaptureRun(faulty(garbled=frozenset({4, COUNT - 10}), stale=frozenset({8}))).run()
+    run_result.assert_right()
+    assert not {0, 1} & {r.pattern for r in run_result.refused}
 
 
-def test_a_refused_frame_is_handed_over_with_its_image_and_time() -> None:
-    taken = Taken(faulty(garbled=frozenset({17}))).run()
-    (refused,) = taken.refused
+def test_a_rejected_frame_is_reported_with_its_image_and_time() -> None:
+    run_result = CaptureRun(faulty(garbled=frozenset({17}))).run()
+    (refused,) = run_result.refused
     assert refused.shot is not None
     assert (refused.pattern, refused.camera, refused.attempt) == (17, "right", 1)
     assert refused.shot.image.shape == (150, 200)
-    right = [s.time_s for s in taken.yielded if s.camera == "right" and s.pattern in {16, 17}]
+    right = [s.time_s for s in run_result.yielded if s.camera == "right" and s.pattern in {16, 17}]
     assert right[0] is not None
     assert right[1] is not None
     assert refused.shot.time_s is not None
@@ -395,36 +395,36 @@ def test_a_refused_frame_is_handed_over_with_its_image_and_time() -> None:
         ),
     ],
 )
-def test_three_failures_end_the_scan_and_tell_why(faults: dict[str, object], words: str) -> None:
-    taken = Taken(faulty(**faults))
+def test_three_failures_end_the_scan_with_all_causes(faults: dict[str, object], words: str) -> None:
+    run_result = CaptureRun(faulty(**faults))
     with pytest.raises(ScanEvidenceError, match=words):
-        taken.run()
-    worst = max(r.attempt for r in taken.refused)
+        run_result.run()
+    worst = max(r.attempt for r in run_result.refused)
     assert worst == MAX_FAILURES
     # Every frame that was made counts or was refused.
-    delivered = [r for r in taken.refused if r.delivered]
-    assert len(taken.yielded) == len(taken.latest) + len(delivered)
+    delivered = [r for r in run_result.refused if r.delivered]
+    assert len(run_result.yielded) == len(run_result.latest) + len(delivered)
 
 
 def test_a_frame_that_does_not_come_three_times_ends_the_scan() -> None:
-    taken = Taken(faulty(drop=frozenset({5, 7, 9})))
+    run_result = CaptureRun(faulty(drop=frozenset({5, 7, 9})))
     with pytest.raises(
         FrameTimeoutError,
         match=r"camera 'right', pattern 5 \(column Gray bit 1 of 5, inverse\): it failed 3 times, each time alike: no "
         r"frame came within 2.010 s of its light, visible since \d+ ns ± 1000 ns",
     ):
-        taken.run()
-    assert taken.fake.world.calls.count("show 5") == 3
+        run_result.run()
+    assert run_result.fake.world.calls.count("show 5") == 3
 
 
-def test_frames_that_are_lost_now_and_then_say_nothing_against_those_that_come() -> None:
+def test_only_consecutive_lost_frames_count() -> None:
     # Pattern 15: lost, damaged, lost, damaged, and then well.
-    taken = Taken(faulty(drop=frozenset({15, 19}), garbled=frozenset({17, 21}))).run()
-    taken.assert_right()
-    assert [(r.pattern, r.attempt) for r in taken.refused] == [(15, 1), (15, 2), (15, 3), (15, 4)]
+    run_result = CaptureRun(faulty(drop=frozenset({15, 19}), garbled=frozenset({17, 21}))).run()
+    run_result.assert_right()
+    assert [(r.pattern, r.attempt) for r in run_result.refused] == [(15, 1), (15, 2), (15, 3), (15, 4)]
 
 
-def test_a_camera_is_not_exposed_for_ever() -> None:
+def test_the_number_of_exposures_is_limited() -> None:
     policy = RetryPolicy(SHORT, Evidence(SHORT.patterns, {"left": Scene().format}), lambda _: None)
     assert policy.max_exposures == MAX_FAILURES * len(SHORT)
     for number in range(policy.max_exposures):
@@ -444,12 +444,12 @@ def test_a_projector_that_swapped_two_patterns_once_is_overcome() -> None:
         return shown(index)
 
     fake.projector.show = show  # type: ignore[method-assign, assignment]
-    taken = Taken(fake).run()
-    taken.assert_right()
-    assert {r.pattern for r in taken.refused} >= {4, 5}
+    run_result = CaptureRun(fake).run()
+    run_result.assert_right()
+    assert {r.pattern for r in run_result.refused} >= {4, 5}
 
 
-def test_an_object_that_moved_is_not_hidden_by_shooting_again() -> None:
+def test_repeating_frames_does_not_hide_movement() -> None:
     fake = fake_rig(cameras=["left"])
     shown = fake.projector.show
 
@@ -460,13 +460,13 @@ def test_an_object_that_moved_is_not_hidden_by_shooting_again() -> None:
         return shown(index)
 
     fake.projector.show = show  # type: ignore[method-assign, assignment]
-    taken = Taken(fake)
+    run_result = CaptureRun(fake)
     with pytest.raises(ScanEvidenceError, match=r"pattern 20 \(white\): it failed 3 times.*moved"):
-        taken.run()
-    assert {r.pattern for r in taken.refused} == {COUNT - 2}
+        run_result.run()
+    assert {r.pattern for r in run_result.refused} == {COUNT - 2}
 
 
-# ---- sequences that a projector plays by wire: they count as a whole, and a shift by one is told in words
+# ---- sequences that a projector plays by wire: they count as a whole, and a shift by one is reported
 
 
 def wired(*others: str, projector: dict[str, object] | None = None, **faults: object) -> FakeRig:
@@ -483,11 +483,11 @@ def plays(fake: FakeRig) -> int:
     return fake.world.calls.count("play")
 
 
-def test_a_sound_play_counts_at_once() -> None:
-    taken = Taken(wired("left")).run()
-    assert (len(taken.latest), taken.refused) == (2 * COUNT, [])
-    assert str(taken.summary) == f"{COUNT}/{COUNT} patterns verified"
-    assert plays(taken.fake) == 1
+def test_a_correct_play_counts_at_once() -> None:
+    run_result = CaptureRun(wired("left")).run()
+    assert (len(run_result.latest), run_result.refused) == (2 * COUNT, [])
+    assert str(run_result.summary) == f"{COUNT}/{COUNT} patterns verified"
+    assert plays(run_result.fake) == 1
 
 
 @pytest.mark.parametrize(
@@ -503,11 +503,11 @@ def test_a_sound_play_counts_at_once() -> None:
     ],
 )
 def test_a_play_that_failed_is_repeated_whole(projector: dict[str, object], faults: dict[str, object]) -> None:
-    taken = Taken(wired(projector=projector, **faults)).run()
-    taken.assert_right()
-    assert {r.attempt for r in taken.refused} == set(range(1, plays(taken.fake)))
-    words = f"{COUNT}/{COUNT} patterns verified, {len(taken.refused)} frames shot again"
-    assert str(taken.summary).startswith(words)
+    run_result = CaptureRun(wired(projector=projector, **faults)).run()
+    run_result.assert_right()
+    assert {r.attempt for r in run_result.refused} == set(range(1, plays(run_result.fake)))
+    words = f"{COUNT}/{COUNT} patterns verified, {len(run_result.refused)} frames shot again"
+    assert str(run_result.summary).startswith(words)
 
 
 @pytest.mark.parametrize(
@@ -530,18 +530,18 @@ def test_a_play_that_failed_is_repeated_whole(projector: dict[str, object], faul
         ({"missing_pulses": frozenset({4})}, r"pulse|Gray bit"),
     ],
 )
-def test_three_plays_that_fail_tell_why(projector: dict[str, object], words: str) -> None:
+def test_three_failed_plays_report_all_causes(projector: dict[str, object], words: str) -> None:
     fake = wired("left", projector=projector)
     with pytest.raises((ScanEvidenceError, FrameTimeoutError), match=words):
-        Taken(fake).run()
+        CaptureRun(fake).run()
     assert plays(fake) == 3
 
 
-def test_a_gap_between_frames_is_told() -> None:
+def test_a_gap_between_frames_is_reported() -> None:
     # The same frame of each play.
     lost = frozenset({6, COUNT + 6, 2 * COUNT + 6})
     with pytest.raises(ScanEvidenceError, match=r"frame number \d+ follows \d+, 1 were lost"):
-        Taken(wired(drop=lost)).run()
+        CaptureRun(wired(drop=lost)).run()
 
 
 def test_a_scan_can_be_cancelled_between_plays() -> None:

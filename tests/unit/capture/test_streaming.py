@@ -43,7 +43,7 @@ def after(numbers: list[int], t_ns: int, *, jitter_ns: float = 0.0) -> tuple[int
         (list(range(10)), 2, 10),
     ],
 )
-def test_the_first_frame_after_an_instant_is_foretold(
+def test_the_first_frame_after_an_instant_is_predicted(
     numbers: list[int], after_periods: int, foretold_period: int
 ) -> None:
     foretold = after(numbers, after_periods * PERIOD_NS - 1_000)
@@ -61,12 +61,12 @@ def test_a_frame_that_may_begin_too_early_is_not_counted_on() -> None:
     assert abs(start_ns - (10**12 + 31 * PERIOD_NS)) < 2_000_000
 
 
-def test_nothing_is_foretold_of_too_few_or_too_uneven_frames() -> None:
+def test_nothing_is_predicted_from_too_few_or_too_uneven_frames() -> None:
     assert after([0, 1], 0) is None
     assert after(list(range(24)), 0, jitter_ns=PERIOD_NS) is None
 
 
-def test_a_camera_that_counts_anew_is_learnt_anew() -> None:
+def test_a_restarted_count_restarts_the_prediction() -> None:
     cadence = Cadence()
     for number in range(5):
         cadence.add(frame(number, number * PERIOD_NS))
@@ -125,7 +125,7 @@ def test_every_frame_comes_in_order_and_reading_ends() -> None:
     assert not [thread for thread in threading.enumerate() if thread.name == "slrig-frames of top"]
 
 
-def test_what_a_driver_raises_comes_as_it_is() -> None:
+def test_an_exception_of_a_driver_is_passed_on() -> None:
     reader = FrameReader({"eye": armed(unplug_at=1)})
     reader.start()
     came = [arrival for arrival in (reader.next(PATIENCE_S) for _ in range(3)) if arrival is not None]
@@ -134,7 +134,7 @@ def test_what_a_driver_raises_comes_as_it_is() -> None:
     assert isinstance(came[-1][1], DeviceGoneError)
 
 
-def test_nothing_comes_from_nobody() -> None:
+def test_no_camera_gives_no_frames() -> None:
     assert FrameReader({}).next(0.0) is None
 
 
@@ -162,7 +162,7 @@ DELAY_NS = 46_800_000
 """From the refresh that takes a picture to its light."""
 
 
-def test_one_pattern_tells_a_displays_lead_wherever_in_its_refresh_it_was_asked_for() -> None:
+def test_one_pattern_measures_the_lead_at_any_phase_of_the_refresh() -> None:
     for asked_ns in np.linspace(0, REFRESH_NS, 7).astype(int).tolist():
         lead = _DisplayLead(REFRESH_NS)
         assert lead.ns == 0
