@@ -173,7 +173,8 @@ def load_depthai() -> Any:
 def nanoseconds(span: timedelta) -> int:
     """Convert a duration of the library to ns; its resolution is a microsecond.
 
-    >>> nanoseconds(timedelta(milliseconds=2)) 2000000
+    >>> nanoseconds(timedelta(milliseconds=2))
+    2000000
     """
     return span // _MICROSECOND * 1_000
 

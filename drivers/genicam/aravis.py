@@ -77,8 +77,9 @@ def install_command(python: tuple[int, int] = sys.version_info[:2], system: str 
     the extra requires an older PyGObject there.
 
     >>> "libgirepository1.0-dev" in install_command((3, 11)), "libgirepository-2.0-dev" in install_command((3, 13))
-    (True, True) >>> install_command(system="win32") "pip install 'slrig[genicam]' (Aravis with its introspection data
-    first)"
+    (True, True)
+    >>> install_command(system="win32")
+    "pip install 'slrig[genicam]' (Aravis with its introspection data first)"
     """
     if system != "linux":
         return "pip install 'slrig[genicam]' (Aravis with its introspection data first)"

@@ -158,7 +158,8 @@ class Features:
 def differs(got: float, requested: float) -> bool:
     """True if a number that was read back is not the requested one.
 
-    >>> differs(0.01001, 0.01), differs(0.0, 0.0), differs(2.0, 1.5) (False, False, True)
+    >>> differs(0.01001, 0.01), differs(0.0, 0.0), differs(2.0, 1.5)
+    (False, False, True)
     """
     return abs(got - requested) > TOLERANCE * abs(requested) + 1e-12
 

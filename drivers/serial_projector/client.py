@@ -49,7 +49,8 @@ BEATS_PER_WATCHDOG = 5
 def pattern_checksum(image: Pixels) -> int:
     """CRC-32 (ISO-HDLC, as zlib's) of one pattern's image, (H, W) uint8, row by row from the top left.
 
-    >>> hex(pattern_checksum(np.array([[0, 255], [255, 0]], np.uint8))) '0xcf81683'
+    >>> hex(pattern_checksum(np.array([[0, 255], [255, 0]], np.uint8)))
+    '0xcf81683'
     """
     return zlib.crc32(image.tobytes())
 
@@ -72,7 +73,8 @@ def pattern_checksums(sequence: PatternSequence) -> tuple[int, ...]:
 def sequence_checksum(checksums: Sequence[int]) -> int:
     """CRC-32 of a sequence, from those of its patterns in order, four bytes each, most significant first.
 
-    >>> f"{sequence_checksum([0x0CF81683, 0x00000000]):08X}" '46D5955C'
+    >>> f"{sequence_checksum([0x0CF81683, 0x00000000]):08X}"
+    '46D5955C'
     """
     return zlib.crc32(b"".join(crc32.to_bytes(4, "big") for crc32 in checksums))
 

@@ -95,7 +95,8 @@ BoxLine = BoxAnswer | BoxEvent | UnreadableLine
 def encode_line(text: str) -> bytes:
     """Encode a line for the wire.
 
-    >>> encode_line("1A2B 7 SHOW 3").rstrip() b'1A2B 7 SHOW 3*FFE7'
+    >>> encode_line("1A2B 7 SHOW 3").rstrip()
+    b'1A2B 7 SHOW 3*FFE7'
     """
     body = text.encode("ascii")
     return b"%s*%04X\n" % (body, binascii.crc_hqx(body, 0xFFFF))
