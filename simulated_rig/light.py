@@ -342,12 +342,12 @@ class Lamp:
         span = t_end_ns - t_start_ns
         if span <= 0:
             return [(1.0, changes[first][1])]
-        shown: list[tuple[float, LightTable]] = []
+        intervals: list[tuple[float, LightTable]] = []
         begin = t_start_ns
         for i in range(first, len(changes)):
             end = min(changes[i + 1][0], t_end_ns) if i + 1 < len(changes) else t_end_ns
             if end > begin:
                 swing = 1.0 if self.flicker is None else self.flicker.mean(begin, end)
-                shown.append(((end - begin) / span * swing, changes[i][1]))
+                intervals.append(((end - begin) / span * swing, changes[i][1]))
                 begin = end
-        return shown
+        return intervals

@@ -45,13 +45,7 @@ class AravisLibrary:
 
 @lru_cache(maxsize=1)
 def load_aravis() -> AravisLibrary:
-    """Load Aravis once.
-
-    Raises
-    ------
-    LibraryMissingError
-        PyGObject or the Aravis typelib is not installed.
-    """
+    """Load Aravis once. Raises LibraryMissingError if PyGObject or the Aravis typelib is not installed."""
     try:
         gi = importlib.import_module("gi")
         # PyGObject raises ValueError if the system has no typelib of that name.
@@ -128,21 +122,8 @@ def _slrig_error(aravis: Any, name: str, doing: str, cause: Any) -> DeviceError:
 class AravisConnection(GenICamConnection):
     """An open device. Aravis signals the loss of control on its own thread.
 
-    Parameters
-    ----------
-    name
-        Name of the camera, for messages.
-    options
-        `GenicamOptions`.
-
-    Raises
-    ------
-    LibraryMissingError
-        Aravis is not installed.
-    DeviceGoneError
-        No such camera answers.
-    DeviceBusyError
-        Another program controls it.
+    name : for messages. Raises LibraryMissingError (Aravis is not installed), DeviceGoneError (no such camera answers)
+    and DeviceBusyError (another program controls it).
     """
 
     def __init__(self, name: str, options: GenicamOptions) -> None:
@@ -358,11 +339,5 @@ def _read_clocks() -> tuple[int, int]:
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """List every GigE Vision and USB3 Vision camera that answers Aravis. Opens none.
-
-    Raises
-    ------
-    LibraryMissingError
-        Aravis or PyGObject is not installed.
-    """
+    """List every GigE Vision and USB3 Vision camera that answers Aravis. Opens none. Raises LibraryMissingError."""
     return tuple(FoundDevice("genicam", identity, label) for identity, label in list_aravis_cameras())

@@ -56,13 +56,7 @@ def pattern_checksum(image: Pixels) -> int:
 
 
 def pattern_checksums(sequence: PatternSequence) -> tuple[int, ...]:
-    """CRC-32 of every pattern of a sequence.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        A pattern has more than 8 bits.
-    """
+    """CRC-32 of every pattern of a sequence. Raises UnsupportedByDeviceError if a pattern has more than 8 bits."""
     deep = [index for index, profile in enumerate(sequence.profiles) if profile.dtype != np.uint8]
     if deep:
         message = f"patterns {deep} have more than 8 bits, the limit of a trigger box; encode them with 8 bits"
@@ -227,16 +221,8 @@ class BoxStatus:
 class BoxClient:
     """A session with one box. Thread-safe.
 
-    Raises
-    ------
-    DeviceBusyError
-        Another host is in a session with it.
-    UnsupportedByDeviceError
-        It cannot keep to the limits.
-    DeviceError
-        No answer in SLTP/1.
-    DeviceGoneError
-        The port is gone.
+    Raises DeviceBusyError (another host is in a session with it), UnsupportedByDeviceError (it cannot keep to the
+    limits), DeviceError (no answer in SLTP/1) and DeviceGoneError (the port is gone).
     """
 
     def __init__(self, link: BoxLink, limits: BoxLimits, *, label: str, open_s: float) -> None:
