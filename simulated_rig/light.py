@@ -29,7 +29,7 @@ NODES_PER_PX = 32
 """Table nodes per projector pixel, with linear interpolation between them (error below 0.0003 of white at blur 0.5 px).
 """
 
-_WIDEST_SIGMAS = 4.5  # of a Gaussian; 7 parts in a million of its light lie beyond
+_WIDEST_SIGMAS = 4.5  # of a Gaussian; 7 parts per million of its light are beyond
 
 
 NS_PER_S = 1_000_000_000

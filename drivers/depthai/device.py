@@ -258,7 +258,7 @@ class OakDevice:
                 raise
             except RuntimeError as cause:
                 message = (
-                    f"OAK device '{self.device_id}' stores no calibration of its own ({cause}); calibrate the rig with "
+                    f"OAK device '{self.device_id}' stores no calibration ({cause}); calibrate the rig with "
                     "a board instead"
                 )
                 raise CalibrationError(message) from cause

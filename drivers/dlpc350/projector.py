@@ -178,7 +178,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
             message = (
                 f'{self._engine.name}: the list in {flash.folder} is of a flash tagged "{flash.tag}", the engine says '
                 f'"{tag}": it may hold other pictures; flash those of that folder with TI\'s LightCrafter 4500 program '
-                "and give that tag, or let patterns in the rig file name the folder of what is flashed"
+                "and give that tag, or set patterns in the rig file to the folder of the flashed pictures"
             )
             raise UnsupportedByDeviceError(message)
 

@@ -293,7 +293,7 @@ def _open_device(aravis: Any, name: str, device: str) -> Any:
         known = ", ".join(label for _, label in list_aravis_cameras()) or "none"
         message = (
             f"camera '{name}': no GenICam camera '{device}' answers; found: {known}. Check cable, power, and that its "
-            "IP address lies in the network of this machine's card"
+            "IP address is in the network of this machine's card"
         )
         raise DeviceGoneError(message) from error
 
