@@ -47,18 +47,9 @@ class BytePort(Protocol):
 class SerialPort:
     """Implements `BytePort` with pyserial, on a port's name or a pyserial URL (`socket://…`, `rfc2217://…`).
 
-    device : name of the device, as "trigger box"; driver : name of the driver; both for errors.
-
-    Raises
-    ------
-    LibraryMissingError
-        pyserial is not installed.
-    DeviceGoneError
-        The port does not exist.
-    DeviceBusyError
-        Another program holds it.
-    DeviceError
-        It cannot be opened.
+    device : name of the device, as "trigger box"; driver : name of the driver; both for errors. Raises
+    LibraryMissingError (pyserial is not installed), DeviceGoneError (the port does not exist), DeviceBusyError (another
+    program holds it) and DeviceError (it cannot be opened).
     """
 
     def __init__(self, name: str, *, baud: int, device: str, driver: str) -> None:

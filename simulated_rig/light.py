@@ -29,7 +29,7 @@ NODES_PER_PX = 32
 """Table nodes per projector pixel, with linear interpolation between them (error below 0.0003 of white at blur 0.5 px).
 """
 
-_WIDEST_SIGMAS = 4.5  # of a Gaussian; 7 parts in a million of its light lie beyond
+_WIDEST_SIGMAS = 4.5  # of a Gaussian; 7 parts per million of its light are beyond
 
 
 NS_PER_S = 1_000_000_000
@@ -342,12 +342,12 @@ class Lamp:
         span = t_end_ns - t_start_ns
         if span <= 0:
             return [(1.0, changes[first][1])]
-        shown: list[tuple[float, LightTable]] = []
+        intervals: list[tuple[float, LightTable]] = []
         begin = t_start_ns
         for i in range(first, len(changes)):
             end = min(changes[i + 1][0], t_end_ns) if i + 1 < len(changes) else t_end_ns
             if end > begin:
                 swing = 1.0 if self.flicker is None else self.flicker.mean(begin, end)
-                shown.append(((end - begin) / span * swing, changes[i][1]))
+                intervals.append(((end - begin) / span * swing, changes[i][1]))
                 begin = end
-        return shown
+        return intervals

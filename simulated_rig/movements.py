@@ -337,13 +337,13 @@ def _rounded_pose(number: int, middle: FloatArray, rotation: FloatArray) -> Scri
 
 
 def _free_distance(
-    held: FloatArray, sideways: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float
+    corners: FloatArray, sideways: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float
 ) -> float:
     """How many times `sideways`, mm, a board can be moved until it touches a border."""
     low, high = 0.0, _FARTHEST_MM
     for _ in range(_HALVINGS):
         half = (low + high) / 2
-        if _is_visible_to_all(held + half * sideways, fields, edge_px):
+        if _is_visible_to_all(corners + half * sideways, fields, edge_px):
             low = half
         else:
             high = half

@@ -377,7 +377,7 @@ class HeadOptions(Strict, use_attribute_docstrings=True):
     def _check_camera_names(cls, cameras: tuple[SimulatedCameraOptions, ...]) -> tuple[SimulatedCameraOptions, ...]:
         names = [camera.name for camera in cameras]
         if len(set(names)) != len(names):
-            message = f"each camera needs a name of its own, found {names}"
+            message = f"camera names must be unique, found {names}"
             raise ValueError(message)
         return cameras
 

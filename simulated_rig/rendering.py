@@ -90,8 +90,8 @@ def _digitise(
         for c in range(electrons.shape[1]):
             # The well clips the electrons, shot noise included; read noise comes after it.
             mean = electrons[r, c]
-            held = min(mean + np.sqrt(mean + read_variance) * draws[r, c], full_well)
-            value = pedestal + dn_per_electron * held
+            collected = min(mean + np.sqrt(mean + read_variance) * draws[r, c], full_well)
+            value = pedestal + dn_per_electron * collected
             if response != np.float32(1):
                 share = min(max(value, np.float32(0)), full_scale) / full_scale
                 value = full_scale * share**response

@@ -143,16 +143,16 @@ def print_reflectance(
 
 
 def _kernel_arguments(
-    shown: BoardPrint,
+    board_print: BoardPrint,
 ) -> tuple[FloatArray, FloatArray, NDArray[np.uint8], FloatArray, float, float, float]:
     return (
-        shown.across_mm,
-        shown.down_mm,
-        shown.dark,
-        shown.centres_mm,
-        shown.radius_mm,
-        shown.dark_share,
-        shown.curvature_per_mm,
+        board_print.across_mm,
+        board_print.down_mm,
+        board_print.dark,
+        board_print.centres_mm,
+        board_print.radius_mm,
+        board_print.dark_share,
+        board_print.curvature_per_mm,
     )
 
 
@@ -168,20 +168,20 @@ def _arc_length(x: float, curvature: float) -> float:
 @kernel_part
 def _clip_polygon(polygon: FloatArray, count: int, a: float, b: float, limit: float, out: FloatArray) -> int:
     """Clip a convex polygon to a x + b y <= limit (Sutherland and Hodgman 1974). Return its number of corners."""
-    kept = 0
+    size = 0
     for i in range(count):
         j = i + 1 if i + 1 < count else 0
         here = a * polygon[i, 0] + b * polygon[i, 1] - limit
         there = a * polygon[j, 0] + b * polygon[j, 1] - limit
         if here <= 0.0:
-            out[kept, 0], out[kept, 1] = polygon[i, 0], polygon[i, 1]
-            kept += 1
+            out[size, 0], out[size, 1] = polygon[i, 0], polygon[i, 1]
+            size += 1
         if (here < 0.0 < there) or (there < 0.0 < here):
             share = here / (here - there)
-            out[kept, 0] = polygon[i, 0] + share * (polygon[j, 0] - polygon[i, 0])
-            out[kept, 1] = polygon[i, 1] + share * (polygon[j, 1] - polygon[i, 1])
-            kept += 1
-    return kept
+            out[size, 0] = polygon[i, 0] + share * (polygon[j, 0] - polygon[i, 0])
+            out[size, 1] = polygon[i, 1] + share * (polygon[j, 1] - polygon[i, 1])
+            size += 1
+    return size
 
 
 @kernel_part

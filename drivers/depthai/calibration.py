@@ -97,23 +97,10 @@ def read_factory_calibration(device: str, cameras: Mapping[str, Lens] | None = N
 def convert_calibration(
     handler: Any, cameras: Mapping[str, tuple[str, Size | None]], focusing: set[str], vendor: Any
 ) -> FactoryCalibration:
-    """Convert the library's calibration.
+    """Convert the library's calibration, a `CalibrationHandler`.
 
-    Parameters
-    ----------
-    handler
-        A `CalibrationHandler`.
-    cameras
-        By name: socket, and size of the frames (None: of the calibration).
-    focusing
-        Sockets of cameras with autofocus.
-    vendor
-        The library.
-
-    Raises
-    ------
-    CalibrationError
-        See `read_factory_calibration`.
+    cameras : by name, socket and size of the frames (None: of the calibration). focusing : sockets of cameras with
+    autofocus. vendor : the library. Raises CalibrationError, see `read_factory_calibration`.
     """
     if not cameras:
         message = "the device stores no calibration of any of its cameras; calibrate the rig with a board"

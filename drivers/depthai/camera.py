@@ -47,21 +47,8 @@ _SETTLE_S = 2.0
 class OakCamera:
     """Implements `slrig.devices.Camera` on one camera of an OAK device.
 
-    Parameters
-    ----------
-    name
-        Name in the rig file.
-    options
-        Validated options.
-
-    Raises
-    ------
-    LibraryMissingError, DeviceBusyError, DeviceGoneError, DeviceError
-        See `open_device`.
-    ConfigError
-        The settings differ from those of the device's other cameras.
-    UnsupportedByDeviceError
-        The device has no such camera, or the camera does not support an option.
+    Raises the errors of `open_device`, ConfigError if the settings differ from those of the device's other cameras, and
+    UnsupportedByDeviceError if the device has no such camera, or the camera does not support an option.
     """
 
     def __init__(self, name: str, options: OakOptions) -> None:
@@ -87,13 +74,8 @@ class OakCamera:
         return self._info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`. Waits for a frame with these settings. With an external trigger no frame arrives before the
-        first edge, so each frame is checked later instead.
-
-        Raises
-        ------
-        FrameTimeoutError
-            The camera delivers no frame.
+        """See `Camera`. Waits for a frame with these settings; raises FrameTimeoutError if the camera delivers none.
+        With an external trigger no frame arrives before the first edge, so each frame is checked later instead.
         """
         hint = f"exposures are that long at fps = {self._stream.fps:g}"
         self._state.check_settings(settings, self._info, hint=hint)
@@ -301,11 +283,6 @@ class OakCamera:
 def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:  # noqa: ARG001 - every driver's form
     """Open one camera of an OAK device, from its `[[camera]]` table (without `name`, `driver` and settings).
 
-    Raises
-    ------
-    ConfigError
-        The options have faults, all of them in one message.
-    LibraryMissingError, DeviceBusyError, DeviceGoneError, UnsupportedByDeviceError, DeviceError
-        See `OakCamera`.
+    Raises ConfigError with all faults of the options, and the errors of `OakCamera`.
     """
     return OakCamera(name, validate(OakOptions, options, f"the [[camera]] table '{name}'"))

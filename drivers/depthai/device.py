@@ -180,12 +180,8 @@ class FrameQueue:
             self._lost += 1
 
     def take(self, until_ns: int) -> OakFrame | None:
-        """Return the oldest waiting frame, or None if none arrives by this time (CLOCK_MONOTONIC).
-
-        Raises
-        ------
-        DeviceGoneError
-            No more frames will arrive.
+        """Return the oldest waiting frame, or None if none arrives by this time (CLOCK_MONOTONIC). Raises
+        DeviceGoneError if no more frames will arrive.
         """
         with self._changed:
             while True:
@@ -219,10 +215,7 @@ class CameraLink:
 class OakDevice:
     """An open device. Made by `open_device`; its cameras `join` and `leave`, the last one closes it.
 
-    Raises
-    ------
-    DeviceBusyError, DeviceGoneError, DeviceError
-        It cannot be opened.
+    Raises DeviceBusyError, DeviceGoneError or DeviceError if it cannot be opened.
     """
 
     def __init__(self, info: Any, vendor: Any) -> None:
@@ -265,7 +258,7 @@ class OakDevice:
                 raise
             except RuntimeError as cause:
                 message = (
-                    f"OAK device '{self.device_id}' stores no calibration of its own ({cause}); calibrate the rig with "
+                    f"OAK device '{self.device_id}' stores no calibration ({cause}); calibrate the rig with "
                     "a board instead"
                 )
                 raise CalibrationError(message) from cause
@@ -334,14 +327,8 @@ class OakDevice:
             self._close()
 
     def start(self) -> None:
-        """Start streaming from every camera that has joined. Idempotent.
-
-        Raises
-        ------
-        UnsupportedByDeviceError
-            The device refuses the streams.
-        DeviceGoneError
-            It was unplugged.
+        """Start streaming from every camera that has joined. Idempotent. Raises UnsupportedByDeviceError if the device
+        refuses the streams, DeviceGoneError if it was unplugged.
         """
         with self._lock:
             self._require_connected()
@@ -521,12 +508,8 @@ def require_one_clock(vendor: Any) -> None:
 def open_device(device: str) -> OakDevice:
     """Return a device, opened now unless this process has it open.
 
-    Raises
-    ------
-    LibraryMissingError
-        The library is not installed.
-    DeviceBusyError, DeviceGoneError, DeviceError
-        The device cannot be opened.
+    Raises LibraryMissingError if the library is not installed; DeviceBusyError, DeviceGoneError or DeviceError if the
+    device cannot be opened.
     """
     vendor = load_depthai()
     with _DEVICES_LOCK:
@@ -552,13 +535,7 @@ def open_device_ids() -> frozenset[str]:
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """List every OAK device on USB and on the network, in half a second.
-
-    Raises
-    ------
-    LibraryMissingError
-        The library is not installed.
-    """
+    """List every OAK device on USB and on the network, in half a second. Raises LibraryMissingError."""
     vendor = load_depthai()
     found = {info.deviceId or info.name: info for info in vendor.Device.getAllConnectedDevices()}
     in_use = open_device_ids()

@@ -46,14 +46,8 @@ def is_permitted(info: Any, vendor: Any) -> bool:
 def find_available(device: str, vendor: Any) -> Any:
     """Return the library's description of a device that can be opened, by id, address or port.
 
-    Raises
-    ------
-    DeviceBusyError
-        Another program holds it.
-    DeviceGoneError
-        It is not connected.
-    DeviceError
-        This user may not open it.
+    Raises DeviceBusyError if another program holds it, DeviceGoneError if it is not connected, and DeviceError if this
+    user may not open it.
     """
     info = _find_by_name(device, vendor.Device.getAllAvailableDevices())
     if info is not None and is_permitted(info, vendor):
@@ -128,7 +122,7 @@ def read_sensors(features: Iterable[Any], vendor: Any) -> Mapping[str, OakSensor
         kind = feature.supportedTypes[0] if feature.supportedTypes else kinds.MONO
         if kind not in (kinds.MONO, kinds.COLOR) or feature.width < 1 or feature.height < 1:
             continue
-        whole = [
+        full_frame_rates = [
             config.maxFps
             for config in feature.configs
             if (config.width, config.height) == (feature.width, feature.height)
@@ -139,18 +133,14 @@ def read_sensors(features: Iterable[Any], vendor: Any) -> Mapping[str, OakSensor
             size=Size(feature.width, feature.height),
             colour=kind == kinds.COLOR,
             autofocus=feature.hasAutofocus,
-            fastest_fps=max(whole, default=0.0),
+            fastest_fps=max(full_frame_rates, default=0.0),
         )
     return found
 
 
 def load_depthai() -> Any:
-    """Return the module `depthai`, version 3.12 or later.
-
-    Raises
-    ------
-    LibraryMissingError
-        It is not installed, cannot be loaded, or is too old.
+    """Return the module `depthai`, version 3.12 or later. Raises LibraryMissingError if it is missing, broken or too
+    old.
     """
     # Finding it is fast; importing it is slow.
     if importlib.util.find_spec("depthai") is None:
@@ -173,7 +163,8 @@ def load_depthai() -> Any:
 def nanoseconds(span: timedelta) -> int:
     """Convert a duration of the library to ns; its resolution is a microsecond.
 
-    >>> nanoseconds(timedelta(milliseconds=2)) 2000000
+    >>> nanoseconds(timedelta(milliseconds=2))
+    2000000
     """
     return span // _MICROSECOND * 1_000
 

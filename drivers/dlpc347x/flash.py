@@ -125,13 +125,13 @@ def find_lines(block: bytes) -> dict[PatternLine, tuple[FlashedLine, ...]]:
 
 
 def locate_patterns(
-    sequence: PatternSequence, lines: LineEncoder, held: Mapping[PatternLine, tuple[FlashedLine, ...]]
+    sequence: PatternSequence, lines: LineEncoder, available: Mapping[PatternLine, tuple[FlashedLine, ...]]
 ) -> tuple[FlashedLine, ...]:
     """Return the location of each pattern, in a single set if possible. Raises UnsupportedByDeviceError if the flash
     lacks patterns; the message says what to do.
     """
     found = [
-        {place.set: place for line in lines.encode(sequence, index) for place in reversed(held.get(line, ()))}
+        {place.set: place for line in lines.encode(sequence, index) for place in reversed(available.get(line, ()))}
         for index in range(len(sequence))
     ]
     missing = [describe_pattern(sequence.patterns[index]) for index, places in enumerate(found) if not places]

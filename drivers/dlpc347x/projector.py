@@ -46,28 +46,16 @@ MAX_REPEATS = 254
 class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
     """Implements `slrig.devices.StoredPatternProjector` on a DLPC3470 or DLPC3478.
 
-    Parameters
-    ----------
-    bus
-        An open engine in any state; it is dark and ready afterwards, or closed if that failed.
-    options
-        Options of the rig file.
-    clock
-        The rig's; default: the system's.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        It is another controller, or does not accept a setting.
-    DeviceError, DeviceGoneError
-        The engine failed.
+    bus : an open engine in any state; it is dark and ready afterwards, or closed if that failed. clock : the rig's;
+    default: the system's. Raises UnsupportedByDeviceError if it is another controller or does not accept a setting,
+    DeviceError and DeviceGoneError if the engine failed.
     """
 
     def __init__(self, bus: I2cBus, options: Dlpc347xEngineOptions, *, clock: Clock | None = None) -> None:
         super().__init__(Dlpc347xEngine(bus), options, clock=clock)
         self._options = options
         self._lines: LineEncoder
-        self._held: Mapping[PatternLine, tuple[FlashedLine, ...]] = {}
+        self._available: Mapping[PatternLine, tuple[FlashedLine, ...]] = {}
         self._places: tuple[FlashedLine, ...] = ()
         self._colours: tuple[LedColour, ...] = ()
         self._lights: dict[tuple[LedColour, int], LightLimits] = {}
@@ -84,7 +72,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
             if self._engine.flash() == block:
                 return f"the flash of {self._engine.name} holds these {len(sequence)} patterns already"
             self._engine.write_flash(block)
-            self._held = find_lines(block)
+            self._available = find_lines(block)
             self._engine.take_patterns_from_flash()
             self.blank()
         return (
@@ -97,7 +85,7 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, self._lines.mirrors.size)
-        self._places = locate_patterns(sequence, self._lines, self._held)
+        self._places = locate_patterns(sequence, self._lines, self._available)
         self._colours = tuple(map(self._options.led_colour, sequence.patterns))
         self._state.loaded = sequence
 
@@ -204,9 +192,9 @@ class Dlpc347xProjector(EngineProjector[Dlpc347xEngine]):
         # A change of mode may start the engine's default sequence.
         self.blank()
         try:
-            self._held = find_lines(block) if (block := engine.flash()) else {}
+            self._available = find_lines(block) if (block := engine.flash()) else {}
         except struct.error:
-            self._held = {}
+            self._available = {}
         engine.set_current(options.led_current)
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
         light = self._light_limits(options.colour, MAX_LIGHT_US)

@@ -82,13 +82,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """List the light engines that are plugged in. Opens none.
-
-    Raises
-    ------
-    WrongSystemError
-        This is not Linux.
-    """
+    """List the light engines that are plugged in. Opens none. Raises WrongSystemError unless this is Linux."""
     from drivers.dlpc350.projector import DLPC350
     from drivers.pattern_engine.usb import list_devices
 

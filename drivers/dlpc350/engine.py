@@ -136,17 +136,8 @@ def check_timing(timing: Timing, *, bit_depth: int = 1) -> None:
 def check_loading(counts: Sequence[int], period_us: int, image_load_s: float) -> None:
     """Check that each picture is loaded before its first pattern.
 
-    Parameters
-    ----------
-    counts
-        Number of patterns shown of each picture before the next one replaces it.
-    image_load_s
-        Loading time of a picture from the flash.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        A picture would be late; the message names the rule.
+    counts : number of patterns shown of each picture. image_load_s : loading time of a picture from the flash. Raises
+    UnsupportedByDeviceError if a picture would be late; the message names the rule.
     """
     if len(counts) <= BUFFERS:
         return
@@ -209,14 +200,8 @@ class Dlpc350Engine(UsbEngine):
             self.set_byte(Dlpc350Command.MAILBOX, 0)
 
     def validate(self, timeout_s: float) -> None:
-        """Let the engine validate the sequence.
-
-        Raises
-        ------
-        UnsupportedByDeviceError
-            It found faults, which the message lists.
-        DeviceError
-            It did not finish in time.
+        """Let the engine validate the sequence. Raises UnsupportedByDeviceError with the faults found; DeviceError on
+        time-out.
         """
         self.set_byte(Dlpc350Command.VALIDATE, 0)
         until = time.monotonic() + timeout_s

@@ -139,12 +139,8 @@ class FlashContents:
     pictures: tuple[FlashedPicture, ...] = ()
 
     def places(self, sequence: PatternSequence) -> tuple[FlashedPlane, ...]:
-        """Return the location of each pattern, with as few changes of picture as possible.
-
-        Raises
-        ------
-        UnsupportedByDeviceError
-            The flash lacks patterns; the message says what to do.
+        """Return the location of each pattern, with as few changes of picture as possible. Raises
+        UnsupportedByDeviceError if the flash lacks patterns; the message says what to do.
         """
         found = [self._candidates(pattern_plane(sequence, index)) for index in range(len(sequence))]
         missing = [index for index, candidates in enumerate(found) if not candidates]
@@ -192,12 +188,8 @@ def _run_length(found: Sequence[Mapping[int, FlashedPlane]], image: int) -> int:
 
 
 def read_flash_list(folder: Path) -> FlashContents:
-    """Read the list in a folder; without a list, return an empty flash.
-
-    Raises
-    ------
-    ConfigError
-        The list has faults, or a picture does not match the list.
+    """Read the list in a folder; without a list, return an empty flash. Raises ConfigError if the list has faults, or a
+    picture does not match it.
     """
     path = folder / LIST_FILE
     if not path.exists():
@@ -290,15 +282,15 @@ def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Fla
 def _group_planes(sequence: PatternSequence) -> list[list[tuple[Plane, str]]]:
     """Group planes into pictures: each holds all patterns from its first to its last one in the order of play."""
     groups: list[list[tuple[Plane, str]]] = [[]]
-    held: set[bytes] = set()
+    contained: set[bytes] = set()
     for index, pattern in enumerate(sequence.patterns):
         plane = pattern_plane(sequence, index)
         keys = plane_keys(plane)
-        if not held.isdisjoint(keys):
+        if not contained.isdisjoint(keys):
             continue
         if len(groups[-1]) == PLANES:
             groups.append([])
-            held = set()
-        held.update(keys)
+            contained = set()
+        contained.update(keys)
         groups[-1].append((plane, describe_pattern(pattern)))
     return groups

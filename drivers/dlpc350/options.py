@@ -36,8 +36,6 @@ class Dlpc350EngineOptions(UsbLightOptions, use_attribute_docstrings=True):
     standby: bool = False
     """Put the engine into standby when it is closed; it is woken when opened."""
 
-    def load_s(self, *, kept: bool) -> float:
-        """Return the maximum time from the command to start until light. kept : the previous pattern is in the same
-        picture.
-        """
-        return self.image_kept_s if kept and self.image_kept_s is not None else self.image_load_s
+    def load_s(self, *, same_picture: bool) -> float:
+        """Return the maximum time from start to light. same_picture : the previous pattern is in the same picture."""
+        return self.image_kept_s if same_picture and self.image_kept_s is not None else self.image_load_s

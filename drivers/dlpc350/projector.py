@@ -32,21 +32,9 @@ _POLLABLE_US = 1_000_000
 class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
     """Implements `slrig.devices.Projector` on a DLPC350.
 
-    Parameters
-    ----------
-    link
-        An open engine in any state; it is dark and ready afterwards, or closed if that failed.
-    options, flash
-        Options of the rig file, and contents of the engine's flash.
-    clock
-        The rig's; default: the system's.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        The flash does not match the list, or the engine does not accept a setting.
-    DeviceError, DeviceGoneError
-        The engine failed.
+    link : an open engine in any state; it is dark and ready afterwards, or closed if that failed. flash : contents of
+    the engine's flash. clock : the rig's; default: the system's. Raises UnsupportedByDeviceError if the flash does not
+    match its list or the engine does not accept a setting, DeviceError and DeviceGoneError if the engine failed.
     """
 
     def __init__(
@@ -98,7 +86,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
         """
         self._state.require_pattern(index)
         place = self._places[index]
-        load_s = self._options.load_s(kept=self._shown_picture == place.image)
+        load_s = self._options.load_s(same_picture=self._shown_picture == place.image)
         # The sequence ends by itself; it may have to load a picture first.
         alone_us = round((MAX_UNATTENDED_S - self._options.image_load_s) * 1e6)
         if self.is_polarity_unknown:
@@ -167,7 +155,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
             serial=self._serial,
             size=MIRRORS,
             plays=not self.is_polarity_unknown,
-            latency_s=options.load_s(kept=True) + COMMANDS_S,
+            latency_s=options.load_s(same_picture=True) + COMMANDS_S,
             gap_s=options.light_margin_s,
             duty=options.duty_limit,
             lights=options.colour is LedColour.WHITE,
@@ -190,7 +178,7 @@ class Dlpc350Projector(UsbEngineProjector[Dlpc350Engine]):
             message = (
                 f'{self._engine.name}: the list in {flash.folder} is of a flash tagged "{flash.tag}", the engine says '
                 f'"{tag}": it may hold other pictures; flash those of that folder with TI\'s LightCrafter 4500 program '
-                "and give that tag, or let patterns in the rig file name the folder of what is flashed"
+                "and give that tag, or set patterns in the rig file to the folder of the flashed pictures"
             )
             raise UnsupportedByDeviceError(message)
 

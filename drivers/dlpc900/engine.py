@@ -168,13 +168,13 @@ class Dlpc900Engine(UsbEngine):
         """Set an entry of the pattern table, effective from the next `configure` on."""
         self._send(Dlpc900Command.DEFINITION, entry)
 
-    def configure(self, entries: int, shown: int) -> None:
+    def configure(self, entries: int, count: int) -> None:
         """Use the first entries of the table in their order, and show this number of patterns."""
-        self._send(Dlpc900Command.CONFIGURATION, struct.pack("<HI", entries, shown))
+        self._send(Dlpc900Command.CONFIGURATION, struct.pack("<HI", entries, count))
 
-    def order(self, indices: Sequence[int], shown: int) -> None:
+    def order(self, indices: Sequence[int], count: int) -> None:
         """Show this number of patterns, cycling through these entries."""
-        self._link.send(Dlpc900Command.ORDER, struct.pack(f"<HI{len(indices)}H", len(indices), shown, *indices))
+        self._link.send(Dlpc900Command.ORDER, struct.pack(f"<HI{len(indices)}H", len(indices), count, *indices))
         self._check_error_code("take the order of the patterns")
 
     def upload(self, number: int, parts: Sequence[bytes]) -> None:

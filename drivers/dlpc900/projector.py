@@ -34,21 +34,9 @@ _ALONE_US = round(MAX_UNATTENDED_S * 1e6) - _DARK_END_US
 class Dlpc900Projector(UsbEngineProjector[Dlpc900Engine]):
     """Implements `slrig.devices.Projector` on a DLPC900.
 
-    Parameters
-    ----------
-    link
-        An open engine in any state; it is dark and ready afterwards, or closed if that failed.
-    options
-        Options of the rig file.
-    clock
-        The rig's; default: the system's.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        Its firmware or its mirrors are not supported, or it does not accept a setting.
-    DeviceError, DeviceGoneError
-        The engine failed.
+    link : an open engine in any state; it is dark and ready afterwards, or closed if that failed. clock : the rig's;
+    default: the system's. Raises UnsupportedByDeviceError if its firmware or mirrors are not supported or it does not
+    accept a setting, DeviceError and DeviceGoneError if the engine failed.
     """
 
     def __init__(

@@ -45,13 +45,7 @@ class AravisLibrary:
 
 @lru_cache(maxsize=1)
 def load_aravis() -> AravisLibrary:
-    """Load Aravis once.
-
-    Raises
-    ------
-    LibraryMissingError
-        PyGObject or the Aravis typelib is not installed.
-    """
+    """Load Aravis once. Raises LibraryMissingError if PyGObject or the Aravis typelib is not installed."""
     try:
         gi = importlib.import_module("gi")
         # PyGObject raises ValueError if the system has no typelib of that name.
@@ -77,8 +71,9 @@ def install_command(python: tuple[int, int] = sys.version_info[:2], system: str 
     the extra requires an older PyGObject there.
 
     >>> "libgirepository1.0-dev" in install_command((3, 11)), "libgirepository-2.0-dev" in install_command((3, 13))
-    (True, True) >>> install_command(system="win32") "pip install 'slrig[genicam]' (Aravis with its introspection data
-    first)"
+    (True, True)
+    >>> install_command(system="win32")
+    "pip install 'slrig[genicam]' (Aravis with its introspection data first)"
     """
     if system != "linux":
         return "pip install 'slrig[genicam]' (Aravis with its introspection data first)"
@@ -127,21 +122,8 @@ def _slrig_error(aravis: Any, name: str, doing: str, cause: Any) -> DeviceError:
 class AravisConnection(GenICamConnection):
     """An open device. Aravis signals the loss of control on its own thread.
 
-    Parameters
-    ----------
-    name
-        Name of the camera, for messages.
-    options
-        `GenicamOptions`.
-
-    Raises
-    ------
-    LibraryMissingError
-        Aravis is not installed.
-    DeviceGoneError
-        No such camera answers.
-    DeviceBusyError
-        Another program controls it.
+    name : for messages. Raises LibraryMissingError (Aravis is not installed), DeviceGoneError (no such camera answers)
+    and DeviceBusyError (another program controls it).
     """
 
     def __init__(self, name: str, options: GenicamOptions) -> None:
@@ -311,7 +293,7 @@ def _open_device(aravis: Any, name: str, device: str) -> Any:
         known = ", ".join(label for _, label in list_aravis_cameras()) or "none"
         message = (
             f"camera '{name}': no GenICam camera '{device}' answers; found: {known}. Check cable, power, and that its "
-            "IP address lies in the network of this machine's card"
+            "IP address is in the network of this machine's card"
         )
         raise DeviceGoneError(message) from error
 
@@ -357,11 +339,5 @@ def _read_clocks() -> tuple[int, int]:
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """List every GigE Vision and USB3 Vision camera that answers Aravis. Opens none.
-
-    Raises
-    ------
-    LibraryMissingError
-        Aravis or PyGObject is not installed.
-    """
+    """List every GigE Vision and USB3 Vision camera that answers Aravis. Opens none. Raises LibraryMissingError."""
     return tuple(FoundDevice("genicam", identity, label) for identity, label in list_aravis_cameras())

@@ -61,14 +61,8 @@ class _TimedFrame:
 
 
 class Acquisition:
-    """Acquisition of an armed camera: its stream, and its frames in order. Used by one thread.
-
-    Parameters
-    ----------
-    connection
-        The open device, set up.
-    options, form, size
-        Current settings.
+    """Acquisition of an armed camera: its stream, and its frames in order. Used by one thread. form, size : current
+    settings.
     """
 
     def __init__(
@@ -246,10 +240,7 @@ class Acquisition:
 def set_up_camera(connection: GenICamConnection, options: GenICamCameraOptions) -> Size:
     """Stop the camera, switch automatic functions off, set format, region and features. Return the image size.
 
-    Raises
-    ------
-    UnsupportedByDeviceError
-        The camera does not accept a value, or changes it.
+    Raises UnsupportedByDeviceError if the camera does not accept a value, or changes it.
     """
     features = connection.features
     with connection.access("stopping it") as camera:
@@ -301,12 +292,8 @@ def _set_region(connection: GenICamConnection, options: GenICamCameraOptions) ->
 
 
 def choose_trigger_line(connection: GenICamConnection, options: GenICamCameraOptions) -> str | None:
-    """Return the input of the hardware trigger; None if the camera has none.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        The camera does not have the requested line.
+    """Return the input of the hardware trigger; None if the camera has none. Raises UnsupportedByDeviceError if it does
+    not have the requested line.
     """
     features = connection.features
     if features.has(_SELECTOR):
@@ -328,12 +315,8 @@ def choose_trigger_line(connection: GenICamConnection, options: GenICamCameraOpt
 
 
 def set_trigger(connection: GenICamConnection, source: str | None, options: GenICamCameraOptions) -> None:
-    """Let `source` start every exposure; None lets the camera run freely.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        The camera does not accept it, or another value is read back.
+    """Let `source` start every exposure; None lets the camera run freely. Raises UnsupportedByDeviceError if it is not
+    accepted.
     """
     features = connection.features
     selectors = features.choices(_SELECTOR) if features.has(_SELECTOR) else ()
@@ -361,19 +344,9 @@ def _start_selector(selectors: tuple[str, ...]) -> str:
 
 
 class GenicamCamera:
-    """Implements `slrig.devices.Camera`.
+    """Implements `slrig.devices.Camera`. connection : the open device; this camera closes it.
 
-    Parameters
-    ----------
-    connection
-        The open device; this camera closes it.
-    options
-        Validated options.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        The device does not accept an option, or changes it.
+    Raises UnsupportedByDeviceError if the device does not accept an option, or changes it.
     """
 
     def __init__(self, connection: GenICamConnection, options: GenICamCameraOptions) -> None:

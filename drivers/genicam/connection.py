@@ -22,15 +22,8 @@ class Features:
     """Features of a device by name: set, read back and compared. Each call may raise the errors of
     `GenICamConnection.access`.
 
-    Parameters
-    ----------
-    name
-        Name of the camera, for messages.
-    access
-        Gives the `Aravis.Camera` for one request; its registers must not be cached, so that values read back come from
-        the camera.
-    feature_type
-        Returns the type of a feature: see `GenICamConnection`.
+    name : for messages. access : gives the `Aravis.Camera` for one request; its registers must not be cached, so that
+    values read back come from the camera. feature_type : returns the type of a feature, see `GenICamConnection`.
     """
 
     def __init__(
@@ -71,13 +64,7 @@ class Features:
             camera.execute_command(feature)
 
     def choose(self, feature: str, entry: str) -> None:
-        """Set an enumeration.
-
-        Raises
-        ------
-        UnsupportedByDeviceError
-            It has no such entry, or reads back another.
-        """
+        """Set an enumeration. Raises UnsupportedByDeviceError if it has no such entry, or another is read back."""
         offered = self.choices(feature)
         if entry not in offered:
             raise self._refusal(
@@ -158,7 +145,8 @@ class Features:
 def differs(got: float, requested: float) -> bool:
     """True if a number that was read back is not the requested one.
 
-    >>> differs(0.01001, 0.01), differs(0.0, 0.0), differs(2.0, 1.5) (False, False, True)
+    >>> differs(0.01001, 0.01), differs(0.0, 0.0), differs(2.0, 1.5)
+    (False, False, True)
     """
     return abs(got - requested) > TOLERANCE * abs(requested) + 1e-12
 
@@ -199,13 +187,7 @@ class GenICamStream(Protocol):
 
 
 class GenICamConnection(ABC):
-    """An open device. Used by one thread; a thread of the library may report its loss.
-
-    Parameters
-    ----------
-    name
-        Name of the camera, for messages.
-    """
+    """An open device. Used by one thread; a thread of the library may report its loss. name : for messages."""
 
     _camera: Any
     """`Aravis.Camera`, or an object with the same methods."""
@@ -225,14 +207,8 @@ class GenICamConnection(ABC):
     def access(self, doing: str) -> Iterator[Any]:
         """Provide the camera, with the interface of `Aravis.Camera`, for the block.
 
-        Raises
-        ------
-        DeviceStateError
-            It was closed.
-        DeviceGoneError
-            It is lost, before or during the block.
-        DeviceError
-            As `translate_errors` translates the library's errors.
+        Raises DeviceStateError if it was closed, DeviceGoneError if it is lost, before or during the block, and the
+        errors of `translate_errors`.
         """
         self.state.require_open()
         if self._lost.is_set():

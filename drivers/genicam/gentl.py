@@ -50,12 +50,8 @@ _ASK_S = 1e-5
 
 @lru_cache(maxsize=1)
 def load_harvesters() -> Any:
-    """Return the module `harvesters.core`.
-
-    Raises
-    ------
-    LibraryMissingError
-        harvesters, or the wheel of GenICam that it needs, is not installed.
+    """Return the module `harvesters.core`. Raises LibraryMissingError if it, or its wheel of GenICam, is not
+    installed.
     """
     try:
         return importlib.import_module("harvesters.core")
@@ -66,19 +62,7 @@ def load_harvesters() -> Any:
 
 @contextmanager
 def translate_gentl_errors(name: str, doing: str) -> Iterator[None]:
-    """Translate errors of producers and node maps within the block into slrig's.
-
-    Raises
-    ------
-    DeviceGoneError
-        The device no longer answers.
-    DeviceBusyError
-        Another program controls it.
-    UnsupportedByDeviceError
-        It has no such feature, or refused the value.
-    DeviceError
-        Anything else.
-    """
+    """Translate errors of producers and node maps within the block into slrig's, as `translate_aravis_errors`."""
     load_harvesters()
     gentl, genapi = importlib.import_module("genicam.gentl"), importlib.import_module("genicam.genapi")
     errors: tuple[type[Exception], ...] = (gentl.GenericException, genapi.GenericException)
@@ -132,12 +116,8 @@ class GentlProducer:
 
 
 def acquire_producer(file: Path) -> GentlProducer:
-    """Return the producer of a file, loading it if necessary; call `release_producer` after use.
-
-    Raises
-    ------
-    LibraryMissingError
-        harvesters is not installed, or the file does not exist.
+    """Return the producer of a file, loading it if necessary; call `release_producer` after use. Raises
+    LibraryMissingError if harvesters is not installed, or the file does not exist.
     """
     if not file.is_file():
         message = f"GenTL producer {file} not found; install the one that comes with the camera, and write its path"
@@ -170,13 +150,7 @@ def use_producer(file: Path) -> Iterator[GentlProducer]:
 
 
 def list_gentl_cameras() -> tuple[tuple[str, str], ...]:
-    """Return id and label of every camera behind the installed producers, without opening any.
-
-    Raises
-    ------
-    LibraryMissingError
-        harvesters is not installed.
-    """
+    """Return id and label of every camera behind the installed producers, opening none. Raises LibraryMissingError."""
     load_harvesters()
     found = []
     for file in producer_files():
@@ -215,16 +189,8 @@ def feature_type(node: Any) -> str:
 class NodeMapCamera:
     """A camera's features through GenApi's node map, with the methods of `Aravis.Camera` that this driver calls.
 
-    Each may raise GenApi's and GenTL's errors.
-
-    Parameters
-    ----------
-    name
-        Name of the camera, for messages.
-    nodes
-        Its `NodeMap`.
-    device
-        The producer's description of the device.
+    Each may raise GenApi's and GenTL's errors. name : for messages. nodes : its `NodeMap`. device : the producer's
+    description of the device.
     """
 
     def __init__(self, name: str, nodes: Any, device: Any) -> None:
@@ -360,23 +326,9 @@ class NodeMapCamera:
 class GentlConnection(GenICamConnection):
     """An open device.
 
-    Parameters
-    ----------
-    name
-        Name of the camera, for messages.
-    options
-        `GentlOptions`.
-    folder
-        Folder to which the producer's path is relative.
-
-    Raises
-    ------
-    LibraryMissingError
-        harvesters is not installed, or no producer is found.
-    DeviceGoneError
-        No such camera answers.
-    DeviceBusyError
-        Another program controls it.
+    name : for messages. folder : folder to which the producer's path is relative. Raises LibraryMissingError
+    (harvesters is not installed, or no producer is found), DeviceGoneError (no such camera answers) and DeviceBusyError
+    (another program controls it).
     """
 
     def __init__(self, name: str, options: GentlOptions, folder: Path) -> None:
@@ -442,14 +394,7 @@ class GentlConnection(GenICamConnection):
 class GentlStream:
     """Implements `GenICamStream` on a running acquisition.
 
-    Parameters
-    ----------
-    connection
-        The connection that started it.
-    acquirer
-        harvesters' `ImageAcquirer`.
-    lost
-        Set when no more frames can be requested.
+    acquirer : harvesters' `ImageAcquirer`. lost : set when no more frames can be requested.
     """
 
     def __init__(self, connection: GentlConnection, acquirer: Any, lost: threading.Event) -> None:
@@ -510,11 +455,5 @@ def _buffer_field(buffer: Any, what: str, otherwise: int) -> int:
 
 
 def find_gentl_devices() -> tuple[FoundDevice, ...]:
-    """List every camera that an installed GenTL producer sees. Opens none.
-
-    Raises
-    ------
-    LibraryMissingError
-        harvesters is not installed.
-    """
+    """List every camera that an installed GenTL producer sees. Opens none. Raises LibraryMissingError."""
     return tuple(FoundDevice("gentl", identity, label) for identity, label in list_gentl_cameras())

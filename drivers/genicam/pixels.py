@@ -136,10 +136,10 @@ def _take_bytes(data: bytes, count: int, form: PfncFormat) -> Bytes:
 
 
 def _byte_groups(packed: Bytes, group: int) -> NDArray[np.uint16]:
-    """(n, group) uint16: the bytes in groups of whole samples; the last group is padded with zeros."""
+    """(n, group) uint16: the bytes in groups of padded samples; the last group is padded with zeros."""
     short = -len(packed) % group
-    whole = np.concatenate([packed, np.zeros(short, np.uint8)]) if short else packed
-    return whole.reshape(-1, group).astype(np.uint16)
+    padded = np.concatenate([packed, np.zeros(short, np.uint8)]) if short else packed
+    return padded.reshape(-1, group).astype(np.uint16)
 
 
 def _unpack_lsb(packed: Bytes, bit_depth: int) -> NDArray[np.uint16]:

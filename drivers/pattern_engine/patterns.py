@@ -35,19 +35,9 @@ class Timing:
 def light_duration_us(exposure_s: float, period_s: float, *, margin_s: float, least_us: int, dark_us: int = 0) -> int:
     """Duration of the light for an exposure of `exposure_s`, whole microseconds.
 
-    Parameters
-    ----------
-    margin_s
-        Light beyond the exposure: covers the camera's delay from the pulse to its first row.
-    least_us
-        The engine's shortest light.
-    dark_us
-        Dark time that the engine needs between two patterns.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        It does not fit into the period.
+    margin_s : light beyond the exposure, for the camera's delay from the pulse to its first row. least_us : the
+    engine's shortest light. dark_us : dark time that the engine needs between two patterns. Raises
+    UnsupportedByDeviceError if it does not fit into the period.
     """
     period_us = round(period_s * 1e6)
     wanted_us = max(round((exposure_s + margin_s) * 1e6), least_us)

@@ -92,16 +92,8 @@ class CommandRefusedError(DeviceError):
 class UsbLink:
     """An open engine. Thread-safe: each command and its answer are one step.
 
-    Parameters
-    ----------
-    handle
-        File descriptor of a hidraw node, or of anything that preserves report boundaries. The link closes it.
-    name
-        Name of the engine, for messages.
-    kind
-        Type of the controller.
-    answer_s
-        Longest time for an answer.
+    handle : file descriptor of a hidraw node, or of anything that preserves report boundaries; the link closes it. name
+    : for messages. kind : type of the controller. answer_s : longest time for an answer.
     """
 
     def __init__(self, handle: int, name: str, kind: UsbController, *, answer_s: float = ANSWER_TIMEOUT_S) -> None:

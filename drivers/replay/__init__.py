@@ -56,10 +56,10 @@ class ReplayHead:
 
     def __init__(self, bundle: Bundle, clock: ReplayClock | None = None) -> None:
         self.clock = clock = ReplayClock() if clock is None else clock
-        stage = ReplayState()
+        replay_state = ReplayState()
         self._calibration = bundle.calibration
-        self._cameras = {name: ReplayCamera(name, bundle, clock, stage) for name in bundle.capture.cameras}
-        self._projector = ReplayProjector(bundle, self._cameras, clock, stage)
+        self._cameras = {name: ReplayCamera(name, bundle, clock, replay_state) for name in bundle.capture.cameras}
+        self._projector = ReplayProjector(bundle, self._cameras, clock, replay_state)
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -111,7 +111,7 @@ def open_head(options: Mapping[str, object], folder: Path) -> ScannerHead:
     if not bundle.capture.shots:
         message = f"{path / 'bundle.json'}: the recording has no frames; there is nothing to replay"
         raise BundleError(message)
-    capture, told = trim_incomplete_codes(bundle.capture)
-    for words in told:
-        _log.warning(words, recording=str(path))
+    capture, warnings = trim_incomplete_codes(bundle.capture)
+    for warning in warnings:
+        _log.warning(warning, recording=str(path))
     return ReplayHead(replace(bundle, capture=capture), ReplayClock(table.speed))

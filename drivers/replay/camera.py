@@ -19,13 +19,13 @@ _EXPOSURE_TOLERANCE = 0.01
 class ReplayState:
     """The shown pattern, and how often it was shown before in the sequence."""
 
-    shown: tuple[Pattern, int] | None = None
+    pattern: tuple[Pattern, int] | None = None
 
 
 class ReplayCamera:
     """Implements `slrig.devices.Camera` on one camera's recorded frames."""
 
-    def __init__(self, name: str, bundle: Bundle, clock: ReplayClock, stage: ReplayState) -> None:
+    def __init__(self, name: str, bundle: Bundle, clock: ReplayClock, replay_state: ReplayState) -> None:
         capture = bundle.capture
         self._recorded: dict[Pattern, list[Shot]] = defaultdict(list)
         for shot in capture.shots:
@@ -47,7 +47,7 @@ class ReplayCamera:
         )
         self._applied = AppliedSettings(exposures[0] if exposures else 0.01, 1.0)
         self._clock = clock
-        self._stage = stage
+        self._replay_state = replay_state
         self._pending: deque[Frame] = deque()
         self._state = CameraState(name)
         self._number = 0
@@ -155,7 +155,7 @@ class ReplayCamera:
         return same_exposure or shots
 
     def _recorded_shot(self) -> Shot:
-        pattern, showing = self._stage.shown if self._stage.shown is not None else (Black(), 0)
+        pattern, showing = self._replay_state.pattern if self._replay_state.pattern is not None else (Black(), 0)
         shots = self.recorded_frames(pattern)
         if not shots:
             message = (

@@ -16,7 +16,7 @@ class ReplayProjector:
     """Implements `slrig.devices.Projector` on the patterns of a recording."""
 
     def __init__(
-        self, bundle: Bundle, cameras: Mapping[str, ReplayCamera], clock: ReplayClock, stage: ReplayState
+        self, bundle: Bundle, cameras: Mapping[str, ReplayCamera], clock: ReplayClock, replay_state: ReplayState
     ) -> None:
         self._info = ProjectorInfo(
             name="projector",
@@ -36,7 +36,7 @@ class ReplayProjector:
         self._recorded = tuple(dict.fromkeys(bundle.capture.patterns))
         self._cameras = cameras
         self._clock = clock
-        self._stage = stage
+        self._replay_state = replay_state
         self._state = ProjectorState("the recording's projector")
 
     @property
@@ -68,7 +68,7 @@ class ReplayProjector:
         patterns = self._state.require_pattern(index).patterns
         pattern = patterns[index]
         showing = patterns[:index].count(pattern)
-        self._stage.shown = (pattern, showing)
+        self._replay_state.pattern = (pattern, showing)
         times_s = [
             shots[min(showing, len(shots) - 1)].time_s
             for shots in (camera.recorded_frames(pattern) for camera in self._cameras.values())
@@ -86,7 +86,7 @@ class ReplayProjector:
 
     def blank(self) -> None:
         """See `Projector`."""
-        self._stage.shown = None
+        self._replay_state.pattern = None
         self._clock.change_light()
 
     def close(self) -> None:

@@ -49,19 +49,14 @@ BEATS_PER_WATCHDOG = 5
 def pattern_checksum(image: Pixels) -> int:
     """CRC-32 (ISO-HDLC, as zlib's) of one pattern's image, (H, W) uint8, row by row from the top left.
 
-    >>> hex(pattern_checksum(np.array([[0, 255], [255, 0]], np.uint8))) '0xcf81683'
+    >>> hex(pattern_checksum(np.array([[0, 255], [255, 0]], np.uint8)))
+    '0xcf81683'
     """
     return zlib.crc32(image.tobytes())
 
 
 def pattern_checksums(sequence: PatternSequence) -> tuple[int, ...]:
-    """CRC-32 of every pattern of a sequence.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        A pattern has more than 8 bits.
-    """
+    """CRC-32 of every pattern of a sequence. Raises UnsupportedByDeviceError if a pattern has more than 8 bits."""
     deep = [index for index, profile in enumerate(sequence.profiles) if profile.dtype != np.uint8]
     if deep:
         message = f"patterns {deep} have more than 8 bits, the limit of a trigger box; encode them with 8 bits"
@@ -72,7 +67,8 @@ def pattern_checksums(sequence: PatternSequence) -> tuple[int, ...]:
 def sequence_checksum(checksums: Sequence[int]) -> int:
     """CRC-32 of a sequence, from those of its patterns in order, four bytes each, most significant first.
 
-    >>> f"{sequence_checksum([0x0CF81683, 0x00000000]):08X}" '46D5955C'
+    >>> f"{sequence_checksum([0x0CF81683, 0x00000000]):08X}"
+    '46D5955C'
     """
     return zlib.crc32(b"".join(crc32.to_bytes(4, "big") for crc32 in checksums))
 
@@ -225,16 +221,8 @@ class BoxStatus:
 class BoxClient:
     """A session with one box. Thread-safe.
 
-    Raises
-    ------
-    DeviceBusyError
-        Another host is in a session with it.
-    UnsupportedByDeviceError
-        It cannot keep to the limits.
-    DeviceError
-        No answer in SLTP/1.
-    DeviceGoneError
-        The port is gone.
+    Raises DeviceBusyError (another host is in a session with it), UnsupportedByDeviceError (it cannot keep to the
+    limits), DeviceError (no answer in SLTP/1) and DeviceGoneError (the port is gone).
     """
 
     def __init__(self, link: BoxLink, limits: BoxLimits, *, label: str, open_s: float) -> None:

@@ -95,7 +95,8 @@ BoxLine = BoxAnswer | BoxEvent | UnreadableLine
 def encode_line(text: str) -> bytes:
     """Encode a line for the wire.
 
-    >>> encode_line("1A2B 7 SHOW 3").rstrip() b'1A2B 7 SHOW 3*FFE7'
+    >>> encode_line("1A2B 7 SHOW 3").rstrip()
+    b'1A2B 7 SHOW 3*FFE7'
     """
     body = text.encode("ascii")
     return b"%s*%04X\n" % (body, binascii.crc_hqx(body, 0xFFFF))
@@ -131,10 +132,10 @@ class LineSplitter:
 
     def lines(self, data: bytes) -> list[bytes]:
         """Return the completed lines without their ends; empty ones are omitted."""
-        *whole, self._rest = (self._rest + data).split(b"\n")
+        *complete, self._rest = (self._rest + data).split(b"\n")
         # A longer line is invalid in any case.
         self._rest = self._rest[-2 * MAX_LINE_BYTES :]
-        return [line for line in whole if line.strip(b"\r")]
+        return [line for line in complete if line.strip(b"\r")]
 
 
 def find_ports(by_id: Path = BY_ID) -> tuple[FoundDevice, ...]:
@@ -238,23 +239,9 @@ class BoxLink:
     ) -> Reply:
         """Send a command until it is answered; return the answer.
 
-        Parameters
-        ----------
-        takes_s
-            Duration of the command itself.
-        while_closing
-            Send it even if `closing` is set.
-
-        Raises
-        ------
-        BoxRefusedError
-            The box refuses.
-        NoAnswerError
-            No answer.
-        DeviceGoneError
-            The port is gone.
-        DeviceStateError
-            `closing` was set meanwhile.
+        takes_s : duration of the command itself. while_closing : send it even if `closing` is set. Raises
+        BoxRefusedError (the box refuses), NoAnswerError, DeviceGoneError (the port is gone) and DeviceStateError
+        (`closing` was set meanwhile).
         """
         self._number = (self._number + 1) % NUMBERS
         line = encode_line(" ".join(map(str, (self.session, self._number, verb, *numbers))))

@@ -37,18 +37,10 @@ class SerialProjector:
     """Implements `slrig.devices.Projector` on a box that speaks SLTP/1.
 
     A thread of the driver feeds the box's watchdog. When a command fails and the box does not confirm that it is dark,
-    that thread stops, and the watchdog puts the light out.
+    that thread stops, and the watchdog switches the light off.
 
-    Parameters
-    ----------
-    open_port
-        Opens the port, at first and after the box was unplugged while dark; the projector closes it.
-    options
-        Validated options.
-    export_folder
-        Folder for `write_patterns`.
-    clock
-        The rig's.
+    open_port : opens the port, at first and after the box was unplugged while dark; the projector closes it.
+    export_folder : folder for `write_patterns`. clock : the rig's.
     """
 
     def __init__(
@@ -110,12 +102,8 @@ class SerialProjector:
         return tuple(DisplayedPattern(*frame) for frame in self._client.frames())
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`. The box must hold these patterns: their checksums are compared.
-
-        Raises
-        ------
-        UnsupportedByDeviceError
-            Patterns are missing, or the sequence has another size, or is too long.
+        """See `Projector`. The box must hold these patterns: their checksums are compared. Raises
+        UnsupportedByDeviceError if patterns are missing, or the sequence has another size, or is too long.
         """
         self._state.require_open()
         self._state.loaded = None
@@ -316,12 +304,7 @@ def _fault_message(port: str, words: tuple[str, ...]) -> str:
 def export_patterns(sequence: PatternSequence, folder: Path) -> None:
     """Write the images for the light engine's flash, `000.png` …, and `patterns.json` for the box.
 
-    Raises
-    ------
-    DeviceError
-        The folder cannot be written.
-    UnsupportedByDeviceError
-        A pattern has more than 8 bits.
+    Raises DeviceError if the folder cannot be written, UnsupportedByDeviceError if a pattern has more than 8 bits.
     """
     size = sequence.projector
     checksums = pattern_checksums(sequence)

@@ -2,19 +2,19 @@
 
 The protocol of lines, version 1
 --------------------------------
-ASCII, 115 200 baud unless the rig file says otherwise, lines end with a line feed; a carriage return before it is
-passed over. Numbers are degrees with up to three decimals. The host sends one command and waits for its answer; STOP
-alone may come while the board turns.
+ASCII, 115 200 baud unless the rig file says otherwise, lines end with a line feed; a preceding carriage return is
+ignored. Numbers are degrees with up to three decimals. The host sends one command and waits for its answer; only STOP
+may be sent while the board turns.
 
-    ID?             slrig-turntable 1 <steps of the motor in a turn of the table, a whole number>
-    TURN <angle>    go to this angle, counted from where the board was started, the short way or the long: 370 is ten
-                    degrees beyond a whole turn. Once it stands: OK <angle reached>, the nearest whole step
-    STOP            stop, if it turns, and answer OK <angle where it stands>; a TURN that is stopped is not answered
-    anything else   ERR <what is wrong, in words>; so is a TURN that cannot be obeyed
+    ID?             slrig-turntable 1 <motor steps per turn of the table, an integer>
+    TURN <angle>    turn to this absolute angle from the position at the start: 370 is ten degrees beyond a full turn.
+                    When it has stopped: OK <angle reached>, the nearest full step
+    STOP            stop, if it turns, and answer OK <current angle>; a TURN that is stopped is not answered
+    anything else   ERR <description>; also for a TURN that cannot be executed
 
-When it starts, also when it is reset, the board sends START: its angle is 0 again, wherever it stands. The host
-sends STOP, because a host before it may have been killed in a turn, then ID?, both again until that one is answered,
-then STOP to learn the angle. Lines that are neither are passed over, so a board may chat.
+When it starts or is reset, the board sends START: its current position is angle 0. The host sends STOP, because an
+earlier host may have been killed during a turn, then ID?, both repeated until ID? is answered, then STOP to read the
+angle. Other lines are ignored, so a board may print messages.
 
 A session, `>` to the board, `<` from it:
 

@@ -68,14 +68,8 @@ _ALARMS = {
 class LineController:
     """Implements `TurntableController` for the protocol of lines. Its unit is a degree.
 
-    Raises
-    ------
-    DeviceGoneError
-        The port is gone.
-    UnsupportedByDeviceError
-        It speaks another version.
-    DeviceError
-        No answer in this protocol.
+    Raises DeviceGoneError (the port is gone), UnsupportedByDeviceError (it speaks another version) and DeviceError (no
+    answer).
     """
 
     def __init__(self, lines: ControllerLink, options: LineOptions) -> None:
@@ -158,14 +152,8 @@ class _GrblStatus:
 class GrblController:
     """Implements `TurntableController` for GRBL 1.1 and compatible firmware (grblHAL, FluidNC).
 
-    Raises
-    ------
-    DeviceGoneError
-        The port is gone.
-    UnsupportedByDeviceError
-        It is not GRBL, lacks the axis, or has settings that do not allow endless rotation.
-    DeviceError
-        No answer.
+    Raises DeviceGoneError (the port is gone), UnsupportedByDeviceError (it is not GRBL, lacks the axis, or has settings
+    that do not allow endless rotation) and DeviceError (no answer).
     """
 
     def __init__(self, lines: ControllerLink, options: GrblOptions) -> None:

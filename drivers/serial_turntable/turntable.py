@@ -72,9 +72,9 @@ class ControllerLink:
         return lines
 
     def _split_lines(self, data: bytes) -> None:
-        *whole, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
+        *complete, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         self._rest = rest[-_MAX_LINE_BYTES:]
-        for raw in whole:
+        for raw in complete:
             line = raw.decode("ascii", "replace").strip()
             if line and line.isascii() and line.isprintable():
                 self._waiting.append(line)
@@ -110,16 +110,8 @@ class SerialTurntable(TurntableBase):
     A controller that restarts counts from zero again. So its position is checked before each turn, and after a failed
     turn the turntable refuses to move: the rig has to be opened again, and angles count from there.
 
-    Parameters
-    ----------
-    port
-        Open port; the turntable closes it, also if opening fails.
-    options
-        Validated options.
-    open_controller
-        Returns the controller at the other end of the line.
-    clock
-        For settling and time-outs.
+    port : open; the turntable closes it, also if opening fails. open_controller : returns the controller at the other
+    end of the line. clock : for settling and time-outs.
     """
 
     def __init__(

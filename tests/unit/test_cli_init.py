@@ -98,7 +98,7 @@ def test_person_is_asked_until_the_driver_takes_the_answer(bench: Bench) -> None
     code, shown = bench.run(found=(OAK, HDMI), answers="1 1\n1\n0.0333\nleft\nCAM_B\nCAM_C\n")
     assert code == 0, shown
     assert "socket: input should be 'CAM_A', 'CAM_B'" in " ".join(shown.split())
-    assert "Which camera of it." in shown
+    assert "Camera of the device." in shown
     rig = bench.rig()
     assert [(each.name, each.options["socket"], each.exposure_s) for each in rig.cameras] == [
         ("left", "CAM_B", 0.0333),
@@ -354,7 +354,7 @@ def test_options_fit_80_columns() -> None:
     lines = shown.splitlines()
     place = next(number for number, line in enumerate(lines) if line.startswith("fps "))
     assert lines[place].split() == ["fps", "number", "Hz", "20"]
-    assert lines[place + 1].startswith("    How many frames the sensor makes per second")
+    assert lines[place + 1].startswith("    Frame rate of the sensor")
     assert "1 to 240." in " ".join(lines[place + 1 : place + 3])
     assert "[[camera]]" in lines
     assert "name, driver, exposure_s and gain" in " ".join(shown.split())

@@ -23,7 +23,8 @@ try:
     from drivers.serial_projector.device.protocol import TriggerBox
 except ImportError:
     # On a box the files are in one folder.
-    from box import HardwareError  # type: ignore[no-redef]
+    from box import BoxDescription, BoxHardware, HardwareError  # type: ignore[no-redef]
+    from protocol import TriggerBox  # type: ignore[no-redef]
 
 MODEL, FIRMWARE = "slrig-pico", "1.1.0"
 WIDTH_PX, HEIGHT_PX = 912, 1140

@@ -14,7 +14,12 @@ try:
 except ImportError:
     # On a box the files are in one folder.
     import wire  # type: ignore[import-not-found, no-redef]
-    from box import HardwareError, LightTime  # type: ignore[import-not-found, no-redef]
+    from box import (  # type: ignore[import-not-found, no-redef]
+        BoxDescription,
+        BoxHardware,
+        HardwareError,
+        LightTime,
+    )
 
 MIN_WATCHDOG_MS = 50
 MAX_PICKED = 512

@@ -72,7 +72,7 @@ def test_all_faults_of_the_options_come_in_one_message(tmp_path: Path) -> None:
         ({"camera": {"stamp_error_s": 0.1}}, "trigger_latency_s"),
         ({"camera": {"pedestal_dn": 255.0}}, "full scale"),
         ({"faults": {"cameras": ["nose"]}}, "nose"),
-        ({"cameras": [head_options()["camera"][0], head_options()["camera"][0]]}, "name of its own"),
+        ({"cameras": [head_options()["camera"][0], head_options()["camera"][0]]}, "must be unique"),
         ({"samples_per_axis": 0}, "samples_per_axis"),
         ({"seed": 1.5}, "seed"),
         (

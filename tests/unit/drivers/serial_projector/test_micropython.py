@@ -27,10 +27,10 @@ CRC32 = list(range(1000, 1026))
 PLAY = """
 from binascii import hexlify, unhexlify
 import main  # the pins, which `test_board` tries: here it is to load
-from box import Description, Hardware, HardwareError
-from protocol import Device
+from box import BoxDescription, BoxHardware, HardwareError
+from protocol import TriggerBox
 
-class Light(Hardware):
+class Light(BoxHardware):
     now_us, calls = 0, 0
     def time_us(self):
         return self.now_us
@@ -44,16 +44,16 @@ class Light(Hardware):
     def light(self):
         self._did("light")
         self.now_us += 20
-    def dark(self):
+    def switch_off(self):
         self._did("dark")
     def pulse(self):
         self._did("pulse")
-    def dim(self, permille):
+    def set_brightness(self, permille):
         return permille
 
 light = Light()
-about = Description("test", "1", 400, 300, CRC32, light_us=3000, error_us=50, gap_us=2000, hold_us=500, least_us=100)
-box = Device(light, about, 0xC0FFEE)
+about = BoxDescription("test", "1", 400, 300, CRC32, light_us=3000, error_us=50, gap_us=2000, hold_us=500, least_us=100)
+box = TriggerBox(light, about, 0xC0FFEE)
 for passed_us, line in LINES:
     until_us = light.now_us + passed_us
     while light.now_us < until_us and 0 <= box.wait_us() <= until_us - light.now_us:
