@@ -108,7 +108,7 @@ class AxisFrames:
     @property
     def line_pairs(self) -> tuple[list[NDArray[Any]], list[NDArray[Any]]] | None:
         """Two line images and their inverses, to estimate the response of the camera from; None if bits have inverses,
-        or there are no such lines.
+        or lines have none.
         """
         pairs = () if self.inverses is not None else diagnostic_line_pairs(self.line_patterns)
         direct, inverted = ([self.lines[self.line_patterns.index(pair[i])] for pair in pairs] for i in (0, 1))
@@ -269,8 +269,8 @@ def used_frames(patterns: Sequence[Pattern], exposures_s: Sequence[float | None]
 
     patterns, exposures_s : pattern and exposure of each frame, in the order of the sequence. If every code and line
     pattern is shown once, the white and black frames before the first of them are used, so that each frame can be
-    processed as it comes; those that close the sequence are not. If patterns are repeated or bracketed, or there are no
-    white and black frames at the start, all are used.
+    processed as it comes; those that close the sequence are not. If patterns are repeated or bracketed, or the sequence
+    does not open with white and black, all are used.
     """
     bodies = [i for i, p in enumerate(patterns) if isinstance(p, Gray | LineShift)]
     once = len({patterns[i] for i in bodies}) == len(bodies) and exposure_count(exposures_s) <= 1

@@ -60,7 +60,7 @@ def lit_runs(pattern: LineShift, size: Size) -> list[FloatArray]:
 
 @AXES
 @EXTENTS
-def test_every_position_lies_in_the_cell_that_its_light_names(
+def test_every_position_is_in_the_cell_of_its_code_word(
     axis: Axis, extent_px: int, cell_px: int, offset_px: int
 ) -> None:
     code, size = code_of(axis, extent_px, cell_px, offset_px), size_of(axis, extent_px)
@@ -76,7 +76,7 @@ def test_every_position_lies_in_the_cell_that_its_light_names(
 @AXES
 @pytest.mark.parametrize(("period_px", "width_px"), [(4, 1), (6, 1), (8, 1), (8, 2), (7, 3), (9, 4)])
 @pytest.mark.parametrize(("extent_px", "offset_px"), [(40, 0), (43, 0), (40, 3), (61, 11)])
-def test_each_line_is_named_by_the_cells_it_may_be_seen_in(
+def test_each_line_is_identified_by_its_cells(
     axis: Axis, period_px: int, width_px: int, extent_px: int, offset_px: int
 ) -> None:
     cell_px = period_px // 2

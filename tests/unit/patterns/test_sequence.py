@@ -47,7 +47,7 @@ def test_white_and_black_open_and_close_bits_with_their_inverses_and_each_shift_
     assert alone == tuple(pattern for pattern in patterns if not isinstance(pattern, LineShift))
 
 
-def test_what_tells_how_a_camera_sees_comes_before_the_lines_of_its_axis_and_the_other_bits_after() -> None:
+def test_response_patterns_come_first_and_the_remaining_bits_last() -> None:
     patterns = [pattern for pattern in patterns_of(Size(1024, 192), rows=True) if isinstance(pattern, Gray | LineShift)]
     played = [f"{pattern.axis} {pattern.bit if isinstance(pattern, Gray) else 'lines'}" for pattern in patterns]
     assert [each for each, _ in groupby(played)] == [
@@ -64,7 +64,7 @@ def test_rows_follow_columns_with_bits_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("options", [{}, {"line_shift": False}])
-def test_white_in_each_light_stands_before_a_pattern_that_tells_an_old_frame_and_after_one(options: Any) -> None:
+def test_coloured_white_is_between_code_frames(options: Any) -> None:
     patterns = patterns_of(Size(64, 48), coloured_light=True, **options)
     at = [index for index, pattern in enumerate(patterns) if isinstance(pattern, Primary)]
     assert [patterns[index] for index in at] == [Primary("red"), Primary("green"), Primary("blue")]

@@ -97,7 +97,7 @@ def relative_error(found: Albedo, truth: FloatArray) -> float:
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_albedo_is_what_the_ball_is_painted_with(channels: int) -> None:
+def test_albedo_matches_the_paint_of_the_ball(channels: int) -> None:
     view = seen_by(CAMERA, channels=channels)
     points = points_in(view)
     found = estimate_albedo(points, [view], PROJECTOR.centre_mm)
@@ -126,7 +126,7 @@ def test_places_between_pixels_are_those_of_opencv() -> None:
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_cameras_of_different_gain_come_to_one_scale_by_what_both_see(order: tuple[int, int]) -> None:
+def test_cameras_of_different_gain_come_to_one_scale_by_common_points(order: tuple[int, int]) -> None:
     both = [seen_by(CAMERA), seen_by(OTHER_CAMERA, gain=3.7)]
     views = [both[index] for index in order]
     points = points_in(*views)
@@ -145,7 +145,7 @@ def test_cameras_that_see_nothing_in_common_come_to_the_same_median() -> None:
     assert np.median(found.value[points.camera == 1]) == pytest.approx(np.median(found.value[points.camera == 0]))
 
 
-def test_the_gain_is_not_that_of_what_is_clipped_or_of_another_surface() -> None:
+def test_clipped_points_and_other_surfaces_do_not_count_for_the_gain() -> None:
     views = [seen_by(CAMERA), seen_by(OTHER_CAMERA, gain=2.0)]
     bright = views[1].contrast[..., 0] > np.percentile(views[1].contrast[views[1].decoded], 40)
     contrast = np.where(bright[..., None], np.float32(50), views[1].contrast)
@@ -211,7 +211,7 @@ def test_a_scan_of_marked_points_or_of_none_has_a_scale_all_the_same() -> None:
     assert estimate_albedo(none, [view, view], None).value.shape == (0, 1)
 
 
-def test_an_uneven_projector_is_made_up_for() -> None:
+def test_an_uneven_projector_is_corrected() -> None:
     view = seen_by(CAMERA)
     points = points_in(view)
     row = np.arange(SHAPE[0], dtype=np.float32)[:, None, None]

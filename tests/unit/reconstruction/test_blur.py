@@ -1,4 +1,4 @@
-"""The camera's blur, told by lines that are blurred on a fine grid."""
+"""Blur of the camera, estimated from lines that are blurred on a fine grid."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PERIOD_PX = 8
 EXPECTED_PX = 0.65
 
 
-def told(
+def blur_of(
     blur_px: float,
     slopes: FloatArray,
     focus_px: float = 0.9,
@@ -50,28 +50,28 @@ def told(
 
 
 @pytest.mark.parametrize(("blur_px", "focus_px"), [(0.4, 0.3), (0.65, 1.5), (1.4, 1.5)])
-def test_lines_tell_the_blur_whatever_the_projectors(blur_px: float, focus_px: float) -> None:
-    blur = told(blur_px, np.array([0.5, 1.9, 0.8, 1.5]), focus_px)
+def test_blur_is_estimated_independent_of_the_projectors(blur_px: float, focus_px: float) -> None:
+    blur = blur_of(blur_px, np.array([0.5, 1.9, 0.8, 1.5]), focus_px)
     assert blur.from_lines
     assert blur.sigma_px**2 == pytest.approx(blur_px**2, abs=0.1)
 
 
-def test_few_slopes_tell_of_a_camera_out_of_focus_all_the_same() -> None:
-    blur = told(1.25, np.array([0.7, 1.3]))
+def test_few_slopes_suffice_for_a_camera_out_of_focus() -> None:
+    blur = blur_of(1.25, np.array([0.7, 1.3]))
     assert blur.from_lines
     assert blur.sigma_px**2 == pytest.approx(1.25**2, rel=0.1)
 
 
-def test_edges_of_a_print_say_nothing_else() -> None:
+def test_edges_of_a_print_do_not_bias_the_blur() -> None:
     """With them 17 % less of the variance is told."""
-    blur = told(1.25, np.array([0.5, 1.9, 0.8, 1.5]), print_ratio=7.0)
+    blur = blur_of(1.25, np.array([0.5, 1.9, 0.8, 1.5]), print_ratio=7.0)
     assert blur.sigma_px**2 == pytest.approx(1.25**2, rel=0.05)
 
 
-def test_an_even_slope_tells_nothing() -> None:
-    blur = told(1.0, np.array([1.1, 1.1]))
+def test_an_even_slope_returns_the_expected_blur() -> None:
+    blur = blur_of(1.0, np.array([1.1, 1.1]))
     assert blur == (EXPECTED_PX, False)
 
 
-def test_a_blur_that_is_known_stays() -> None:
-    assert told(1.0, np.array([0.5, 1.9]), expected_px=0.0) == (0.0, False)
+def test_a_known_blur_is_returned() -> None:
+    assert blur_of(1.0, np.array([0.5, 1.9]), expected_px=0.0) == (0.0, False)

@@ -1,4 +1,4 @@
-"""The share of a calibration's error in every vertex, against points found again with devices a little wrong."""
+"""The share of a calibration's error in every vertex, against points triangulated with slightly wrong devices."""
 
 from __future__ import annotations
 
@@ -251,7 +251,7 @@ def test_cameras_in_another_order_and_one_that_is_not_in_the_scan() -> None:
 
 
 @slow
-def test_without_a_normal_the_viewing_ray_stands() -> None:
+def test_without_a_normal_the_viewing_ray_is_used() -> None:
     calibration = calibrated({"left": left_camera()}, light_source())
     points, _ = surface(30, 8)
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -267,7 +267,7 @@ def test_a_calibration_without_covariance_has_no_modes_and_an_exact_one_no_share
     assert (share(exact, *surface(5, 9)) == 0).all()
 
 
-def test_a_volume_that_no_device_sees_is_refused_with_words() -> None:
+def test_a_volume_that_no_device_sees_is_refused() -> None:
     calibration = calibrated({"left": left_camera()}, light_source())
     assert calibration.solved is not None
     behind = replace(calibration, solved=replace(calibration.solved, volume_mm=BOX - [0, 0, 5000]))

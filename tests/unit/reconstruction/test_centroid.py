@@ -89,11 +89,11 @@ def test_noise_of_white_and_black_hardly_enters() -> None:
     shape = (80, 90)
     position = (40 + 1.2 * np.arange(90.0) + np.zeros(shape)).astype(np.float32)
     white = (100 + random.normal(0, 3, shape)).astype(np.float32)
-    told = resample_to_pixel_centres(
+    estimated = resample_to_pixel_centres(
         PositionMap(position, 0 * position), white, np.full(shape, 3, dtype=np.float32), BLUR_PX
     ).position
-    untold = resample_to_pixel_centres(PositionMap(position, 0 * position), white, 0 * white, BLUR_PX).position
-    assert np.std(told - position) < 0.6 * np.std(untold - position)
+    fixed = resample_to_pixel_centres(PositionMap(position, 0 * position), white, 0 * white, BLUR_PX).position
+    assert np.std(estimated - position) < 0.6 * np.std(fixed - position)
     # A texture well above the noise is undone all the same.
     white = (100 * np.exp(0.3 * np.sin(np.arange(90.0) / 2)) + random.normal(0, 1, shape)).astype(np.float32)
     found = resample_to_pixel_centres(
@@ -107,7 +107,7 @@ def test_noise_of_white_and_black_hardly_enters() -> None:
 
 @pytest.mark.parametrize("blur_px", [1.2, 1.5])
 @pytest.mark.parametrize("slope", [0.7, 1.2])
-def test_what_the_first_order_leaves_at_an_edge_out_of_focus_is_stated(blur_px: float, slope: float) -> None:
+def test_the_residual_at_an_edge_out_of_focus_is_stated(blur_px: float, slope: float) -> None:
     x = fine_x()
     position = 40 + slope * x
     measured, white = seen_through_blur(np.where(x < 30.3, 1.0, 7.0), position, blur_px)
@@ -123,7 +123,7 @@ def test_what_the_first_order_leaves_at_an_edge_out_of_focus_is_stated(blur_px: 
 
 
 @pytest.mark.parametrize("blur_px", [0.4, 0.65, 0.9])
-def test_edges_of_a_print_tell_how_wide_the_blur_is(blur_px: float) -> None:
+def test_edges_of_a_print_determine_the_blur(blur_px: float) -> None:
     x = np.arange(PIXELS * FINE) / FINE - 0.5
     position = 40 + 1.1 * x
     measured, white = seen_through_blur(np.where(np.floor(x / 7.3) % 2 == 0, 1.0, 5.0), position, blur_px)
@@ -131,20 +131,20 @@ def test_edges_of_a_print_tell_how_wide_the_blur_is(blur_px: float) -> None:
     contrast, quiet = np.tile(20 * white, (25, 1)).astype(np.float32), np.full((25, PIXELS), 0.1, dtype=np.float32)
     clear = np.ones(contrast.shape, dtype=np.bool_)
     expected_px = 0.65
-    told, untold = (
+    estimated, fixed = (
         resample_to_pixel_centres(seen, contrast, quiet, expected_px, **known).position[12, 5:-5]
         for known in ({"clear": clear}, {})
     )
     # As much blur as displaces positions so far.
-    far = np.abs(seen.position[12, 5:-5] - untold)
-    ratio = np.abs(seen.position[12, 5:-5] - told)[far > 0.05] / far[far > 0.05]
+    far = np.abs(seen.position[12, 5:-5] - fixed)
+    ratio = np.abs(seen.position[12, 5:-5] - estimated)[far > 0.05] / far[far > 0.05]
     assert expected_px * np.sqrt(np.median(ratio)) == pytest.approx(blur_px, rel=0.15)
     # Where nothing is clear of shadows, what is expected stands.
     unclear = resample_to_pixel_centres(seen, contrast, quiet, expected_px, clear=~clear).position[12, 5:-5]
-    np.testing.assert_array_equal(unclear, untold)
+    np.testing.assert_array_equal(unclear, fixed)
 
 
-def test_shading_that_follows_the_surface_tells_no_blur() -> None:
+def test_shading_that_follows_the_surface_does_not_determine_the_blur() -> None:
     x, y = grid((40, 90))
     flutes = 3 * np.sin(x / 4)
     # Light from the side: brighter where the surface turns to it.
@@ -153,8 +153,10 @@ def test_shading_that_follows_the_surface_tells_no_blur() -> None:
     position = (40 + 1.1 * x + 0.1 * y + 0.1 * flutes + random.normal(0, 0.01, x.shape)).astype(np.float32)
     seen, quiet = PositionMap(position, np.full_like(position, 0.01)), np.full_like(position, 0.1)
     known = resample_to_pixel_centres(seen, contrast, quiet, BLUR_PX).position
-    told = resample_to_pixel_centres(seen, contrast, quiet, BLUR_PX, clear=np.ones(x.shape, dtype=np.bool_)).position
-    np.testing.assert_array_equal(told, known)
+    estimated = resample_to_pixel_centres(
+        seen, contrast, quiet, BLUR_PX, clear=np.ones(x.shape, dtype=np.bool_)
+    ).position
+    np.testing.assert_array_equal(estimated, known)
 
 
 SIXTH_ORDER = np.array([-1, 9, -45, 0, 45, -9, 1]) / 60
@@ -190,9 +192,9 @@ def shift_along_rows(position: FloatArray, light: FloatArray, variance: FloatArr
     fine = sum(weight * each for weight, each in zip(SIXTH_ORDER, log, strict=True) if weight)
     wide = (log[6] - log[0]) / 6
     more, plain = fine - wide, (log[4] - log[2]) / 2
-    told = wide + more**5 / (more**4 + 16 * (np.sum(SIXTH_ORDER**2) * variance) ** 2)
+    estimated = wide + more**5 / (more**4 + 16 * (np.sum(SIXTH_ORDER**2) * variance) ** 2)
     slope = np.where(flat, (p[6] - p[0]) / 6, (p[4] - p[2]) / 2)
-    rise = np.where(flat & np.isfinite(fine), told, plain**5 / (plain**4 + 16 * (0.5 * variance) ** 2))
+    rise = np.where(flat & np.isfinite(fine), estimated, plain**5 / (plain**4 + 16 * (0.5 * variance) ** 2))
     of_one = np.abs(p[2] - 2 * p[3] + p[4]) < 4
     return np.where(of_one, np.nan_to_num(slope * rise), 0)
 
@@ -217,7 +219,7 @@ def test_the_shift_is_that_of_the_rule() -> None:
         np.testing.assert_allclose(shift_of(position, contrast, deviation), wanted, rtol=1e-4, atol=2e-5)
 
 
-def test_what_edges_tell_of_the_blur_is_that_of_the_rule() -> None:
+def test_the_blur_by_edges_matches_the_formula() -> None:
     stencil, expected = _edge_stencil(), 0.42
     for seed in range(3):
         (position, sigma), contrast, deviation = seen_print(seed)
@@ -243,11 +245,13 @@ def test_what_edges_tell_of_the_blur_is_that_of_the_rule() -> None:
         wanted = [off_r * off_p, off_r**2, off_p**2, 1 / weight]
         assert strong.sum() > near.sum() > 15
         np.testing.assert_array_equal(sums[:, 4], strong.sum(axis=1))
-        for told, each in zip(sums[:, :4].T, wanted, strict=True):
-            np.testing.assert_allclose(told, np.sum(np.where(near, weight * each, 0), axis=1), rtol=1e-3, atol=1e-3)
+        for estimated, each in zip(sums[:, :4].T, wanted, strict=True):
+            np.testing.assert_allclose(
+                estimated, np.sum(np.where(near, weight * each, 0), axis=1), rtol=1e-3, atol=1e-3
+            )
 
 
-def test_the_weights_see_nothing_of_a_quadratic_surface() -> None:
+def test_the_weights_do_not_respond_to_a_quadratic_surface() -> None:
     stencil = _edge_stencil()
     x, y = grid(stencil.shape)
     for each in (np.ones_like(x), x, y, x * x, x * y, y * y):

@@ -1,4 +1,4 @@
-"""What JPEG took from frames, against what it took in fact; and frames that never were JPEG."""
+"""Compression loss against the actual loss of JPEG, and frames that were never JPEG."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def loss_in_fact(image: Image, seen: Image) -> NDArray[np.float64]:
     ("quality", "colour", "limited"),
     [(95, False, False), (50, False, False), (90, True, False), (75, False, True)],
 )
-def test_the_loss_is_told_by_the_decoded_pixels(quality: int, colour: bool, limited: bool) -> None:
+def test_the_loss_is_measured_in_the_decoded_pixels(quality: int, colour: bool, limited: bool) -> None:
     seen = decoded(stripes(), quality, colour=colour, limited=limited)
     before = decoded(stripes(), 100, colour=colour, limited=limited)
-    told, found = compression_loss([seen], [seen], EVERYWHERE, 255.0), loss_in_fact(before, seen)
+    estimated, found = compression_loss([seen], [seen], EVERYWHERE, 255.0), loss_in_fact(before, seen)
     for cycles_per_px in ((0.0, 0.0), (1 / 7.3, 0.0)):
         summed = PixelSum(np.outer([1, 2, 3, 2, 1], [1, 2, 3, 2, 1]) / 81, cycles_per_px)
-        ratio = equivalent_white_variance(told, summed) / equivalent_white_variance(found, summed)
+        ratio = equivalent_white_variance(estimated, summed) / equivalent_white_variance(found, summed)
         assert 0.4 < ratio < 1.25
 
 
@@ -82,11 +82,11 @@ def drawn(steps: int) -> Image:
     ],
     ids=["noise", "none", "none, by blocks", "little", "two levels", "four levels", "flat", "random", "smooth"],
 )
-def test_frames_without_loss_lost_nothing(image: Image) -> None:
+def test_frames_without_loss_have_zero_loss(image: Image) -> None:
     assert not compression_loss([image], [image], EVERYWHERE, 255.0).any()
 
 
-def test_clipped_blocks_and_others_that_are_not_asked_for_tell_nothing() -> None:
+def test_clipped_blocks_and_blocks_outside_the_mask_are_ignored() -> None:
     seen = decoded(stripes(), 75)
     assert compression_loss([seen], [seen], EVERYWHERE, 255.0).any()
     assert not compression_loss([seen], [seen], ~EVERYWHERE, 255.0).any()
@@ -97,12 +97,12 @@ def test_steps_are_looked_for_in_the_code_where_lines_are_cut_off_at_zero() -> N
     dark = np.maximum(stripes() - 40, 0)
     seen, code = decoded(dark, 75), decoded(stripes(), 75)
     assert not compression_loss([seen], [seen], EVERYWHERE, 255.0).any()
-    told, found = compression_loss([seen], [code], EVERYWHERE, 255.0), loss_in_fact(dark, seen)
-    assert 0.5 < np.mean(told) / np.mean(found) < 1.5
+    estimated, found = compression_loss([seen], [code], EVERYWHERE, 255.0), loss_in_fact(dark, seen)
+    assert 0.5 < np.mean(estimated) / np.mean(found) < 1.5
 
 
 @pytest.mark.parametrize("cycles_per_px", [(0.0, 0.0), (0.13, 0.02)])
-def test_what_pixels_err_by_errs_their_weighted_sum(cycles_per_px: tuple[float, float]) -> None:
+def test_errors_of_pixels_propagate_to_their_weighted_sum(cycles_per_px: tuple[float, float]) -> None:
     """Errors of known spectrum, drawn block by block and weighed."""
     random = np.random.default_rng(7)
     loss = random.uniform(0, 9, (8, 8)) * (np.add.outer(np.arange(8), np.arange(8)) < 5)
@@ -114,8 +114,8 @@ def test_what_pixels_err_by_errs_their_weighted_sum(cycles_per_px: tuple[float, 
     turned = errors * np.exp(-2j * np.pi * (cycles_per_px[0] * x + cycles_per_px[1] * y))
     sums = cv2.filter2D(turned.real, -1, weights) + 1j * cv2.filter2D(turned.imag, -1, weights)
     found = float(np.mean(np.abs(sums[8:-8, 8:-8]) ** 2))
-    told = equivalent_white_variance(loss, PixelSum(weights, cycles_per_px)) * float(np.sum(weights**2))
-    assert told == pytest.approx(found, rel=0.05)
+    estimated = equivalent_white_variance(loss, PixelSum(weights, cycles_per_px)) * float(np.sum(weights**2))
+    assert estimated == pytest.approx(found, rel=0.05)
 
 
 def test_independent_pixels_are_their_own_equivalent() -> None:

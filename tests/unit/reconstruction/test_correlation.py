@@ -1,4 +1,4 @@
-"""Noise that neighbours share, drawn with a known spectrum; and noise that they do not."""
+"""Noise correlation of neighbouring pixels, with a known spectrum and without."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_independent_noise_stays_as_it_is(summed: PixelSum) -> None:
     assert noise_correlation(frames, estimate_noise(frames), EVERYWHERE, summed) == 1.0
 
 
-def test_rows_that_err_as_a_whole_are_told() -> None:
+def test_noise_common_to_a_row_is_measured() -> None:
     frames = noisy(ALONE, rows=1.0)
     # Of the sums' variance, rows add Σ over rows of (Σ over columns of w)², a quarter as strong as pixels' noise.
     rows = np.sum(STENCIL.sum(axis=1) ** 2) / np.sum(STENCIL**2)
@@ -93,7 +93,7 @@ def test_lamps_that_a_bit_shares_with_its_inverse_err_frames_but_not_their_diffe
     assert noise_correlation(lit, noise, EVERYWHERE, PixelSum(STENCIL)) > 10.0
 
 
-def test_a_model_that_is_too_small_is_made_up_for_and_one_too_large_is_not() -> None:
+def test_a_model_that_is_too_small_is_corrected_and_one_too_large_is_not() -> None:
     frames = noisy(ALONE)
     assert noise_correlation(frames, NoiseModel(2.0, 0.0), EVERYWHERE, PHASES) == pytest.approx(2.0, rel=0.05)
     assert noise_correlation(frames, NoiseModel(8.0, 0.0), EVERYWHERE, PHASES) == 1.0
@@ -112,7 +112,7 @@ def test_edges_of_the_code_do_not_count_where_they_break_the_sum() -> None:
     assert found == 1.0
 
 
-def test_what_tells_nothing_changes_nothing() -> None:
+def test_unsuitable_frames_give_no_correlation() -> None:
     frames = noisy(SMOOTH)
     noise = estimate_noise(frames)
     assert noise_correlation(replace(frames, inverses=None), noise, EVERYWHERE, PHASES) == 1.0

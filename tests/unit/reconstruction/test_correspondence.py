@@ -190,7 +190,7 @@ def test_crossings_are_those_of_plain_numpy(down: bool) -> None:
 
 
 @pytest.mark.parametrize(("period_px", "paired", "most_px"), [(0, True, 0.03), (8, True, 0.03), (0, False, 0.05)])
-def test_positions_are_right_within_what_they_state(period_px: int, paired: bool, most_px: float) -> None:
+def test_positions_are_right_within_their_stated_deviation(period_px: int, paired: bool, most_px: float) -> None:
     # Without inverses the middle of white and black stands for them.
     seen, off = Wall().found(period_px=period_px, paired=paired)
     assert seen.by_phase == (period_px > 0)
@@ -202,7 +202,7 @@ def test_positions_are_right_within_what_they_state(period_px: int, paired: bool
 
 
 @pytest.mark.parametrize("blur_px", [0.65, 1.3])
-def test_what_noise_does_not_tell_of_a_crossing_is_in_its_deviation(blur_px: float) -> None:
+def test_the_deviation_of_a_crossing_includes_the_error_of_the_cubic(blur_px: float) -> None:
     # Next to no noise: the cubic's own error is all there is. Of a sharp edge the deviation holds half.
     seen, off = Wall(blur_px=blur_px).found(noise=NoiseModel(1e-3, 0.0))
     assert np.sqrt(np.mean(off**2)) < 0.015
@@ -226,7 +226,7 @@ def test_a_surface_brighter_on_one_side_displaces_nothing(period_px: int) -> Non
     assert abs(offs[0]) < 0.1 * abs(offs[1])
 
 
-def test_pixels_beside_an_edge_of_the_print_are_left_out() -> None:
+def test_pixels_near_an_edge_of_the_print_are_left_out() -> None:
     edges = (100.2, 130.7)
     seen, off = Wall(black_px=edges, blur_px=1.1).found(noise=NoiseModel(0.1, 0.005), period_px=8)
     x = seen.pixels_px[:, 0]
@@ -250,7 +250,7 @@ def test_even_paper_has_no_edges_of_print_however_dark_and_noisy() -> None:
     assert not near[:, 75:].any()
 
 
-def test_the_finest_bits_drop_out_where_they_are_lost() -> None:
+def test_unresolved_finest_bits_are_left_out() -> None:
     # A blur of 3.2 px leaves a fortieth of bars 3.6 px wide; the coarser bits' edges still stand.
     seen, off = Wall(blur_px=3.2).found()
     cells = np.rint(seen.position_px + 0.5).astype(int)
@@ -260,7 +260,7 @@ def test_the_finest_bits_drop_out_where_they_are_lost() -> None:
     assert np.sqrt(np.mean(off**2)) < 0.1
 
 
-def test_an_unlit_or_unasked_surface_has_no_correspondences() -> None:
+def test_a_surface_unlit_or_outside_the_region_has_no_correspondences() -> None:
     frames = Wall().frames(noise=NOISE)
     unlit = [np.full_like(image, BLACK) for image in frames.bits]
     dark = replace(frames, white=frames.black, bits=unlit, inverses=unlit)

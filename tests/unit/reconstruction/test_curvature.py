@@ -1,4 +1,4 @@
-"""What blur makes of curved surfaces, against light that is blurred on a fine grid; the kernel against plain numpy."""
+"""Effect of blur on curved surfaces, against light that is blurred on a fine grid; the kernel against plain numpy."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def freed(position: FloatArray, sigma_px: float = 0.001, usable: NDArray[np.bool
 
 @pytest.mark.parametrize(("right", "down"), [(1.1, 0.2), (0.3, -0.9), (2.4, 0.5)])
 @pytest.mark.parametrize("bend", [(0.02, 0.0, 0.0), (0.0, 0.0, 0.02), (-0.015, 0.01, -0.01)])
-def test_a_curved_surface_lies_where_it_is(right: float, down: float, bend: tuple[float, float, float]) -> None:
+def test_a_curved_surface_is_not_displaced(right: float, down: float, bend: tuple[float, float, float]) -> None:
     x, y = fine_grid()
     xx, xy, yy = bend
     measured, true = seen_through_blur(40 + right * x + down * y + xx * x * x + xy * x * y + yy * y * y)
@@ -81,7 +81,7 @@ def test_a_surface_bends_up_to_its_border() -> None:
     assert after[usable].max() < 0.2 * before[usable].max()
 
 
-def test_what_a_neighbour_says_of_another_surface_does_not_count() -> None:
+def test_a_neighbour_on_another_surface_is_ignored() -> None:
     y, x = np.indices((30, 40)).astype(np.float64)
     position = 40 + 1.1 * x + 0.02 * x * x + 0.01 * y * y
     position[:, 20] = np.nan
@@ -95,7 +95,7 @@ def test_what_a_neighbour_says_of_another_surface_does_not_count() -> None:
     assert not stays[3:-3, 25:29].any()
 
 
-def test_the_kernel_is_what_plain_least_squares_say() -> None:
+def test_the_kernel_matches_plain_least_squares() -> None:
     random = np.random.default_rng(8)
     y, x = np.indices((24, 26)).astype(np.float64)
     # A step in slope, so that both windows are taken, and noise, so that some is in doubt.

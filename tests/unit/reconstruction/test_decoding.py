@@ -174,12 +174,12 @@ READ: dict[str, tuple[AxisFrames, tuple[int, int], Refusal]] = {
     "more doubts than are followed": (one_pixel([1.0, *[0.0] * 5]), REFUSED, Refusal.AMBIGUOUS_BIT),
     "the projector's last cell": (with_bits(39, **{f"b{turning(39)}": 0.0}), (39, 39), Refusal.NONE),
     "beyond the projector": (with_bits(40), REFUSED, Refusal.BEYOND_PROJECTOR),
-    "not lit, whatever the bits": (one_pixel([0.0] * BITS, white=23.0, black=20.0), REFUSED, Refusal.NOT_LIT),
+    "not lit, with any bits": (one_pixel([0.0] * BITS, white=23.0, black=20.0), REFUSED, Refusal.NOT_LIT),
     "clipped": (clipped(), REFUSED, Refusal.SATURATED),
     "clipped white, which leaves no middle": (
         one_pixel(swings_of(9), white=255.0, paired=False), REFUSED, Refusal.SATURATED,
     ),
-    "clipped white beside inverses": (one_pixel(swings_of(9), white=255.0), (9, 9), Refusal.NONE),
+    "clipped white with inverses": (one_pixel(swings_of(9), white=255.0), (9, 9), Refusal.NONE),
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Pixels beside shadows and depth steps."""
+"""Pixels near shadows and depth steps."""
 
 from __future__ import annotations
 

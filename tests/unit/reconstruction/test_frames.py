@@ -1,4 +1,4 @@
-"""Frames sorted by what they show: averages, stand-ins, and the words of the errors."""
+"""Frames sorted by pattern: averages, substitutes, and error messages."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def first_pixels(images: Images) -> list[float]:
     return [float(image[0, 0]) for image in images]
 
 
-def test_frames_are_sorted_by_what_they_show() -> None:
+def test_frames_are_sorted_by_pattern() -> None:
     seen: list[Seen] = [(LINES[2], 72, None), (BITS[1], 21, None), (LINES[0], 70, None), (INVERSES[0], 30, None)]
     seen += [*ENDS, (INVERSES[1], 31, None), (BITS[0], 20, None)]
     frames = axis_frames(capture_of(*seen), "eye", Axis.COLUMN)
@@ -89,7 +89,7 @@ def test_rows_of_frames_are_those_of_all_images() -> None:
     assert subsample(frames.bits, 2, 3).shape == (2, -(-frames.white.shape[0] // 2), -(-frames.white.shape[1] // 3))
 
 
-def test_only_the_axis_and_the_camera_asked_for_are_taken() -> None:
+def test_only_the_requested_axis_and_camera_are_used() -> None:
     row = Gray(Axis.ROW, 0, 1)
     both = capture_of(*ENDS, *plain(*BITS), *plain(row, LineShift(Axis.ROW, 0, 4), value=77))
     assert first_pixels(axis_frames(both, "eye", Axis.ROW).bits) == [77]
@@ -122,12 +122,12 @@ def test_white_and_black_that_close_a_sequence_are_evidence_only() -> None:
 
 
 @pytest.mark.parametrize("opening", [2, 3])
-def test_ends_that_are_shown_several_times_before_the_code_have_less_noise(opening: int) -> None:
+def test_repeated_reference_frames_have_less_noise(opening: int) -> None:
     frames = axis_frames(capture_of(*(ENDS * opening), *plain(*BITS), *ENDS), "eye", Axis.COLUMN)
     assert frames.reference_repeats == opening
 
 
-def test_a_bit_shown_only_inverted_is_turned_back() -> None:
+def test_a_bit_shown_only_inverted_is_inverted() -> None:
     frames = axis_frames(capture_of(*ENDS, *plain(BITS[0]), (INVERSES[1], 60, None)), "eye", Axis.COLUMN)
     assert first_pixels(frames.bits) == [50, 200 + 10 - 60]
 
@@ -169,7 +169,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_frames_that_cannot_be_decoded_are_refused_in_words_that_help(case: str) -> None:
+def test_frames_that_cannot_be_decoded_are_refused(case: str) -> None:
     seen, words = REFUSED[case]
     with pytest.raises(PatternError) as caught:
         axis_frames(capture_of(*seen), "eye", Axis.COLUMN)
@@ -177,7 +177,7 @@ def test_frames_that_cannot_be_decoded_are_refused_in_words_that_help(case: str)
         assert word in str(caught.value)
 
 
-def test_recorded_frames_are_left_alone() -> None:
+def test_recorded_frames_are_not_modified() -> None:
     capture = capture_of(*ENDS, *plain(*BITS), *plain(*BITS, value=60), *plain(INVERSES[0]), *ENDS)
     before = [shot.image.copy() for shot in capture.shots]
     axis_frames(capture, "eye", Axis.COLUMN)

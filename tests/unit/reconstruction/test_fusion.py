@@ -1,4 +1,4 @@
-"""Several exposures fused: nothing is bent where they meet, noise is as small as they allow, and as stated."""
+"""Fusion of exposures: continuous where they meet, with minimal noise, as stated."""
 
 from __future__ import annotations
 
@@ -119,10 +119,10 @@ def position_of(frames: AxisFrames, noise: NoiseModel, plate: Plate) -> tuple[Fl
     return np.asarray(seen.position - plate.column_px), np.asarray(seen.sigma, dtype=np.float64)
 
 
-def test_what_is_clipped_in_a_long_exposure_comes_from_the_short_ones() -> None:
-    told = fused()
-    weights = dict(zip(told.exposures_s.tolist(), told.weights, strict=True))
-    np.testing.assert_allclose(told.weights.sum(axis=0), 1, rtol=1e-6)
+def test_values_clipped_in_a_long_exposure_come_from_short_ones() -> None:
+    fusion = fused()
+    weights = dict(zip(fusion.exposures_s.tolist(), fusion.weights, strict=True))
+    np.testing.assert_allclose(fusion.weights.sum(axis=0), 1, rtol=1e-6)
     brightest = PLATE.mean(White(), 1.0) * 1.0
     assert (weights[0.08][brightest * 0.08 > 270] == 0).all()
     assert (weights[0.08][brightest * 0.08 < 220] > 0.5).all()
@@ -130,10 +130,10 @@ def test_what_is_clipped_in_a_long_exposure_comes_from_the_short_ones() -> None:
     assert (weights[0.005] > 0).all()
     # In units of the longest exposure there is no step where another one takes over.
     truth = PLATE.brightness * 0.08
-    assert np.abs(told.frames.contrast / truth - 1)[truth > 40].max() < 0.12
-    assert np.abs(np.median(told.frames.contrast / truth, axis=0) - 1).max() < 0.04
-    assert told.frames.exposure_ratio == pytest.approx(16, rel=0.01)
-    assert told.frames.reference_repeats == 2.0
+    assert np.abs(fusion.frames.contrast / truth - 1)[truth > 40].max() < 0.12
+    assert np.abs(np.median(fusion.frames.contrast / truth, axis=0) - 1).max() < 0.04
+    assert fusion.frames.exposure_ratio == pytest.approx(16, rel=0.01)
+    assert fusion.frames.reference_repeats == 2.0
 
 
 def without(capture: Capture, keep: Callable[[Shot], bool]) -> Capture:
@@ -150,8 +150,8 @@ def decoded(frames: AxisFrames, noise: NoiseModel) -> NDArray[np.uint8]:
 
 def test_a_pixel_that_every_exposure_clips_is_refused_as_saturated_and_one_that_any_shows_is_not() -> None:
     plate = Plate(steps() * np.where(np.arange(SHAPE[1]) < 150, 1.0, 20.0), line=0.4)
-    told = fuse_exposures(unpaired(plate.capture(seed=1)), "eye", COLUMN)
-    refusal = decoded(told.frames, told.noise)
+    fusion = fuse_exposures(unpaired(plate.capture(seed=1)), "eye", COLUMN)
+    refusal = decoded(fusion.frames, fusion.noise)
     assert (refusal[:, 150:] == Refusal.SATURATED).all()
     assert np.mean(refusal[:, :150] == Refusal.NONE) > 0.98
     # A bit and its inverse may be told apart where one of them is clipped; the position of the lines cannot.
@@ -174,11 +174,11 @@ def test_a_pixel_that_every_exposure_clips_is_refused_as_saturated_and_one_that_
 )
 def test_the_same_exposures_in_all_frames_of_a_pixel_keep_lines_where_they_are(plate: Plate) -> None:
     capture = plate.capture()
-    told = fuse_exposures(capture, "eye", COLUMN)
+    fusion = fuse_exposures(capture, "eye", COLUMN)
     peak = plate.brightness * plate.light(0.08)
     bright = (peak > 900) & (peak < 3500)
     assert np.count_nonzero(bright) > 3000
-    error, _ = position_of(told.frames, told.noise, plate)
+    error, _ = position_of(fusion.frames, fusion.noise, plate)
     # What is left is that of rounding to whole numbers. Were each sample from the longest exposure at which it itself
     # is not clipped, it were more than four times as much.
     assert np.sqrt(np.mean(error[bright] ** 2)) < 0.006
@@ -195,7 +195,7 @@ def scattered(count: int) -> tuple[list[FusedFrames], dict[str, NDArray[np.bool_
     return [fused(NOISY, seed=seed) for seed in range(count)], parts
 
 
-def test_the_noise_that_is_stated_is_the_noise_that_there_is() -> None:
+def test_stated_noise_matches_actual_noise() -> None:
     tries, parts = scattered(10)
     for part in parts.values():
         assert np.count_nonzero(part) > 2000
@@ -226,40 +226,40 @@ def test_fused_exposures_have_less_noise_than_the_best_of_them(exposures_s: Sequ
 def test_light_that_does_not_follow_the_exposure_is_measured() -> None:
     # A projector that refreshes: of 5 ms, two thirds of the light that they should have.
     plate = Plate(steps(), light=lambda exposure_s: exposure_s * (0.67 if exposure_s < 0.01 else 1.0))
-    told = fused(plate)
-    np.testing.assert_allclose(told.light, [1, 0.25, 0.0625 * 0.67], rtol=0.02)
-    uses = exposure_use(told, np.ones(SHAPE, dtype=np.bool_))
+    fusion = fused(plate)
+    np.testing.assert_allclose(fusion.light, [1, 0.25, 0.0625 * 0.67], rtol=0.02)
+    uses = exposure_use(fusion, np.ones(SHAPE, dtype=np.bool_))
     assert [round(each.light, 1) for each in uses] == [0.7, 1.0, 1.0]
     truth = plate.brightness * 0.08
-    assert np.abs(np.median(told.frames.contrast / truth, axis=0) - 1).max() < 0.04
+    assert np.abs(np.median(fusion.frames.contrast / truth, axis=0) - 1).max() < 0.04
 
 
 def test_too_few_clear_pixels_leave_it_to_the_clock() -> None:
-    told = fused(Plate(np.full(SHAPE, 90.0)), seed=1)
-    np.testing.assert_allclose(told.light, [1, 0.25, 0.0625])
+    fusion = fused(Plate(np.full(SHAPE, 90.0)), seed=1)
+    np.testing.assert_allclose(fusion.light, [1, 0.25, 0.0625])
 
 
-def test_the_use_of_each_exposure_is_told_from_short_to_long() -> None:
-    told = fused()
+def test_the_use_of_each_exposure_is_listed_from_short_to_long() -> None:
+    fusion = fused()
     everywhere = np.ones(SHAPE, dtype=np.bool_)
-    uses = exposure_use(told, everywhere)
+    uses = exposure_use(fusion, everywhere)
     assert [each.exposure_s for each in uses] == list(EXPOSURES_S)
     assert sum(each.longest_of for each in uses) == pytest.approx(1)
     assert sum(each.weight for each in uses) == pytest.approx(1)
     white = PLATE.mean(White(), 1.0)
     assert uses[2].longest_of == pytest.approx(np.mean(white * 0.08 < 0.97 * 255), abs=0.05)
-    dark = exposure_use(told, white * 0.08 < 200)
+    dark = exposure_use(fusion, white * 0.08 < 200)
     assert (dark[0].longest_of, dark[1].longest_of, dark[2].longest_of) == (0, 0, 1)
-    assert exposure_use(told, ~everywhere)[0].weight == 0
+    assert exposure_use(fusion, ~everywhere)[0].weight == 0
 
 
 def test_the_order_in_which_exposures_come_and_how_exactly_they_are_named_does_not_matter() -> None:
     capture = PLATE.capture(seed=2)
-    told = fuse_exposures(capture, "eye", COLUMN)
+    fusion = fuse_exposures(capture, "eye", COLUMN)
     jittered = tuple(replace(s, exposure_s=(s.exposure_s or 0) * (1 + 1e-4 * (s.pattern % 3))) for s in capture.shots)
     again = fuse_exposures(replace(capture, shots=jittered[::-1]), "eye", COLUMN)
     for name in ("white", "black", "bits", "lines"):
-        np.testing.assert_array_equal(getattr(told.frames, name), getattr(again.frames, name))
+        np.testing.assert_array_equal(getattr(fusion.frames, name), getattr(again.frames, name))
 
 
 REFUSED: Mapping[str, tuple[Callable[[Capture], Capture], Sequence[str]]] = {
@@ -281,7 +281,7 @@ REFUSED: Mapping[str, tuple[Callable[[Capture], Capture], Sequence[str]]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_a_bracket_that_is_not_whole_is_refused_in_words_that_help(case: str) -> None:
+def test_an_incomplete_bracket_is_refused(case: str) -> None:
     change, words = REFUSED[case]
     with pytest.raises(PatternError) as caught:
         fuse_exposures(change(PLATE.capture()), "eye", COLUMN)
@@ -290,6 +290,6 @@ def test_a_bracket_that_is_not_whole_is_refused_in_words_that_help(case: str) ->
 
 
 def test_a_bracket_without_inverses_is_fused_as_well() -> None:
-    told = fuse_exposures(unpaired(PLATE.capture(seed=4)), "eye", COLUMN)
-    assert told.frames.inverses is None
-    assert np.mean(decoded(told.frames, told.noise) == Refusal.NONE) > 0.95
+    fusion = fuse_exposures(unpaired(PLATE.capture(seed=4)), "eye", COLUMN)
+    assert fusion.frames.inverses is None
+    assert np.mean(decoded(fusion.frames, fusion.noise) == Refusal.NONE) > 0.95

@@ -111,7 +111,7 @@ def test_a_stripe_takes_the_positions_that_its_pixels_show(case: str) -> None:
     assert column(refusal, len(cells)) == causes
 
 
-def test_points_beside_a_shadow_and_on_a_step_are_refused_for_that() -> None:
+def test_points_near_a_shadow_and_on_a_step_are_refused_for_that() -> None:
     seen = image([2] * 6 + [None] * 3 + [2] * 6)
     seen.near_step[[6, 14], 2] = True
     coded, refusal = numbered(seen, stripes_of([down(range(15))]))

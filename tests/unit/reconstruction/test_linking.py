@@ -63,7 +63,7 @@ def test_one_light_on_a_step_makes_two_stripes_and_one_curve_along_its_sheet(
     assert np.flatnonzero(sheet.bridge_after).tolist() == [len(above) - 1]
 
 
-def test_a_cliff_can_mislead_the_papers_rule_and_the_light_sheet_knows_the_order() -> None:
+def test_a_cliff_can_mislead_the_papers_rule_but_not_the_light_sheet() -> None:
     # The lower stripe lies so far aside that a line to its far end turns less than one to its near end.
     above, below = lit_plate(0.0, np.arange(20.0, 110.0, 0.4)), lit_plate(-60.0, np.arange(112.0, 230.0, 0.4))
     ensemble = linked(above, below, position_px=[COLUMN, COLUMN])

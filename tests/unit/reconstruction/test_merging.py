@@ -95,7 +95,7 @@ def test_the_fused_point_has_the_weighted_mean_depth_and_its_deviation() -> None
 
 
 @pytest.mark.parametrize("swapped", [False, True])
-def test_a_hole_of_one_camera_is_filled_by_the_other_and_is_no_bridge_any_more(*, swapped: bool) -> None:
+def test_a_hole_of_one_camera_is_filled_by_the_other_without_a_bridge(*, swapped: bool) -> None:
     holed, whole = ROWS[(ROWS < 100) | (ROWS > 130)], ROWS + 0.3
     first, second = (whole, holed) if swapped else (holed, whole)
     parts = seen(CAMERA, first), seen(OTHER_CAMERA, second)
@@ -111,7 +111,7 @@ def test_a_hole_of_one_camera_is_filled_by_the_other_and_is_no_bridge_any_more(*
     assert np.abs(BALL.distance_mm(result.curves.points_mm)).max() < 2e-4
 
 
-def test_what_each_camera_sees_alone_is_joined_by_a_bridge() -> None:
+def test_stretches_of_single_cameras_are_joined_by_a_bridge() -> None:
     result = both(seen(CAMERA, ROWS[ROWS < 100]), seen(OTHER_CAMERA, ROWS[ROWS > 130]))
     require_one_sheet(result.curves)
     assert not (result.curves.source == Source.ALL).any()
@@ -206,7 +206,7 @@ def test_points_of_one_ray_are_averaged_by_their_variances(pair: tuple[Sheet, Sh
     assert together > 10
 
 
-def test_points_are_alone_where_the_first_camera_has_no_stretch(pair: tuple[Sheet, Sheet]) -> None:
+def test_points_are_unmatched_where_the_first_camera_has_no_stretch(pair: tuple[Sheet, Sheet]) -> None:
     first, second = pair
     alone = _unmatched_kernel(first.offsets, first.along, first.bridge, second.offsets, second.along, GAP_PX)
     for curve in range(len(first.offsets) - 1):
@@ -236,13 +236,13 @@ def share(value_mm: float) -> FloatArray:
 
 
 @pytest.mark.parametrize("outlying", [0.0, 0.2])
-def test_cameras_that_agree_within_their_noise_say_nothing(outlying: float) -> None:
+def test_cameras_that_agree_within_their_noise_have_no_disagreement(outlying: float) -> None:
     assert find_disagreement(met(0.0, outlying=outlying), None) is None
     assert find_disagreement(met(0.0, outlying=outlying), share(0.1)) is None
 
 
 @pytest.mark.parametrize("offset_mm", [0.5, -0.5])
-def test_cameras_that_contradict_each_other_are_told_by_how_much(offset_mm: float) -> None:
+def test_the_disagreement_of_cameras_is_measured(offset_mm: float) -> None:
     found = find_disagreement(met(offset_mm, outlying=0.1), None)
     assert found is not None
     assert found.distance_mm == pytest.approx(0.5, rel=0.02)
@@ -253,12 +253,12 @@ def test_cameras_that_contradict_each_other_are_told_by_how_much(offset_mm: floa
     assert "calibrate again" in str(found)
 
 
-def test_an_error_that_the_calibration_states_is_no_contradiction() -> None:
+def test_a_stated_error_of_the_calibration_is_not_a_disagreement() -> None:
     assert find_disagreement(met(0.2), share(0.15)) is None
     assert isinstance(find_disagreement(met(0.2), share(0.02)), Disagreement)
 
 
-def test_few_points_that_both_see_say_nothing() -> None:
+def test_few_common_points_give_no_disagreement() -> None:
     assert find_disagreement(met(0.5, points=MIN_POINTS - 1), None) is None
     nothing = met(0.0)
     same = MergedCurves(nothing.curves, nothing.camera, 0 * nothing.residual_sigma, 0 * nothing.residual_mm)

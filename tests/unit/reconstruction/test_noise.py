@@ -1,4 +1,4 @@
-"""The noise model is recovered from frames that were given a known one."""
+"""The noise model, recovered from frames with known noise."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_variance_of_dark_and_bright_pixels_is_recovered(
         assert variance == pytest.approx(read_variance + slope * level, rel=0.1)
 
 
-def test_whole_numbers_of_a_bright_surface_tell_the_noise_of_the_dark() -> None:
+def test_noise_of_dark_levels_is_measured_with_integers_of_a_bright_surface() -> None:
     # Of eight bits and few frames; no level of the sums is dark.
     rng, (x, y) = np.random.default_rng(5), grid(SHAPE)
     white, black = 140 + 40 * np.sin(x / 40) * np.cos(y / 50), 2 + 0.002 * y
@@ -101,7 +101,7 @@ def test_frames_without_noise_still_have_that_of_quantisation(*, paired: bool) -
     assert found.slope == pytest.approx(0.0, abs=1e-4)
 
 
-def test_an_image_too_small_to_tell_anything_gets_the_floor() -> None:
+def test_an_image_too_small_for_an_estimate_gets_the_floor() -> None:
     flat = np.full((4, 4), 9, dtype=np.float32)
     frames = code_frames(bits=np.stack([flat] * 3), inverses=np.stack([flat] * 3), white=flat, black=flat)
     assert estimate_noise(frames) == NoiseModel(1 / 12, 0.0)
@@ -126,7 +126,7 @@ def variance_at(model: NoiseModel, level: float) -> float:
 
 
 @CAMERAS
-def test_an_evenly_lit_wall_tells_its_noise_in_the_dark_as_well(read_variance: float, slope: float) -> None:
+def test_noise_of_dark_levels_is_measured_on_an_evenly_lit_wall(read_variance: float, slope: float) -> None:
     rng = np.random.default_rng(8)
     repeats = 2
 

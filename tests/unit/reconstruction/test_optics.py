@@ -1,4 +1,4 @@
-"""Pixels to rays and back, and stripes beside epipolar lines, against OpenCV."""
+"""Pixels to rays and back, and stripes along epipolar lines, against OpenCV."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_the_crossing_is_the_angle_between_stripe_and_epipolar_line(other: Pinho
     assert stripe_crossing(stripes(points, normals), CAMERA, other) == pytest.approx(expected, abs=5e-4)
 
 
-def test_without_a_point_nothing_speaks_against_the_pair() -> None:
+def test_without_a_point_the_crossing_is_1() -> None:
     assert stripe_crossing(ensemble_of([], []), CAMERA, OTHER_CAMERA) == 1.0
 
 

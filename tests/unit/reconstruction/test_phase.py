@@ -151,7 +151,7 @@ def test_refused_pixels_have_no_position() -> None:
         np.testing.assert_array_equal(np.isnan(each), (x >= 10) & (x < 15))
 
 
-def test_a_code_cell_that_is_one_off_beside_its_border_names_the_period_all_the_same() -> None:
+def test_a_code_cell_that_is_one_off_near_its_border_gives_the_right_period() -> None:
     x, y = grid(SHAPE)
     position = 20.0 + 0.37 * x + 0.21 * y
     part = (position + 0.5) / 4 % 1
@@ -178,7 +178,7 @@ def test_an_interval_of_code_cells_never_gives_a_position_of_another_period(belo
         assert np.isfinite(found).all()
 
 
-def test_without_all_line_frames_the_middle_of_the_code_interval_stands() -> None:
+def test_without_all_line_frames_the_position_is_the_middle_of_the_code_interval() -> None:
     lowest = np.array([[3, 4, -1]], dtype=np.int32)
     highest = np.array([[3, 5, -1]], dtype=np.int32)
     code = CodeMap(lowest, highest, np.array([[0, 0, 3]], dtype=np.uint8))
@@ -334,7 +334,7 @@ def test_pixels_that_fix_no_plane_give_no_point() -> None:
     assert fitted_points(there, np.asarray(cross), starts, targets)[3].all()
 
 
-def test_what_is_not_measured_gives_no_point() -> None:
+def test_unmeasured_pixels_give_no_point() -> None:
     x, y = grid(SHAPE)
     truth = plane(1.0, 0.4, x, y)
     starts = np.array([[30.2, 30.1], [40.0, 20.0]])

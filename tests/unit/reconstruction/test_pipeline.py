@@ -1,4 +1,4 @@
-"""One camera's walk from frames to linked curves, on a scene whose projector coordinate is known everywhere."""
+"""Pipeline of one camera from frames to linked curves, on a scene with known projector coordinates."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def test_without_line_frames_code_edges_stand_in(*, paired: bool, most_px: float
     assert np.abs(errors).max() < 0.4
 
 
-def test_shadows_and_steps_are_kept_clear_of_and_points_left_out_keep_their_cause() -> None:
+def test_points_near_shadows_and_steps_are_refused_with_their_cause() -> None:
     curves, _ = walk(rendered(cliff, patterns()))
     x = curves.ensemble.points_px[:, 0]
     # The shadow runs from 98.5 to 110.5. Blur lights two pixels of it, and from there two more are refused.
@@ -279,12 +279,12 @@ def test_stripes_are_located_before_the_bits_come_that_only_number_them(
     bits = [pattern.bit for pattern in capture.patterns if isinstance(pattern, Gray)]
     assert bits == [0, 0, 1, 1, 2, 2, 5, 5, 6, 6, 3, 3, 4, 4]
     count = len(used_shots(capture, "eye"))
-    told: list[str] = []
-    got, wanted = streamed(capture, range(count), told.append), walk(capture)[0]
+    steps: list[str] = []
+    got, wanted = streamed(capture, range(count), steps.append), walk(capture)[0]
     stages = ["measure noise", *["locate stripes"] * 8, "decode", "refine stripes", "identify stripes", "link stripes"]
-    assert [each for each in told if not each.startswith("frame")] == [*stages, "finish"]
+    assert [each for each in steps if not each.startswith("frame")] == [*stages, "finish"]
     first_number = capture.patterns.index(Gray(Axis.COLUMN, 3, 7, cell_px=1))
-    assert told.index(f"frame {first_number}") > len(told) - 1 - told[::-1].index("locate stripes")
+    assert steps.index(f"frame {first_number}") > len(steps) - 1 - steps[::-1].index("locate stripes")
     for order in ([*range(12), *range(20, 24), *range(12, 20)], range(count - 1, -1, -1)):
         other = streamed(capture, order)
         for each in (other, wanted):
@@ -298,7 +298,7 @@ def test_stripes_are_located_before_the_bits_come_that_only_number_them(
     assert (got.noise_correlation > 2) == (seen is compressed)
 
 
-def test_a_stream_that_lacks_a_frame_says_which() -> None:
+def test_missing_frames_are_listed() -> None:
     capture = rendered(slope, patterns())
     count = len(used_shots(capture, "eye"))
     with pytest.raises(PatternError, match=r"1 of the frames announced did not come: LineShift\(.*shift=7"):
@@ -428,7 +428,7 @@ def test_of_half_period_lines_every_pixel_that_one_crosses_has_a_point(halves: C
     assert counts[[0, 1, -2, -1]].sum() == 0
 
 
-def test_half_period_lines_whose_light_changes_stand_as_their_frames_show_them(halves: Capture) -> None:
+def test_half_period_lines_in_changing_light_are_not_refined(halves: Capture) -> None:
     changed = LineShift(Axis.COLUMN, 3, 8, 4)
     capture = replace(halves, shots=tuple(
         replace(shot, image=np.clip(np.roll(shot.image, 1, axis=1), 0, 255))

@@ -1,4 +1,4 @@
-"""The spare equation of two cameras, against projections by OpenCV and a plain walk along the curves."""
+"""Redundancy of two cameras, against projections by OpenCV and a plain walk along the curves."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_points_on_a_gap_of_the_other_camera_have_no_partner() -> None:
 
 
 @by_kernel
-def test_sheets_that_one_camera_has_alone_are_left_out() -> None:
+def test_sheets_of_a_single_camera_are_left_out() -> None:
     first, second = seen(CAMERA), seen(OTHER_CAMERA)
     apart = replace(second, position_px=second.position_px + 1)
     assert len(both(first, apart).residual_px) == 0
@@ -163,7 +163,7 @@ def figures(residual: FloatArray, pixels: FloatArray, sigma: float = 0.02) -> Pa
     return summarise_pair(spare, "left", "right", Size(600, 480))
 
 
-def test_the_map_tells_each_cell_of_the_reference_image_apart() -> None:
+def test_the_map_has_each_cell_of_the_reference_image() -> None:
     rng = np.random.default_rng(5)
     pixels = rng.uniform([-0.5, -0.5], [599.5, 479.5], (20_000, 2))
     cell = np.stack([(pixels[:, 1] + 0.5) // 80, (pixels[:, 0] + 0.5) // 100], axis=1).astype(int)
@@ -199,7 +199,7 @@ def test_points_of_two_different_things_are_counted_and_left_out() -> None:
 
 
 @by_kernel
-def test_without_a_spare_equation_the_reason_is_told() -> None:
+def test_without_redundancy_the_reason_is_stated() -> None:
     part = seen(CAMERA)
     alone = evaluate_redundancy([part], {"left": CAMERA}, Axis.COLUMN, widest_gap_px=GAP_PX)
     assert alone.pairs == ()

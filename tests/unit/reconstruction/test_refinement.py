@@ -1,4 +1,4 @@
-"""Stripe points moved to where the light of all frames puts them, and the check that this light was steady."""
+"""Refinement of stripe points by the light of all frames, and the check that this light was steady."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_points_of_the_filter_move_onto_their_lines_and_say_how_far(slope: float
         assert points.strength[kept:].max(initial=0.0) < points.strength[:kept].min(initial=1.0)
 
 
-def test_a_sample_tells_of_the_light_and_the_map_gives_all_points() -> None:
+def test_a_sample_checks_the_light_and_the_map_gives_all_points() -> None:
     surface = tilted(0.9, 0.3)
     here, code = mapped(surface, noise=0.002)
     frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_TABLE)
@@ -203,7 +203,7 @@ def test_no_pixel_holds_two_points_of_one_line(slope: float, angle_rad: float, s
 
 
 @pytest.mark.parametrize(("slope", "angle_rad"), [(2.8, 0.0), (3.5, 0.4), (2.8, math.pi / 2), (-3.0, 0.2)])
-def test_squeezed_stripes_that_no_filter_tells_apart_are_added(slope: float, angle_rad: float) -> None:
+def test_squeezed_stripes_that_no_filter_resolves_are_added(slope: float, angle_rad: float) -> None:
     surface = tilted(slope, angle_rad)
     here, code = mapped(surface, noise=0.02)
     x, y = grid(SHAPE)
@@ -224,7 +224,7 @@ def test_squeezed_stripes_that_no_filter_tells_apart_are_added(slope: float, ang
 
 
 @pytest.mark.parametrize("accepted", [True, False])
-def test_points_are_held_once(*, accepted: bool) -> None:
+def test_points_are_stored_once(*, accepted: bool) -> None:
     here, code = mapped(tilted(0.9, 0.3))
     frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_TABLE)
     given = [points_at(starts[frame == k]) for k in range(8)]
@@ -258,7 +258,7 @@ def test_mixed_light_and_pixels_of_two_lines_give_no_points() -> None:
     assert lost > 100
 
 
-def test_points_beside_a_step_stay_and_state_what_light_of_the_other_side_does() -> None:
+def test_points_next_to_a_step_state_the_error_by_light_of_the_other_side() -> None:
     here, code = mapped(tilted(1.0, 0.0), noise=0.01)
     step = np.zeros(SHAPE, dtype=np.bool_)
     step[:, 40] = True

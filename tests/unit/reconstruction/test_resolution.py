@@ -1,4 +1,4 @@
-"""Which of the finest bits a camera resolves: told by the frames alone, block by block."""
+"""Finest bits that a camera resolves, block by block."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_bit_is_resolved_where_two_of_its_edges_have_two_pixels(columns_per_px
     assert (unresolved_bits(frames(ramp(columns_per_px)), LIT) == bits).mean() > 0.95
 
 
-def test_a_bit_lost_in_noise_is_not_resolved_however_wide_its_cells() -> None:
+def test_a_bit_in_noise_is_unresolved_for_any_width_of_cells() -> None:
     seen = frames(ramp(0.3))
     assert seen.inverses is not None
     rng = np.random.default_rng(0)
@@ -80,7 +80,7 @@ def test_each_part_of_an_image_has_its_own_whichever_way_stripes_run() -> None:
     np.testing.assert_array_equal(found, unresolved_bits(lying, LIT.T.copy()).T)
 
 
-def test_light_from_elsewhere_leaves_out_nothing() -> None:
+def test_light_from_elsewhere_leaves_no_bits_out() -> None:
     seen = frames(ramp(0.5))
     assert seen.inverses is not None
     rng = np.random.default_rng(0)
@@ -125,7 +125,7 @@ def lines_of(column: NDArray[np.float64], period_px: float) -> tuple[CodeMap, ND
 
 
 @pytest.mark.parametrize("down", [False, True])
-def test_lines_are_lost_where_less_than_half_of_their_points_are_found(down: bool) -> None:
+def test_lines_are_unresolved_with_less_than_half_of_their_points(down: bool) -> None:
     code, points = lines_of(ramp(0.7, rows=192, width=256), 1.0)
     some = np.random.default_rng(1).random(len(points))
     kept = np.where(points[:, 0] < 128, some < 0.7, some < 0.3)

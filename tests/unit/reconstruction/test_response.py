@@ -1,4 +1,4 @@
-"""Frames of cameras that bend their values, and of those that only seem to."""
+"""Gamma of cameras, and frames that only seem to have one."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def seen_by(
     [(1.8, {}), (2.6, {}), (2.2, {"room": 0.2}), (2.6, {"room": 0.2}), (1.8, {"quality": 0.3})],
     ids=["1.8", "2.6", "2.2, bright room", "2.6, bright room", "1.8, dark plate"],
 )
-def test_edges_of_the_code_tell_how_values_are_bent(gamma: float, seen: dict[str, Any]) -> None:
+def test_gamma_is_estimated_from_edges_of_the_code(gamma: float, seen: dict[str, Any]) -> None:
     assert estimate_gamma(seen_by(gamma, **seen)) == pytest.approx(gamma, rel=0.05)
 
 
@@ -73,12 +73,12 @@ def test_values_in_proportion_to_light_stay_as_they_are(seen: dict[str, Any]) ->
     assert estimate_gamma(seen_by(1.0, **seen)) == 1.0
 
 
-def test_a_projector_that_dims_all_white_pictures_bends_nothing() -> None:
+def test_a_projector_that_dims_white_pictures_does_not_change_gamma() -> None:
     linear = seen_by(1.0)
     assert estimate_gamma(replace(linear, white=0.7 * linear.white)) == 1.0
 
 
-def test_frames_that_do_not_tell_are_left_alone() -> None:
+def test_frames_without_edges_have_gamma_1() -> None:
     bent = seen_by(2.2)
     assert estimate_gamma(replace(bent, inverses=None)) == 1.0
     assert estimate_gamma(replace(bent, exposure_ratio=4.0)) == 1.0

@@ -1,4 +1,4 @@
-"""Leaving points out of curves, putting stripes in the order of the sheet, and what errors mean in space."""
+"""Selection of points of curves, order of stripes along the sheet, and standard deviations in space."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def curves_of(
     )
 
 
-def told(curves: SheetCurves) -> list[int]:
+def point_ids(curves: SheetCurves) -> list[int]:
     return [int(x) for x in curves.points_mm[:, 0]]
 
 
@@ -59,7 +59,7 @@ def keeping(count: int, *left_out: int) -> NDArray[np.bool_]:
 def test_points_are_left_out_with_all_that_belongs_to_them() -> None:
     curves = curves_of([(0, [1.0, 2.0, 3.0])], [(1, [1.0, 2.0])])
     kept = select_points(curves, keeping(5, 1, 3))
-    assert told(kept) == [0, 2, 101]
+    assert point_ids(kept) == [0, 2, 101]
     assert kept.offsets.tolist() == [0, 2, 3]
     np.testing.assert_array_equal(kept.deviation_mm[:, 0], [1000, 1002, 1101])
     np.testing.assert_array_equal(kept.pixels_px[:, 0], [0.5, 2.5, 101.5])
@@ -117,20 +117,20 @@ def test_stripes_of_a_curve_follow_one_another_by_row(
 ) -> None:
     made = curves_of(*curves)
     ordered = order_along_sheet(made)
-    assert told(ordered) == points
+    assert point_ids(ordered) == points
     assert ordered.offsets.tolist() == made.offsets.tolist()
     assert np.flatnonzero(ordered.bridge_after).tolist() == bridges
     np.testing.assert_array_equal(ordered.deviation_mm, ordered.points_mm + 1000)
     # What is in order is left as it is.
     again = order_along_sheet(ordered)
-    assert told(again) == points
+    assert point_ids(again) == points
     np.testing.assert_array_equal(again.bridge_after, ordered.bridge_after)
 
 
 def test_keeping_everything_or_nothing() -> None:
     curves = curves_of([(0, [1.0, 2.0]), (1, [5.0, 6.0])], [(2, [1.0])])
     same = select_points(curves, keeping(5))
-    assert told(same) == told(curves)
+    assert point_ids(same) == point_ids(curves)
     np.testing.assert_array_equal(same.bridge_after, curves.bridge_after)
     none = select_points(curves, np.zeros(5, dtype=np.bool_))
     assert none.offsets.tolist() == [0, 0, 0]

@@ -45,7 +45,7 @@ def test_curves_run_by_the_rows_of_the_first_camera() -> None:
     np.testing.assert_array_equal(curves.along_px, curves.pixels_px[:, 1])
 
 
-def test_codes_that_one_camera_has_alone_give_nothing() -> None:
+def test_codes_of_a_single_camera_give_no_points() -> None:
     first, second = (
         seen_on_ball(CAMERA, [110.0, 138.5, 166.0], ROWS),
         seen_on_ball(OTHER_CAMERA, [138.5, 150.0, 166.0, 190.0], ROWS),
@@ -57,7 +57,7 @@ def test_codes_that_one_camera_has_alone_give_nothing() -> None:
     assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 1e-4
 
 
-def test_nothing_is_crossed_on_a_bridge() -> None:
+def test_bridges_are_not_crossed() -> None:
     gap = (ROWS < 100) | (ROWS > 130)
     second = seen_on_ball(OTHER_CAMERA, [138.5], ROWS[gap])
     curves = triangulate_camera_pair(seen_on_ball(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)

@@ -93,7 +93,7 @@ def test_scale_and_width_need_not_match(width_px: float, scale_px: float) -> Non
 
 
 @pytest.mark.parametrize("radius_px", [12.0, 20.0, 32.0])
-def test_a_curved_stripe_is_displaced_towards_its_centre_as_smoothing_foretells(radius_px: float) -> None:
+def test_a_curved_stripe_is_displaced_towards_its_centre_as_smoothing_predicts(radius_px: float) -> None:
     # A bar of curvature 1/R smoothed with scale σ_f has its ridge σ_f²/2R nearer to the centre.
     distance = circle(radius_px)
     stripes = located(gaussian_stripe(distance(*grid(SHAPE)), 1.2), sigma_px=1.2)

@@ -1,4 +1,4 @@
-"""What counts as a stripe, and the kernels of the detector against plain correlation."""
+"""Thresholds of stripes, and the kernels of the detector against plain correlation."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_the_second_step_is_a_correlation_with_kernels_centred_on_the_point(kind
 
 @KINDS
 @pytest.mark.parametrize("shape", [(20, 60), (20, 7)])
-def test_unlit_margins_change_nothing_between_them(kind: int, shape: tuple[int, int]) -> None:
+def test_unlit_margins_do_not_change_the_rest(kind: int, shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(6)
     image, noise = rng.normal(0, 1, shape).astype(np.float32), np.full(shape, 0.1, dtype=np.float32)
     everywhere = taylor_step(

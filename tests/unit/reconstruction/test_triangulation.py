@@ -93,7 +93,7 @@ def test_the_deviation_is_how_far_the_point_moves_with_its_stripe() -> None:
     assert 0.5 < np.linalg.norm(curves.deviation_mm, axis=1).mean() / (0.03 * 520**2 / (1400 * 150)) < 2.0
 
 
-def test_nothing_is_met_where_the_projectors_lens_has_turned_back() -> None:
+def test_points_where_the_projectors_distortion_is_not_monotonic_are_refused() -> None:
     # x (1 - 0.5 r²) turns back at r = 0.82; points beyond have positions in the image all the same, but no light.
     camera = looking((-90.0, 0.0, -500.0), (0.0, 150.0, 0.0), size=Size(640, 480), focal_px=(300.0, 300.0),
                      distortion=(0.0, 0.0, 0.0, 0.0, 0.0))  # fmt: skip
@@ -142,7 +142,7 @@ def test_unmeasured_pixels_give_no_points() -> None:
     assert np.isfinite(curves.points_mm).all()
 
 
-def test_bridges_are_kept_and_stripes_follow_by_row() -> None:
+def test_bridges_remain_and_stripes_follow_by_row() -> None:
     rows = np.concatenate([np.arange(60.0, 80.0), np.arange(120.0, 150.0), np.arange(95.0, 110.0)])
     ensemble = seen_on_ball(CAMERA, [140.0], rows)
     curves, _ = triangulate_camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
