@@ -398,7 +398,7 @@ def equally_likely(ranked: Sequence[Hypothesis], /) -> tuple[Hypothesis, ...]:
     similar = [
         each for each in ranked[1:] if best.evidence - each.evidence < MIN_EVIDENCE_GAP and each.kind is not Change.NONE
     ]
-    # "Turned and moved" includes "turned" as a special case and is no real alternative to it.
+    # "Turned and moved" includes "turned" as a special case: do not list it as an alternative.
     return tuple(each for each in similar if each.kind is not Change.BUMPED or best.kind is Change.BUMPED)
 
 

@@ -106,7 +106,7 @@ class Thresholds:
     mean : mean epipolar residual of a pair, px. rms_ratio : rms residual over that after the calibration. error_ratio :
     expected error over the stated one, for a change with watch_evidence. sure_error_ratio : the same for a change that
     is certain by sure_sigmas. watch_evidence : of a change too small to matter yet (6 is 20 times likelier than none).
-    trend_chance : probability below which a creep of the board's measured size, or of a pair's mean, is no chance.
+    trend_chance : probability below which a creep of the board's measured size, or of a pair's mean, is reported.
     jump_evidence : of a single verification that counts at once (100 is 10 σ), jump_mean_sigmas the same for a pair's
     mean.
     """
