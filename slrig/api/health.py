@@ -16,7 +16,7 @@ from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
 from slrig.api.service import Service, Serving
 from slrig.bundle.validation import AwareMoment, Strict
 from slrig.calibration.board import Board
-from slrig.calibration.health.verification import THRESHOLDS, DriftEstimate, HealthState, PairFigures, Thresholds
+from slrig.calibration.health import THRESHOLDS, DriftEstimate, HealthState, PairFigures, Thresholds
 from slrig.errors import CalibrationError
 from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.verify.plot import health_svg

@@ -18,7 +18,7 @@ from slrig.api.openapi import problems
 from slrig.api.problems import answer, explanations, problem
 from slrig.api.schemas import Explanation, Probe
 from slrig.api.service import Probed, Service, Serving
-from slrig.calibration.health.verification import HealthState
+from slrig.calibration.health import HealthState
 from slrig.errors import StorageError
 from slrig.jobs.records import JobState, utc_now
 from slrig.scan.runner import RunnerStatus

@@ -69,7 +69,7 @@ def solve_poses(
     """
     # Late: the service knows these values, and loads no compiled kernel before somebody solves.
     from slrig.calibration.accuracy import expected_error
-    from slrig.calibration.solving.solve import solve
+    from slrig.calibration.solving import solve
 
     observed = tuple(pose.observation for pose in poses)
     observations = Observations(board, cameras, projector, observed)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, QhullError
 
 from slrig.calibration.board import COLUMN, ROW, Observations
 from slrig.calibration.solution import (
@@ -108,6 +107,9 @@ def sample_volume(solution: Solution, observations: Observations, /) -> tuple[Fl
 
     Raises CalibrationError if there are too few such points, or the corners are in one plane.
     """
+    # Imported here: the service imports the classes of this module and calls none of its functions.
+    from scipy.spatial import Delaunay, QhullError
+
     corners = _board_corners(solution, observations)
     volume_mm = np.stack([corners.min(axis=0), corners.max(axis=0)])
     extent = volume_mm[1] - volume_mm[0]

@@ -147,7 +147,7 @@ class ExpectedError:
     """Expected error of a scan with this calibration, mm, over the volume in which the board was held.
 
     All figures are root mean squares over the volume of one standard deviation. They leave out rigid motions of the
-    whole, which are no errors of a measurement.
+    whole, which do not affect a measurement.
 
     volume_mm : (2, 3) float64, opposite corners of the volume's box in the world.
     point_mm : error of a point along the first camera's viewing ray, from the calibration alone. noise_mm : from the

@@ -6,7 +6,7 @@ from typing import get_args
 
 from sqlalchemy.orm import Session
 
-from slrig.calibration.health.verification import HealthState
+from slrig.calibration.health import HealthState
 from slrig.config import NoticeKind
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Outbox

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from markupsafe import Markup
 
-from slrig.calibration.health.verification import THRESHOLDS, HealthState, Thresholds
+from slrig.calibration.health import THRESHOLDS, HealthState, Thresholds
 from slrig.reports.drawing import shape
 from slrig.reports.trend import (
     END,

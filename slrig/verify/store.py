@@ -11,13 +11,7 @@ from uuid import UUID, uuid4
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from slrig.calibration.health.verification import (
-    Health,
-    HealthState,
-    Verification,
-    judge_health,
-    verification_from_document,
-)
+from slrig.calibration.health import Health, HealthState, Verification, judge_health, verification_from_document
 from slrig.jobs.database import Database
 from slrig.jobs.tables import VerificationRow
 

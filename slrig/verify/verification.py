@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from slrig.calibrate.tools import CapturePose
 from slrig.calibration.board import Board
-from slrig.calibration.health.verification import Health, HealthState, Verification
+from slrig.calibration.health import Health, HealthState, Verification
 from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.compute import Compute
 from slrig.model import Calibration

@@ -17,7 +17,7 @@ from slrig.bundle import Bundle, read_bundle
 from slrig.calibrate.pose_reading import read_pose
 from slrig.calibrate.solving import solve_poses
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.health.verification import HealthState, judge_health
+from slrig.calibration.health import HealthState, judge_health
 from slrig.calibration.solution import PROJECTOR
 from slrig.capture.verifier import check_capture
 from slrig.model import Axis, Calibration, Capture, LineShift, Size

@@ -1,1 +1,30 @@
-"""Does a calibration still hold? What a verification by the board says of a rig that may have changed."""
+"""Health of a calibration: verifications, detection of changed devices, and the state that follows.
+
+Only values are exported: computations load compiled kernels and are imported from their modules.
+"""
+
+from slrig.calibration.health.state import (
+    THRESHOLDS,
+    DriftEstimate,
+    Health,
+    HealthState,
+    PairFigures,
+    Thresholds,
+    Verification,
+    judge_health,
+    verification_from_document,
+    verification_from_scan,
+)
+
+__all__ = [
+    "THRESHOLDS",
+    "DriftEstimate",
+    "Health",
+    "HealthState",
+    "PairFigures",
+    "Thresholds",
+    "Verification",
+    "judge_health",
+    "verification_from_document",
+    "verification_from_scan",
+]

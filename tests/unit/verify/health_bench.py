@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
 
-from slrig.calibration.health.verification import DriftEstimate, PairFigures, Verification
+from slrig.calibration.health import DriftEstimate, PairFigures, Verification
 
 START = datetime(2026, 11, 20, 8, 0, tzinfo=UTC)
 

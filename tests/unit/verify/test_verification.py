@@ -15,7 +15,7 @@ import pytest
 
 from slrig.calibrate.solving import ReadPose
 from slrig.calibration.board import Board, BoardKind, PoseObservation, ViewQuality
-from slrig.calibration.health.verification import Health, HealthState, Verification, judge_health
+from slrig.calibration.health import Health, HealthState, Verification, judge_health
 from slrig.devices import Rig
 from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.data_folder import DataFolder

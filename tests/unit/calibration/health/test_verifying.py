@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.calibration.health.drift import Change
-from slrig.calibration.health.verification import (
+from slrig.calibration.health import (
     HealthState,
     PairFigures,
     Verification,
     judge_health,
     verification_from_document,
     verification_from_scan,
-    verify_by_board,
 )
+from slrig.calibration.health.drift import Change
+from slrig.calibration.health.verification import verify_by_board
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, Pinhole
@@ -146,7 +146,7 @@ def test_a_device_left_out_of_a_verification_raises_no_alarm_and_is_named() -> N
         assert (found.expected_mm or 0) < 1.4 * (found.stated_mm or 0)
         health = judge_health([found])
         assert health.state is HealthState.GOOD
-        assert f"camera '{absent}' did not take part in the last verification" in health.reasons[0]
+        assert f"camera '{absent}' was not observed in the last verification" in health.reasons[0]
         # A change of the others is found all the same.
         lamp = planted(rig.devices, "projector focal")
         seen = look_of(lamp, 5)
@@ -155,7 +155,7 @@ def test_a_device_left_out_of_a_verification_raises_no_alarm_and_is_named() -> N
         )
         alarm = judge_health([verify_by_board([other], BOARD, rig.calibration)])
         assert alarm.state is HealthState.STALE
-        assert alarm.reasons[-1].startswith(f"camera '{absent}' did not take part")
+        assert alarm.reasons[-1].startswith(f"camera '{absent}' was not observed")
     dark = replace(look_of(rig.devices, 5), correspondences={})
     assert verify_by_board([dark], BOARD, rig.calibration).unseen == (PROJECTOR,)
 
@@ -187,7 +187,7 @@ def test_a_device_that_was_knocked_is_turned_and_moved() -> None:
 def test_a_rig_of_other_cameras_is_refused_with_words() -> None:
     rig = bench()
     other = Calibration({"front": rig.calibration.cameras["left"]}, rig.calibration.projector)
-    with pytest.raises(CalibrationError, match="of camera front, the board was seen by left: check the calibration"):
+    with pytest.raises(CalibrationError, match="of camera front, the board was seen by left: check that"):
         verify_by_board([look_of(rig.devices, 0)], BOARD, other)
 
 
@@ -219,7 +219,7 @@ def test_a_scan_with_two_cameras_is_a_look_too() -> None:
     assert verdict.state is HealthState.STALE
     assert "'left' and 'right' disagree by 0.42 px in the mean" in verdict.reasons[0]
     assert verdict.remedy is not None
-    assert "shoot a verification" in verdict.remedy
+    assert "verify with the board" in verdict.remedy
     assert verification_from_scan([]) is None
 
 
