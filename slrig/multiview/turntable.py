@@ -425,7 +425,7 @@ def axis_from_board(
             f"expected {MIN_POSES} poses or more of a board on the turntable, found {len(names)}: turn the turntable "
             "and shoot the board again, best at six angles all around"
         )
-    board = _BoardPoses(names, poses, covariance, points_mm)
+    board = _TurnedBoard(names, poses, covariance, points_mm)
     axis = board.fit(range(len(names)))
     turn_deg = 0.0 if axis is None else _span_deg(axis.angles_rad)
     if axis is None or turn_deg < MIN_TURN_DEG:
@@ -449,7 +449,7 @@ def axis_from_board(
     )
 
 
-class _BoardPoses(NamedTuple):
+class _TurnedBoard(NamedTuple):
     """See `axis_from_board`."""
 
     names: Sequence[str]
