@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from simulated_rig.light import Float32Array, Lamp, LightFlicker, LightTable, nanoseconds
+from simulated_rig.light import Float32Array, Lamp, LampFlicker, LightTable, nanoseconds
 from simulated_rig.options import Faults, SimulatedCameraOptions
 from simulated_rig.rendering import CameraView
 from slrig.devices import COMPUTED_LIMITS, AppliedSettings, CameraInfo, CameraSettings, CameraState, Clock, Trigger
@@ -44,7 +44,7 @@ class SimulatedCamera:
         *,
         faults: Faults,
         seed: tuple[int, int],
-        ambient_flicker: LightFlicker | None = None,
+        ambient_flicker: LampFlicker | None = None,
     ) -> None:
         self._options = options
         self._view = view

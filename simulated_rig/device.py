@@ -13,7 +13,7 @@ from simulated_rig.camera import SimulatedCamera
 from simulated_rig.light import (
     NS_PER_S,
     Lamp,
-    LightFlicker,
+    LampFlicker,
     LightTable,
     VirtualClock,
     dark_table,
@@ -67,7 +67,7 @@ class SimulatedProjector:
         self._scene_controller = scene_controller
         self._response = options.response()
         self._dark = self._table(np.zeros((1, 1), np.uint8))
-        swing = LightFlicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
+        swing = LampFlicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
         self.lamp = Lamp(self._dark, swing)
         self._rng = np.random.default_rng((seed, 0x70726F6A))
         self._state = ProjectorState("the simulated projector")
@@ -214,7 +214,7 @@ class SimulatedHead:
         )
         swing = None
         if options.ambient_flicker_depth > 0:
-            swing = LightFlicker(options.ambient_flicker_hz, options.ambient_flicker_depth)
+            swing = LampFlicker(options.ambient_flicker_hz, options.ambient_flicker_depth)
         self._views = {
             camera.name: CameraView(
                 camera.pinhole(),

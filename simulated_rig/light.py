@@ -290,7 +290,7 @@ class VirtualClock:
 
 
 @dataclass(frozen=True, slots=True)
-class LightFlicker:
+class LampFlicker:
     """Light that oscillates about its mean, 1 + depth · sin(2π f t): mains lamps or a colour wheel."""
 
     frequency_hz: float
@@ -307,7 +307,7 @@ class LightFlicker:
 class Lamp:
     """Light of the projector over time, as a list of changes. Dark at first. Thread-safe."""
 
-    def __init__(self, dark: LightTable, flicker: LightFlicker | None = None) -> None:
+    def __init__(self, dark: LightTable, flicker: LampFlicker | None = None) -> None:
         self._dark = dark
         self.flicker = flicker
         self._changes: deque[tuple[int, LightTable]] = deque([(0, dark)], maxlen=_MAX_CHANGES)

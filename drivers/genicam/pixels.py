@@ -25,7 +25,7 @@ _GREY_CONVERSIONS = {
 }
 
 
-class SamplePacking(Enum):
+class PixelPacking(Enum):
     """Layout of samples in memory: each in 8 or 16 bits (little endian, right aligned), or packed.
 
     `LSB` is PFNC's "p": a stream of bits, least significant first. `GIGE` is GigE Vision's "Packed": of two samples,
@@ -46,7 +46,7 @@ class PfncFormat:
 
     name: str
     bit_depth: int
-    packing: SamplePacking
+    packing: PixelPacking
     mosaic: str = ""
 
     @property
@@ -58,10 +58,10 @@ class PfncFormat:
         """Number of bytes of an image."""
         count = size.width_px * size.height_px * self.samples
         bits = {
-            SamplePacking.BYTE: 8,
-            SamplePacking.WORD: 16,
-            SamplePacking.LSB: self.bit_depth,
-            SamplePacking.GIGE: 12,
+            PixelPacking.BYTE: 8,
+            PixelPacking.WORD: 16,
+            PixelPacking.LSB: self.bit_depth,
+            PixelPacking.GIGE: 12,
         }[self.packing]
         return -(-count * bits // 8)
 
@@ -70,11 +70,11 @@ def _build_formats() -> Mapping[str, PfncFormat]:
     mosaics = {"Mono": "", "BayerRG": "RGGB", "BayerGR": "GRBG", "BayerGB": "GBRG", "BayerBG": "BGGR"}
     found = []
     for family, mosaic in mosaics.items():
-        found.append(PfncFormat(f"{family}8", 8, SamplePacking.BYTE, mosaic))
-        found += [PfncFormat(f"{family}{depth}", depth, SamplePacking.WORD, mosaic) for depth in (10, 12, 14, 16)]
-        found += [PfncFormat(f"{family}{depth}p", depth, SamplePacking.LSB, mosaic) for depth in (10, 12)]
-        found += [PfncFormat(f"{family}{depth}Packed", depth, SamplePacking.GIGE, mosaic) for depth in (10, 12)]
-    found += [PfncFormat("RGB8", 8, SamplePacking.BYTE, "RGB"), PfncFormat("BGR8", 8, SamplePacking.BYTE, "BGR")]
+        found.append(PfncFormat(f"{family}8", 8, PixelPacking.BYTE, mosaic))
+        found += [PfncFormat(f"{family}{depth}", depth, PixelPacking.WORD, mosaic) for depth in (10, 12, 14, 16)]
+        found += [PfncFormat(f"{family}{depth}p", depth, PixelPacking.LSB, mosaic) for depth in (10, 12)]
+        found += [PfncFormat(f"{family}{depth}Packed", depth, PixelPacking.GIGE, mosaic) for depth in (10, 12)]
+    found += [PfncFormat("RGB8", 8, PixelPacking.BYTE, "RGB"), PfncFormat("BGR8", 8, PixelPacking.BYTE, "BGR")]
     return {form.name: form for form in found}
 
 
@@ -95,14 +95,14 @@ def decode_pixels(
     ValueError
         The buffer is too short, or pads the rows of a packed format.
     """
-    if form.packing in {SamplePacking.LSB, SamplePacking.GIGE}:
+    if form.packing in {PixelPacking.LSB, PixelPacking.GIGE}:
         if padding_bytes:
             message = f"{form.name}: rows are padded by {padding_bytes} bytes, which a packed format cannot be"
             raise ValueError(message)
         packed = _take_bytes(data, form.size_bytes(size), form)
         flat = (
             _unpack_lsb(packed, form.bit_depth)
-            if form.packing is SamplePacking.LSB
+            if form.packing is PixelPacking.LSB
             else _unpack_gige(packed, form.bit_depth)
         )
         image: Pixels = flat[: size.width_px * size.height_px].reshape(size.shape)
@@ -113,7 +113,7 @@ def decode_pixels(
         # The last row need not be padded.
         padded = np.concatenate([raw, np.zeros(padding_bytes, np.uint8)]) if padding_bytes else raw
         rows = np.ascontiguousarray(padded.reshape(size.height_px, stride)[:, :row_bytes])
-        if form.packing is SamplePacking.WORD:
+        if form.packing is PixelPacking.WORD:
             image = np.minimum(rows.view("<u2"), np.uint16(2**form.bit_depth - 1))
         else:
             image = rows

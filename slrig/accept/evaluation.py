@@ -65,7 +65,7 @@ def errors_by_step(readings: Sequence[Reading], quantity: Quantity) -> dict[str,
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class ReadingPoints:
     """The points behind a reading.
 
     points_mm : (n, 3) float64, all of the scan; artefact : (n,) uint8, 0 elsewhere, 1 on the plane, the sphere or the
@@ -79,7 +79,7 @@ class Evidence:
     sigma_mm: FloatArray
 
 
-def reading(mesh: Mesh, step: Step, take: int, plan: AcceptancePlan) -> tuple[Reading, Evidence]:
+def reading(mesh: Mesh, step: Step, take: int, plan: AcceptancePlan) -> tuple[Reading, ReadingPoints]:
     """The errors that a scan of one position shows, and its points.
 
     Raises NothingToReconstructError if the artefact is not in the scan, or too little of it.
@@ -111,7 +111,7 @@ def reading(mesh: Mesh, step: Step, take: int, plan: AcceptancePlan) -> tuple[Re
         turned=sum(each.misoriented for each in parts),
         rejected_share=sum(each.rejected for each in fits) / len(used),
     )
-    return found, Evidence(points, artefact, distances, sigma)
+    return found, ReadingPoints(points, artefact, distances, sigma)
 
 
 def _parts(points: FloatArray, normals: FloatArray, step: Step, plan: AcceptancePlan) -> list[ArtefactPoints]:

@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from slrig.accept.evaluation import Evidence, Reading
+from slrig.accept.evaluation import Reading, ReadingPoints
 from slrig.accept.plan import AcceptancePlan, Artefact, Step
 from slrig.accept.scene import turn_deg
 from slrig.accept.store import HTML, JSON, kept_points, points_file
@@ -116,7 +116,7 @@ def _capture(reading: Reading) -> dict[str, object]:
     }
 
 
-def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evidence]) -> str:
+def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], ReadingPoints]) -> str:
     """The page. `evidence_of` is asked for the points of one reading at a time: all at once are large."""
     plan = result.plan
     camera = next(iter(result.calibration.cameras.values()))
@@ -148,7 +148,7 @@ def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evide
     )
 
 
-def error_map(evidence: Evidence, camera: Pinhole, *, most_mm: float) -> Pixels:
+def error_map(evidence: ReadingPoints, camera: Pinhole, *, most_mm: float) -> Pixels:
     """An artefact as the camera sees it, coloured by how far its points lie off the fit: (H, W, 3) uint8, BGR.
 
     Dark blue is most_mm inwards (below), yellow as much outwards.

@@ -30,7 +30,7 @@ from slrig.jobs.records import utc_now
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import decode_mesh_ply
-from slrig.scan.plan import Progress, ReconstructionPlan, ScanPlan
+from slrig.scan.plan import ProgressCallback, ReconstructionPlan, ScanPlan
 
 _BUNDLE, _MESH = "bundle", "mesh"
 
@@ -50,7 +50,7 @@ def evaluated(
     take: int,
     /,
     *,
-    progress: Progress,
+    progress: ProgressCallback,
     cancelled: Callable[[], bool],
 ) -> Reading:
     """Reconstruct the bundle in `work`, measure the artefact in its mesh, and keep its points in `folder`."""
@@ -70,7 +70,7 @@ def run_acceptance(
     plan: AcceptancePlan,
     folder: Path,
     *,
-    progress: Progress,
+    progress: ProgressCallback,
     cancelled: Callable[[], bool],
     place: Place | None = None,
     again: Callable[[Step, SlrigError], bool] | None = None,
@@ -107,7 +107,7 @@ def measured(
     done: int,
     folder: Path,
     *,
-    progress: Progress,
+    progress: ProgressCallback,
     cancelled: Callable[[], bool],
     place: Place | None,
     again: Callable[[Step, SlrigError], bool] | None = None,
@@ -151,7 +151,7 @@ def _captured(
     step: Step,
     take: int,
     folder: Path,
-    progress: Progress,
+    progress: ProgressCallback,
     cancelled: Callable[[], bool],
     evaluate: Evaluate,
 ) -> Reading:

@@ -19,7 +19,7 @@ from uuid import UUID
 import numpy as np
 import structlog
 
-from slrig.accept.evaluation import Evidence
+from slrig.accept.evaluation import ReadingPoints
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
 from slrig.bundle.storage import write_file
 from slrig.calibration.artefacts import Decision
@@ -102,7 +102,7 @@ def points_file(step: str, take: int) -> str:
     return f"points/{step}-{take + 1}.npz"
 
 
-def keep_points(evidence: Evidence, folder: Path, step: str, take: int) -> None:
+def keep_points(evidence: ReadingPoints, folder: Path, step: str, take: int) -> None:
     """Write the points of a capture into the folder of its test. Raises StorageError."""
     packed = BytesIO()
     np.savez_compressed(
@@ -118,11 +118,11 @@ def keep_points(evidence: Evidence, folder: Path, step: str, take: int) -> None:
     write_file(path, packed.getvalue())
 
 
-def kept_points(folder: Path, step: str, take: int) -> Evidence:
+def kept_points(folder: Path, step: str, take: int) -> ReadingPoints:
     """The points of a capture, coordinates and deviations to single precision. Raises StorageError."""
     path = folder / points_file(step, take)
     with storage_errors(path), np.load(path) as kept:
-        return Evidence(
+        return ReadingPoints(
             kept["points_mm"].astype(np.float64),
             kept["artefact"],
             kept["distances_mm"],

@@ -17,7 +17,7 @@ from slrig.model import Calibration
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class QuantityVerdict:
     """One quantity over all positions. error_mm : of the reading with the largest, which is that of `step`, `take`.
     scatter_mm : the standard deviation of repeated captures, NaN where none were made; repeats : captures that tell it.
     It is told and decides nothing: the rig's own scatter is in its errors.
@@ -44,7 +44,7 @@ class AcceptanceResult:
     plan: AcceptancePlan
     calibration: Calibration
     readings: tuple[Reading, ...]
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[QuantityVerdict, ...]
 
     @property
     def decision(self) -> Decision:
@@ -66,18 +66,18 @@ class AcceptanceResult:
         return len(self.readings) == len(self.plan.takes)
 
 
-def verdicts(readings: Sequence[Reading], plan: AcceptancePlan) -> tuple[Verdict, ...]:
+def verdicts(readings: Sequence[Reading], plan: AcceptancePlan) -> tuple[QuantityVerdict, ...]:
     """What is decided of each quantity that was measured."""
     told = {quantity for each in readings for quantity in each.errors_mm}
     return tuple(_verdict(quantity, readings, plan) for quantity in Quantity if quantity in told)
 
 
-def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePlan) -> Verdict:
+def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePlan) -> QuantityVerdict:
     having = [each for each in readings if quantity in each.errors_mm]
     worst = max(having, key=lambda each: abs(each.errors_mm[quantity]))
     error, limit = worst.errors_mm[quantity], plan.limits.limit_mm(quantity)
     uncertainty = error_uncertainty(quantity, plan.artefacts)
-    return Verdict(
+    return QuantityVerdict(
         quantity, error, limit, worst.step, worst.take, uncertainty, *_scatter(quantity, having),
         decide(error, limit, uncertainty.expanded_mm),
     )  # fmt: skip

@@ -15,7 +15,7 @@ from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, pla
 from slrig.calibration.board import DEFAULT_BOARD, BoardKind, BoardShape
 from slrig.jobs.records import JobState
 from slrig.scan.plan import PatternPlan
-from slrig.schedule.task_options import BoardOptions
+from slrig.schedule.task_options import ScheduledBoard
 
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
 CornerCount = Annotated[int, Field(ge=3, le=60)]
@@ -24,7 +24,7 @@ Known = Annotated[float | None, BeforeValidator(plain)]
 IfBusy = Literal["reject", "queue"]
 
 
-class BoardRequest(BoardOptions):
+class BoardRequest(ScheduledBoard):
     """The board that is printed: see `slrig calibrate board`."""
 
     corners: Annotated[

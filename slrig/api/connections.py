@@ -70,14 +70,14 @@ class Room:
         self.most_per_address = most_per_address
         self._open: Counter[str] = Counter()
         # Those that owe something, the one that has owed for longest first.
-        self._owing: dict[Connection, None] = {}
+        self._owing: dict[HttpConnection, None] = {}
 
     @property
     def open(self) -> int:
         """How many connections are open."""
         return self._open.total()
 
-    def enter(self, newcomer: Connection) -> None:
+    def enter(self, newcomer: HttpConnection) -> None:
         """Let a connection in, and have one make room for it where there is none: itself if nobody else owes anything,
         and `NEWCOMERS` wait already.
         """
@@ -88,7 +88,7 @@ class Room:
         elif self.open > self.most + NEWCOMERS or (self.open > self.most and next(iter(self._owing)) is not newcomer):
             self._make_room(iter(self._owing))
 
-    def _make_room(self, candidates: Iterator[Connection]) -> None:
+    def _make_room(self, candidates: Iterator[HttpConnection]) -> None:
         chosen = next(candidates)
         self._owing.pop(chosen)
         chosen.leave(
@@ -96,14 +96,14 @@ class Room:
             "As many connections are open as this service allows. Try again in a moment.",
         )
 
-    def owes(self, connection: Connection, *, owing: bool) -> None:
+    def owes(self, connection: HttpConnection, *, owing: bool) -> None:
         """Note whether a connection owes the service something from now on."""
         if not owing:
             self._owing.pop(connection, None)
         elif connection.address in self._open:
             self._owing.setdefault(connection)
 
-    def exit(self, connection: Connection) -> None:
+    def exit(self, connection: HttpConnection) -> None:
         """Forget a connection."""
         self._owing.pop(connection, None)
         self._open[connection.address] -= 1
@@ -117,7 +117,7 @@ class ConnectionConfig(uvicorn.Config):
     def __init__(self, app: Any, *, deadlines: Deadlines, room: Room, **settings: Any) -> None:
         super().__init__(
             app,
-            http=Connection,
+            http=HttpConnection,
             # An upgrade is answered as the plain request that it came with.
             ws="none",
             proxy_headers=False,
@@ -132,7 +132,7 @@ class ConnectionConfig(uvicorn.Config):
         self.room = room
 
 
-class Connection(H11Protocol):
+class HttpConnection(H11Protocol):
     """One connection, held to its deadlines."""
 
     config: ConnectionConfig

@@ -15,7 +15,7 @@ from slrig.api.schemas import filled
 from slrig.api.service import Cursor, PageLength, Serving, paged
 from slrig.bundle.validation import FreeText, Strict
 from slrig.jobs.records import utc_now
-from slrig.schedule.records import LEAST_RETRY_S, MOST_GRACE_S, Cron, Order, Run, Schedule, TaskKind
+from slrig.schedule.records import LEAST_RETRY_S, MOST_GRACE_S, Cron, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 
 router = APIRouter(prefix="/schedule", tags=["schedule"])
 
@@ -51,10 +51,10 @@ class ScheduleRequest(Strict):
     )
     enabled: bool = True
 
-    def order(self) -> Order:
+    def order(self) -> ScheduleSpec:
         """What is asked for. Raises ScheduleError."""
         asked = {name: value for name, value in self if name not in {"cron", "time_zone"}}
-        return Order(Cron(self.cron, self.time_zone), **asked)
+        return ScheduleSpec(Cron(self.cron, self.time_zone), **asked)
 
 
 class ScheduleLinks(BaseModel):
@@ -99,7 +99,7 @@ class RunPage(BaseModel):
     one, null on the last.
     """
 
-    runs: list[Run]
+    runs: list[ScheduledRun]
     next: str | None
 
 
@@ -163,7 +163,7 @@ def list_runs(
 
 
 @router.post("/{schedule_id}/run", status_code=202, responses=problems(409))
-def run_now(service: Serving, schedule_id: UUID) -> Run:
+def run_now(service: Serving, schedule_id: UUID) -> ScheduledRun:
     """Do what a schedule does now, once, though it is not due, or paused. It waits for the rig as every run does, and
     is listed with the others. The answer comes at once.
     """

@@ -13,7 +13,7 @@ from fastapi import Depends, Query, Request, Response
 from slrig.accept.desk import AcceptanceDesk
 from slrig.api.latency import Durations
 from slrig.bundle.options import Preset, ScanDefaults
-from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.calibrating import CalibrationSessions
 from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
@@ -37,7 +37,7 @@ from slrig.scan.retention import ScanLimits, ScanRetention
 from slrig.scan.runner import Runner
 from slrig.schedule.notices import NoticedHealth, tell_run
 from slrig.schedule.receivers import senders_of
-from slrig.schedule.records import Run
+from slrig.schedule.records import ScheduledRun
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
 from slrig.schedule.tasks import Tasks
@@ -98,7 +98,7 @@ class Service:
         self.keys = RequestKeys(database, life_s=settings.idempotency_keep_s)
         self.keys.release_all()
         self.audit = Audit(database)
-        self.calibrations = Calibrations(
+        self.calibrations = CalibrationSessions(
             folder,
             runner,
             JobStore(database, JobKind.POSE, JobKind.SOLVE, outbox=outbox),
@@ -244,7 +244,7 @@ Probed = Annotated[Service, Depends(_of_request)]
 
 Cursor = Annotated[int | None, Query(ge=1, le=2**53, description="`next` of the page before")]
 PageLength = Annotated[int, Query(ge=1, le=200)]
-Shown = TypeVar("Shown", JobRecord, Run, AuditEntry)
+Shown = TypeVar("Shown", JobRecord, ScheduledRun, AuditEntry)
 
 
 def paged(

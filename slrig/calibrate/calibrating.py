@@ -41,7 +41,7 @@ EXPORTS = ("calibration.json", "calibration.yml", "calibration.xml")
 _log = structlog.get_logger(__name__)
 
 
-class Calibrations:
+class CalibrationSessions:
     """The calibrations of a data folder, and the work on them. Any thread may call; `close` at the end.
 
     jobs : those of poses and solves. `poses` shoots, `solves` solves, `register` has the records.

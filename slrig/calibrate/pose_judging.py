@@ -14,7 +14,7 @@ from slrig.calibrate.pose_pictures import white_frame
 from slrig.calibrate.records import SessionRecord, plain
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose
-from slrig.calibrate.tools import Judgement, Setting, Standing
+from slrig.calibrate.tools import Judgement, SessionGuidance, Setting
 from slrig.calibration.judgement import describe_board
 from slrig.calibration.poses import Advice, Coverage, advise_pose, check_pose, coverage, estimate_rig
 
@@ -42,7 +42,7 @@ def judgement(pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> 
     return Judgement(found.refusals, _fields(found, *_ANSWER), _standing(found.coverage, found.advice))
 
 
-def standing(poses: Sequence[ReadPose], setting: Setting) -> Standing:
+def standing(poses: Sequence[ReadPose], setting: Setting) -> SessionGuidance:
     """Return what the accepted poses cover, and what to move next."""
     observations = [each.observation for each in poses]
     guess = estimate_rig(observations, setting.board, setting.sizes)
@@ -108,11 +108,11 @@ def warm() -> None:
     importlib.import_module("slrig.calibrate.pose_reading")
 
 
-def _standing(found: Coverage, advice: Advice) -> Standing:
+def _standing(found: Coverage, advice: Advice) -> SessionGuidance:
     shown = ("cells", "reachable", "share", "depths", "tilted", "turns", "distance_mm")
     devices = {name: _fields(each, *shown) for name, each in found.devices.items()}
     told = _fields(advice, "enough", "camera", "outline_px", "worst_px", "expected_px")
-    return Standing({**_fields(found, "poses", "missing"), "devices": devices}, {"words": advice.text, **told})
+    return SessionGuidance({**_fields(found, "poses", "missing"), "devices": devices}, {"words": advice.text, **told})
 
 
 def _fields(value: object, *names: str) -> dict[str, Any]:

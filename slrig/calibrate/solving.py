@@ -14,7 +14,7 @@ from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
 from slrig.errors import CalibrationError, SolveRefusedError
 from slrig.jobs.records import utc_now
 from slrig.model import Calibration, Size, SolveRecord
-from slrig.scan.plan import Progress
+from slrig.scan.plan import ProgressCallback
 
 _SOLVE_SHARE = 0.95
 
@@ -50,7 +50,7 @@ def solve_poses(
     poses: Sequence[ReadPose],
     /,
     *,
-    progress: Progress = lambda _stage, _fraction, _detail: None,
+    progress: ProgressCallback = lambda _stage, _fraction, _detail: None,
     earlier: Calibration | None = None,
     board_shape: BoardShape = BoardShape.AUTO,
     wanted_mm: float | None = None,

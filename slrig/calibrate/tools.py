@@ -22,7 +22,7 @@ from slrig.jobs.compute import Compute
 from slrig.jobs.rig_jobs import Recorded
 from slrig.model import Calibration, Size
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import Progress, ScanPlan
+from slrig.scan.plan import ProgressCallback, ScanPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ def setting_of(record: SessionRecord) -> Setting:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class SessionGuidance:
     """Where a session stands: what its poses cover, and what to move next and why; JSON values."""
 
     coverage: Mapping[str, Any]
@@ -63,14 +63,14 @@ class Judgement:
 
     refusals: tuple[str, ...]
     answer: Mapping[str, Any]
-    standing: Standing | None
+    standing: SessionGuidance | None
 
 
 class CapturePose(Protocol):
     """`slrig.scan.acquisition.capture_frames`."""
 
     def __call__(
-        self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: Progress, cancelled: Callable[[], bool]
+        self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: ProgressCallback, cancelled: Callable[[], bool]
     ) -> Recorded:
         """Play the patterns, and record a bundle for `folder`."""
         ...
@@ -86,7 +86,7 @@ class CalibrationTools:
     capture: CapturePose
     read: Callable[[Path, Board, str], ReadPose]
     judge: Callable[[ReadPose, Sequence[ReadPose], Setting], Judgement]
-    survey: Callable[[Sequence[ReadPose], Setting], Standing]
+    survey: Callable[[Sequence[ReadPose], Setting], SessionGuidance]
     picture: Callable[[Path, str, ReadPose | None, Board], bytes]
     coverage_picture: Callable[[Setting, str, Sequence[ReadPose], Mapping[str, Any]], bytes]
     solve: Callable[..., CalibrationResult]

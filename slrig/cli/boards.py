@@ -10,12 +10,12 @@ import typer
 
 from slrig.bundle.storage import write_file
 from slrig.calibration.board import DEFAULT_BOARD, Board, BoardKind
-from slrig.cli.options import BoardOptions
+from slrig.cli.options import BoardArguments
 from slrig.disk import storage_errors
 from slrig.errors import CalibrationError
 
 
-def chosen_board(asked: BoardOptions) -> Board:
+def chosen_board(asked: BoardArguments) -> Board:
     """The board that a command's options describe; without any, the usual one, which is then told on stderr.
 
     The usual board may be named in part, so that a print that measures 11.94 mm is `--square-mm 11.94`. Any other board
@@ -49,7 +49,7 @@ def chosen_board(asked: BoardOptions) -> Board:
     return board
 
 
-def _as_printed(board: Board, asked: BoardOptions) -> Board:
+def _as_printed(board: Board, asked: BoardArguments) -> Board:
     """The board with what was said of the size of its print."""
     if asked.square_sigma is not None:
         board = replace(board, square_sigma=asked.square_sigma)

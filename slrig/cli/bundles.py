@@ -22,7 +22,7 @@ from slrig.disk import storage_errors
 from slrig.errors import ConfigError
 from slrig.failure import UNEXPECTED, job_failure
 from slrig.scan.artefacts import REPORT
-from slrig.scan.plan import Progress
+from slrig.scan.plan import ProgressCallback
 
 Row = tuple[str, ...]
 """What the table says of a bundle, or of one of its cameras, beside name and seconds; the last cell is a remark."""
@@ -53,9 +53,9 @@ def named_bundles(asked: Sequence[Path]) -> tuple[list[Path], bool]:
 def work_through(
     bundles: Sequence[Path],
     output: Path,
-    work: Callable[[Path, Path, Progress], Sequence[Row]],
+    work: Callable[[Path, Path, ProgressCallback], Sequence[Row]],
     *,
-    prepare: Callable[[Progress], object] = lambda _: None,
+    prepare: Callable[[ProgressCallback], object] = lambda _: None,
     heads: Sequence[Column],
     places: Sequence[str],
 ) -> None:
@@ -168,7 +168,7 @@ def _failure_told(bundle: Path, failed: dict[Path, str], display: ProgressDispla
         failed[bundle] = failure.code
 
 
-def _part_of(display: Progress, place: int, count: int, name: str) -> Progress:
+def _part_of(display: ProgressCallback, place: int, count: int, name: str) -> ProgressCallback:
     """Progress of one bundle as that of all. place : 1 for the first."""
 
     def told(stage: str, fraction: float, detail: str, /) -> None:

@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 
 import typer
 
-from slrig.cli.options import AsJson, BoardOptions, Service, by_beginning, grouped
+from slrig.cli.options import AsJson, BoardArguments, ServiceOptions, by_beginning, grouped
 from slrig.errors import CalibrationNotFoundError, ConfigError, ServiceError
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ Shape = Annotated[
 @grouped
 def board(
     output: Annotated[Path, typer.Option(help="File for the page: .pdf or .svg.")],
-    asked: BoardOptions,
+    asked: BoardArguments,
     page: Annotated[
         str, typer.Option(help="A4, A3, letter; fit, as large as the board needs; or WIDTHxHEIGHT in mm.")
     ] = "A4",
@@ -69,7 +69,7 @@ def solve(
         typer.Argument(metavar="FOLDER", help="Folder with one bundle per pose, each a folder with bundle.json."),
     ],
     output: Annotated[Path, typer.Option(help="File for the calibration: .json, or OpenCV's .yml or .xml.")],
-    asked: BoardOptions,
+    asked: BoardArguments,
     board_shape: Shape = "auto",
     report: Annotated[Path | None, typer.Option(help="Write the report, one HTML page with pictures, as well.")] = None,
     earlier: Annotated[
@@ -105,7 +105,7 @@ def solve(
 @grouped
 def run(
     *,
-    asked: BoardOptions,
+    asked: BoardArguments,
     board_shape: Shape = "auto",
     cameras_alone: Annotated[
         bool, typer.Option("--cameras-alone", help="Calibrate cameras, or one, without the projector: light is white.")
@@ -123,7 +123,7 @@ def run(
     exposure_s: Annotated[
         float | None, typer.Option(help="Exposure of every camera, seconds. Default: as the rig file says.")
     ] = None,
-    service: Service,
+    service: ServiceOptions,
 ) -> None:
     """Walk through a calibration with a running service.
 
@@ -149,7 +149,7 @@ def run(
 
 @app.command(name="list")
 @grouped
-def list_stored(service: Service, as_json: AsJson = False) -> None:
+def list_stored(service: ServiceOptions, as_json: AsJson = False) -> None:
     """List the calibrations that a service keeps, from new to old."""
     from rich.table import Column
     from rich.text import Text
@@ -183,7 +183,7 @@ def list_stored(service: Service, as_json: AsJson = False) -> None:
 
 @app.command()
 @grouped
-def show(calibration: CalibrationId, service: Service, as_json: AsJson = False) -> None:
+def show(calibration: CalibrationId, service: ServiceOptions, as_json: AsJson = False) -> None:
     """Show how good a calibration is, or what its poses still lack."""
     from slrig.cli.calibration_screen import tell_session
     from slrig.cli.display import print_json
@@ -199,10 +199,10 @@ def check(
     poses: Annotated[
         str, typer.Argument(metavar="FOLDER_OR_ID", help="Folder with one bundle per pose, or a calibration's id.")
     ],
-    asked: BoardOptions,
+    asked: BoardArguments,
     board_shape: Shape = "auto",
     *,
-    service: Service,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Check the stated error by odd against even poses.
@@ -232,7 +232,7 @@ def check(
 def compare(
     first: Annotated[str, typer.Argument(metavar="FIRST", help=_ID_HELP)],
     second: Annotated[str, typer.Argument(metavar="SECOND", help="Id of the one to compare it with.")],
-    service: Service,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Compare two calibrations, and say by how much points move.
@@ -272,7 +272,7 @@ def light(
 
 @app.command()
 @grouped
-def activate(calibration: CalibrationId, service: Service) -> None:
+def activate(calibration: CalibrationId, service: ServiceOptions) -> None:
     """Have scans use a calibration from now on."""
     with service.client() as client:
         found = client.post(f"{_path(client, calibration)}/activate", None)
@@ -281,7 +281,7 @@ def activate(calibration: CalibrationId, service: Service) -> None:
 
 @app.command()
 @grouped
-def deactivate(calibration: CalibrationId, service: Service) -> None:
+def deactivate(calibration: CalibrationId, service: ServiceOptions) -> None:
     """Have scans use the rig's own calibration again."""
     with service.client() as client:
         client.post(f"{_path(client, calibration)}/deactivate", None)
@@ -303,7 +303,7 @@ def export(
         typer.Option(help="Whose form. ros: a new folder of camera_info and transforms. Default: by the ending."),
     ] = None,
     *,
-    service: Service,
+    service: ServiceOptions,
 ) -> None:
     """Write a calibration of a service, or a file, into a file.
 
@@ -356,7 +356,7 @@ def submit(
         ),
     ],
     label: Annotated[str | None, typer.Option(help="Free text, to find the calibration again.")] = None,
-    service: Service,
+    service: ServiceOptions,
 ) -> None:
     """Give a service a calibration that was found elsewhere."""
     import tempfile

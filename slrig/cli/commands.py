@@ -18,7 +18,16 @@ from slrig.cli.backup import backup, restore
 from slrig.cli.fleet import fleet
 from slrig.cli.foreign import import_images
 from slrig.cli.model import model
-from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
+from slrig.cli.options import (
+    AcceptanceOptions,
+    AsJson,
+    BoardArguments,
+    MeshOptions,
+    RigFile,
+    ServiceOptions,
+    given,
+    grouped,
+)
 from slrig.cli.patterns import patterns
 from slrig.cli.scan_options import ScanOptions
 from slrig.cli.serve import serve
@@ -90,7 +99,7 @@ def demo(
 @grouped
 def scan(
     *,
-    service: Service,
+    service: ServiceOptions,
     output: Annotated[Path, typer.Option(help="Folder for the files of the scan.")] = Path("scans/latest"),
     file: Annotated[
         list[str] | None,
@@ -315,7 +324,7 @@ def verify(
         Path,
         typer.Argument(metavar="SOURCE", help="A recorded pose of the board, a bundle; or a rig file to shoot one."),
     ],
-    board: BoardOptions,
+    board: BoardArguments,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration to verify. Default: the bundle's, or the rig file's.")
     ] = None,

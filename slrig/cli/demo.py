@@ -23,7 +23,7 @@ from slrig.cli.scan import scan_with, tell_result
 from slrig.client import Client
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ServiceError
-from slrig.scan.plan import Progress
+from slrig.scan.plan import ProgressCallback
 
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
@@ -107,7 +107,7 @@ def _url(process: subprocess.Popen[bytes], data: Path) -> str:
     return url
 
 
-def _await_ready(process: subprocess.Popen[bytes], client: Client, data: Path, display: Progress) -> None:
+def _await_ready(process: subprocess.Popen[bytes], client: Client, data: Path, display: ProgressCallback) -> None:
     deadline = time.monotonic() + START_LIMIT_S
     told = ""
     while (missing := still_missing(client)) is not None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from slrig.cli.options import AsJson, Service, given, grouped
+from slrig.cli.options import AsJson, ServiceOptions, given, grouped
 
 
 @grouped
@@ -20,7 +20,7 @@ def fleet(
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="TOML file with its settings, as a service has them.")] = None,
     *,
-    service: Service,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """List the rigs that share a catalogue.

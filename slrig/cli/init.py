@@ -37,7 +37,7 @@ _USUAL_EXPOSURE_S = 0.0167
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class RigFileTable:
     """A table of the rig file: the projector's or a camera's. label : what the device is, for people."""
 
     kind: str
@@ -102,7 +102,7 @@ def terminal() -> bool:
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
-def _named_cameras(texts: Sequence[str], found: DiscoveredDevices) -> list[Part]:
+def _named_cameras(texts: Sequence[str], found: DiscoveredDevices) -> list[RigFileTable]:
     parts = []
     for number, text in enumerate(texts):
         name, _, rest = text.partition("=") if "=" in text.partition(":")[0] else ("", "", text)
@@ -110,7 +110,7 @@ def _named_cameras(texts: Sequence[str], found: DiscoveredDevices) -> list[Part]
     return parts
 
 
-def _named(kind: str, text: str, found: DiscoveredDevices, name: str) -> Part:
+def _named(kind: str, text: str, found: DiscoveredDevices, name: str) -> RigFileTable:
     """What DRIVER:DEVICE means; a driver alone means its only device. Raises ConfigError, DriverNotFoundError."""
     driver, _, device = text.partition(":")
     kinds = driver_kinds(driver)
@@ -125,18 +125,18 @@ def _named(kind: str, text: str, found: DiscoveredDevices, name: str) -> Part:
     return _part(kind, driver, device or next((each.device for each in devices), ""), label, name)
 
 
-def _part(kind: str, driver: str, device: str, label: str, name: str) -> Part:
+def _part(kind: str, driver: str, device: str, label: str, name: str) -> RigFileTable:
     """The table of a device. It is named by the option of which the driver's model says `json_schema_extra={"takes":
     "device"}`, else by `device`.
     """
     if not device:
-        return Part(kind, driver, label, {}, name)
+        return RigFileTable(kind, driver, label, {}, name)
     known = _properties(driver)
     key = next((key for key, part in known.items() if part.get("takes") == "device"), "device")
-    return Part(kind, driver, label, {key: typed(device, json_types(known.get(key, {"type": "string"})))}, name)
+    return RigFileTable(kind, driver, label, {key: typed(device, json_types(known.get(key, {"type": "string"})))}, name)
 
 
-def _chosen_cameras(offered: Sequence[FoundDevice], *, ask: bool) -> list[Part]:
+def _chosen_cameras(offered: Sequence[FoundDevice], *, ask: bool) -> list[RigFileTable]:
     chosen = list(offered)
     if ask:
         _offer("Cameras", offered)
@@ -149,7 +149,7 @@ def _chosen_cameras(offered: Sequence[FoundDevice], *, ask: bool) -> list[Part]:
     ]
 
 
-def _chosen_projector(offered: Sequence[FoundDevice], *, ask: bool) -> Part:
+def _chosen_projector(offered: Sequence[FoundDevice], *, ask: bool) -> RigFileTable:
     if len(offered) > 1 and not ask:
         one = f"{offered[0].driver}:{offered[0].device}"
         message = f"{len(offered)} devices may be the projector: {_listed(offered)}; name it: --projector {one}"
@@ -169,7 +169,7 @@ def _exposure_s(given: float | None, *, ask: bool) -> float:
     return _USUAL_EXPOSURE_S if given is None else given
 
 
-def _assign(text: str, parts: Mapping[str, Part]) -> None:
+def _assign(text: str, parts: Mapping[str, RigFileTable]) -> None:
     """Set the option of TABLE.KEY=VALUE. Raises ConfigError."""
     table, dot, rest = text.partition(".")
     key, equals, value = rest.partition("=")
@@ -183,7 +183,7 @@ def _assign(text: str, parts: Mapping[str, Part]) -> None:
     part.options[key] = typed(value, json_types(_properties(part.driver).get(key, {})))
 
 
-def _complete(part: Part, *, ask: bool) -> None:
+def _complete(part: RigFileTable, *, ask: bool) -> None:
     """Ask for what the driver needs and the rig file does not say. Raises ConfigError where there is nobody to ask."""
     model = option_model(part.driver)
     schema = {} if model is None else model.model_json_schema()
@@ -268,7 +268,7 @@ def _nothing_there(
     return "\n  ".join(lines)
 
 
-def _tell(projector: Part, cameras: Sequence[Part], output: Path) -> None:
+def _tell(projector: RigFileTable, cameras: Sequence[RigFileTable], output: Path) -> None:
     named = ", ".join(f"{each.name} ({each.driver})" for each in cameras)
     _say(f"\nWrote {output}: projector ({projector.driver}), {named}. No device was opened. Next:")
     better = output.with_stem(f"{output.stem}-measured")
@@ -323,7 +323,7 @@ def failure_of(driver: str, options: Mapping[str, object], key: str = "") -> str
     return ""
 
 
-def rig_text(path: Path, name: str, projector: Part, cameras: Sequence[Part], exposure_s: float) -> str:
+def rig_text(path: Path, name: str, projector: RigFileTable, cameras: Sequence[RigFileTable], exposure_s: float) -> str:
     """Return the file's text, which was read again and checked by every driver's model. Raises ConfigError.
 
     exposure_s : of every camera that has none of its own.
@@ -342,7 +342,7 @@ def rig_text(path: Path, name: str, projector: Part, cameras: Sequence[Part], ex
     return text
 
 
-def _lines(name: str, projector: Part, cameras: Sequence[Part], exposure_s: float) -> Iterator[str]:
+def _lines(name: str, projector: RigFileTable, cameras: Sequence[RigFileTable], exposure_s: float) -> Iterator[str]:
     yield "# Written by slrig init. For every option: slrig devices --options DRIVER"
     yield f"name = {toml_value(name)}"
     yield '# calibration = "calibration.json"  # beside this file, once there is one'
@@ -365,7 +365,7 @@ def _lines(name: str, projector: Part, cameras: Sequence[Part], exposure_s: floa
     )
 
 
-def _keys(part: Part, *, without: str = "") -> Iterator[str]:
+def _keys(part: RigFileTable, *, without: str = "") -> Iterator[str]:
     if part.label:
         yield from _comment(part.label)
     yield f"driver = {toml_value(part.driver)}"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slrig.cli.options import Service, given, grouped
+from slrig.cli.options import ServiceOptions, given, grouped
 from slrig.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def model(
         typer.Option(help="With --shoot: the rig file to shoot with; what the folder has of an earlier call stays."),
     ] = None,
     by_hand: Annotated[bool, typer.Option("--by-hand", help="With --shoot: turn it yourself, when told.")] = False,
-    service: Service,
+    service: ServiceOptions,
     angle: Annotated[
         float | None,
         typer.Option(metavar="DEG", help="The stage turned the object by so much, right-handed, from scan to scan."),

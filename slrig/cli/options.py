@@ -22,7 +22,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
+class ServiceOptions:
     """Where a running service is, and its key."""
 
     url: Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is.")] = "http://127.0.0.1:8731"
@@ -49,7 +49,7 @@ def _read_key(file: Path) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class BoardOptions:
+class BoardArguments:
     """A calibration board as far as the command line names it."""
 
     kind: Annotated[

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from slrig.cli.options import AsJson, Service, grouped
+from slrig.cli.options import AsJson, ServiceOptions, grouped
 from slrig.errors import ConfigError
 
 app = typer.Typer(no_args_is_help=True, help="Options of scans by name: for dark objects, for shiny ones.")
@@ -19,7 +19,7 @@ MOST_BYTES = 2**20
 
 @app.command(name="list")
 @grouped
-def list_presets(service: Service, as_json: AsJson = False) -> None:
+def list_presets(service: ServiceOptions, as_json: AsJson = False) -> None:
     """List presets, and where they come from."""
     from slrig.cli.display import print_json, print_table
 
@@ -34,7 +34,7 @@ def list_presets(service: Service, as_json: AsJson = False) -> None:
 
 @app.command()
 @grouped
-def export(name: Name, service: Service) -> None:
+def export(name: Name, service: ServiceOptions) -> None:
     """Print a preset as JSON, for a file that another rig imports."""
     from slrig.cli.display import print_json
 
@@ -47,7 +47,7 @@ def export(name: Name, service: Service) -> None:
 def import_preset(
     name: Name,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A file that export wrote; - is standard input.")],
-    service: Service,
+    service: ServiceOptions,
 ) -> None:
     """Have the service keep a preset by this name."""
     from slrig.bundle.validation import read_text
@@ -59,7 +59,7 @@ def import_preset(
 
 @app.command()
 @grouped
-def delete(name: Name, service: Service) -> None:
+def delete(name: Name, service: ServiceOptions) -> None:
     """Delete a preset that was imported."""
     with service.client() as client:
         client.presets.delete(name)

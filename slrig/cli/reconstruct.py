@@ -22,7 +22,7 @@ from slrig.jobs.worker_wait import PREPARING
 from slrig.logs import set_up_console_logs
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, write_converted
 from slrig.scan.offered import BUNDLE_ZIP, CALIBRATION_USED, missing_for, offered, on_demand
-from slrig.scan.plan import Progress, ReconstructionPlan
+from slrig.scan.plan import ProgressCallback, ReconstructionPlan
 from slrig.scan.records import report_summary
 
 
@@ -36,7 +36,7 @@ def decode_and_tell(asked: Sequence[Path], output: Path) -> None:
     bundles, several = named_bundles(asked)
     if several:
 
-        def decoded(bundle: Path, folder: Path, progress: Progress) -> list[Row]:
+        def decoded(bundle: Path, folder: Path, progress: ProgressCallback) -> list[Row]:
             progress("decode", 0.0, "")
             found, notes = decode_bundle(bundle, folder)
             progress("done", 1.0, "")
@@ -81,7 +81,7 @@ def reconstruct_and_tell(
     if calibration is not None:
         read_calibration(calibration)
 
-    def reconstructed(bundle: Path, folder: Path, progress: Progress) -> dict[str, Any]:
+    def reconstructed(bundle: Path, folder: Path, progress: ProgressCallback) -> dict[str, Any]:
         from slrig.scan.reconstruct import reconstruct_bundle
 
         cameras = _require_offered(further, bundle)
@@ -166,7 +166,7 @@ def warm() -> None:
     typer.echo(f"{count} kernels are ready, kept {place} ({time.monotonic() - began_s:.0f} s)")
 
 
-def prepare_kernels(display: Progress) -> int:
+def prepare_kernels(display: ProgressCallback) -> int:
     """Compile the kernels of a usual scan that no earlier run has, under progress; return how many there are."""
     keep_kernels()
     display("loading", 0.0, "")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slrig.cli.options import AsJson, Service, by_beginning, given, grouped
+from slrig.cli.options import AsJson, ServiceOptions, by_beginning, given, grouped
 from slrig.errors import ScheduleError, ScheduleNotFoundError
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def add(
         bool, typer.Option("--catch-up/--no-catch-up", help="After a long pause, run once for what was missed.")
     ] = True,
     paused: Annotated[bool, typer.Option("--paused", help="Put it on record without starting it.")] = False,
-    service: Service,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """Have a service do something by the clock.
@@ -65,7 +65,7 @@ def add(
 
 @app.command(name="list")
 @grouped
-def list_schedules(service: Service, as_json: AsJson = False) -> None:
+def list_schedules(service: ServiceOptions, as_json: AsJson = False) -> None:
     """List schedules with the time that each is due next."""
     from slrig.cli.display import print_json, print_table
 
@@ -96,7 +96,7 @@ def runs(
     *,
     schedule: ScheduleId,
     limit: Annotated[int, typer.Option(min=1, max=200, help="How many, from the newest.")] = 20,
-    service: Service,
+    service: ServiceOptions,
     as_json: AsJson = False,
 ) -> None:
     """List what became of a schedule's due times, from new to old."""
@@ -124,7 +124,7 @@ def runs(
 
 @app.command()
 @grouped
-def pause(schedule: ScheduleId, service: Service) -> None:
+def pause(schedule: ScheduleId, service: ServiceOptions) -> None:
     """Let nothing become due until the schedule is resumed."""
     with service.client() as client:
         client.post(f"{_path(client, schedule)}/pause", None)
@@ -133,7 +133,7 @@ def pause(schedule: ScheduleId, service: Service) -> None:
 
 @app.command()
 @grouped
-def resume(schedule: ScheduleId, service: Service) -> None:
+def resume(schedule: ScheduleId, service: ServiceOptions) -> None:
     """Go on after a pause."""
     with service.client() as client:
         _tell_schedule(client.post(f"{_path(client, schedule)}/resume", None))
@@ -141,7 +141,7 @@ def resume(schedule: ScheduleId, service: Service) -> None:
 
 @app.command()
 @grouped
-def cancel(schedule: ScheduleId, service: Service) -> None:
+def cancel(schedule: ScheduleId, service: ServiceOptions) -> None:
     """Have the run under way end early. The schedule stays as it is."""
     with service.client() as client:
         client.post(f"{_path(client, schedule)}/cancel", None)
@@ -150,7 +150,7 @@ def cancel(schedule: ScheduleId, service: Service) -> None:
 
 @app.command()
 @grouped
-def remove(schedule: ScheduleId, service: Service) -> None:
+def remove(schedule: ScheduleId, service: ServiceOptions) -> None:
     """Forget a schedule and its runs."""
     with service.client() as client:
         client.delete(_path(client, schedule))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slrig.cli.options import BoardOptions, grouped
+from slrig.cli.options import BoardArguments, grouped
 
 if TYPE_CHECKING:
     from slrig.bundle.options import StageRecord
@@ -21,7 +21,7 @@ def axis(
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="Bundles of a board that stood on the stage, one per angle.")
     ],
-    asked: BoardOptions,
+    asked: BoardArguments,
     calibration: Annotated[Path, typer.Option(metavar="FILE", help="The calibration of the rig.")],
     output: Annotated[Path, typer.Option(metavar="FILE", help="The stage's file. One that is there keeps its planes.")],
     angle: Annotated[

@@ -20,7 +20,7 @@ from slrig.errors import CalibrationError
 from slrig.logs import set_up_console_logs
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import Progress, ScanPlan
+from slrig.scan.plan import ProgressCallback, ScanPlan
 from slrig.verify.verification import verify_bundle
 
 _COLOURS = {HealthState.GOOD: "green", HealthState.WATCH: "yellow", HealthState.STALE: "bold red"}
@@ -74,7 +74,7 @@ def tell(verification: Verification, health: Health, console: Console) -> None:
 
 
 def _shot(
-    source: Path, board: Board, calibration_file: Path | None, position: int | None, display: Progress
+    source: Path, board: Board, calibration_file: Path | None, position: int | None, display: ProgressCallback
 ) -> Verification:
     config = read_rig(source)
     given = None if calibration_file is None else _calibration(calibration_file)

@@ -14,16 +14,16 @@ from slrig.client.connection import Connection, Json, given
 from slrig.client.events import Event
 from slrig.client.resources import (
     Acceptance,
-    Calibrations,
+    CalibrationResource,
     IfBusy,
     Models,
-    Presets,
+    PresetResource,
     RigHealth,
     RigState,
     Scans,
     Schedules,
-    Stage,
     System,
+    TurntableResource,
 )
 from slrig.client.results import ProgressCallback, ScanJob, ScanResult
 from slrig.errors import ServiceError
@@ -52,11 +52,11 @@ class Client:
         self.connection = Connection(url, key, pause=pause, transport=transport)
         self.scans = Scans(self.connection)
         self.models = Models(self.connection)
-        self.presets = Presets(self.connection)
+        self.presets = PresetResource(self.connection)
         self.rig = RigState(self.connection)
-        self.calibration = Calibrations(self.connection)
+        self.calibration = CalibrationResource(self.connection)
         self.health = RigHealth(self.connection)
-        self.stage = Stage(self.connection)
+        self.stage = TurntableResource(self.connection)
         self.accept = Acceptance(self.connection)
         self.schedules = Schedules(self.connection)
         self.system = System(self.connection)

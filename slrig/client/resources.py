@@ -18,7 +18,7 @@ Poses: TypeAlias = Literal["turntable", "markers", "unknown"] | Sequence[Sequenc
 """How the poses of a model's scans are found; or the poses themselves, 4 x 4 each, in mm."""
 
 
-class ScanOptions(TypedDict, total=False):
+class ScanFields(TypedDict, total=False):
     """The options of a scan, as `Client.scan` explains them."""
 
     label: str | None
@@ -40,7 +40,7 @@ class ScanOptions(TypedDict, total=False):
 class Scans(Resource):
     """Scans on record."""
 
-    def start(self, **options: Unpack[ScanOptions]) -> Json:
+    def start(self, **options: Unpack[ScanFields]) -> Json:
         """Start a scan, and return its record; `Client.start_scan` returns a job to follow."""
         return self._connection.json("POST", "/scan", once=True, json=given(**options))
 
@@ -210,7 +210,7 @@ class Models(Resource):
         return model
 
 
-class Presets(Resource):
+class PresetResource(Resource):
     """Options of scans by name."""
 
     def list(self) -> Json:
@@ -255,7 +255,7 @@ class RigState(Resource):
         return self._connection.pictures(path("/preview/{}", camera), params=given(light=light, marks=marks))
 
 
-class Calibrations(Resource):
+class CalibrationResource(Resource):
     """Calibrations: a session of poses, a solve, and its use."""
 
     def open(
@@ -423,7 +423,7 @@ class RigHealth(Resource):
         return self._connection.follow(path("/rig/verification/{}/events", verification_id))
 
 
-class Stage(Resource):
+class TurntableResource(Resource):
     """The turntable of a rig: its axis, and the planes by which models are cut."""
 
     def get(self) -> Json:

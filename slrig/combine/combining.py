@@ -39,7 +39,7 @@ from slrig.multiview import (
 )
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.mesh_formats import encode_mesh_glb
-from slrig.scan.plan import Progress
+from slrig.scan.plan import ProgressCallback
 from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
 
 _SURFACE_POINTS = 500  # of a view, at which it is told how well markers put it
@@ -56,7 +56,7 @@ def combine_into(
     voxel_mm: float | None = None,
     planes: Sequence[StagePlane] = (),
     notes: Sequence[str] = (),
-    progress: Progress,
+    progress: ProgressCallback,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> None:
     """Make one model of the meshes of several views, in the frame of the first, and write its files into a folder that

@@ -36,7 +36,7 @@ from slrig.jobs.rig_jobs import Outcome, Parts, RigJobs
 from slrig.jobs.store import JobStore
 from slrig.model import StagePlane
 from slrig.scan.artefacts import MESH
-from slrig.scan.plan import Progress
+from slrig.scan.plan import ProgressCallback
 
 _FILES_OF_MESHES = 3
 """A model's files over the meshes of its scans: placed.ply is as large as all of them, model.ply and model.glb less."""
@@ -62,7 +62,7 @@ class CombineInto(Protocol):
         voxel_mm: float | None,
         planes: Sequence[StagePlane],
         notes: Sequence[str],
-        progress: Progress,
+        progress: ProgressCallback,
         cancelled: Callable[[], bool],
     ) -> None:
         """Write the files of a model."""

@@ -15,7 +15,7 @@ import dask
 import structlog
 from distributed import Client, Future, Security
 
-from slrig.compute.host import Answer, Order, compute, resource
+from slrig.compute.host import PoolRequest, PoolResponse, compute, resource
 from slrig.compute.store import PoolError
 from slrig.jobs.versions import versions
 
@@ -64,7 +64,7 @@ class Cluster(Protocol):
         """Wait at most so long until orders can be given; return whether they can."""
         ...
 
-    def submit(self, order: Order, told: Told) -> concurrent.futures.Future[Answer]:
+    def submit(self, order: PoolRequest, told: Told) -> concurrent.futures.Future[PoolResponse]:
         """Give an order, which ends where the future is cancelled before it has begun. Its exception is a PoolError, or
         CancelledError where the pool is gone. Raises PoolError.
         """
@@ -104,7 +104,7 @@ class DaskCluster:
         """See `Cluster`."""
         return self._usable.wait(timeout_s)
 
-    def submit(self, order: Order, told: Told) -> concurrent.futures.Future[Answer]:
+    def submit(self, order: PoolRequest, told: Told) -> concurrent.futures.Future[PoolResponse]:
         """See `Cluster`."""
         if self._loop is None or not self._usable.is_set():
             raise PoolError(self.fault)
@@ -191,15 +191,15 @@ class DaskCluster:
             return f"no worker of {self._address} has this machine's versions of slrig and its libraries"
         return None
 
-    async def _answer(self, order: Order) -> Answer:
-        future: Future[Answer] | None = None
+    async def _answer(self, order: PoolRequest) -> PoolResponse:
+        future: Future[PoolResponse] | None = None
         try:
             if self._client is None:
                 raise PoolError(self.fault)  # noqa: TRY301 - lost since it was asked
             # By a key of its own: two orders of one bundle are two. dask gives it to another machine when one is lost;
             # a scheduler that is lost knows nothing of it any more.
             future = self._client.submit(compute, order, key=order.job, pure=False, resources={self._resource: 1})
-            answer: Answer = await future
+            answer: PoolResponse = await future
             return answer  # noqa: TRY300
         except asyncio.CancelledError:
             raise

@@ -39,7 +39,7 @@ _log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class PoolRequest:
     """A task for a pool. bundle : its key in the store. task : `given` lacks the two folders, see `Task.movable`.
     topic : of dask's events, where its progress is told. versions : of the rig; others must not compute it.
     """
@@ -52,7 +52,7 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class PoolResponse:
     """What came of an order: the task's result, and the hash of each file in the store by its name; or a fault."""
 
     result: Any = None
@@ -80,7 +80,7 @@ class Host(WorkerPlugin):
         """Drop what is computed: the pool is left, and dask gives it to another one. See `WorkerPlugin`."""
         self._left = True
 
-    def done(self, order: Order, tell: Tell) -> Answer:
+    def done(self, order: PoolRequest, tell: Tell) -> PoolResponse:
         """Do an order. tell : takes progress, and signs of life. Whatever goes wrong is in the answer."""
         beaten_s, looked_s, stop = self._clock(), self._clock(), False
 
@@ -107,13 +107,13 @@ class Host(WorkerPlugin):
             return self._computed(order, tell, beat, stopped)
         except (PoolError, WorkerLostError) as error:
             # A process that is lost, as where memory runs out, is the machine's fault rather than the task's.
-            return Answer(fault=JobFailure(POOL_FAULT, str(error)))
+            return PoolResponse(fault=JobFailure(POOL_FAULT, str(error)))
         except BaseException as error:  # noqa: BLE001 - a panic of obstore, too: the rig is told, and computes by itself
             if not isinstance(error, ScanCancelledError):
                 _log.warning("an order came to nothing", job=order.job, cause=repr(error))
-            return Answer(fault=job_failure(error))
+            return PoolResponse(fault=job_failure(error))
 
-    def _computed(self, order: Order, tell: Tell, beat: Callable[[], None], stopped: Callable[[], bool]) -> Answer:
+    def _computed(self, order: PoolRequest, tell: Tell, beat: Callable[[], None], stopped: Callable[[], bool]) -> PoolResponse:
         # Of the process that computes: after an update of the files beneath, it is newer than this one.
         mine = self._worker.run(_VERSIONS, cancelled=stopped)
         if mine != order.versions:
@@ -146,14 +146,14 @@ class Host(WorkerPlugin):
                 for path in result.iterdir():
                     if path.name not in files:
                         made(path.name)
-                return Answer(answer, {name: files[name].result() for name in sorted(files)})
+                return PoolResponse(answer, {name: files[name].result() for name in sorted(files)})
             finally:
                 line.shutdown(cancel_futures=True)
 
 
-def compute(order: Order) -> Answer:
+def compute(order: PoolRequest) -> PoolResponse:
     """Do an order on the machine that dask chose: what a rig submits."""
     worker = get_worker()
     host: Any = worker.plugins[Host.name]
-    answer: Answer = host.done(order, lambda told: worker.log_event(order.topic, dict(told)))
+    answer: PoolResponse = host.done(order, lambda told: worker.log_event(order.topic, dict(told)))
     return answer

@@ -20,7 +20,7 @@ from uuid import uuid4
 import structlog
 
 from slrig.compute.cluster import Cluster, DaskCluster
-from slrig.compute.host import POOL_FAULT, Answer, Order
+from slrig.compute.host import POOL_FAULT, PoolRequest, PoolResponse
 from slrig.compute.security import pool_security
 from slrig.compute.store import PoolError, PoolStore, open_store
 from slrig.config import ServiceSettings
@@ -145,7 +145,7 @@ class PooledWorker:
         self, task: Task, key: str, result: Path, progress: Told, cancelled: Callable[[], bool], made: Made
     ) -> Any:
         job = uuid4().hex
-        order = Order(job, key, replace(task, given=task.given[2:]), self._cluster.topic, versions())
+        order = PoolRequest(job, key, replace(task, given=task.given[2:]), self._cluster.topic, versions())
         told: SimpleQueue[Mapping[str, Any]] = SimpleQueue()
         coming, answer = self._cluster.submit(order, told.put), None
         try:
@@ -163,11 +163,11 @@ class PooledWorker:
     def _answer(
         self,
         task: Task,
-        coming: Future[Answer],
+        coming: Future[PoolResponse],
         told: SimpleQueue[Mapping[str, Any]],
         progress: Told,
         cancelled: Callable[[], bool],
-    ) -> Answer:
+    ) -> PoolResponse:
         heard_s, begun = self._clock(), False
         while True:
             answer = None

@@ -97,7 +97,7 @@ def back_up(root: Path, to: Path, *, previous: Path | None = None) -> Manifest:
             data = staged / DATA
             data.mkdir(mode=0o700)
             scans = _copy_records(root / DATABASE, data / DATABASE)
-            copy = _Copy(root, data, earlier)
+            copy = _BackupCopy(root, data, earlier)
             copy.everything(scans)
             _forget(data / DATABASE, copy.gone)
             with (data / DATABASE).open("rb") as file:
@@ -188,7 +188,7 @@ class _GoneError(Exception):
     """A folder was removed while it was being copied."""
 
 
-class _Copy:
+class _BackupCopy:
     """Copies folders of files that a service goes on using. files, folders : what was copied, by path below the root.
 
     left_out : what was not, with the reason. gone : the paths of folders that were removed meanwhile.

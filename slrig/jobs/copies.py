@@ -19,7 +19,7 @@ from slrig.jobs.tables import CopyRow, JobRow, record_of
 
 
 @dataclass(frozen=True, slots=True)
-class Copy:
+class CatalogueCopy:
     """What a catalogue is told of a job that ended. number : the order in which jobs ended. job : JSON values."""
 
     number: int
@@ -39,13 +39,13 @@ class Copies:
         session.add(CopyRow(at=stamp(self._clock()), job_id=str(job.id), body=told(job)))
         event.listen(session, "after_commit", lambda _: self.news.set(), once=True)
 
-    def oldest(self, limit: int) -> Sequence[Copy]:
+    def oldest(self, limit: int) -> Sequence[CatalogueCopy]:
         """Those to copy next."""
         with self._database.reading() as session:
             rows = session.scalars(select(CopyRow).order_by(CopyRow.number).limit(limit))
-            return [Copy(row.number, row.body) for row in rows]
+            return [CatalogueCopy(row.number, row.body) for row in rows]
 
-    def taken(self, copies: Sequence[Copy]) -> None:
+    def taken(self, copies: Sequence[CatalogueCopy]) -> None:
         """Forget what the catalogue has."""
         with self._database.changing() as session:
             session.execute(delete(CopyRow).where(CopyRow.number.in_([each.number for each in copies])))

@@ -27,7 +27,7 @@ from slrig import logs
 from slrig.errors import ScanCancelledError, WorkerBusyError, WorkerLostError
 from slrig.failure import errors_by_code, interruption_error
 from slrig.jobs.frame_feed import FrameFeed
-from slrig.jobs.worker_process import Failed, Fed, Preparing, Ready, Run, Task, Unloadable, received, sent, serve
+from slrig.jobs.worker_process import Failed, Fed, Preparing, Ready, RunTask, Task, Unloadable, received, sent, serve
 from slrig.jobs.worker_wait import POLL_S, PREPARING, JobWait, Made, Told
 from slrig.model import Region
 
@@ -227,7 +227,7 @@ class Worker:
                 if fed and feed is not None:
                     fed = job.settled(feed)
                 with self._sending:
-                    begun = sent(pipe, Run(number, task, fed, structlog.contextvars.get_contextvars()))
+                    begun = sent(pipe, RunTask(number, task, fed, structlog.contextvars.get_contextvars()))
                 if not begun:
                     # What it last said may lie in the pipe still: why it could not be loaded.
                     self._noted(received(pipe))

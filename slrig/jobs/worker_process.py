@@ -53,7 +53,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class RunTask:
     """Parent to child: do this, with the frames that were sent under the same number if `fed`.
 
     named : what the lines of the log carry meanwhile, as the job's id.
@@ -176,7 +176,7 @@ def serve(
         raise SystemExit(1) from None
     sent(pipe, Ready())
     while (message := received(pipe)) is not None:
-        if isinstance(message, Run):
+        if isinstance(message, RunTask):
             live = fed.taken(message.number) if message.fed else None
             try:
                 with structlog.contextvars.bound_contextvars(**message.named):
@@ -202,7 +202,7 @@ def _be_ended_first() -> None:
         Path("/proc/self/oom_score_adj").write_text("500")
 
 
-def _answer(pipe: Connection, stops: Connection, run: Run, live: Any) -> Done | Failed:
+def _answer(pipe: Connection, stops: Connection, run: RunTask, live: Any) -> Done | Failed:
     stopped = False
     # A task may tell of its progress from several threads.
     telling = threading.Lock()

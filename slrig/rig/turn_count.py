@@ -25,7 +25,7 @@ FROM_THE_START = "start"
 _log = structlog.get_logger(__name__)
 
 
-class _Standing(BaseModel):
+class _LastPosition(BaseModel):
     """Where a table was left. at_deg : None while it turned. own_deg : by its own count."""
 
     count: str
@@ -93,26 +93,26 @@ class CountedTurntable:
             self._table.turn(angle_deg)
             return
         own_deg = angle_deg - self._offset_deg
-        self._keep(_Standing(count=self.count))
+        self._keep(_LastPosition(count=self.count))
         self._table.turn(own_deg)
         # If that is refused, the next opening counts anew.
         with suppress(StorageError):
-            self._keep(_Standing(count=self.count, at_deg=angle_deg, own_deg=opened_deg + own_deg))
+            self._keep(_LastPosition(count=self.count, at_deg=angle_deg, own_deg=opened_deg + own_deg))
 
     def close(self) -> None:
         """See `Positioner`."""
         self._table.close()
 
-    def _keep(self, standing: _Standing) -> None:
+    def _keep(self, standing: _LastPosition) -> None:
         with storage_errors(self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
         write_file(self._path, standing.model_dump_json().encode())
 
 
-def _left(path: Path) -> _Standing | None:
+def _left(path: Path) -> _LastPosition | None:
     """Where the table was left, None where nobody knows. What cannot be read is not known either."""
     try:
-        return _Standing.model_validate_json(path.read_bytes())
+        return _LastPosition.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         return None
     except (OSError, ValidationError) as error:

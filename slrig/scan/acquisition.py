@@ -28,7 +28,7 @@ from slrig.jobs.frame_feed import FrameSink
 from slrig.model import CaptureHeader, Shot, Truth
 from slrig.rig.turn_count import CountedTurntable
 from slrig.scan.bracketing import Exposing
-from slrig.scan.plan import Progress, ScanPlan
+from slrig.scan.plan import ProgressCallback, ScanPlan
 from slrig.scan.plan_check import in_colour, no_turntable, pattern_sequence
 
 MOST_WAITING_BYTES = 256 * 2**20
@@ -145,7 +145,7 @@ def capture_frames(
     plan: ScanPlan,
     folder: Path,
     *,
-    progress: Progress,
+    progress: ProgressCallback,
     cancelled: Callable[[], bool],
     frames: FrameSink | None = None,
 ) -> Recording:
@@ -217,7 +217,7 @@ def capture_frames(
         return Recording(folder, writing.pop_all(), told, rig.truth(), stage)
 
 
-def _turned(rig: Rig, plan: ScanPlan, progress: Progress) -> StageAngle | None:
+def _turned(rig: Rig, plan: ScanPlan, progress: ProgressCallback) -> StageAngle | None:
     """Where the stage stands when the object was turned as the plan says; None where it says nothing of a stage."""
     if plan.turn_deg is None:
         return None

@@ -32,7 +32,7 @@ from slrig.model import Black, PatternSequence, Pixels, Shot, White
 
 
 @dataclass(slots=True)
-class _Run:
+class _BracketRun:
     """One sequence at one exposure: what of it stands, how often each frame was refused, white and black as last seen,
     and samples for the comparison with other exposures.
     """
@@ -78,7 +78,7 @@ class Exposing:
         self._samplers = (
             {name: Sampler.from_size(form.size) for name, form in self._formats.items()} if self._bracket else {}
         )
-        self._runs: list[_Run] = []
+        self._runs: list[_BracketRun] = []
         self._compared: dict[str, ExposureSamples] = {}
         self._refused: list[RefusedFrame] = []
         self._done: set[tuple[float | None, int, str]] = set()
@@ -136,7 +136,7 @@ class Exposing:
         self._skip(exposure_s, set(self._formats) - set(cameras))
         while taking:
             formats = {name: self._formats[name] for name in taking}
-            run = _Run(exposure_s, Evidence(self._sequence.patterns, formats))
+            run = _BracketRun(exposure_s, Evidence(self._sequence.patterns, formats))
             try:
                 yield from self._run(run, taking, since_ns)
             except ScanEvidenceError as error:
@@ -153,7 +153,7 @@ class Exposing:
             self._runs.append(run)
             return
 
-    def _run(self, run: _Run, taking: Sequence[str], since_ns: int | None) -> Iterator[Shot]:
+    def _run(self, run: _BracketRun, taking: Sequence[str], since_ns: int | None) -> Iterator[Shot]:
         shots = capture(
             self._set_to(run.exposure_s, taking),
             self._sequence,
@@ -190,14 +190,14 @@ class Exposing:
             self._begun_s = shot.time_s
         return replace(shot, time_s=round(shot.time_s - self._begun_s, 9))
 
-    def _see(self, run: _Run, shot: Shot) -> None:
+    def _see(self, run: _BracketRun, shot: Shot) -> None:
         if self._bracket:
             if isinstance(self._sequence.patterns[shot.pattern], White | Black):
                 run.ends[shot.pattern, shot.camera] = shot.image
             samples = self._samplers[shot.camera].take(shot.image)
             run.samples.setdefault(shot.camera, {})[shot.pattern] = samples
 
-    def _take_refusal(self, run: _Run, refused: RefusedFrame) -> None:
+    def _take_refusal(self, run: _BracketRun, refused: RefusedFrame) -> None:
         if self._bracket:
             shot = None if refused.shot is None else self._timed(refused.shot)
             if shot is not None:
@@ -211,7 +211,7 @@ class Exposing:
         self._refused.append(refused)
         self._tell(refused)
 
-    def _unfit(self, run: _Run, taking: Sequence[str]) -> dict[str, ExposureVerdict]:
+    def _unfit(self, run: _BracketRun, taking: Sequence[str]) -> dict[str, ExposureVerdict]:
         """The cameras to which this exposure is of no use, and why."""
         if not self._bracket:
             return {}
@@ -226,11 +226,11 @@ class Exposing:
                 found[name] = told
         return found
 
-    def _end(self, run: _Run, name: str, kind: White | Black) -> Pixels | None:
+    def _end(self, run: _BracketRun, name: str, kind: White | Black) -> Pixels | None:
         index = self._sequence.patterns.index(kind) if kind in self._sequence.patterns else -1
         return run.ends.get((index, name))
 
-    def _leave_out(self, run: _Run, unfit: dict[str, ExposureVerdict]) -> None:
+    def _leave_out(self, run: _BracketRun, unfit: dict[str, ExposureVerdict]) -> None:
         """Take back what there is of a sequence, and say why."""
         again = f"at {run.exposure_s:g} s, the sequence was begun again without camera {', '.join(unfit)}"
         for name, told in unfit.items():
@@ -248,7 +248,7 @@ class Exposing:
     def _skip(self, exposure_s: float | None, cameras: set[str]) -> None:
         self._done.update((exposure_s, index, name) for name in cameras for index in range(len(self._sequence)))
 
-    def _compare(self, run: _Run, taking: Sequence[str]) -> None:
+    def _compare(self, run: _BracketRun, taking: Sequence[str]) -> None:
         """Raise ScanEvidenceError if something moved since the exposure before."""
         if not self._bracket:
             return
@@ -263,5 +263,5 @@ class Exposing:
                     raise ScanEvidenceError(message)
             self._compared[name] = exposed
 
-    def _placed(self, error: ScanEvidenceError, run: _Run) -> ScanEvidenceError:
+    def _placed(self, error: ScanEvidenceError, run: _BracketRun) -> ScanEvidenceError:
         return ScanEvidenceError(f"at an exposure of {run.exposure_s:g} s, {error}") if self._bracket else error

@@ -24,7 +24,7 @@ from slrig.scan.artefacts import MESH, REPORT, decode_mesh_ply
 from slrig.scan.cloud_formats import encode_depth_tiff, encode_npz, encode_pcd
 from slrig.scan.offered import causes_picture
 from slrig.scan.organised import OrganisedCloud, organised
-from slrig.scan.plan import Progress
+from slrig.scan.plan import ProgressCallback
 
 STAGE = "organise points"
 
@@ -43,7 +43,7 @@ def cloud_file(
     *,
     bundle: Path | None = None,
     calibration: Path | None = None,
-    progress: Progress = lambda *_: None,
+    progress: ProgressCallback = lambda *_: None,
 ) -> bytes:
     """Make a file of a finished scan. form : of `slrig.scan.offered.requested_forms`. camera : None for a file of all.
     bundle : None for that of the scan. calibration : the one that the mesh was made with, None for that in the bundle.

@@ -23,7 +23,7 @@ _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _POINTS, _TRIANGLES = 0, 4
 
 
-class Part(NamedTuple):
+class BufferPart(NamedTuple):
     """One attribute of the vertices, or the corners of the triangles (`INDICES`). more : of the accessor.
 
     array : contiguous, little endian, a row for each element; longer than `kind` says where that is no multiple of 4
@@ -36,7 +36,7 @@ class Part(NamedTuple):
     more: Mapping[str, object] = {}
 
 
-def encode_glb(parts: Sequence[Part], node: Mapping[str, object], *, extensions: Sequence[str] = ()) -> bytes:
+def encode_glb(parts: Sequence[BufferPart], node: Mapping[str, object], *, extensions: Sequence[str] = ()) -> bytes:
     """A GLB: of points where there are no indices. node : without its mesh; extensions : that readers must know."""
     length = sum(part.array.nbytes for part in parts)
     tree = json.dumps(_tree(parts, node, extensions, length), separators=(",", ":")).encode()
@@ -51,7 +51,7 @@ def encode_glb(parts: Sequence[Part], node: Mapping[str, object], *, extensions:
 
 
 def _tree(
-    parts: Sequence[Part], node: Mapping[str, object], extensions: Sequence[str], length: int
+    parts: Sequence[BufferPart], node: Mapping[str, object], extensions: Sequence[str], length: int
 ) -> dict[str, object]:
     tree: dict[str, object] = {
         "asset": {"version": "2.0", "generator": "slrig"},

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Mesh, srgb_to_linear
-from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, Part, encode_glb
+from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, BufferPart, encode_glb
 
 _MOST_ROWS = 2**15  # rows that are worked on together: they stay in the processor's cache
 
@@ -35,12 +35,12 @@ def encode_mesh_glb(mesh: Mesh) -> bytes:
     parts = []
     if len(positions):
         ends = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-        parts.append(Part("POSITION", positions, "VEC3", ends))
+        parts.append(BufferPart("POSITION", positions, "VEC3", ends))
         if np.isfinite(mesh.normals).all():
-            parts.append(Part("NORMAL", np.ascontiguousarray(mesh.normals, dtype="<f4"), "VEC3"))
-        parts.append(Part("COLOR_0", opaque, "VEC4", {"normalized": True}))
+            parts.append(BufferPart("NORMAL", np.ascontiguousarray(mesh.normals, dtype="<f4"), "VEC3"))
+        parts.append(BufferPart("COLOR_0", opaque, "VEC4", {"normalized": True}))
     if len(mesh.faces):
-        parts.append(Part(INDICES, np.ascontiguousarray(mesh.faces, dtype="<u4").reshape(-1), "SCALAR"))
+        parts.append(BufferPart(INDICES, np.ascontiguousarray(mesh.faces, dtype="<u4").reshape(-1), "SCALAR"))
     node = {"name": "scan", "rotation": [*HALF_A_TURN_ABOUT_X], "scale": [METRES_PER_MM] * 3}
     return encode_glb(parts, node)
 

@@ -17,7 +17,7 @@ MOST_TURN_DEG = 3600.0
 """Ten turns either way: more is a slip, and winds up the cables of what stands on a stage."""
 
 
-class Progress(Protocol):
+class ProgressCallback(Protocol):
     """Told how far a scan is: the stage, the fraction done (0 to 1) of the whole call, and a few words."""
 
     def __call__(self, stage: str, fraction: float, detail: str, /) -> None:

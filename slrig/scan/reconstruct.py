@@ -41,7 +41,7 @@ from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.offered import causes_picture, rejected_picture
 from slrig.scan.pictures import described_causes, encode_png, preview, rejection_picture, rejection_size
-from slrig.scan.plan import Progress, ReconstructionPlan
+from slrig.scan.plan import ProgressCallback, ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
     Stopwatch,
@@ -87,7 +87,7 @@ def reconstruct_bundle(
     *,
     plan: ReconstructionPlan,
     calibration: Path | None = None,
-    progress: Progress,
+    progress: ProgressCallback,
     cancelled: Callable[[], bool],
     live: LiveScan | None = None,
 ) -> dict[str, object]:
@@ -113,7 +113,7 @@ def reconstruct_into(
     *,
     plan: ReconstructionPlan,
     calibration: Path | None = None,
-    progress: Progress,
+    progress: ProgressCallback,
     cancelled: Callable[[], bool],
     made: Callable[[str], None] = lambda _: None,
     where: Mapping[str, str] | None = None,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Mesh, srgb_to_linear
-from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, Part, encode_glb
+from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, BufferPart, encode_glb
 
 SIGMA_STEP_MM = 1e-4
 COARSE_TRIANGLES = 30_000
@@ -48,23 +48,23 @@ def encode_view_glb(mesh: Mesh) -> bytes:
     positions = np.zeros((count, 4), dtype="<u2")
     positions[:, :3] = np.rint((mesh.vertices_mm - origin) / step_mm)
     ends = {"min": positions[:, :3].min(axis=0).tolist(), "max": positions[:, :3].max(axis=0).tolist()}
-    parts = [Part("POSITION", positions, "VEC3", ends)]
+    parts = [BufferPart("POSITION", positions, "VEC3", ends)]
     if np.isfinite(mesh.normals).all():
         normals = np.zeros((count, 4), dtype=np.int8)
         normals[:, :3] = np.rint(mesh.normals * np.float32(127))
-        parts.append(Part("NORMAL", normals, "VEC3", {"normalized": True}))
+        parts.append(BufferPart("NORMAL", normals, "VEC3", {"normalized": True}))
     colours = np.full((count, 4), _MOST, dtype="<u2")
     colours[:, :3] = srgb_to_linear(mesh.colour)
     sigma, stripe = np.zeros((count, 2), dtype="<u2"), np.zeros((count, 2), dtype="<u2")
     sigma[:, 0] = np.fmin(np.rint(mesh.sigma_mm / np.float32(SIGMA_STEP_MM)), _MOST)
     # A negative number, read without its sign, is a great one.
     stripe[:, 0] = np.minimum(mesh.stripe.astype(np.uint32), _MOST)
-    parts.append(Part("COLOR_0", colours, "VEC4", {"normalized": True}))
-    parts += [Part("_SIGMA", sigma, "SCALAR"), Part("_STRIPE", stripe, "SCALAR")]
+    parts.append(BufferPart("COLOR_0", colours, "VEC4", {"normalized": True}))
+    parts += [BufferPart("_SIGMA", sigma, "SCALAR"), BufferPart("_STRIPE", stripe, "SCALAR")]
     if len(mesh.faces):
         # The greatest value of the type names no vertex (section 3.7.2.1).
         kind = "<u2" if count <= _MOST else "<u4"
-        parts.append(Part(INDICES, np.ascontiguousarray(mesh.faces, dtype=kind).reshape(-1), "SCALAR"))
+        parts.append(BufferPart(INDICES, np.ascontiguousarray(mesh.faces, dtype=kind).reshape(-1), "SCALAR"))
     return encode_glb(parts, node, extensions=[_EXTENSION])
 
 

@@ -10,7 +10,7 @@ from slrig.calibration.health import HealthState
 from slrig.config import NoticeKind
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Outbox
-from slrig.schedule.records import Run, RunState, Schedule
+from slrig.schedule.records import RunState, Schedule, ScheduledRun
 from slrig.verify.store import HealthStore, VerificationRecord
 
 TOLD: dict[RunState, NoticeKind] = {
@@ -19,7 +19,7 @@ TOLD: dict[RunState, NoticeKind] = {
 """What becomes of a run that a person has to know of."""
 
 
-def tell_run(outbox: Outbox, session: Session, schedule: Schedule, run: Run) -> None:
+def tell_run(outbox: Outbox, session: Session, schedule: Schedule, run: ScheduledRun) -> None:
     """As `slrig.schedule.store.Notice`: tell of a run that a person has to know of."""
     if run.state not in TOLD:
         return

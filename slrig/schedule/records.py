@@ -114,7 +114,7 @@ class TaskKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class ScheduleSpec:
     """What a person asks for: when, what, and how late it may be.
 
     grace_s : how long after its time a run may still start, a busy rig's included. retry_s : a run that finds the rig
@@ -153,7 +153,7 @@ class Schedule:
     """An order on record. `next_due` is the time that no run has been recorded for yet."""
 
     id: UUID
-    order: Order
+    order: ScheduleSpec
     created_at: datetime
     next_due: datetime
 
@@ -182,7 +182,7 @@ class RunState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class ScheduledRun:
     """One due time of one schedule, and what became of it.
 
     count : how many due times the row stands for, 1 but for missed and coalesced ones. deadline : the latest start.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
-from slrig.schedule.records import Order, RunState
+from slrig.schedule.records import RunState, ScheduleSpec
 
 MOST_COUNTED = 10_000
 """Due times that a pause may leave behind are counted up to here."""
@@ -30,7 +30,7 @@ class Due:
     next_due: datetime
 
 
-def due_runs(order: Order, next_due: datetime, now: datetime) -> Due:
+def due_runs(order: ScheduleSpec, next_due: datetime, now: datetime) -> Due:
     """What became due since, and what is to be done about it.
 
     One due time within its grace runs. After a pause the newest is the one that counts: it runs if it is still within
@@ -71,5 +71,5 @@ def _older(first: datetime, newest: datetime, count: int, *, coalesced: bool) ->
     return DueRun(first, RunState.MISSED, f"{times} passed unattended", count, newest)
 
 
-def _clock(order: Order, moment: datetime) -> str:
+def _clock(order: ScheduleSpec, moment: datetime) -> str:
     return order.cron.local(moment).isoformat(timespec="minutes")

@@ -12,7 +12,7 @@ from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.desk import AcceptanceDesk
 from slrig.accept.records import AcceptanceState
 from slrig.accept.verdicts import verdicts
-from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.calibrating import CalibrationSessions
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import SessionState
 from slrig.calibration.board import Board
@@ -74,7 +74,7 @@ class VerificationTask:
 
     options = VerificationOptions
 
-    def __init__(self, queue: JobQueue, calibrations: Calibrations, desk: VerificationDesk) -> None:
+    def __init__(self, queue: JobQueue, calibrations: CalibrationSessions, desk: VerificationDesk) -> None:
         self._queue = queue
         self._calibrations = calibrations
         self._desk = desk
@@ -122,7 +122,7 @@ class CalibrationTask:
 
     options = CalibrationOptions
 
-    def __init__(self, queue: JobQueue, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
+    def __init__(self, queue: JobQueue, calibrations: CalibrationSessions, tidy: Callable[[], object]) -> None:
         self._queue = queue
         self._calibrations = calibrations
         self._tidy = tidy

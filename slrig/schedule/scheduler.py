@@ -20,7 +20,7 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.jobs.records import Clock, acting_as, utc_now
-from slrig.schedule.records import Run, RunState, Schedule
+from slrig.schedule.records import RunState, Schedule, ScheduledRun
 from slrig.schedule.store import ScheduleStore
 
 LOOK_S = 10.0
@@ -32,7 +32,7 @@ _LEAST_WAIT_S = 0.05
 _log = structlog.get_logger(__name__)
 
 
-Work = Callable[[Schedule, Run, Callable[[], bool]], Mapping[str, Any]]
+Work = Callable[[Schedule, ScheduledRun, Callable[[], bool]], Mapping[str, Any]]
 """Does what a schedule asks for, on a thread of the scheduler's, until the call that it is given says that it is
 cancelled. Returns what there is to tell.
 
@@ -117,7 +117,7 @@ class Scheduler:
         look = now + timedelta(seconds=LOOK_S)
         return min(store.next_moment() or look, look)
 
-    def _begin(self, run: Run) -> None:
+    def _begin(self, run: ScheduledRun) -> None:
         schedule = self._store.get(run.schedule)
         self._idle.clear()
 
@@ -134,7 +134,7 @@ class Scheduler:
 
         self._execute(do)
 
-    def _end(self, schedule: Schedule, run: Run) -> None:
+    def _end(self, schedule: Schedule, run: ScheduledRun) -> None:
         state, reason, result = RunState.FAILED, None, None
         cut_off = False
         try:
@@ -172,7 +172,7 @@ class Scheduler:
                 self._wanted.wait(min(max(wait_s, _LEAST_WAIT_S), LOOK_S))
 
 
-def _log_runs(runs: Iterable[Run]) -> None:
+def _log_runs(runs: Iterable[ScheduledRun]) -> None:
     for run in runs:
         log = _log.info if run.state in {RunState.SUCCEEDED, RunState.COALESCED} else _log.warning
         log("scheduled run", schedule=str(run.schedule), due=run.due.isoformat(), state=run.state, cause=run.reason)

@@ -20,7 +20,7 @@ from slrig.errors import ScanStateError, ScheduleNotFoundError
 from slrig.jobs.database import Database
 from slrig.jobs.records import stamp
 from slrig.jobs.tables import RunRow, ScheduleRow
-from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from slrig.schedule.recurrence import DueRun, due_runs
 
 LIFE_S = 60.0
@@ -32,10 +32,10 @@ _PENDING = tuple(str(state) for state in RunState if not state.final)
 _AS_ORDERED = ("task", "options", "label", "grace_s", "retry_s", "catch_up", "enabled")
 """The columns that are as an order's attributes of the same name."""
 
-_run_adapter = TypeAdapter(Run)
+_run_adapter = TypeAdapter(ScheduledRun)
 
 
-Notice = Callable[[Session, Schedule, Run], None]
+Notice = Callable[[Session, Schedule, ScheduledRun], None]
 """Told of every run that came to an end, or never began, in the transaction that records it."""
 
 
@@ -47,7 +47,7 @@ class ScheduleStore:
         self._notice = notice
         self._owner = str(uuid4())
 
-    def create(self, order: Order, now: datetime) -> Schedule:
+    def create(self, order: ScheduleSpec, now: datetime) -> Schedule:
         """Put a new schedule on record. It is due from now on."""
         row = ScheduleRow(
             id=str(uuid4()),
@@ -87,7 +87,7 @@ class ScheduleStore:
         with self.database.changing() as session:
             session.delete(_found(session, schedule_id))
 
-    def runs(self, schedule_id: UUID, *, before: int | None = None, limit: int = 50) -> Sequence[Run]:
+    def runs(self, schedule_id: UUID, *, before: int | None = None, limit: int = 50) -> Sequence[ScheduledRun]:
         """Up to `limit` runs of a schedule, newest first, whose number is below `before`."""
         with self.database.reading() as session:
             _found(session, schedule_id)
@@ -106,7 +106,7 @@ class ScheduleStore:
         with self.database.reading() as session:
             return {(TaskKind(task), RunState(state)): int(count) for task, state, count in session.execute(query)}
 
-    def record_due(self, now: datetime) -> Sequence[Run]:
+    def record_due(self, now: datetime) -> Sequence[ScheduledRun]:
         """Record what has become due. Returns the rows made."""
         made: list[RunRow] = []
         with self.database.changing() as session:
@@ -124,7 +124,7 @@ class ScheduleStore:
             session.flush()
             return [_run(each) for each in made]
 
-    def run_now(self, schedule_id: UUID, now: datetime) -> Run:
+    def run_now(self, schedule_id: UUID, now: datetime) -> ScheduledRun:
         """Record a run that is due at this moment, whatever the order's times are, and though it may be paused.
 
         Raises ScheduleNotFoundError; ScanStateError: one of its runs is under way, or waits for the rig.
@@ -144,7 +144,7 @@ class ScheduleStore:
             _prune(session, schedule.id)
             return _run(made[0])
 
-    def startable(self, now: datetime) -> Sequence[Run]:
+    def startable(self, now: datetime) -> Sequence[ScheduledRun]:
         """The runs that wait for the rig and may try it now, the one due first first."""
         query = (
             select(RunRow)
@@ -162,7 +162,7 @@ class ScheduleStore:
             found = [first for query in (due, attempt) if (first := session.scalar(query)) is not None]
             return datetime.fromisoformat(min(found)) if found else None
 
-    def start(self, run: Run, now: datetime) -> bool:
+    def start(self, run: ScheduledRun, now: datetime) -> bool:
         """Take a waiting run; False if somebody else has it, or another run is under way."""
         with self.database.changing() as session:
             row = session.get(RunRow, run.number)
@@ -173,7 +173,7 @@ class ScheduleStore:
             row.started_at, row.alive_until = stamp(now), stamp(now + timedelta(seconds=LIFE_S))
             return True
 
-    def postpone(self, run: Run, reason: str, next_attempt: datetime) -> None:
+    def postpone(self, run: ScheduledRun, reason: str, next_attempt: datetime) -> None:
         """Put a run that could not have the rig back among those that wait."""
         with self.database.changing() as session:
             row = session.get(RunRow, run.number)
@@ -182,7 +182,7 @@ class ScheduleStore:
                 row.owner = row.alive_until = row.started_at = None
 
     def finish(
-        self, run: Run, state: RunState, now: datetime, *, reason: str | None, result: Mapping[str, Any] | None = None
+        self, run: ScheduledRun, state: RunState, now: datetime, *, reason: str | None, result: Mapping[str, Any] | None = None
     ) -> None:
         """Record what became of a run. The first final state stands."""
         with self.database.changing() as session:
@@ -199,7 +199,7 @@ class ScheduleStore:
             for row in session.scalars(query):
                 row.alive_until = stamp(now + timedelta(seconds=LIFE_S))
 
-    def interrupt_dead(self, now: datetime, *, alone: bool = False) -> Sequence[Run]:
+    def interrupt_dead(self, now: datetime, *, alone: bool = False) -> Sequence[ScheduledRun]:
         """Record runs whose process died as interrupted: those that did not say for long that they are alive.
 
         alone : no other process uses the database, so that every run of another one is dead.
@@ -212,14 +212,14 @@ class ScheduleStore:
             )
         return self._closed(query, RunState.INTERRUPTED, now, lambda _: "the service ended in the middle of it")
 
-    def interrupt_own(self, now: datetime) -> Sequence[Run]:
+    def interrupt_own(self, now: datetime) -> Sequence[ScheduledRun]:
         """Record the runs that this process began as interrupted. Only while it has none under way: what it still has
         on record as running ended while the disk refused to take that down.
         """
         query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner == self._owner)
         return self._closed(query, RunState.INTERRUPTED, now, lambda _: "it ended, and how could not be put on record")
 
-    def expire(self, now: datetime) -> Sequence[Run]:
+    def expire(self, now: datetime) -> Sequence[ScheduledRun]:
         """Record runs that waited for the whole of their grace as skipped, each with what it waited for."""
         query = select(RunRow).where(RunRow.state == RunState.WAITING, RunRow.deadline < stamp(now))
 
@@ -231,7 +231,7 @@ class ScheduleStore:
 
     def _closed(
         self, query: Select[RunRow], state: RunState, now: datetime, reason: Callable[[RunRow], str]
-    ) -> Sequence[Run]:
+    ) -> Sequence[ScheduledRun]:
         with self.database.changing() as session:
             rows = list(session.scalars(query))
             for row in rows:
@@ -291,9 +291,9 @@ def _close(row: RunRow, state: RunState, now: datetime, reason: str | None) -> N
     row.next_attempt = row.alive_until = None
 
 
-def _order(row: ScheduleRow) -> Order:
+def _order(row: ScheduleRow) -> ScheduleSpec:
     given = {name: getattr(row, name) for name in _AS_ORDERED}
-    return Order(Cron(row.cron, row.time_zone), **{**given, "task": TaskKind(row.task)})
+    return ScheduleSpec(Cron(row.cron, row.time_zone), **{**given, "task": TaskKind(row.task)})
 
 
 def _schedule(row: ScheduleRow) -> Schedule:
@@ -301,6 +301,6 @@ def _schedule(row: ScheduleRow) -> Schedule:
     return Schedule(UUID(row.id), _order(row), created_at, next_due)
 
 
-def _run(row: RunRow) -> Run:
+def _run(row: RunRow) -> ScheduledRun:
     found = {column.name: getattr(row, column.name) for column in RunRow.__table__.columns}
     return _run_adapter.validate_python({**found, "schedule": row.schedule_id})

@@ -16,7 +16,7 @@ ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
 Position = Annotated[int, Field(ge=0, le=10_000)]
 
 
-class BoardOptions(Strict):
+class ScheduledBoard(Strict):
     """The board, as POST /calibration has it."""
 
     kind: Annotated[BoardKind, Field(strict=False)]
@@ -43,7 +43,7 @@ class BoardOptions(Strict):
 class VerificationOptions(Strict):
     """Of a verification. board None : that of the calibration in use. position None : the board stays where it is."""
 
-    board: BoardOptions | None = None
+    board: ScheduledBoard | None = None
     position: Position | None = None
     exposure_s: ExposureSeconds | None = None
 
@@ -53,7 +53,7 @@ class CalibrationOptions(Strict):
     unless its verdict leaves that to a person.
     """
 
-    board: BoardOptions
+    board: ScheduledBoard
     positions: Annotated[list[Position | FreeText], Field(max_length=1000)] = Field(default_factory=list)
     exposure_s: ExposureSeconds | None = None
     activate: bool = False

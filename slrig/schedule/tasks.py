@@ -9,18 +9,18 @@ from uuid import UUID, uuid4
 
 from slrig.accept.desk import AcceptanceDesk
 from slrig.bundle.validation import Strict
-from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.calibrating import CalibrationSessions
 from slrig.errors import CalibrationError, ScanStateError, ScheduleError
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import utc_now
-from slrig.schedule.records import Order, Run, Schedule, TaskKind
+from slrig.schedule.records import Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from slrig.schedule.rig_tasks import AcceptanceTask, CalibrationTask, VerificationTask, until
 from slrig.schedule.task_options import checked
 from slrig.verify.job import VerificationDesk
 
 
-class Task(Protocol):
+class ScheduledTask(Protocol):
     """One kind of work. options : what may be said of it; both methods are given one of these."""
 
     @property
@@ -52,14 +52,14 @@ class Tasks:
     def __init__(
         self,
         queue: JobQueue,
-        calibrations: Calibrations,
+        calibrations: CalibrationSessions,
         verifications: VerificationDesk,
         acceptance: AcceptanceDesk,
         *,
         tidy: Callable[[], object] = lambda: None,
     ) -> None:
         self._queue = queue
-        self._of: Mapping[TaskKind, Task] = {
+        self._of: Mapping[TaskKind, ScheduledTask] = {
             TaskKind.VERIFICATION: VerificationTask(queue, calibrations, verifications),
             TaskKind.CALIBRATION: CalibrationTask(queue, calibrations, tidy),
             TaskKind.ACCEPTANCE: AcceptanceTask(queue, acceptance),
@@ -67,7 +67,7 @@ class Tasks:
         self._lock = threading.Lock()
         self._stops: dict[UUID, threading.Event] = {}
 
-    def check(self, order: Order) -> None:
+    def check(self, order: ScheduleSpec) -> None:
         """Raise ScheduleError, with every fault, for options that no run could be done with."""
         task = self._of[order.task]
         try:
@@ -76,7 +76,7 @@ class Tasks:
             message = f"options: {error}"
             raise ScheduleError(message) from error
 
-    def __call__(self, schedule: Schedule, run: Run, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:
+    def __call__(self, schedule: Schedule, run: ScheduledRun, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:
         """See `slrig.schedule.scheduler.Work`."""
         order, stop = schedule.order, threading.Event()
         task, holder = self._of[order.task], holder_of(schedule, run)
@@ -114,7 +114,7 @@ class Tasks:
             raise errors[0]
 
 
-def holder_of(schedule: Schedule, run: Run) -> Holder:
+def holder_of(schedule: Schedule, run: ScheduledRun) -> Holder:
     """Who holds the rig for a run.
 
     >>> from datetime import UTC, datetime

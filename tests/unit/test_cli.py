@@ -35,7 +35,7 @@ from slrig.cli.accept import moving, placed_by_hand, plan_for
 from slrig.cli.commands import INTERRUPTED, app
 from slrig.cli.demo import remove_earlier, still_missing
 from slrig.cli.display import ProgressDisplay, print_json, print_table
-from slrig.cli.options import AcceptanceOptions, Service
+from slrig.cli.options import AcceptanceOptions, ServiceOptions
 from slrig.cli.quality import quality_lines
 from slrig.cli.scan import scan_with, series_with, tell_result
 from slrig.client import Client, ScanJob
@@ -177,7 +177,7 @@ def test_patterns_are_not_written_for_a_projector_that_shows_any(monkeypatch: py
 
 def test_key_comes_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def sent(key_file: Path | None) -> str | None:
-        with Service(key_file=key_file).client() as client:
+        with ServiceOptions(key_file=key_file).client() as client:
             return client.connection.http.headers.get("Authorization")
 
     monkeypatch.setenv("SLRIG_API_KEY", "from the environment")

@@ -21,7 +21,7 @@ from slrig.calibration.board import DEFAULT_BOARD, BoardShape
 from slrig.cli.calibrate_walk import Walk, opened
 from slrig.cli.calibration_screen import tell_result
 from slrig.cli.commands import INTERRUPTED
-from slrig.cli.options import Service
+from slrig.cli.options import ServiceOptions
 from slrig.client import Client
 from slrig.errors import PoseRefusedError, SolveRefusedError
 from tests.unit import command
@@ -296,7 +296,7 @@ class Hand:
 def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
     made = Desk()
     monkeypatch.setattr("slrig.cli.calibrate_walk.time.sleep", lambda _s: None)
-    monkeypatch.setattr(Service, "client", lambda _self: client_of(made))
+    monkeypatch.setattr(ServiceOptions, "client", lambda _self: client_of(made))
     return made
 
 
@@ -425,7 +425,7 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[httpx2.Request]:
         return httpx2.Response(200, json=answers.get(request.url.path, first))
 
     client = Client("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(answer))
-    monkeypatch.setattr(Service, "client", lambda _self: client)
+    monkeypatch.setattr(ServiceOptions, "client", lambda _self: client)
     monkeypatch.setattr(Client, "__exit__", lambda *_: None)
     return requests
 

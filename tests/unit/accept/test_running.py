@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from slrig.accept import running as acceptance
-from slrig.accept.evaluation import Evidence, Reading, reading
+from slrig.accept.evaluation import Reading, ReadingPoints, reading
 from slrig.accept.plan import AcceptancePlan, Artefact, Artefacts, Certified, Limits, Quantity, Step, usual_limits
 from slrig.accept.positions import acceptance_plan
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
@@ -370,7 +370,7 @@ def test_position_starts_from_its_first_capture_where_repeats_are_missing() -> N
 LENGTH_MM = 110.0
 BAR = replace(GOOD, distance=Certified(LENGTH_MM, 0.002), expansion_per_k=0.0)
 
-POINTS = Evidence(np.array([[0.0, 0.0, 0.0]]), np.ones(1, np.uint8), np.zeros(1), np.zeros(1))
+POINTS = ReadingPoints(np.array([[0.0, 0.0, 0.0]]), np.ones(1, np.uint8), np.zeros(1), np.zeros(1))
 
 
 def of_bars(share: float, *, scatter_mm: float = 0.004, places: int = 7, seed: int = 3) -> list[Reading]:

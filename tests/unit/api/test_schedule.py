@@ -17,7 +17,7 @@ from fastapi.testclient import TestClient
 from typer.testing import Result
 
 from slrig.bundle.calibration import write_calibration
-from slrig.cli.options import Service
+from slrig.cli.options import ServiceOptions
 from slrig.client import Client
 from slrig.schedule.records import RunState
 from tests.unit import command
@@ -45,10 +45,10 @@ def emptied(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
         kind = {"content-type": answer.headers.get("content-type", "")}
         return httpx2.Response(answer.status_code, content=answer.content, headers=kind)
 
-    def reaching(_service: Service) -> Client:
+    def reaching(_service: ServiceOptions) -> Client:
         return Client("http://127.0.0.1:1", KEY, transport=httpx2.MockTransport(forward))
 
-    monkeypatch.setattr(Service, "client", reaching)
+    monkeypatch.setattr(ServiceOptions, "client", reaching)
     yield
     for each in kept(client):
         assert client.delete(each["links"]["self"]).status_code == 204

@@ -22,9 +22,9 @@ from starlette.types import Receive, Scope, Send
 
 from slrig.api import connections
 from slrig.api.connections import (
-    Connection,
     ConnectionConfig,
     Deadlines,
+    HttpConnection,
     Room,
     listening_socket,
     quiet_accepts,
@@ -459,7 +459,7 @@ async def test_a_request_under_way_never_makes_room() -> None:
             assert (await reader.readline()).startswith(b"HTTP/1.1 200 ")
 
 
-class _Peer(Connection):
+class _Peer(HttpConnection):
     """A connection without a socket."""
 
     def __init__(self, address: str) -> None:

@@ -13,11 +13,11 @@ from uuid import UUID
 import numpy as np
 
 from slrig.bundle import read_calibration
-from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.calibrating import CalibrationSessions
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState
 from slrig.calibrate.solving import CalibrationResult, ReadPose
-from slrig.calibrate.tools import CalibrationTools, Judgement, Setting, Standing
+from slrig.calibrate.tools import CalibrationTools, Judgement, SessionGuidance, Setting
 from slrig.calibration.accuracy import compare_calibrations
 from slrig.calibration.board import Board, BoardKind, BoardShape, BoardView, PoseObservation, ViewQuality
 from slrig.devices import Rig
@@ -27,7 +27,7 @@ from slrig.jobs.rig_jobs import Recorded
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration, Pinhole, Size, SolveRecord
 from slrig.rig.session import ActiveCalibration
-from slrig.scan.plan import Progress, ScanPlan
+from slrig.scan.plan import ProgressCallback, ScanPlan
 from tests.samples import put_database
 from tests.unit.scan.bench import Bench, wait_for
 from tests.unit.scan.fakes import WAIT_S, TameBench, TamePositioner
@@ -89,7 +89,7 @@ class TameCalibrating:
             capture=self._capture,
             read=self._read,
             judge=self._judge,
-            survey=lambda poses, _: Standing({"poses": [each.observation.name for each in poses]}, {}),
+            survey=lambda poses, _: SessionGuidance({"poses": [each.observation.name for each in poses]}, {}),
             picture=lambda *_: PNG,
             coverage_picture=lambda _, device, poses, __: f"{device} {len(poses)}".encode(),
             solve=self._solve,
@@ -100,7 +100,7 @@ class TameCalibrating:
         )
 
     def _capture(
-        self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: Progress, cancelled: Callable[[], bool]
+        self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: ProgressCallback, cancelled: Callable[[], bool]
     ) -> Recorded:
         self.captured.append((rig, plan))
         return self.bench.capture(rig, plan, folder, progress=progress, cancelled=cancelled, frames=Mock())
@@ -122,7 +122,7 @@ class TameCalibrating:
         self.judged.append(names)
         if not self.refusals:
             names = [*names, pose.observation.name]
-        standing = Standing({"poses": names}, {"words": "tilt it", "enough": False})
+        standing = SessionGuidance({"poses": names}, {"words": "tilt it", "enough": False})
         return Judgement(self.refusals, {"corners_found": {"cam0": 12}}, standing)
 
     def _solve(
@@ -133,7 +133,7 @@ class TameCalibrating:
         poses: Sequence[ReadPose],
         /,
         *,
-        progress: Progress,
+        progress: ProgressCallback,
         earlier: Calibration | None = None,
         board_shape: BoardShape = BoardShape.AUTO,
         wanted_mm: float | None = None,
@@ -159,11 +159,11 @@ class CalibrationBench(Bench):
         self.tame = TameCalibrating(self)
         self._positioner = positioner
         self.jobs = JobStore(self.store.database, JobKind.POSE, JobKind.SOLVE)
-        self.calibrations = Calibrations(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
+        self.calibrations = CalibrationSessions(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
 
-    def restarted(self) -> Calibrations:
+    def restarted(self) -> CalibrationSessions:
         """The calibrations as the next start of the service has them."""
-        again = Calibrations(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
+        again = CalibrationSessions(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
         again.take_up()
         return again
 

@@ -29,7 +29,7 @@ from slrig.client.errors import (
     UnreachableError,
 )
 from slrig.client.events import Captured, Progress, StateChange
-from slrig.client.resources import ScanOptions
+from slrig.client.resources import ScanFields
 from slrig.errors import ConfigError, ServiceError, StorageError
 from tests.unit.client.service import URL, Broken, client_of, event_answer, failing, stream
 
@@ -97,7 +97,7 @@ def request_of(name: str, *, file: str = "the.name") -> httpx2.Request:
     _, *parameters = inspect.signature(METHODS[name]).parameters.values()
     given: dict[str, Any] = {each.name: f"<{each.name}>" for each in parameters}
     if name == "scans.start":
-        given = dict.fromkeys(ScanOptions.__annotations__, "given")
+        given = dict.fromkeys(ScanFields.__annotations__, "given")
     if "document" in given:
         given["document"] = {"format": "any"}
     if name.endswith(".file"):
@@ -166,7 +166,7 @@ def test_the_client_has_no_other_requests() -> None:
 
 
 def test_a_scan_takes_the_options_of_a_start() -> None:
-    names = set(ScanOptions.__annotations__)
+    names = set(ScanFields.__annotations__)
     assert {*inspect.signature(Client.start_scan).parameters} - {"self"} == names
     assert {*inspect.signature(Client.scan).parameters} - {"self", "progress"} == names
     scan, start = inspect.signature(Client.scan).parameters, inspect.signature(Client.start_scan).parameters

@@ -19,7 +19,7 @@ from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import JobKind, JobRecord, utc_now
 from slrig.jobs.store import JobStore
 from slrig.model import MeasuredAxis, StagePlane
-from slrig.scan.plan import Progress, ScanPlan
+from slrig.scan.plan import ProgressCallback, ScanPlan
 from slrig.scan.records import plan_json
 from slrig.scan.sweep import sweep
 from tests.samples import put_database
@@ -65,7 +65,7 @@ class TameCombining:
         voxel_mm: float | None,
         planes: Sequence[StagePlane],
         notes: Sequence[str],
-        progress: Progress,
+        progress: ProgressCallback,
         cancelled: Callable[[], bool],
     ) -> None:
         self.planes = planes

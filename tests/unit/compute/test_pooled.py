@@ -33,7 +33,7 @@ from obstore.store import MemoryStore
 
 from slrig.compute.certificates import AUTHORITY_KEY, make_certificates
 from slrig.compute.cluster import DaskCluster, Told
-from slrig.compute.host import BEAT_S, POOL_FAULT, TELL_S, Answer, Host, Order, resource
+from slrig.compute.host import BEAT_S, POOL_FAULT, TELL_S, Host, PoolRequest, PoolResponse, resource
 from slrig.compute.pooled import BEGIN_LIMIT_S, SILENCE_LIMIT_S, TRANSFER_LIMIT_S, PooledWorker
 from slrig.compute.security import KEY, pool_security
 from slrig.compute.serving import KEPT_EVENTS, _scratch, serve_scheduler
@@ -101,16 +101,16 @@ class TameWorker:
         return getattr(importlib.import_module(module), name)(*task.given, **task.options, **told)
 
 
-class TameOrder(Future[Answer]):
+class TameOrder(Future[PoolResponse]):
     """An order: `act` is asked for its answer."""
 
-    def __init__(self, act: Callable[[Order], Answer | None], order: Order, told: Told) -> None:
+    def __init__(self, act: Callable[[PoolRequest], PoolResponse | None], order: PoolRequest, told: Told) -> None:
         super().__init__()
         self._act = act
         self.order = order
         self.told = told
 
-    def result(self, timeout: float | None = None) -> Answer:  # noqa: ARG002
+    def result(self, timeout: float | None = None) -> PoolResponse:  # noqa: ARG002
         if (answer := self._act(self.order)) is None:
             raise TimeoutError
         return answer
@@ -124,7 +124,7 @@ class TameCluster:
     def __init__(self, host: Host) -> None:
         self.host = host
         self.there = True
-        self.acts: list[Callable[[Order], Answer | None]] = []
+        self.acts: list[Callable[[PoolRequest], PoolResponse | None]] = []
         self.orders: list[TameOrder] = []
         self.told: list[Mapping[str, Any]] = []
 
@@ -137,7 +137,7 @@ class TameCluster:
     def usable(self, timeout_s: float = 0.0) -> bool:  # noqa: ARG002
         return self.there
 
-    def submit(self, order: Order, told: Told) -> TameOrder:
+    def submit(self, order: PoolRequest, told: Told) -> TameOrder:
         act = self.acts.pop(0) if self.acts else lambda each: self.host.done(each, self.told.append)
         self.orders.append(TameOrder(act, order, told))
         return self.orders[-1]
@@ -154,10 +154,10 @@ class Pool:
         self.cluster = TameCluster(Host(self.store, self.remote, clock=lambda: self.now_s))
         self.worker = PooledWorker(self.local, self.cluster, self.store, clock=lambda: self.now_s)
 
-    def passes(self, seconds: float) -> Callable[[Order], None]:
+    def passes(self, seconds: float) -> Callable[[PoolRequest], None]:
         """An act: time passes without an answer."""
 
-        def act(_order: Order) -> None:
+        def act(_order: PoolRequest) -> None:
             self.now_s += seconds
 
         return act
@@ -168,7 +168,7 @@ class Pool:
         return {each["path"] for each in self.objects.list().collect()}
 
 
-def lost(_order: Order) -> Answer | None:
+def lost(_order: PoolRequest) -> PoolResponse | None:
     raise PoolError("the pool lost the job")
 
 
@@ -372,7 +372,7 @@ def never_begins(pool: Pool) -> None:
 
 
 def falls_silent(pool: Pool) -> None:
-    def tells_once(order: Order) -> None:
+    def tells_once(order: PoolRequest) -> None:
         begun = pool.now_s > 0
         pool.now_s += SILENCE_LIMIT_S + 1 if begun else 1
         if not begun:
@@ -387,7 +387,7 @@ def is_lost_twice(pool: Pool) -> None:
 
 
 def is_lost_for_good(pool: Pool) -> None:
-    def act(_order: Order) -> Answer:
+    def act(_order: PoolRequest) -> PoolResponse:
         pool.cluster.there = False
         raise PoolError("the pool lost the job")
 
@@ -395,7 +395,7 @@ def is_lost_for_good(pool: Pool) -> None:
 
 
 def answers_wrong_bytes(pool: Pool) -> None:
-    def act(order: Order) -> Answer:
+    def act(order: PoolRequest) -> PoolResponse:
         answer = pool.cluster.host.done(order, lambda _: None)
         obstore.put(pool.objects, f"results/{order.job}/points.ply", b"other bytes")
         return answer
@@ -404,7 +404,7 @@ def answers_wrong_bytes(pool: Pool) -> None:
 
 
 def names_a_file_elsewhere(pool: Pool) -> None:
-    pool.cluster.acts = [lambda _: Answer({}, {"../../record.json": "0" * 64})] * 2
+    pool.cluster.acts = [lambda _: PoolResponse({}, {"../../record.json": "0" * 64})] * 2
 
 
 def is_slow(pool: Pool) -> None:
@@ -537,13 +537,13 @@ def test_a_disk_that_is_full_is_no_fault_of_the_pool(
         pool.worker.run(task)
 
 
-def order(pool: Pool, folder: Path, what: str = "finish") -> Order:
+def order(pool: Pool, folder: Path, what: str = "finish") -> PoolRequest:
     task = job(folder, what)
     key = pool.store.put_bundle(task.given[0], lambda: None)
-    return Order("job", key, replace(task, given=task.given[2:]), "rig", versions())
+    return PoolRequest("job", key, replace(task, given=task.given[2:]), "rig", versions())
 
 
-def fault(answer: Answer) -> tuple[str, str]:
+def fault(answer: PoolResponse) -> tuple[str, str]:
     assert answer.fault is not None
     assert (answer.result, dict(answer.files)) == (None, {})
     return answer.fault.code, answer.fault.message

@@ -16,7 +16,7 @@ import pytest
 from slrig.accept import running as acceptance
 from slrig.accept.desk import AcceptanceDesk
 from slrig.accept.evaluation import Reading
-from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.calibrating import CalibrationSessions
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibration.board import Board, PoseObservation
 from slrig.combine.desk import ModelDesk
@@ -93,7 +93,7 @@ class Service(Bench):
         monkeypatch.setattr(acceptance, "capture_frames", tools.capture)
         database, queue = self.store.database, self.runner.queue
         self.of_calibrations = JobStore(database, JobKind.POSE, JobKind.SOLVE)
-        self.calibrations = Calibrations(
+        self.calibrations = CalibrationSessions(
             self.folder, self.runner, self.of_calibrations, rig_name="bench",
             tools=replace(tools, read=read, solve=solve),
         )  # fmt: skip

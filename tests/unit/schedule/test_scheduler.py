@@ -29,7 +29,7 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.jobs.database import Database
-from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from slrig.schedule.scheduler import LOOK_S, Scheduler
 from slrig.schedule.store import ScheduleStore
 from tests.samples import put_database
@@ -47,7 +47,7 @@ class Desk:
         self.now = now
         self.busy: str | None = None
         self.fails: Exception | None = None
-        self.done: list[tuple[Schedule, Run]] = []
+        self.done: list[tuple[Schedule, ScheduledRun]] = []
         self.told: list[tuple[datetime, RunState]] = []
         self.during: Callable[[], None] = lambda: None
         self.store = ScheduleStore(
@@ -62,7 +62,7 @@ class Desk:
             execute=lambda call: call(),
         )
 
-    def _work(self, schedule: Schedule, run: Run, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:
+    def _work(self, schedule: Schedule, run: ScheduledRun, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:
         assert not cancelled()
         if self.busy is not None:
             raise RigBusyError(self.busy, holder=self.busy, since=START.isoformat())
@@ -75,7 +75,7 @@ class Desk:
     def daily(self, **more: Any) -> Schedule:
         """A schedule on record: 06:00 UTC, an hour of grace, tries every ten minutes."""
         order = {"cron": Cron("0 6 * * *", "UTC"), "task": TaskKind.VERIFICATION, "retry_s": 600.0, **more}
-        return self.store.create(Order(**order), self.now)
+        return self.store.create(ScheduleSpec(**order), self.now)
 
     def look(self, **step: float) -> None:
         """Let time pass, then look at the clock."""
@@ -87,7 +87,7 @@ class Desk:
         runs = sorted(self.store.runs(schedule.id, limit=1000), key=lambda run: run.due)
         return [(run.due.strftime("%d %H:%M"), run.state, run.count) for run in runs]
 
-    def run(self, schedule: Schedule) -> Run:
+    def run(self, schedule: Schedule) -> ScheduledRun:
         return self.store.runs(schedule.id, limit=1)[0]
 
 
@@ -176,7 +176,7 @@ def test_invalid_cron_text_or_zone_is_refused(text: str, zone: str, words: str) 
 
 def test_order_lists_all_its_faults() -> None:
     with pytest.raises(ScheduleError, match=r"grace_s.*retry_s"):
-        Order(Cron("0 6 * * *", "UTC"), TaskKind.VERIFICATION, grace_s=-1, retry_s=0)
+        ScheduleSpec(Cron("0 6 * * *", "UTC"), TaskKind.VERIFICATION, grace_s=-1, retry_s=0)
 
 
 def test_schedule_is_read_back_as_recorded(desk: Desk) -> None:

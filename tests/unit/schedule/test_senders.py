@@ -22,7 +22,7 @@ from slrig.jobs.records import JobKind, JobRecord, JobState, acting_as
 from slrig.jobs.store import JobStore
 from slrig.schedule.notices import TOLD, NoticedHealth, tell_run
 from slrig.schedule.receivers import senders_of
-from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from slrig.schedule.sending import Sender
 from slrig.schedule.webhook import Webhook, signature, signing_key
 from tests.samples import put_database
@@ -32,7 +32,7 @@ from tests.unit.schedule.receivers import PATH, SECRET, Hook, own_certificate, s
 from tests.unit.verify.health_bench import a_verification, hours
 
 DUE = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
-SCHEDULE = Schedule(UUID(int=7), Order(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION), DUE, DUE)
+SCHEDULE = Schedule(UUID(int=7), ScheduleSpec(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION), DUE, DUE)
 
 
 @pytest.fixture
@@ -55,8 +55,8 @@ def told(outbox: Outbox) -> list[dict[str, Any]]:
     return found
 
 
-def run(state: RunState, *, count: int = 1) -> Run:
-    return Run(4, SCHEDULE.id, DUE, state, "rig busy: a scan", count, 1, DUE, None, None, None, None)
+def run(state: RunState, *, count: int = 1) -> ScheduledRun:
+    return ScheduledRun(4, SCHEDULE.id, DUE, state, "rig busy: a scan", count, 1, DUE, None, None, None, None)
 
 
 def test_runs_that_need_a_person_give_a_notice_and_no_others(database: Database, outbox: Outbox) -> None:

@@ -33,7 +33,7 @@ from slrig.jobs.job import Holder, Job
 from slrig.jobs.records import JobKind, JobState, utc_now
 from slrig.jobs.store import JobStore
 from slrig.schedule import rig_tasks
-from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.records import Cron, RunState, Schedule, ScheduledRun, ScheduleSpec, TaskKind
 from slrig.schedule.rig_tasks import error_of
 from slrig.schedule.tasks import Tasks
 from slrig.verify.job import VerificationDesk
@@ -90,10 +90,10 @@ class TaskBench(CalibrationBench):
         self.health.database.close()
 
 
-def scheduled(task: TaskKind, options: Mapping[str, Any]) -> tuple[Schedule, Run]:
+def scheduled(task: TaskKind, options: Mapping[str, Any]) -> tuple[Schedule, ScheduledRun]:
     due = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
-    schedule = Schedule(ID, Order(Cron("30 6 * * *", "Europe/Berlin"), task, options), due, due)
-    return schedule, Run(1, ID, due, RunState.RUNNING, None, 1, 1, due, None, None, None, None)
+    schedule = Schedule(ID, ScheduleSpec(Cron("30 6 * * *", "Europe/Berlin"), task, options), due, due)
+    return schedule, ScheduledRun(1, ID, due, RunState.RUNNING, None, 1, 1, due, None, None, None, None)
 
 
 ID = UUID("3f2a0000-9f0e-4c57-8a39-5f8a4f0c2b11")
@@ -124,7 +124,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TaskBench]:
 
 
 def checked(tasks: Tasks, task: TaskKind, options: Mapping[str, Any]) -> None:
-    tasks.check(Order(Cron("* * * * *", "UTC"), task, options))
+    tasks.check(ScheduleSpec(Cron("* * * * *", "UTC"), task, options))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from simulated_rig.device import SimulatedHead
-from simulated_rig.light import LightFlicker
+from simulated_rig.light import LampFlicker
 from slrig.devices import CameraSettings
 from slrig.model import Axis, Black, FloatArray, LineShift, PatternSequence, Pixels, Size, White
 from tests.unit.simulated_rig.building import frames_of, small_head, white_black_lines
@@ -32,7 +32,7 @@ def half(axis: Axis) -> PatternSequence:
 
 
 def test_flicker_averages_out_over_whole_periods() -> None:
-    flicker = LightFlicker(100.0, 0.5)
+    flicker = LampFlicker(100.0, 0.5)
     assert flicker.mean(3_000_000, 13_000_000) == pytest.approx(1.0)
     # A quarter of a period from the start of the sine, by its integral.
     assert flicker.mean(0, 2_500_000) == pytest.approx(1 + 0.5 * 2 / np.pi)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.genicam.pixels import FORMATS, PfncFormat, SamplePacking, decode_pixels
+from drivers.genicam.pixels import FORMATS, PfncFormat, PixelPacking, decode_pixels
 from slrig.model import Pixels, Size
 from tests.unit.drivers.genicam.conftest import encoded
 
@@ -85,5 +85,5 @@ def test_samples_above_the_bit_depth_are_cut_off() -> None:
 
 def test_every_format_says_how_it_is_packed() -> None:
     for form in FORMATS.values():
-        assert form.name.endswith("p") == (form.packing is SamplePacking.LSB)
-        assert form.name.endswith("Packed") == (form.packing is SamplePacking.GIGE)
+        assert form.name.endswith("p") == (form.packing is PixelPacking.LSB)
+        assert form.name.endswith("Packed") == (form.packing is PixelPacking.GIGE)
