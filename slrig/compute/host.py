@@ -113,7 +113,9 @@ class Host(WorkerPlugin):
                 _log.warning("an order came to nothing", job=order.job, cause=repr(error))
             return PoolResponse(fault=job_failure(error))
 
-    def _computed(self, order: PoolRequest, tell: Tell, beat: Callable[[], None], stopped: Callable[[], bool]) -> PoolResponse:
+    def _computed(
+        self, order: PoolRequest, tell: Tell, beat: Callable[[], None], stopped: Callable[[], bool]
+    ) -> PoolResponse:
         # Of the process that computes: after an update of the files beneath, it is newer than this one.
         mine = self._worker.run(_VERSIONS, cancelled=stopped)
         if mine != order.versions:

@@ -182,7 +182,13 @@ class ScheduleStore:
                 row.owner = row.alive_until = row.started_at = None
 
     def finish(
-        self, run: ScheduledRun, state: RunState, now: datetime, *, reason: str | None, result: Mapping[str, Any] | None = None
+        self,
+        run: ScheduledRun,
+        state: RunState,
+        now: datetime,
+        *,
+        reason: str | None,
+        result: Mapping[str, Any] | None = None,
     ) -> None:
         """Record what became of a run. The first final state stands."""
         with self.database.changing() as session:

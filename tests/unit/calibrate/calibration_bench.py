@@ -159,7 +159,9 @@ class CalibrationBench(Bench):
         self.tame = TameCalibrating(self)
         self._positioner = positioner
         self.jobs = JobStore(self.store.database, JobKind.POSE, JobKind.SOLVE)
-        self.calibrations = CalibrationSessions(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
+        self.calibrations = CalibrationSessions(
+            self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools()
+        )
 
     def restarted(self) -> CalibrationSessions:
         """The calibrations as the next start of the service has them."""
