@@ -20,7 +20,7 @@ from simulated_rig.scene import Names, NotNegative, Pair, Positive, PrintedBoard
 from slrig.bundle.validation import Strict
 from slrig.devices import TurntableBase
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
-from slrig.model import FloatArray, Pinhole, StageAxis
+from slrig.model import FloatArray, Pinhole, RotationAxis
 
 PROJECTOR = "projector"
 
@@ -147,9 +147,9 @@ class TurntableOptions(Strict, use_attribute_docstrings=True):
         return direction
 
     @property
-    def axis(self) -> StageAxis:
+    def axis(self) -> RotationAxis:
         """The axis in the world."""
-        return StageAxis(np.array(self.point_mm), np.array(self.direction) / np.linalg.norm(self.direction))
+        return RotationAxis(np.array(self.point_mm), np.array(self.direction) / np.linalg.norm(self.direction))
 
     def motion(self, angle_deg: float) -> FloatArray:
         """(4, 4): motion of the objects from 0° to the exact angle."""
@@ -181,7 +181,7 @@ class SimulatedTurntable(TurntableBase):
         self._closed = False
 
     @property
-    def axis(self) -> StageAxis | None:
+    def axis(self) -> RotationAxis | None:
         """See `Turntable`. Without the errors."""
         return self._options.axis if self._options.knows_axis else None
 

@@ -108,7 +108,7 @@ class VerificationTable(Strict):
 class AccuracyTable(Strict, use_attribute_docstrings=True):
     """Required accuracy."""
 
-    wanted_mm: Annotated[float, Field(gt=0, le=1000)] | None = None
+    tolerance_mm: Annotated[float, Field(gt=0, le=1000)] | None = None
     """Largest error of 95 % of the points of a scan. Calibrations are graded by it, and the limits of an acceptance
     test follow it."""
 
@@ -173,7 +173,7 @@ class RigConfig:
     scan: ScanDefaults
     synchronisation: SynchronisationTable | None = None
     refuse_when_stale: bool = False
-    wanted_mm: float | None = None
+    tolerance_mm: float | None = None
     presets: Mapping[str, Preset] = field(default_factory=dict)
     positioner: DriverTable | None = None
 
@@ -209,7 +209,7 @@ def parse_rig(data: Mapping[str, Any], path: Path) -> RigConfig:
         scan=table.scan,
         synchronisation=table.synchronisation,
         refuse_when_stale=table.verification.refuse_when_stale,
-        wanted_mm=table.accuracy.wanted_mm,
+        tolerance_mm=table.accuracy.tolerance_mm,
         presets=table.presets,
         positioner=table.positioner,
     )

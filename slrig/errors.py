@@ -12,7 +12,7 @@ _FLAGS = {
     "exposures_s": "exposure-s",
     "kind": "board",
     "line_shift_period_px": "period-px",
-    "turned_by": "by-hand",
+    "turned_by": "manual",
 }
 """Flags of the command line with another name than the setting."""
 
@@ -173,9 +173,9 @@ class RegistrationRefusedError(SlrigError, code="registration-refused"):
     """
 
 
-class StageRefusedError(SlrigError, code="stage-refused"):
-    """The poses of a stage do not determine its axis or its planes, or cutting by them removes a whole view. Name the
-    pose or the view, and what to shoot instead.
+class TurntableRefusedError(SlrigError, code="stage-refused"):
+    """The poses of a turntable do not determine its axis or its planes, or cutting by them removes a whole view. Name
+    the pose or the view, and what to shoot instead.
     """
 
 

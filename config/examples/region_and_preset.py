@@ -22,7 +22,7 @@ def main(box_mm: list[list[float]]) -> None:
         part = client.scan(
             preset="two-exposures",
             label="part",
-            reconstruction={"region": {"box_mm": box_mm, "most_sigma_mm": 0.05}},
+            reconstruction={"region": {"box_mm": box_mm, "max_sigma_mm": 0.05}},
         )
         for result in (whole, part):
             low, high = result.mesh.bounds

@@ -14,7 +14,7 @@ from drivers.serial_port import SLICE_S, BytePort
 from drivers.serial_turntable.options import LineOptions
 from slrig.devices import Clock, TurntableBase
 from slrig.errors import DeviceError, DeviceStateError, SlrigError, UnsupportedByDeviceError
-from slrig.model import StageAxis
+from slrig.model import RotationAxis
 
 NS_PER_S = 1_000_000_000
 _MAX_LINE_BYTES = 1024
@@ -136,7 +136,7 @@ class SerialTurntable(TurntableBase):
         self._lost: str | None = None
 
     @property
-    def axis(self) -> StageAxis | None:
+    def axis(self) -> RotationAxis | None:
         """See `Turntable`. Unknown."""
         return None
 

@@ -66,7 +66,9 @@ class ArtefactsRequest(Strict):
 
 
 class LimitsRequest(Strict):
-    """Limits in mm; absent ones follow wanted_mm: as much for spacing and size, twice as much for form and flatness."""
+    """Limits in mm; absent ones follow tolerance_mm: as much for spacing and size, twice as much for form and
+    flatness.
+    """
 
     spacing_mm: Length | None = None
     form_mm: Length | None = None
@@ -81,7 +83,7 @@ class AcceptanceRequest(Strict):
     volume_mm: tuple[Corner, Corner] | None = Field(
         default=None, strict=False, description="least and greatest corner in the world; absent, the calibration's"
     )
-    wanted_mm: Length | None = Field(
+    tolerance_mm: Length | None = Field(
         default=None,
         description="what a point may be wrong by in what the rig is for; absent, the rig file's, or 1/5000 of the "
         "volume's diagonal",
@@ -91,8 +93,8 @@ class AcceptanceRequest(Strict):
     exposure_s: Annotated[float, Field(gt=0, le=60)] | None = None
     notes: Annotated[str, Field(max_length=1000)] = ""
 
-    def plan(self, calibration: Calibration, wanted_mm: float | None = None, /) -> AcceptancePlan:
-        """The plan for a rig so calibrated; wanted_mm is its rig file's. Raises InvalidInputError."""
+    def plan(self, calibration: Calibration, tolerance_mm: float | None = None, /) -> AcceptancePlan:
+        """The plan for a rig so calibrated; tolerance_mm is its rig file's. Raises InvalidInputError."""
         rendered = self.artefacts is None
         volume = rig_volume_mm(calibration) if self.volume_mm is None else np.array(self.volume_mm, np.float64)
         if not (volume[0] < volume[1]).all():
@@ -104,7 +106,9 @@ class AcceptanceRequest(Strict):
             volume,
             exact_artefacts(volume) if self.artefacts is None else self.artefacts.artefacts(),
             rendered=rendered,
-            limits=replace(usual_limits(volume, wanted_mm if self.wanted_mm is None else self.wanted_mm), **told),
+            limits=replace(
+                usual_limits(volume, tolerance_mm if self.tolerance_mm is None else self.tolerance_mm), **told
+            ),
             repeats=self.repeats,
             exposure_s=self.exposure_s,
             notes=self.notes,

@@ -49,18 +49,18 @@ class AcceptanceDesk:
         *,
         evaluate: Evaluate,
         report: Callable[[AcceptanceResult, Path], None],
-        wanted_mm: float | None = None,
+        tolerance_mm: float | None = None,
         clock: Clock = utc_now,
     ) -> None:
         """`evaluate` : as `slrig.accept.running.evaluated`. report : writes the reports of a test. jobs : those of
-        positions. wanted_mm : what a point may be wrong by in what the rig is for, by the rig file.
+        positions. tolerance_mm : what a point may be wrong by in what the rig is for, by the rig file.
         """
         self._data = folder
         self._store = AcceptanceStore(folder)
         self._queue = queue
         self.jobs = jobs
         self._work = RigJobs(jobs, queue, folder)
-        self._clock, self._wanted_mm = clock, wanted_mm
+        self._clock, self._wanted_mm = clock, tolerance_mm
         self._evaluate, self._report = evaluate, report
         self._lock = threading.RLock()
         self._tests = {record.id: record for record in self._store.load()}

@@ -174,17 +174,17 @@ def diagonal_mm(volume_mm: FloatArray) -> float:
     return float(np.linalg.norm(volume_mm[1] - volume_mm[0]))
 
 
-def usual_limits(volume_mm: FloatArray, wanted_mm: float | None = None) -> Limits:
-    """The limits where none are given, from what a point may be wrong by in what the rig is for: wanted_mm, or
+def usual_limits(volume_mm: FloatArray, tolerance_mm: float | None = None) -> Limits:
+    """The limits where none are given, from what a point may be wrong by in what the rig is for: tolerance_mm, or
     L0 / 5000.
 
-    A size or a spacing may be wrong by wanted_mm. A form is a range, from the point furthest out to that furthest in,
-    each of which may be wrong by wanted_mm: 2 wanted_mm.
+    A size or a spacing may be wrong by tolerance_mm. A form is a range, from the point furthest out to that furthest
+    in, each of which may be wrong by tolerance_mm: 2 tolerance_mm.
 
     >>> usual_limits(np.array([[0.0, 0.0, 0.0], [200.0, 100.0, 200.0]]), 0.05)
     Limits(form_mm=0.1, size_mm=0.05, spacing_mm=0.05, flatness_mm=0.1)
     """
-    length_mm = WANTED_SHARE * diagonal_mm(volume_mm) if wanted_mm is None else wanted_mm
+    length_mm = WANTED_SHARE * diagonal_mm(volume_mm) if tolerance_mm is None else tolerance_mm
     return Limits(form_mm=2 * length_mm, size_mm=length_mm, spacing_mm=length_mm, flatness_mm=2 * length_mm)
 
 

@@ -28,8 +28,8 @@ from slrig.api import (
     scans,
     schedules,
     sessions,
-    stage,
     system,
+    turntable,
 )
 from slrig.api.access import Access
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
@@ -70,7 +70,7 @@ def bare_app() -> FastAPI:
         rig,
         calibration,
         health,
-        stage,
+        turntable,
         acceptance,
         schedules,
         sessions,

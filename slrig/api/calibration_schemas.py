@@ -232,7 +232,7 @@ class ComparisonBody(BaseModel):
     moved_rms_mm: Known = Field(
         description="by how much points in the volume move, beyond the rigid motion of them all; null without a volume"
     )
-    moved_most_mm: Known
+    moved_max_mm: Known
     turn_deg: Known = Field(description="of that rigid motion, about the volume's middle")
     shift_mm: Known = Field(description="of that rigid motion, of the volume's middle")
     words: list[str]

@@ -29,7 +29,7 @@ class ModelShootRequest(MadeRequest):
 
     views: Annotated[int, Field(ge=2, le=MOST_VIEWS)] = Field(default=8, description="how many")
     scan: ShotRequest = Field(default_factory=ShotRequest, description="how each is shot")
-    by_hand: bool = Field(
+    manual: bool = Field(
         default=False,
         description="false: the rig's turntable turns the object. true: a person does; the first view is shot at once, "
         "each of the others by POST /model/{id}/view, and `progress` says when and how far to turn",
@@ -59,7 +59,7 @@ def shoot_model(
     the model is made of those that succeed, and `notes` of its summary tell of the others.
     """
     preset = None if request.scan.preset is None else service.presets.get(request.scan.preset)
-    shoot = ShootPlan(request.views, scan_plan(request.scan, service.scan_defaults, preset), request.by_hand)
+    shoot = ShootPlan(request.views, scan_plan(request.scan, service.scan_defaults, preset), request.manual)
     plan = request.plan((), shoot=shoot)
 
     def start(key: str | None) -> UUID:

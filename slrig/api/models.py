@@ -39,7 +39,7 @@ class MadeRequest(Strict):
 
     poses: Literal["turntable", "markers", "unknown"] | Annotated[list[PoseEntry], Field(max_length=MAX_VIEWS)] = Field(
         default="turntable",
-        description='about where the scans belong. "turntable": a stage turned the object. "markers": '
+        description='about where the scans belong. "turntable": a turntable turned the object. "markers": '
         'printed ones turn with it. "unknown": found from what they see, or refused, as of an object that is '
         "symmetric. Or of each scan a motion, 4 × 4, that takes its mm "
         "to a common frame",
@@ -48,7 +48,7 @@ class MadeRequest(Strict):
         default=None, description=f"OpenCV's name for that of the markers. Default: {MARKER_DICTIONARY}"
     )
     axis: AxisEntry | None = Field(
-        default=None, description="of a turntable, in the scans' frame. Default: the stage's own, where it is known"
+        default=None, description="of a turntable, in the scans' frame. Default: the turntable's own, where it is known"
     )
     start_error_mm: Annotated[float, Field(ge=0.01, le=100)] = Field(
         default=START_ERROR_MM, description="how far a surface may be from where poses, or angles and axis, put it"
@@ -57,7 +57,8 @@ class MadeRequest(Strict):
         default=None, description="length of the model's edges. Default: 1.25 times that of the scans'"
     )
     cut: bool = Field(
-        default=True, description="whether plate and backdrops, where the stage's planes are known, are cut away first"
+        default=True,
+        description="whether plate and backdrops, where the turntable's planes are known, are cut away first",
     )
     label: FreeText | None = Field(default=None, description="free text, to find the model again")
 
@@ -99,7 +100,7 @@ class ModelRequest(MadeRequest):
     )
     angles_deg: Annotated[list[float], Field(max_length=MAX_VIEWS)] | None = Field(
         default=None,
-        description="of a turntable: where the stage stood at each scan, right-handed about its axis. Default: as the "
+        description="of a turntable: its angle at each scan, right-handed about its axis. Default: as the "
         "scans' reports say",
     )
 

@@ -156,7 +156,7 @@ class ScanRequest(ShotRequest):
     label: FreeText | None = Field(default=None, description="free text, to find the scan again")
     turn_deg: Annotated[float, Field(ge=-MOST_TURN_DEG, le=MOST_TURN_DEG)] | None = Field(
         default=None,
-        description="angle of the stage that the object is shot at, right-handed about its axis; the report says so. "
+        description="angle of the turntable for this scan, right-handed about its axis; the report says so. "
         "The rig's turntable turns there first, from where it stood when it was opened. Default: nothing is turned",
     )
     turned_by: TurnedBy = Field(

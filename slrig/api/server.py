@@ -96,7 +96,7 @@ def open_service(
     runner = Runner(
         store,
         folder,
-        RigSession(rig.name, lambda: open_rig(rig), table_at=folder.root / "stage" / "table.json"),
+        RigSession(rig.name, lambda: open_rig(rig), table_at=folder.root / "turntable" / "position.json"),
         worker,
         capture=capture_frames,
         queue_length=settings.queue_length,
@@ -115,7 +115,7 @@ def open_service(
             worker,
             rig_name=rig.name,
             refuse_when_stale=rig.refuse_when_stale,
-            wanted_mm=rig.wanted_mm,
+            tolerance_mm=rig.tolerance_mm,
             presets=rig.presets,
         )
     except BaseException:

@@ -22,7 +22,7 @@ from slrig.catalogue.standing import standing
 from slrig.catalogue.store import catalogue_of
 from slrig.combine.desk import CombineInto, ModelDesk
 from slrig.combine.shooting import ViewShooting
-from slrig.combine.stage import StageStore
+from slrig.combine.turntable import TurntableStore
 from slrig.config import ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
 from slrig.jobs.compute import Compute
@@ -54,8 +54,8 @@ class Service:
     """One service: its settings, its data, the one that scans, those that calibrate, verify and test, and the schedule.
 
     Until `start` nothing works. store : of scans; all jobs tell of their ends where those do. worker : the runner's,
-    which computes for all of them. refuse_when_stale : whether the rig file has scans refused then. wanted_mm : what it
-    wants of a point's error. presets : the rig file's.
+    which computes for all of them. refuse_when_stale : whether the rig file has scans refused then. tolerance_mm :
+    what it wants of a point's error. presets : the rig file's.
 
     Raises
     ------
@@ -81,7 +81,7 @@ class Service:
         calibration_tools: CalibrationTools | None = None,
         combine: CombineInto | None = None,
         refuse_when_stale: bool = False,
-        wanted_mm: float | None = None,
+        tolerance_mm: float | None = None,
         presets: Mapping[str, Preset] | None = None,
     ) -> None:
         self.settings = settings
@@ -105,7 +105,7 @@ class Service:
             rig_name=rig_name,
             tools=calibration_tools or usual_calibration_tools(worker),
             spare_bytes=spare_bytes,
-            wanted_mm=wanted_mm,
+            tolerance_mm=tolerance_mm,
         )
         self.verifications = VerificationDesk(
             folder,
@@ -122,23 +122,23 @@ class Service:
             JobStore(database, JobKind.POSITION, outbox=outbox),
             evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
             report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
-            wanted_mm=wanted_mm,
+            tolerance_mm=tolerance_mm,
         )
-        self.stage = StageStore(folder.root / "stage")
+        self.turntable = TurntableStore(folder.root / "turntable")
         self.models = ModelDesk(
             folder,
             runner.queue,
             JobStore(database, JobKind.MODEL, outbox=outbox),
             scans=store,
             combine=combine or worker.task("slrig.combine.combining:combine_into", "model"),
-            stage=self.stage,
+            turntable=self.turntable,
             keep=settings.keep_models,
             spare_bytes=spare_bytes,
         )
         runner.spare_what_is_used(self.models.unused)
         self.shooting = ViewShooting(self.models, runner, store)
-        self.find_axis = worker.task("slrig.calibrate.stage_axis:axis_of_poses", "axis of the stage")
-        self.find_planes = worker.task("slrig.combine.empty_stage:planes_in", "planes of the stage")
+        self.find_axis = worker.task("slrig.calibrate.turntable_axis:axis_of_poses", "axis of the turntable")
+        self.find_planes = worker.task("slrig.combine.turntable_planes:planes_in", "planes of the turntable")
         self.durations = Durations()
         self.observers = [each for observe in load(OBSERVERS).values() if (each := observe()) is not None]
         self._desks = (self.verifications, self.calibrations, self.acceptance, self.models)

@@ -29,7 +29,7 @@ from slrig.model import (
     PlaneKind,
     Region,
     SequenceName,
-    StagePlane,
+    TurntablePlane,
     bracket_fault,
 )
 
@@ -57,7 +57,7 @@ PRESET_NAME = r"[a-z][a-z0-9_-]{0,39}"
 
 
 class AxisEntry(Strict):
-    """An axis in the frame of the views; the stage's angle is counted about its direction, right-handed."""
+    """An axis in the frame of the views; the turntable's angle is counted about its direction, right-handed."""
 
     point_mm: Vector3
     direction: Vector3
@@ -196,10 +196,10 @@ class ChangeEntry(Strict):
     taken: bool = Field(description="whether it is in the axis on record")
 
 
-class StageEntry(Strict):
-    """The whole of stage.json."""
+class TurntableEntry(Strict):
+    """The whole of turntable.json."""
 
-    format: Literal["slrig-stage"]
+    format: Literal["slrig-turntable"]
     version: Literal[1]
     axis: MeasuredEntry | None = None
     planes: list[PlaneEntry] = Field(default_factory=list, max_length=_MAX_PLANES)
@@ -207,28 +207,32 @@ class StageEntry(Strict):
 
 
 @dataclass(frozen=True, slots=True)
-class StageRecord:
-    """Axis, planes and history of a stage. history : from old to new."""
+class TurntableRecord:
+    """Axis, planes and history of a turntable. history : from old to new."""
 
     axis: MeasuredAxis | None = None
-    planes: tuple[StagePlane, ...] = ()
+    planes: tuple[TurntablePlane, ...] = ()
     history: tuple[ChangeEntry, ...] = ()
 
 
-def read_stage(path: Path) -> StageRecord:
-    """Return the record of a stage in a file. Raises ConfigError: it cannot be read or is invalid, with every fault."""
-    return stage_record(read_json_model(path, StageEntry, "stage", max_bytes=_TURNTABLE_MAX_BYTES, error=ConfigError))
+def read_turntable(path: Path) -> TurntableRecord:
+    """Return the record of a turntable in a file. Raises ConfigError: it cannot be read or is invalid, with every
+    fault.
+    """
+    return turntable_record(
+        read_json_model(path, TurntableEntry, "turntable", max_bytes=_TURNTABLE_MAX_BYTES, error=ConfigError)
+    )
 
 
-def stage_record(entry: StageEntry) -> StageRecord:
+def turntable_record(entry: TurntableEntry) -> TurntableRecord:
     """Convert a validated document to a record."""
     axis = entry.axis
-    return StageRecord(
+    return TurntableRecord(
         None
         if axis is None
         else MeasuredAxis(np.array(axis.point_mm), _normalise(axis.direction), np.array(axis.covariance)),
         tuple(
-            StagePlane(
+            TurntablePlane(
                 each.kind,
                 np.array(each.point_mm),
                 _normalise(each.normal),
@@ -242,8 +246,8 @@ def stage_record(entry: StageEntry) -> StageRecord:
     )
 
 
-def stage_entry(record: StageRecord) -> StageEntry:
-    """Convert a record to a document, as the inverse of `stage_record`."""
+def turntable_entry(record: TurntableRecord) -> TurntableEntry:
+    """Convert a record to a document, as the inverse of `turntable_record`."""
     axis, measured = record.axis, None
     if axis is not None:
         point, direction, covariance = (each.tolist() for each in (axis.point_mm, axis.direction, axis.covariance))
@@ -259,14 +263,14 @@ def stage_entry(record: StageRecord) -> StageEntry:
         )
         for each in record.planes
     ]
-    return StageEntry(
-        format="slrig-stage", version=1, axis=measured, planes=planes, history=list(record.history[-MAX_HISTORY:])
+    return TurntableEntry(
+        format="slrig-turntable", version=1, axis=measured, planes=planes, history=list(record.history[-MAX_HISTORY:])
     )
 
 
-def encode_stage(record: StageRecord) -> bytes:
-    """Return a stage as a file's bytes."""
-    return json_bytes(stage_entry(record).model_dump(mode="json"))
+def encode_turntable(record: TurntableRecord) -> bytes:
+    """Return a turntable as a file's bytes."""
+    return json_bytes(turntable_entry(record).model_dump(mode="json"))
 
 
 def _normalise(vector: list[float]) -> FloatArray:
@@ -301,10 +305,10 @@ class RegionTable(Strict):
         default_factory=dict,
         description="by camera, the same as a PNG of the image's extent, in base64: black is invalid",
     )
-    least_contrast: Annotated[float, Field(gt=0, lt=1)] | None = Field(
+    min_contrast: Annotated[float, Field(gt=0, lt=1)] | None = Field(
         default=None, description="minimum of white less black of a pixel, as a share of full scale"
     )
-    most_sigma_mm: Annotated[float, Field(gt=0)] | None = Field(
+    max_sigma_mm: Annotated[float, Field(gt=0)] | None = Field(
         default=None, description="maximum stated standard deviation of a vertex"
     )
 

@@ -1,4 +1,4 @@
-"""Further files of a bundle: truth of a rendered scene, health, notes, refused frames, stage angle.
+"""Further files of a bundle: truth of a rendered scene, health, notes, refused frames, turntable angle.
 
 `truth.ply` is the surface (binary little endian), `visible_points.npy` its points that the first camera sees lit by the
 projector, `truth-CAMERA.npz` the maps of each camera. Maps and surface are float32 on disk: at a distance of one metre
@@ -33,7 +33,7 @@ REFUSED_FOLDER = "refused"
 REFUSED_LIST = "refused.json"
 _REFUSED_MAX_BYTES = 16 * 2**20
 
-TURNTABLE_FILE = "stage.json"
+TURNTABLE_FILE = "turntable.json"
 TURNTABLE_MAX_BYTES = 2**16
 
 SURFACE_FILE = "truth.ply"
@@ -137,9 +137,9 @@ TurnedBy = Literal["table", "hand"]
 """The object is turned by the rig's turntable, or by a person."""
 
 
-class StageAngle(Strict):
-    """Angle of the stage. angle_deg : right-handed about its axis, from an arbitrary zero. count : equal for angles of
-    a turntable with the same zero; None if that is not known.
+class TurntableAngle(Strict):
+    """Angle of the turntable. angle_deg : right-handed about its axis, from an arbitrary zero. count : equal for
+    angles of a turntable with the same zero; None if that is not known.
     """
 
     angle_deg: Annotated[float, Field(allow_inf_nan=False)]
@@ -147,21 +147,23 @@ class StageAngle(Strict):
     count: Annotated[str, Field(max_length=80)] | None = None
 
     def document(self) -> dict[str, object]:
-        """Return the angle as in stage.json and in a scan's report."""
+        """Return the angle as in turntable.json and in a scan's report."""
         return self.model_dump(exclude_none=True)
 
 
-def write_stage(folder: Path, stage: StageAngle) -> None:
-    """Write the stage angle into a bundle. Raises StorageError."""
-    write_file(folder / TURNTABLE_FILE, json_bytes(stage.document()))
+def write_turntable_angle(folder: Path, turntable: TurntableAngle) -> None:
+    """Write the turntable angle into a bundle. Raises StorageError."""
+    write_file(folder / TURNTABLE_FILE, json_bytes(turntable.document()))
 
 
-def read_stage(folder: Path) -> StageAngle | None:
-    """Return the stage angle of a bundle, None if it has none. Raises BundleError: the file is invalid."""
+def read_turntable_angle(folder: Path) -> TurntableAngle | None:
+    """Return the turntable angle of a bundle, None if it has none. Raises BundleError: the file is invalid."""
     path = folder / TURNTABLE_FILE
     if not path.exists():
         return None
-    return read_json_model(path, StageAngle, "angle of a stage", max_bytes=TURNTABLE_MAX_BYTES, error=BundleError)
+    return read_json_model(
+        path, TurntableAngle, "angle of a turntable", max_bytes=TURNTABLE_MAX_BYTES, error=BundleError
+    )
 
 
 @dataclass(frozen=True, slots=True)

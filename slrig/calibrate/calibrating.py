@@ -58,7 +58,7 @@ class CalibrationSessions:
         rig_name: str,
         tools: CalibrationTools,
         spare_bytes: int = 0,
-        wanted_mm: float | None = None,
+        tolerance_mm: float | None = None,
     ) -> None:
         self._data = folder
         self.store = CalibrationStore(folder)
@@ -68,7 +68,7 @@ class CalibrationSessions:
         self._rig_name = rig_name
         self._tools = tools
         self.poses = PoseDesk(self.register, folder, self._work, tools, spare_bytes)
-        self.solves = SolveDesk(self.register, self._work, tools, wanted_mm, self._of_the_rig)
+        self.solves = SolveDesk(self.register, self._work, tools, tolerance_mm, self._of_the_rig)
         runner.use_calibration(self.store.active_calibration())
 
     def _of_the_rig(self) -> Calibration | None:

@@ -69,7 +69,7 @@ def summary(result: CalibrationResult) -> Mapping[str, Any]:
             result.expected, "point_mm", "noise_mm", "total_mm", "length_share", "across", "volume_mm", "board_mm"
         ),
         "odd_even": None if checked is None else {**_fields(checked, *_CHECK), **checked.motion._asdict()},
-        "verdict": _fields(result.verdict, "grade", "summary", "reasons", "remarks", "unattended", "wanted_mm"),
+        "verdict": _fields(result.verdict, "grade", "summary", "reasons", "remarks", "unattended", "tolerance_mm"),
         "board": {
             "bowed": solution.board_shape_mm is not None,
             "bow_mm": None if bow is None else [bow.height_mm, bow.sigma_mm],

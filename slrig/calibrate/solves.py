@@ -33,7 +33,7 @@ class SolveDesk:
     register: CalibrationRegister
     work: RigJobs
     tools: CalibrationTools
-    wanted_mm: float | None = None
+    tolerance_mm: float | None = None
     """What the rig file says that a point of a scan may be wrong by."""
     of_the_rig: Callable[[], Calibration | None] = lambda: None
     """Gives the calibration that the rig has by itself."""
@@ -102,7 +102,7 @@ class SolveDesk:
             progress=progress,
             earlier=self._comparable(record),
             board_shape=BoardShape(plan["board_shape"]),
-            wanted_mm=self.wanted_mm,
+            tolerance_mm=self.tolerance_mm,
         )
         number = plan["number"]
         if result.calibration.solved is not None:

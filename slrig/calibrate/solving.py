@@ -53,13 +53,13 @@ def solve_poses(
     progress: ProgressCallback = lambda _stage, _fraction, _detail: None,
     earlier: Calibration | None = None,
     board_shape: BoardShape = BoardShape.AUTO,
-    wanted_mm: float | None = None,
+    tolerance_mm: float | None = None,
 ) -> CalibrationResult:
     """Solve the poses, say how far the result may be trusted, and give it an identity.
 
     cameras : the first one's frame becomes the world; one is enough, also without a projector. projector : None where
     no light was captured. earlier : a calibration of the same devices, to compare the scale with. board_shape : whether
-    the board may be bowed. wanted_mm : what a point of a scan may be wrong by in 95 of 100 places; None goes by the
+    the board may be bowed. tolerance_mm : what a point of a scan may be wrong by in 95 of 100 places; None goes by the
     volume.
 
     Raises
@@ -101,7 +101,9 @@ def solve_poses(
         solution=solution,
         calibration=replace(solution.calibration, solved=solved),
         expected=expected,
-        verdict=judge_calibration(solution, expected, covered, checked, board=board, scale=scale, wanted_mm=wanted_mm),
+        verdict=judge_calibration(
+            solution, expected, covered, checked, board=board, scale=scale, tolerance_mm=tolerance_mm
+        ),
         coverage=covered,
         odd_even=checked,
     )

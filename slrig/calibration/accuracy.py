@@ -310,7 +310,7 @@ class DeviceDifference:
 class Comparison:
     """Comparison of two calibrations. devices : those that both have. missing : those that only one has.
 
-    moved_rms_mm, moved_most_mm : rms and maximum displacement of points in the volume that are measured from the same
+    moved_rms_mm, moved_max_mm : rms and maximum displacement of points in the volume that are measured from the same
     pixels with the second instead of the first, without their common rigid motion: turn_deg about the volume's centre
     and shift_mm of it. All NaN if neither states a volume, or they have only one device in common. words : sentences,
     the displacements first.
@@ -319,7 +319,7 @@ class Comparison:
     devices: Mapping[str, DeviceDifference]
     missing: tuple[str, ...]
     moved_rms_mm: float
-    moved_most_mm: float
+    moved_max_mm: float
     turn_deg: float
     shift_mm: float
     words: tuple[str, ...]

@@ -260,8 +260,8 @@ class Verdict:
 
     grade : the worst of all figures. summary : one sentence. reasons : messages of all figures that are not good, the
     worst first. remarks : possible improvements whose effect the stated error includes. unattended : reasons why a
-    schedule must not activate the calibration. figures : all, the worst first. wanted_mm : wanted error of a point in
-    95 of 100 places.
+    schedule must not activate the calibration. figures : all, the worst first. tolerance_mm : wanted error of a point
+    in 95 of 100 places.
     """
 
     grade: Grade
@@ -270,7 +270,7 @@ class Verdict:
     figures: tuple[GradedFigure, ...]
     remarks: tuple[str, ...] = ()
     unattended: tuple[str, ...] = ()
-    wanted_mm: float = float("nan")
+    tolerance_mm: float = float("nan")
 
 
 def judge_calibration(
@@ -281,17 +281,21 @@ def judge_calibration(
     *,
     board: Board,
     scale: ScaleCheck | None = None,
-    wanted_mm: float | None = None,
+    tolerance_mm: float | None = None,
 ) -> Verdict:
     """Grade a solved calibration by its expected error and by the credibility of that error.
 
     expected : None if unknown; covered : of the solved poses, checked : by halves of them, both None if unknown.
-    scale : relative to an earlier calibration, None without one. wanted_mm : wanted error of a point in 95 of 100
+    scale : relative to an earlier calibration, None without one. tolerance_mm : wanted error of a point in 95 of 100
     places; None takes 1/2000 of the diagonal of the volume in which the board was held.
     """
-    if wanted_mm is None:
-        wanted_mm = DEFAULT_ERROR_RATIO * _diagonal_mm(expected) if expected is not None else float("nan")
-    figures = [*_grade_expected_error(expected, wanted_mm), *grade_board_size(solution, scale), *_grade_poses(solution)]
+    if tolerance_mm is None:
+        tolerance_mm = DEFAULT_ERROR_RATIO * _diagonal_mm(expected) if expected is not None else float("nan")
+    figures = [
+        *_grade_expected_error(expected, tolerance_mm),
+        *grade_board_size(solution, scale),
+        *_grade_poses(solution),
+    ]
     for name, residuals in solution.residuals.items():
         figures += [*_grade_residuals(name, residuals), *_grade_residual_map(name, residuals)]
     figures += [*_grade_parameters(solution), *_grade_bend(solution)]
@@ -307,16 +311,16 @@ def judge_calibration(
     inconsistent = () if checked is None or checked.fits else ("its odd and even poses differ by more than it states",)
     return Verdict(
         grade=grade,
-        summary=_summary(grade, expected, wanted_mm, len(reasons)),
+        summary=_summary(grade, expected, tolerance_mm, len(reasons)),
         reasons=reasons,
         figures=tuple(figures),
         remarks=tuple(each.message for each in figures if each.grade is Grade.GOOD and each.is_remark),
         unattended=(*unusable, *inconsistent, *unattended_faults(solution, board, scale)),
-        wanted_mm=wanted_mm,
+        tolerance_mm=tolerance_mm,
     )
 
 
-def _summary(grade: Grade, expected: ExpectedError | None, wanted_mm: float, count: int) -> str:
+def _summary(grade: Grade, expected: ExpectedError | None, tolerance_mm: float, count: int) -> str:
     error = ""
     if expected is not None and np.isfinite(expected.point_mm) and expected.point_mm > 0:
         limit = ", by the size of the board most of all" if _limited_by_board(expected) else ""
@@ -327,7 +331,7 @@ def _summary(grade: Grade, expected: ExpectedError | None, wanted_mm: float, cou
     single = expected is not None and expected.across
     note = "; it cannot scan alone: that takes a projector or a second camera, calibrated with it" if single else ""
     if grade is Grade.GOOD:
-        return f"good{error}; twice that is within the wanted {wanted_mm:.2g} mm{note}"
+        return f"good{error}; twice that is within the wanted {tolerance_mm:.2g} mm{note}"
     return f"{grade.label}{error}; {count} thing{'s' if count > 1 else ''} to look at{note}"
 
 
@@ -354,21 +358,21 @@ def _grade_figure(
     return GradedFigure(grade, figure, device, value, message, is_remark=not fine)
 
 
-def _grade_expected_error(expected: ExpectedError | None, wanted_mm: float) -> Iterator[GradedFigure]:
+def _grade_expected_error(expected: ExpectedError | None, tolerance_mm: float) -> Iterator[GradedFigure]:
     figure = "error"
     if expected is None or not np.isfinite(expected.point_mm):
         message = "the error of a scan is unknown: add poses that all devices see, at three distances"
         yield GradedFigure(Grade.USABLE, figure, None, float("nan"), message)
         return
     diagonal_mm, error_mm = _diagonal_mm(expected), _SIGMAS * expected.point_mm
-    good, usable = error_mm <= wanted_mm, error_mm <= _USABLE_RATIO * wanted_mm
+    good, usable = error_mm <= tolerance_mm, error_mm <= _USABLE_RATIO * tolerance_mm
     grade = Grade.GOOD if good else Grade.USABLE if usable else Grade.DO_NOT_USE
     noisy = f" ({expected.total_mm:.2g} mm with the noise of the light)" if np.isfinite(expected.total_mm) else ""
     length_mm = expected.length_share * diagonal_mm / 2
     lengths = f", and a length of {diagonal_mm / 2:.0f} mm {length_mm:.2g} mm wrong" if np.isfinite(length_mm) else ""
     found = (
         f"{expected.point_description} is expected {expected.point_mm:.2g} mm off{expected.direction_description} by "
-        f"the calibration{noisy}{lengths}; twice that of a point is {error_mm:.2g} mm, wanted are {wanted_mm:.2g} mm"
+        f"the calibration{noisy}{lengths}; twice that of a point is {error_mm:.2g} mm, wanted are {tolerance_mm:.2g} mm"
     )
     remedy = "add poses where the map of the expected error is worst, tilted and at several distances"
     if _limited_by_board(expected):

@@ -46,7 +46,7 @@ class RigStanding:
     computing: int | None
     uncopied: int | None
     health: str | None
-    health_words: str
+    health_message: str
     verified_at: datetime | None
     last_scan: LastScan | None
     scans_of_day: int

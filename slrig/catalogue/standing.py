@@ -29,7 +29,7 @@ def standing(runner: Runner, verifications: VerificationDesk, *, data: Path, sta
         "waiting": status.waiting,
         "computing": len(status.computing),
         "health": str(health.state),
-        "health_words": "; ".join(health.reasons),
+        "health_message": "; ".join(health.reasons),
         "verified_at": None if latest is None else latest.at,
     }
 

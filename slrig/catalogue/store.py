@@ -273,7 +273,7 @@ def _standing(row: Mapping[Any, Any], now: datetime, scans: int, failed: int) ->
         computing=row["computing"] if current else None,
         uncopied=row["uncopied"] if current else None,
         health=row["health"] if current else None,
-        health_words=row["health_words"] if current else "",
+        health_message=row["health_message"] if current else "",
         verified_at=row["verified_at"],
         last_scan=last,
         scans_of_day=scans,

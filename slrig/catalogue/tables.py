@@ -56,7 +56,7 @@ class RigRow(CatalogueBase):
     computing: Mapped[int] = mapped_column(Integer)
     uncopied: Mapped[int] = mapped_column(Integer)
     health: Mapped[str] = mapped_column(String)
-    health_words: Mapped[str] = mapped_column(String)
+    health_message: Mapped[str] = mapped_column(String)
     verified_at: Mapped[datetime | None] = mapped_column(Moment)
 
 

@@ -52,7 +52,7 @@ def plan_for(asked: AcceptanceOptions, rig: Rig) -> AcceptancePlan:
         volume,
         _artefacts(asked, exact_artefacts(volume) if rendered else None),
         rendered=rendered,
-        limits=_limits(asked, usual_limits(volume, asked.wanted_mm)),
+        limits=_limits(asked, usual_limits(volume, asked.tolerance_mm)),
         repeats=asked.repeats,
         exposure_s=asked.exposure_s,
         notes=asked.notes,
@@ -103,8 +103,8 @@ def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: 
     """
     set_up_console_logs()
     config = read_rig(rig_file)
-    if asked.wanted_mm is None:
-        asked = replace(asked, wanted_mm=config.wanted_mm)
+    if asked.tolerance_mm is None:
+        asked = replace(asked, tolerance_mm=config.tolerance_mm)
     console = Console(stderr=as_json)
     with TemporaryDirectory(prefix="slrig-acceptance-") as scratch:
         if scripted:
@@ -178,8 +178,8 @@ def _tested(rig: Rig, plan: AcceptancePlan, output: Path, *, scripted: bool, con
         console.print(Text(f"{step.name}: {error}", style="red"))
         return True
 
-    by_hand = placed_by_hand(plan, console)
-    return run_acceptance(rig, plan, output, progress=_quiet, cancelled=lambda: False, place=by_hand, again=again)
+    manual = placed_by_hand(plan, console)
+    return run_acceptance(rig, plan, output, progress=_quiet, cancelled=lambda: False, place=manual, again=again)
 
 
 def _quiet(_stage: str, _fraction: float, _detail: str, /) -> None:

@@ -75,7 +75,7 @@ def solve(
     earlier: Annotated[
         Path | None, typer.Option(help="Calibration of the same rig: is the board's size what it was then?")
     ] = None,
-    wanted_mm: Annotated[
+    tolerance_mm: Annotated[
         float | None,
         typer.Option(
             min=1e-4, max=1000.0, help="What a point may be wrong by, mm. Default: 1/2000 of the volume's diagonal."
@@ -96,7 +96,7 @@ def solve(
         report=report,
         earlier=earlier,
         board_shape=shape,
-        wanted_mm=wanted_mm,
+        tolerance_mm=tolerance_mm,
         as_json=as_json,
     )
 

@@ -53,13 +53,13 @@ def solve_folder(
     report: Path | None,
     earlier: Path | None,
     board_shape: BoardShape,
-    wanted_mm: float | None,
+    tolerance_mm: float | None,
     as_json: bool,
 ) -> None:
     """Read the poses, solve, print how good the calibration is, and write it and its report.
 
     earlier : file of a calibration of the same devices, to compare the scale with. board_shape : whether the board may
-    be bowed. wanted_mm : what a point of a scan may be wrong by.
+    be bowed. tolerance_mm : what a point of a scan may be wrong by.
 
     Raises ConfigError or StorageError where the output cannot be written, BundleError where there are no bundles,
     CalibrationError where the poses are of different rigs or the earlier calibration cannot be read, PoseRefusedError
@@ -67,7 +67,7 @@ def solve_folder(
     """
     _require_writable(output, report)
     document = _solved(
-        folder, board, output, report=report, earlier=earlier, board_shape=board_shape, wanted_mm=wanted_mm
+        folder, board, output, report=report, earlier=earlier, board_shape=board_shape, tolerance_mm=tolerance_mm
     )
     if as_json:
         print_json({**document, "output": str(output), "report": report and str(report)})
@@ -83,7 +83,7 @@ def check_folder(folder: Path, board: Board, *, board_shape: BoardShape, as_json
 
     Raises as `solve_folder` does, and ConfigError where the poses are too few to be halved.
     """
-    document = _solved(folder, board, None, report=None, earlier=None, board_shape=board_shape, wanted_mm=None)
+    document = _solved(folder, board, None, report=None, earlier=None, board_shape=board_shape, tolerance_mm=None)
     (print_json if as_json else tell_check)(checked(document))
 
 
@@ -95,7 +95,7 @@ def _solved(
     report: Path | None,
     earlier: Path | None,
     board_shape: BoardShape,
-    wanted_mm: float | None,
+    tolerance_mm: float | None,
 ) -> dict[str, Any]:
     """Solve, write the calibration and its report where a file is named, and return what is told of it."""
     set_up_console_logs()
@@ -129,7 +129,7 @@ def _solved(
                 progress=solving,
                 earlier=before,
                 board_shape=board_shape,
-                wanted_mm=wanted_mm,
+                tolerance_mm=tolerance_mm,
             )
         except SolveRefusedError as error:
             raise SolveRefusedError(_with_refused(str(error), found.refused)) from error

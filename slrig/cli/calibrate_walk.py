@@ -71,7 +71,7 @@ def walk(
         if scripted:
             walked.by_script(positions=positions, activate=activate)
         else:
-            walked.by_hand()
+            walked.manual()
     except KeyboardInterrupt:
         walked.leave()
         raise
@@ -109,7 +109,7 @@ class Walk:
                 # Refuses when the service is gone, which `still_missing` takes for one that is still starting.
                 self._client.get("/rig")
 
-    def by_hand(self) -> None:
+    def manual(self) -> None:
         """Shoot when the person says so, until they solve and leave.
 
         Raises

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import typer
 import typer.core
 
-from slrig.cli import calibrate, key, pool, preset, schedule, stage
+from slrig.cli import calibrate, key, pool, preset, schedule, turntable
 from slrig.cli.backup import backup, restore
 from slrig.cli.fleet import fleet
 from slrig.cli.foreign import import_images
@@ -373,7 +373,7 @@ app.command()(restore)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
 app.add_typer(preset.app, name="preset")
-app.add_typer(stage.app, name="stage")
+app.add_typer(turntable.app, name="turntable")
 app.add_typer(key.app, name="key")
 app.add_typer(pool.app, name="pool")
 app.command()(pool.worker)

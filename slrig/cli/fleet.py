@@ -76,7 +76,7 @@ def _row(rig: Mapping[str, Any]) -> tuple[str, ...]:
         backlog,
         ended if last is None or last["state"] == "succeeded" else f"{ended} {last['state']}",
         f"{rig['scans_of_day']}" + (f", {failed} failed" if failed else ""),
-        rig["words"] if rig["state"] != "ready" else rig["health_words"] if rig["health"] != "good" else "",
+        rig["words"] if rig["state"] != "ready" else rig["health_message"] if rig["health"] != "good" else "",
     )
 
 

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 _OFF_DEG = 5.0
-"""Between what is said of a stage and what a scan's report says: more than stages err by, less than views are apart."""
+"""Between what is said of a turntable and what a scan's report says: more than turntables err by, less than views are
+apart.
+"""
 
 
 @grouped
@@ -38,14 +40,17 @@ def model(
         Path | None,
         typer.Option(help="With --shoot: the rig file to shoot with; what the folder has of an earlier call stays."),
     ] = None,
-    by_hand: Annotated[bool, typer.Option("--by-hand", help="With --shoot: turn it yourself, when told.")] = False,
+    manual: Annotated[bool, typer.Option("--manual", help="With --shoot: turn it yourself, when told.")] = False,
     service: ServiceOptions,
     angle: Annotated[
         float | None,
-        typer.Option(metavar="DEG", help="The stage turned the object by so much, right-handed, from scan to scan."),
+        typer.Option(
+            metavar="DEG", help="The turntable turned the object by so much, right-handed, from scan to scan."
+        ),
     ] = None,
     axis: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="With --angle or --shoot: the stage's axis, as in poses.json.")
+        Path | None,
+        typer.Option(metavar="FILE", help="With --angle or --shoot: the turntable's axis, as in poses.json."),
     ] = None,
     axis_point: Annotated[
         Vector | None, typer.Option(metavar="X Y Z", help="With --angle: a point of the axis, mm, in the scans' frame.")
@@ -53,13 +58,15 @@ def model(
     axis_direction: Annotated[
         Vector | None, typer.Option(metavar="X Y Z", help="With --axis-point: the direction of the axis.")
     ] = None,
-    stage: Annotated[
+    turntable: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="What slrig stage wrote: the axis for --angle, and planes to cut views by."),
+        typer.Option(
+            metavar="FILE", help="What slrig turntable wrote: the axis for --angle, and planes to cut views by."
+        ),
     ] = None,
-    no_cut: Annotated[bool, typer.Option("--no-cut", help="With --stage: leave plate and backdrops in the views.")] = (
-        False
-    ),
+    no_cut: Annotated[
+        bool, typer.Option("--no-cut", help="With --turntable: leave plate and backdrops in the views.")
+    ] = (False),
     poses: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Poses to start from, by the scans' names, as in poses.json.")
     ] = None,
@@ -82,10 +89,10 @@ def model(
 ) -> None:
     """Make one mesh of scans of an object from several sides.
 
-    Says how well they agree, and which motions their shape leaves open. The start is a stage's angle, poses,
+    Says how well they agree, and which motions their shape leaves open. The start is a turntable's angle, poses,
     markers, or unknown. Where no scan has seen the object, the mesh is open.
     """
-    from slrig.bundle.options import StageRecord, read_stage
+    from slrig.bundle.options import TurntableRecord, read_turntable
     from slrig.cli.display import progress_shown
     from slrig.cli.reconstruct import keep_kernels
     from slrig.combine.offered import POSES, REPORT, REPORT_FORMAT
@@ -95,12 +102,12 @@ def model(
 
     set_up_console_logs()
     keep_kernels()
-    known, notes = StageRecord() if stage is None else read_stage(stage), list[str]()
+    known, notes = TurntableRecord() if turntable is None else read_turntable(turntable), list[str]()
     told = _axis(axis, axis_point, axis_direction)
     if told is None and known.axis is not None and poses is None and not (unknown or markers):
         told = StatedAxis.of(known.axis.point_mm, known.axis.direction)
-    if (shoot is None) == (not scans) or (shoot is None and (rig or by_hand)):
-        raise ConfigError("expected scans, or --shoot N (with --rig or a service, and --by-hand), and not both")
+    if (shoot is None) == (not scans) or (shoot is None and (rig or manual)):
+        raise ConfigError("expected scans, or --shoot N (with --rig or a service, and --manual), and not both")
     if dictionary is not None and not markers:
         raise ConfigError("--dictionary: expected --markers beside it, whose dictionary it is; leave it out")
     found = MarkerPoses(dictionary or MARKER_DICTIONARY) if markers else UnknownPoses() if unknown else None
@@ -118,13 +125,13 @@ def model(
     elif rig is not None:
         from slrig.cli.model_shoot import views_here
 
-        files, start, notes = views_here(rig, shoot, output, by_hand=by_hand, axis=told, found=found)
+        files, start, notes = views_here(rig, shoot, output, manual=manual, axis=told, found=found)
         output /= "model"
     else:
         from slrig.cli.model_shoot import views_there
 
         request = given(
-            views=shoot, by_hand=by_hand, poses=None if found is None else found.kind, dictionary=dictionary,
+            views=shoot, manual=manual, poses=None if found is None else found.kind, dictionary=dictionary,
             axis=None if told is None else asdict(told), start_error_mm=start_error_mm, voxel_mm=voxel_mm,
             cut=not no_cut,
         )  # fmt: skip
@@ -132,7 +139,7 @@ def model(
             views_there(client, request, output)
         _tell_all(json.loads((output / REPORT).read_bytes()), output)
         return
-    read = [each for each in (axis, poses, stage) if each and each.name != POSES]
+    read = [each for each in (axis, poses, turntable) if each and each.name != POSES]
     _require_apart(output, [*files.values(), *read])
     with staged_folder(output, REPORT_FORMAT) as folder, progress_shown() as display:
         from slrig.combine.combining import combine_into
@@ -188,7 +195,9 @@ def _tell(report: Mapping[str, Any]) -> None:
     print_table((Column("view", overflow="fold"), *(Column(each, justify="right") for each in figures)), rows)
     removed = [sum(each["share"] for each in view["removed"]) for view in report["views"] if view["removed"]]
     if removed:
-        typer.echo(f"{'cut':<10}{min(removed):.0%} to {max(removed):.0%} of the views lay behind the stage's planes")
+        typer.echo(
+            f"{'cut':<10}{min(removed):.0%} to {max(removed):.0%} of the views lay behind the turntable's planes"
+        )
     holds = "held as the start has it" if report["markers"] is None else "held by the markers"
     for kind in dict.fromkeys(each["motion"] for each in report["free"]):
         mine = [each for each in report["free"] if each["motion"] == kind]
@@ -210,10 +219,10 @@ def _tell(report: Mapping[str, Any]) -> None:
         x, y, z = turned["point_mm"]
         a, b, c = turned["direction"]
         sigma_deg = math.degrees(turned["direction_sigma_rad"])
-        worst = max(map(abs, turned["stage_error_deg"]))
+        worst = max(map(abs, turned["turntable_error_deg"]))
         typer.echo(
             f"{'axis':<10}through ({x:.3f}, {y:.3f}, {z:.3f}) mm ± {turned['point_sigma_mm']:.4f} mm, along "
-            f"({a:.5f}, {b:.5f}, {c:.5f}) ± {sigma_deg:.4f}°; the stage's angles are up to {worst:.3f}° off"
+            f"({a:.5f}, {b:.5f}, {c:.5f}) ± {sigma_deg:.4f}°; the turntable's angles are up to {worst:.3f}° off"
         )
 
 
@@ -233,12 +242,12 @@ def _starts(
     ways = [angle is not None, file is not None, found is not None]
     if sum(ways) != 1 or (angle is None) != (axis is None):
         told = {
-            "--angle": angle, "--axis, --axis-point or --stage": axis, "--poses": file,
+            "--angle": angle, "--axis, --axis-point or --turntable": axis, "--poses": file,
             "--unknown or --markers": found,
         }  # fmt: skip
         said = ", ".join(way for way, value in told.items() if value is not None) or "none of them"
         message = (
-            "expected a stage's --angle with its axis (--stage FILE, --axis FILE, or --axis-point and "
+            "expected a turntable's --angle with its axis (--turntable FILE, --axis FILE, or --axis-point and "
             f"--axis-direction), --poses FILE, --markers, or --unknown, found {said}. Where --unknown is refused, "
             "place the scans by hand in another program, and write what it says into a file as "
             "slrig/multiview/README.md describes"
@@ -257,20 +266,21 @@ def _starts(
 
 
 def _require_order(files: Mapping[str, Path], angle: float) -> None:
-    """Raises ConfigError: the scans' own reports say that the stage stood elsewhere, as where a shell has put view-10
-    before view-2.
+    """Raises ConfigError: the scans' own reports say that the turntable stood elsewhere, as where a shell has put
+    view-10 before view-2.
     """
-    from slrig.combine.plan import stage_told
+    from slrig.combine.plan import turntable_angle
     from slrig.scan.artefacts import REPORT
 
     reports = [mesh.with_name(REPORT) for mesh in files.values()]
-    told = [stage_told(report.read_bytes()) if report.is_file() else None for report in reports]
-    stood = [stage[0] for stage in told if stage is not None]
+    told = [turntable_angle(report.read_bytes()) if report.is_file() else None for report in reports]
+    stood = [turntable[0] for turntable in told if turntable is not None]
     off = [math.remainder(each - stood[0] - angle * number, 360.0) for number, each in enumerate(stood)]
     if len(stood) == len(files) and max(map(abs, off)) > _OFF_DEG:
         where = ", ".join(f"{name} at {each:g}°" for name, each in zip(files, stood, strict=True))
         message = (
-            f"--angle {angle:g}: expected scans in the order in which the stage turned, so far from one to the next, "
+            f"--angle {angle:g}: expected scans in the order in which the turntable turned, so far from one to the "
+            f"next, "
             f"found by their own reports {where}. Name them in that order, or the folder that they lie in"
         )
         raise ConfigError(message)

@@ -13,7 +13,7 @@ from uuid import uuid4
 import typer
 
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.bundle import DESCRIPTION, read_stage
+from slrig.bundle import DESCRIPTION, read_turntable_angle
 from slrig.cli.display import answered, progress_shown
 from slrig.cli.reconstruct import prepare_kernels
 from slrig.client import Client
@@ -38,7 +38,7 @@ def views_here(
     count: int,
     output: Path,
     *,
-    by_hand: bool,
+    manual: bool,
     axis: StatedAxis | None,
     found: StartingPoses | None = None,
     ask: Callable[[str], str] = input,
@@ -60,11 +60,11 @@ def views_here(
         Fewer than two views succeeded.
     """
     config = read_rig(rig_file)
-    shoot, model_id, notes = ShootPlan(count, scan_plan(ScanRequest(), config.scan), by_hand), uuid4(), []
+    shoot, model_id, notes = ShootPlan(count, scan_plan(ScanRequest(), config.scan), manual), uuid4(), []
     meshes = {number: output / f"view-{number}" / MESH for number in range(1, count + 1)}
     with open_rig(config) as rig:
         table = rig.positioner if isinstance(rig.positioner, Turntable) else None
-        if table is None and not by_hand:
+        if table is None and not manual:
             raise no_turntable(0.0)
         if table is not None:
             rig = replace(rig, positioner=CountedTurntable(table, output / "table.json"))
@@ -72,19 +72,19 @@ def views_here(
             axis = StatedAxis.of(table.axis.point_mm, table.axis.direction)
         if axis is None and found is None:
             raise ConfigError(
-                "expected the stage's axis, which the rig does not know: say --axis, --axis-point, --markers or "
+                "expected the turntable's axis, which the rig does not know: say --axis, --axis-point, --markers or "
                 "--unknown"
             )
         for number in [number for number, mesh in meshes.items() if not mesh.is_file()]:
             prompt = f"turn the object by about {shoot.step_deg:g}°, to {shoot.angle_deg(number):g}° in all,"
-            while not by_hand or number == 1 or answered(ask, f"{prompt} then press Enter (q: no more) > ") != "q":
+            while not manual or number == 1 or answered(ask, f"{prompt} then press Enter (q: no more) > ") != "q":
                 try:
                     _shot(rig, shoot.view(number, model_id, utc_now()), output, number)
                     break
                 except SlrigError as error:
                     typer.secho(f"view-{number}: {error}", fg="red", err=True)
                     prompt = "to shoot it again, turn nothing,"
-                    if not by_hand or number == 1:
+                    if not manual or number == 1:
                         notes.append(f"view-{number}, at {shoot.angle_deg(number):g}°, is not in it: {error}")
                         break
             else:
@@ -93,15 +93,19 @@ def views_here(
     if len(good) < 2:
         message = f"{len(good)} of {count} views succeeded, and a model takes two. The same command shoots the others."
         raise ViewsFailedError(message)
-    stages = [stage for stage in map(read_stage, (output / f"bundle-{number}" for number in good)) if stage is not None]
-    if found is None and (len(stages) < len(good) or len({stage.count for stage in stages}) > 1):
+    turntables = [
+        turntable
+        for turntable in map(read_turntable_angle, (output / f"bundle-{number}" for number in good))
+        if turntable is not None
+    ]
+    if found is None and (len(turntables) < len(good) or len({turntable.count for turntable in turntables}) > 1):
         message = (
             f"{output}: expected views whose angles have one zero, found some without one, or that the turntable lost "
             "its place between them; shoot into another folder, or say --unknown"
         )
         raise ConfigError(message)
     # As they were shot, perhaps by a command that asked for another number of views.
-    angles_deg = tuple(stage.angle_deg for stage in stages)
+    angles_deg = tuple(turntable.angle_deg for turntable in turntables)
     poses = TurntablePoses(axis, angles_deg) if found is None else found
     return {mesh.parent.name: mesh for mesh in good.values()}, poses, notes
 

@@ -167,7 +167,7 @@ class AcceptanceOptions:
             "Default: that of the calibration.",
         ),
     ] = None
-    wanted_mm: Annotated[
+    tolerance_mm: Annotated[
         float | None,
         typer.Option(
             min=1e-4,
@@ -177,16 +177,16 @@ class AcceptanceOptions:
         ),
     ] = None
     spacing_limit_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="Limit of sphere spacing. Default: --wanted-mm.")
+        float | None, typer.Option(min=0.0, help="Limit of sphere spacing. Default: --tolerance-mm.")
     ] = None
     form_limit_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="Limit of probing form. Default: twice --wanted-mm.")
+        float | None, typer.Option(min=0.0, help="Limit of probing form. Default: twice --tolerance-mm.")
     ] = None
     size_limit_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="Limit of probing size. Default: --wanted-mm.")
+        float | None, typer.Option(min=0.0, help="Limit of probing size. Default: --tolerance-mm.")
     ] = None
     flatness_limit_mm: Annotated[
-        float | None, typer.Option(min=0.0, help="Limit of flatness. Default: twice --wanted-mm.")
+        float | None, typer.Option(min=0.0, help="Limit of flatness. Default: twice --tolerance-mm.")
     ] = None
     repeats: Annotated[
         int, typer.Option(min=1, max=50, help="Captures of the first position of each artefact, for the scatter.")

@@ -32,10 +32,10 @@ class ScanOptions:
     ] = None
     turn_deg: Annotated[
         float | None,
-        typer.Option(help="Angle of the stage that the object is shot at; the rig's turntable turns there first."),
+        typer.Option(help="Angle of the turntable that the object is shot at; the rig's turntable turns there first."),
     ] = None
-    by_hand: Annotated[
-        bool, typer.Option("--by-hand", help="With --turn-deg: the object was turned by hand; nothing moves.")
+    manual: Annotated[
+        bool, typer.Option("--manual", help="With --turn-deg: the object was turned by hand; nothing moves.")
     ] = False
 
     def asked(self) -> dict[str, Any]:
@@ -45,5 +45,5 @@ class ScanOptions:
             colour=self.colour,
             coloured_light=self.coloured_light,
             turn_deg=self.turn_deg,
-            turned_by="hand" if self.by_hand else None,
+            turned_by="hand" if self.manual else None,
         )

@@ -56,7 +56,7 @@ class Client:
         self.rig = RigState(self.connection)
         self.calibration = CalibrationResource(self.connection)
         self.health = RigHealth(self.connection)
-        self.stage = TurntableResource(self.connection)
+        self.turntable = TurntableResource(self.connection)
         self.accept = Acceptance(self.connection)
         self.schedules = Schedules(self.connection)
         self.system = System(self.connection)

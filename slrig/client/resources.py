@@ -135,7 +135,7 @@ class Models(Resource):
         *,
         views: int | None = None,
         scan: Mapping[str, Any] | None = None,
-        by_hand: bool | None = None,
+        manual: bool | None = None,
         poses: Poses | None = None,
         dictionary: str | None = None,
         axis: Mapping[str, Any] | None = None,
@@ -149,7 +149,7 @@ class Models(Resource):
         options = given(
             views=views,
             scan=scan,
-            by_hand=by_hand,
+            manual=manual,
             poses=poses,
             dictionary=dictionary,
             axis=axis,
@@ -428,11 +428,11 @@ class TurntableResource(Resource):
 
     def get(self) -> Json:
         """The axis, its accuracy, the planes, and whether both still hold."""
-        return self._connection.json("GET", "/rig/stage")
+        return self._connection.json("GET", "/rig/turntable")
 
     def plot(self) -> str:
         """The movement of the axis over time, as SVG."""
-        return self._connection.send("GET", "/rig/stage.svg").text
+        return self._connection.send("GET", "/rig/turntable.svg").text
 
     def calibrate(
         self, calibration: str, *, poses: Sequence[int] | None = None, angles_deg: Sequence[float] | None = None
@@ -442,19 +442,19 @@ class TurntableResource(Resource):
         angles_deg : of the turntable, pose by pose.
         """
         options = given(calibration=calibration, poses=poses, angles_deg=angles_deg)
-        return self._connection.json("POST", "/rig/stage/axis", json=options)
+        return self._connection.json("POST", "/rig/turntable/axis", json=options)
 
     def find_planes(self, scan: str) -> Json:
         """Find the plate and backdrops in a scan of the empty turntable."""
-        return self._connection.json("POST", "/rig/stage/planes", json={"scan": scan})
+        return self._connection.json("POST", "/rig/turntable/planes", json={"scan": scan})
 
     def put(self, document: Mapping[str, Any] | str | bytes) -> Json:
         """Replace axis, planes and history by a stored document."""
-        return self._connection.json("PUT", "/rig/stage", **document_body(document))
+        return self._connection.json("PUT", "/rig/turntable", **document_body(document))
 
     def delete(self) -> None:
         """Delete axis, planes and history."""
-        self._connection.send("DELETE", "/rig/stage")
+        self._connection.send("DELETE", "/rig/turntable")
 
 
 class Acceptance(Resource):
@@ -465,7 +465,7 @@ class Acceptance(Resource):
         *,
         artefacts: Mapping[str, Any] | None = None,
         volume_mm: Sequence[Sequence[float]] | None = None,
-        wanted_mm: float | None = None,
+        tolerance_mm: float | None = None,
         limits: Mapping[str, Any] | None = None,
         repeats: int | None = None,
         exposure_s: float | None = None,
@@ -475,7 +475,7 @@ class Acceptance(Resource):
         options = given(
             artefacts=artefacts,
             volume_mm=volume_mm,
-            wanted_mm=wanted_mm,
+            tolerance_mm=tolerance_mm,
             limits=limits,
             repeats=repeats,
             exposure_s=exposure_s,

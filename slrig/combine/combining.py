@@ -21,7 +21,7 @@ from slrig.disk import storage_errors
 from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
 from slrig.kernels import report_compilations
 from slrig.meshing import open_borders
-from slrig.model import AlbedoMark, Mesh, StagePlane
+from slrig.model import AlbedoMark, Mesh, TurntablePlane
 from slrig.multiview import (
     FusedModel,
     MarkerFit,
@@ -54,7 +54,7 @@ def combine_into(
     *,
     start_error_mm: float = START_ERROR_MM,
     voxel_mm: float | None = None,
-    planes: Sequence[StagePlane] = (),
+    planes: Sequence[TurntablePlane] = (),
     notes: Sequence[str] = (),
     progress: ProgressCallback,
     cancelled: Callable[[], bool] = lambda: False,
@@ -77,7 +77,7 @@ def combine_into(
         share too few markers.
     BundleError, CalibrationError
         Markers were to be found, and a scan has no frames or no calibration, or there is no such dictionary.
-    StageRefusedError
+    TurntableRefusedError
         All but nothing of a view would be left before the planes.
     InvalidInputError
         A mesh is not as slrig wrote it, is no manifold, or the voxels are too fine for it.
@@ -244,10 +244,12 @@ def _of_markers(found: MarkerFit, seen: Sequence[MarkerObservations], names: Seq
 
 
 def _axis(found: TurntableAxis, told: StartingPoses) -> dict[str, Any]:
-    """The axis as the views have it. stage_error_deg : (N,), angles as found less those told, within half a turn."""
+    """The axis as the views have it. turntable_error_deg : (N,), angles as found less those told, within half a
+    turn.
+    """
     stated_deg = np.array(told.angles_deg if isinstance(told, TurntablePoses) else ())
     off_deg = np.rad2deg(found.angles_rad) - (stated_deg - stated_deg[0])
-    return {**asdict(found), "stage_error_deg": (off_deg + 180) % 360 - 180}
+    return {**asdict(found), "turntable_error_deg": (off_deg + 180) % 360 - 180}
 
 
 def _of_model(whole: FusedModel) -> dict[str, Any]:

@@ -21,10 +21,10 @@ from slrig.combine.plan import (
     TurntablePoses,
     plan_from_json,
     plan_json,
-    stage_told,
+    turntable_angle,
 )
-from slrig.combine.stage import StageStore
 from slrig.combine.store import ModelStore, found_axis, summary
+from slrig.combine.turntable import TurntableStore
 from slrig.errors import ConfigError, JobNotFoundError, QueueFullError, ScanStateError, StorageError
 from slrig.failure import job_failure
 from slrig.jobs.data_folder import BUNDLE, DataFolder
@@ -34,7 +34,7 @@ from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.rig_jobs import Outcome, Parts, RigJobs
 from slrig.jobs.store import JobStore
-from slrig.model import StagePlane
+from slrig.model import TurntablePlane
 from slrig.scan.artefacts import MESH
 from slrig.scan.plan import ProgressCallback
 
@@ -60,7 +60,7 @@ class CombineInto(Protocol):
         *,
         start_error_mm: float,
         voxel_mm: float | None,
-        planes: Sequence[StagePlane],
+        planes: Sequence[TurntablePlane],
         notes: Sequence[str],
         progress: ProgressCallback,
         cancelled: Callable[[], bool],
@@ -72,7 +72,7 @@ class CombineInto(Protocol):
 class ModelDesk:
     """Has models made, and keeps the newest. Any thread may call.
 
-    scans : those on record. combine : see `CombineInto`. stage : knows its axis and planes, and learns
+    scans : those on record. combine : see `CombineInto`. turntable : knows its axis and planes, and learns
     of each model's axis. keep : so many models are kept. spare_bytes : left free on the disk.
     """
 
@@ -84,7 +84,7 @@ class ModelDesk:
         *,
         scans: JobStore,
         combine: CombineInto,
-        stage: StageStore,
+        turntable: TurntableStore,
         keep: int,
         spare_bytes: int = 0,
     ) -> None:
@@ -94,7 +94,7 @@ class ModelDesk:
         self._queue = queue
         self._scans = scans
         self._combine = combine
-        self._stage = stage
+        self._turntable = turntable
         self._keep = keep
         self._spare_bytes = spare_bytes
         self._work = RigJobs(jobs, queue, folder)
@@ -179,22 +179,24 @@ class ModelDesk:
         self._remove_old()
 
     def with_axis(self, plan: ModelPlan) -> ModelPlan:
-        """The plan with the stage's axis in it, where it leaves that to the stage. Raises ConfigError."""
+        """The plan with the turntable's axis in it, where it leaves that to the turntable. Raises ConfigError."""
         poses = plan.poses
         if not isinstance(poses, TurntablePoses) or poses.axis is not None:
             return plan
-        axis = self._stage.axis()
+        axis = self._turntable.axis()
         if axis is None:
             message = (
-                "axis: expected that of the stage, and none is known here; say axis, with point_mm and direction "
+                "axis: expected that of the turntable, and none is known here; say axis, with point_mm and direction "
                 "in the scans' frame, or give the poses"
             )
             raise ConfigError(message)
         stated = StatedAxis.of(axis.point_mm, axis.direction)
-        return replace(plan, poses=replace(poses, axis=stated, of_stage=True))
+        return replace(plan, poses=replace(poses, axis=stated, of_turntable=True))
 
     def settled(self, plan: ModelPlan) -> ModelPlan:
-        """The plan with the stage's axis and angles in it, where it leaves them to the stage. Raises as `combine`."""
+        """The plan with the turntable's axis and angles in it, where it leaves them to the turntable. Raises as
+        `combine`.
+        """
         for scan in plan.scans:
             found = self._scans.get(scan)
             if found.state is not JobState.SUCCEEDED:
@@ -215,21 +217,21 @@ class ModelDesk:
             return plan
         if poses.angles_deg is None:
             told = {scan: self._angle_told(scan) for scan in plan.scans}
-            untold = [str(scan) for scan, stage in told.items() if stage is None]
+            untold = [str(scan) for scan, turntable in told.items() if turntable is None]
             if untold:
                 message = (
-                    "angles_deg: expected the stage's angle in the report of each scan, found none in "
+                    "angles_deg: expected the turntable's angle in the report of each scan, found none in "
                     f"{', '.join(untold)}; say angles_deg, one for each scan in their order, or give the poses"
                 )
                 raise ConfigError(message)
-            stages = [stage for stage in told.values() if stage is not None]
-            if len({count for _, count in stages}) > 1:
+            turntables = [turntable for turntable in told.values() if turntable is not None]
+            if len({count for _, count in turntables}) > 1:
                 message = (
                     "angles_deg: expected angles with one zero, and the turntable lost its place between these scans; "
                     'say angles_deg as they are, "poses": "unknown", or shoot them again'
                 )
                 raise ConfigError(message)
-            poses = replace(poses, angles_deg=tuple(angle_deg for angle_deg, _ in stages))
+            poses = replace(poses, angles_deg=tuple(angle_deg for angle_deg, _ in turntables))
         return replace(plan, poses=poses)
 
     def cancel(self, model_id: UUID) -> JobRecord:
@@ -302,7 +304,7 @@ class ModelDesk:
             plan.poses,
             start_error_mm=plan.start_error_mm,
             voxel_mm=plan.voxel_mm,
-            planes=self._stage.planes() if plan.cut else (),
+            planes=self._turntable.planes() if plan.cut else (),
             notes=plan.notes,
             progress=progress,
             cancelled=job.stop.is_set,
@@ -314,20 +316,20 @@ class ModelDesk:
             )
             raise StorageError(message)
         found = summary(staged)
-        axis = found_axis(staged) if self._tells_of_the_stage(plan) else None
+        axis = found_axis(staged) if self._updates_turntable(plan) else None
         self.store.commit(record.id)
         if axis is not None:
             try:
-                self._stage.note(axis, of=str(record.id))
+                self._turntable.note(axis, of=str(record.id))
             except Exception:  # noqa: BLE001 - the model is there, and is no worse for that
                 _log.exception("the axis of a model could not be noted", model=str(record.id))
         return Outcome(found)
 
-    def _tells_of_the_stage(self, plan: ModelPlan) -> bool:
-        """Whether the axis of a model is news of the stage: it was made by the stage's own, of scans that no earlier
-        model was made of.
+    def _updates_turntable(self, plan: ModelPlan) -> bool:
+        """Whether the axis of a model is news of the turntable: it was made by the turntable's own, of scans that no
+        earlier model was made of.
         """
-        if not (isinstance(plan.poses, TurntablePoses) and plan.poses.of_stage):
+        if not (isinstance(plan.poses, TurntablePoses) and plan.poses.of_turntable):
             return False
         known = {scan for each in self.jobs.finished() if each.summary is not None for scan in each.plan["scans"]}
         return known.isdisjoint(map(str, plan.scans))
@@ -340,9 +342,11 @@ class ModelDesk:
         return mesh
 
     def _angle_told(self, scan_id: UUID) -> tuple[float, str | None] | None:
-        """Where the stage stood, deg, and what that counts from, as a scan's report says; None where it does not."""
+        """Where the turntable stood, deg, and what that counts from, as a scan's report says; None where it does
+        not.
+        """
         try:
-            return stage_told(self._folder.read(self._folder.scan(scan_id) / "report.json"))
+            return turntable_angle(self._folder.read(self._folder.scan(scan_id) / "report.json"))
         except FileNotFoundError:
             return None
 

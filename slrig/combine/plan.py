@@ -36,8 +36,8 @@ Matrix = tuple[Row, Row, Row, Row]
 
 @dataclass(frozen=True, slots=True)
 class StatedAxis:
-    """A stage's axis in the scans' frame: a point of it, mm, and its direction, of any length, about which angles count
-    right-handed.
+    """A turntable's axis in the scans' frame: a point of it, mm, and its direction, of any length, about which angles
+    count right-handed.
 
     Raises ConfigError: the direction has no length.
     """
@@ -47,7 +47,7 @@ class StatedAxis:
 
     def __post_init__(self) -> None:
         if not 0 < math.hypot(*self.direction) < math.inf:
-            message = f"direction: expected a vector with a length, found {self.direction}; a stage turns about one"
+            message = f"direction: expected a vector with a length, found {self.direction}; a turntable turns about one"
             raise ConfigError(message)
 
     @classmethod
@@ -59,13 +59,13 @@ class StatedAxis:
 
 @dataclass(frozen=True, slots=True)
 class TurntablePoses:
-    """A stage turned the object. axis : None is the stage's own. angles_deg : where it stood at each scan; None is as
-    the scans' reports say. of_stage : the axis was filled in as the stage's own.
+    """A turntable turned the object. axis : None is the turntable's own. angles_deg : where it stood at each scan;
+    None is as the scans' reports say. of_turntable : the axis was filled in as the turntable's own.
     """
 
     axis: StatedAxis | None = None
     angles_deg: tuple[float, ...] | None = None
-    of_stage: bool = False
+    of_turntable: bool = False
     kind: Literal["turntable"] = "turntable"
 
 
@@ -100,26 +100,26 @@ class MarkerPoses:
 StartingPoses = TurntablePoses | GivenPoses | UnknownPoses | MarkerPoses
 
 
-def stage_told(report: bytes) -> tuple[float, str | None] | None:
-    """Where the stage stood, deg, and what that counts from, as a scan's report says; None where it does not."""
+def turntable_angle(report: bytes) -> tuple[float, str | None] | None:
+    """Where the turntable stood, deg, and what that counts from, as a scan's report says; None where it does not."""
     try:
-        stage = json.loads(report)["stage"]
-        return float(stage["angle_deg"]), stage.get("count")
+        turntable = json.loads(report)["turntable"]
+        return float(turntable["angle_deg"]), turntable.get("count")
     except (ValueError, KeyError, TypeError):
         return None
 
 
 @dataclass(frozen=True, slots=True)
 class ShootPlan:
-    """What is shot for a model: so many views, evenly around a stage. scan : each of them, but for its angle. by_hand :
-    a person turns the object, and says when.
+    """What is shot for a model: so many views, evenly around a turntable. scan : each of them, but for its angle.
+    manual : a person turns the object, and says when.
 
     Raises ConfigError: there are fewer than two views, or more than MOST_VIEWS.
     """
 
     views: int
     scan: ScanPlan = field(default_factory=ScanPlan)
-    by_hand: bool = False
+    manual: bool = False
 
     def __post_init__(self) -> None:
         if not 2 <= self.views <= MOST_VIEWS:
@@ -132,13 +132,13 @@ class ShootPlan:
         return 360 / self.views
 
     def angle_deg(self, number: int) -> float:
-        """Where the stage stands for a view, counted from 1."""
+        """Where the turntable stands for a view, counted from 1."""
         return (number - 1) * self.step_deg
 
     def view(self, number: int, model_id: UUID, begins_at: datetime) -> ScanPlan:
         """The scan of a view, counted from 1."""
         place = SeriesPlace(model_id, number, self.views, begins_at)
-        turned_by: TurnedBy = "hand" if self.by_hand else "table"
+        turned_by: TurnedBy = "hand" if self.manual else "table"
         return replace(self.scan, turn_deg=self.angle_deg(number), turned_by=turned_by, series=place)
 
 
@@ -147,8 +147,8 @@ class ModelPlan:
     """One model. scans : in the frame of the first one it is. poses : where their registration starts from.
 
     start_error_mm : how far a surface may be from where `poses` put it. voxel_mm : length of the model's edges; None is
-    1.25 times that of the scans'. cut : whether what lies behind the planes of the stage, where there are any, is cut
-    away first. shoot : what is shot for it, None of scans that there were; until that has ended
+    1.25 times that of the scans'. cut : whether what lies behind the planes of the turntable, where there are any, is
+    cut away first. shoot : what is shot for it, None of scans that there were; until that has ended
     there are no `scans`, and poses that are given are of all views. notes : for the report, in sentences.
 
     Raises
@@ -178,7 +178,7 @@ class ModelPlan:
         if isinstance(self.poses, UnknownPoses) and count > MOST_UNKNOWN:
             message = (
                 f"poses: expected at most {MOST_UNKNOWN} views whose poses nobody knows, found {count}; each is held "
-                "against all others. Say poses, or a stage's axis and angles, or take fewer"
+                "against all others. Say poses, or a turntable's axis and angles, or take fewer"
             )
             raise ConfigError(message)
         name = "poses" if isinstance(self.poses, GivenPoses) else "angles_deg"

@@ -79,7 +79,7 @@ class View:
     @property
     def count(self) -> str | None:
         """What the turntable's angle of its good scan counts from; None where that is not kept, as by hand."""
-        found = None if self.good is None else (self.good.summary or {}).get("stage", {}).get("count")
+        found = None if self.good is None else (self.good.summary or {}).get("turntable", {}).get("count")
         return None if found is None else str(found)
 
     @property
@@ -144,7 +144,7 @@ class ViewShooting:
         """
         shoot = _shoot_plan(plan)
         plan = self._desk.with_axis(plan)
-        model_id, numbers = uuid4(), range(1, 2 if shoot.by_hand else shoot.views + 1)
+        model_id, numbers = uuid4(), range(1, 2 if shoot.manual else shoot.views + 1)
 
         def begun() -> None:
             jobs, rig = self._desk.jobs, self._runner.queue.rig.name
@@ -248,7 +248,7 @@ class ViewShooting:
                 return
             shoot = _shoot_plan(plan)
             views = self._views(model_id, shoot)
-            if shoot.by_hand:
+            if shoot.manual:
                 # The object stands as for the last that was begun; the first one needs no hand.
                 begun = [view for view in views if view.scans] or [views[0]]
                 missing = [view for view in begun[-1:] if view.again or not view.scans]
@@ -261,9 +261,9 @@ class ViewShooting:
                 plans = [shoot.view(view.number, model_id, utc_now()) for view in missing]
                 with acting_as(record.requested_by):
                     self._runner.add_views(plans, model_id, label=record.label)
-            elif shoot.by_hand and not (views[-1].ended and views[-1].good is views[-1].scans[-1]):
+            elif shoot.manual and not (views[-1].ended and views[-1].good is views[-1].scans[-1]):
                 pass  # A person turns, or decides what becomes of a last view that failed.
-            elif all(view.ended or shoot.by_hand for view in views):
+            elif all(view.ended or shoot.manual for view in views):
                 self._combine(record, shoot, views)
                 return
             self._tell(model_id, shoot)
@@ -300,9 +300,9 @@ class ViewShooting:
         """A model that waits for a hand. Raises JobNotFoundError, ScanStateError."""
         record = self._desk.jobs.get(model_id)
         plan = plan_from_json(record.plan)
-        if record.state.final or not plan.being_shot or plan.shoot is None or not plan.shoot.by_hand:
-            how = "is not shot by hand" if plan.shoot is None or not plan.shoot.by_hand else f"is {record.state}"
-            message = f'Model {model_id} {how}. Begin one: POST /model/shoot with "by_hand": true.'
+        if record.state.final or not plan.being_shot or plan.shoot is None or not plan.shoot.manual:
+            how = "is not shot by hand" if plan.shoot is None or not plan.shoot.manual else f"is {record.state}"
+            message = f'Model {model_id} {how}. Begin one: POST /model/shoot with "manual": true.'
             raise ScanStateError(message)
         views = self._views(model_id, plan.shoot)
         for view in views:
@@ -323,7 +323,7 @@ class ViewShooting:
         under_way = next((view for view in views if view.scans and not view.ended), None)
         # Where none is under way the last has just ended, and the model comes next.
         stage, detail = VIEW, f"view {(under_way or views[-1]).number} of {shoot.views}"
-        if under_way is None and shoot.by_hand:
+        if under_way is None and shoot.manual:
             stage, last = TURN, ([view for view in views if view.scans] or [views[0]])[-1]
             detail = (
                 f"turn the object by {shoot.step_deg:g}° for view {last.number + 1} of {shoot.views}"

@@ -13,7 +13,7 @@ from typing import Protocol, Self, runtime_checkable
 from slrig.devices.camera import Camera, CameraSettings
 from slrig.devices.projector import Projector
 from slrig.errors import UnsupportedByDeviceError
-from slrig.model import Calibration, StageAxis, Truth
+from slrig.model import Calibration, RotationAxis, Truth
 
 
 @runtime_checkable
@@ -78,7 +78,7 @@ class Turntable(Positioner, Protocol):
     """A positioner that turns the object about one axis to any angle. Its poses are angles."""
 
     @property
-    def axis(self) -> StageAxis | None:
+    def axis(self) -> RotationAxis | None:
         """The axis if the device knows it; None if it must be measured, as on real hardware."""
         ...
 

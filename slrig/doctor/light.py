@@ -615,7 +615,8 @@ def _check_coverage(subject: str, sequence: PatternSequence, picture: LocatedPic
 def find_current_direction(session: CameraSession, sequence: PatternSequence, light: LightMeasurement) -> Finding:
     """Show white at two currents, below and above half of the range, and find which number is brighter.
 
-    sequence : with white. The projector is an `UnknownPolarityProjector`: light may fall as the number for the current rises.
+    sequence : with white. The projector is an `UnknownPolarityProjector`: light may fall as the number for the current
+    rises.
     """
     projector = session.projector
     if not isinstance(projector, UnknownPolarityProjector):
@@ -633,7 +634,8 @@ def find_current_direction(session: CameraSession, sequence: PatternSequence, li
         remedy = "shade the room's light, see that nothing moves and nothing is saturated, and run the doctor again"
         return fault("light.current", "projector", f"{message}: the direction of the current is not certain", remedy)
     remedy = (
-        f"write {projector.polarity_option(rises=ratio > 1)} into the [projector] table of the rig file, choose led_current "
+        f"write {projector.polarity_option(rises=ratio > 1)} into the [projector] table of the rig file, choose "
+        f"led_current "
         "there, and run the doctor again: it measures the rest then, because until then light is dim and pulses"
     )
     return note("light.current", "projector", message, remedy)

@@ -52,7 +52,9 @@ class ProgressRecorder:
         self._recorded("that the rig is free of a job could not be told", lambda: self._store.captured(self._job_id))
 
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
-        """Take note, as `slrig.scan.plan.ProgressCallback` asks. A record that is refused fails no work: see the log."""
+        """Take note, as `slrig.scan.plan.ProgressCallback` asks. A record that is refused fails no work: see the
+        log.
+        """
         overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
         since_s = self._now_s() - self._told_s
         goes_on = detail != self._told.detail and since_s >= _DETAIL_S

@@ -278,8 +278,8 @@ def _baselines_px_mm(cameras: Sequence[Pinhole], projector: Pinhole | None) -> t
 
 
 @dataclass(frozen=True, slots=True)
-class StageAxis:
-    """Rotation axis of a stage in the calibration's world frame.
+class RotationAxis:
+    """Rotation axis of a turntable in the calibration's world frame.
 
     point_mm : (3,), any point on the axis. direction : (3,), unit; angles are right-handed about it.
     """
@@ -289,7 +289,7 @@ class StageAxis:
 
 
 @dataclass(frozen=True, slots=True)
-class MeasuredAxis(StageAxis):
+class MeasuredAxis(RotationAxis):
     """A rotation axis with its uncertainty.
 
     covariance : (6, 6) float64, of the point (mm) and the direction (rad), both across the axis; zero along it.
@@ -316,8 +316,8 @@ class PlaneKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class StagePlane:
-    """A plane of the empty stage in the calibration's world frame. The object is entirely in front of it.
+class TurntablePlane:
+    """A plane of the empty turntable in the calibration's world frame. The object is entirely in front of it.
 
     point_mm : (3,), centre of the measured area. normal : (3,), unit, towards the cameras. sigma_mm : standard
     deviation of the surface from the plane. radius_mm : radius of the measured area. margin_mm : thickness of the layer

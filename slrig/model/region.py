@@ -28,8 +28,8 @@ class Region:
 
     box_mm : minimum and maximum corner of a box in the world. depth_mm : minimum and maximum depth along each camera's
     optical axis. polygons_px : by camera, corners (x, y) of the measured part of its image. masks : by camera, a PNG of
-    the image's size in base64; pixels that are not black are measured. least_contrast : minimum of white − black, as a
-    fraction of full scale. most_sigma_mm : maximum standard deviation of a point.
+    the image's size in base64; pixels that are not black are measured. min_contrast : minimum of white − black, as a
+    fraction of full scale. max_sigma_mm : maximum standard deviation of a point.
 
     Raises ConfigError: a limit excludes everything, or is not a valid number, polygon or PNG.
     """
@@ -38,8 +38,8 @@ class Region:
     depth_mm: tuple[float, float] | None = None
     polygons_px: Mapping[str, Polygon] = field(default_factory=dict)
     masks: Mapping[str, str] = field(default_factory=dict)
-    least_contrast: float | None = None
-    most_sigma_mm: float | None = None
+    min_contrast: float | None = None
+    max_sigma_mm: float | None = None
 
     def __post_init__(self) -> None:
         if self.box_mm is not None:
@@ -61,8 +61,8 @@ class Region:
         for camera in self.masks:
             self.mask_size(camera)
         for name, value, most in (
-            ("least_contrast", self.least_contrast, 1.0),
-            ("most_sigma_mm", self.most_sigma_mm, math.inf),
+            ("min_contrast", self.min_contrast, 1.0),
+            ("max_sigma_mm", self.max_sigma_mm, math.inf),
         ):
             if value is not None and not 0 < value < most:
                 below = " and below 1" if most == 1 else ""

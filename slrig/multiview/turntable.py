@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from slrig.errors import StageRefusedError
+from slrig.errors import TurntableRefusedError
 from slrig.meshing import used_vertices
-from slrig.model import FloatArray, MeasuredAxis, Mesh, PlaneKind, StageAxis, StagePlane
+from slrig.model import FloatArray, MeasuredAxis, Mesh, PlaneKind, RotationAxis, TurntablePlane
 from slrig.multiview.registration import START_ERROR_MM, Registration, register_views
 
 AXIS_SPAN_MM = 50.0  # distance along the axis, both ways from the object's middle, within which two axes are compared
@@ -52,8 +52,8 @@ def update_axis(record: MeasuredAxis, found: MeasuredAxis) -> AxisUpdate:
     base = record.point_mm + along * (along @ (found.point_mm - record.point_mm))
     across = np.linalg.svd(along[None])[2][1:]
     drift = np.diag([_DRIFT_MM**2] * 2 + [_DRIFT_RAD**2] * 2)
-    _, before = _axis_parameters(StageAxis(base, along), across, record)
-    difference, of_found = _axis_parameters(StageAxis(base, along), across, found)
+    _, before = _axis_parameters(RotationAxis(base, along), across, record)
+    difference, of_found = _axis_parameters(RotationAxis(base, along), across, found)
     before = before + drift
     gain = before @ np.linalg.inv(before + of_found)
     offset, tilt = difference[:2], difference[2:]
@@ -72,7 +72,7 @@ def update_axis(record: MeasuredAxis, found: MeasuredAxis) -> AxisUpdate:
     return AxisUpdate(axis, max(distances), float(np.rad2deg(angle)), sigmas)
 
 
-def _axis_parameters(base: StageAxis, across: FloatArray, axis: MeasuredAxis) -> tuple[FloatArray, FloatArray]:
+def _axis_parameters(base: RotationAxis, across: FloatArray, axis: MeasuredAxis) -> tuple[FloatArray, FloatArray]:
     """(4,), (4, 4): point (mm) and slopes of an axis where it crosses the plane through `base` square to it, in the
     coordinates `across` (2, 3); and their covariance.
     """
@@ -97,19 +97,21 @@ _PLATE_COSINE = 0.97  # of a plate's normal and the axis: 14°, more than a plat
 _MIN_LEFT = 0.01  # share of a view's vertices that a cut has to leave
 
 
-def find_turntable_planes(empty: Mesh, axis: StageAxis | None = None) -> tuple[StagePlane, ...]:
+def find_turntable_planes(empty: Mesh, axis: RotationAxis | None = None) -> tuple[TurntablePlane, ...]:
     """Find the plate and backdrops in a scan of an empty turntable, the largest first.
 
     axis : of the turntable, identifies the plate; without it all planes are backdrops.
 
-    Raises StageRefusedError: no plane was found.
+    Raises TurntableRefusedError: no plane was found.
     """
     points, normals = empty.vertices_mm.astype(np.float64), empty.normals.astype(np.float64)
     if len(points) < 3:
-        raise StageRefusedError(f"expected a scan of the empty turntable, found {len(points)} vertices: scan it again")
+        raise TurntableRefusedError(
+            f"expected a scan of the empty turntable, found {len(points)} vertices: scan it again"
+        )
     random = np.random.default_rng(len(points))  # reproducible
     remaining = np.ones(len(points), dtype=np.bool_)
-    found: list[StagePlane] = []
+    found: list[TurntablePlane] = []
     while len(found) < _MAX_PLANES and remaining.sum() > max(_MIN_SHARE * len(points), 3):
         own, middle, normal, sigma = _find_plane(points, remaining, random)
         flat = float(np.mean(np.abs(normals[own] @ normal) > _FLAT_COSINE)) if own.any() else 0.0
@@ -119,7 +121,7 @@ def find_turntable_planes(empty: Mesh, axis: StageAxis | None = None) -> tuple[S
         # Surface near or behind the plane belongs to it or is hidden by it.
         remaining &= (points - middle) @ found[-1].normal > found[-1].margin_mm
     if not found:
-        raise StageRefusedError(
+        raise TurntableRefusedError(
             f"expected a plate or a backdrop in the scan of the empty turntable, found no plane that holds "
             f"{_MIN_SHARE:.0%} of its {len(points):,} vertices and is flat to {_PLANE_REACH_MM / _PLANE_SIGMAS:g} mm: "
             "take the object away, light the plate, and scan it again"
@@ -173,8 +175,8 @@ def _build_plane(
     middle: FloatArray,
     normal: FloatArray,
     sigma: float,
-    axis: StageAxis | None,
-) -> StagePlane:
+    axis: RotationAxis | None,
+) -> TurntablePlane:
     # Normals of a scan's vertices point towards the camera.
     normal = normal * (1.0 if np.nanmedian(normals @ normal) > 0 else -1.0)
     radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 99))
@@ -184,7 +186,7 @@ def _build_plane(
     if kind is PlaneKind.PLATE:
         # As it turns, a plate tilted against the axis rises at its rim by twice its tilt.
         margin += 2 * radius * float(np.sqrt(max(1 - cosine**2, 0.0)))
-    return StagePlane(kind, middle, normal, sigma, radius, margin)
+    return TurntablePlane(kind, middle, normal, sigma, radius, margin)
 
 
 class CutView(NamedTuple):
@@ -196,10 +198,10 @@ class CutView(NamedTuple):
     removed: tuple[float, ...]
 
 
-def cut_view(view: Mesh, planes: Sequence[StagePlane], *, name: str = "the view") -> CutView:
+def cut_view(view: Mesh, planes: Sequence[TurntablePlane], *, name: str = "the view") -> CutView:
     """Remove the vertices behind planes or within their margin in front of them, and all triangles of these vertices.
 
-    Raises StageRefusedError: less than a hundredth would be left.
+    Raises TurntableRefusedError: less than a hundredth would be left.
     """
     if not planes:
         return CutView(view, ())
@@ -214,7 +216,7 @@ def cut_view(view: Mesh, planes: Sequence[StagePlane], *, name: str = "the view"
     used = used_vertices(faces, len(points))
     if used.mean() < _MIN_LEFT:
         shares = ", ".join(f"{plane.kind} {share:.0%}" for plane, share in zip(planes, removed, strict=True))
-        raise StageRefusedError(
+        raise TurntableRefusedError(
             f"{name}: expected an object in front of the turntable's planes, found that a cut would leave "
             f"{used.mean():.1%} of the view ({shares}). The turntable or the cameras were moved: scan the empty "
             "turntable again, or do not cut"
@@ -417,11 +419,11 @@ def axis_from_board(
     points_mm : (n, 3), the board's corners. angles_deg : (m,), stated by the turntable; their sense determines the
     direction of the axis. Without them it points up in the first camera's image.
 
-    Raises StageRefusedError: there are fewer than three poses, or the board was turned by less than 20°, slipped, or
-    does not turn about one axis.
+    Raises TurntableRefusedError: there are fewer than three poses, or the board was turned by less than 20°, slipped,
+    or does not turn about one axis.
     """
     if len(names) < MIN_POSES:
-        raise StageRefusedError(
+        raise TurntableRefusedError(
             f"expected {MIN_POSES} poses or more of a board on the turntable, found {len(names)}: turn the turntable "
             "and shoot the board again, best at six angles all around"
         )
@@ -429,7 +431,7 @@ def axis_from_board(
     axis = board.fit(range(len(names)))
     turn_deg = 0.0 if axis is None else _span_deg(axis.angles_rad)
     if axis is None or turn_deg < MIN_TURN_DEG:
-        raise StageRefusedError(
+        raise TurntableRefusedError(
             f"expected a board turned by {MIN_TURN_DEG:g}° or more in all, found {turn_deg:.1f}° over {len(names)} "
             "poses: turn the turntable further between them"
         )
@@ -471,16 +473,16 @@ class _TurnedBoard(NamedTuple):
         return np.asarray(np.sqrt(np.square(corners - corners.mean(axis=0)).sum(axis=2).mean(axis=1)))
 
     def require_fixed(self, axis: TurntableAxis, residual: FloatArray) -> None:
-        """Raises StageRefusedError: the board moved on the turntable, for one pose or from one on."""
+        """Raises TurntableRefusedError: the board moved on the turntable, for one pose or from one on."""
         best = min(self._slips(), default=(np.inf, ""))
         if best[0] < min(_SLIP_SHARE * axis.rms_mm, _MAX_RESIDUAL_MM):
-            raise StageRefusedError(
+            raise TurntableRefusedError(
                 f"{best[1]}: the poses are off turns about one axis by {axis.rms_mm:.3f} mm rms, without that by "
                 f"{best[0]:.3f} mm. Fix the board to the turntable, and shoot all poses again, or leave that out"
             )
         if axis.rms_mm > _MAX_RESIDUAL_MM:
             worst = int(np.argmax(residual))
-            raise StageRefusedError(
+            raise TurntableRefusedError(
                 f"expected a board that turns about one axis, found poses that are off by {axis.rms_mm:.2f} mm rms, "
                 f"'{self.names[worst]}' by {residual[worst]:.2f} mm, the most: the board slipped more than once, or "
                 "was held by hand. Fix it to the turntable, and shoot all poses again"

@@ -33,7 +33,7 @@ function Row({each, here, stale}) {
     <th scope="row">${each.name}<div class="quiet">${here && "this one, on "}${each.host}</div></th>
     <td><${Badge} kind=${kind}>${word}<//><div class="quiet">seen ${moment(new Date(Date.now() - 1000 * each.seen_s).toISOString())}</div>${known && each.words && html`<div class="quiet clip">${each.words}</div>`}</td>
     <td>${known ? html`<${Badge} kind=${HEALTH[each.health] ?? ""}>${each.health === "unknown" ? "not known" : each.health}<//>` : "not known"}
-      ${known && each.health !== "good" && html`<div class="quiet clip">${each.health_words}</div>`}</td>
+      ${known && each.health !== "good" && html`<div class="quiet clip">${each.health_message}</div>`}</td>
     <td>${known ? each.waiting + each.computing : "not known"}${known && each.uncopied > 0 && html`<div class="quiet">${each.uncopied} to copy</div>`}</td>
     <td>${last ? html`<${JobBadge} state=${last.state} /> ${moment(last.finished_at)}<div class="quiet clip">${last.error ?? last.label}</div>` : "none"}</td>
     <td>${each.scans_of_day}${each.failed_of_day > 0 && html` <${Badge} kind="bad">${each.failed_of_day} failed<//>`}</td>

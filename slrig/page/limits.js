@@ -11,8 +11,8 @@ export function useLimits() {
   const [typed, setTyped] = useState(() => JSON.parse(sessionStorage.getItem(KEPT) ?? "{}"));
   const {near, far, contrast, sigma, box} = typed;
   const region = {
-    ...(near || far) && {depth_mm: [Number(near || 0), Number(far || FURTHEST_MM)]}, ...contrast && {least_contrast: contrast / 100},
-    ...sigma && {most_sigma_mm: Number(sigma)}, ...box && {box_mm: box},
+    ...(near || far) && {depth_mm: [Number(near || 0), Number(far || FURTHEST_MM)]}, ...contrast && {min_contrast: contrast / 100},
+    ...sigma && {max_sigma_mm: Number(sigma)}, ...box && {box_mm: box},
   };
   const change = (part) => {
     sessionStorage.setItem(KEPT, JSON.stringify({...typed, ...part}));
@@ -44,7 +44,7 @@ export function Limits({typed, region, change, others, preset}) {
 /** What a scan was asked for, in words; null for everything. */
 export function limits(region) {
   if (!region) return null;
-  const {box_mm: box, depth_mm: depth, polygons_px: polygons, masks, least_contrast: contrast, most_sigma_mm: sigma} = region;
+  const {box_mm: box, depth_mm: depth, polygons_px: polygons, masks, min_contrast: contrast, max_sigma_mm: sigma} = region;
   return [
     box && `a box, ${["x", "y", "z"].map((axis, at) => `${axis} ${box[0][at]} to ${box[1][at]}`).join(", ")} mm`,
     depth && `depths of ${depth[0]} to ${depth[1]} mm`,

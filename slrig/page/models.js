@@ -1,4 +1,4 @@
-// Models: scans of one object from several sides, shot on a stage or by hand, or chosen, and the one mesh that is made of them.
+// Models: scans of one object from several sides, shot on a turntable or by hand, or chosen, and the one mesh that is made of them.
 import {Mesh, loadDrawing} from "./mesh.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, Confirm, Facts, Field, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
@@ -9,7 +9,7 @@ const USUAL_VIEWS = 8;
 const over = (model) => ["succeeded", "failed", "cancelled", "interrupted"].includes(model.state);
 const PURPOSES = {
   [MODEL]: "the model in mm, with σ for each vertex", "model.glb": "for viewers and web pages, in metres", "placed.ply": "all views in one frame, not merged",
-  "poses.json": "where each view belongs, and the stage's axis", "report.json": "all figures of this model", "sides.png": "a picture from six sides",
+  "poses.json": "where each view belongs, and the turntable's axis", "report.json": "all figures of this model", "sides.png": "a picture from six sides",
   "view.glb": "what this page shows", "coarse.glb": "what this page shows first",
 };
 
@@ -45,8 +45,8 @@ function Shoot({rig}) {
   const [views, setViews] = useState(String(USUAL_VIEWS));
   const turns = rig?.turntable === true;
   const [hand, setHand] = useState(false);
-  const by_hand = hand || !turns;
-  const [start, busy, refused] = useAction(async () => shown(await ask("POST", "/model/shoot", {body: {views: Number(views), by_hand, if_busy: "queue"}, headers: once()})));
+  const manual = hand || !turns;
+  const [start, busy, refused] = useAction(async () => shown(await ask("POST", "/model/shoot", {body: {views: Number(views), manual, if_busy: "queue"}, headers: once()})));
   return html`<section aria-label="Shoot from all sides"><h2>Shoot from all sides</h2>
     <div class="row"><${Field} label="Views, evenly around" value=${views} change=${setViews} min="2" step="1" />
       ${turns ? html`<label><input type="checkbox" checked=${hand} onChange=${(event) => setHand(event.target.checked)} /> I turn the object by hand</label>` : ""}</div>
@@ -64,8 +64,8 @@ function Join() {
   const toggle = (id) => setChosen((before) => before.includes(id) ? before.filter((each) => each !== id) : [...before, id]);
   const [start, busy, refused] = useAction(async () => shown(await ask("POST", "/model", {body: {scans: chosen}, headers: once()})));
   return html`<section aria-label="Join scans"><h2>Join scans that there are</h2>
-    ${list && scans.length < 2 ? html`<p class="quiet">It takes two scans that know the angle of their stage.</p>` : html`
-      <div class="wide pick"><table><thead><tr><th>Scan</th><th>Stage</th><th>In the model</th></tr></thead>
+    ${list && scans.length < 2 ? html`<p class="quiet">It takes two scans that know the angle of their turntable.</p>` : html`
+      <div class="wide pick"><table><thead><tr><th>Scan</th><th>Turntable</th><th>In the model</th></tr></thead>
         <tbody>${scans.map((scan) => html`<tr><th scope="row"><a href=${`#/scan/${scan.id}`}>${scan.label ?? moment(scan.created_at)}</a></th>
           <td>${scan.plan.turn_deg === null || scan.plan.turn_deg === undefined ? "–" : `${Number(scan.plan.turn_deg.toFixed(2))}°`}</td>
           <td><label><input type="checkbox" checked=${chosen.includes(scan.id)} onChange=${() => toggle(scan.id)} /> ${chosen.includes(scan.id) ? `view ${chosen.indexOf(scan.id) + 1}` : "no"}</label></td></tr>`)}</tbody></table></div>
@@ -140,7 +140,7 @@ function Figures({report, path}) {
       ["Views", views.length], ["Triangles", count(model.triangles)], ["Vertices", count(model.vertices)], ["Edges", length(model.voxel_mm)],
       ["σ, median", length(model.sigma_mm)], ["Neighbours err alike by", length(model.correlated_mm)], ["Seen by one view only", percent(once_seen)],
       ["The least known view, σ", length(Math.max(...views.map(({sigma_mm}) => sigma_mm)))],
-      ["The stage's angles, most off", axis && `${Math.max(...axis.stage_error_deg.map(Math.abs)).toFixed(3)}°`],
+      ["The turntable's angles, most off", axis && `${Math.max(...axis.turntable_error_deg.map(Math.abs)).toFixed(3)}°`],
     ]} />
     <p><a href=${path}>The whole report</a></p>`;
 }

@@ -206,14 +206,14 @@ class RegionMask:
     """Scan region in the image of one camera.
 
     pixels : (H, W) bool, or None for all; lowest_px, highest_px : (H, W) float32, range of the light position in which
-    the ray of the pixel is inside the region, or None for any; least_contrast : of white less black, as a share of full
+    the ray of the pixel is inside the region, or None for any; min_contrast : of white less black, as a share of full
     scale.
     """
 
     pixels: NDArray[np.bool_] | None = None
     lowest_px: NDArray[np.float32] | None = None
     highest_px: NDArray[np.float32] | None = None
-    least_contrast: float = 0.0
+    min_contrast: float = 0.0
 
     def mask(self, frames: AxisFrames, code: CodeMap, cell_position: FloatArray) -> NDArray[np.bool_]:
         """(H, W) bool: pixels of the region, pixels without code included.
@@ -221,9 +221,9 @@ class RegionMask:
         cell_position : (cells,) float64, middle of each cell of the code, px.
         """
         inside = np.ones(code.refusal.shape, dtype=np.bool_) if self.pixels is None else self.pixels.copy()
-        if self.least_contrast:
+        if self.min_contrast:
             # Unlit pixels keep their own cause.
-            strong = frames.contrast >= np.float32(self.least_contrast * frames.full_scale)
+            strong = frames.contrast >= np.float32(self.min_contrast * frames.full_scale)
             inside &= strong | (code.refusal == Refusal.NOT_LIT)
         if self.lowest_px is not None and self.highest_px is not None:
             half = np.float32(frames.gray.cell_px / 2)

@@ -177,8 +177,8 @@ class AxisPatterns:
     def noise_patterns(self) -> frozenset[Pattern]:
         """Patterns to estimate noise and response of the camera from.
 
-        With inverses, white and black these are `diagnostic_bits`; without inverses `diagnostic_line_pairs`, or else lines of half
-        their period and some bits; otherwise the whole code.
+        With inverses, white and black these are `diagnostic_bits`; without inverses `diagnostic_line_pairs`, or else
+        lines of half their period and some bits; otherwise the whole code.
         """
         if len(self.reference) == 2:
             pairs = diagnostic_line_pairs(self.lines)

@@ -14,7 +14,7 @@ from slrig.bundle.storage import write_file
 from slrig.devices import Turntable
 from slrig.disk import storage_errors
 from slrig.errors import StorageError
-from slrig.model import StageAxis
+from slrig.model import RotationAxis
 
 SAME_PLACE_DEG = 0.1
 """How far a table's own count may be from where it was left: above any step of a motor, below any turn of a hand."""
@@ -65,7 +65,7 @@ class CountedTurntable:
         return self._table.poses
 
     @property
-    def axis(self) -> StageAxis | None:
+    def axis(self) -> RotationAxis | None:
         """See `Turntable`."""
         return self._table.axis
 

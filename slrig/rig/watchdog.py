@@ -42,7 +42,7 @@ from slrig.errors import (
     SlrigError,
     UnsupportedByDeviceError,
 )
-from slrig.model import Frame, PatternSequence, StageAxis
+from slrig.model import Frame, PatternSequence, RotationAxis
 from slrig.rig.settings import SettingsInUse
 
 OPEN = "open"
@@ -341,7 +341,7 @@ class GuardedTurntable(GuardedPositioner):
         self._turntable = turntable
 
     @property
-    def axis(self) -> StageAxis | None:
+    def axis(self) -> RotationAxis | None:
         """See `Turntable`."""
         return self._turntable.axis
 

@@ -20,7 +20,15 @@ from typing import Self
 
 import structlog
 
-from slrig.bundle import REFUSED_FOLDER, BundleWriter, RefusedFrame, StageAngle, write_notes, write_stage, write_truth
+from slrig.bundle import (
+    REFUSED_FOLDER,
+    BundleWriter,
+    RefusedFrame,
+    TurntableAngle,
+    write_notes,
+    write_truth,
+    write_turntable_angle,
+)
 from slrig.capture import SETTINGS_TOLERANCE, choose_triggers, round_to_refresh_s
 from slrig.devices import Camera, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
@@ -45,13 +53,18 @@ class Recording:
     """
 
     def __init__(
-        self, folder: Path, writing: ExitStack, notes: Sequence[str], truth: Truth | None, stage: StageAngle | None
+        self,
+        folder: Path,
+        writing: ExitStack,
+        notes: Sequence[str],
+        truth: Truth | None,
+        turntable: TurntableAngle | None,
     ) -> None:
         self._folder = folder
         self._writing = writing
         self._notes = notes
         self._truth = truth
-        self._stage = stage
+        self._turntable = turntable
 
     def finish(self) -> None:
         """Wait until the bundle is in its place, and write what belongs to it. Raises StorageError: the disk refused,
@@ -61,8 +74,8 @@ class Recording:
         write_notes(self._folder, self._notes)
         if self._truth is not None:
             write_truth(self._folder, self._truth)
-        if self._stage is not None:
-            write_stage(self._folder, self._stage)
+        if self._turntable is not None:
+            write_turntable_angle(self._folder, self._turntable)
 
     def discard(self) -> None:
         """Let it go. Nothing is left of it."""
@@ -186,7 +199,7 @@ def capture_frames(
         progress("capture", 0.0, words)
     formats = {name: camera.info.format for name, camera in rig.cameras.items()}
     colour = in_colour(plan, {name: camera.info for name, camera in rig.cameras.items()}, rig.projector.info)
-    stage = _turned(rig, plan, progress)
+    turntable = _turned(rig, plan, progress)
     writer = BundleWriter(
         folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration, captured_at=datetime.now(UTC)
     )
@@ -214,11 +227,11 @@ def capture_frames(
             raise type(error)(message) from error
         if frames is not None:
             frames.end(exposing.summary())
-        return Recording(folder, writing.pop_all(), told, rig.truth(), stage)
+        return Recording(folder, writing.pop_all(), told, rig.truth(), turntable)
 
 
-def _turned(rig: Rig, plan: ScanPlan, progress: ProgressCallback) -> StageAngle | None:
-    """Where the stage stands when the object was turned as the plan says; None where it says nothing of a stage."""
+def _turned(rig: Rig, plan: ScanPlan, progress: ProgressCallback) -> TurntableAngle | None:
+    """Turn the object as planned; return the turntable's angle, None if the plan has none."""
     if plan.turn_deg is None:
         return None
     count: str | None = None
@@ -228,7 +241,7 @@ def _turned(rig: Rig, plan: ScanPlan, progress: ProgressCallback) -> StageAngle 
         progress("turn", 0.0, f"to {plan.turn_deg:g}°")
         rig.positioner.turn(plan.turn_deg)
         count = rig.positioner.count if isinstance(rig.positioner, CountedTurntable) else None
-    return StageAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by, count=count)
+    return TurntableAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by, count=count)
 
 
 def _of_the_rig(rig: Rig) -> list[str]:

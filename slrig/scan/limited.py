@@ -111,7 +111,7 @@ def frame_part(
         if projector is not None:
             ends = _light(near, far, directions, device, projector, axis)
             lowest, highest = (each.reshape(exact.shape) for each in ends)
-    asked = RegionMask(exact, lowest, highest, region.least_contrast or 0.0)
+    asked = RegionMask(exact, lowest, highest, region.min_contrast or 0.0)
     return FramePart(rows, columns, asked, form)
 
 

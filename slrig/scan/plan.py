@@ -14,7 +14,7 @@ from slrig.model import Axis, FlipRule, Region, SequenceName, bracket_fault
 from slrig.patterns import SEQUENCES, SequenceOptions
 
 MOST_TURN_DEG = 3600.0
-"""Ten turns either way: more is a slip, and winds up the cables of what stands on a stage."""
+"""Ten turns either way: more is a slip, and winds up the cables of what stands on a turntable."""
 
 
 class ProgressCallback(Protocol):
@@ -162,7 +162,7 @@ class ScanPlan:
     see `slrig.scan.acquisition.exposed`. preset : where some of this came from, None where no preset was named.
     colour : keep white and black frames in colour, None where a camera has it. coloured_light : play white in red,
     green and blue as well, for the cameras that have no colour. series : None for a scan alone. turn_deg : the angle
-    of the stage that the object is shot at, right-handed about its axis; None where there is no stage. turned_by : the
+    of the turntable that the object is shot at, right-handed about its axis; None without one. turned_by : the
     table turns to it before the first frame; a hand has turned already, and nothing moves.
 
     Raises

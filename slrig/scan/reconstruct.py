@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import read_health, read_notes, read_stage, read_truth
+from slrig.bundle import read_health, read_notes, read_truth, read_turntable_angle
 from slrig.bundle.storage import write_file
 from slrig.capture import EvidenceSummary
 from slrig.errors import ScanCancelledError
@@ -183,8 +183,8 @@ def reconstruct_into(
         for name, picture in pictures.result().items():
             place(name, picture)
         known = _compared_with_truth(bundle, mesh, cameras[0], plan.region, entered)
-        if (stage := read_stage(bundle)) is not None:
-            known["stage"] = stage.document()
+        if (turntable := read_turntable_angle(bundle)) is not None:
+            known["turntable"] = turntable.document()
         entered("write report", 0.98, "")
         seconds = watch.finished()
         report = {
@@ -263,7 +263,7 @@ def _meshed(
     apart = find_disagreement(joined_curves, share)
     if apart is not None:
         sigma = np.hypot(sigma, apart.sigma_mm)
-    limit_mm = None if plan.region is None else plan.region.most_sigma_mm
+    limit_mm = None if plan.region is None else plan.region.max_sigma_mm
     if limit_mm is not None:
         known = sigma <= limit_mm
         surface = surface.with_points(known, "sigma_limit")

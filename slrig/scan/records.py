@@ -67,7 +67,7 @@ def read_record(folder: Path) -> KeptRecord | None:
 
 def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:
     """The part of a report that is worth a row in a list: its plain values, and the whole of "truth", "mesh",
-    "notes", "stage" (where the object's stage stood), "computed", and the seconds of each stage of the work.
+    "notes", "turntable" (its angle), "computed", and the seconds of each stage of the work.
 
     >>> report_summary({"method": "Gray-only", "stages": {"decode": 0.1}, "truth": {"rms_mm": float("nan")}})
     {'method': 'Gray-only', 'truth': {'rms_mm': None}}
@@ -75,7 +75,7 @@ def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: _finite(value)
         for name, value in report.items()
-        if name in {"truth", "mesh", "notes", "stage", "computed", STAGES_S}
+        if name in {"truth", "mesh", "notes", "turntable", "computed", STAGES_S}
         or value is None
         or isinstance(value, (bool, int, float, str))
     }

@@ -323,10 +323,10 @@ def test_real_captures_are_imported_as_they_were_by_hand(
     given = [str(folder / word) if word.endswith(".json") else word for word in words]
     done = run(folder / "frames", "--output", tmp_path / "bundle", *given)
     assert done.exit_code == 0, done.output
-    by_hand, found = read_bundle(folder), read_bundle(tmp_path / "bundle")
-    assert found.capture.patterns == by_hand.capture.patterns
-    assert found.capture.cameras == by_hand.capture.cameras
-    for one, other in zip(found.capture.shots, by_hand.capture.shots, strict=True):
+    manual, found = read_bundle(folder), read_bundle(tmp_path / "bundle")
+    assert found.capture.patterns == manual.capture.patterns
+    assert found.capture.cameras == manual.capture.cameras
+    for one, other in zip(found.capture.shots, manual.capture.shots, strict=True):
         assert one.pattern == other.pattern
         assert (one.image == other.image).all()
-    assert (found.calibration is None) == (by_hand.calibration is None)
+    assert (found.calibration is None) == (manual.calibration is None)

@@ -35,7 +35,7 @@ def on_a_stage(data: Path) -> tuple[list[str], list[np.ndarray]]:
         folder.mkdir(parents=True)
         (folder / "mesh.ply").write_bytes(encode_mesh_ply(view))
         (folder / "report.json").write_text(
-            json.dumps({"format": "slrig-report", "stage": {"angle_deg": angle, "turned_by": "table"}})
+            json.dumps({"format": "slrig-report", "turntable": {"angle_deg": angle, "turned_by": "table"}})
         )
         write_record(folder, KeptRecord(scan_id, "small", None, ScanPlan(), utc_now(), utc_now()))
         scans.append(str(scan_id))
@@ -67,7 +67,7 @@ def test_scans_become_a_model_over_http_and_a_kill_while_it_is_made_costs_nothin
         whole = decode_mesh_ply((tmp_path / "model.ply").read_bytes())
         assert np.sqrt(np.mean(off_surface_mm(bumpy, whole) ** 2)) < 0.06
         assert (tmp_path / "model.glb").read_bytes()[:4] == b"glTF"
-        assert report["axis"]["stage_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
+        assert report["axis"]["turntable_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
         with pytest.raises(ModelFailedError, match="share more than 2%"):
             client.models.wait(client.models.start(scans, axis=STAGE, angles_deg=[0, 180, 270])["id"])
         worker = first.worker_id()

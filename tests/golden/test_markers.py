@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from slrig.bundle.options import StageRecord, encode_stage, read_poses
+from slrig.bundle.options import TurntableRecord, encode_turntable, read_poses
 from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
-from slrig.model import PlaneKind, StagePlane
+from slrig.model import PlaneKind, TurntablePlane
 from slrig.multiview.turntable import cut_view, turntable_poses
-from tests.golden.test_stage import AXIS as STAGE_AXIS
-from tests.golden.test_stage import VASE, scanned
+from tests.golden.test_turntable import AXIS as STAGE_AXIS
+from tests.golden.test_turntable import VASE, scanned
 from tests.turned_views import displacement_mm
 
 pytestmark = pytest.mark.slow
@@ -49,11 +49,11 @@ FROM_ABOVE: dict[str, dict[str, Any]] = {
 def modelled(folder: Path, name: str, *told: str) -> tuple[dict[str, Any], list[float], str]:
     """What `slrig model` reports, how far off each view is, rms mm, and what it prints. The plate is cut away."""
     output = folder / name
-    plate = StagePlane(PlaneKind.PLATE, np.array([2.0, 30.0, 1.5]), np.array([0.0, -1.0, 0.0]), 0.01, 60.0, 1.2)
-    (folder / "stage.json").write_bytes(encode_stage(StageRecord(planes=(plate,))))
+    plate = TurntablePlane(PlaneKind.PLATE, np.array([2.0, 30.0, 1.5]), np.array([0.0, -1.0, 0.0]), 0.01, 60.0, 1.2)
+    (folder / "turntable.json").write_bytes(encode_turntable(TurntableRecord(planes=(plate,))))
     scans = [str(folder / "scans" / f"{angle:03.0f}") for angle in ANGLES]
     done = CliRunner().invoke(
-        app, ["model", *scans, "--output", str(output), "--stage", str(folder / "stage.json"), *told]
+        app, ["model", *scans, "--output", str(output), "--turntable", str(folder / "turntable.json"), *told]
     )
     assert done.exit_code == 0, done.output
     true = turntable_poses(AXIS_POINT, AXIS, np.deg2rad(ANGLES))

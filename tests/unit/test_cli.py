@@ -512,7 +512,7 @@ def test_metal_needs_the_certificates(rig: Rig) -> None:
     with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not told"):
         plan_for(given, metal)
     certain = replace(given, sphere_form_mm=0.001, plane_form_mm=0.002, spacing_limit_mm=0.05)
-    wanted = plan_for(replace(certain, wanted_mm=0.03), metal).limits
+    wanted = plan_for(replace(certain, tolerance_mm=0.03), metal).limits
     assert wanted == Limits(form_mm=0.06, size_mm=0.03, spacing_mm=0.05, flatness_mm=0.06)
     assert not plan_for(certain, metal).rendered
 

@@ -304,7 +304,7 @@ def walked(desk: Desk, *answers: str) -> tuple[str, Hand]:
     stream, hand = io.StringIO(), Hand(*answers)
     with client_of(desk) as client:
         session = opened(client, BOARD, label=None)
-        Walk(client, session, Console(file=stream, width=120), ask=hand).by_hand()
+        Walk(client, session, Console(file=stream, width=120), ask=hand).manual()
     return stream.getvalue(), hand
 
 
@@ -404,7 +404,7 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[httpx2.Request]:
     known = {"value": -0.02, "sigma": 0.011, "sigmas": 1.8, "words": "shorter"}
     unknown = {"value": 0.5, "sigma": None, "sigmas": None, "words": "farther"}
     left = {"focal_percent": known, "principal_px": known, "rotation_deg": None, "baseline_mm": None}
-    moved = {"moved_rms_mm": 0.01, "moved_most_mm": 0.03, "turn_deg": 0.002, "shift_mm": 0.1}
+    moved = {"moved_rms_mm": 0.01, "moved_max_mm": 0.03, "turn_deg": 0.002, "shift_mm": 0.1}
     compared = {
         "first": ID,
         "second": OTHER,

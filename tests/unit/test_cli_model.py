@@ -1,4 +1,4 @@
-"""`slrig model` of scans and of views that it shoots, by a rig or a service; `slrig stage planes`."""
+"""`slrig model` of scans and of views that it shoots, by a rig or a service; `slrig turntable planes`."""
 
 from __future__ import annotations
 
@@ -13,23 +13,31 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import Result
 
-from slrig.bundle.options import AxisSource, Poses, StageRecord, encode_poses, encode_stage, read_poses, read_stage
-from slrig.bundle.sidecars import StageAngle, write_stage
+from slrig.bundle.options import (
+    AxisSource,
+    Poses,
+    TurntableRecord,
+    encode_poses,
+    encode_turntable,
+    read_poses,
+    read_turntable,
+)
+from slrig.bundle.sidecars import TurntableAngle, write_turntable_angle
 from slrig.cli import model_shoot
 from slrig.client.events import Progress
 from slrig.combine import plan
-from slrig.combine.stage import with_axis
+from slrig.combine.turntable import with_axis
 from slrig.devices import Rig
 from slrig.errors import ConfigError, DeviceGoneError, ServiceError
-from slrig.model import MeasuredAxis, PlaneKind, StagePlane
+from slrig.model import MeasuredAxis, PlaneKind, TurntablePlane
 from slrig.multiview import registration
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.scan.plan import ScanPlan
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, seen, vase
 from tests.unit.capture.fake_rig import FakeTurntable, fake_rig
 from tests.unit.command import done, refused, slrig
-from tests.unit.multiview.test_stage_planes import AXIS as PLATE_AXIS
-from tests.unit.multiview.test_stage_planes import PLATE, WALL, joined
+from tests.unit.multiview.test_turntable_planes import AXIS as PLATE_AXIS
+from tests.unit.multiview.test_turntable_planes import PLATE, WALL, joined
 
 ANGLE = 40.0
 STAGE = [
@@ -40,7 +48,7 @@ STAGE = [
 
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with scans 9, 10 and 11 of an object on a stage, and one scan's mesh of a vase beside it."""
+    """A folder with scans 9, 10 and 11 of an object on a turntable, and one scan's mesh of a vase beside it."""
     folder = tmp_path_factory.mktemp("scans")
     turned = seen(bumpy, [0.0, ANGLE, 2 * ANGLE], pitch_mm=1.5)
     for number, view in zip((9, 10, 11), turned.noisy(0, length_mm=2.0), strict=True):
@@ -65,7 +73,7 @@ def test_scans_of_a_stage_are_placed_and_their_poses_place_them_again(scans: Pat
     report = json.loads((tmp_path / "model" / "report.json").read_text())
     assert len(report["pairs"]) == 3
     assert np.shape(report["registration"]["covariance"]) == (12, 12)
-    assert report["axis"]["stage_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
+    assert report["axis"]["turntable_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
     known = read_poses(tmp_path / "model" / "poses.json")
     assert list(known.poses) == ["scan-9", "scan-10", "scan-11"]
     # One mesh in the frame of the first scan: the second one's vertices follow its own.
@@ -97,16 +105,16 @@ def test_error_of_a_start_is_stated_once() -> None:
 
 @pytest.mark.slow
 def test_free_motion_of_a_vase_is_reported(scans: Path, tmp_path: Path) -> None:
-    # What is known of the stage is in a file: its axis, and a plate that hides a part of the vase.
+    # What is known of the turntable is in a file: its axis, and a plate that hides a part of the vase.
     views = [decode_mesh_ply((scans / f"vase-{number}.ply").read_bytes()) for number in (0, 1)]
     height = (views[0].vertices_mm - AXIS_POINT_MM) @ AXIS
-    foot = StagePlane(PlaneKind.PLATE, AXIS_POINT_MM + np.quantile(height, 0.1) * AXIS, AXIS, 0.02, 50.0, 1.0)
+    foot = TurntablePlane(PlaneKind.PLATE, AXIS_POINT_MM + np.quantile(height, 0.1) * AXIS, AXIS, 0.02, 50.0, 1.0)
     known = MeasuredAxis(np.add(AXIS_POINT_MM, [0.3, 0.0, -0.2]), AXIS, 1e-4 * np.eye(6))
-    (tmp_path / "stage.json").write_bytes(encode_stage(StageRecord(known, (foot,))))
-    words = ("--angle", ANGLE, "--stage", tmp_path / "stage.json")
+    (tmp_path / "turntable.json").write_bytes(encode_turntable(TurntableRecord(known, (foot,))))
+    words = ("--angle", ANGLE, "--turntable", tmp_path / "turntable.json")
     done = model(scans / "vase-0.ply", scans / "vase-1.ply", "--output", tmp_path / "model", *words)
     assert done.exit_code == 0, done.output
-    assert "of the views lay behind the stage's planes" in done.stdout
+    assert "of the views lay behind the turntable's planes" in done.stdout
     assert "free      1 view may turn about an axis along (-0.0" in done.stdout
     assert "held as the start has it" in done.stdout
     (free,) = json.loads((tmp_path / "model" / "report.json").read_text())["free"]
@@ -117,7 +125,7 @@ def test_free_motion_of_a_vase_is_reported(scans: Path, tmp_path: Path) -> None:
 def test_scans_in_another_order_than_the_stage_turned_in_are_refused(scans: Path, tmp_path: Path) -> None:
     named = [scans / "all" / f"scan-{number}" for number in (9, 10, 11)]
     for number, folder in enumerate(named):
-        (folder / "report.json").write_text(json.dumps({"stage": {"angle_deg": 320 + ANGLE * number}}))
+        (folder / "report.json").write_text(json.dumps({"turntable": {"angle_deg": 320 + ANGLE * number}}))
     try:
         # As a shell sorts them.
         shuffled = [named[1], named[2], named[0]]
@@ -158,20 +166,20 @@ def test_nothing_that_is_read_is_replaced(scans: Path, tmp_path: Path) -> None:
     own = tmp_path / "model"
     own.mkdir()
     (own / "report.json").write_text('{"format": "slrig-model"}')
-    by_hand = own / "by-hand.json"
-    by_hand.write_bytes(encode_poses(Poses({f"scan-{number}": np.eye(4) for number in (9, 10, 11)})))
+    manual = own / "by-hand.json"
+    manual.write_bytes(encode_poses(Poses({f"scan-{number}": np.eye(4) for number in (9, 10, 11)})))
     scan = tmp_path / "scan"
     scan.mkdir()
     (scan / "report.json").write_text('{"format": "slrig-report"}')
     for words, expected in (
         ([scans / "all", "--output", scans / "all", *STAGE], "would be replaced"),
         ([scans / "all", "--output", scans / "all" / "scan-9", *STAGE], "would be replaced"),
-        ([scans / "all", "--output", own, "--poses", by_hand], "would be replaced"),
+        ([scans / "all", "--output", own, "--poses", manual], "would be replaced"),
         ([scans / "all", "--output", scan, *STAGE], "a folder with other files in it"),
     ):
         refused = model(*words)
         assert (refused.exit_code, expected in refused.stderr) == (2, True), (words, refused.output)
-    assert by_hand.exists()
+    assert manual.exists()
 
 
 def test_file_of_poses_holds_rotations_and_an_axis(tmp_path: Path) -> None:
@@ -227,7 +235,9 @@ class Bench:
             raise error
         (output / f"view-{number}").mkdir(parents=True)
         (output / f"bundle-{number}").mkdir()
-        write_stage(output / f"bundle-{number}", StageAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by))
+        write_turntable_angle(
+            output / f"bundle-{number}", TurntableAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by)
+        )
         (output / f"view-{number}" / "mesh.ply").write_bytes(encode_mesh_ply(self.meshes[plan.turn_deg]))
 
 
@@ -246,7 +256,7 @@ def bench(made: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 @pytest.mark.slow
 def test_a_person_turns_leaves_and_goes_on_in_the_same_folder(bench: Bench, tmp_path: Path) -> None:
-    shoot = ["--shoot", 9, "--rig", RIG, "--by-hand", "--output", tmp_path, *TABLE]
+    shoot = ["--shoot", 9, "--rig", RIG, "--manual", "--output", tmp_path, *TABLE]
     bench.faults = {40.0: DeviceGoneError("left was unplugged")}
     done = model(*shoot, typed="\n\nq\n")
     assert done.exit_code == 0, done.output
@@ -259,14 +269,14 @@ def test_a_person_turns_leaves_and_goes_on_in_the_same_folder(bench: Bench, tmp_
     assert bench.shot == [0.0, 40.0, 40.0, 80.0]
     report = json.loads((tmp_path / "model" / "report.json").read_bytes())
     assert [each["name"] for each in report["views"]] == ["view-1", "view-2", "view-3"]
-    assert report["axis"]["stage_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
+    assert report["axis"]["turntable_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
     # Another number of views changes nothing of where those stood that there are.
-    fewer = model("--shoot", 3, "--rig", RIG, "--by-hand", "--output", tmp_path, *TABLE)
+    fewer = model("--shoot", 3, "--rig", RIG, "--manual", "--output", tmp_path, *TABLE)
     assert fewer.exit_code == 0, fewer.output
     assert json.loads((tmp_path / "model" / "poses.json").read_bytes())["views"][2]["name"] == "view-3"
-    assert json.loads((tmp_path / "model" / "report.json").read_bytes())["axis"]["stage_error_deg"] == pytest.approx(
-        [0, 0, 0], abs=0.05
-    )
+    assert json.loads((tmp_path / "model" / "report.json").read_bytes())["axis"][
+        "turntable_error_deg"
+    ] == pytest.approx([0, 0, 0], abs=0.05)
 
 
 @pytest.mark.slow
@@ -285,16 +295,16 @@ def test_what_cannot_be_shot_is_said(bench: Bench, tmp_path: Path) -> None:
     rig = ["--shoot", 9, "--rig", RIG, "--output", tmp_path]
     for words, asked in (
         ("this rig has no turntable", [*rig, *TABLE]),
-        ("expected the stage's axis", [*rig, "--by-hand"]),
+        ("expected the turntable's axis", [*rig, "--manual"]),
         ("expected scans, or --shoot N", ["--output", tmp_path]),
-        ("expected scans, or --shoot N", ["--output", tmp_path, "--by-hand", tmp_path]),
+        ("expected scans, or --shoot N", ["--output", tmp_path, "--manual", tmp_path]),
         ("leave --angle and --poses out", [*rig, "--angle", 40, *TABLE]),
     ):
         refused = model(*asked)
         assert refused.exit_code == 2
         assert words in refused.output
     bench.faults = {0.0: DeviceGoneError("left was unplugged")}
-    failed = model(*rig, "--by-hand", *TABLE, typed="q\n")
+    failed = model(*rig, "--manual", *TABLE, typed="q\n")
     assert (failed.exit_code, "0 of 9 views succeeded" in failed.stderr) == (2, True), failed.output
     assert bench.shot == [0.0]
 
@@ -351,17 +361,17 @@ def test_service_shoots_what_the_person_answers(tmp_path: Path) -> None:
 
 
 def test_planes_are_added_to_what_the_file_says_of_the_axis(tmp_path: Path) -> None:
-    scan, file = tmp_path / "scan", tmp_path / "stage.json"
+    scan, file = tmp_path / "scan", tmp_path / "turntable.json"
     scan.mkdir()
     (scan / "mesh.ply").write_bytes(encode_mesh_ply(joined(PLATE, WALL)))
     axis = MeasuredAxis(PLATE_AXIS.point_mm, PLATE_AXIS.direction, 1e-4 * np.eye(6))
-    record = with_axis(StageRecord(), axis, source=AxisSource.BOARD, of="board")
-    file.write_bytes(encode_stage(record))
-    shown = done("stage", "planes", scan, "--stage", file, COLUMNS="160")
-    assert [line.split()[0] for line in shown.splitlines()] == ["plane", "backdrop", "plate", "stage"]
-    after = read_stage(file)
+    record = with_axis(TurntableRecord(), axis, source=AxisSource.BOARD, of="board")
+    file.write_bytes(encode_turntable(record))
+    shown = done("turntable", "planes", scan, "--turntable", file, COLUMNS="160")
+    assert [line.split()[0] for line in shown.splitlines()] == ["plane", "backdrop", "plate", "turntable"]
+    after = read_turntable(file)
     assert [plane.kind for plane in after.planes] == [PlaneKind.BACKDROP, PlaneKind.PLATE]
     assert after.history == record.history
     file.write_text("{}")
-    assert "is not a valid stage" in refused(slrig("stage", "planes", scan, "--stage", file))
+    assert "is not a valid turntable" in refused(slrig("turntable", "planes", scan, "--turntable", file))
     assert file.read_text() == "{}"

@@ -28,7 +28,7 @@ def upgrade() -> None:
         sa.Column("computing", sa.Integer, nullable=False),
         sa.Column("uncopied", sa.Integer, nullable=False),
         sa.Column("health", sa.String, nullable=False),
-        sa.Column("health_words", sa.String, nullable=False),
+        sa.Column("health_message", sa.String, nullable=False),
         sa.Column("verified_at", _MOMENT),
     )
     op.create_table(

@@ -159,7 +159,7 @@ def test_a_result_is_looked_at_measured_compared_and_downloaded(service: Service
 
 
 def test_the_region_of_a_scan_is_named_and_drawn(service: ServiceProcess, visit: Visit) -> None:
-    region = {"box_mm": [[-20, -25, -40], [20, 15, 40]], "least_contrast": 0.02}
+    region = {"box_mm": [[-20, -25, -40], [20, 15, 40]], "min_contrast": 0.02}
     with service.client() as client:
         scan = scanned(client, reconstruction={"region": region})
     assert scan["state"] == "succeeded", scan
@@ -192,7 +192,7 @@ def test_the_region_of_a_scan_is_named_and_drawn(service: ServiceProcess, visit:
     with service.client() as client:
         region_sent = client.get(page.url.rpartition("#")[2])["plan"]["reconstruction"]["region"]
     least, most = region_sent["box_mm"]
-    assert (region_sent["depth_mm"], region_sent["least_contrast"], region_sent["most_sigma_mm"]) == (
+    assert (region_sent["depth_mm"], region_sent["min_contrast"], region_sent["max_sigma_mm"]) == (
         [100, 1000],
         0.04,
         0.5,

@@ -197,7 +197,7 @@ def test_scans_are_joined_and_an_object_is_turned_by_hand(start: Start, tmp_path
 
     with service.client() as client:
         axis = {**STAGE, "covariance": COVARIANCE}
-        client.stage.put({"format": "slrig-stage", "version": 1, "axis": axis})
+        client.turntable.put({"format": "slrig-turntable", "version": 1, "axis": axis})
     page.get_by_role("button", name="Make one model of 3").click()
     page.get_by_text("succeeded").wait_for()
     page.get_by_role("img", name="The model from six sides").wait_for()
@@ -235,7 +235,7 @@ def others(catalogue: Catalogue) -> None:
     catalogue.see(row("hall-1", words="scan 5f1c", health="good", uncopied=0))
     why = "The camera 'left' does not answer. Plug it in again, then scan."
     catalogue.see(row("hall-2", state="fault", words=why, waiting=0, computing=0, health="stale", uncopied=12,
-                      health_words="the projector has turned by 0.06°"))  # fmt: skip
+                      health_message="the projector has turned by 0.06°"))  # fmt: skip
     catalogue.see(row("hall-3"))
     too_dark = {"state": "failed", "fault_message": "The pictures are too dark: open the aperture."}
     catalogue.copy([

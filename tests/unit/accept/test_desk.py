@@ -73,10 +73,10 @@ def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameQueue) -> 
     database = Database(folder.database)
     take_scans_from(monkeypatch, PLAN)
 
-    def make(*, wanted_mm: float | None = None) -> Desk:
+    def make(*, tolerance_mm: float | None = None) -> Desk:
         desk = Desk(
             folder, queue, JobStore(database, JobKind.POSITION),
-            evaluate=evaluated, report=write_reports, wanted_mm=wanted_mm,
+            evaluate=evaluated, report=write_reports, tolerance_mm=tolerance_mm,
         )  # fmt: skip
         desk.take_up()
         return desk
@@ -100,11 +100,11 @@ def the_plan(_: Calibration, _wanted_mm: float | None) -> AcceptancePlan:
 
 
 def test_limits_follow_the_rig_file_unless_asked_for(desks: Desks) -> None:
-    desk = desks(wanted_mm=0.04)
+    desk = desks(tolerance_mm=0.04)
     least, greatest = (tuple(corner) for corner in VOLUME.tolist())
     asked = AcceptanceRequest(volume_mm=(least, greatest))
     assert desk.open(asked.plan).plan.limits == usual_limits(VOLUME, 0.04)
-    assert desk.open(asked.model_copy(update={"wanted_mm": 0.01}).plan).plan.limits == usual_limits(VOLUME, 0.01)
+    assert desk.open(asked.model_copy(update={"tolerance_mm": 0.01}).plan).plan.limits == usual_limits(VOLUME, 0.01)
     assert desks().open(asked.plan).plan.limits == usual_limits(VOLUME)
 
 

@@ -223,7 +223,7 @@ def test_calibrations_are_imported_compared_and_refused(calibrating: TestClient,
     assert "a real change" in found["devices"]["cam0"]["focal_percent"]["words"]
     assert found["devices"]["cam0"]["baseline_mm"] is None
     assert found["devices"]["projector"]["baseline_mm"]["value"] == 0
-    assert 0 < found["moved_rms_mm"] <= found["moved_most_mm"]
+    assert 0 < found["moved_rms_mm"] <= found["moved_max_mm"]
     for name, kind in (("calibration.yml", "application/yaml"), ("calibration.xml", "text/xml; charset=utf-8")):
         text = client.get(f"/calibration/{first['id']}/{name}").content
         again = client.post("/calibration/import", content=text, headers={"Content-Type": kind})

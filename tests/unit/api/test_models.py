@@ -17,7 +17,7 @@ from tests.unit.combine.model_bench import kept_scan, until_told
 AXIS = {"point_mm": [4.0, 45.0, 12.0], "direction": [0.0, -1.0, 0.0]}
 STILL = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 MIRROR = [[-1.0, 0.0, 0.0, 0.0], *STILL[1:]]
-BY_HAND = {"by_hand": True, "axis": AXIS, "views": 3, "label": "cup", "if_busy": "queue"}
+BY_HAND = {"manual": True, "axis": AXIS, "views": 3, "label": "cup", "if_busy": "queue"}
 
 
 @pytest.fixture
@@ -43,7 +43,12 @@ def test_model_is_made_once_followed_and_fetched(client: TestClient, served: Ser
     done = over(client, model)
     assert client.post("/model", json=request, headers=key).json()["id"] == model["id"]
     assert done["state"] == "succeeded", done["error"]
-    assert done["plan"]["poses"] == {"axis": AXIS, "angles_deg": [0.0, 40.0], "of_stage": False, "kind": "turntable"}
+    assert done["plan"]["poses"] == {
+        "axis": AXIS,
+        "angles_deg": [0.0, 40.0],
+        "of_turntable": False,
+        "kind": "turntable",
+    }
     assert served.combining.asked[-1][1:] == (
         TurntablePoses(StatedAxis((4.0, 45.0, 12.0), (0.0, -1.0, 0.0)), (0.0, 40.0)), 3.0, 0.4,
     )  # fmt: skip
@@ -147,9 +152,9 @@ def test_views_wait_for_a_busy_rig_only_on_request(client: TestClient, served: S
         (422, "poses", {"scans": [0, 1], "poses": "somewhere"}),
         (422, "expected the frames of each scan", {"scans": [0, 1], "poses": "markers"}),
         (422, "dictionary", {"scans": [0, 1], "poses": "unknown", "dictionary": "DICT_4X4_50"}),
-        (422, "axis: expected that of the stage", {"by_hand": True}),
+        (422, "axis: expected that of the stage", {"manual": True}),
         (422, "views", {**BY_HAND, "views": 1}),
-        (422, "one for each of 3 scans", {"by_hand": True, "views": 3, "poses": [STILL, STILL]}),
+        (422, "one for each of 3 scans", {"manual": True, "views": 3, "poses": [STILL, STILL]}),
         (422, "repeat", {**BY_HAND, "scan": {"repeat": 2}}),
         (422, "turn_deg", {**BY_HAND, "scan": {"turn_deg": 2}}),
         (422, "one of", {**BY_HAND, "scan": {"exposure_s": 0.1, "exposures_s": [0.1, 0.2]}}),

@@ -74,7 +74,7 @@ def planned(request: dict[str, Any], **defaults: Any) -> ScanPlan:
         ({"exposure_s": 0.02, "exposures_s": [0.02, 0.08]}, "exposures_s", "found both"),
         (in_region(box_mm=BOX[::-1]), "reconstruction.region", "x: expected two rising numbers"),
         (in_region(box_mm=[[0, 0], [1, 1]]), "reconstruction.region.box_mm.0.2", "required"),
-        (in_region(least_contrast=2), "reconstruction.region.least_contrast", "less than 1"),
+        (in_region(min_contrast=2), "reconstruction.region.min_contrast", "less than 1"),
         (in_region(roi=1), "reconstruction.region.roi", "no such field"),
         ({"every_s": 5}, "every_s", "expected repeat above 1"),
         ({"repeat": 0}, "repeat", ""),
@@ -169,8 +169,8 @@ def test_plan_is_the_request_over_the_rig_file_over_the_default(client: TestClie
     assert planned({"exposures_s": (0.02, 0.2)}, **usual).exposures_s == (0.02, 0.2)
     one = planned({"exposure_s": 0.03}, **usual)
     assert (one.exposure_s, one.exposures_s) == (0.03, None)
-    chosen = planned(in_region(least_contrast=0.1), **usual)
-    assert chosen.reconstruction.region == Region(least_contrast=0.1)
+    chosen = planned(in_region(min_contrast=0.1), **usual)
+    assert chosen.reconstruction.region == Region(min_contrast=0.1)
     assert planned({}).reconstruction.region is None
     assert not planned({}).coloured_light
     assert planned({}, coloured_light=True).coloured_light
@@ -191,7 +191,7 @@ def test_mask_may_be_longer_than_other_requests(client: TestClient) -> None:
 def test_plan_on_record_keeps_its_exposures_and_its_region() -> None:
     region = Region(
         box_mm=((-1, -2, -3), (1, 2, 3)), depth_mm=(100, 200), polygons_px={"left": ((0, 0), (9, 0), (9, 9))},
-        masks={"right": mask_of(4, 3)}, least_contrast=0.1, most_sigma_mm=0.02,
+        masks={"right": mask_of(4, 3)}, min_contrast=0.1, max_sigma_mm=0.02,
     )  # fmt: skip
     plan = ScanPlan(exposures_s=(0.08, 0.005, 0.02), reconstruction=ReconstructionPlan(region=region))
     assert plan.rising_exposures_s == (0.005, 0.02, 0.08)
@@ -217,8 +217,8 @@ def test_plan_on_record_keeps_its_exposures_and_its_region() -> None:
         (Region, {"masks": {"left": "bm90IGEgUE5H"}}, "masks.left: expected a PNG"),
         (Region, {"masks": {"left": "not base64"}}, "masks.left: expected a PNG"),
         (Region, {"masks": {"left": "A" * 300_000}}, "at most 262144 characters, found 300000"),
-        (Region, {"least_contrast": 1.0}, "least_contrast: expected a number above 0 and below 1"),
-        (Region, {"most_sigma_mm": 0.0}, "most_sigma_mm: expected a number above 0, found 0"),
+        (Region, {"min_contrast": 1.0}, "min_contrast: expected a number above 0 and below 1"),
+        (Region, {"max_sigma_mm": 0.0}, "max_sigma_mm: expected a number above 0, found 0"),
     ],
 )
 def test_plan_and_region_refuse_what_makes_no_sense(

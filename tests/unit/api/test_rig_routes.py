@@ -1,4 +1,4 @@
-"""/rig/health, /rig/stage and /acceptance over stand-ins for the service."""
+"""/rig/health, /rig/turntable and /acceptance over stand-ins for the service."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from fastapi.testclient import TestClient
 from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.desk import AcceptanceDesk
 from slrig.api import acceptance as router_module
-from slrig.api import health, stage
+from slrig.api import health, turntable
 from slrig.calibrate.records import PoseRecord, SessionRecord
 from slrig.calibration.board import DEFAULT_BOARD
-from slrig.combine.stage import StageStore
+from slrig.combine.turntable import TurntableStore
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.keys import RequestKeys
@@ -30,8 +30,8 @@ from slrig.verify.store import HealthStore
 from tests.unit.accept.test_desk import PLAN, desk, desks, queue
 from tests.unit.api.conftest import app_of, refusal
 from tests.unit.jobs.tame_queue import TameQueue
-from tests.unit.multiview.test_stage_axis import SIX_DEG, shot
-from tests.unit.multiview.test_stage_planes import AXIS, PLATE
+from tests.unit.multiview.test_turntable_axis import SIX_DEG, shot
+from tests.unit.multiview.test_turntable_planes import AXIS, PLATE
 from tests.unit.verify.test_verification import TAME, queue_of
 
 __all__ = ["desk", "desks", "queue"]
@@ -119,15 +119,15 @@ def found(observed: list[int], _board: object, _calibration: object, angles_deg:
 
 
 @pytest.fixture
-def stage_client(tmp_path: Path) -> Iterator[TestClient]:
+def turntable_client(tmp_path: Path) -> Iterator[TestClient]:
     folder = DataFolder(tmp_path / "data")
     folder.scan(SCAN).mkdir(parents=True)
-    (folder.scan(SCAN) / "mesh.ply").write_bytes(b"of the empty stage")
+    (folder.scan(SCAN) / "mesh.ply").write_bytes(b"of the empty turntable")
     session = SessionRecord(1, SESSION, POSES[0].created_at, "rig", board=DEFAULT_BOARD, poses=POSES)
     readings = [SimpleNamespace(observation=number) for number in range(6)]
     service = SimpleNamespace(
         folder=folder,
-        stage=StageStore(folder.root / "stage"),
+        turntable=TurntableStore(folder.root / "turntable"),
         calibrations=SimpleNamespace(
             register=SimpleNamespace(get=lambda _: session), store=SimpleNamespace(readings=lambda _: readings)
         ),
@@ -136,28 +136,28 @@ def stage_client(tmp_path: Path) -> Iterator[TestClient]:
         find_axis=found,
         find_planes=lambda _mesh, _axis: find_turntable_planes(PLATE, AXIS),
     )
-    with TestClient(app_of(stage.router, service)) as made:
+    with TestClient(app_of(turntable.router, service)) as made:
         yield made
     folder.release()
 
 
-def test_an_axis_and_planes_are_calibrated_kept_and_put_back(stage_client: TestClient) -> None:
-    before = stage_client.get("/rig/stage").json()
+def test_an_axis_and_planes_are_calibrated_kept_and_put_back(turntable_client: TestClient) -> None:
+    before = turntable_client.get("/rig/turntable").json()
     assert before["state"] == "unknown"
-    assert "POST /rig/stage/axis" in before["remedy"]
+    assert "POST /rig/turntable/axis" in before["remedy"]
     asked = {"calibration": str(SESSION), "angles_deg": SIX_DEG.tolist()}
-    calibrated = stage_client.post("/rig/stage/axis", json=asked).json()
+    calibrated = turntable_client.post("/rig/turntable/axis", json=asked).json()
     assert calibrated["state"] == "known"
     assert calibrated["point_sigma_mm"] < 1
     assert [pose["name"] for pose in calibrated["poses"]] == [f"pose {n}" for n in range(1, 7)]
     assert abs(calibrated["poses"][2]["error_deg"]) < 0.1
-    with_plane = stage_client.post("/rig/stage/planes", json={"scan": str(SCAN)}).json()
+    with_plane = turntable_client.post("/rig/turntable/planes", json={"scan": str(SCAN)}).json()
     assert with_plane["document"]["planes"][0]["kind"] == "plate"
-    assert stage_client.get("/rig/stage.svg").text.startswith("<svg")
-    assert stage_client.delete("/rig/stage").status_code == 204
-    assert stage_client.get("/rig/stage").json() == before
-    assert stage_client.put("/rig/stage", json=with_plane["document"]).json() == with_plane
-    assert stage_client.get("/rig/stage").json() == with_plane
+    assert turntable_client.get("/rig/turntable.svg").text.startswith("<svg")
+    assert turntable_client.delete("/rig/turntable").status_code == 204
+    assert turntable_client.get("/rig/turntable").json() == before
+    assert turntable_client.put("/rig/turntable", json=with_plane["document"]).json() == with_plane
+    assert turntable_client.get("/rig/turntable").json() == with_plane
 
 
 @pytest.mark.parametrize(
@@ -168,16 +168,18 @@ def test_an_axis_and_planes_are_calibrated_kept_and_put_back(stage_client: TestC
         ({"poses": [2, 3]}, "expected 3 poses or more"),
     ],
 )
-def test_poses_that_give_no_axis_are_refused(stage_client: TestClient, asked: dict[str, object], words: str) -> None:
-    answer = stage_client.post("/rig/stage/axis", json={"calibration": str(SESSION)} | asked)
+def test_poses_that_give_no_axis_are_refused(
+    turntable_client: TestClient, asked: dict[str, object], words: str
+) -> None:
+    answer = turntable_client.post("/rig/turntable/axis", json={"calibration": str(SESSION)} | asked)
     assert answer.status_code == 422
     assert words in answer.json()["detail"]
-    assert stage_client.get("/rig/stage").json()["state"] == "unknown"
+    assert turntable_client.get("/rig/turntable").json()["state"] == "unknown"
 
 
-def test_a_document_that_is_none_is_refused_with_its_faults(stage_client: TestClient) -> None:
-    sent = {"format": "slrig-stage", "version": 1, "axis": {"point_mm": [0, 0, 0], "direction": [0, 0, 0]}}
-    answer = stage_client.put("/rig/stage", json=sent)
+def test_a_document_that_is_none_is_refused_with_its_faults(turntable_client: TestClient) -> None:
+    sent = {"format": "slrig-turntable", "version": 1, "axis": {"point_mm": [0, 0, 0], "direction": [0, 0, 0]}}
+    answer = turntable_client.put("/rig/turntable", json=sent)
     assert answer.status_code == 422
     assert "covariance" in answer.text
 

@@ -85,9 +85,9 @@ def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
 
 
 def test_stage_is_turned_by_hand_where_the_rig_has_no_turntable(client: TestClient) -> None:
-    by_hand = client.post("/scan", json={"turn_deg": -45, "turned_by": "hand"}).json()
-    assert (by_hand["plan"]["turn_deg"], by_hand["plan"]["turned_by"]) == (-45.0, "hand")
-    assert ended(client, by_hand["id"])["state"] == "succeeded"
+    manual = client.post("/scan", json={"turn_deg": -45, "turned_by": "hand"}).json()
+    assert (manual["plan"]["turn_deg"], manual["plan"]["turned_by"]) == (-45.0, "hand")
+    assert ended(client, manual["id"])["state"] == "succeeded"
     refused = client.post("/scan", json={"turn_deg": 45})
     assert (refused.status_code, refused.json()["type"]) == (422, "/problems/unsupported-by-device")
     assert "this rig has no turntable. Turn it by hand, and say so" in refused.json()["detail"]

@@ -81,7 +81,7 @@ class TameCalibrating:
         self.solved: list[list[str]] = []
         self.earlier: list[Calibration | None] = []
         self.board_shapes: list[BoardShape] = []
-        self.wanted_mm: float | None = None
+        self.tolerance_mm: float | None = None
         self.calibration = tame_calibration()
 
     def tools(self) -> CalibrationTools:
@@ -136,7 +136,7 @@ class TameCalibrating:
         progress: ProgressCallback,
         earlier: Calibration | None = None,
         board_shape: BoardShape = BoardShape.AUTO,
-        wanted_mm: float | None = None,
+        tolerance_mm: float | None = None,
     ) -> CalibrationResult:
         assert (board, dict(cameras), projector) == (BOARD, {"cam0": Size(64, 48)}, Size(64, 40))
         progress("adjust", 0.5, "turn 3")
@@ -146,7 +146,7 @@ class TameCalibrating:
         self.solved.append([each.observation.name for each in poses])
         self.earlier.append(earlier)
         self.board_shapes.append(board_shape)
-        self.wanted_mm = wanted_mm
+        self.tolerance_mm = tolerance_mm
         return cast("CalibrationResult", TameResult(self.calibration))
 
 

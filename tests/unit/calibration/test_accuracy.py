@@ -402,7 +402,7 @@ def with_right(calibration: Calibration, **changes: Any) -> Calibration:
 def test_calibration_is_the_same_as_itself() -> None:
     found = compare_calibrations(rig(), rig())
     assert found.missing == ()
-    assert found.moved_rms_mm == found.moved_most_mm == found.turn_deg == found.shift_mm == 0
+    assert found.moved_rms_mm == found.moved_max_mm == found.turn_deg == found.shift_mm == 0
     assert found.words[0].startswith(
         "Points in the working volume move by 0 mm rms and at most 0 mm, in addition to a turn"
     )
@@ -458,9 +458,9 @@ def test_points_move_by_what_a_longer_baseline_makes_of_them() -> None:
     # The middle of the volume moves away, by 0.6 mm, and the rest about it: the farthest point is a corner.
     assert found.shift_mm == pytest.approx((share - 1) * 600, rel=1e-4)
     assert found.turn_deg < 1e-6
-    assert found.moved_most_mm == pytest.approx((share - 1) * np.linalg.norm([80, 60, 50]), rel=1e-4)
-    assert found.moved_rms_mm < found.moved_most_mm
-    assert f"at most {found.moved_most_mm:.3g} mm, in addition to a turn of" in found.words[0]
+    assert found.moved_max_mm == pytest.approx((share - 1) * np.linalg.norm([80, 60, 50]), rel=1e-4)
+    assert found.moved_rms_mm < found.moved_max_mm
+    assert f"at most {found.moved_max_mm:.3g} mm, in addition to a turn of" in found.words[0]
     assert "and a shift of 0.6 mm of all of them" in found.words[0]
 
 
@@ -492,7 +492,7 @@ def test_world_frame_makes_no_difference() -> None:
 
     second = Calibration({name: moved(each) for name, each in first.cameras.items()}, moved(first.projector))
     found = compare_calibrations(rig(), second)
-    assert found.moved_most_mm < 1e-6
+    assert found.moved_max_mm < 1e-6
     right = found.devices["right"]
     assert right.rotation_deg is not None
     assert right.rotation_deg.value < 1e-5

@@ -179,9 +179,9 @@ def test_the_grade_follows_the_millimetres_that_are_wanted() -> None:
     found = judged(_solution(), replace(EXPECTED, point_mm=0.1, total_mm=0.102))
     assert found.grade is Grade.USABLE
     assert _says(found, "0.1 mm off by the calibration (0.1 mm with", "0.2 mm, wanted are 0.16 mm", "add poses")
-    assert judged(_solution(), replace(EXPECTED, point_mm=0.1), wanted_mm=0.21).grade is Grade.GOOD
-    assert judged(_solution(), wanted_mm=0.019).grade is Grade.USABLE
-    assert judged(_solution(), wanted_mm=0.009).grade is Grade.DO_NOT_USE
+    assert judged(_solution(), replace(EXPECTED, point_mm=0.1), tolerance_mm=0.21).grade is Grade.GOOD
+    assert judged(_solution(), tolerance_mm=0.019).grade is Grade.USABLE
+    assert judged(_solution(), tolerance_mm=0.009).grade is Grade.DO_NOT_USE
     lengths = judged(_solution(), replace(EXPECTED, length_share=4e-4))
     assert "a length of 162 mm 0.065 mm wrong" in lengths.figures[0].message
     unknown = judged(_solution(), None)
@@ -193,7 +193,7 @@ def test_a_board_that_limits_the_error_is_named_with_what_to_do() -> None:
     found = judged(_solution(), replace(EXPECTED, board_mm=0.009))
     assert _remarks(found, "limited by the board, whose size contributes 0.009 mm", "measure both rulers")
     assert "by the size of the board most of all" in found.summary
-    poor = judged(_solution(), replace(EXPECTED, board_mm=0.009), wanted_mm=0.015)
+    poor = judged(_solution(), replace(EXPECTED, board_mm=0.009), tolerance_mm=0.015)
     assert poor.grade is Grade.USABLE
     assert _says(poor, "limited by the board", "--square-sigma")
     assert judged(_solution(), replace(EXPECTED, board_mm=0.005)).remarks == ()

@@ -22,7 +22,7 @@ from slrig.errors import (
     ScanEvidenceError,
     UnsupportedByDeviceError,
 )
-from slrig.model import CameraFormat, Frame, Pattern, PatternSequence, Pixels, Shot, Size, StageAxis
+from slrig.model import CameraFormat, Frame, Pattern, PatternSequence, Pixels, RotationAxis, Shot, Size
 from slrig.patterns.sequence import encode, scan_patterns
 
 EXPOSURE_S = 0.01
@@ -260,7 +260,7 @@ class FakeTurntable:
 
     turned_deg: list[float] = field(default_factory=list)
     error: Exception | None = None
-    axis: StageAxis | None = None
+    axis: RotationAxis | None = None
     opened_at_deg: float | None = None
 
     @property

@@ -71,7 +71,7 @@ def job(rig: str = "hall-3", **other: Any) -> dict[str, Any]:
 def row(name: str = "hall-3", **other: Any) -> dict[str, Any]:
     return {
         "name": name, "origin": f"{name}:/data", "host": name, "version": "0.1.0", "started_at": NOW, "state": "busy",
-        "words": "scan 1", "waiting": 2, "computing": 1, "uncopied": 4, "health": "valid", "health_words": "",
+        "words": "scan 1", "waiting": 2, "computing": 1, "uncopied": 4, "health": "valid", "health_message": "",
         "verified_at": NOW, **other,
     }  # fmt: skip
 

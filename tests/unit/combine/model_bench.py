@@ -13,12 +13,12 @@ from slrig.bundle.options import AxisSource
 from slrig.combine.desk import ModelDesk
 from slrig.combine.offered import MEDIA_TYPES, REPORT
 from slrig.combine.plan import StartingPoses
-from slrig.combine.stage import StageStore
+from slrig.combine.turntable import TurntableStore
 from slrig.errors import ScanCancelledError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import JobKind, JobRecord, utc_now
 from slrig.jobs.store import JobStore
-from slrig.model import MeasuredAxis, StagePlane
+from slrig.model import MeasuredAxis, TurntablePlane
 from slrig.scan.plan import ProgressCallback, ScanPlan
 from slrig.scan.records import plan_json
 from slrig.scan.sweep import sweep
@@ -27,12 +27,12 @@ from tests.unit.scan.bench import Bench, wait_for
 
 
 def kept_scan(store: JobStore, folder: DataFolder, *, angle_deg: float | None = None, mesh: bytes = b"ply") -> UUID:
-    """A scan that succeeded, on a stage if there is an angle."""
+    """A scan that succeeded, on a turntable if there is an angle."""
     scan_id = uuid4()
     folder.scan(scan_id).mkdir()
     (folder.scan(scan_id) / "mesh.ply").write_bytes(mesh)
-    stage = {} if angle_deg is None else {"stage": {"angle_deg": angle_deg, "turned_by": "table"}}
-    (folder.scan(scan_id) / "report.json").write_text(json.dumps({"format": "slrig-report", **stage}))
+    turntable = {} if angle_deg is None else {"turntable": {"angle_deg": angle_deg, "turned_by": "table"}}
+    (folder.scan(scan_id) / "report.json").write_text(json.dumps({"format": "slrig-report", **turntable}))
     store.restore(
         scan_id, plan_json(ScanPlan()), {}, rig="bench", label=None, created_at=utc_now(), started_at=utc_now()
     )
@@ -47,7 +47,7 @@ class TameCombining:
 
     def __init__(self) -> None:
         self.asked: list[tuple[Mapping[str, Path], StartingPoses, float, float | None]] = []
-        self.planes: Sequence[StagePlane] = ()
+        self.planes: Sequence[TurntablePlane] = ()
         self.axis: Mapping[str, Any] | None = None
         self.error: Exception | None = None
         self.gate = threading.Event()
@@ -63,7 +63,7 @@ class TameCombining:
         *,
         start_error_mm: float,
         voxel_mm: float | None,
-        planes: Sequence[StagePlane],
+        planes: Sequence[TurntablePlane],
         notes: Sequence[str],
         progress: ProgressCallback,
         cancelled: Callable[[], bool],
@@ -110,16 +110,16 @@ class ModelBench(Bench):
         self.tame = TameCombining()
         self.models = JobStore(self.store.database, JobKind.MODEL)
         sweep(self.store, self.folder)
-        self.stage = StageStore(root / "stage")
+        self.turntable = TurntableStore(root / "turntable")
         if axis is not None:
-            self.stage.put_axis(axis, source=AxisSource.BOARD, of="a board")
+            self.turntable.put_axis(axis, source=AxisSource.BOARD, of="a board")
         self.desk = ModelDesk(
             self.folder,
             self.runner.queue,
             self.models,
             scans=self.store,
             combine=self.tame,
-            stage=self.stage,
+            turntable=self.turntable,
             keep=keep,
         )
         self.runner.spare_what_is_used(self.desk.unused)

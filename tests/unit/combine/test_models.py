@@ -43,7 +43,7 @@ from slrig.failure import interruption_error, job_failure
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.records import JobProgress, JobRecord, JobState, utc_now
 from slrig.jobs.rig_jobs import Recorded
-from slrig.model import MeasuredAxis, PlaneKind, StagePlane
+from slrig.model import MeasuredAxis, PlaneKind, TurntablePlane
 from slrig.rig.session import RigSession
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import plan_from_json as scan_plan_from_json
@@ -69,7 +69,7 @@ def test_a_model_is_made_of_scans_on_a_stage_and_lies_in_its_place(bench: ModelB
     made = bench.desk.combine(ModelPlan(scans, TurntablePoses(AXIS), voxel_mm=0.4), label="cup")
     done = bench.over(made.id)
     assert (done.state, done.label, done.rig) == (JobState.SUCCEEDED, "cup", "bench")
-    # What it is made with is on record, whatever becomes of reports and stage.
+    # What it is made with is on record, whatever becomes of reports and turntable.
     used = ModelPlan(scans, TurntablePoses(AXIS, (0.0, 40.0, 80.0)), voxel_mm=0.4)
     assert plan_from_json(done.plan) == used
     ((meshes, poses, start_error_mm, voxel_mm),) = bench.tame.asked
@@ -92,15 +92,15 @@ def test_the_axis_is_the_stages_own_unless_it_is_said(tmp_path: Path) -> None:
     scans = bench.kept_scans(None, None)
     for axis, expected in ((None, StatedAxis((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))), (AXIS, AXIS)):
         plan = ModelPlan(scans, TurntablePoses(axis, (10.0, 55.0)))
-        assert bench.desk.settled(plan).poses == TurntablePoses(expected, (10.0, 55.0), of_stage=axis is None)
+        assert bench.desk.settled(plan).poses == TurntablePoses(expected, (10.0, 55.0), of_turntable=axis is None)
     bench.close()
 
 
 def test_views_are_cut_by_the_stages_planes_and_the_axis_found_is_noted(tmp_path: Path) -> None:
     covariance = np.diag([1e-4, 1e-4, 0.0, 1e-8, 1e-8, 0.0])
     bench = ModelBench(tmp_path, axis=MeasuredAxis(np.zeros(3), np.array([0.0, 0.0, 1.0]), covariance))
-    plate = StagePlane(PlaneKind.PLATE, np.zeros(3), np.array([0.0, 0.0, -1.0]), 0.03, 80.0, 1.2)
-    bench.stage.put_planes([plate])
+    plate = TurntablePlane(PlaneKind.PLATE, np.zeros(3), np.array([0.0, 0.0, -1.0]), 0.03, 80.0, 1.2)
+    bench.turntable.put_planes([plate])
     bench.tame.axis = {
         "point_mm": [0.02, 0.0, 5.0], "direction": [0.0, 0.0, 1.0], "covariance": covariance.tolist(),
     }  # fmt: skip
@@ -108,12 +108,12 @@ def test_views_are_cut_by_the_stages_planes_and_the_axis_found_is_noted(tmp_path
         scans = bench.kept_scans(0.0, 40.0)
         made = bench.over(bench.desk.combine(ModelPlan(scans, TurntablePoses(), cut=cut)).id)
         assert [each.kind for each in bench.tame.planes] == [PlaneKind.PLATE] * cut
-        assert bench.stage.record().history[-1].of == str(made.id)
+        assert bench.turntable.record().history[-1].of == str(made.id)
     # The same scans once more add nothing, nor does an axis that a person has stated.
     for known, poses in ((scans, TurntablePoses()), (bench.kept_scans(0.0, 40.0), TurntablePoses(AXIS))):
         bench.over(bench.desk.combine(ModelPlan(known, poses)).id)
-        assert bench.stage.record().history[-1].of == str(made.id)
-    axis = bench.stage.axis()
+        assert bench.turntable.record().history[-1].of == str(made.id)
+    axis = bench.turntable.axis()
     assert axis is not None
     assert 0.01 < axis.point_mm[0] < 0.02
     bench.close()
@@ -134,7 +134,7 @@ def test_what_cannot_be_made_is_refused_before_it_is_on_record(bench: ModelBench
         (lambda: ModelPlan((first, uuid4())), JobNotFoundError, "No scan"),
         (lambda: ModelPlan((first, failed)), ScanStateError, f"Scan {failed} is failed"),
         (lambda: ModelPlan(both, TurntablePoses(AXIS)), ConfigError, f"found none in {second}"),
-        (lambda: ModelPlan(both), ConfigError, "axis: expected that of the stage"),
+        (lambda: ModelPlan(both), ConfigError, "axis: expected that of the turntable"),
     ]
     for plan, error, words in refused:
         with pytest.raises(error, match=words):
@@ -236,8 +236,8 @@ def test_a_plan_is_the_same_after_it_was_on_record() -> None:
         assert plan_from_json(plan_json(replace(plan, voxel_mm=0.3))).voxel_mm == 0.3
 
 
-def shoot_plan(views: int = 4, *, by_hand: bool = False, exposure_s: float | None = None) -> ModelPlan:
-    return ModelPlan((), TurntablePoses(AXIS), shoot=ShootPlan(views, ScanPlan(exposure_s=exposure_s), by_hand))
+def shoot_plan(views: int = 4, *, manual: bool = False, exposure_s: float | None = None) -> ModelPlan:
+    return ModelPlan((), TurntablePoses(AXIS), shoot=ShootPlan(views, ScanPlan(exposure_s=exposure_s), manual))
 
 
 class ShootingBench(ModelBench):
@@ -390,11 +390,11 @@ def test_what_cannot_be_shot_is_refused_and_nothing_is_on_record(tmp_path: Path)
     bench = ShootingBench(tmp_path, table=False)
     with pytest.raises(UnsupportedByDeviceError, match=r"this rig has no turntable\. Turn it by hand"):
         started(bench)
-    with pytest.raises(ConfigError, match="axis: expected that of the stage"):
+    with pytest.raises(ConfigError, match="axis: expected that of the turntable"):
         started(bench, replace(shoot_plan(), poses=TurntablePoses()))
     bench.held()
     with pytest.raises(RigBusyError):
-        started(bench, shoot_plan(by_hand=True))
+        started(bench, shoot_plan(manual=True))
     assert bench.models.states() == {}
     for wrong in (1, 73):
         with pytest.raises(ConfigError, match=f"views: expected 2 to 72, found {wrong}"):
@@ -404,7 +404,7 @@ def test_what_cannot_be_shot_is_refused_and_nothing_is_on_record(tmp_path: Path)
 
 def test_by_hand_it_may_end_early_with_what_there_is(tmp_path: Path) -> None:
     bench = ShootingBench(tmp_path, table=False)
-    model_id = started(bench, shoot_plan(4, by_hand=True))
+    model_id = started(bench, shoot_plan(4, manual=True))
     bench.until_told(model_id, "view 2 of 4")
     bench.shooting.shoot_view(model_id, again=False, wait=False)
     bench.until_told(model_id, "turn the object by 90° for view 3 of 4")
@@ -418,7 +418,7 @@ def test_by_hand_it_may_end_early_with_what_there_is(tmp_path: Path) -> None:
 
 def test_by_hand_each_view_waits_for_a_person_and_the_last_may_be_shot_again(tmp_path: Path) -> None:
     bench = ShootingBench(tmp_path, table=False)
-    model_id = started(bench, shoot_plan(3, by_hand=True))
+    model_id = started(bench, shoot_plan(3, manual=True))
     waiting = bench.until_told(model_id, "turn the object by 120° for view 2 of 3")
     assert (waiting.state, waiting.progress.stage, bench.shot) == (JobState.CAPTURING, "turn", [0.0])
     with pytest.raises(ScanStateError, match="has 1 good views of 3; it takes two"):
@@ -445,11 +445,11 @@ def test_by_hand_each_view_waits_for_a_person_and_the_last_may_be_shot_again(tmp
     bench.close()
 
 
-def killed(root: Path, leave: Callable[[ShootingBench, UUID], None], *, by_hand: bool = False) -> UUID:
+def killed(root: Path, leave: Callable[[ShootingBench, UUID], None], *, manual: bool = False) -> UUID:
     """A model on record as a kill of the service leaves it."""
     bench = ShootingBench(root, start=False)
     bench.store.after_end = lambda _: None
-    plan = shoot_plan(by_hand=by_hand)
+    plan = shoot_plan(manual=manual)
     model_id = bench.models.create(plan_json(plan), rig="bench", label="cup").id
     leave(bench, model_id)
     bench.close()
@@ -463,7 +463,7 @@ def view(bench: ShootingBench, model_id: UUID, number: int, state: JobState, *, 
     if state is JobState.SUCCEEDED:
         scan_id = kept_scan(bench.store, bench.folder)
         bench.store.delete(scan_id)
-        summary = {} if count is None else {"stage": {"count": count}}
+        summary = {} if count is None else {"turntable": {"count": count}}
         bench.store.restore(
             scan_id, document, summary, rig="bench", label="cup", created_at=utc_now(), started_at=utc_now(),
             parent=model_id,
@@ -542,7 +542,7 @@ def test_after_a_kill_a_model_by_hand_waits_where_it_was(
             view(bench, model_id, 1, JobState.SUCCEEDED)
             bench.models.advance(model_id, JobState.CAPTURING)
 
-    model_id = killed(tmp_path, leave, by_hand=True)
+    model_id = killed(tmp_path, leave, manual=True)
     bench = ShootingBench(tmp_path, table=False)
     waiting = bench.until_told(model_id, "turn the object by 90° for view 2 of 4")
     assert (waiting.state, bench.shot) == (JobState.CAPTURING, shot)

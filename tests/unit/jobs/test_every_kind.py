@@ -21,7 +21,7 @@ from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibration.board import Board, PoseObservation
 from slrig.combine.desk import ModelDesk
 from slrig.combine.plan import ModelPlan, StatedAxis, TurntablePoses
-from slrig.combine.stage import StageStore
+from slrig.combine.turntable import TurntableStore
 from slrig.errors import DeviceGoneError, OutOfMemoryError, RigBusyError, ScanCancelledError, ScanInterruptedError
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.jobs.store import JobStore
@@ -103,7 +103,7 @@ class Service(Bench):
         )  # fmt: skip
         self.models = ModelDesk(
             self.folder, queue, JobStore(database, JobKind.MODEL), scans=self.store, combine=combine,
-            stage=StageStore(root / "stage"), keep=100,
+            turntable=TurntableStore(root / "turntable"), keep=100,
         )  # fmt: skip
         self.acceptance = AcceptanceDesk(
             self.folder, queue, JobStore(database, JobKind.POSITION), evaluate=evaluate,

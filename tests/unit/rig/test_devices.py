@@ -27,7 +27,7 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.model import StageAxis
+from slrig.model import RotationAxis
 from slrig.rig.preview import Light, Picture, Previews, Watch
 from slrig.rig.session import RigSession
 from slrig.rig.settings import SettingsInUse
@@ -529,7 +529,7 @@ class Table(TurntableBase):
         self._homed = homed
 
     @property
-    def axis(self) -> StageAxis | None:
+    def axis(self) -> RotationAxis | None:
         return None
 
     @property

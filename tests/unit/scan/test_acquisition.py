@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from slrig.bundle import BundleWriter, read_bundle
-from slrig.bundle.sidecars import RefusedFrame, StageAngle, read_notes, read_refused, read_stage
+from slrig.bundle.sidecars import RefusedFrame, TurntableAngle, read_notes, read_refused, read_turntable_angle
 from slrig.capture.exposure import check_exposures
 from slrig.capture.verifier import EvidenceSummary, check_capture
 from slrig.devices import CameraSettings, Projector, Synchronisation, Trigger
@@ -132,13 +132,13 @@ def test_the_turntable_turns_before_the_first_frame_and_the_bundle_says_where_to
     on_stage = replace(fake, rig=replace(fake.rig, positioner=table))
     told = captured(on_stage, tmp_path / "table", plan=ScanPlan(SHORT, turn_deg=135.0))
     assert (told[0], table.turned_deg) == ((0.0, "to 135°"), [135.0])
-    assert read_stage(tmp_path / "table") == StageAngle(angle_deg=135.0, turned_by="table")
+    assert read_turntable_angle(tmp_path / "table") == TurntableAngle(angle_deg=135.0, turned_by="table")
     # A hand has turned: the table stays where it is.
     captured(on_stage, tmp_path / "hand", plan=ScanPlan(SHORT, turn_deg=90.0, turned_by="hand"))
     assert table.turned_deg == [135.0]
-    assert read_stage(tmp_path / "hand") == StageAngle(angle_deg=90.0, turned_by="hand")
+    assert read_turntable_angle(tmp_path / "hand") == TurntableAngle(angle_deg=90.0, turned_by="hand")
     captured(on_stage, tmp_path / "none", plan=ScanPlan(SHORT))
-    assert read_stage(tmp_path / "none") is None
+    assert read_turntable_angle(tmp_path / "none") is None
 
 
 def test_no_frame_is_shot_where_nothing_turns(tmp_path: Path) -> None:
@@ -156,9 +156,9 @@ def test_no_frame_is_shot_where_nothing_turns(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "read"),
     [
-        ("stage.json", '{"angle_deg": NaN, "turned_by": "hand"}', read_stage),
-        ("stage.json", '{"angle_deg": 1}', read_stage),
-        ("stage.json", "[]", read_stage),
+        ("turntable.json", '{"angle_deg": NaN, "turned_by": "hand"}', read_turntable_angle),
+        ("turntable.json", '{"angle_deg": 1}', read_turntable_angle),
+        ("turntable.json", "[]", read_turntable_angle),
         ("notes.json", '{"light": "late"}', read_notes),
     ],
 )

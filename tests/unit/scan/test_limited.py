@@ -152,11 +152,11 @@ def test_a_polygon_and_a_mask_cut_the_image(scanned: Scanned) -> None:
 def test_weak_contrast_and_large_deviations_are_left_out(scanned: Scanned) -> None:
     whole, _, _ = scanned()
     limit_mm = float(np.quantile(whole.sigma_mm, 0.8))
-    part, report, _ = scanned(Region(most_sigma_mm=limit_mm))
+    part, report, _ = scanned(Region(max_sigma_mm=limit_mm))
     assert part.sigma_mm.max() <= np.float32(limit_mm)
     assert len(part.vertices_mm) == pytest.approx(0.8 * len(whole.vertices_mm), rel=0.05)
     assert report["mesh"]["sigma_limit"]["triangles"] > 0
-    bright, _, _ = scanned(Region(least_contrast=0.4))
+    bright, _, _ = scanned(Region(min_contrast=0.4))
     capture = read_bundle(scanned.bundle).capture
     ends = [shot.image.astype(float) for shot in capture.shots[:2]]
     contrast = abs(ends[0] - ends[1]) / 255
@@ -213,7 +213,7 @@ def test_a_region_without_a_surface_and_one_out_of_sight_are_told_apart(scanned:
     before = device.centre_mm - 100 * device.rotation[2]
     least, most = before - 5, before + 5
     with pytest.raises(NothingToReconstructError, match="outside the region"):
-        scanned(Region(box_mm=(tuple(least), tuple(most)), least_contrast=0.001))
+        scanned(Region(box_mm=(tuple(least), tuple(most)), min_contrast=0.001))
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from slrig.bundle import BundleWriter, read_bundle, read_calibration, write_bund
 from slrig.bundle.description import read_description
 from slrig.bundle.images import read_with_colour as read_frame_pages
 from slrig.bundle.reading import MAX_READERS, open_bundle
-from slrig.bundle.sidecars import StageAngle, write_notes, write_stage
+from slrig.bundle.sidecars import TurntableAngle, write_notes, write_turntable_angle
 from slrig.capture.verifier import check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -143,12 +143,12 @@ def test_a_scan_of_the_rendered_rig_is_a_mesh_with_its_files(read: Read) -> None
 @pytest.mark.slow
 def test_results_of_an_earlier_run_are_replaced_and_other_folders_are_not(recorded: Path, tmp_path: Path) -> None:
     bundle = shutil.copytree(recorded, tmp_path / "bundle")
-    assert "stage" not in run(bundle, tmp_path / "out")
+    assert "turntable" not in run(bundle, tmp_path / "out")
     # What the bundle says of the stage is said by every reconstruction of it.
-    write_stage(bundle, StageAngle(angle_deg=45.0, turned_by="hand"))
+    write_turntable_angle(bundle, TurntableAngle(angle_deg=45.0, turned_by="hand"))
     run(bundle, tmp_path / "out")
     written = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert written["stage"] == {"angle_deg": 45.0, "turned_by": "hand"}
+    assert written["turntable"] == {"angle_deg": 45.0, "turned_by": "hand"}
     other = tmp_path / "holiday"
     other.mkdir()
     (other / "picture.jpg").write_bytes(b"not ours")

@@ -137,7 +137,7 @@ def checked(tasks: Tasks, task: TaskKind, options: Mapping[str, Any]) -> None:
         ("verification", {"board": {**BOARD, "corners": [1, 3]}}, "found 1 x 3"),
         ("calibration", {}, "board: missing.*are: board, positions, exposure_s, activate"),
         ("calibration", {"board": BOARD, "activate": "yes", "poses": 3}, "activate.*poses"),
-        ("acceptance", {"repeats": 0}, "repeats.*are: artefacts, volume_mm, wanted_mm, limits"),
+        ("acceptance", {"repeats": 0}, "repeats.*are: artefacts, volume_mm, tolerance_mm, limits"),
         ("acceptance", {"artefacts": {"plane_mm": [1, 2]}}, "sphere: missing"),
         # What can only fail on this rig.
         ("verification", {}, r"not known: no calibration that was made here is in use\. Give the schedule .*\"board\""),

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slrig.calibration.board import DEFAULT_BOARD
-from slrig.errors import StageRefusedError
+from slrig.errors import TurntableRefusedError
 from slrig.model import FloatArray, MeasuredAxis
 from slrig.multiview.turntable import BoardAxis, axis_from_board, update_axis
 
@@ -91,7 +91,7 @@ def test_the_sense_of_stated_angles_is_that_of_the_axis() -> None:
 def test_poses_that_determine_no_axis_are_refused(
     angles_deg: FloatArray, slipped: tuple[slice, float], words: str
 ) -> None:
-    with pytest.raises(StageRefusedError, match=words):
+    with pytest.raises(TurntableRefusedError, match=words):
         axis_from_board(*shot(angles_deg, 1, slipped), DEFAULT_BOARD.points_mm)
 
 

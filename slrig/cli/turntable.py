@@ -1,4 +1,4 @@
-"""`slrig stage`: the axis of a turntable and the planes behind it, in a file that `slrig model` takes."""
+"""`slrig turntable`: the axis of a turntable and the planes behind it, in a file that `slrig model` takes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 from slrig.cli.options import BoardArguments, grouped
 
 if TYPE_CHECKING:
-    from slrig.bundle.options import StageRecord
+    from slrig.bundle.options import TurntableRecord
 
 app = typer.Typer(no_args_is_help=True, help="A turntable's axis, its plate and what is behind.")
 
@@ -19,13 +19,15 @@ app = typer.Typer(no_args_is_help=True, help="A turntable's axis, its plate and 
 @grouped
 def axis(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Bundles of a board that stood on the stage, one per angle.")
+        Path, typer.Argument(metavar="FOLDER", help="Bundles of a board that stood on the turntable, one per angle.")
     ],
     asked: BoardArguments,
     calibration: Annotated[Path, typer.Option(metavar="FILE", help="The calibration of the rig.")],
-    output: Annotated[Path, typer.Option(metavar="FILE", help="The stage's file. One that is there keeps its planes.")],
+    output: Annotated[
+        Path, typer.Option(metavar="FILE", help="The turntable's file. One that is there keeps its planes.")
+    ],
     angle: Annotated[
-        float | None, typer.Option(metavar="DEG", help="The stage turned by so much from bundle to bundle.")
+        float | None, typer.Option(metavar="DEG", help="The turntable turned by so much from bundle to bundle.")
     ] = None,
 ) -> None:
     """Find the axis from a board that was turned.
@@ -56,10 +58,10 @@ def axis(
     )
     keep_kernels()
     with progress_shown() as display:
-        from slrig.bundle.options import encode_stage
+        from slrig.bundle.options import encode_turntable
         from slrig.calibrate.pose_reading import read_pose
-        from slrig.calibrate.stage_axis import axis_of_poses
-        from slrig.combine.stage import with_axis
+        from slrig.calibrate.turntable_axis import axis_of_poses
+        from slrig.combine.turntable import with_axis
 
         read, angles, refused = [], [], {}
         for number, (name, bundle) in enumerate(bundles.items()):
@@ -71,7 +73,7 @@ def axis(
                 refused[name] = str(error)
         found = axis_of_poses(read, board, rig, None if angle is None else angles)
         record = with_axis(before, found.axis.measured_axis, source=AxisSource.BOARD, of=folder.absolute().name)
-        write_file(output, encode_stage(record))
+        write_file(output, encode_turntable(record))
         display("done", 1.0, "")
     rows = [
         (name, f"{found.angles_deg[name]:.3f}°", f"{found.errors_deg[name]:.3f}°" if found.errors_deg else "",
@@ -92,34 +94,36 @@ def axis(
         typer.echo(
             f"{'moved':<10}by {last.moved_mm:.3f} mm and {last.moved_deg:.3f}°, {last.sigmas:.1f} σ, since before"
         )
-    typer.echo(f"{'stage':<10}{output}")
+    typer.echo(f"{'turntable':<11}{output}")
 
 
 @app.command()
 def planes(
     scan: Annotated[
-        Path, typer.Argument(metavar="SCAN", help="A scan of the empty stage: its folder, or its mesh.ply.")
+        Path, typer.Argument(metavar="SCAN", help="A scan of the empty turntable: its folder, or its mesh.ply.")
     ],
-    stage: Annotated[Path, typer.Option(metavar="FILE", help="The stage's file, to which the planes are added.")],
+    turntable: Annotated[
+        Path, typer.Option(metavar="FILE", help="The turntable's file, to which the planes are added.")
+    ],
 ) -> None:
-    """Find plate and backdrops in a scan of the empty stage.
+    """Find plate and backdrops in a scan of the empty turntable.
 
     The plate is what is square to the axis. Planes of an earlier scan are replaced.
     """
     from dataclasses import replace
 
-    from slrig.bundle.options import encode_stage
+    from slrig.bundle.options import encode_turntable
     from slrig.bundle.storage import write_file
     from slrig.cli.display import print_table
     from slrig.cli.reconstruct import keep_kernels
     from slrig.scan.artefacts import MESH
 
-    before = _known(stage)
+    before = _known(turntable)
     keep_kernels()
-    from slrig.combine.empty_stage import planes_in
+    from slrig.combine.turntable_planes import planes_in
 
     found = planes_in(scan / MESH if scan.is_dir() else scan, before.axis)
-    write_file(stage, encode_stage(replace(before, planes=found)))
+    write_file(turntable, encode_turntable(replace(before, planes=found)))
     rows = [
         (str(each.kind), "({:.1f}, {:.1f}, {:.1f}) mm".format(*each.point_mm),
          "({:.4f}, {:.4f}, {:.4f})".format(*each.normal), f"{each.radius_mm:.0f} mm", f"{each.sigma_mm:.3f} mm",
@@ -127,11 +131,11 @@ def planes(
         for each in found
     ]  # fmt: skip
     print_table(("plane", "middle", "normal", "radius", "σ", "margin"), rows)
-    typer.echo(f"{'stage':<10}{stage}")
+    typer.echo(f"{'turntable':<11}{turntable}")
 
 
-def _known(file: Path) -> StageRecord:
+def _known(file: Path) -> TurntableRecord:
     """What the file says already. Raises ConfigError: it is damaged, and is left as it is."""
-    from slrig.bundle.options import StageRecord, read_stage
+    from slrig.bundle.options import TurntableRecord, read_turntable
 
-    return read_stage(file) if file.exists() else StageRecord()
+    return read_turntable(file) if file.exists() else TurntableRecord()

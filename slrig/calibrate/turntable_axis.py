@@ -1,4 +1,4 @@
-"""The axis of a stage from a session's poses. Run by the worker and by `slrig stage axis`."""
+"""The axis of a turntable from a session's poses. Run by the worker and by `slrig turntable axis`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def axis_of_poses(
     calibration: Calibration,
     angles_deg: Sequence[float] | None = None,
 ) -> BoardAxis:
-    """The axis that a board was turned about. angles_deg : where the stage says that it stood, pose by pose.
+    """The axis that a board was turned about. angles_deg : where the turntable says that it stood, pose by pose.
 
     Raises
     ------
     CalibrationError
         The calibration is of other cameras than saw the board.
-    StageRefusedError
+    TurntableRefusedError
         As `axis_from_board` does.
     """
     known = estimate_board_poses(poses, board, calibration)

@@ -1,4 +1,6 @@
-"""The stage of a rig on disk, DATA/stage/stage.json: its axis, which every model improves, and its planes."""
+"""The turntable of a rig on disk, DATA/turntable/turntable.json: its axis, which every model improves, and its
+planes.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +15,19 @@ from pathlib import Path
 import numpy as np
 import structlog
 
-from slrig.bundle.options import AxisSource, ChangeEntry, StageRecord, encode_stage, read_stage
+from slrig.bundle.options import AxisSource, ChangeEntry, TurntableRecord, encode_turntable, read_turntable
 from slrig.bundle.storage import sync_folder, write_file
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.records import utc_now
-from slrig.model import MeasuredAxis, StagePlane
+from slrig.model import MeasuredAxis, TurntablePlane
 from slrig.multiview import MAX_AXIS_SIGMAS, AxisUpdate, update_axis
 
-_FILE = "stage.json"
+_FILE = "turntable.json"
 _log = structlog.get_logger(__name__)
 
 
-class StageState(StrEnum):
+class TurntableState(StrEnum):
     """unknown : there is no axis. known : there is. moved : the last model turned about another one."""
 
     UNKNOWN = "unknown"
@@ -33,34 +35,37 @@ class StageState(StrEnum):
     MOVED = "moved"
 
 
-def state_of(record: StageRecord) -> tuple[StageState, str]:
-    """The state of a stage, and what to do about it; empty where nothing is to be done."""
+def state_of(record: TurntableRecord) -> tuple[TurntableState, str]:
+    """The state of a turntable, and what to do about it; empty where nothing is to be done."""
     if record.axis is None:
-        return StageState.UNKNOWN, (
-            "stand a board on the stage, shoot it at six angles as poses of a calibration (POST /calibration), and "
-            "POST /rig/stage/axis"
+        return TurntableState.UNKNOWN, (
+            "stand a board on the turntable, shoot it at six angles as poses of a calibration (POST /calibration), and "
+            "POST /rig/turntable/axis"
         )
     if record.history and not record.history[-1].taken:
         last = record.history[-1]
-        return StageState.MOVED, (
+        return TurntableState.MOVED, (
             f"model {last.of} turned about an axis that is {last.moved_mm:.3f} mm and {last.moved_deg:.3f}° from the "
-            f"one on record, {last.sigmas:.0f} deviations where {MAX_AXIS_SIGMAS:g} are allowed: were the stage or the "
-            "cameras moved, or is the rig newly calibrated? Then calibrate the axis again (POST /rig/stage/axis) and "
-            "scan the empty stage (POST /rig/stage/planes); else scan the object again"
+            f"one on record, {last.sigmas:.0f} deviations where {MAX_AXIS_SIGMAS:g} are allowed: were the turntable "
+            f"or the "
+            "cameras moved, or is the rig newly calibrated? Then calibrate the axis again (POST /rig/turntable/axis) "
+            "and "
+            "scan the empty turntable (POST /rig/turntable/planes); else scan the object again"
         )
-    return StageState.KNOWN, ""
+    return TurntableState.KNOWN, ""
 
 
 def with_axis(
-    record: StageRecord, axis: MeasuredAxis, *, source: AxisSource, of: str, at: datetime | None = None
-) -> StageRecord:
+    record: TurntableRecord, axis: MeasuredAxis, *, source: AxisSource, of: str, at: datetime | None = None
+) -> TurntableRecord:
     """The record with an axis in place of any other, and with how far it has moved."""
     apart = None if record.axis is None else update_axis(record.axis, axis)
     return replace(record, axis=axis, history=(*record.history, _change(axis, source, of, at, apart, taken=True)))
 
 
-class StageStore:
-    """The stage of a data folder. One process uses it, from any thread. root : its own folder in there, DATA/stage.
+class TurntableStore:
+    """The turntable of a data folder. One process uses it, from any thread. root : its own folder in there,
+    DATA/turntable.
 
     Whatever reads or writes raises StorageError: the disk refused, or the file is damaged. A damaged one is never
     overwritten: it has to be deleted first.
@@ -70,16 +75,17 @@ class StageStore:
         self._path = root / _FILE
         self._lock = threading.RLock()
 
-    def record(self) -> StageRecord:
+    def record(self) -> TurntableRecord:
         """What is known; nothing where there is no file."""
         if not self._path.exists():
-            return StageRecord()
+            return TurntableRecord()
         try:
-            return read_stage(self._path)
+            return read_turntable(self._path)
         except ConfigError as error:
             message = (
-                f"The record of the stage is damaged, and is left as it is. {error}\nBring {self._path} back from a "
-                "backup, or delete it (DELETE /rig/stage) and calibrate the stage again."
+                f"The record of the turntable is damaged, and is left as it is. {error}\nBring {self._path} back from "
+                f"a "
+                "backup, or delete it (DELETE /rig/turntable) and calibrate the turntable again."
             )
             raise StorageError(message) from error
 
@@ -87,16 +93,18 @@ class StageStore:
         """The axis on record; None where none is."""
         return self.record().axis
 
-    def planes(self) -> Sequence[StagePlane]:
+    def planes(self) -> Sequence[TurntablePlane]:
         """Those that views are cut by."""
         return self.record().planes
 
-    def put_axis(self, axis: MeasuredAxis, *, source: AxisSource, of: str, at: datetime | None = None) -> StageRecord:
+    def put_axis(
+        self, axis: MeasuredAxis, *, source: AxisSource, of: str, at: datetime | None = None
+    ) -> TurntableRecord:
         """Put an axis on record in place of any other. of : what it was found by, by its id."""
         with self._lock:
             return self.replace(with_axis(self.record(), axis, source=source, of=of, at=at))
 
-    def put_planes(self, planes: Sequence[StagePlane]) -> StageRecord:
+    def put_planes(self, planes: Sequence[TurntablePlane]) -> TurntableRecord:
         """Put planes on record in place of all others."""
         with self._lock:
             return self.replace(replace(self.record(), planes=tuple(planes)))
@@ -114,20 +122,20 @@ class StageStore:
             change = _change(axis, AxisSource.MODEL, of, at, found, taken=found.agrees)
             self.replace(replace(record, axis=found.axis, history=(*record.history, change)))
         if not found.agrees:
-            _log.warning("the stage was moved?", model=of, moved_mm=found.moved_mm, sigmas=found.sigmas)
+            _log.warning("the turntable was moved?", model=of, moved_mm=found.moved_mm, sigmas=found.sigmas)
         return found
 
-    def replace(self, record: StageRecord) -> StageRecord:
+    def replace(self, record: TurntableRecord) -> TurntableRecord:
         """Put a whole record in place of the one there is, unless that is damaged."""
         with self._lock:
             self.record()
             with storage_errors(self._path):
                 self._path.parent.mkdir(exist_ok=True)
-            write_file(self._path, encode_stage(record))
+            write_file(self._path, encode_turntable(record))
             return record
 
     def delete(self) -> None:
-        """Forget the stage, whatever the file holds. Idempotent."""
+        """Forget the turntable, whatever the file holds. Idempotent."""
         with self._lock, storage_errors(self._path), suppress(FileNotFoundError):
             self._path.unlink()
             sync_folder(self._path.parent)

@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from simulated_rig.device import open_simulated_head
 from slrig.bundle import write_calibration
-from slrig.bundle.options import read_stage
+from slrig.bundle.options import read_turntable
 from slrig.cli.commands import app
 from slrig.combine.combining import read_mesh
 from slrig.devices import CameraSettings, Rig, Turntable
-from slrig.model import PlaneKind, StageAxis
+from slrig.model import PlaneKind, RotationAxis
 from slrig.multiview.registration import register_views
 from slrig.multiview.turntable import cut_view, find_turntable_planes, turntable_poses
 from slrig.scan.acquisition import capture_frames
@@ -35,8 +35,8 @@ BOARD += ["--dictionary", "DICT_4X4_50"]
 VIEW_ANGLES = (0.0, 12.0, 24.0)
 
 
-def axis_of(point_mm: Sequence[float], direction: Sequence[float]) -> StageAxis:
-    return StageAxis(np.array(point_mm), np.array(direction) / np.linalg.norm(direction))
+def axis_of(point_mm: Sequence[float], direction: Sequence[float]) -> RotationAxis:
+    return RotationAxis(np.array(point_mm), np.array(direction) / np.linalg.norm(direction))
 
 
 def recorded(rig: Rig, angle_deg: float, bundle: Path, *, rows: bool) -> Path:
@@ -62,13 +62,13 @@ def test_the_axis_is_found_from_a_board_at_six_angles(tmp_path: Path) -> None:
     done = CliRunner().invoke(
         app,
         [
-            "stage", "axis", str(tmp_path / "poses"), *BOARD, "--calibration", str(tmp_path / "calibration.json"),
-            "--angle", "20", "--output", str(tmp_path / "stage.json"),
+            "turntable", "axis", str(tmp_path / "poses"), *BOARD, "--calibration", str(tmp_path / "calibration.json"),
+            "--angle", "20", "--output", str(tmp_path / "turntable.json"),
         ],
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     print(done.stdout)  # noqa: T201
-    found = read_stage(tmp_path / "stage.json").axis
+    found = read_turntable(tmp_path / "turntable.json").axis
     assert found is not None
     across = np.linalg.svd(found.direction[None])[2][1:]
     along = found.direction @ (found.point_mm - axis.point_mm) / (found.direction @ axis.direction)

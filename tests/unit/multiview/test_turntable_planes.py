@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.errors import StageRefusedError
-from slrig.model import FloatArray, Mesh, PlaneKind, StageAxis
+from slrig.errors import TurntableRefusedError
+from slrig.model import FloatArray, Mesh, PlaneKind, RotationAxis
 from slrig.multiview.turntable import cut_view, find_turntable_planes
 from tests.unit.meshing.plain import grid_faces, joined, mesh_of
 
 __all__ = ["AXIS", "PLATE", "WALL", "joined"]
 
 UP = np.array([0.0, -0.8, -0.6])
-"""Of a stage that a camera in the origin looks down on."""
+"""Of a turntable that a camera in the origin looks down on."""
 STAGE_MM = np.array([5.0, 40.0, 500.0])
-AXIS = StageAxis(STAGE_MM, UP)
+AXIS = RotationAxis(STAGE_MM, UP)
 BACK = np.array([0.0, 0.0, -1.0])
 
 
@@ -79,12 +79,12 @@ def test_a_tilted_plate_is_cut_as_high_as_it_rises() -> None:
 
 
 def test_a_scan_without_a_plane_is_refused() -> None:
-    with pytest.raises(StageRefusedError, match="no plane that holds 10% of its 6,400"):
+    with pytest.raises(TurntableRefusedError, match="no plane that holds 10% of its 6,400"):
         find_turntable_planes(ball(STAGE_MM, 40.0), AXIS)
 
 
 def test_a_view_of_the_empty_turntable_is_refused_by_name() -> None:
-    with pytest.raises(StageRefusedError, match=r"side: .* leave 0\.0% of the view \(backdrop 61%, plate 39%\)"):
+    with pytest.raises(TurntableRefusedError, match=r"side: .* leave 0\.0% of the view \(backdrop 61%, plate 39%\)"):
         cut_view(joined(PLATE, WALL), find_turntable_planes(joined(PLATE, WALL), AXIS), name="side")
 
 

@@ -1,4 +1,6 @@
-"""/rig/stage: the axis of the stage, calibrated from a board and improved by models, and the planes behind it."""
+"""/rig/turntable: the axis of the turntable, calibrated from a board and improved by models, and the planes behind
+it.
+"""
 
 from __future__ import annotations
 
@@ -11,33 +13,33 @@ from pydantic import BaseModel, Field
 
 from slrig.api.openapi import file_of, problems
 from slrig.api.service import Serving
-from slrig.bundle.options import AxisSource, StageEntry, StageRecord, stage_entry, stage_record
+from slrig.bundle.options import AxisSource, TurntableEntry, TurntableRecord, turntable_entry, turntable_record
 from slrig.bundle.validation import Strict
 from slrig.calibrate.tools import setting_of
-from slrig.combine.stage import StageState, state_of
-from slrig.combine.stage_plot import stage_svg
+from slrig.combine.turntable import TurntableState, state_of
+from slrig.combine.turntable_plot import turntable_svg
 from slrig.errors import CalibrationStateError, ConfigError, ScanStateError
 from slrig.jobs.records import JobState
 from slrig.scan.artefacts import MESH
 
-router = APIRouter(prefix="/rig", tags=["stage"])
+router = APIRouter(prefix="/rig", tags=["turntable"])
 
 _MOST_POSES = 100
 
 
-class StageBody(BaseModel):
-    """What is known of the stage. `document` can be kept, and put back with PUT."""
+class TurntableBody(BaseModel):
+    """What is known of the turntable. `document` can be kept, and put back with PUT."""
 
-    state: StageState
+    state: TurntableState
     remedy: str = Field(description="what to do; empty where nothing is to be done")
     point_sigma_mm: float | None = Field(description="standard deviation of the axis' point across it")
     direction_sigma_deg: float | None = Field(description="the same of its direction")
-    document: StageEntry
+    document: TurntableEntry
     links: dict[str, str]
 
 
 class AxisRequest(Strict):
-    """The axis from a session in which a board stood on the stage, turned from pose to pose."""
+    """The axis from a session in which a board stood on the turntable, turned from pose to pose."""
 
     calibration: Annotated[UUID, Field(strict=False)] = Field(
         description="the session; it need not be solved, and need not be the calibration in use"
@@ -46,18 +48,18 @@ class AxisRequest(Strict):
         default=None, description="their numbers. Default: all that were accepted"
     )
     angles_deg: Annotated[list[float], Field(max_length=_MOST_POSES)] | None = Field(
-        default=None, description="where the stage says that it stood, pose by pose. Default: not known"
+        default=None, description="where the turntable says that it stood, pose by pose. Default: not known"
     )
 
 
 class PlanesRequest(Strict):
-    """The planes from a scan of the stage with nothing on it."""
+    """The planes from a scan of the turntable with nothing on it."""
 
     scan: Annotated[UUID, Field(strict=False)]
 
 
-class StagePose(BaseModel):
-    """A pose of the board. error_deg : of the stage's angle, null where it was not told."""
+class TurntablePose(BaseModel):
+    """A pose of the board. error_deg : of the turntable's angle, null where it was not told."""
 
     name: str
     residual_mm: float = Field(description="rms distance of the board's corners from where a pure turn puts them")
@@ -65,27 +67,27 @@ class StagePose(BaseModel):
     error_deg: float | None
 
 
-class AxisBody(StageBody):
+class AxisBody(TurntableBody):
     """The axis that was calibrated, and the poses that tell it."""
 
-    poses: list[StagePose]
+    poses: list[TurntablePose]
 
 
-@router.get("/stage")
-def look_at_stage(service: Serving) -> StageBody:
-    """Return the axis of the stage, its planes, how the axis came to be, and whether it still holds."""
-    return _body(service.stage.record())
+@router.get("/turntable")
+def get_turntable(service: Serving) -> TurntableBody:
+    """Return the axis of the turntable, its planes, how the axis came to be, and whether it still holds."""
+    return _body(service.turntable.record())
 
 
-@router.get("/stage.svg", response_class=Response, responses=file_of("image/svg+xml"))
-def plot_stage(service: Serving) -> Response:
+@router.get("/turntable.svg", response_class=Response, responses=file_of("image/svg+xml"))
+def plot_turntable(service: Serving) -> Response:
     """Draw how the axis has moved."""
-    return Response(stage_svg(service.stage.record().history), media_type="image/svg+xml")
+    return Response(turntable_svg(service.turntable.record().history), media_type="image/svg+xml")
 
 
-@router.post("/stage/axis", responses=problems(404, 409, 503, 507))
-def calibrate_stage(service: Serving, request: Annotated[AxisRequest, Body()]) -> AxisBody:
-    """Calibrate the axis from poses of a board that stood on the stage, by the calibration in use."""
+@router.post("/turntable/axis", responses=problems(404, 409, 503, 507))
+def calibrate_turntable(service: Serving, request: Annotated[AxisRequest, Body()]) -> AxisBody:
+    """Calibrate the axis from poses of a board that stood on the turntable, by the calibration in use."""
     record = service.calibrations.register.get(request.calibration)
     board, (_, _, calibration) = setting_of(record).board, service.verifications.health()
     if calibration is None:
@@ -103,49 +105,53 @@ def calibrate_stage(service: Serving, request: Annotated[AxisRequest, Body()]) -
         raise ConfigError(message)
     observed = [accepted[number].observation for number in numbers]
     found = service.find_axis(observed, board, calibration, request.angles_deg)
-    stage = service.stage.put_axis(found.axis.measured_axis, source=AxisSource.BOARD, of=str(record.id))
+    turntable = service.turntable.put_axis(found.axis.measured_axis, source=AxisSource.BOARD, of=str(record.id))
     poses = [
-        StagePose(name=name, residual_mm=left, angle_deg=found.angles_deg[name], error_deg=found.errors_deg.get(name))
+        TurntablePose(
+            name=name, residual_mm=left, angle_deg=found.angles_deg[name], error_deg=found.errors_deg.get(name)
+        )
         for name, left in found.residual_mm.items()
     ]
-    return AxisBody(**dict(_body(stage)), poses=poses)
+    return AxisBody(**dict(_body(turntable)), poses=poses)
 
 
-@router.post("/stage/planes", responses=problems(404, 409, 503, 507))
-def find_planes(service: Serving, request: Annotated[PlanesRequest, Body()]) -> StageBody:
-    """Find plate and backdrops in a scan of the empty stage. Views of models are cut by them from then on."""
+@router.post("/turntable/planes", responses=problems(404, 409, 503, 507))
+def find_planes(service: Serving, request: Annotated[PlanesRequest, Body()]) -> TurntableBody:
+    """Find plate and backdrops in a scan of the empty turntable. Views of models are cut by them from then on."""
     scan, mesh = service.store.get(request.scan), service.folder.scan(request.scan) / MESH
     if scan.state is not JobState.SUCCEEDED or not service.folder.owns(mesh):
-        message = f"Scan {request.scan} is {scan.state} and has no {MESH} here. Scan the empty stage, and wait for it."
+        message = (
+            f"Scan {request.scan} is {scan.state} and has no {MESH} here. Scan the empty turntable, and wait for it."
+        )
         raise ScanStateError(message)
-    return _body(service.stage.put_planes(service.find_planes(mesh, service.stage.axis())))
+    return _body(service.turntable.put_planes(service.find_planes(mesh, service.turntable.axis())))
 
 
-@router.put("/stage", responses=problems(507))
-def replace_stage(service: Serving, request: Annotated[StageEntry, Body()]) -> StageBody:
+@router.put("/turntable", responses=problems(507))
+def replace_turntable(service: Serving, request: Annotated[TurntableEntry, Body()]) -> TurntableBody:
     """Put back a document that was kept, in place of all that is known."""
-    return _body(service.stage.replace(stage_record(request)))
+    return _body(service.turntable.replace(turntable_record(request)))
 
 
-@router.delete("/stage", status_code=204, responses=problems(507))
-def forget_stage(service: Serving) -> None:
+@router.delete("/turntable", status_code=204, responses=problems(507))
+def delete_turntable(service: Serving) -> None:
     """Forget axis, planes and history, a damaged record too."""
-    service.stage.delete()
+    service.turntable.delete()
 
 
-def _body(record: StageRecord) -> StageBody:
+def _body(record: TurntableRecord) -> TurntableBody:
     state, remedy = state_of(record)
     axis = record.axis
-    return StageBody(
+    return TurntableBody(
         state=state,
         remedy=remedy,
         point_sigma_mm=None if axis is None else axis.point_sigma_mm,
         direction_sigma_deg=None if axis is None else float(np.rad2deg(axis.direction_sigma_rad)),
-        document=stage_entry(record),
+        document=turntable_entry(record),
         links={
-            "self": "/rig/stage",
-            "plot": "/rig/stage.svg",
-            "axis": "/rig/stage/axis",
-            "planes": "/rig/stage/planes",
+            "self": "/rig/turntable",
+            "plot": "/rig/turntable.svg",
+            "axis": "/rig/turntable/axis",
+            "planes": "/rig/turntable/planes",
         },
     )

@@ -1,4 +1,4 @@
-"""How the axis of a stage has moved, as one SVG picture: every axis that was found, beside the first of them."""
+"""How the axis of a turntable has moved, as one SVG picture: every axis that was found, beside the first of them."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _HEIGHT = 470.0
 _COLOURS = {AxisSource.BOARD: GREY, AxisSource.DOCUMENT: GREY, AxisSource.MODEL: GREEN}
 
 
-def stage_svg(history: Sequence[ChangeEntry], /) -> Markup:
+def turntable_svg(history: Sequence[ChangeEntry], /) -> Markup:
     """The picture of all axes that were found, from old to new. With none it says so in words."""
     if not history:
-        return nothing_yet("No axis was found yet. POST /rig/stage/axis calibrates one.")
+        return nothing_yet("No axis was found yet. POST /rig/turntable/axis calibrates one.")
     moments = [each.at for each in history]
     apart = [_apart(history[0], each) for each in history]
     second = TOP + PANEL + GAP
@@ -45,7 +45,7 @@ def stage_svg(history: Sequence[ChangeEntry], /) -> Markup:
     for number, (colour, words) in enumerate(((GREY, "board"), (GREEN, "model"), (ORANGE, "not taken"))):
         x = END - 190 + 64 * number
         parts += [shape("circle", cx=x, cy=TOP - 16, r=3.2, fill=colour), shape("text", words, x=x + 8, y=TOP - 12)]
-    words = f"the axis of the stage as it was found {len(history)} times, now {apart[-1][0]:.3g} mm from the first"
+    words = f"the axis of the turntable as it was found {len(history)} times, now {apart[-1][0]:.3g} mm from the first"
     return trend(words, _HEIGHT, [*parts, *times(moments, second + PANEL)])
 
 
