@@ -508,7 +508,7 @@ def describe_board(solution: Solution) -> str:
 def _format_figure(value: float, sigma: float) -> str:
     """Format a number and its deviation, both with two digits of the deviation.
 
-    >>> _figure(1.0715, 0.1042), _figure(0.0173, 0.0)
+    >>> _format_figure(1.0715, 0.1042), _format_figure(0.0173, 0.0)
     ('1.07 ± 0.10', '0.017 ± 0')
     """
     if not sigma > 0:

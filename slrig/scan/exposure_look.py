@@ -35,7 +35,7 @@ _PATTERNS = (White(), Black(), White(), Black())
 class _Unjudged(Evidence):
     """Takes frames as they are: at an exposure that is far off, white and black prove nothing, and tell what to try."""
 
-    def contradictions(self, shot: Shot) -> tuple[()]:  # noqa: ARG002 - as it is called
+    def add_shot(self, shot: Shot) -> tuple[()]:  # noqa: ARG002 - as it is called
         return ()
 
 

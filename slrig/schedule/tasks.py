@@ -118,11 +118,11 @@ def holder_of(schedule: Schedule, run: ScheduledRun) -> Holder:
     """Who holds the rig for a run.
 
     >>> from datetime import UTC, datetime
-    >>> from slrig.schedule.records import Cron, RunState
+    >>> from slrig.schedule.records import Cron, RunState, ScheduleSpec
     >>> due = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
-    >>> order = Order(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION)
+    >>> order = ScheduleSpec(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION)
     >>> schedule = Schedule(UUID(int=7), order, due, due)
-    >>> run = Run(1, schedule.id, due, RunState.RUNNING, None, 1, 1, due, None, None, None, None)
+    >>> run = ScheduledRun(1, schedule.id, due, RunState.RUNNING, None, 1, 1, due, None, None, None, None)
     >>> holder_of(schedule, run).name
     'schedule 00000000, verification due 06:30'
     """

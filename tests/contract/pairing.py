@@ -83,7 +83,7 @@ class IdlingProjector:
 class Unproven(Evidence):
     """Believes every frame: what is left is what the driver itself keeps away."""
 
-    def contradictions(self, shot: Shot) -> tuple[Contradiction, ...]:
+    def add_shot(self, shot: Shot) -> tuple[Contradiction, ...]:
         del shot
         return ()
 

@@ -199,7 +199,7 @@ def test_a_camera_is_calibrated_alone_by_command_and_again_from_the_poses_of_the
         monkeypatch.setenv("SLRIG_API_KEY", KEY)
         monkeypatch.setenv("SLRIG_URL", service.url)
         refused = calibrate("run", *board, "--cameras-alone", "--scripted", "--activate", code=2)
-        assert "of camera 'left' alone, without a projector: it tells no depth, and cannot scan" in refused
+        assert "of camera 'left' alone, without a projector: it has no depth, and cannot scan" in refused
         (listed,) = json.loads(calibrate("list", "--json"))["calibrations"]
         assert (listed["state"], listed["active"]) == ("solved", False)
         shown = json.loads(calibrate("show", listed["id"][:8], "--json"))["result"]

@@ -384,7 +384,7 @@ def test_it_is_no_calibration_for_scans_and_is_compared_by_its_lens() -> None:
         require_two_rays(of_one().calibration, ["left", "right"], "calibration 3f2a")
     assert str(refusal.value) == (
         "calibration 3f2a: expected a calibration with two rays for each point, found that of camera 'left' alone, "
-        "without a projector: it tells no depth, and cannot scan; calibrate the camera together with the projector or "
+        "without a projector: it has no depth, and cannot scan; calibrate the camera together with the projector or "
         "with a second camera"
     )
     with pytest.raises(CalibrationError, match="one of camera 'left' alone: calibrate it again"):

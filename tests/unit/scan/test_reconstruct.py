@@ -173,7 +173,7 @@ def test_what_the_calibration_or_the_code_lacks_is_named(recorded: Path, tmp_pat
     path = bundle / "calibration.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"projector": None}))
     words = refused(CalibrationError, bundle, tmp_path / "out")
-    assert "alone, without a projector: it tells no depth, and cannot scan; calibrate the camera together with" in words
+    assert "alone, without a projector: it has no depth, and cannot scan; calibrate the camera together with" in words
     path.unlink()
     assert "calibration.json" in refused(CalibrationError, bundle, tmp_path / "out")
     assert "calibration (--calibration)" in refused(CalibrationError, bundle, tmp_path / "out")
