@@ -3,7 +3,7 @@
 from drivers.depthai.calibration import FactoryCalibration, Lens, read_calibration, read_factory_calibration
 from drivers.depthai.camera import OakCamera, open_camera
 from drivers.depthai.device import find_devices
-from drivers.depthai.options import OakOptions
+from drivers.depthai.library import OakOptions
 
 __all__ = [
     "FactoryCalibration",

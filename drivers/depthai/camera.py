@@ -23,8 +23,7 @@ from drivers.depthai.device import (
     open_device,
     read_luminance,
 )
-from drivers.depthai.library import OakSensor, load_depthai
-from drivers.depthai.options import OakOptions, OakStream
+from drivers.depthai.library import OakOptions, OakSensor, OakStream, load_depthai
 from slrig.bundle.validation import validate
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import CalibrationError, FrameTimeoutError, UnsupportedByDeviceError

@@ -25,6 +25,7 @@ import numpy as np
 from drivers.depthai.library import (
     UDEV_RULE,
     OakSensor,
+    OakStream,
     find_available,
     is_permitted,
     load_depthai,
@@ -32,7 +33,6 @@ from drivers.depthai.library import (
     nanoseconds,
     read_sensors,
 )
-from drivers.depthai.options import OakStream
 from drivers.v4l2.formats import bgr_from_luma
 from slrig.devices import FoundDevice
 from slrig.errors import (

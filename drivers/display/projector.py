@@ -9,6 +9,7 @@ scan-out has passed some of the rows; these come one T later: b lies between the
 from __future__ import annotations
 
 import queue
+import struct
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -24,6 +25,43 @@ from slrig.bundle.validation import Strict
 from slrig.devices import DisplayedPattern, ProjectorInfo, ProjectorState, SystemClock
 from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Pattern, PatternSequence, Pixels, Primary, Size
+
+_HEADER = bytes.fromhex("00ffffffffffff00")
+_DESCRIPTORS = (54, 72, 90, 108)
+_NAME, _SERIAL = 0xFC, 0xFF
+
+
+@dataclass(frozen=True, slots=True)
+class Edid:
+    """A display's maker (three letters), model name and serial number; name and serial may be empty."""
+
+    maker: str
+    name: str
+    serial: str
+
+    def __str__(self) -> str:
+        return " ".join(part for part in (self.maker, self.name) if part)
+
+
+def parse_edid(block: bytes) -> Edid | None:
+    """Parse an EDID; return None if it is damaged or of another kind.
+
+    >>> parse_edid(b"") is None
+    True
+    """
+    base = block[:128]
+    if len(base) < 128 or base[:8] != _HEADER or sum(base) % 256:
+        return None
+    (packed,) = struct.unpack_from(">H", base, 8)
+    maker = "".join(chr(64 + (packed >> shift & 31)) for shift in (10, 5, 0))
+    texts = {
+        base[at + 3]: base[at + 5 : at + 18].split(b"\n")[0].decode("latin-1").strip()
+        for at in _DESCRIPTORS
+        if base[at : at + 3] == b"\x00\x00\x00"
+    }
+    (number,) = struct.unpack_from("<I", base, 12)
+    return Edid(maker, texts.get(_NAME, ""), texts.get(_SERIAL, "") or (str(number) if number else ""))
+
 
 Extent = Annotated[int, Field(ge=1, le=65_535)]
 Seconds = Annotated[float, Field(ge=0, le=5)]

@@ -51,7 +51,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     Parameters
     ----------
     options
-        `drivers.dlpc347x.options.Dlpc347xEngineOptions`.
+        `drivers.dlpc347x.engine.Dlpc347xEngineOptions`.
     folder
         Folder of the rig file, not used.
 
@@ -71,7 +71,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
         This user may not open it, or it failed.
     """
     from drivers.dlpc347x.bus import open_bus
-    from drivers.dlpc347x.options import Dlpc347xEngineOptions
+    from drivers.dlpc347x.engine import Dlpc347xEngineOptions
     from drivers.dlpc347x.projector import Dlpc347xProjector
     from drivers.linux import require_linux
 

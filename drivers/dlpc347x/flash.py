@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.pattern_engine.patterns import describe_pattern, pattern_plane
+from drivers.pattern_engine.projector import describe_pattern, pattern_plane
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 from drivers.dlpc347x.bus import I2cBus
-from drivers.dlpc347x.engine import Dlpc347xEngine, LightLimits, OrderEntry
+from drivers.dlpc347x.engine import Dlpc347xEngine, Dlpc347xEngineOptions, LightLimits, OrderEntry
 from drivers.dlpc347x.flash import (
     Dlpc347xMirrors,
     FlashedLine,
@@ -18,10 +18,8 @@ from drivers.dlpc347x.flash import (
     find_lines,
     locate_patterns,
 )
-from drivers.dlpc347x.options import Dlpc347xEngineOptions
 from drivers.pattern_engine.options import LedColour
-from drivers.pattern_engine.patterns import MAX_UNATTENDED_S, Timing, check_duty, light_duration_us
-from drivers.pattern_engine.projector import EngineProjector
+from drivers.pattern_engine.projector import MAX_UNATTENDED_S, EngineProjector, Timing, check_duty, light_duration_us
 from slrig.devices import Clock, DisplayedPattern, ProjectorInfo
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size

@@ -50,7 +50,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     Parameters
     ----------
     options
-        `drivers.dlpc350.options.Dlpc350EngineOptions`.
+        `drivers.dlpc350.engine.Dlpc350EngineOptions`.
     folder
         Folder of the rig file: the path of the list of flashed pictures is relative to it.
 
@@ -69,8 +69,8 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceError
         This user may not open it, or it failed.
     """
+    from drivers.dlpc350.engine import Dlpc350EngineOptions
     from drivers.dlpc350.flash import read_flash_list
-    from drivers.dlpc350.options import Dlpc350EngineOptions
     from drivers.dlpc350.projector import DLPC350, Dlpc350Projector
     from drivers.pattern_engine.usb import choose_engine, find_engines, open_link, require_hidraw
 

@@ -7,6 +7,7 @@ from drivers.dlpc350.engine import (
     MAX_PATTERNS,
     Dlpc350Command,
     Dlpc350Engine,
+    Dlpc350EngineOptions,
     PatternTables,
     build_tables,
     check_loading,
@@ -14,10 +15,15 @@ from drivers.dlpc350.engine import (
     play_timing,
 )
 from drivers.dlpc350.flash import MIRRORS, FlashContents, FlashedPlane
-from drivers.dlpc350.options import Dlpc350EngineOptions
 from drivers.pattern_engine.options import LedColour
-from drivers.pattern_engine.patterns import MAX_UNATTENDED_S, Timing
-from drivers.pattern_engine.projector import COMMANDS_S, DIM_TIMING, START_TIMEOUT_S, UsbEngineProjector
+from drivers.pattern_engine.projector import (
+    COMMANDS_S,
+    DIM_TIMING,
+    MAX_UNATTENDED_S,
+    START_TIMEOUT_S,
+    Timing,
+    UsbEngineProjector,
+)
 from drivers.pattern_engine.usb import UsbCommand, UsbController, UsbLink
 from slrig.devices import Clock, DisplayedPattern, ProjectorInfo
 from slrig.errors import UnsupportedByDeviceError

@@ -48,7 +48,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     Parameters
     ----------
     options
-        `drivers.dlpc900.options.Dlpc900EngineOptions`.
+        `drivers.dlpc900.engine.Dlpc900EngineOptions`.
     folder
         Folder of the rig file, not used.
 
@@ -67,7 +67,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     DeviceError
         This user may not open it, or it failed.
     """
-    from drivers.dlpc900.options import Dlpc900EngineOptions
+    from drivers.dlpc900.engine import Dlpc900EngineOptions
     from drivers.dlpc900.projector import DLPC900, Dlpc900Projector
     from drivers.pattern_engine.usb import choose_engine, find_engines, open_link, require_hidraw
 

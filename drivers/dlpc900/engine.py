@@ -25,13 +25,127 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import IntEnum
+from typing import Annotated
 
-from drivers.dlpc900.pictures import MemoryPlane
-from drivers.pattern_engine.patterns import Timing, check_duty, light_duration_us
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.pattern_engine.options import UsbLightOptions
+from drivers.pattern_engine.projector import Plane, Timing, check_duty, light_duration_us, pattern_plane, plane_keys
 from drivers.pattern_engine.usb import CommandRefusedError, UsbCommand, UsbEngine
 from slrig.errors import DeviceError, UnsupportedByDeviceError
-from slrig.model import Size
+from slrig.model import PatternSequence, Size
+
+PLANES = 24
+MAX_ENTRIES = 400
+"""Entries of the pattern table (DLPU018 revision J, table 2-139)."""
+MAX_PICTURES = 18
+"""Picture indices are 0 to 17 (DLPU018 table 2-139)."""
+_HEADER = struct.Struct("<4sHHI8sIBBB21x")
+_ENHANCED = 2
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryPlane:
+    """Location of a pattern in the engine's memory."""
+
+    picture: int
+    plane: int
+
+
+@dataclass(frozen=True, slots=True)
+class PatternMemory:
+    """Pictures for the engine. places : location of each pattern, and at the end of a dark one; pictures : (H, W)
+    uint32, bit n of a pixel is plane n.
+    """
+
+    places: tuple[MemoryPlane, ...]
+    pictures: tuple[NDArray[np.uint32], ...]
+
+
+def pack_sequence(sequence: PatternSequence) -> PatternMemory:
+    """Return the pictures that hold a sequence, each pattern once, and a dark one. Raises UnsupportedByDeviceError if a
+    pattern has shades of grey, or there are too many.
+    """
+    dark = np.zeros(sequence.projector.shape, np.bool_)
+    planes = [*(pattern_plane(sequence, index) for index in range(len(sequence))), dark]
+    found: dict[bytes, MemoryPlane] = {}
+    groups: list[tuple[bool, list[Plane]]] = []
+    places = []
+    for plane in planes:
+        key, _ = plane_keys(plane)
+        if key not in found:
+            by_rows = bool((plane[:, :1] == plane).all()) and not (plane == plane[0, 0]).all()
+            at = next((at for at, (rows, group) in enumerate(groups) if rows == by_rows and len(group) < PLANES), None)
+            if at is None:
+                at = len(groups)
+                groups.append((by_rows, []))
+            found[key] = MemoryPlane(at, len(groups[at][1]))
+            groups[at][1].append(plane)
+        places.append(found[key])
+    if len(places) > MAX_ENTRIES or len(groups) > MAX_PICTURES:
+        message = (
+            f"the sequence has {len(sequence)} patterns in {len(groups)} pictures, the engine takes "
+            f"{MAX_ENTRIES - 1} in {MAX_PICTURES}; scan one axis only, or with a shorter line_shift_period_px"
+        )
+        raise UnsupportedByDeviceError(message)
+    return PatternMemory(tuple(places), tuple(_merge_planes(group, sequence.projector) for _, group in groups))
+
+
+def _merge_planes(planes: Sequence[Plane], size: Size) -> NDArray[np.uint32]:
+    pixels = np.zeros(size.shape, np.uint32)
+    for number, plane in enumerate(planes):
+        pixels |= plane.astype(np.uint32) << np.uint32(number)
+    return pixels
+
+
+def encode_picture(picture: NDArray[np.uint32]) -> bytes:
+    """Encode a picture, or one half of it, with its header, for sending."""
+    rows, columns = picture.shape
+    lines = []
+    before: NDArray[np.uint32] | None = None
+    for line in picture:
+        same = before is not None and np.array_equal(line, before)
+        lines.append(b"\0\1" + _encode_count(columns) if same else _encode_line(line))
+        before = line
+    data = b"".join(lines) + b"\0\1\0"
+    data += bytes(-len(data) % 4)
+    return _HEADER.pack(b"Spld", columns, rows, len(data), b"\xff" * 8, 0, 0, _ENHANCED, 1) + data
+
+
+def _encode_line(line: NDArray[np.uint32]) -> bytes:
+    """Encode runs of two pixels and more, and single pixels between them uncompressed."""
+    starts = np.flatnonzero(np.diff(line, prepend=~line[:1]))
+    lengths = np.diff(starts, append=line.size)
+    out = bytearray()
+    single: list[int] = []
+    for start, length in zip(starts.tolist(), lengths.tolist(), strict=True):
+        if length == 1:
+            single.append(start)
+            continue
+        out += _encode_raw(line[single]) + _encode_count(length) + _encode_pixel(line[start])
+        single = []
+    return bytes(out + _encode_raw(line[single]))
+
+
+def _encode_raw(pixels: NDArray[np.uint32]) -> bytes:
+    if pixels.size == 0:
+        return b""
+    # A single pixel is a run of one: "0 1" has another meaning.
+    head = b"\1" if pixels.size == 1 else b"\0" + _encode_count(pixels.size)
+    return head + b"".join(_encode_pixel(pixel) for pixel in pixels)
+
+
+def _encode_pixel(pixel: np.uint32) -> bytes:
+    return int(pixel).to_bytes(3, "big")
+
+
+def _encode_count(count: int) -> bytes:
+    return bytes([count]) if count < 128 else bytes([0x80 | count & 0x7F, count >> 7])
+
 
 MAX_US = 2**24 - 1
 """Limit of exposure and dark time, 24 bits each."""
@@ -221,3 +335,14 @@ class Dlpc900Engine(UsbEngine):
         return UnsupportedByDeviceError(
             f"{self.name} did not {action}: {reason}; report this message to the driver's maintainer"
         )
+
+
+class Dlpc900EngineOptions(UsbLightOptions, use_attribute_docstrings=True):
+    """The keys of a `[projector]` table with `driver = "dlpc900"`."""
+
+    start_s: Annotated[float, Field(ge=0, le=1)] = 0.05
+    """Longest time from the engine's report that its sequencer runs until a shown pattern is lit. Not documented;
+    `slrig latency` measures it."""
+
+    trigger_delay_us: Annotated[int, Field(ge=TRIGGER_DELAY_RANGE_US[0], le=TRIGGER_DELAY_RANGE_US[1])] = 0
+    """Delay of TRIG_OUT_1 after the light."""

@@ -9,15 +9,23 @@ from drivers.dlpc900.engine import (
     ON_THE_FLY,
     SECOND_READY,
     Dlpc900Engine,
+    Dlpc900EngineOptions,
     Dlpc900Mirrors,
+    MemoryPlane,
     encode_definition,
+    encode_picture,
+    pack_sequence,
     play_timing,
 )
-from drivers.dlpc900.options import Dlpc900EngineOptions
-from drivers.dlpc900.pictures import MemoryPlane, encode_picture, pack_sequence
 from drivers.pattern_engine.options import LedColour
-from drivers.pattern_engine.patterns import MAX_UNATTENDED_S, Timing
-from drivers.pattern_engine.projector import COMMANDS_S, DIM_TIMING, START_TIMEOUT_S, UsbEngineProjector
+from drivers.pattern_engine.projector import (
+    COMMANDS_S,
+    DIM_TIMING,
+    MAX_UNATTENDED_S,
+    START_TIMEOUT_S,
+    Timing,
+    UsbEngineProjector,
+)
 from drivers.pattern_engine.usb import UsbCommand, UsbController, UsbLink
 from slrig.devices import Clock, DisplayedPattern, ProjectorInfo
 from slrig.errors import DeviceError, UnsupportedByDeviceError

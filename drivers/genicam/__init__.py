@@ -9,8 +9,8 @@ harvesters; extra `gentl`. Tested with our own producer.
 
 from drivers.genicam.aravis import find_devices
 from drivers.genicam.camera import GenicamCamera, open_camera, open_gentl_camera
+from drivers.genicam.connection import GenicamOptions, GentlOptions
 from drivers.genicam.gentl import find_gentl_devices
-from drivers.genicam.options import GenicamOptions, GentlOptions
 
 __all__ = [
     "GenicamCamera",

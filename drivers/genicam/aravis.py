@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from drivers.genicam.connection import GenICamConnection, GenICamStream, RawFrame, RawImage
-from drivers.genicam.options import GenicamOptions
+from drivers.genicam.connection import GenICamConnection, GenicamOptions, GenICamStream, RawFrame, RawImage
 from slrig.devices import FoundDevice
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import Size

@@ -21,9 +21,17 @@ from functools import partial
 from pathlib import Path
 
 from drivers.genicam.aravis import AravisConnection
-from drivers.genicam.connection import GenICamConnection, GenICamStream, RawFrame, differs
+from drivers.genicam.connection import (
+    GenICamCameraOptions,
+    GenICamConnection,
+    GenicamOptions,
+    GenICamStream,
+    GentlOptions,
+    RawFrame,
+    SensorRegion,
+    differs,
+)
 from drivers.genicam.gentl import GentlConnection
-from drivers.genicam.options import GenICamCameraOptions, GenicamOptions, GentlOptions, SensorRegion
 from drivers.genicam.pixels import FORMATS, PfncFormat, decode_pixels
 from drivers.genicam.timing import Arrival, FrameNumbers, Interval, StartClock, TriggeredStarts, UntriggeredStarts
 from slrig.bundle.validation import validate

@@ -24,8 +24,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from drivers.genicam.connection import GenICamConnection, GenICamStream, RawFrame, RawImage
-from drivers.genicam.options import GentlOptions
+from drivers.genicam.connection import GenICamConnection, GenICamStream, GentlOptions, RawFrame, RawImage
 from slrig.devices import FoundDevice
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import Size

@@ -36,7 +36,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     Parameters
     ----------
     options
-        `drivers.kms.options.KmsOptions`.
+        `drivers.kms.card.KmsOptions`.
     folder
         The rig file's folder; unused.
 
@@ -55,7 +55,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceError
         This user may not open it, or the kernel refuses.
     """
-    from drivers.kms.options import KmsOptions
+    from drivers.kms.card import KmsOptions
     from drivers.linux import require_linux
     from slrig.bundle.validation import validate
 

@@ -9,14 +9,25 @@ import select
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from drivers.display.projector import DisplayOptions
 from drivers.kms import kernel
 from drivers.kms.kernel import MODE_DOUBLE_CLOCK, MODE_DOUBLE_SCAN, MODE_INTERLACED, MODE_PREFERRED, ModeInfo
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Size
+
+
+class KmsOptions(DisplayOptions, use_attribute_docstrings=True):
+    """The keys of a `[projector]` table with `driver = "kms"`. `output` as the kernel names it (HDMI-A-1, DP-2)."""
+
+    refresh_hz: Annotated[float, Field(ge=1, le=1000, json_schema_extra={"unit": "Hz"})] | None = None
+    """Pictures per second, within 0.5; else the rate that the display prefers at that size."""
+
 
 _RATE_TOLERANCE_HZ = 0.5
 _MAX_LISTED = 12

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.display.edid import Edid, parse_edid
+from drivers.display.projector import Edid, parse_edid
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 
 SYSTEM = Path("/sys/class/drm")

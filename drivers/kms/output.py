@@ -19,7 +19,17 @@ import numpy as np
 
 from drivers.display.projector import ScanoutStart, require_equal_pixels, rgb_pixels, start_of_flip
 from drivers.kms import finding, holding
-from drivers.kms.card import Card, CardConnector, DumbBuffer, KmsMode, KmsPlane, Property, PropertyChange, choose_mode
+from drivers.kms.card import (
+    Card,
+    CardConnector,
+    DumbBuffer,
+    KmsMode,
+    KmsOptions,
+    KmsPlane,
+    Property,
+    PropertyChange,
+    choose_mode,
+)
 from drivers.kms.guard import KmsGuardTask
 from drivers.kms.holding import HeldCard
 from drivers.kms.kernel import (
@@ -31,7 +41,6 @@ from drivers.kms.kernel import (
     PAGE_FLIP_EVENT,
     PLANE_PRIMARY,
 )
-from drivers.kms.options import KmsOptions
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Pixels
 

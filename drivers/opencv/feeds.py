@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from drivers.opencv.controls import require_free, require_present
 from drivers.opencv.options import CaptureSource
-from drivers.v4l2.timing import ExposureInterval
+from drivers.v4l2.stream import ExposureInterval
 from slrig.errors import DeviceError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 
 _OTHER_CLOCK_NS = 10_000_000_000

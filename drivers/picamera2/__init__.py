@@ -7,7 +7,6 @@ libcamera's documentation, and tested with a stand-in for the library, not yet o
 - https://libcamera.org/api-html/namespacelibcamera_1_1controls.html (controls and metadata)
 """
 
-from drivers.picamera2.camera import PiCamera, find_devices, open_camera
-from drivers.picamera2.options import PiCameraOptions
+from drivers.picamera2.camera import PiCamera, PiCameraOptions, find_devices, open_camera
 
 __all__ = ["PiCamera", "PiCameraOptions", "find_devices", "open_camera"]

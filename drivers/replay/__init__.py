@@ -13,9 +13,7 @@ from pathlib import Path
 import structlog
 from pydantic import Field, field_validator
 
-from drivers.replay.camera import ReplayCamera, ReplayState
-from drivers.replay.clock import ReplayClock
-from drivers.replay.projector import ReplayProjector
+from drivers.replay.camera import ReplayCamera, ReplayClock, ReplayProjector, ReplayState
 from slrig.bundle import Bundle, read_bundle
 from slrig.bundle.validation import Strict, validate
 from slrig.devices import Camera, Projector, ScannerHead

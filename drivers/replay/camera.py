@@ -2,15 +2,135 @@
 
 from __future__ import annotations
 
+import math
+import threading
+import time
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
-from slrig.devices import COMPUTED_LIMITS, AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
-from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
-from slrig.model import Black, Frame, Pattern, Shot
+from slrig.devices import (
+    COMPUTED_LIMITS,
+    AppliedSettings,
+    CameraInfo,
+    CameraSettings,
+    CameraState,
+    DisplayedPattern,
+    ProjectorInfo,
+    ProjectorState,
+    Trigger,
+)
+from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError, setting
+from slrig.model import Black, Frame, Gray, LineShift, Pattern, PatternSequence, Primary, Shot, White
+
+_TICK_NS = 1_000
+_GLANCE_S = 0.05
+_LEAD_NS = 1_000_000
+"""From the first `show` to the recording's first frame: margin so that the frame is not late."""
+
+
+class ReplayClock:
+    """The rig's clock, ns. Devices advance it to the recorded times; it never runs by itself.
+
+    Implements `slrig.devices.Clock`.
+
+    At speed 0 it starts at 0 and jumps, so a replay is as fast as the disk. At a speed above 0 it starts at
+    CLOCK_MONOTONIC, and a jump takes the recording's time divided by the speed. A caller that is slower than the
+    recording is not delayed further, and still finds the recorded times.
+
+    Parameters
+    ----------
+    speed
+        Seconds of the recording per second; 0 for no pacing.
+    real_ns, wait
+        The pacing clock, and a function that waits for some seconds; by default until `release`.
+    """
+
+    def __init__(
+        self,
+        speed: float = 0.0,
+        *,
+        real_ns: Callable[[], int] = time.monotonic_ns,
+        wait: Callable[[float], object] | None = None,
+    ) -> None:
+        self._speed = speed
+        self._released = threading.Event()
+        self._real_ns = real_ns
+        self._wait = self._released.wait if wait is None else wait
+        self._now_ns = real_ns() if speed else 0
+        self._held_ns = self._now_ns
+        self._paced_from_ns = (self._now_ns, self._now_ns)
+        self._origin_ns: int | None = None
+        self._rewound = True
+
+    def now_ns(self) -> int:
+        """See `slrig.devices.Clock`."""
+        return self._now_ns
+
+    def wait_until(self, t_ns: int, stop: threading.Event) -> None:
+        """See `slrig.devices.Clock`."""
+        while not stop.is_set() and (left_s := self._left_s(t_ns)) > 0:
+            self._wait(min(left_s, _GLANCE_S))
+        if not stop.is_set():
+            self._now_ns = max(self._now_ns, t_ns)
+
+    def rewind(self) -> None:
+        """Restart the recording with the next shown pattern, unless that is still to come in it."""
+        self._rewound = True
+
+    def recorded_ns(self, time_s: float | None) -> int:
+        """Return the time at which a frame of this recorded time is due; 0 if the recording has no time."""
+        return 0 if time_s is None or self._origin_ns is None else self._origin_ns + round(time_s * 1e9)
+
+    def hold(self, until_ns: int) -> None:
+        """Keep the light unchanged until an exposure has ended."""
+        self._held_ns = max(self._held_ns, until_ns)
+
+    def change_light(self, time_s: float | None = None) -> int:
+        """Advance to the end of all exposures, and at least to a recorded time; return the new time."""
+        earliest_ns = max(self._now_ns, self._held_ns) + _TICK_NS
+        if time_s is not None:
+            if self._rewound and (self._origin_ns is None or self.recorded_ns(time_s) < earliest_ns):
+                self._begin(earliest_ns, time_s)
+            self._rewound = False
+        self._now_ns = max(earliest_ns, self.recorded_ns(time_s))
+        self._pace(self._now_ns)
+        return self._now_ns
+
+    def wait_until_reached(self, at_ns: int, within_s: float) -> bool:
+        """Wait until the clock may be at `at_ns`; return False at once if that would take longer than `within_s`."""
+        if self._left_s(at_ns) > within_s:
+            return False
+        self._pace(at_ns)
+        return True
+
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass, also in real time if the replay is paced."""
+        passed_ns = round(seconds * 1e9 * (self._speed or 1))
+        self._now_ns = self._held_ns = max(self._now_ns + passed_ns, self._held_ns)
+        if self._speed:
+            self._wait(seconds)
+
+    def release(self) -> None:
+        """End all waits. For `close`, from any thread."""
+        self._released.set()
+
+    def _begin(self, earliest_ns: int, time_s: float) -> None:
+        self._now_ns = max(earliest_ns, self._real_ns()) if self._speed else earliest_ns
+        self._origin_ns = self._now_ns + _LEAD_NS - round(time_s * 1e9)
+        self._paced_from_ns = (self._real_ns(), self._now_ns)
+
+    def _left_s(self, at_ns: int) -> float:
+        if not self._speed or self._released.is_set():
+            return 0.0
+        real_ns, rig_ns = self._paced_from_ns
+        return (real_ns - self._real_ns() + math.ceil((at_ns - rig_ns) / self._speed)) / 1e9
+
+    def _pace(self, at_ns: int) -> None:
+        while (left_s := self._left_s(at_ns)) > 0:
+            self._wait(left_s)
+
 
 _EXPOSURE_TOLERANCE = 0.01
 
@@ -165,3 +285,116 @@ class ReplayCamera:
             raise DeviceStateError(message)
         # A pattern shown more often than recorded repeats its last frame.
         return shots[min(showing, len(shots) - 1)]
+
+
+class ReplayProjector:
+    """Implements `slrig.devices.Projector` on the patterns of a recording."""
+
+    def __init__(
+        self, bundle: Bundle, cameras: Mapping[str, ReplayCamera], clock: ReplayClock, replay_state: ReplayState
+    ) -> None:
+        self._info = ProjectorInfo(
+            name="projector",
+            model="recorded projector",
+            serial=bundle.folder.name,
+            size=bundle.capture.projector,
+            plays=False,
+            latency_s=0.0,
+            limits=COMPUTED_LIMITS,
+            recorded=tuple(
+                pattern
+                for pattern in bundle.capture.patterns
+                if all(camera.recorded_frames(pattern) for camera in cameras.values())
+            ),
+            lights=any(isinstance(pattern, Primary) for pattern in bundle.capture.patterns),
+        )
+        self._recorded = tuple(dict.fromkeys(bundle.capture.patterns))
+        self._cameras = cameras
+        self._clock = clock
+        self._replay_state = replay_state
+        self._state = ProjectorState("the recording's projector")
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        return self._info
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`. Refuses a pattern of which a camera has no frame."""
+        self._state.require_open()
+        self._state.require_size(sequence, self._info.size)
+        for pattern in sequence.patterns:
+            missing = [name for name, camera in self._cameras.items() if not camera.recorded_frames(pattern)]
+            if missing:
+                recorded = "; ".join(dict.fromkeys(map(_describe_family, self._recorded)))
+                message = (
+                    f"the recording '{self._info.serial}' has no frame of {_describe_pattern(pattern)} from camera "
+                    f"{', '.join(missing)}; it has {recorded}. Leave the patterns out of the "
+                    "request and of the rig file's [scan] to replay all recorded ones; or request some of them: "
+                    f"{setting('gray_cell_px')}, {setting('line_shift_period_px')} and similar settings"
+                )
+                raise UnsupportedByDeviceError(message)
+        self.blank()
+        self._clock.rewind()
+        self._state.loaded = sequence
+
+    def show(self, index: int) -> DisplayedPattern:
+        """See `Projector`."""
+        patterns = self._state.require_pattern(index).patterns
+        pattern = patterns[index]
+        showing = patterns[:index].count(pattern)
+        self._replay_state.pattern = (pattern, showing)
+        times_s = [
+            shots[min(showing, len(shots) - 1)].time_s
+            for shots in (camera.recorded_frames(pattern) for camera in self._cameras.values())
+        ]
+        first_s = min((time_s for time_s in times_s if time_s is not None), default=0.0)
+        return DisplayedPattern(index, self._clock.change_light(first_s), 0)
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. Not supported."""
+        self._state.refuse_to_play(exposure_s, period_s)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self.blank()
+
+    def blank(self) -> None:
+        """See `Projector`."""
+        self._replay_state.pattern = None
+        self._clock.change_light()
+
+    def close(self) -> None:
+        """See `Projector`."""
+        self._clock.release()
+        self.blank()
+        self._state.loaded = None
+        self._state.closed.set()
+
+
+def _describe_pattern(pattern: Pattern) -> str:
+    """Describe a pattern within its family."""
+    match pattern:
+        case Gray():
+            return f"bit {pattern.bit} of {_describe_family(pattern)}"
+        case LineShift():
+            return f"shift {pattern.shift} of {_describe_family(pattern)}"
+        case _:
+            return _describe_family(pattern)
+
+
+def _describe_family(pattern: Pattern) -> str:
+    """Describe the family of a pattern as in a request."""
+    match pattern:
+        case White() | Black():
+            return pattern.kind
+        case Primary():
+            return pattern.description
+        case Gray():
+            inverse = ", inverted" if pattern.inverted else ""
+            offset = f", offset {pattern.offset_px} px" if pattern.offset_px else ""
+            return (
+                f"a {pattern.axis} Gray code of {pattern.bits} bits with cells of {pattern.cell_px} px{offset}{inverse}"
+            )
+        case LineShift():
+            return f"{pattern.axis} lines of {pattern.line_width_px} px, period {pattern.period_px} px"

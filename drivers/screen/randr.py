@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.display.edid import Edid, parse_edid
+from drivers.display.projector import Edid, parse_edid
 from drivers.screen.x11 import XConnection, XScreen, atom_name
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size

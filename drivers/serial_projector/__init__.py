@@ -178,7 +178,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     Parameters
     ----------
     options
-        `drivers.serial_projector.options.SerialProjectorOptions`.
+        `drivers.serial_projector.client.SerialProjectorOptions`.
     folder
         Folder of the rig file: `export_folder` is relative to it.
 
@@ -198,7 +198,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
         No answer in SLTP/1, or this user may not open the port.
     """
     from drivers.serial_port import SerialPort
-    from drivers.serial_projector.options import SerialProjectorOptions
+    from drivers.serial_projector.client import SerialProjectorOptions
     from drivers.serial_projector.projector import SerialProjector
 
     table = validate(SerialProjectorOptions, options, "the [projector] table of a serial projector")

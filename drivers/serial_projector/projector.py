@@ -12,9 +12,15 @@ import cv2
 import numpy as np
 
 from drivers.serial_port import BytePort
-from drivers.serial_projector.client import BoxClient, BoxLimits, KeepAlive, pattern_checksums, sequence_checksum
+from drivers.serial_projector.client import (
+    BoxClient,
+    BoxLimits,
+    KeepAlive,
+    SerialProjectorOptions,
+    pattern_checksums,
+    sequence_checksum,
+)
 from drivers.serial_projector.link import BoxFault, BoxLink, BoxRefusedError, RefusalCode, SequenceMode
-from drivers.serial_projector.options import SerialProjectorOptions
 from slrig.devices import Clock, DisplayedPattern, ProjectorInfo, ProjectorState, SystemClock
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size

@@ -25,8 +25,16 @@ from drivers.v4l2.controls import (
 from drivers.v4l2.finding import CameraNode, NodeIdentity, query_identity, resolve_node
 from drivers.v4l2.formats import CorruptFrameError, PixelLayout, colour_image, grey_image
 from drivers.v4l2.options import V4L2Options
-from drivers.v4l2.stream import FilledBuffer, FrameCounter, V4L2Stream, Waker, negotiate_format
-from drivers.v4l2.timing import ExposureInterval, SensorDurations, exposure_interval
+from drivers.v4l2.stream import (
+    ExposureInterval,
+    FilledBuffer,
+    FrameCounter,
+    SensorDurations,
+    V4L2Stream,
+    Waker,
+    exposure_interval,
+    negotiate_format,
+)
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Pixels

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from enum import StrEnum
 from fractions import Fraction
 from functools import partial
 from itertools import count
@@ -24,9 +25,79 @@ from numpy.typing import NDArray
 from drivers.v4l2 import kernel
 from drivers.v4l2.formats import LAYOUTS, PREFERRED, PixelLayout
 from drivers.v4l2.options import V4L2Options
-from drivers.v4l2.timing import OTHER_CLOCK_NS, BufferStamp, StampSource
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Size
+
+OTHER_CLOCK_NS = 1_000_000_000
+"""A stamp that is off by more is of another clock. uvcvideo can be set to stamp by CLOCK_REALTIME, and still declares
+CLOCK_MONOTONIC."""
+
+
+class StampSource(StrEnum):
+    """The instant of a frame that a buffer's time stamp marks."""
+
+    EXPOSURE_START = "start of exposure"
+    FRAME_END = "end of frame"
+    NONE = "nothing"
+
+
+@dataclass(frozen=True, slots=True)
+class SensorDurations:
+    """Durations of a sensor, ns. readout_ns : from the first row to the last. delay_ns : delay of its time stamps."""
+
+    exposure_ns: int
+    readout_ns: int
+    delay_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class BufferStamp:
+    """A buffer's time stamp, and when it was queued and dequeued, ns, CLOCK_MONOTONIC."""
+
+    source: StampSource
+    stamp_ns: int
+    queued_ns: int
+    dequeued_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureInterval:
+    """All rows were exposed between `earliest_ns` and `latest_ns`."""
+
+    earliest_ns: int
+    latest_ns: int
+
+    def centred_exposure(self, exposure_ns: int) -> tuple[int, int, int]:
+        """Return start, end and error of an exposure of this length in the middle of the interval.
+
+        >>> ExposureInterval(100, 160).centred_exposure(20)
+        (120, 140, 20)
+        """
+        spare_ns = max(self.latest_ns - self.earliest_ns - exposure_ns, 0)
+        error_ns = (spare_ns + 1) // 2
+        start_ns = self.earliest_ns + error_ns
+        return start_ns, start_ns + exposure_ns, error_ns
+
+
+def is_monotonic_stamp(stamp: BufferStamp, durations: SensorDurations) -> bool:
+    """True if a stamp can be an instant of its frame by CLOCK_MONOTONIC."""
+    min_ns = stamp.queued_ns - durations.readout_ns - durations.exposure_ns - OTHER_CLOCK_NS
+    return min_ns <= stamp.stamp_ns <= stamp.dequeued_ns + OTHER_CLOCK_NS
+
+
+def exposure_interval(stamp: BufferStamp, durations: SensorDurations) -> ExposureInterval:
+    """Return the interval in which every row was exposed; see the module's docstring."""
+    before_ns = durations.exposure_ns + durations.delay_ns
+    source = stamp.source if is_monotonic_stamp(stamp, durations) else StampSource.NONE
+    match source:
+        case StampSource.EXPOSURE_START:
+            latest_ns = stamp.stamp_ns + durations.readout_ns + durations.exposure_ns
+            return ExposureInterval(stamp.stamp_ns - before_ns, latest_ns)
+        case StampSource.FRAME_END:
+            return ExposureInterval(stamp.stamp_ns - durations.readout_ns - before_ns, stamp.stamp_ns)
+        case StampSource.NONE:
+            return ExposureInterval(stamp.queued_ns - durations.readout_ns - before_ns, stamp.dequeued_ns)
+
 
 Answer = TypeVar("Answer", bound=ctypes.Structure)
 

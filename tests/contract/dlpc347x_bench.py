@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.dlpc347x.bus import I2cBus
-from drivers.dlpc347x.options import Dlpc347xEngineOptions
+from drivers.dlpc347x.engine import Dlpc347xEngineOptions
 from drivers.dlpc347x.projector import Dlpc347xProjector
 from slrig.model import Pixels, Size
 from slrig.patterns.sequence import merge_sequences

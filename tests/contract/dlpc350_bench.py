@@ -19,8 +19,8 @@ from typing import Any
 import pytest
 
 from drivers import dlpc350, dlpc900
+from drivers.dlpc350.engine import Dlpc350EngineOptions
 from drivers.dlpc350.flash import MIRRORS, read_flash_list, write_pictures
-from drivers.dlpc350.options import Dlpc350EngineOptions
 from drivers.dlpc350.projector import DLPC350, Dlpc350Projector
 from drivers.pattern_engine.usb import UsbLink, find_engines
 from slrig.capture.sequencer import capture

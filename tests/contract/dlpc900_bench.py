@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers import dlpc900
-from drivers.dlpc900.options import Dlpc900EngineOptions
+from drivers.dlpc900.engine import Dlpc900EngineOptions
 from drivers.dlpc900.projector import DLPC900, Dlpc900Projector
 from drivers.pattern_engine.usb import UsbLink
 from slrig.model import Size

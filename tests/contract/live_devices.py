@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivers.display.projector import UNMEASURED_LATENCY_S, full_light_time, start_of_flip
-from drivers.v4l2.timing import BufferStamp, ExposureInterval, SensorDurations, StampSource, exposure_interval
+from drivers.v4l2.stream import BufferStamp, ExposureInterval, SensorDurations, StampSource, exposure_interval
 from slrig.devices import (
     AppliedSettings,
     CameraInfo,

@@ -8,11 +8,11 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from drivers.display.edid import parse_edid
 from drivers.display.projector import (
     ScanoutStart,
     WorkerThread,
     full_light_time,
+    parse_edid,
     rgb_pixels,
     start_of_copy,
     start_of_flip,

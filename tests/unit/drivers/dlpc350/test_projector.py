@@ -11,7 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.dlpc350.engine import MIN_EXPOSURE_US, build_tables, check_loading, check_timing, play_timing
+from drivers.dlpc350.engine import (
+    MIN_EXPOSURE_US,
+    Dlpc350EngineOptions,
+    build_tables,
+    check_loading,
+    check_timing,
+    play_timing,
+)
 from drivers.dlpc350.flash import (
     EXPORT_FOLDER,
     LIST_FILE,
@@ -23,10 +30,9 @@ from drivers.dlpc350.flash import (
     read_flash_list,
     write_pictures,
 )
-from drivers.dlpc350.options import Dlpc350EngineOptions
 from drivers.dlpc350.projector import DLPC350, Dlpc350Projector
 from drivers.pattern_engine.options import LedColour
-from drivers.pattern_engine.patterns import Timing, pattern_plane
+from drivers.pattern_engine.projector import Timing, pattern_plane
 from drivers.pattern_engine.usb import UsbLink
 from slrig.bundle.validation import validate
 from slrig.devices import StoredPatternProjector

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.dlpc900.pictures import MAX_PICTURES, encode_picture, pack_sequence
-from drivers.pattern_engine.patterns import pattern_plane
+from drivers.dlpc900.engine import MAX_PICTURES, encode_picture, pack_sequence
+from drivers.pattern_engine.projector import pattern_plane
 from slrig.devices import StoredPatternProjector
 from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, PatternSequence, Size, White

@@ -18,7 +18,7 @@ from drivers.opencv.feeds import (
     exposure_from_stamp,
     is_monotonic_stamp,
 )
-from drivers.v4l2.timing import ExposureInterval
+from drivers.v4l2.stream import ExposureInterval
 from slrig.errors import DeviceGoneError
 
 LONG_S = 20.0

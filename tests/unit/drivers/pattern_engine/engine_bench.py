@@ -13,13 +13,13 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from drivers.dlpc347x.bus import I2cBus
-from drivers.dlpc347x.options import Dlpc347xEngineOptions as Options347x
+from drivers.dlpc347x.engine import Dlpc347xEngineOptions as Options347x
 from drivers.dlpc347x.projector import Dlpc347xProjector as LightEngine347x
+from drivers.dlpc350.engine import Dlpc350EngineOptions as Options350
 from drivers.dlpc350.flash import MIRRORS, FlashContents, write_pictures
-from drivers.dlpc350.options import Dlpc350EngineOptions as Options350
 from drivers.dlpc350.projector import DLPC350
 from drivers.dlpc350.projector import Dlpc350Projector as LightEngine350
-from drivers.dlpc900.options import Dlpc900EngineOptions as Options900
+from drivers.dlpc900.engine import Dlpc900EngineOptions as Options900
 from drivers.dlpc900.projector import DLPC900
 from drivers.dlpc900.projector import Dlpc900Projector as LightEngine900
 from drivers.pattern_engine.usb import UsbLink

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.display.edid import Edid
+from drivers.display.projector import Edid
 from drivers.screen import find_devices, open_projector, sdl, x11
 from drivers.screen.options import ScreenOptions
 from drivers.screen.randr import (

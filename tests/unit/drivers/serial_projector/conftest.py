@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from drivers.serial_projector.client import pattern_checksums
-from drivers.serial_projector.options import SerialProjectorOptions
+from drivers.serial_projector.client import SerialProjectorOptions, pattern_checksums
 from drivers.serial_projector.projector import SerialProjector
 from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.v4l2.stream import FilledBuffer, FrameCounter
-from drivers.v4l2.timing import (
+from drivers.v4l2.stream import (
     BufferStamp,
     ExposureInterval,
+    FilledBuffer,
+    FrameCounter,
     SensorDurations,
     StampSource,
     exposure_interval,
