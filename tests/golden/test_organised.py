@@ -24,7 +24,8 @@ from slrig.bundle.description import read_description
 from slrig.bundle.reading import read_bundle
 from slrig.model import FloatArray, Pinhole, White
 from slrig.scan.artefacts import decode_mesh_ply, write_converted
-from slrig.scan.cloud_files import ENCODERS, cloud_file
+from slrig.scan.cloud_files import cloud_file
+from slrig.scan.offered import requested_forms
 from tests.golden.conftest import Scan
 from tests.ros_readers import colours, library, point_columns, seen_at
 
@@ -56,7 +57,7 @@ def scan(scan_of: Callable[[str], Scan], tmp_path_factory: pytest.TempPathFactor
     calibration = made.bundle / "calibration.json"
     library("pye57")
     for camera in CAMERAS:
-        for form in ENCODERS:
+        for form in (each for each in requested_forms() if "{camera}" in each):
             data = cloud_file(folder, form, camera, calibration=calibration)
             (folder / form.format(camera=camera)).write_bytes(data)
     library("rosbags.rosbag2")
