@@ -26,7 +26,7 @@ from simulated_rig.options import Faults, HeadOptions, SimulatedProjectorOptions
 from simulated_rig.rendering import CameraView, SceneState
 from simulated_rig.scene import read_scene
 from simulated_rig.staging import PoseScript, SceneController
-from slrig.bundle.validation import validate
+from slrig.bundle import validate
 from slrig.devices import (
     COMPUTED_LIMITS,
     Camera,

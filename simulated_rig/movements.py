@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from simulated_rig.optics import field_radius, image_positions
 from simulated_rig.scene import Names, NotNegative, Pair, Positive, PrintedBoard, Triple
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.devices import TurntableBase
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Pinhole, RotationAxis

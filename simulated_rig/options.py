@@ -20,7 +20,7 @@ from simulated_rig.movements import (
 from simulated_rig.optics import Focus, look_at
 from simulated_rig.rendering import SensorModel
 from simulated_rig.scene import Fraction, Names, NotNegative, Pair, Positive, Triple, require_one
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.errors import CalibrationError
 from slrig.model import Pinhole, Size
 

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from simulated_rig import shapes
 from simulated_rig.shapes import MeshPart, bent_sheet, rectangle_between
-from slrig.bundle.validation import Strict, read_toml, validate
+from slrig.bundle import Strict, read_toml, validate
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, IntArray
 

@@ -14,9 +14,18 @@ from urllib.parse import urlsplit
 from pydantic import ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
 
-from slrig.bundle import CameraName
-from slrig.bundle.options import ExposureSeconds, Preset, PresetName, ScanDefaults, embed_masks
-from slrig.bundle.validation import Strict, describe_errors, read_toml, validate
+from slrig.bundle import (
+    CameraName,
+    ExposureSeconds,
+    Preset,
+    PresetName,
+    ScanDefaults,
+    Strict,
+    describe_errors,
+    embed_masks,
+    read_toml,
+    validate,
+)
 from slrig.errors import ConfigError
 
 MAX_CONFIG_BYTES = 2**20

@@ -21,8 +21,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from slrig.bundle import check_calibration, read_calibration, require_two_rays
-from slrig.bundle.validation import describe_errors
+from slrig.bundle import check_calibration, describe_errors, read_calibration, require_two_rays
 from slrig.config import DriverTable, RigConfig
 from slrig.devices import (
     Camera,

@@ -24,7 +24,7 @@ from drivers.depthai.device import (
     read_luminance,
 )
 from drivers.depthai.library import OakOptions, OakSensor, OakStream, load_depthai
-from slrig.bundle.validation import validate
+from slrig.bundle import validate
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import CalibrationError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Size

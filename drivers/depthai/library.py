@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, LibraryMissingError
 from slrig.model import Size
 

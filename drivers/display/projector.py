@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.devices import DisplayedPattern, ProjectorInfo, ProjectorState, SystemClock
 from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Pattern, PatternSequence, Pixels, Primary, Size

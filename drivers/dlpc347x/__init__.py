@@ -39,7 +39,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import validate
+from slrig.bundle import validate
 from slrig.devices import Projector
 
 __all__ = ["open_projector"]

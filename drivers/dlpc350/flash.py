@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.pattern_engine.projector import Plane, describe_pattern, pattern_plane, plane_keys
-from slrig.bundle.validation import Strict, read_json, read_text, validate
+from slrig.bundle import Strict, read_json, read_text, validate
 from slrig.errors import ConfigError, StorageError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 

@@ -34,7 +34,7 @@ from drivers.genicam.connection import (
 from drivers.genicam.gentl import GentlConnection
 from drivers.genicam.pixels import FORMATS, PfncFormat, decode_pixels
 from drivers.genicam.timing import Arrival, FrameNumbers, Interval, StartClock, TriggeredStarts, UntriggeredStarts
-from slrig.bundle.validation import validate
+from slrig.bundle import validate
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
 from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Pixels, Size

@@ -12,7 +12,7 @@ from typing import Any, Literal, Protocol, Self
 
 from pydantic import Field, model_validator
 
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.devices import CameraState
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size

@@ -57,7 +57,7 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     """
     from drivers.kms.card import KmsOptions
     from drivers.linux import require_linux
-    from slrig.bundle.validation import validate
+    from slrig.bundle import validate
 
     del folder
     kms_options = validate(KmsOptions, options, "the [projector] table of driver 'kms'")

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit, urlunsplit
 import cv2
 from pydantic import Field, field_validator
 
-from slrig.bundle.validation import Strict, validate
+from slrig.bundle import Strict, validate
 from slrig.errors import ConfigError
 from slrig.model import Size
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.model import Pattern, Primary
 
 Share = Annotated[float, Field(gt=0, le=1)]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from drivers.v4l2.formats import PixelLayout, SamplePacking, colour_image, grey_image
-from slrig.bundle.validation import Strict, validate
+from slrig.bundle import Strict, validate
 from slrig.devices import (
     AppliedSettings,
     Camera,

@@ -14,8 +14,7 @@ import structlog
 from pydantic import Field, field_validator
 
 from drivers.replay.camera import ReplayCamera, ReplayClock, ReplayProjector, ReplayState
-from slrig.bundle import Bundle, read_bundle
-from slrig.bundle.validation import Strict, validate
+from slrig.bundle import Bundle, Strict, read_bundle, validate
 from slrig.devices import Camera, Projector, ScannerHead
 from slrig.errors import BundleError, ConfigError
 from slrig.model import Calibration, Truth, trim_incomplete_codes

@@ -25,7 +25,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import validate
+from slrig.bundle import validate
 from slrig.devices import FoundDevice, Projector
 from slrig.errors import DeviceError, LibraryMissingError
 

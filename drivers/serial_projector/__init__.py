@@ -166,7 +166,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import validate
+from slrig.bundle import validate
 from slrig.devices import FoundDevice, Projector
 
 __all__ = ["find_devices", "open_projector"]

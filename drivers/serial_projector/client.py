@@ -25,7 +25,7 @@ from drivers.serial_projector.link import (
     Reply,
     SequenceMode,
 )
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.devices import Clock
 from slrig.errors import DeviceBusyError, DeviceError, SlrigError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Pixels

@@ -38,7 +38,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from slrig.bundle.validation import validate
+from slrig.bundle import validate
 from slrig.devices import Clock, SystemClock, Turntable
 
 __all__ = ["open_grbl", "open_turntable"]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 
 AXES = "XYZABC"
 

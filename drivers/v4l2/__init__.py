@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from drivers.linux import require_linux
-from slrig.bundle.validation import validate
+from slrig.bundle import validate
 from slrig.devices import Camera, FoundDevice
 
 

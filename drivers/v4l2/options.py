@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, field_validator, model_validator
 
 from drivers.v4l2.formats import LAYOUTS
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.model import Size
 
 Extent = Annotated[int, Field(ge=1, le=65_536)]

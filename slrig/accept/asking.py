@@ -18,7 +18,7 @@ from slrig.accept.plan import (
     usual_limits,
 )
 from slrig.accept.positions import acceptance_plan, rig_volume_mm
-from slrig.bundle.validation import SafeText, Strict
+from slrig.bundle import SafeText, Strict
 from slrig.errors import InvalidInputError
 from slrig.model import Calibration
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
 from slrig.accept.plan import AcceptancePlan, Artefact, Limits, Quantity, Step
-from slrig.calibration.artefacts import (
+from slrig.calibration import (
     ArtefactPoints,
     FittedPlane,
     FittedSphere,

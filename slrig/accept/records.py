@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from slrig.accept.evaluation import Reading
 from slrig.accept.plan import AcceptancePlan, Step
 from slrig.calibrate.records import plain
-from slrig.calibration.artefacts import Decision
+from slrig.calibration import Decision
 from slrig.errors import StorageError
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobProgress, JobRecord, JobState

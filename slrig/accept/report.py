@@ -17,8 +17,8 @@ from slrig.accept.scene import turn_deg
 from slrig.accept.store import HTML, JSON, kept_points, points_file
 from slrig.accept.uncertainty import FORMULA
 from slrig.accept.verdicts import AcceptanceResult
-from slrig.bundle.storage import write_file
-from slrig.calibration.artefacts import MAX_REJECTED_FRACTION
+from slrig.bundle import write_file
+from slrig.calibration import MAX_REJECTED_FRACTION
 from slrig.model import FloatArray, Pinhole, Pixels
 from slrig.reports.drawing import WIDTH, drawing, legend, path, polygon, ramp, shape
 from slrig.reports.page import filled, jpeg_uri

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from slrig.accept.plan import AcceptancePlan, Artefact, Step
-from slrig.bundle.storage import write_file
+from slrig.bundle import write_file
 from slrig.config import HeadTable, RigConfig
 from slrig.disk import storage_errors
 from slrig.errors import UnsupportedByDeviceError, setting

@@ -21,8 +21,8 @@ import structlog
 
 from slrig.accept.evaluation import ReadingPoints
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
-from slrig.bundle.storage import write_file
-from slrig.calibration.artefacts import Decision
+from slrig.bundle import write_file
+from slrig.calibration import Decision
 from slrig.disk import storage_errors
 from slrig.errors import StorageError
 from slrig.failure import disk_errors

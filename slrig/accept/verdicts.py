@@ -12,7 +12,7 @@ from slrig.accept.evaluation import Reading, errors_by_step
 from slrig.accept.plan import AcceptancePlan, Quantity
 from slrig.accept.scale import Scale, scale_by_bar
 from slrig.accept.uncertainty import ErrorUncertainty, error_uncertainty
-from slrig.calibration.artefacts import Decision, decide
+from slrig.calibration import Decision, decide
 from slrig.model import Calibration
 
 

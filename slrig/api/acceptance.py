@@ -19,8 +19,8 @@ from slrig.api.idempotency import IdempotencyKey, once, started_once
 from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import AnyFault, filled
 from slrig.api.service import Serving
-from slrig.bundle.validation import Strict
-from slrig.calibration.artefacts import Decision
+from slrig.bundle import Strict
+from slrig.calibration import Decision
 
 router = APIRouter(prefix="/acceptance", tags=["acceptance"])
 

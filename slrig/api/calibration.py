@@ -32,13 +32,12 @@ from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import filled, pattern_plan
 from slrig.api.service import Service, Serving
-from slrig.bundle import CAMERA_NAME, MAX_CALIBRATION_BYTES
-from slrig.bundle.validation import FreeText, SafeText
+from slrig.bundle import CAMERA_NAME, MAX_CALIBRATION_BYTES, FreeText, SafeText
 from slrig.calibrate.calibrating import EXPORTS
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import USUAL_PATTERNS, PoseRecord, SessionRecord, pose_of
 from slrig.calibrate.store import REPORT, picture_name
-from slrig.calibration.board import DEFAULT_BOARD, Board, BoardKind
+from slrig.calibration import DEFAULT_BOARD, Board, BoardKind
 from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
 
 IMPORT_PATH = "/calibration/import"

@@ -10,9 +10,9 @@ from uuid import UUID
 from pydantic import BaseModel, BeforeValidator, Field
 
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, filled
-from slrig.bundle.validation import FreeText, SafeText, Strict
+from slrig.bundle import FreeText, SafeText, Strict
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, plain
-from slrig.calibration.board import DEFAULT_BOARD, BoardKind, BoardShape
+from slrig.calibration import DEFAULT_BOARD, BoardKind, BoardShape
 from slrig.jobs.records import JobState
 from slrig.scan.plan import PatternPlan
 from slrig.schedule.task_options import ScheduledBoard

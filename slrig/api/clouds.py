@@ -10,8 +10,7 @@ from pathlib import Path
 from uuid import UUID
 
 from slrig.api.service import Service
-from slrig.bundle import CALIBRATION, DESCRIPTION
-from slrig.bundle.storage import write_file
+from slrig.bundle import CALIBRATION, DESCRIPTION, write_file
 from slrig.errors import InvalidInputError, JobNotFoundError, StorageError, WorkerBusyError
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.worker_process import Task

@@ -10,8 +10,7 @@ from pydantic import BaseModel, Field
 from slrig.api.openapi import problems
 from slrig.api.schemas import PatternRequest, ScanRequest, filled, scan_plan
 from slrig.api.service import Serving
-from slrig.bundle.options import PresetName
-from slrig.bundle.validation import Strict
+from slrig.bundle import PresetName, Strict
 from slrig.scan.exposure_look import proposed_exposures
 
 router = APIRouter(prefix="/exposure", tags=["scan"])

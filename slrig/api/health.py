@@ -14,8 +14,8 @@ from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
 from slrig.api.service import Service, Serving
-from slrig.bundle.validation import AwareMoment, Strict
-from slrig.calibration.board import Board
+from slrig.bundle import AwareMoment, Strict
+from slrig.calibration import Board
 from slrig.calibration.health import THRESHOLDS, DriftEstimate, HealthState, PairFigures, Thresholds
 from slrig.errors import CalibrationError
 from slrig.jobs.records import JobRecord, JobState, utc_now

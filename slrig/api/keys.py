@@ -20,8 +20,7 @@ from pydantic import AwareDatetime, Field, TypeAdapter, ValidationError
 
 from slrig import KEY_VARIABLE
 from slrig.api.scopes import Scope
-from slrig.bundle.storage import write_file
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict, write_file
 from slrig.errors import ConfigError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.records import Clock, utc_now

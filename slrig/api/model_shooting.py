@@ -13,7 +13,7 @@ from slrig.api.models import MadeRequest, ModelBody, model_body
 from slrig.api.openapi import problems
 from slrig.api.schemas import ShotRequest, scan_plan
 from slrig.api.service import Serving
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.combine.plan import MOST_VIEWS, ShootPlan
 from slrig.verify.verification import require_healthy
 

@@ -14,8 +14,7 @@ from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import problems
 from slrig.api.schemas import JobBody, JobLinks, filled
 from slrig.api.service import Cursor, PageLength, Service, Serving, paged
-from slrig.bundle.options import MAX_VIEWS, AxisEntry, PoseEntry, orthonormalise_pose
-from slrig.bundle.validation import FreeText, SafeText, Strict
+from slrig.bundle import MAX_VIEWS, AxisEntry, FreeText, PoseEntry, SafeText, Strict, orthonormalise_pose
 from slrig.combine.offered import MEDIA_TYPES
 from slrig.combine.plan import (
     MARKER_DICTIONARY,

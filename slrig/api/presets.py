@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 from slrig.api.openapi import problems
 from slrig.api.schemas import filled
 from slrig.api.service import Serving
-from slrig.bundle.options import PresetDocument, PresetName
+from slrig.bundle import PresetDocument, PresetName
 from slrig.scan.presets import PresetSource
 
 router = APIRouter(prefix="/preset", tags=["scan"])

@@ -19,18 +19,19 @@ from pydantic import (
 )
 
 from slrig.api.problems import fault_problem
-from slrig.bundle import TurnedBy
-from slrig.bundle.options import (
+from slrig.bundle import (
     EXPOSURE_KEYS,
     BracketSeconds,
     ExposureFactors,
+    FreeText,
     PresetDocument,
     PresetName,
     RegionTable,
     ScanDefaults,
+    Strict,
+    TurnedBy,
     refuse_alternatives,
 )
-from slrig.bundle.validation import FreeText, Strict
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
 from slrig.model import Axis, FlipRule, SequenceName, Size

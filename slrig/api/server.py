@@ -23,7 +23,7 @@ from slrig.api.connections import ConnectionConfig, Deadlines, listening_socket,
 from slrig.api.keys import KeyRing, first_key
 from slrig.api.service import Service
 from slrig.api.sessions import LINK_PATH, Sessions
-from slrig.bundle.storage import write_file
+from slrig.bundle import write_file
 from slrig.compute.security import require_pool_extra
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig

@@ -12,7 +12,7 @@ from fastapi import Depends, Query, Request, Response
 
 from slrig.accept.desk import AcceptanceDesk
 from slrig.api.latency import Durations
-from slrig.bundle.options import Preset, ScanDefaults
+from slrig.bundle import Preset, ScanDefaults
 from slrig.calibrate.calibrating import CalibrationSessions
 from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools

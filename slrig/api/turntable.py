@@ -13,8 +13,7 @@ from pydantic import BaseModel, Field
 
 from slrig.api.openapi import file_of, problems
 from slrig.api.service import Serving
-from slrig.bundle.options import AxisSource, TurntableEntry, TurntableRecord, turntable_entry, turntable_record
-from slrig.bundle.validation import Strict
+from slrig.bundle import AxisSource, Strict, TurntableEntry, TurntableRecord, turntable_entry, turntable_record
 from slrig.calibrate.tools import setting_of
 from slrig.combine.turntable import TurntableState, state_of
 from slrig.combine.turntable_plot import turntable_svg

@@ -8,16 +8,15 @@ from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.bundle import write_calibration, write_opencv_calibration
-from slrig.bundle.storage import write_durably
+from slrig.bundle import write_calibration, write_durably, write_opencv_calibration
 from slrig.calibrate.pose_shooting import PoseDesk, outcome_of
 from slrig.calibrate.records import USUAL_PATTERNS, SessionRecord, SessionState
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.solves import SolveDesk
 from slrig.calibrate.store import CALIBRATION, READING, ActivePointer, CalibrationStore
 from slrig.calibrate.tools import CalibrationTools, setting_of
+from slrig.calibration import Board
 from slrig.calibration.accuracy import Comparison
-from slrig.calibration.board import Board
 from slrig.errors import (
     ArtefactNotReadyError,
     CalibrationError,

@@ -11,8 +11,7 @@ from markupsafe import Markup
 
 from slrig.calibrate.figures import named_devices
 from slrig.calibrate.words import rounded
-from slrig.calibration.board import Board
-from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose, DeviceResiduals, ExpectedError
+from slrig.calibration import CELLS, PROJECTOR, Board, BoardPose, DeviceResiduals, ExpectedError
 from slrig.model import Calibration, FloatArray, Pinhole, Size
 from slrig.reports.drawing import WIDTH, drawing, ink_on, path, polygon, ramp_colour, shape
 

@@ -12,9 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slrig.calibrate.solving import CalibrationResult
-from slrig.calibration.board import Board
+from slrig.calibration import PARAMETERS, PROJECTOR, Board, BoardPose, DeviceResiduals
 from slrig.calibration.poses import attitude
-from slrig.calibration.solution import PARAMETERS, PROJECTOR, BoardPose, DeviceResiduals
 from slrig.model import LENS_TERMS, Calibration, FloatArray, Pinhole, Size
 
 _INNER = PARAMETERS[:9]

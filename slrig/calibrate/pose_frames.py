@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle import read_description
-from slrig.calibration.solution import PROJECTOR
+from slrig.calibration import PROJECTOR
 from slrig.errors import PoseRefusedError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White
 from slrig.reconstruction import exposure_count

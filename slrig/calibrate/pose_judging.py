@@ -8,7 +8,7 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
-from slrig.bundle.storage import write_file
+from slrig.bundle import write_file
 from slrig.calibrate.figures import baselines, device_figures
 from slrig.calibrate.pose_pictures import white_frame
 from slrig.calibrate.records import SessionRecord, plain

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from slrig.calibrate.pose_frames import Image, Mask, window_about
-from slrig.calibration.board import Board, BoardView
+from slrig.calibration import Board, BoardView
 from slrig.calibration.detection import find_board, refine_view
 from slrig.errors import PoseRefusedError
 from slrig.model import FloatArray

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from slrig.bundle import read_description, read_pages
 from slrig.calibrate.solving import ReadPose
 from slrig.calibrate.tools import Setting
-from slrig.calibration.board import Board, PoseObservation
+from slrig.calibration import PROJECTOR, Board, PoseObservation
 from slrig.calibration.poses import coverage, draw_coverage, draw_pose, projector_view
-from slrig.calibration.solution import PROJECTOR
 from slrig.errors import BundleError
 from slrig.model import FloatArray, Pixels, Size, White
 

@@ -15,7 +15,7 @@ from slrig.bundle import read_capture
 from slrig.calibrate.pose_frames import PoseFrames, coded_axes, cut_capture, pose_frames, window_about
 from slrig.calibrate.pose_movement import differ, moved_px
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.board import COLUMN, ROW, Board, BoardView, Correspondences, PoseObservation, ViewQuality
+from slrig.calibration import COLUMN, ROW, Board, BoardView, Correspondences, PoseObservation, ViewQuality
 from slrig.calibration.detection import board_mask, find_board, interior_mask, measure_blur_px, paper_mask
 from slrig.errors import PatternError, PoseRefusedError
 from slrig.model import Axis, Capture, Size

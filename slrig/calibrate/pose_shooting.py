@@ -16,7 +16,7 @@ from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.bundle.storage import write_durably
+from slrig.bundle import write_durably
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, pose_of
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.solving import ReadPose

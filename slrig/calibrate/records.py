@@ -12,7 +12,7 @@ from uuid import UUID
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from slrig.calibration.board import Board
+from slrig.calibration import Board
 from slrig.errors import InvalidInputError, PoseRefusedError, StorageError
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState

@@ -12,10 +12,9 @@ from slrig.calibrate import charts
 from slrig.calibrate.figures import PoseFigures, baselines, device_figures, named_devices, pose_figures
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.words import rounded
-from slrig.calibration.board import Board
+from slrig.calibration import PROJECTOR, Board, device_title
 from slrig.calibration.judgement import describe_board
 from slrig.calibration.poses import draw_pose, projector_view
-from slrig.calibration.solution import PROJECTOR, device_title
 from slrig.model import Pixels
 from slrig.reports.drawing import legend
 from slrig.reports.page import filled, jpeg_uri

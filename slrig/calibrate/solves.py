@@ -14,7 +14,7 @@ from slrig.calibrate.records import SessionRecord, SessionState
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.store import CALIBRATION, REPORT
 from slrig.calibrate.tools import CalibrationTools, setting_of
-from slrig.calibration.board import BoardShape
+from slrig.calibration import BoardShape
 from slrig.errors import CalibrationError, CalibrationStateError, SolveRefusedError
 from slrig.jobs.data_folder import BUNDLE
 from slrig.jobs.job import Holder

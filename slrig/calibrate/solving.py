@@ -6,11 +6,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from uuid import uuid4
 
+from slrig.calibration import (
+    PROJECTOR,
+    Board,
+    BoardShape,
+    ExpectedError,
+    Observations,
+    PoseObservation,
+    Solution,
+    ViewQuality,
+)
 from slrig.calibration.accuracy import OddEven, compare_halves
-from slrig.calibration.board import Board, BoardShape, Observations, PoseObservation, ViewQuality
 from slrig.calibration.judgement import Verdict, check_scale, judge_calibration
 from slrig.calibration.poses import Coverage, coverage
-from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
 from slrig.errors import CalibrationError, SolveRefusedError
 from slrig.jobs.records import utc_now
 from slrig.model import Calibration, Size, SolveRecord

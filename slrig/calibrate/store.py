@@ -24,11 +24,10 @@ from uuid import UUID
 
 import numpy as np
 
-from slrig.bundle import read_calibration
-from slrig.bundle.storage import sync_folder, sync_tree, write_durably, write_file
+from slrig.bundle import read_calibration, sync_folder, sync_tree, write_durably, write_file
 from slrig.calibrate.records import SessionRecord, session_from_json, session_json
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.board import BoardView, Correspondences, PoseObservation, ViewQuality
+from slrig.calibration import BoardView, Correspondences, PoseObservation, ViewQuality
 from slrig.errors import CalibrationError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import BUNDLE, DataFolder

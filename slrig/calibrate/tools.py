@@ -13,9 +13,8 @@ from typing import Any, Protocol
 
 from slrig.calibrate.records import SessionRecord
 from slrig.calibrate.solving import CalibrationResult, ReadPose
+from slrig.calibration import PROJECTOR, Board
 from slrig.calibration.accuracy import Comparison
-from slrig.calibration.board import Board
-from slrig.calibration.solution import PROJECTOR
 from slrig.devices import Rig
 from slrig.errors import CalibrationStateError
 from slrig.jobs.compute import Compute

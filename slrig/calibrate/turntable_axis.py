@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from slrig.calibration.board import Board, PoseObservation
+from slrig.calibration import Board, PoseObservation
 from slrig.calibration.health.drift import estimate_board_poses
 from slrig.model import Calibration
 from slrig.multiview import BoardAxis, axis_from_board

@@ -29,7 +29,7 @@ from slrig.accept.running import Place, required_calibration, run_acceptance
 from slrig.accept.scene import scripted_config
 from slrig.accept.store import HTML, JSON
 from slrig.accept.verdicts import AcceptanceResult
-from slrig.calibration.artefacts import Decision
+from slrig.calibration import Decision
 from slrig.cli.display import answered, progress_shown
 from slrig.cli.options import AcceptanceOptions
 from slrig.config import RigConfig, read_rig

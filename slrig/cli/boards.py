@@ -8,8 +8,8 @@ from pathlib import Path
 
 import typer
 
-from slrig.bundle.storage import write_file
-from slrig.calibration.board import DEFAULT_BOARD, Board, BoardKind
+from slrig.bundle import write_file
+from slrig.calibration import DEFAULT_BOARD, Board, BoardKind
 from slrig.cli.options import BoardArguments
 from slrig.disk import storage_errors
 from slrig.errors import CalibrationError

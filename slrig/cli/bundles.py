@@ -15,8 +15,7 @@ from pathlib import Path
 import typer
 from rich.table import Column
 
-from slrig.bundle import DESCRIPTION, read_description
-from slrig.bundle.storage import natural_sort_key
+from slrig.bundle import DESCRIPTION, natural_sort_key, read_description
 from slrig.cli.display import ProgressDisplay, print_table, progress_shown
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError

@@ -84,7 +84,7 @@ def solve(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate from recorded poses. Needs no service and no rig."""
-    from slrig.calibration.board import BoardShape
+    from slrig.calibration import BoardShape
     from slrig.cli.boards import chosen_board
     from slrig.cli.calibrate_solve import solve_folder
 
@@ -210,7 +210,7 @@ def check(
     They are solved apart and compared, in mm: a folder's here and now, by a service with every solve.
     """
     if Path(poses).is_dir():
-        from slrig.calibration.board import BoardShape
+        from slrig.calibration import BoardShape
         from slrig.cli.boards import chosen_board
         from slrig.cli.calibrate_solve import check_folder
 

@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Any
 import typer
 from rich.console import Console
 
-from slrig.bundle import read_calibration, write_calibration, write_opencv_calibration
-from slrig.bundle.storage import write_file
+from slrig.bundle import read_calibration, write_calibration, write_file, write_opencv_calibration
 from slrig.calibrate.pose_frames import bundle_device_sizes
-from slrig.calibration.board import Board, BoardShape
+from slrig.calibration import PROJECTOR, Board, BoardShape
 from slrig.calibration.poses import check_same_devices
-from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import checked, tell_check, tell_result
 from slrig.cli.display import ProgressDisplay, counted, print_json, progress_shown
 from slrig.cli.reconstruct import keep_kernels

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from slrig.calibration.board import Board
+from slrig.calibration import Board
 from slrig.cli.calibration_screen import coverage_picture, outcome, refused, tell_next, tell_result
 from slrig.cli.demo import still_missing
 from slrig.cli.display import answered, progress_shown

@@ -13,7 +13,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from slrig.calibrate.words import rounded
-from slrig.calibration.solution import CELLS, MIN_HALVED_POSES
+from slrig.calibration import CELLS, MIN_HALVED_POSES
 from slrig.cli.display import counted, plain_table
 from slrig.errors import ConfigError
 from slrig.printable import printable

@@ -17,8 +17,7 @@ from typing import Any, TypeVar
 import typer
 from pydantic import ValidationError
 
-from slrig.bundle.storage import write_file
-from slrig.bundle.validation import describe_errors, model_keys
+from slrig.bundle import describe_errors, model_keys, write_file
 from slrig.cli.driver_options import explained, option
 from slrig.config import parse_rig
 from slrig.devices import FoundDevice

@@ -92,7 +92,7 @@ def model(
     Says how well they agree, and which motions their shape leaves open. The start is a turntable's angle, poses,
     markers, or unknown. Where no scan has seen the object, the mesh is open.
     """
-    from slrig.bundle.options import TurntableRecord, read_turntable
+    from slrig.bundle import TurntableRecord, read_turntable
     from slrig.cli.display import progress_shown
     from slrig.cli.reconstruct import keep_kernels
     from slrig.combine.offered import POSES, REPORT, REPORT_FORMAT
@@ -236,7 +236,7 @@ def _starts(
     """Where the scans start from. found : unknown, or by markers. Raises ConfigError: that is not told in one way
     alone, or not of all scans.
     """
-    from slrig.bundle.options import read_poses
+    from slrig.bundle import read_poses
     from slrig.combine.plan import GivenPoses, TurntablePoses
 
     ways = [angle is not None, file is not None, found is not None]
@@ -288,7 +288,7 @@ def _require_order(files: Mapping[str, Path], angle: float) -> None:
 
 def _axis(file: Path | None, point: Vector | None, direction: Vector | None) -> StatedAxis | None:
     """The axis that was told. Raises ConfigError: twice, by half, without a length, or `file` has none."""
-    from slrig.bundle.options import read_poses
+    from slrig.bundle import read_poses
     from slrig.combine.plan import StatedAxis
 
     if (point is None) != (direction is None) or (file is not None and point is not None):
@@ -313,7 +313,7 @@ def _named_meshes(asked: Sequence[Path]) -> dict[str, Path]:
 
     Raises ConfigError: there is none, fewer than two, or two of one name.
     """
-    from slrig.bundle.storage import natural_sort_key
+    from slrig.bundle import natural_sort_key
     from slrig.cli.bundles import matching
     from slrig.scan.artefacts import MESH
 

@@ -116,14 +116,14 @@ class MeshOptions:
 
     def asked(self) -> dict[str, Any]:
         """What was given, as a request says it. Raises ConfigError: the file of the region is wrong."""
-        from slrig.bundle.options import read_region
+        from slrig.bundle import read_region
 
         region = None if self.region is None else read_region(self.region).model_dump(mode="json", exclude_unset=True)
         return given(**{**asdict(self), "region": region})
 
     def chosen(self) -> dict[str, Any]:
         """What was given, as a plan has it. Raises ConfigError: the file of the region is wrong."""
-        from slrig.bundle.options import read_region
+        from slrig.bundle import read_region
 
         return given(**{**asdict(self), "region": None if self.region is None else read_region(self.region).region()})
 

@@ -50,7 +50,7 @@ def import_preset(
     service: ServiceOptions,
 ) -> None:
     """Have the service keep a preset by this name."""
-    from slrig.bundle.validation import read_text
+    from slrig.bundle import read_text
 
     document = sys.stdin.read(MOST_BYTES) if str(file) == "-" else read_text(file, MOST_BYTES, ConfigError)
     with service.client() as client:

@@ -11,8 +11,7 @@ from typing import Any
 import typer
 from rich.table import Column
 
-from slrig.bundle import read_calibration, read_description
-from slrig.bundle.storage import write_file
+from slrig.bundle import read_calibration, read_description, write_file
 from slrig.cli.bundles import Row, named_bundles, work_through
 from slrig.cli.display import counted, progress_shown
 from slrig.cli.quality import quality_lines

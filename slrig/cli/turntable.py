@@ -10,7 +10,7 @@ import typer
 from slrig.cli.options import BoardArguments, grouped
 
 if TYPE_CHECKING:
-    from slrig.bundle.options import TurntableRecord
+    from slrig.bundle import TurntableRecord
 
 app = typer.Typer(no_args_is_help=True, help="A turntable's axis, its plate and what is behind.")
 
@@ -39,9 +39,7 @@ def axis(
 
     from rich.table import Column
 
-    from slrig.bundle import read_calibration
-    from slrig.bundle.options import AxisSource
-    from slrig.bundle.storage import write_file
+    from slrig.bundle import AxisSource, read_calibration, write_file
     from slrig.cli.boards import chosen_board
     from slrig.cli.calibrate_solve import pose_bundles
     from slrig.cli.display import print_table, progress_shown
@@ -58,7 +56,7 @@ def axis(
     )
     keep_kernels()
     with progress_shown() as display:
-        from slrig.bundle.options import encode_turntable
+        from slrig.bundle import encode_turntable
         from slrig.calibrate.pose_reading import read_pose
         from slrig.calibrate.turntable_axis import axis_of_poses
         from slrig.combine.turntable import with_axis
@@ -112,8 +110,7 @@ def planes(
     """
     from dataclasses import replace
 
-    from slrig.bundle.options import encode_turntable
-    from slrig.bundle.storage import write_file
+    from slrig.bundle import encode_turntable, write_file
     from slrig.cli.display import print_table
     from slrig.cli.reconstruct import keep_kernels
     from slrig.scan.artefacts import MESH
@@ -136,6 +133,6 @@ def planes(
 
 def _known(file: Path) -> TurntableRecord:
     """What the file says already. Raises ConfigError: it is damaged, and is left as it is."""
-    from slrig.bundle.options import TurntableRecord, read_turntable
+    from slrig.bundle import TurntableRecord, read_turntable
 
     return read_turntable(file) if file.exists() else TurntableRecord()

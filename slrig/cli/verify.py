@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from slrig.bundle import read_calibration
 from slrig.calibrate.records import USUAL_PATTERNS
-from slrig.calibration.board import Board
+from slrig.calibration import Board
 from slrig.calibration.health import Health, HealthState, Verification, judge_health
 from slrig.cli.display import print_json, progress_shown
 from slrig.config import read_rig

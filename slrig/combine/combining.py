@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from slrig.bundle.options import Poses, encode_poses
-from slrig.bundle.storage import write_file
+from slrig.bundle import Poses, encode_poses, write_file
 from slrig.combine.markers import markers_of
 from slrig.combine.offered import COARSE, MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT, SIDES, VIEW
 from slrig.combine.pictures import six_sides_png

@@ -15,8 +15,15 @@ from pathlib import Path
 import numpy as np
 import structlog
 
-from slrig.bundle.options import AxisSource, ChangeEntry, TurntableRecord, encode_turntable, read_turntable
-from slrig.bundle.storage import sync_folder, write_file
+from slrig.bundle import (
+    AxisSource,
+    ChangeEntry,
+    TurntableRecord,
+    encode_turntable,
+    read_turntable,
+    sync_folder,
+    write_file,
+)
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.records import utc_now

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from markupsafe import Markup
 
-from slrig.bundle.options import AxisSource, ChangeEntry
+from slrig.bundle import AxisSource, ChangeEntry
 from slrig.multiview import AXIS_SPAN_MM
 from slrig.reports.drawing import shape
 from slrig.reports.trend import (

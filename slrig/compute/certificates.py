@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from slrig.bundle.storage import write_file
+from slrig.bundle import write_file
 from slrig.compute.security import AUTHORITY, CERTIFICATE, KEY
 from slrig.config import read_private_text
 from slrig.disk import storage_errors

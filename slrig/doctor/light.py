@@ -28,8 +28,7 @@ from slrig.doctor.measures import (
     light_levels,
 )
 from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
-from slrig.model import Axis, Black, Calibration, FloatArray, Frame, Gray, PatternSequence, Shot, White
-from slrig.model.patterns import gray_index
+from slrig.model import Axis, Black, Calibration, FloatArray, Frame, Gray, PatternSequence, Shot, White, gray_index
 from slrig.patterns import cell_centre_px
 
 _NS = 1e9

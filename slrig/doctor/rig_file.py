@@ -13,8 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from slrig.bundle.storage import write_durably
-from slrig.bundle.validation import read_text
+from slrig.bundle import read_text, write_durably
 from slrig.config import MAX_CONFIG_BYTES, read_rig
 from slrig.disk import staging_name, storage_errors
 from slrig.doctor.advice import ExposureAdvice

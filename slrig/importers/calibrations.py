@@ -17,16 +17,20 @@ from slrig.bundle import (
     CAMERA_NAME,
     MAX_SIDE_PX,
     MAX_STORAGE_BYTES,
+    Strict,
     Value,
     five_distortion_terms,
     read_calibration,
     read_file_storage,
     read_opencv_calibration,
+    read_text,
+    sync_folder,
+    validate,
     write_calibration,
+    write_durably,
+    write_file,
     write_opencv_calibration,
 )
-from slrig.bundle.storage import sync_folder, write_durably, write_file
-from slrig.bundle.validation import Strict, read_text, validate
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, Gray, Pinhole, Size

@@ -11,9 +11,15 @@ from typing import NoReturn
 
 import numpy as np
 
-from slrig.bundle import MAX_CAMERA_PX, BundleWriter, check_calibration, read_frame_format, read_with_colour
-from slrig.bundle.storage import natural_sort_key
-from slrig.bundle.validation import read_text
+from slrig.bundle import (
+    MAX_CAMERA_PX,
+    BundleWriter,
+    check_calibration,
+    natural_sort_key,
+    read_frame_format,
+    read_text,
+    read_with_colour,
+)
 from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
 from slrig.importers.calibrations import read_any_calibration

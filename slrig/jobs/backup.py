@@ -22,7 +22,7 @@ from typing import BinaryIO, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-from slrig.bundle.storage import sync_folder, sync_tree
+from slrig.bundle import sync_folder, sync_tree
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import StorageError
 from slrig.jobs.data_folder import DATABASE, ORPHANS, SCANS

@@ -25,7 +25,7 @@ from uuid import UUID
 import structlog
 from filelock import FileLock, Timeout
 
-from slrig.bundle.storage import sync_folder, sync_tree
+from slrig.bundle import sync_folder, sync_tree
 from slrig.errors import DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError
 
-from slrig.bundle.storage import write_file
+from slrig.bundle import write_file
 from slrig.jobs.data_folder import SCANS
 from slrig.jobs.records import utc_now
 

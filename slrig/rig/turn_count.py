@@ -10,7 +10,7 @@ from uuid import uuid4
 import structlog
 from pydantic import BaseModel, ValidationError
 
-from slrig.bundle.storage import write_file
+from slrig.bundle import write_file
 from slrig.devices import Turntable
 from slrig.disk import storage_errors
 from slrig.errors import StorageError

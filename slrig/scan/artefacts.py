@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.storage import sync_folder, sync_tree, write_file
+from slrig.bundle import sync_folder, sync_tree, write_file
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray, IntArray, Mesh, PointCurves

@@ -15,8 +15,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from slrig.bundle import read_capture
-from slrig.bundle.storage import write_file
+from slrig.bundle import read_capture, write_file
 from slrig.disk import storage_errors
 from slrig.errors import PatternError, setting
 from slrig.model import Axis, Capture, Gray, Refusal, trim_incomplete_codes

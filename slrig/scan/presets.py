@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from slrig.bundle.options import PRESET_NAME, Preset, PresetDocument
-from slrig.bundle.storage import json_bytes, write_file
-from slrig.bundle.validation import read_json_model
+from slrig.bundle import PRESET_NAME, Preset, PresetDocument, json_bytes, read_json_model, write_file
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, PresetNotFoundError
 from slrig.model import SequenceName

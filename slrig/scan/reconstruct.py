@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import read_health, read_notes, read_truth, read_turntable_angle
-from slrig.bundle.storage import write_file
+from slrig.bundle import read_health, read_notes, read_truth, read_turntable_angle, write_file
 from slrig.capture import EvidenceSummary
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames

@@ -12,7 +12,7 @@ from uuid import UUID
 
 from pydantic import TypeAdapter, ValidationError
 
-from slrig.bundle.storage import write_file
+from slrig.bundle import write_file
 from slrig.jobs.timeline import STAGES_S
 from slrig.scan.plan import ScanPlan
 

@@ -15,7 +15,7 @@ from slrig.accept.verdicts import verdicts
 from slrig.calibrate.calibrating import CalibrationSessions
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import SessionState
-from slrig.calibration.board import Board
+from slrig.calibration import Board
 from slrig.errors import (
     CalibrationError,
     CalibrationNotFoundError,

@@ -7,8 +7,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import Field, ValidationError
 
-from slrig.bundle.validation import FreeText, Strict, describe_errors, model_keys
-from slrig.calibration.board import PRINT_SIGMA, Board, BoardKind
+from slrig.bundle import FreeText, Strict, describe_errors, model_keys
+from slrig.calibration import PRINT_SIGMA, Board, BoardKind
 from slrig.errors import ScheduleError
 from slrig.rig.session import RigFacts
 

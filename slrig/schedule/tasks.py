@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from uuid import UUID, uuid4
 
 from slrig.accept.desk import AcceptanceDesk
-from slrig.bundle.validation import Strict
+from slrig.bundle import Strict
 from slrig.calibrate.calibrating import CalibrationSessions
 from slrig.errors import CalibrationError, ScanStateError, ScheduleError
 from slrig.jobs.job import Holder, Job

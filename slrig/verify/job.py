@@ -11,7 +11,7 @@ from uuid import UUID, uuid4
 from pydantic import TypeAdapter
 
 from slrig.calibrate.records import USUAL_PATTERNS
-from slrig.calibration.board import Board
+from slrig.calibration import Board
 from slrig.calibration.health import Health, HealthState, verification_from_scan
 from slrig.errors import CalibrationError, CalibrationStateError, UnsupportedByDeviceError
 from slrig.jobs.data_folder import BUNDLE, DataFolder

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slrig.calibrate.tools import CapturePose
-from slrig.calibration.board import Board
+from slrig.calibration import Board
 from slrig.calibration.health import Health, HealthState, Verification
 from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.compute import Compute

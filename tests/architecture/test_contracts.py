@@ -43,8 +43,20 @@ def test_broken_contracts_are_noticed(tmp_path: Path) -> None:
     assert "slrig.helpers" in result.stdout
 
 
-ROOMS = ("capture", "conformance", "doctor", "meshing", "patterns", "reconstruction", "multiview")
+ROOMS = (
+    "bundle", "calibration", "capture", "conformance", "devices", "doctor", "importers", "meshing", "model",
+    "multiview", "patterns", "reconstruction",
+)  # fmt: skip
 """Rooms whose `__init__` exports all that others import from them."""
+
+PUBLIC_MODULES = {
+    # These load OpenCV or compiled kernels, which code that only names boards and calibrations must not.
+    *(f"slrig.calibration.{name}" for name in ("accuracy", "judgement", "printing")),
+    *(f"slrig.calibration.{name}" for name in ("detection", "health", "health.drift", "poses", "solving")),
+    # The rendered rig must not import slrig's lens: a contract names these two modules.
+    "slrig.model.lens", "slrig.model.lens_kernels",
+}  # fmt: skip
+"""Modules of these rooms that others import directly."""
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -56,6 +68,8 @@ def test_other_rooms_import_what_a_room_exports(room: str) -> None:
         for path in sources
         if inside not in path.parents
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"slrig.{room}.")
+        if isinstance(node, ast.ImportFrom)
+        and (node.module or "").startswith(f"slrig.{room}.")
+        and node.module not in PUBLIC_MODULES
     }
     assert bypassing == set()

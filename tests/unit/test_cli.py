@@ -567,7 +567,7 @@ def test_the_command_does_the_test_and_returns_the_decision(
     monkeypatch.setattr(accepting, "run_acceptance", shortened)
     output, rig_file = tmp_path / "out", tmp_path / "rig.toml"
     text = BALL_BAR.read_text(encoding="utf-8").replace('"../', f'"{RIGS.parent}/')
-    rig_file.write_text(f"{text}\n[accuracy]\nwanted_mm = 0.04\n", encoding="utf-8")
+    rig_file.write_text(f"{text}\n[accuracy]\ntolerance_mm = 0.04\n", encoding="utf-8")
     # Sphere spacing is right to a few µm: a limit of one tenth of a µm fails, that of the rig file passes.
     more = ["--spacing-limit-mm", "0.0000001", "--json"] if as_json else []
     ran = slrig("accept", rig_file, "--scripted", "--output", output, *more)
