@@ -2,9 +2,9 @@
 
 A driver package declares factories in the groups below; slrig names no driver. A camera's factory is `open_camera(name,
 options, folder) -> Camera`, a projector's `open_projector(options, folder) -> Projector`, a head's `open_head(options,
-folder) -> ScannerHead`, a positioner's `open_positioner(options, folder) -> Positioner`; `options`
-are the driver's own keys
-of the rig file, `folder` is the folder of that file. A finder is `find_devices() -> tuple[FoundDevice, ...]`.
+folder) -> ScannerHead`, a positioner's `open_positioner(options, folder) -> Positioner`; `options` are the
+driver's own keys of the rig file, `folder` is the folder of that file. A finder is
+`find_devices() -> tuple[FoundDevice, ...]`.
 
 In the group slrig.options, a package may declare a pydantic model of a driver's options. It serves only to write rig
 files, and loads neither the driver nor its vendor's library.

@@ -1,4 +1,4 @@
-"""ROS 2's messages of a scan: what stands in them, whosever classes they are made of.
+"""ROS 2 messages of a scan: their contents, for the message classes of any library.
 
 The bag is made with rosbags' classes, and what the node publishes with ROS's own; both take fields by name. Lengths are
 metres (REP 103). A device's frame is called NAME_optical_frame, and its axes are those of ROS's optical frames, which

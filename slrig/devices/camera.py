@@ -125,7 +125,9 @@ class Camera(Protocol):
         ...
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """Prepare for `count` frames. Raises UnsupportedByDeviceError, DeviceStateError."""
+        """Prepare for `count` frames; a free-running camera may deliver more. Raises UnsupportedByDeviceError,
+        DeviceStateError.
+        """
         ...
 
     def trigger(self) -> None:
@@ -133,7 +135,8 @@ class Camera(Protocol):
         ...
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """Return the next frame whose exposure starts after `after_ns` (the rig's clock), and discard earlier frames.
+        """Return the next frame of which every row began after `after_ns` (the rig's clock), time-stamp
+        error subtracted; discard earlier frames.
 
         Raises FrameTimeoutError: no such frame came within `timeout_s`; DeviceGoneError: the device was unplugged;
         DeviceStateError: the camera is not armed.

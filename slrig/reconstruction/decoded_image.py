@@ -179,7 +179,7 @@ def code_edge_points(
         read = lit if decoded.unresolved is None else lit & (index < len(frames.bits) - decoded.unresolved)
         if within is not None:
             read &= within
-        parts.append(edge_points(*_bit_difference(decoded, index), read, limits, sigma_px=scale_px))
+        parts.append(edge_points(*_bit_difference(decoded, index), read, limits, filter_px=scale_px))
     return parts
 
 

@@ -1,9 +1,9 @@
 """Gray-code decoding with a cause for every refused pixel, unresolved bits and lines, and the mask of the scan region.
 
-A bit is read by comparing it with its inverse (or with the middle of white and black) against a margin set by noise. A
-bit inside the margin is ambiguous; the pixel then has an interval of cells. One such bit at its own code edge gives two
-neighbouring cells and does no harm; a finest bit lost in blur costs resolution only; in all other cases the interval is
-wide and the pixel is refused.
+A bit is 1 where its frame is brighter than its inverse (without inverses: than `AxisFrames.middle`). Where the
+difference is below a margin, the larger of a multiple of the noise and a fraction of the contrast, both values are
+tried, and the pixel has an interval of cells. An uncertain bit at its own code edge gives two neighbouring cells and
+does no harm; a finest bit lost in blur costs resolution only; otherwise the interval is wide and the pixel is refused.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _BEYOND_PROJECTOR = int(Refusal.BEYOND_PROJECTOR)
 _MAX_UNCERTAIN_BITS = 4  # each doubles the number of words to look up
 
 _REACH_PX = 8
-"""Distance of pixels on which a point depends: fits reach 2 px, filters 9 px, with little weight."""
+"""Distance of pixels on which a point depends. A filter reaches 9 px, but its outermost pixel has hardly any weight."""
 
 # Unresolved bits and lines.
 BLOCK_PX = 32
@@ -35,9 +35,10 @@ BLOCK_PX = 32
 _MIN_PASSAGES = 48
 """With fewer passages, a bit counts as resolved."""
 _MIN_CORRECT = 0.7
-"""Share of the passages of cells with the right change of a bit. Random bits have it in a quarter of passages."""
+"""Least share of passages (runs of pixels of one cell between its neighbours) in which the bit changes once, the right
+way. Random bits do in a quarter."""
 _MIN_PASSAGE_PX = 2.0
-"""Mean length of a passage of both halves of a cell: each pixel then has one code edge at most."""
+"""Least mean width of a cell in camera pixels, so that no pixel holds two code edges."""
 _MAX_UNRESOLVED_BITS = 3
 """If more bits were left out, the image does not show the code."""
 _MIN_FOUND = 0.5
@@ -147,7 +148,7 @@ def _decode_rows(
 @kernel
 def _decode_kernel(
     first: int, last: int, bit_images: Any, reference: Any, paired: bool, white: Any, lit: Any, unread: Any,
-    margin: Any, full_scale: Any, index_of_word: Any, cell_count: int, widest: int, lowest: Any, highest: Any,
+    margin: Any, clipped_at: Any, index_of_word: Any, cell_count: int, widest: int, lowest: Any, highest: Any,
     refusal: Any,
 ) -> None:  # fmt: skip
     bits, _, columns = bit_images.shape
@@ -157,7 +158,7 @@ def _decode_kernel(
             if not lit[y, x]:
                 refusal[y, x] = _NOT_LIT
                 continue
-            if not paired and white[y, x] >= full_scale:
+            if not paired and white[y, x] >= clipped_at:
                 refusal[y, x] = _SATURATED
                 continue
             word = 0
@@ -169,7 +170,7 @@ def _decode_kernel(
                 other = reference[b, y, x] if paired else reference[0, y, x]
                 if value > other:
                     word |= 1 << (bits - 1 - b)
-                if paired and value >= full_scale and other >= full_scale:
+                if paired and value >= clipped_at and other >= clipped_at:
                     clipped = True
                 if b >= read or abs(value - other) < margin[y, x]:
                     if count < len(uncertain):

@@ -446,16 +446,18 @@ class Disagreement:
     def __str__(self) -> str:
         return (
             f"the cameras contradict each other: they place the surface {self.distance_mm:.3f} mm apart (median), "
-            f"{self.sigma_ratio:.1f} times what is stated for them. The standard deviations were widened by as much; "
+            f"{self.sigma_ratio:.1f} times what is stated for them. This distance was added to the standard "
+            f"deviations, in squares; "
             "a camera has moved or the calibration is wrong: verify it (slrig verify), and calibrate again"
         )
 
 
-def find_disagreement(merged: MergedCurves, share_mm: FloatArray | None, /) -> Disagreement | None:
+def find_disagreement(merged: MergedCurves, calibration_sigma_mm: FloatArray | None, /) -> Disagreement | None:
     """Compare the distances between cameras with the stated deviations; None if they agree or have few points in
     common.
 
-    share_mm : (n,) float64, share of the calibration in the standard deviation of each point, None if it states none.
+    calibration_sigma_mm : (n,) float64, the calibration's part of the standard deviation of each point, None if it
+    states none.
     """
     distance = np.abs(merged.residual_mm)
     is_stated = (merged.residual_sigma != 0) & np.isfinite(merged.residual_sigma)
@@ -463,6 +465,6 @@ def find_disagreement(merged: MergedCurves, share_mm: FloatArray | None, /) -> D
         return None
     noise = distance[is_stated] / np.abs(merged.residual_sigma[is_stated])
     # Each of the two has the calibration's error.
-    calibration_sigma = 0.0 if share_mm is None else 2**0.5 * float(np.median(share_mm))
-    ratio = DEVIATIONS_PER_MEDIAN * float(np.median(distance[is_stated] / np.hypot(noise, calibration_sigma)))
+    between_sigma_mm = 0.0 if calibration_sigma_mm is None else 2**0.5 * float(np.median(calibration_sigma_mm))
+    ratio = DEVIATIONS_PER_MEDIAN * float(np.median(distance[is_stated] / np.hypot(noise, between_sigma_mm)))
     return Disagreement(float(np.median(distance[is_stated])), ratio) if ratio > MAX_OVER_SIGMA else None

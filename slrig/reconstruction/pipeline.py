@@ -64,7 +64,7 @@ from slrig.reconstruction.phase import (
     step_sigma_px,
 )
 from slrig.reconstruction.refinement import refine_points
-from slrig.reconstruction.stripes import LinePoints, StripeLimits, chain_stripes, stripe_points, stripe_sigma_px
+from slrig.reconstruction.stripes import LinePoints, StripeLimits, chain_stripes, stripe_points, stripe_width_px
 
 # Chosen: at 0.7 px, narrow stripes are found with three times the error.
 _MIN_SCALE_PX = 1.0
@@ -225,7 +225,7 @@ class CameraStream:
         """Find the points of the line frames that are there, or of all code edges."""
         if self._scale is None and not self._stacks.patterns.lines:
             self._report_step("locate stripes")
-            scale_px = self._limits.stripes.sigma_px or _MIN_SCALE_PX
+            scale_px = self._limits.stripes.filter_px or _MIN_SCALE_PX
             self._scale = _FilterScale(scale_px, _MIN_SCALE_PX)
             image = image.with_position_noise(image.frames.bits, edge_pixel_sum(scale_px))
             self._points = code_edge_points(image, self._limits.stripes, scale_px)
@@ -242,7 +242,7 @@ class CameraStream:
             scale, rows = self._scale, self._scale.rows
             line, deviation = line_image(image, len(self._points), rows.index)
             lit = image.search_mask[rows.index] & rows.inner
-            points = stripe_points(line, deviation, lit, self._limits.stripes, sigma_px=scale.filter_px)
+            points = stripe_points(line, deviation, lit, self._limits.stripes, filter_px=scale.filter_px)
             self._points.append(rows.to_image_rows(points))
         return image
 
@@ -251,8 +251,8 @@ class CameraStream:
         phase_suffices = _phase_finds_all_points(image.frames)
         rows = _sampled_rows(image) if phase_suffices else _ALL_ROWS
         line, deviation = line_image(image, 0, rows.index)
-        blur_px = stripe_sigma_px(line, deviation, image.search_mask[rows.index] & rows.inner)
-        filter_px = self._limits.stripes.sigma_px or _matched_scale_px(blur_px)
+        blur_px = stripe_width_px(line, deviation, image.search_mask[rows.index] & rows.inner)
+        filter_px = self._limits.stripes.filter_px or _matched_scale_px(blur_px)
         sampled = phase_suffices and filter_px < _MIN_FILTER_ONLY_PX
         return _FilterScale(filter_px, blur_px, sampled, rows if sampled else _ALL_ROWS)
 
@@ -395,7 +395,7 @@ def _refine_identify_link(
     )  # fmt: skip
     if scale.sampled and not aligned.refined:
         aligned.points[:] = [
-            stripe_points(*line_image(image, index), image.search_mask, limits.stripes, sigma_px=scale.filter_px)
+            stripe_points(*line_image(image, index), image.search_mask, limits.stripes, filter_px=scale.filter_px)
             for index in range(len(frames.lines))
         ]
     points, code, near_shadow, near_step = aligned.points, aligned.code, aligned.near_shadow, aligned.near_step
@@ -517,11 +517,11 @@ def _points_outside(points: LinePoints, mask: NDArray[np.bool_]) -> LinePoints:
     return LinePoints(*(each[outside] for each in points))
 
 
-def _matched_scale_px(stripe_sigma_px: float) -> float:
+def _matched_scale_px(stripe_width_px: float) -> float:
     """Scale of the Gaussian for stripes of this width, px.
 
     The width of the stripe itself is the best scale against noise. Stripes too sharp for the pixels are smoothed more:
     below a total of 1.4 px the sampling itself displaces the centre.
     """
-    more = np.sqrt(max(_MIN_SMOOTHED_PX**2 - stripe_sigma_px**2, 0.0))
-    return float(np.clip(max(stripe_sigma_px, more), _MIN_SCALE_PX, _MAX_SCALE_PX))
+    more = np.sqrt(max(_MIN_SMOOTHED_PX**2 - stripe_width_px**2, 0.0))
+    return float(np.clip(max(stripe_width_px, more), _MIN_SCALE_PX, _MAX_SCALE_PX))

@@ -215,8 +215,9 @@ def refine_points(
     Points of mixed light (not `usable`) or of no single line are left out, and those with a standard deviation above
     coarsest_px pixels. position_table : (frames, cells) float64, as for `identify_stripes`; step_px : from the lines of
     one frame to those of the next. extra_sigma_px : (H, W), standard deviation of errors that the scatter of pixels
-    does not show; it is added. sampled : `found` are some of the points, to check that the light was the same in all
-    frames, and all points come from the position map. release_lines : called if it was, before the largest allocation.
+    does not show; added in squares. sampled : `found` are some of the points, to check that the light was the same in
+    all frames, and all points come from the position map. release_lines : called if it was, before the largest
+    allocation.
     """
     borders = np.concatenate([[0], np.cumsum([len(each.points_px) for each in found], dtype=np.int64)])
     parts = [slice(a, b) for a, b in pairwise(borders)]
@@ -328,7 +329,7 @@ def _max_disagreement_px(disagreement: FloatArray) -> float:
 def _combine_kernel(
     first: int, last: int, starts: Any, filter_sigma: Any, clear: Any, coarsest: float, fitted: Any, distance: Any
 ) -> None:
-    """Combine each point with the position in its own frame, and store in `away` how far the fit moved it.
+    """Combine each point with the position in its own frame, and store in `distance` how far the fit moved it.
 
     If the camera's pixels are finer than the projector's, 5 x 5 of them contain only a part of a stripe, and its own
     frame may be more accurate: the weight of each is its share of the inverse variance. The filter counts only clear of

@@ -43,15 +43,15 @@ _SAME_LINE_COSINE = np.cos(_SAME_LINE_ANGLE)
 _HALF_OCTANT = np.tan(np.pi / 8)  # slope of the border between two octants
 
 
-def gaussian_kernels(sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+def gaussian_kernels(filter_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Sampled Gaussian of this scale and its first two derivatives, each (2 r + 1,) float32."""
-    radius = int(np.ceil(_SUPPORT * sigma_px))
+    radius = int(np.ceil(_SUPPORT * filter_px))
     offset = np.arange(-radius, radius + 1, dtype=np.float64)
-    zero = np.exp(-(offset**2) / (2 * sigma_px**2))
+    zero = np.exp(-(offset**2) / (2 * filter_px**2))
     zero /= zero.sum()
-    one = offset / sigma_px**2 * zero
+    one = offset / filter_px**2 * zero
     one /= (one * offset).sum()
-    two = (offset**2 / sigma_px**4 - 1 / sigma_px**2) * zero
+    two = (offset**2 / filter_px**4 - 1 / filter_px**2) * zero
     two -= two.mean()
     two /= (two * offset**2).sum() / 2
     # For correlation: a rising ramp gives +1 with `one`, a parabola x²/2 gives +1 with `two`.
@@ -579,12 +579,12 @@ def _alignment(vectors: Any, a: int, b: int) -> float:
 class StripeLimits:
     """Thresholds for stripes.
 
-    sigma_px : scale of the Gaussian; None matches it to the stripes, between 1 and 2.5 px. strong_sigma, weak_sigma :
+    filter_px : scale of the Gaussian; None matches it to the stripes, between 1 and 2.5 px. strong_sigma, weak_sigma :
     hysteresis, in standard deviations of the response to noise. weak_fraction : least fraction of the typical response
     of the image. shortest_points : a stripe of fewer points is refused.
     """
 
-    sigma_px: float | None = None
+    filter_px: float | None = None
     strong_sigma: float = 7.0
     weak_sigma: float = 3.5
     weak_fraction: float = 0.12
@@ -739,13 +739,13 @@ def _normalise_line_kernel(
             deviation[y, x] = noise * abs(weight)
 
 
-def stripe_sigma_px(image: NDArray[np.float32], noise: NDArray[np.float32], lit: NDArray[np.bool_]) -> float:
+def stripe_width_px(image: NDArray[np.float32], noise: NDArray[np.float32], lit: NDArray[np.bool_]) -> float:
     """Standard deviation of the cross-section of the stripes, px: median over the clear points of one frame.
 
     For a Gaussian bar smoothed to scale S the response is -r/S² at the centre, so S² = -r/r_nn.
     """
     probe = 1.2
-    found = line_points(RIDGE, image, noise, lit, StripeLimits(weak_sigma=12.0), sigma_px=probe)
+    found = line_points(RIDGE, image, noise, lit, StripeLimits(weak_sigma=12.0), filter_px=probe)
     strength = found.strength
     if len(strength) < 50:
         return probe
@@ -765,27 +765,27 @@ def line_points(
     limits: StripeLimits,
     /,
     *,
-    sigma_px: float,
+    filter_px: float,
 ) -> LinePoints:
     """Points of one frame, with their standard deviations.
 
     kind : `RIDGE` or `EDGE`; image, noise : (H, W) float32; lit : (H, W) bool, pixels that can contain a point;
-    sigma_px : scale of the Gaussian.
+    filter_px : scale of the Gaussian.
     """
     # Standard deviation of the response to noise over that of the noise: ∫ g_xx² = 3/(16 π σ⁶) for the ridge response,
     # ∫ g_x² = 1/(8 π σ⁴) for the gradient. For the numerator of the last step: ∫ g_x², and ∫ g² = 1/(4 π σ²).
-    gradient_noise = np.sqrt(1 / (8 * np.pi)) / sigma_px**2
+    gradient_noise = np.sqrt(1 / (8 * np.pi)) / filter_px**2
     if kind == RIDGE:
-        response_noise, gain = np.sqrt(3 / (16 * np.pi)) / sigma_px**3, gradient_noise
+        response_noise, gain = np.sqrt(3 / (16 * np.pi)) / filter_px**3, gradient_noise
     else:
-        response_noise, gain = gradient_noise, np.sqrt(1 / (4 * np.pi)) / sigma_px
+        response_noise, gain = gradient_noise, np.sqrt(1 / (4 * np.pi)) / filter_px
     weakest = np.float32(limits.weak_sigma * response_noise)
-    offset, strength = taylor_step(image, noise, lit, weakest, *gaussian_kernels(sigma_px), kind)
+    offset, strength = taylor_step(image, noise, lit, weakest, *gaussian_kernels(filter_px), kind)
     rows, columns, height = _responses_kernel(strength)
     if len(height):
         significant = height > limits.weak_fraction * np.percentile(height, 90)
         rows, columns = rows[significant], columns[significant]
-    x, y, normals, response, valid = newton_step(image, offset, columns, rows, sigma_px, kind)
+    x, y, normals, response, valid = newton_step(image, offset, columns, rows, filter_px, kind)
     strongest = np.float32(limits.strong_sigma * response_noise)
     return LinePoints(*_points_kernel(valid, x, y, normals, response, noise, rows, columns, gain, strongest))
 

@@ -1,4 +1,17 @@
-"""Standard deviation of points in space: noise, sensitivity of the triangulation, and share of the calibration."""
+"""Last steps of the standard deviation of points: its part along the normal, and the calibration's part.
+
+The σ of a vertex consists of, added in squares:
+
+1. noise of the pixels (`camera_response.estimate_noise`, with correlation and compression), over the gradient of the
+   position (`surface_fit`), or the filter's own σ (`stripes`), joined by `refinement`;
+2. mixed light near depth steps (`phase.step_sigma_px`) and brightness gradients (`phase.centroid_residual_px`);
+3. both moved through the triangulation, which gives millimetres (`triangulation`, fused by `merging`), and projected
+   onto the normal (`sigma_along_normal`);
+4. the calibration's covariance, if it states one (`calibration_sigma`);
+5. the distance between cameras that contradict each other (`merging.find_disagreement`).
+
+`slrig.scan.reconstruct` adds 3 to 5.
+"""
 
 from __future__ import annotations
 

@@ -62,16 +62,16 @@ _BETWEEN = frozenset({"read bundle", "check frames"})
 class _Meshed:
     """The mesh and its points, the cameras with all their refusals, and what the report says.
 
-    share_mm : (n,) float64, the calibration's part of each point's standard deviation, and mesh_share_mm : (V,) of each
-    vertex's; None where the calibration does not state its error. normals : (n, 3) float32 of the points, NaN beside
-    the mesh. notes : for the report.
+    calibration_sigma_mm : (n,) float64, the calibration's part of each point's standard deviation, and
+    mesh_calibration_sigma_mm : (V,) of each vertex's; None where the calibration does not state its error. normals :
+    (n, 3) float32 of the points, NaN beside the mesh. notes : for the report.
     """
 
     mesh: Mesh
     curves: PointCurves
     normals: NDArray[np.float32]
-    share_mm: FloatArray | None
-    mesh_share_mm: FloatArray | None
+    calibration_sigma_mm: FloatArray | None
+    mesh_calibration_sigma_mm: FloatArray | None
     cameras: list[CameraResult]
     stages: tuple[MeshStage, ...]
     figures: Mapping[str, object]
@@ -171,11 +171,14 @@ def reconstruct_into(
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         # One at a time: each is as large as the mesh.
-        place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_share_mm))
+        place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_calibration_sigma_mm))
         # The mesh is what somebody waits for; what is left is shared by two threads.
         pictures = beside.submit(_encoded_pictures, mesh, cameras)
         place("mesh.glb", encode_mesh_glb(mesh))
-        place("points.ply", encode_points_ply(meshed.curves, meshed.normals, sigma_calibration_mm=meshed.share_mm))
+        place(
+            "points.ply",
+            encode_points_ply(meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm),
+        )
         covered = covered_share(mesh, cameras[0])
         figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
         entered("pictures", 0.85, "")
@@ -189,7 +192,7 @@ def reconstruct_into(
         report = {
             **walked.sections,
             "notes": [*read_notes(bundle), *walked.notes, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
-            "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
+            "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_calibration_sigma_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
             "computed": computed(where or {"where": "local"}),
@@ -288,8 +291,8 @@ def _meshed(
         mesh=mesh,
         curves=curves,
         normals=surface.normals,
-        share_mm=share,
-        mesh_share_mm=None if share is None else share[_used(surface.faces, len(share))],
+        calibration_sigma_mm=share,
+        mesh_calibration_sigma_mm=None if share is None else share[_used(surface.faces, len(share))],
         cameras=cameras,
         stages=surface.stages,
         figures=mesh_report(surface, mesh, curves),

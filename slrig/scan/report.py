@@ -222,18 +222,19 @@ _SECONDS_PER_DAY = 86_400.0
 
 
 def calibration_report(
-    calibration: Calibration, bundle: Path, sigma_mm: NDArray[np.float32], share_mm: FloatArray | None, /
+    calibration: Calibration, bundle: Path, sigma_mm: NDArray[np.float32], calibration_sigma_mm: FloatArray | None, /
 ) -> dict[str, object]:
     """The report's section on the calibration.
 
-    sigma_mm : (V,), standard deviation of each vertex; share_mm : (V,), the calibration's part of it, None where the
-    calibration does not state its error. Then only `id` is known, a digest of its numbers, and `absent` says why.
+    sigma_mm : (V,), standard deviation of each vertex; calibration_sigma_mm : (V,), the calibration's part of it, None
+    where the calibration does not state its error. Then only `id` is known, a digest of its numbers, and `absent` says
+    why.
 
     `sigma_share` is the calibration's fraction of a vertex's variance, the median. `age_days` counts from the solve to
     the capture, and is null where one of the two instants is not known.
     """
     solved = calibration.solved
-    if solved is None or share_mm is None:
+    if solved is None or calibration_sigma_mm is None:
         return {
             "id": calibration.digest,
             "solved_at": None,
@@ -243,7 +244,7 @@ def calibration_report(
             "absent": "the calibration says nothing of its own error: it was written by hand, imported, or is exact",
         }
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = (share_mm / sigma_mm.astype(np.float64)) ** 2
+        share = (calibration_sigma_mm / sigma_mm.astype(np.float64)) ** 2
     known = np.isfinite(share)
     age_days, words = _age(solved, bundle)
     report: dict[str, Any] = {
@@ -252,7 +253,7 @@ def calibration_report(
         "age_days": age_days,
         "expected_error_mm": solved.expected_error_mm,
         "sigma_share": float(np.median(share[known])) if known.any() else None,
-        "sigma_calibration_mm": float(np.median(share_mm[known])) if known.any() else None,
+        "sigma_calibration_mm": float(np.median(calibration_sigma_mm[known])) if known.any() else None,
     }
     return report if words is None else {**report, "age_absent": words}
 

@@ -22,7 +22,7 @@ from slrig.reconstruction.stripes import (
     edge_points,
     normalise,
     stripe_points,
-    stripe_sigma_px,
+    stripe_width_px,
 )
 from tests.unit.reconstruction.builders import gaussian_stripe, grid, rms
 
@@ -60,7 +60,7 @@ def located(
     deviation = np.full(image.shape, noise, dtype=np.float32)
     lit = np.ones(image.shape, dtype=np.bool_)
     find = edge_points if edge else stripe_points
-    return chain_stripes([find(image, deviation, lit, limits or StripeLimits(), sigma_px=sigma_px)], image.shape)
+    return chain_stripes([find(image, deviation, lit, limits or StripeLimits(), filter_px=sigma_px)], image.shape)
 
 
 def errors_px(stripes: Stripes, distance: Distance) -> FloatArray:
@@ -159,12 +159,12 @@ def test_the_width_of_stripes_is_measured(width_px: float) -> None:
     clean = gaussian_stripe(from_line, width_px)
     image = clean + np.random.default_rng(2).normal(0, 0.02, clean.shape).astype(np.float32)
     noise, lit = np.full(image.shape, 0.02, dtype=np.float32), np.ones(image.shape, dtype=np.bool_)
-    assert stripe_sigma_px(image, noise, lit) == pytest.approx(width_px, rel=0.05)
+    assert stripe_width_px(image, noise, lit) == pytest.approx(width_px, rel=0.05)
 
 
 def test_too_few_stripes_to_measure_give_the_width_looked_for() -> None:
     empty = np.zeros(SHAPE, dtype=np.float32)
-    assert stripe_sigma_px(empty, empty + np.float32(0.02), np.ones(SHAPE, dtype=np.bool_)) == pytest.approx(1.2)
+    assert stripe_width_px(empty, empty + np.float32(0.02), np.ones(SHAPE, dtype=np.bool_)) == pytest.approx(1.2)
 
 
 @pytest.mark.parametrize("dark", [0.1, 0.5])
@@ -178,7 +178,7 @@ def test_a_step_of_albedo_does_not_move_the_stripe_once_normalised(dark: float) 
     noise = np.full(SHAPE, 0.5, dtype=np.float32)
     raw = located(np.asarray((seen - black) / 200, dtype=np.float32), sigma_px=1.3)
     image, deviation = normalise(seen, black, albedo, noise)
-    stripes = chain_stripes([stripe_points(image, deviation, albedo > 0, StripeLimits(), sigma_px=1.3)], SHAPE)
+    stripes = chain_stripes([stripe_points(image, deviation, albedo > 0, StripeLimits(), filter_px=1.3)], SHAPE)
     assert rms(errors_px(raw, distance)) > 0.1
     assert rms(errors_px(stripes, distance)) < 0.005
 

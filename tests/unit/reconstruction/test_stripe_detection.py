@@ -51,7 +51,7 @@ def points_of(
 ) -> LinePoints:
     return stripe_points(
         image, np.full(image.shape, noise, dtype=np.float32),
-        np.ones(image.shape, dtype=np.bool_) if lit is None else lit, limits or StripeLimits(), sigma_px=1.2,
+        np.ones(image.shape, dtype=np.bool_) if lit is None else lit, limits or StripeLimits(), filter_px=1.2,
     )  # fmt: skip
 
 
