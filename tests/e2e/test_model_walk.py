@@ -1,4 +1,4 @@
-"""Scans of an object on a stage made one model over HTTP: the mesh is right, and a kill in the middle costs nothing."""
+"""Scans of an object on a turntable made one model over HTTP: the mesh is right, and a kill in the middle costs nothing."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from tests.e2e.conftest import Start, write_rig
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, off_surface_mm, seen
 
 ANGLES = [0.0, 40.0, 80.0]
-STAGE = {"point_mm": np.add(AXIS_POINT_MM, [0.3, 0.0, -0.2]).tolist(), "direction": AXIS.tolist()}
+TURNTABLE = {"point_mm": np.add(AXIS_POINT_MM, [0.3, 0.0, -0.2]).tolist(), "direction": AXIS.tolist()}
 
 
-def on_a_stage(data: Path) -> tuple[list[str], list[np.ndarray]]:
+def on_a_turntable(data: Path) -> tuple[list[str], list[np.ndarray]]:
     """Write scans as if they had been shot at `ANGLES`, and return their ids and true poses."""
     turned, scans = seen(bumpy, ANGLES, pitch_mm=1.5), []
     for angle, view in zip(ANGLES, turned.noisy(0, length_mm=2.0), strict=True):
@@ -49,10 +49,10 @@ def followed_to(client: Client, model: str, stage: str) -> None:
 @pytest.mark.slow
 def test_scans_become_a_model_over_http_and_a_kill_while_it_is_made_costs_nothing(start: Start, tmp_path: Path) -> None:
     rig, data = write_rig(tmp_path / "rig"), tmp_path / "data"
-    scans, true = on_a_stage(data)
+    scans, true = on_a_turntable(data)
     first = start(rig, data)
     with first.client() as client:
-        made = client.models.wait(client.models.start(scans, axis=STAGE, label="bumpy")["id"])
+        made = client.models.wait(client.models.start(scans, axis=TURNTABLE, label="bumpy")["id"])
         assert set(made["links"]["files"]) == set(MEDIA_TYPES)
         for name, link in made["links"]["files"].items():
             client.fetch(link, tmp_path / name)
@@ -69,12 +69,12 @@ def test_scans_become_a_model_over_http_and_a_kill_while_it_is_made_costs_nothin
         assert (tmp_path / "model.glb").read_bytes()[:4] == b"glTF"
         assert report["axis"]["turntable_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
         with pytest.raises(ModelFailedError, match="share more than 2%"):
-            client.models.wait(client.models.start(scans, axis=STAGE, angles_deg=[0, 180, 270])["id"])
+            client.models.wait(client.models.start(scans, axis=TURNTABLE, angles_deg=[0, 180, 270])["id"])
         worker = first.worker_id()
-        cut_off = client.models.start(scans, axis=STAGE)["id"]
+        cut_off = client.models.start(scans, axis=TURNTABLE)["id"]
         followed_to(client, cut_off, "registering")
         os.kill(worker, signal.SIGSTOP)
-        waiting = client.models.start(scans[:2], axis=STAGE)["id"]
+        waiting = client.models.start(scans[:2], axis=TURNTABLE)["id"]
         with pytest.raises(ConflictError, match="needed by model"):
             client.scans.delete(scans[0])
         assert client.models.get(cut_off)["state"] == "computing"

@@ -28,7 +28,7 @@ from tests.e2e.conftest import KEY, SLOW, Start, write_rig
 from tests.e2e.page.conftest import PHONE, Visit, count, disabled, fits, looking, violations
 from tests.e2e.page.golden import looks_as_kept
 from tests.e2e.test_calibration_walk import write_rig as write_board_rig
-from tests.e2e.test_model_walk import ANGLES, STAGE, on_a_stage
+from tests.e2e.test_model_walk import ANGLES, TURNTABLE, on_a_turntable
 from tests.unit.catalogue.test_store import job, row
 
 if TYPE_CHECKING:
@@ -175,13 +175,13 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     assert violations(page) == []
 
 
-# As of a stage that was measured with a ruler.
+# As of a turntable that was measured with a ruler.
 COVARIANCE = np.diag([0.25, 0.0, 0.25, 1e-4, 0.0, 1e-4]).tolist()
 
 
 def test_scans_are_joined_and_an_object_is_turned_by_hand(start: Start, tmp_path: Path, visit: Visit) -> None:
     data = tmp_path / "data"
-    on_a_stage(data)
+    on_a_turntable(data)
     service = start(write_rig(tmp_path / "rig"), data)
     page = visit(service, "models", size=(1280, 1100), ignored="4")
     page.get_by_text("None yet.").wait_for()
@@ -192,11 +192,11 @@ def test_scans_are_joined_and_an_object_is_turned_by_hand(start: Start, tmp_path
     for number in reversed(range(len(ANGLES))):
         boxes.nth(number).check()
     page.get_by_role("button", name="Make one model of 3").click()
-    page.get_by_role("alert").get_by_text("axis: expected that of the stage").wait_for()
+    page.get_by_role("alert").get_by_text("axis: expected that of the turntable").wait_for()
     assert violations(page) == []
 
     with service.client() as client:
-        axis = {**STAGE, "covariance": COVARIANCE}
+        axis = {**TURNTABLE, "covariance": COVARIANCE}
         client.turntable.put({"format": "slrig-turntable", "version": 1, "axis": axis})
     page.get_by_role("button", name="Make one model of 3").click()
     page.get_by_text("succeeded").wait_for()
