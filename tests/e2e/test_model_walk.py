@@ -1,4 +1,4 @@
-"""Scans of an object on a turntable made one model over HTTP: the mesh is right, and a kill in the middle costs nothing."""
+"""Scans of an object on a turntable become one model over HTTP: the mesh is right, and a kill costs nothing."""
 
 from __future__ import annotations
 
