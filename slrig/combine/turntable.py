@@ -27,8 +27,7 @@ from slrig.bundle import (
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.records import utc_now
-from slrig.model import MeasuredAxis, TurntablePlane
-from slrig.multiview import MAX_AXIS_SIGMAS, AxisUpdate, update_axis
+from slrig.model import MAX_AXIS_SIGMAS, AxisUpdate, MeasuredAxis, TurntablePlane, update_axis
 
 _FILE = "turntable.json"
 _log = structlog.get_logger(__name__)

@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from slrig.bundle import AxisSource, ChangeEntry
-from slrig.multiview import AXIS_SPAN_MM
+from slrig.model import AXIS_SPAN_MM
 from slrig.reports.drawing import shape
 from slrig.reports.trend import (
     END,

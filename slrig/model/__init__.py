@@ -17,9 +17,12 @@ from slrig.model.capture import (
     trim_incomplete_codes,
 )
 from slrig.model.geometry import (
+    AXIS_SPAN_MM,
     DEVICE_PARAMETERS,
+    MAX_AXIS_SIGMAS,
     MIN_BASELINE_FRACTION,
     Axis,
+    AxisUpdate,
     Calibration,
     FloatArray,
     IntArray,
@@ -37,8 +40,10 @@ from slrig.model.geometry import (
     light_map_coordinates,
     require_array,
     triangulated_axis,
+    update_axis,
 )
 from slrig.model.lens import LENS_TERMS
+from slrig.model.noise import NoiseModel, fit_noise
 from slrig.model.patterns import (
     MIN_LINE_STEPS,
     Black,
@@ -74,8 +79,10 @@ from slrig.model.surface import (
 )
 
 __all__ = [
+    "AXIS_SPAN_MM",
     "DEVICE_PARAMETERS",
     "LENS_TERMS",
+    "MAX_AXIS_SIGMAS",
     "MAX_EXPOSURES",
     "MAX_MASK_CHARACTERS",
     "MIN_BASELINE_FRACTION",
@@ -83,6 +90,7 @@ __all__ = [
     "MIN_LINE_STEPS",
     "AlbedoMark",
     "Axis",
+    "AxisUpdate",
     "Black",
     "Calibration",
     "CameraFormat",
@@ -99,6 +107,7 @@ __all__ = [
     "LineShift",
     "MeasuredAxis",
     "Mesh",
+    "NoiseModel",
     "Pattern",
     "PatternSequence",
     "Pinhole",
@@ -125,6 +134,7 @@ __all__ = [
     "diagnostic_bits",
     "diagnostic_line_pairs",
     "exposure_groups",
+    "fit_noise",
     "from_gray",
     "gray_index",
     "has_even_shifts",
@@ -135,4 +145,5 @@ __all__ = [
     "to_gray",
     "triangulated_axis",
     "trim_incomplete_codes",
+    "update_axis",
 ]

@@ -4,9 +4,6 @@ from slrig.multiview.fusion import FusedModel, PoseErrors, concatenate_views, fu
 from slrig.multiview.markers import MarkerFit, MarkerObservation, MarkerObservations, marker_poses
 from slrig.multiview.registration import Registration, register_views
 from slrig.multiview.turntable import (
-    AXIS_SPAN_MM,
-    MAX_AXIS_SIGMAS,
-    AxisUpdate,
     BoardAxis,
     TurntableAxis,
     axis_from_board,
@@ -14,14 +11,10 @@ from slrig.multiview.turntable import (
     find_turntable_planes,
     fit_plane,
     register_on_turntable,
-    update_axis,
 )
 from slrig.multiview.unknown_poses import find_start_poses
 
 __all__ = [
-    "AXIS_SPAN_MM",
-    "MAX_AXIS_SIGMAS",
-    "AxisUpdate",
     "BoardAxis",
     "FusedModel",
     "MarkerFit",
@@ -40,5 +33,4 @@ __all__ = [
     "marker_poses",
     "register_on_turntable",
     "register_views",
-    "update_axis",
 ]

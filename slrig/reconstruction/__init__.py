@@ -12,7 +12,7 @@ from slrig.reconstruction.albedo import (
     Illumination,
     estimate_albedo,
 )
-from slrig.reconstruction.camera_response import NoiseModel, estimate_noise, fit_noise
+from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
 from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
 from slrig.reconstruction.decoding import DecodingLimits, RegionMask, decode, lit_pixels, unresolved_bits
@@ -81,7 +81,6 @@ __all__ = [
     "Illumination",
     "Image",
     "MergedCurves",
-    "NoiseModel",
     "PairRedundancy",
     "ProjectorPositions",
     "ReconstructionLimits",
@@ -101,7 +100,6 @@ __all__ = [
     "exposure_count",
     "exposure_use",
     "find_disagreement",
-    "fit_noise",
     "fuse_colour",
     "fuse_exposures",
     "has_phase",

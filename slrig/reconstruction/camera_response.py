@@ -23,7 +23,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
@@ -31,19 +30,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import FloatArray, IntArray, coarse_bit_count, diagnostic_bits
-from slrig.reconstruction.frames import AxisFrames, Images, select_rows, stack_rows, subsample
+from slrig.model import FloatArray, IntArray, NoiseModel, coarse_bit_count, diagnostic_bits, fit_noise
+from slrig.reconstruction.frames import AxisFrames, Images, stack_rows, subsample
 from slrig.reconstruction.surface_fit import stencils
 
 # Noise.
-_QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
 _MAX_SAMPLES = 200_000  # about 8000 for each bin
 _MIN_RANGE_SIGMA = 10.0  # of levels, in standard deviations of the noise, to fit a slope
 # Share of the brightest level that the darkest must be below; otherwise read noise is extrapolated, and too large.
 _DARK_SHARE = 0.25
 # Chosen. Half and double change stated errors on glossy surfaces that one exposure saturates.
-_BINS = 24
-_MIN_PER_BIN = 50
 _BOX = np.ones((3, 3), dtype=np.uint8)
 _MIN_BITS = 3
 _MIN_LIT = 0.02  # of full scale, white over black
@@ -84,52 +80,6 @@ _MAX_PIXELS = 200_000
 _GAMMA_ITERATIONS = 20  # each halves the interval of γ
 
 
-@dataclass(frozen=True, slots=True)
-class NoiseModel:
-    """variance(I) = read_variance · read_share + slope · shot_share · I, camera units squared.
-
-    read_variance, slope : of a frame as the camera gives it. read_share, shot_share : (H, W) float32, their remaining
-    share at each pixel of fused exposures (`slrig.reconstruction.fusion`); None for frames as the camera gives them,
-    where both are 1. loss : (8, 8), result of `compression_loss` for fused or linearised frames, which do not show it
-    any more; None for others.
-    """
-
-    read_variance: float
-    slope: float
-    read_share: NDArray[np.float32] | None = None
-    shot_share: NDArray[np.float32] | None = None
-    loss: FloatArray | None = None
-
-    def variance(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W) float32: expected variance of each sample of `image`."""
-        if self.read_share is None or self.shot_share is None:
-            # One array, because new memory costs more than the sums.
-            variance = np.maximum(image, 0)
-            variance *= np.float32(self.slope)
-            variance += np.float32(self.read_variance)
-            return np.asarray(variance)
-        read, shot = np.float32(self.read_variance) * self.read_share, np.float32(self.slope) * self.shot_share
-        return np.asarray(read + shot * np.maximum(image, 0), dtype=np.float32)
-
-    def variance_at(self, level: float) -> float:
-        """Variance of a sample of this level, for a frame as the camera gives it."""
-        return self.read_variance + self.slope * max(level, 0.0)
-
-    def rows(self, rows: slice | IntArray) -> NoiseModel:
-        """Select rows."""
-        return replace(
-            self, read_share=select_rows(self.read_share, rows), shot_share=select_rows(self.shot_share, rows)
-        )
-
-    def scale_variance(self, factor: float) -> NoiseModel:
-        """Multiply the variance of every sample."""
-        return replace(self, read_variance=self.read_variance * factor, slope=self.slope * factor)
-
-    def add_variance(self, variance: float) -> NoiseModel:
-        """Add variance to every sample, at all levels."""
-        return replace(self, read_variance=self.read_variance + variance)
-
-
 def estimate_noise(frames: AxisFrames) -> NoiseModel:
     """Fit the noise model to the frames of one camera.
 
@@ -148,12 +98,6 @@ def estimate_noise(frames: AxisFrames) -> NoiseModel:
     return fit_noise([sample_noise(frames)])
 
 
-def fit_noise(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> NoiseModel:
-    """Fit the noise model to the results of `sample_noise` for each exposure of one camera."""
-    levels, variances = zip(*samples, strict=True)
-    return _fit_model(np.concatenate(levels), np.concatenate(variances))
-
-
 def sample_noise(
     frames: AxisFrames, where: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -170,7 +114,7 @@ def sample_noise(
         level, variance = _scatter_of_bits(frames, coarse_count, where)
         by_lines = _scatter_of_lines(frames, where) if lines is None else _scatter_of_pairs(frames, lines, where)
         bright = float(np.median(frames.white))
-        if _fit_model(*by_lines).variance_at(bright) < _fit_model(level, variance).variance_at(bright):
+        if fit_noise([by_lines]).variance_at(bright) < fit_noise([(level, variance)]).variance_at(bright):
             level, variance = by_lines
     else:
         return _scatter_between_neighbours(frames, where, frames.white, frames.black)
@@ -290,35 +234,6 @@ def _scatter_between_neighbours(
         # The squared norm of the mask is 36.
         variances.append(second_difference[unclipped] ** 2 * (frames.reference_repeats / 36 / _MEDIAN_SQUARE))
     return np.concatenate(levels), np.concatenate(variances)
-
-
-def _fit_model(level: NDArray[np.float32], variance: NDArray[np.float32]) -> NoiseModel:
-    floor = NoiseModel(_QUANTISATION_VARIANCE, 0.0)
-    if len(level) < _MIN_PER_BIN:
-        return floor
-    # Sorted by level, a bin is a range of samples with its median level in the middle.
-    order = np.argsort(level)
-    level, variance = level[order], variance[order]
-    borders = np.unique(np.quantile(level, np.linspace(0, 1, _BINS + 1)))
-    # A sample on a border belongs to the bin above it, the largest to the last.
-    bin_ends = np.searchsorted(level, borders[1:-1], side="left")
-    points = [
-        (float(np.median(level[a:b])), float(np.median(variance[a:b])), int(b - a))
-        for a, b in pairwise([0, *bin_ends, len(level)])
-        if b - a >= _MIN_PER_BIN
-    ]
-    if not points:
-        return floor
-    x, y, weight = np.array(points).T
-    # Levels that hardly differ do not determine the slope.
-    if np.ptp(x) < _MIN_RANGE_SIGMA * np.sqrt(np.median(y)):
-        return NoiseModel(max(float(np.median(y)), _QUANTISATION_VARIANCE), 0.0)
-    # Weighted by 1/variance: the scatter of a variance grows with the variance.
-    root = np.sqrt(weight) / np.maximum(y, _QUANTISATION_VARIANCE)
-    slope, read = np.linalg.lstsq(np.stack([x, np.ones_like(x)], axis=1) * root[:, None], y * root, rcond=None)[0]
-    if slope <= 0:
-        return NoiseModel(max(float(np.average(y, weights=weight)), _QUANTISATION_VARIANCE), 0.0)
-    return NoiseModel(max(float(read), _QUANTISATION_VARIANCE), float(slope))
 
 
 class PixelSum(NamedTuple):

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.model import Axis, FloatArray, Refusal
-from slrig.reconstruction.camera_response import NoiseModel, compression_loss, linearisation_gain
+from slrig.model import Axis, FloatArray, NoiseModel, Refusal
+from slrig.reconstruction.camera_response import compression_loss, linearisation_gain
 from slrig.reconstruction.decoded_image import CodeTables, linearise_frames
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, FrameStacks, Images, rows_per_band, stack_rows

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import FloatArray, IntArray, Refusal
+from slrig.model import FloatArray, IntArray, NoiseModel, Refusal
 from slrig.reconstruction.camera_response import (
     CameraResponse,
-    NoiseModel,
     PixelSum,
     estimate_gamma,
     estimate_noise,

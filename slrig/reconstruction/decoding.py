@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
-from slrig.model import FloatArray, IntArray, Refusal
-from slrig.reconstruction.camera_response import NoiseModel
+from slrig.model import FloatArray, IntArray, NoiseModel, Refusal
 from slrig.reconstruction.frames import AxisFrames, rows_per_band, stack_rows
 
 _NOT_LIT = int(Refusal.NOT_LIT)

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Capture, FloatArray, Gray, Pattern, exposure_groups
-from slrig.reconstruction.camera_response import NoiseModel, compression_loss, fit_noise, sample_noise
+from slrig.model import Axis, Capture, FloatArray, Gray, NoiseModel, Pattern, exposure_groups, fit_noise
+from slrig.reconstruction.camera_response import compression_loss, sample_noise
 from slrig.reconstruction.frames import (
     NEAR_SATURATION,
     AxisFrames,

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.model import FloatArray, LineShift, has_even_shifts
-from slrig.reconstruction.camera_response import NoiseModel
+from slrig.model import FloatArray, LineShift, NoiseModel, has_even_shifts
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames, rows_per_band, stack_rows
 from slrig.reconstruction.surface_fit import stencils

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import FloatArray, IntArray, Pattern, Refusal
+from slrig.model import FloatArray, IntArray, NoiseModel, Pattern, Refusal
 from slrig.reconstruction.blur import correct_curvature, estimate_blur
-from slrig.reconstruction.camera_response import CameraResponse, NoiseModel, edge_pixel_sum, phase_pixel_sum
+from slrig.reconstruction.camera_response import CameraResponse, edge_pixel_sum, phase_pixel_sum
 from slrig.reconstruction.decoded_image import (
     CodeTables,
     DecodedImage,

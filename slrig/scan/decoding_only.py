@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from slrig.bundle import read_capture, write_file
 from slrig.disk import storage_errors
 from slrig.errors import PatternError, setting
-from slrig.model import Axis, Capture, Gray, Refusal, trim_incomplete_codes
+from slrig.model import Axis, Capture, Gray, NoiseModel, Refusal, trim_incomplete_codes
 from slrig.patterns import cell_positions, index_of_word
 from slrig.reconstruction import (
     AxisFrames,
     DecodingLimits,
-    NoiseModel,
     axis_frames,
     decode,
     estimate_noise,

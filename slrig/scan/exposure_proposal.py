@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slrig.capture import MIN_CONTRAST_DN, MIN_CONTRAST_TO_NOISE, NEAR_SATURATION, SampleMask, Samples
 from slrig.errors import ConfigError
-from slrig.reconstruction import NoiseModel, fit_noise
+from slrig.model import NoiseModel, fit_noise
 
 DECODED_CLEAR = 7.0
 """Noises that white lies above black where a pixel is decoded. On dark and mixed rendered reliefs, at nine exposures,

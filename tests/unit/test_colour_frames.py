@@ -18,10 +18,22 @@ from slrig.bundle import read_bundle, read_capture, write_bundle
 from slrig.bundle.reading import open_bundle
 from slrig.devices import ProjectorInfo
 from slrig.errors import BundleError, UnsupportedByDeviceError
-from slrig.model import Axis, Black, CameraFormat, Capture, Gray, PatternSequence, Pixels, Primary, Shot, Size, White
+from slrig.model import (
+    Axis,
+    Black,
+    CameraFormat,
+    Capture,
+    Gray,
+    NoiseModel,
+    PatternSequence,
+    Pixels,
+    Primary,
+    Shot,
+    Size,
+    White,
+)
 from slrig.model.capture import CaptureHeader
 from slrig.patterns.sequence import encode
-from slrig.reconstruction.camera_response import NoiseModel
 from slrig.reconstruction.fusion import FusedFrames, fuse_colour
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import in_colour

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from slrig.calibration.board import DEFAULT_BOARD
 from slrig.errors import TurntableRefusedError
-from slrig.model import FloatArray, MeasuredAxis
-from slrig.multiview.turntable import BoardAxis, axis_from_board, update_axis
+from slrig.model import FloatArray, MeasuredAxis, update_axis
+from slrig.multiview.turntable import BoardAxis, axis_from_board
 
 POINT_MM = np.array([12.0, 60.0, 480.0])
 DIRECTION = np.array([0.05, -0.93, -0.36]) / np.linalg.norm([0.05, -0.93, -0.36])

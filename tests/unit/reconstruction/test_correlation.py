@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import convolve
 
-from slrig.model import FloatArray
-from slrig.reconstruction.camera_response import NoiseModel, PixelSum, edge_pixel_sum, estimate_noise, noise_correlation
+from slrig.model import FloatArray, NoiseModel
+from slrig.reconstruction.camera_response import PixelSum, edge_pixel_sum, estimate_noise, noise_correlation
 from slrig.reconstruction.frames import AxisFrames
 from tests.unit.reconstruction.builders import code_frames, grid
 

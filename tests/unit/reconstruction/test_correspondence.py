@@ -10,10 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from slrig.model import Axis, FloatArray, Gray, LineShift, Pattern, Size
+from slrig.model import Axis, FloatArray, Gray, LineShift, NoiseModel, Pattern, Size
 from slrig.patterns.codes import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.patterns.sequence import profile
-from slrig.reconstruction.camera_response import NoiseModel
 from slrig.reconstruction.correspondence import (
     CorrespondenceLimits,
     ProjectorPositions,

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.model import Axis, Gray, IntArray, Refusal
+from slrig.model import Axis, Gray, IntArray, NoiseModel, Refusal
 from slrig.patterns.codes import index_of_word
-from slrig.reconstruction.camera_response import NoiseModel
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames
 from tests.unit.reconstruction.builders import code_frames

@@ -18,6 +18,7 @@ from slrig.model import (
     FloatArray,
     Gray,
     LineShift,
+    NoiseModel,
     Pattern,
     Refusal,
     Shot,
@@ -25,7 +26,7 @@ from slrig.model import (
     White,
 )
 from slrig.patterns.codes import cell_positions, index_of_word
-from slrig.reconstruction.camera_response import NoiseModel, estimate_noise
+from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, axis_frames
 from slrig.reconstruction.fusion import FusedFrames, exposure_use, fuse_exposures

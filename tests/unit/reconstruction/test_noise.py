@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.model import FloatArray
-from slrig.reconstruction.camera_response import NoiseModel, estimate_noise
+from slrig.model import FloatArray, NoiseModel
+from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.frames import AxisFrames
 from tests.unit.reconstruction.builders import code_frames, grid
 

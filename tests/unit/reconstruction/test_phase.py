@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from slrig.kernels import in_bands
-from slrig.model import Axis, FloatArray, LineShift
-from slrig.reconstruction.camera_response import NoiseModel
+from slrig.model import Axis, FloatArray, LineShift, NoiseModel
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.phase import (

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from slrig.meshing.surface import compact_mesh
-from slrig.model import AlbedoMark, Axis, FloatArray, Mesh, Pinhole, Refusal, Size
-from slrig.reconstruction.camera_response import NoiseModel
+from slrig.model import AlbedoMark, Axis, FloatArray, Mesh, NoiseModel, Pinhole, Refusal, Size
 from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.pipeline import CameraCurves
 from slrig.scan.colouring import Coloured, albedo_report, coloured
