@@ -77,7 +77,8 @@ def test_other_rooms_import_what_a_room_exports(room: str) -> None:
 
 def test_the_service_loads_no_mathematics() -> None:
     """A package that exports mathematics is imported by the worker and by commands that compute, not by the service."""
-    code = "import sys, slrig.api.app, slrig.api.server; print(*[m for m in ('numba', 'scipy.optimize', 'scipy.spatial') if m in sys.modules])"
+    heavy = ("numba", "scipy.optimize", "scipy.spatial")
+    code = f"import sys, slrig.api.app, slrig.api.server; print(*[m for m in {heavy} if m in sys.modules])"
     found = subprocess.run(  # noqa: S603 - our own interpreter and code
         [sys.executable, "-c", code],
         cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=True, timeout=60,
