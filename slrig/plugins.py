@@ -45,6 +45,17 @@ class FileFormat:
         """The command that installs the library; None if it is installed."""
         return None if importlib.util.find_spec(self.library) is not None else self.install
 
+    def matches(self, name: str) -> bool:
+        """True if a file of this name has this format.
+
+        >>> FileFormat("points-{camera}.xyz", "text/plain", "json", "", "").matches("points-left.xyz")
+        True
+        """
+        before, of_camera, after = self.name.partition("{camera}")
+        if not of_camera:
+            return name == self.name
+        return name.startswith(before) and name.endswith(after) and len(name) > len(before) + len(after)
+
     def load(self) -> Callable[..., bytes]:
         """Import the encoder."""
         module, _, function = self.encoder.partition(":")

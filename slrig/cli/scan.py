@@ -15,7 +15,7 @@ from slrig.cli.quality import quality_lines
 from slrig.client import Client, ScanJob
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
-from slrig.scan.offered import PREFIXES, installed_by, offered
+from slrig.scan.offered import camera_prefixes, installed_by, offered
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
@@ -156,7 +156,7 @@ def _completed(
 def _require_offered(client: Client, files: Sequence[str]) -> None:
     """Refuse names that no scan has before minutes are spent on one."""
     unknown, cameras = [name for name in files if name not in offered(())], []
-    if unknown and all(name.startswith(PREFIXES) for name in unknown):
+    if unknown and all(name.startswith(camera_prefixes()) for name in unknown):
         # A file per camera: which there are is known once the rig is open.
         cameras = [each["name"] for each in client.get("/rig")["cameras"]]
         unknown = [name for name in unknown if cameras and name not in offered(cameras)]

@@ -6,7 +6,6 @@ Loads nothing: a command asks it before anything is shot.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from pathlib import PurePath
 
 from slrig.plugins import formats
 
@@ -62,8 +61,14 @@ def requested_forms() -> Mapping[str, str]:
     return {**CLOUDS, **{each.name: each.media_type for each in formats()}}
 
 
-PREFIXES = ("rejected-", "causes-", "depth-", "points-")
-"""Beginnings of the names of a camera's files."""
+def camera_prefixes() -> tuple[str, ...]:
+    """Beginnings of the names of a camera's files.
+
+    >>> camera_prefixes()
+    ('rejected-', 'causes-', 'depth-', 'points-')
+    """
+    of_cameras = {form.partition("{")[0] for form in requested_forms() if "{camera}" in form}
+    return "rejected-", "causes-", *sorted(of_cameras)
 
 
 def camera_files(camera: str) -> tuple[str, ...]:
@@ -77,8 +82,8 @@ def camera_files(camera: str) -> tuple[str, ...]:
 
 
 def missing_for(name: str) -> str | None:
-    """The command that installs what a file of this name needs; None if nothing is missing."""
-    return next((each.missing for each in formats() if PurePath(each.name).suffix == PurePath(name).suffix), None)
+    """The command that installs what a file of this name, or form, needs; None if nothing is missing."""
+    return next((each.missing for each in formats() if each.matches(name)), None)
 
 
 def installed_by(name: str) -> str | None:
@@ -87,7 +92,7 @@ def installed_by(name: str) -> str | None:
     >>> installed_by("points-left.e57"), installed_by("points-left.npz")
     ("pip install 'slrig[e57]'", None)
     """
-    return next((each.install for each in formats() if PurePath(each.name).suffix == PurePath(name).suffix), None)
+    return next((each.install for each in formats() if each.matches(name)), None)
 
 
 def on_demand(name: str, cameras: Iterable[str]) -> tuple[str, str | None] | None:

@@ -8,8 +8,10 @@ from collections.abc import Iterator
 import pytest
 
 from slrig import plugins
+from slrig.config import ServiceSettings
 from slrig.errors import ConfigError
-from slrig.scan.offered import missing_for, on_demand, requested_forms
+from slrig.scan.offered import camera_prefixes, missing_for, on_demand, requested_forms
+from slrig.schedule.receivers import wanted_kinds
 
 
 @pytest.fixture
@@ -28,12 +30,23 @@ def test_a_format_of_a_plugin_is_offered_and_names_what_it_needs(entries: list[i
     assert on_demand("cloud-left.xyz", ["right", "left"]) == ("cloud-{camera}.xyz", "left")
     assert missing_for("cloud-left.xyz") == "pip install xyz"
     assert FORMAT.load() is encode
+    assert "cloud-left.xyz".startswith(camera_prefixes())
+    # Another file with the same ending needs nothing.
+    assert missing_for("points-left.xyz") is None
 
 
 def test_a_plugin_that_cannot_be_loaded_is_named(entries: list[importlib.metadata.EntryPoint]) -> None:
     entries.append(importlib.metadata.EntryPoint("broken", "slrig.no_such_module:x", plugins.RECEIVERS))
     with pytest.raises(ConfigError, match=r"slrig\.receivers: 'broken' .* cannot be loaded: ModuleNotFoundError"):
         plugins.load(plugins.RECEIVERS)
+
+
+def test_a_receiver_that_settings_name_is_not_left_out_in_silence(
+    entries: list[importlib.metadata.EntryPoint],
+) -> None:
+    assert entries == []
+    with pytest.raises(ConfigError, match=r"^mqtt_url: no installed package sends notices there"):
+        wanted_kinds(ServiceSettings(mqtt_url="mqtt://127.0.0.1/rigs"))
 
 
 def encode(_cloud: object) -> bytes:
