@@ -43,7 +43,7 @@ from slrig.model.geometry import (
     update_axis,
 )
 from slrig.model.lens import LENS_TERMS
-from slrig.model.noise import NoiseModel, fit_noise
+from slrig.model.noise import MIN_RANGE_SIGMA, NoiseModel, fit_noise
 from slrig.model.patterns import (
     MIN_LINE_STEPS,
     Black,
@@ -88,6 +88,7 @@ __all__ = [
     "MIN_BASELINE_FRACTION",
     "MIN_EXPOSURES",
     "MIN_LINE_STEPS",
+    "MIN_RANGE_SIGMA",
     "AlbedoMark",
     "Axis",
     "AxisUpdate",

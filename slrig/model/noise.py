@@ -13,7 +13,8 @@ from slrig.model.geometry import FloatArray, IntArray
 
 _QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
 _BINS = 24
-_MIN_RANGE_SIGMA = 10.0  # of levels, in standard deviations of the noise, to fit a slope
+MIN_RANGE_SIGMA = 10.0
+"""Least range of levels, in standard deviations of the noise, that determines the slope."""
 _MIN_PER_BIN = 50
 
 
@@ -64,12 +65,8 @@ class NoiseModel:
 
 
 def fit_noise(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> NoiseModel:
-    """Fit the noise model to the results of `sample_noise` for each exposure of one camera."""
-    levels, variances = zip(*samples, strict=True)
-    return _fit_model(np.concatenate(levels), np.concatenate(variances))
-
-
-def _fit_model(level: NDArray[np.float32], variance: NDArray[np.float32]) -> NoiseModel:
+    """Fit the noise model to levels and variances of samples, (n,) float32 each, of each exposure of one camera."""
+    level, variance = map(np.concatenate, zip(*samples, strict=True))
     floor = NoiseModel(_QUANTISATION_VARIANCE, 0.0)
     if len(level) < _MIN_PER_BIN:
         return floor
@@ -88,7 +85,7 @@ def _fit_model(level: NDArray[np.float32], variance: NDArray[np.float32]) -> Noi
         return floor
     x, y, weight = np.array(points).T
     # Levels that hardly differ do not determine the slope.
-    if np.ptp(x) < _MIN_RANGE_SIGMA * np.sqrt(np.median(y)):
+    if np.ptp(x) < MIN_RANGE_SIGMA * np.sqrt(np.median(y)):
         return NoiseModel(max(float(np.median(y)), _QUANTISATION_VARIANCE), 0.0)
     # Weighted by 1/variance: the scatter of a variance grows with the variance.
     root = np.sqrt(weight) / np.maximum(y, _QUANTISATION_VARIANCE)

@@ -30,13 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import FloatArray, IntArray, NoiseModel, coarse_bit_count, diagnostic_bits, fit_noise
+from slrig.model import MIN_RANGE_SIGMA, FloatArray, IntArray, NoiseModel, coarse_bit_count, diagnostic_bits, fit_noise
 from slrig.reconstruction.frames import AxisFrames, Images, stack_rows, subsample
 from slrig.reconstruction.surface_fit import stencils
 
 # Noise.
 _MAX_SAMPLES = 200_000  # about 8000 for each bin
-_MIN_RANGE_SIGMA = 10.0  # of levels, in standard deviations of the noise, to fit a slope
 # Share of the brightest level that the darkest must be below; otherwise read noise is extrapolated, and too large.
 _DARK_SHARE = 0.25
 # Chosen. Half and double change stated errors on glossy surfaces that one exposure saturates.
@@ -127,7 +126,7 @@ def sample_noise(
 def _determines_slope(level: NDArray[np.float32], variance: NDArray[np.float32]) -> bool:
     """Return True if levels differ by more than noise and some are dark, without the outermost hundredths."""
     low, high = np.quantile(level, (0.01, 0.99))
-    return bool(high - low >= _MIN_RANGE_SIGMA * np.sqrt(np.median(variance)) and low < _DARK_SHARE * high)
+    return bool(high - low >= MIN_RANGE_SIGMA * np.sqrt(np.median(variance)) and low < _DARK_SHARE * high)
 
 
 def _scatter_of_sums(
