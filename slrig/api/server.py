@@ -96,7 +96,7 @@ def open_service(
     runner = Runner(
         store,
         folder,
-        RigSession(rig.name, lambda: open_rig(rig), table_at=folder.root / "turntable" / "position.json"),
+        RigSession(rig.name, lambda: open_rig(rig), table_at=folder.root / "turntable" / "table.json"),
         worker,
         capture=capture_frames,
         queue_length=settings.queue_length,

@@ -141,7 +141,7 @@ class TurntableStore:
             return record
 
     def delete(self) -> None:
-        """Forget the turntable, whatever the file holds. Idempotent."""
+        """Delete the turntable file. Idempotent."""
         with self._lock, storage_errors(self._path), suppress(FileNotFoundError):
             self._path.unlink()
             sync_folder(self._path.parent)
