@@ -12,6 +12,13 @@ from slrig.reconstruction.albedo import (
     Illumination,
     estimate_albedo,
 )
+from slrig.reconstruction.calibration_check import (
+    CalibrationCheck,
+    CalibrationFit,
+    Correspondences,
+    check_calibration,
+    find_correspondences,
+)
 from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
 from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
@@ -19,6 +26,7 @@ from slrig.reconstruction.decoding import DecodingLimits, RegionMask, decode, li
 from slrig.reconstruction.frames import (
     NEAR_SATURATION,
     AxisFrames,
+    AxisPatterns,
     FrameStacks,
     Image,
     axis_frames,
@@ -41,6 +49,7 @@ from slrig.reconstruction.merging import (
 )
 from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.pipeline import CameraCurves, CameraStream, camera_curves
+from slrig.reconstruction.second_axis import AxisPositions, axis_residuals, decode_second_axis
 from slrig.reconstruction.triangulation import (
     CONVERGED,
     SheetCurves,
@@ -70,10 +79,15 @@ __all__ = [
     "Albedo",
     "AlbedoSamples",
     "AxisFrames",
+    "AxisPatterns",
+    "AxisPositions",
+    "CalibrationCheck",
+    "CalibrationFit",
     "CameraCurves",
     "CameraStream",
     "CodeTables",
     "CorrespondenceLimits",
+    "Correspondences",
     "DecodingLimits",
     "ExposureUse",
     "FrameStacks",
@@ -89,16 +103,20 @@ __all__ = [
     "SheetCurves",
     "axis_frames",
     "axis_patterns",
+    "axis_residuals",
     "calibration_modes",
     "calibration_sigma",
     "camera_curves",
+    "check_calibration",
     "decode",
+    "decode_second_axis",
     "distorted_from_pixel",
     "estimate_albedo",
     "estimate_noise",
     "evaluate_redundancy",
     "exposure_count",
     "exposure_use",
+    "find_correspondences",
     "find_disagreement",
     "fuse_colour",
     "fuse_exposures",

@@ -26,6 +26,7 @@ from slrig.capture import Evidence, EvidenceSummary, check_exposures, checked_fr
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
 from slrig.model import MIN_BASELINE_FRACTION, Axis, Calibration, CaptureHeader, Region, Shot, trim_incomplete_codes
 from slrig.reconstruction import exposure_count
+from slrig.scan.agreement import AxisAgreement, check_cameras
 from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
@@ -54,6 +55,7 @@ class Walked:
     cell_px: float
     sections: dict[str, object]
     notes: list[str]
+    agreement: AxisAgreement
 
 
 def measured(
@@ -110,8 +112,11 @@ def _tried(
         require_surface(any(each.curves.stripe_count > 0 for each in seen), folder, "no stripe was found", seen)
     except NothingToReconstructError as error:
         return error
+    entered("compare axes", 0.58, "")
+    agreeing, agreement = check_cameras(folder, seen, walked.devices.projector, walked.axis)
+    walked = replace(walked, seen=agreeing, agreement=agreement, notes=[*walked.notes, *agreement.notes])
     entered("triangulate", 0.6, "")
-    return walked, triangulated(seen, walked.devices.projector, walked.axis, region)
+    return walked, triangulated(agreeing, walked.devices.projector, walked.axis, region, agreement.checks)
 
 
 def _is_weak(tried: tuple[Walked, Triangulated] | NothingToReconstructError) -> bool:
@@ -223,7 +228,8 @@ def _walked(
         *camera_notes(seen),
         *unresolved_notes(seen, step, cell),
     ]
-    return Walked(devices, stream.axis, stream.header.axes, seen, step, cell, sections, notes)
+    agreement = AxisAgreement(stream.axis, {})
+    return Walked(devices, stream.axis, stream.header.axes, seen, step, cell, sections, notes, agreement)
 
 
 def _streamed(

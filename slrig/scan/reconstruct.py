@@ -32,6 +32,7 @@ from slrig.reconstruction import (
     sigma_along_normal,
     stripe_tangents,
 )
+from slrig.scan.agreement import agreement_report, axis_error
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.colouring import albedo_report, coloured
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface
@@ -265,6 +266,9 @@ def _meshed(
     apart = find_disagreement(joined_curves, share)
     if apart is not None:
         sigma = np.hypot(sigma, apart.sigma_mm)
+    tested = axis_error(walked.agreement, joined_curves, [each.name for each in cameras], surface.normals, sigma)
+    if tested is not None:
+        sigma = np.hypot(sigma, tested.sigma_mm)
     limit_mm = None if plan.region is None else plan.region.max_sigma_mm
     if limit_mm is not None:
         known = sigma <= limit_mm
@@ -296,9 +300,12 @@ def _meshed(
         cameras=cameras,
         stages=surface.stages,
         figures=mesh_report(surface, mesh, curves),
-        redundancy=redundancy_report(joined_curves, points.source, found.spare),
+        redundancy={
+            **redundancy_report(joined_curves, points.source, found.spare),
+            **agreement_report(walked.agreement),
+        },
         albedo=albedo_report(colours, mesh, cameras, lit=projector is not None, mapped=light is not None),
-        notes=() if apart is None else (str(apart),),
+        notes=(*(() if apart is None else (str(apart),)), *(() if tested is None else (tested.note,))),
     )
 
 

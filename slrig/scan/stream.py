@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture import EvidenceSummary
+from slrig.errors import PatternError
 from slrig.model import (
     Axis,
     Black,
@@ -38,9 +39,12 @@ from slrig.patterns import cell_positions, edge_positions, index_of_word, line_p
 from slrig.reconstruction import (
     NEAR_SATURATION,
     AxisFrames,
+    AxisPatterns,
+    AxisPositions,
     CameraCurves,
     CameraStream,
     CodeTables,
+    Correspondences,
     ExposureUse,
     FrameStacks,
     FusedFrames,
@@ -50,8 +54,10 @@ from slrig.reconstruction import (
     axis_frames,
     axis_patterns,
     camera_curves,
+    decode_second_axis,
     exposure_count,
     exposure_use,
+    find_correspondences,
     fuse_colour,
     fuse_exposures,
     linearise,
@@ -80,7 +86,8 @@ class CameraResult:
     white : (H, W) uint16, the white frame in camera units; full_scale : of them what to show as white; contrast :
     (H, W, C) float32, white minus black in proportion to light, as grey or as red, green and blue. A bracket's are
     those of the longest exposure, and go beyond the camera's full scale. clipped : (H, W) bool, where white is no
-    measure of light. exposures : of a bracket, from short to long.
+    measure of light. exposures : of a bracket, from short to long. second : what the other axis shows, None where it
+    was not played.
     """
 
     name: str
@@ -91,6 +98,20 @@ class CameraResult:
     clipped: NDArray[np.bool_]
     full_scale: float
     exposures: tuple[ExposureUse, ...] = ()
+    second: SecondAxisResult | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SecondAxisResult:
+    """Light of the axis that is not triangulated by, at one camera.
+
+    positions : (H, W), projector position along that axis; pairs : camera and projector pixels that both axes give;
+    codes : Gray codes of columns and rows.
+    """
+
+    positions: AxisPositions
+    pairs: Correspondences
+    codes: tuple[Gray, Gray]
 
 
 class ScanStream:
@@ -150,6 +171,7 @@ class ScanStream:
             camera = self._cameras.pop(name)
             curves, frames, fused = camera.finish()
             part, used = camera.part, curves.refusal == Refusal.NONE
+            second = camera.second_axis(curves)
             white, black = (camera.colour(each, fused) for each in (White(), Black()))
             clipped = frames.white >= NEAR_SATURATION * frames.clipped_at
             if white is None or black is None:
@@ -176,6 +198,7 @@ class ScanStream:
                     clipped=clipped,
                     full_scale=frames.full_scale if fused is None else _shown_white(frames, used),
                     exposures=() if fused is None else exposure_use(fused, used),
+                    second=second,
                 )
             )
         return seen
@@ -219,6 +242,7 @@ class _CameraFrames:
         used = [header.patterns[index] for index in self._waiting.elements()]
         self._wanted = Counter(used)
         self._stream: CameraStream | None = None
+        self._second: FrameStacks | None = None
         patterns = axis_patterns(self._wanted, name, axis)
         if one_exposure and all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift)):
             form = header.cameras[name]
@@ -232,6 +256,8 @@ class _CameraFrames:
             self._stream = CameraStream(
                 stacks, tables, ReconstructionLimits(), report_step=self._entered, region=self._asked
             )
+            if (second := self._second_patterns()) is not None:
+                self._second = FrameStacks(second, form.size.shape, full_scale=float(form.full_scale))
 
     @property
     def _asked(self) -> RegionMask | None:
@@ -259,7 +285,10 @@ class _CameraFrames:
         repeats = self._repeats.setdefault(pattern, [])
         repeats.append(shot.image)
         if len(repeats) == self._wanted[pattern]:
-            self._stream.take(pattern, mean_image(self._repeats.pop(pattern)))
+            image = mean_image(self._repeats.pop(pattern))
+            self._stream.take(pattern, image)
+            if self._second is not None:
+                self._second.put(pattern, image)
 
     def finish(self) -> tuple[CameraCurves, AxisFrames, FusedFrames | None]:
         """The curves, and the frames that they were found in; and how these were fused, if they are a bracket's."""
@@ -269,16 +298,51 @@ class _CameraFrames:
         capture = Capture(header.projector, header.patterns, header.cameras, tuple(self._kept))
         for shot in used_shots(capture, self._name):
             self._keep_colour(shot)
+        second = self._second_patterns()
         if exposure_count([shot.exposure_s for shot in self._kept]) > 1:
             fused = fuse_exposures(capture, self._name, self._axis)
             frames, noise = fused.frames, fused.noise
+            if second is not None:
+                self._second = FrameStacks.from_frames(fuse_exposures(capture, self._name, second.gray.axis).frames)
         else:
             frames, noise = axis_frames(capture, self._name, self._axis), None
+            if second is not None:
+                self._second = FrameStacks.from_frames(axis_frames(capture, self._name, second.gray.axis))
         tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
         curves = camera_curves(
             frames, tables, ReconstructionLimits(), report_step=self._entered, noise=noise, region=self._asked
         )
         return curves, frames, fused
+
+    def _second_patterns(self) -> AxisPatterns | None:
+        """Patterns of the other axis, None where its code is not complete."""
+        other = Axis.ROW if self._axis is Axis.COLUMN else Axis.COLUMN
+        try:
+            return axis_patterns(self._wanted, self._name, other)
+        except PatternError:
+            return None
+
+    def second_axis(self, curves: CameraCurves) -> SecondAxisResult | None:
+        """Decode the other axis, if it was played. curves : of the first, in the pixels of `part`."""
+        if self._second is None or self._second.missing:
+            return None
+        stacks, self._second = self._second, None
+        if curves.gamma != 1:
+            stacks.linearise(curves.gamma)
+        frames = stacks.frames()
+        tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
+        second = decode_second_axis(frames, curves.noise, tables, ReconstructionLimits().decoding)
+        pairs = find_correspondences(curves.ensemble, second, self._axis)
+        positions = second.positions
+        if self.part is not None:
+            origin = np.array([self.part.columns.start, self.part.rows.start])
+            pairs = replace(pairs, camera_px=pairs.camera_px + origin)
+            positions = AxisPositions(*(self.part.placed(each, beyond=np.nan) for each in (
+                positions.position_px, positions.sigma_px
+            )))  # fmt: skip
+        mine = axis_patterns(self._wanted, self._name, self._axis).gray
+        codes = (mine, frames.gray) if self._axis is Axis.COLUMN else (frames.gray, mine)
+        return SecondAxisResult(positions, pairs, codes)
 
     def _keep_colour(self, shot: Shot) -> None:
         pattern = self._header.patterns[shot.pattern]

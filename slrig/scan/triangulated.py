@@ -5,8 +5,9 @@ And what follows where a camera does not resolve the finest patterns: wider step
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from slrig.errors import setting
 from slrig.meshing import runs_of_curve_parts
 from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Region, baseline_fraction, depth_sensitive_cameras
 from slrig.reconstruction import (
+    CalibrationCheck,
     CameraCurves,
     MergedCurves,
     Redundancy,
@@ -26,6 +28,7 @@ from slrig.reconstruction import (
     triangulate_camera_pair,
     triangulate_camera_projector,
 )
+from slrig.scan.agreement import leave_out_contradicted
 from slrig.scan.limited import limited
 from slrig.scan.report import lit_share
 from slrig.scan.stream import CameraResult
@@ -51,7 +54,11 @@ class Triangulated:
 
 
 def triangulated(
-    cameras: list[CameraResult], projector: Pinhole | None, axis: Axis, region: Region | None = None
+    cameras: list[CameraResult],
+    projector: Pinhole | None,
+    axis: Axis,
+    region: Region | None = None,
+    checks: Mapping[str, CalibrationCheck | None] = MappingProxyType({}),
 ) -> Triangulated:
     """Triangulate the curves of an axis; without a projector, of at least two cameras. region : what of it counts.
 
@@ -74,6 +81,10 @@ def triangulated(
             for seen, (part, cause) in zip(cameras, met, strict=True)
         ]
         parts = [part for part, _ in met]
+        for index, seen in enumerate(told):
+            told[index], parts[index] = leave_out_contradicted(
+                seen, parts[index], projector, axis, checks.get(seen.name)
+            )
         if region is not None:
             for index, seen in enumerate(told):
                 parts[index], told[index] = _limited(region, seen, parts[index])

@@ -1,0 +1,594 @@
+"""Test of a calibration by light of both axes.
+
+A camera pixel with a decoded column c and row r gives two rays. For the right calibration they intersect, which is one
+equation more than the three unknowns of the point: the projector pixel (c, r) is on the epipolar line of the camera
+pixel. The distance from that line is the residual, in projector pixels.
+
+The residuals determine five of the six parameters of the relative pose (not the length of the baseline), so that they
+show errors of depth, too: `fit_calibration` searches the smallest change of pose and lenses that explains them, and
+`CalibrationFit.displacement_mm` what it means for each point. If the residuals are larger than any small change,
+`explain_residuals` tries mistakes that people and programs make, and names the one that brings agreement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy import linalg
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from slrig.model import Axis, FloatArray, Gray, Pinhole, Size, from_gray, to_gray
+from slrig.reconstruction.identification import StripeEnsemble
+from slrig.reconstruction.phase import has_phase
+from slrig.reconstruction.second_axis import SecondAxis
+from slrig.reconstruction.triangulation import pixel_rays, project
+
+_MAX_POINTS = 20_000  # of a check; their mean is known to a hundredth of their scatter
+_EDGE_SIGMA_PX = 0.1  # of a code edge along a stripe
+_FIT_POINTS = 8_000
+_TRIAL_POINTS = 1_000
+_MIN_POINTS = 200
+_CELLS = 8  # along each side of the image, for the systematic part of the residuals
+_MIN_CELL_POINTS = 30
+_MIN_IN_FRONT = 0.9  # share of points in front of both devices, for a calibration that can be right
+_AGREES_PX = 0.5  # median residual of a right calibration with code cells of one pixel is 0.15 px
+_REFUTED_PX, _REFUTED_SIGMA = 5.0, 20.0
+_SIGNIFICANT_CHI2 = 10.0  # for each parameter of a fit: by chance once in 10^8 scans
+_PRIOR_FOCAL, _PRIOR_CENTRE, _PRIOR_K1 = 0.03, 0.03, 0.05  # relative to focal length and width; radial distortion
+_MAX_LOG_SCALE, _MAX_SHIFT = np.log(4), 1.0  # of a picture; the shift relative to its width
+_SCALES = [np.array([each]) for each in np.linspace(-1.3, 1.3, 57)]
+_OUTLIER_SIGMA = 3.0  # scale of the robust loss
+_MAX_CAUSES, _AS_SIMPLE = 2, 4  # causes to name, and free parameters between equally likely ones
+_SIMPLER = 1.5  # a cause without free parameters is preferred up to this ratio of residuals
+_MAX_LENS_PX = 2.0  # residual of the best pose beyond which no small change of a lens helps
+_MAX_TURN_DEG = 20.0  # more is no device that moved a little
+
+
+@dataclass(frozen=True, slots=True)
+class Correspondences:
+    """Pixels of a camera and of the projector that show the same point.
+
+    camera_px, projector_px : (n, 2) float64, (column, row); sigma_px : (n,) float64, standard deviation of the
+    coordinate of the second axis; axis : the one that numbers the stripes, whose coordinate is exact.
+    """
+
+    camera_px: FloatArray
+    projector_px: FloatArray
+    sigma_px: FloatArray
+    axis: Axis
+
+    def __len__(self) -> int:
+        return len(self.camera_px)
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Correspondences:
+        """Select some."""
+        return Correspondences(self.camera_px[index], self.projector_px[index], self.sigma_px[index], self.axis)
+
+    def thinned(self, count: int) -> Correspondences:
+        """At most about `count`, evenly from all."""
+        return self.take(slice(None, None, max(1, len(self) // count)))
+
+
+def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axis) -> Correspondences:
+    """Projector pixels of stripe points: by phase at up to 20 000 points, otherwise where stripes cross code edges.
+
+    axis : the one that numbers the stripes.
+    """
+    points = ensemble.points_px
+    coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))
+    if has_phase(second.frames):
+        step = max(1, len(points) // _MAX_POINTS)
+        points, coded = points[::step], coded[::step]
+        other, sigma = second.positions.sample(points)
+        known = np.isfinite(other)
+        points, coded, other, sigma = points[known], coded[known], other[known], sigma[known]
+    else:
+        ends = ensemble.bridge_after.copy()
+        ends[ensemble.offsets[1:] - 1] = True
+        index, share, other = second.edges(points, ends)
+        points = points[index] + share[:, None] * (points[index + 1] - points[index])
+        coded, sigma = coded[index], np.full(len(index), _EDGE_SIGMA_PX)
+    pair = (coded, other) if axis is Axis.COLUMN else (other, coded)
+    return Correspondences(points, np.column_stack(pair), sigma, axis)
+
+
+@dataclass(frozen=True, slots=True)
+class _RayPairs:
+    """Rays of both devices in the world, (n, 3) each, and what the epipolar distance needs."""
+
+    camera: FloatArray
+    projector: FloatArray
+    baseline_mm: FloatArray
+    rotation: FloatArray
+    focal_px: float
+
+    @classmethod
+    def from_devices(cls, camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> _RayPairs:
+        return cls(
+            pixel_rays(camera, pairs.camera_px),
+            pixel_rays(projector, pairs.projector_px),
+            projector.centre_mm - camera.centre_mm,
+            projector.rotation,
+            float(np.sqrt(projector.matrix[0, 0] * projector.matrix[1, 1])),
+        )
+
+    def residual_px(self) -> FloatArray:
+        """(n,) distance of each projector pixel from its epipolar line; NaN where a lens images no such pixel."""
+        line = np.cross(self.baseline_mm, self.camera) @ self.rotation.T
+        pixel = self.projector @ self.rotation.T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            distance = (line * pixel).sum(axis=1) / pixel[:, 2] / np.hypot(line[:, 0], line[:, 1])
+        return np.asarray(distance * self.focal_px)
+
+    def in_front(self) -> float:
+        """Share of the points in front of both devices."""
+        cc, cp, pp = ((a * b).sum(axis=1) for a, b in (
+            (self.camera, self.camera), (self.camera, self.projector), (self.projector, self.projector)
+        ))  # fmt: skip
+        cb, pb = self.camera @ self.baseline_mm, self.projector @ self.baseline_mm
+        with np.errstate(invalid="ignore"):
+            return float(np.mean((pp * cb - cp * pb > 0) & (cp * cb - cc * pb > 0)))
+
+
+def epipolar_residual_px(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> FloatArray:
+    """(n,) float64: distance of each projector pixel from the epipolar line of its camera pixel."""
+    return _RayPairs.from_devices(camera, projector, pairs).residual_px()
+
+
+def _disagreement_px(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> float:
+    """Median distance from the epipolar line; infinite if points are behind a device or lenses image no such pixels."""
+    rays = _RayPairs.from_devices(camera, projector, pairs)
+    distance = np.abs(rays.residual_px())
+    if np.isfinite(distance).mean() < _MIN_IN_FRONT or rays.in_front() < _MIN_IN_FRONT:
+        return float("inf")
+    return float(np.nanmedian(distance))
+
+
+def _depth_mm(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> FloatArray:
+    """(n,) depth along each camera ray at which it meets the light sheet of the coded position."""
+    along = 1 if pairs.axis is Axis.COLUMN else 0
+    step = np.zeros(2)
+    step[along] = 1.0
+    ends = [pixel_rays(projector, pairs.projector_px + sign * step) for sign in (-1, 1)]
+    normal = np.cross(ends[0], ends[1])
+    rays = pixel_rays(camera, pairs.camera_px)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(normal @ (projector.centre_mm - camera.centre_mm) / (normal * rays).sum(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFit:
+    """Smallest change of the calibration that explains the residuals of both axes.
+
+    camera, projector : as fitted, with the length of the baseline as it was; stated : the devices before. turned_deg,
+    shifted_mm : motion of the projector relative to the camera. residual_px : median absolute residual afterwards.
+    coded_error_px, coded_sigma_px : median error of the coded position by the stated calibration, and its standard
+    deviation. is_significant : True if the change is none that noise makes.
+    """
+
+    stated: tuple[Pinhole, Pinhole]
+    camera: Pinhole
+    projector: Pinhole
+    turned_deg: float
+    shifted_mm: float
+    residual_px: float
+    coded_error_px: float
+    coded_sigma_px: float
+    is_significant: bool
+
+    def displacement_mm(self, points_mm: FloatArray, axis: Axis) -> FloatArray:
+        """(n, 3) float64: points by the fitted calibration minus those by the stated one.
+
+        Both have the camera pixel of the point and its position along `axis`.
+        """
+        camera, projector = self.stated
+        pairs = Correspondences(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
+        ray = pixel_rays(self.camera, pairs.camera_px)
+        depth = _depth_mm(self.camera, self.projector, pairs)
+        return np.asarray(self.camera.centre_mm + depth[:, None] * ray - points_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationCheck:
+    """Residuals of both axes of one camera, and what explains them.
+
+    devices : camera and projector; pairs : number of points compared; sigma_px : median standard deviation of a
+    residual by noise and resolution; median_px : median absolute residual; systematic_px : rms of the means over the
+    8 x 8 cells of the image, less what noise adds. cause : mistake that explains
+    residuals that refute the calibration, empty if none is found or needed.
+    """
+
+    devices: tuple[Pinhole, Pinhole]
+    pairs: int
+    median_px: float
+    systematic_px: float
+    sigma_px: float
+    fit: CalibrationFit | None
+    cause: str = ""
+
+    @property
+    def is_refuted(self) -> bool:
+        """True if the calibration cannot be that of these frames.
+
+        Residuals or the errors that they imply are beyond 5 px, or beyond 20 standard deviations where no small change
+        of the calibration explains them.
+        """
+        limit_px = (
+            _REFUTED_PX if self.explained else min(_REFUTED_PX, max(self.limit_px, _REFUTED_SIGMA * self.sigma_px))
+        )
+        return not max(self.median_px, self.coded_error_px) <= limit_px
+
+    def error_mm(self, points_mm: FloatArray, normals: FloatArray, axis: Axis) -> FloatArray:
+        """(n,) float64: error along the normals (n, 3) that the residuals imply, as a standard deviation.
+
+        That of the fit, with its own standard deviation; without one that explains the residuals, the effect of their
+        median on the coded position.
+        """
+        fit = self.explained
+        camera, projector = self.devices
+        pairs = Correspondences(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
+        pairs.projector_px[:, 0 if axis is Axis.COLUMN else 1] += self.median_px if fit is None else fit.coded_sigma_px
+        depth = _depth_mm(camera, projector, pairs)
+        shifted = camera.centre_mm + depth[:, None] * pixel_rays(camera, pairs.camera_px) - points_mm
+        error = np.abs((shifted * normals).sum(axis=1))
+        if fit is not None:
+            error = np.hypot(error, (fit.displacement_mm(points_mm, axis) * normals).sum(axis=1))
+        return np.asarray(error)
+
+    @property
+    def coded_error_px(self) -> float:
+        """Median error of the coded position that the residuals imply: that of the fit if it explains them."""
+        return self.median_px if self.explained is None else self.explained.coded_error_px
+
+    @property
+    def is_significant(self) -> bool:
+        """True if the residuals show an error of the calibration rather than noise."""
+        return self.explained is None or self.explained.is_significant
+
+    @property
+    def limit_px(self) -> float:
+        """Largest median residual that noise and resolution explain."""
+        return _AGREES_PX + 2 * self.sigma_px
+
+    @property
+    def explained(self) -> CalibrationFit | None:
+        """The fit, if it leaves no more than noise and resolution."""
+        return self.fit if self.fit is not None and self.fit.residual_px <= self.limit_px else None
+
+
+def check_calibration(
+    camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray], /
+) -> CalibrationCheck | None:
+    """Test the calibration of a camera and the projector; None for fewer than 200 correspondences.
+
+    code : Gray codes of columns and rows, to try exchanged bits.
+    """
+    if len(pairs) < _MIN_POINTS:
+        return None
+    devices = camera, projector
+    median, sigma = _disagreement_px(*devices, pairs), float(np.median(pairs.sigma_px))
+    fit = fit_calibration(*devices, pairs) if median <= 4 * _REFUTED_PX else None
+    systematic = _systematic_px(*devices, pairs) if fit is not None else median
+    check = CalibrationCheck(devices, len(pairs), median, systematic, sigma, fit)
+    return replace(check, cause=explain_residuals(*devices, pairs, code)) if check.is_refuted else check
+
+
+def _cells(pixels_px: FloatArray, size: Size) -> NDArray[np.intp]:
+    """(n,) index of the image cell of each pixel."""
+    scale = _CELLS / np.array([size.width_px, size.height_px])
+    column, row = np.clip((pixels_px + 0.5) * scale, 0, _CELLS - 1).astype(np.intp).T
+    return np.asarray(row * _CELLS + column)
+
+
+def _systematic_px(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> float:
+    """Rms of the mean residuals of image cells, less what their noise adds."""
+    residual = epipolar_residual_px(camera, projector, pairs)
+    limit = 5 * np.nanmedian(np.abs(residual))
+    used = np.abs(residual) <= limit
+    cell, residual = _cells(pairs.camera_px[used], camera.size), residual[used]
+    count = np.bincount(cell, minlength=_CELLS**2)
+    enough = count >= _MIN_CELL_POINTS
+    if not enough.any():
+        return float(np.sqrt(np.mean(residual**2)))
+    total, square = (np.bincount(cell, weights=each, minlength=_CELLS**2)[enough] for each in (residual, residual**2))
+    count = count[enough]
+    mean = total / count
+    noise = (square / count - mean**2) / count
+    return float(np.sqrt(max(0.0, np.average(mean**2 - noise, weights=count))))
+
+
+def _turned(projector: Pinhole, camera: Pinhole, turn: FloatArray, aside: FloatArray) -> Pinhole:
+    """The projector turned about its centre (rotation vector, rad), its baseline turned by two angles."""
+    baseline = projector.centre_mm - camera.centre_mm
+    length = linalg.norm(baseline)
+    # Two directions across the baseline, in the frame of the camera.
+    _, _, across = linalg.svd(baseline[None])
+    moved = baseline / length + aside @ across[1:]
+    centre = camera.centre_mm + length * moved / linalg.norm(moved)
+    rotation = Rotation.from_rotvec(turn).as_matrix() @ projector.rotation
+    return replace(projector, rotation=rotation, translation_mm=-rotation @ centre)
+
+
+def _with_lens(device: Pinhole, change: FloatArray) -> Pinhole:
+    """A device with another focal length, principal point and k1. change : (4,), in units of their priors."""
+    matrix, distortion = device.matrix.copy(), device.distortion.copy()
+    matrix[:2, :2] *= np.exp(np.clip(_PRIOR_FOCAL * change[0], -1, 1))
+    matrix[:2, 2] += _PRIOR_CENTRE * device.size.width_px * change[1:3]
+    distortion[0] += _PRIOR_K1 * change[3]
+    return replace(device, matrix=matrix, distortion=distortion)
+
+
+def _changed(camera: Pinhole, projector: Pinhole, x: FloatArray) -> tuple[Pinhole, Pinhole]:
+    """Both devices with a change: (5,) of the pose, or (13,) with the lenses of both."""
+    moved = _turned(projector, camera, x[:3], x[3:5])
+    return (camera, moved) if len(x) == 5 else (_with_lens(camera, x[5:9]), _with_lens(moved, x[9:]))
+
+
+def fit_calibration(camera: Pinhole, projector: Pinhole, pairs: Correspondences, /) -> CalibrationFit | None:
+    """Fit the pose of the projector, then also both lenses if the pose alone leaves a systematic residual.
+
+    None if no small change brings the points in front of both devices.
+    """
+    pairs = pairs.thinned(_FIT_POINTS)
+    scale = _OUTLIER_SIGMA * max(0.1, float(np.median(pairs.sigma_px)))
+    found = None
+    for count in (5, 13):
+
+        def error(x: FloatArray) -> FloatArray:
+            residual = epipolar_residual_px(*_changed(camera, projector, x), pairs) / scale
+            # The priors of the lenses weigh as much as one point each.
+            return np.concatenate([np.nan_to_num(residual, nan=1e3), x[5:]])
+
+        solved = least_squares(error, np.zeros(count), loss="soft_l1", x_scale="jac", max_nfev=60)
+        fitted = _changed(camera, projector, solved.x)
+        median = _disagreement_px(*fitted, pairs)
+        if not np.isfinite(median):
+            break
+        turned = float(np.degrees(linalg.norm(solved.x[:3])))
+        if found is None or median < 0.9 * found.residual_px:
+            covariance = _clustered_covariance(solved.jac, solved.fun, _cells(pairs.camera_px, camera.size))
+            error_px, sigma_px = _coded_error_px((camera, projector), solved.x, covariance, pairs)
+            chi2 = float(solved.x @ linalg.pinv(covariance) @ solved.x)
+            shifted = float(linalg.norm(fitted[1].centre_mm - projector.centre_mm))
+            significant = chi2 > _SIGNIFICANT_CHI2 * count
+            found = CalibrationFit(
+                (camera, projector), *fitted, turned, shifted, median, error_px, sigma_px, significant
+            )  # fmt: skip
+        is_hopeless = median > _MAX_LENS_PX or turned > _MAX_TURN_DEG
+        if is_hopeless or _systematic_px(found.camera, found.projector, pairs) < 0.1:
+            break
+    return found
+
+
+def _clustered_covariance(jacobian: FloatArray, residual: FloatArray, cell: NDArray[np.intp]) -> FloatArray:
+    """Covariance of fitted parameters whose residuals are correlated within image cells.
+
+    H⁻¹ S H⁻¹ with H = JᵀJ and S the sum of gᵀg over cells, g = Σ Jᵀr of a cell (Huber 1967, with clusters). cell :
+    (n,), of the first n residuals; each further one, a prior, is by itself.
+    """
+    cell = np.concatenate([cell, _CELLS**2 + np.arange(len(residual) - len(cell))])
+    score = np.zeros((int(cell.max()) + 1, jacobian.shape[1]))
+    np.add.at(score, cell, jacobian * residual[:, None])
+    inverse = linalg.pinv(jacobian.T @ jacobian)
+    return np.asarray(inverse @ score.T @ score @ inverse)
+
+
+def _coded_error_px(
+    stated: tuple[Pinhole, Pinhole], x: FloatArray, covariance: FloatArray, pairs: Correspondences
+) -> tuple[float, float]:
+    """Median error of the coded position that a fit x implies, and its median standard deviation."""
+    camera, projector = stated
+    axis = 0 if pairs.axis is Axis.COLUMN else 1
+
+    def error(at: FloatArray) -> FloatArray:
+        devices = _changed(camera, projector, at)
+        ray = pixel_rays(devices[0], pairs.camera_px)
+        points = devices[0].centre_mm + _depth_mm(*devices, pairs)[:, None] * ray
+        return np.asarray(project(projector, points)[:, axis] - pairs.projector_px[:, axis])
+
+    here = error(x)
+    values, directions = linalg.eigh(covariance)
+    steps = np.sqrt(np.maximum(values, 0.0))[:, None] * directions.T
+    sigma = np.sqrt(np.sum([(error(x + step) - here) ** 2 for step in steps], axis=0))
+    known = np.isfinite(here + sigma)
+    if not known.any():
+        return float("inf"), float("inf")
+    return float(np.median(np.abs(here[known]))), float(np.median(sigma[known]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """A mistake, and the devices and correspondences without it. free : number of parameters that were fitted."""
+
+    cause: str
+    camera: Pinhole
+    projector: Pinhole
+    pairs: Correspondences
+    free: int = 0
+
+
+def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray], /) -> str:
+    """Name the mistake that brings the two axes into agreement, with the residual that it leaves; empty if none does.
+
+    Of several, the one with fewest free parameters, unless its residual is 1.5 times that of another.
+    code : Gray codes of columns and rows.
+    """
+    pairs = pairs.thinned(_TRIAL_POINTS)
+    limit = _AGREES_PX + float(np.median(pairs.sigma_px))
+    agreeing = []
+    for trial in _trials(camera, projector, pairs, code):
+        if trial.free > 0 and agreeing and agreeing[0][1].free == 0:
+            break  # fitting takes seconds, and could explain the same by a coincidence
+        left = _disagreement_px(trial.camera, trial.projector, trial.pairs)
+        if left <= limit:
+            agreeing.append((left, trial))
+    if not agreeing:
+        return ""
+    best = min(left for left, _ in agreeing)
+    likely = [found for found in agreeing if found[0] <= _SIMPLER * best + 0.02]
+    likely.sort(key=lambda found: (found[1].free, found[0]))
+    left = max(likely[0][0], 0.01)
+    names = " or ".join(
+        trial.cause for _, trial in likely[:_MAX_CAUSES] if trial.free <= likely[0][1].free + _AS_SIMPLE
+    )
+    return f"{names} (both axes then agree to {left:.2f} px)"
+
+
+def _trials(camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray]) -> Iterator[_Trial]:
+    """Mistakes to try, from those without a free parameter to the general ones."""
+    for name, moved in _other_poses(camera, projector):
+        yield _Trial(f"the calibration holds {name}", camera, moved, pairs)
+    lenses = _with_lens_of(camera, projector), _with_lens_of(projector, camera)
+    yield _Trial("the lenses of camera and projector are exchanged in the calibration", *lenses, pairs)
+    for name, moved in _other_poses(*lenses):
+        yield _Trial(
+            f"camera and projector are exchanged in the calibration, which holds {name}", lenses[0], moved, pairs
+        )
+    for name, transformed in _other_images(pairs.camera_px, camera.size):
+        yield _Trial(f"the camera's picture is {name}", camera, projector, replace(pairs, camera_px=transformed))
+    for name, transformed in _other_images(pairs.projector_px, projector.size):
+        yield _Trial(f"the projected image is {name}", camera, projector, replace(pairs, projector_px=transformed))
+    yield from _exchanged_bits(camera, projector, pairs, code)
+    yield from _other_focal_lengths(camera, projector, pairs)
+    yield from _scaled(camera, projector, pairs, "camera's picture", of_camera=True)
+    yield from _scaled(camera, projector, pairs, "projected code", of_camera=False)
+    fitted = fit_calibration(camera, projector, pairs)
+    if fitted is not None and fitted.turned_deg < _MAX_TURN_DEG:
+        yield _Trial(
+            f"the projector has another pose relative to the camera than the calibration says: turned by "
+            f"{fitted.turned_deg:.2f}° and shifted by {fitted.shifted_mm:.1f} mm",
+            fitted.camera, fitted.projector, pairs, 2,
+        )  # fmt: skip
+
+
+def _with_lens_of(device: Pinhole, other: Pinhole) -> Pinhole:
+    """A device with the matrix and distortion of another one."""
+    return replace(device, matrix=other.matrix, distortion=other.distortion)
+
+
+def _other_poses(camera: Pinhole, projector: Pinhole) -> Iterator[tuple[str, Pinhole]]:
+    """Poses of the projector relative to the camera that differ by a convention."""
+    rotation = projector.rotation @ camera.rotation.T
+    translation = projector.translation_mm - rotation @ camera.translation_mm
+    for name, other, shift in (
+        ("the inverse pose (rotation and translation from projector to camera)", rotation.T, -rotation.T @ translation),
+        ("the rotation of the inverse direction", rotation.T, translation),
+        ("the translation of the inverse direction", rotation, -translation),
+        ("the centre of the projector in place of its translation", rotation, -rotation @ translation),
+        ("the inverse rotation with the centre of the projector", rotation.T, -rotation.T @ -translation),
+    ):
+        yield (
+            name,
+            replace(projector, rotation=other @ camera.rotation, translation_mm=other @ camera.translation_mm + shift),
+        )
+
+
+def _other_images(pixels: FloatArray, size: Size) -> Iterator[tuple[str, FloatArray]]:
+    """Pixels (n, 2) of a picture that was mirrored or turned before it came."""
+    right, bottom = size.width_px - 1, size.height_px - 1
+    x, y = pixels.T
+    yield "mirrored left to right", np.column_stack([right - x, y])
+    yield "mirrored top to bottom", np.column_stack([x, bottom - y])
+    yield "turned by 180°", np.column_stack([right - x, bottom - y])
+    # A picture turned by 90° has its extents exchanged; what was stored is of the stated size.
+    yield "turned by 90°", np.column_stack([y, bottom - x])
+    yield "turned by 270°", np.column_stack([right - y, x])
+    yield "mirrored and turned by 90°", np.column_stack([y, x])
+
+
+def _exchanged_bits(
+    camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray]
+) -> Iterator[_Trial]:
+    """Two bits of the code exchanged, or one inverted."""
+    for column, gray in enumerate(code):
+        position = pairs.projector_px[:, column]
+        cell = np.floor((position + 0.5 + gray.offset_px) / gray.cell_px).astype(np.int64)
+        word = np.asarray(to_gray(np.clip(cell, 0, 2**gray.bits - 1)), dtype=np.int64)
+        within = position - (cell * gray.cell_px - gray.offset_px)
+        # A point on the edge of a cell belongs to either cell; the middle is wrong by half a cell at the most.
+        within = np.where(within < 0, (gray.cell_px - 1) / 2, within)
+        place = [1 << (gray.bits - 1 - bit) for bit in range(gray.bits)]
+        of_code = f"of {gray.bits} of the {gray.axis} code"
+        changes = [(f"bit {bit + 1} {of_code} is inverted", word ^ place[bit]) for bit in range(gray.bits)]
+        for i, j in combinations(range(gray.bits), 2):
+            differ = (word & place[i] > 0) != (word & place[j] > 0)
+            exchanged = np.where(differ, word ^ (place[i] | place[j]), word)
+            changes.append((f"bits {i + 1} and {j + 1} {of_code} are exchanged", exchanged))
+        for name, changed in changes:
+            moved = pairs.projector_px.copy()
+            moved[:, column] = from_gray(changed) * gray.cell_px - gray.offset_px + within
+            yield _Trial(name, camera, projector, replace(pairs, projector_px=moved))
+
+
+def _other_focal_lengths(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> Iterator[_Trial]:
+    """Another focal length of one device."""
+    for name, of_camera in (("camera", True), ("projector", False)):
+
+        def changed(x: FloatArray, of_camera: bool = of_camera) -> tuple[Pinhole, Pinhole]:
+            device = camera if of_camera else projector
+            matrix = device.matrix.copy()
+            matrix[:2, :2] *= np.exp(x[0])
+            other = replace(device, matrix=matrix)
+            return (other, projector) if of_camera else (camera, other)
+
+        def residual(x: FloatArray, changed: Callable[..., tuple[Pinhole, Pinhole]] = changed) -> FloatArray:
+            return epipolar_residual_px(*changed(x), pairs)
+
+        found = _minimise(residual, _SCALES)
+        cause = f"the focal length of the {name} is × {np.exp(found[0]):.3f} that of the calibration"
+        yield _Trial(cause, *changed(found), pairs, 1)
+
+
+def _minimise(residual: Callable[[FloatArray], FloatArray], starts: Sequence[FloatArray]) -> FloatArray:
+    """The parameters of the least robust sum, from the three best of several starts."""
+
+    def error(x: FloatArray) -> FloatArray:
+        return np.concatenate([np.nan_to_num(residual(x), nan=1e3), 1e-3 * x])
+
+    coarse = sorted(starts, key=lambda x: float(np.median(np.abs(error(x)))))[:3]
+    solved = [least_squares(error, x, loss="soft_l1", max_nfev=40) for x in coarse]
+    return np.asarray(min(solved, key=lambda each: each.cost).x)
+
+
+def _scaled(
+    camera: Pinhole, projector: Pinhole, pairs: Correspondences, name: str, *, of_camera: bool
+) -> Iterator[_Trial]:
+    """A picture of another resolution, zoomed, shifted, or both: p' = s (p + ½) - ½ + shift."""
+    pixels = pairs.camera_px if of_camera else pairs.projector_px
+    size = camera.size if of_camera else projector.size
+    extent, middle = float(size.width_px), np.array([size.width_px, size.height_px]) / 2
+
+    def transformed(scale: float, shift: FloatArray) -> Correspondences:
+        moved = (pixels + 0.5) * scale - 0.5 + shift
+        return replace(pairs, camera_px=moved) if of_camera else replace(pairs, projector_px=moved)
+
+    def fit(
+        parts: Callable[[FloatArray], tuple[float, FloatArray]], starts: Sequence[FloatArray]
+    ) -> tuple[float, FloatArray]:
+        def residual(x: FloatArray) -> FloatArray:
+            scale, shift = parts(x)
+            # Without limits, everything shrinks to a point on its own epipolar line.
+            if abs(np.log(scale)) > _MAX_LOG_SCALE or np.abs(shift).max() > _MAX_SHIFT * extent:
+                return np.full(len(pixels), 1e3)
+            return epipolar_residual_px(camera, projector, transformed(scale, shift))
+
+        return parts(_minimise(residual, starts))
+
+    shifts = [np.array([x, y]) for x in np.linspace(-0.5, 0.5, 9) for y in np.linspace(-0.5, 0.5, 9)]
+    scale, shift = fit(lambda x: (float(np.exp(x[0])), np.zeros(2)), _SCALES)
+    what = f"of another resolution than its matrix: × {1 / scale:.3f}"
+    yield _Trial(f"the {name} is {what}", camera, projector, transformed(scale, shift), 1)
+    scale, shift = fit(lambda x: (float(np.exp(x[0])), (1 - float(np.exp(x[0]))) * middle), _SCALES)
+    what = f"zoomed about its middle: × {1 / scale:.3f}"
+    yield _Trial(f"the {name} is {what}", camera, projector, transformed(scale, shift), 1)
+    scale, shift = fit(lambda x: (1.0, extent * x), shifts)
+    what = f"shifted by {-shift[0]:.0f}, {-shift[1]:.0f} px: another region, crop or offset"
+    yield _Trial(f"the {name} is {what}", camera, projector, transformed(scale, shift), 2)
+    scale, shift = fit(lambda x: (float(np.exp(x[0])), extent * x[1:]), [np.zeros(3)])
+    what = f"zoomed × {1 / scale:.3f} and shifted by {-shift[0]:.0f}, {-shift[1]:.0f} px"
+    yield _Trial(f"the {name} is {what}", camera, projector, transformed(scale, shift), 9)

@@ -1,0 +1,181 @@
+"""Test of a calibration by light of both axes, on points that OpenCV projects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slrig.model import Axis, FloatArray, Gray, Pinhole, Size
+from slrig.reconstruction import CalibrationCheck, Correspondences, check_calibration
+
+CODES = Gray(Axis.COLUMN, 0, 10), Gray(Axis.ROW, 0, 9)
+Turn = tuple[float, float, float]
+Case = tuple[Pinhole, Pinhole, Correspondences]
+NOISE_PX = 0.05
+
+
+def device(
+    size: Size, focal_px: float, turn_deg: tuple[float, float, float], centre_mm: FloatArray, k1: float
+) -> Pinhole:
+    rotation = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
+    matrix = np.array([[focal_px, 0, size.width_px / 2 + 3], [0, focal_px * 1.001, size.height_px / 2 - 4], [0, 0, 1]])
+    return Pinhole(size, matrix, np.array([k1, 0.02, 3e-4, -2e-4, 0.0]), rotation, -rotation @ centre_mm)
+
+
+CAMERA = device(Size(640, 512), 1375.0, (0, 0, 0), np.zeros(3), -0.08)
+PROJECTOR = device(Size(800, 500), 1450.0, (1, 18, 0.5), np.array([210.0, -12.0, 8.0]), 0.03)
+
+
+def opencv_pixels(each: Pinhole, points_mm: FloatArray) -> FloatArray:
+    vector, _ = cv2.Rodrigues(each.rotation)
+    return cv2.projectPoints(points_mm, vector, each.translation_mm, each.matrix, each.distortion)[0][:, 0]
+
+
+@pytest.fixture(scope="module")
+def pairs() -> Correspondences:
+    """Pixels of a wavy surface 600 mm away that both devices image, with noise of the row."""
+    random = np.random.default_rng(7)
+    x, y = random.uniform(-130, 130, 3000), random.uniform(-100, 100, 3000)
+    points = np.column_stack([x, y, 620 + 25 * np.sin(x / 40) * np.cos(y / 30)])
+    camera, light = opencv_pixels(CAMERA, points), opencv_pixels(PROJECTOR, points)
+    inside = (light > 1).all(axis=1) & (light < (798, 498)).all(axis=1) & (camera > 1).all(axis=1)
+    inside &= (camera < (638, 510)).all(axis=1)
+    light[:, 1] += random.normal(0, NOISE_PX, len(light))
+    assert inside.sum() > 2000
+    return Correspondences(camera[inside], light[inside], np.full(inside.sum(), NOISE_PX), Axis.COLUMN)
+
+
+def turned(each: Pinhole, degrees: Turn) -> Pinhole:
+    rotation = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix() @ each.rotation
+    return replace(each, rotation=rotation, translation_mm=-rotation @ each.centre_mm)
+
+
+def inverse_pose(each: Pinhole) -> Pinhole:
+    return replace(each, rotation=each.rotation.T, translation_mm=-each.rotation.T @ each.translation_mm)
+
+
+def checked(case: Case) -> CalibrationCheck:
+    found = check_calibration(*case, CODES)
+    assert found is not None
+    return found
+
+
+def test_right_calibration_agrees(pairs: Correspondences) -> None:
+    found = checked((CAMERA, PROJECTOR, pairs))
+
+    assert not found.is_refuted
+    assert found.median_px < 2 * NOISE_PX
+    assert found.systematic_px < 0.01
+    assert not found.is_significant
+
+
+@pytest.mark.parametrize("degrees", [(0, 0.05, 0), (0, 0.15, 0), (0.1, 0, 0), (0, 0, 0.2)])
+def test_small_turn_of_projector_is_measured(pairs: Correspondences, degrees: Turn) -> None:
+    found = checked((CAMERA, turned(PROJECTOR, degrees), pairs))
+
+    assert not found.is_refuted
+    assert found.is_significant
+    assert found.explained is not None
+    assert found.explained.turned_deg == pytest.approx(max(degrees), rel=0.15)
+    assert found.explained.residual_px < 2 * NOISE_PX
+
+
+def test_displacement_is_that_of_the_true_surface(pairs: Correspondences) -> None:
+    wrong = turned(PROJECTOR, (0, 0.1, 0))
+    found = checked((CAMERA, wrong, pairs))
+    # Points by the wrong calibration: where the camera ray meets the sheet of light of the wrong projector.
+    x, y = np.meshgrid(np.linspace(-80, 80, 9), np.linspace(-60, 60, 7))
+    truth = np.column_stack([x.ravel(), y.ravel(), 620 + 25 * np.sin(x / 40).ravel() * np.cos(y / 30).ravel()])
+    column = opencv_pixels(PROJECTOR, truth)[:, 0]
+    near, far = np.full(len(truth), 0.7), np.full(len(truth), 1.3)
+    rising = opencv_pixels(wrong, truth * far[:, None])[:, 0] > opencv_pixels(wrong, truth * near[:, None])[:, 0]
+    for _ in range(60):
+        middle = (near + far) / 2
+        beyond = (opencv_pixels(wrong, truth * middle[:, None])[:, 0] > column) == rising
+        near, far = np.where(beyond, near, middle), np.where(beyond, middle, far)
+    measured = truth * near[:, None]
+
+    assert found.explained is not None
+    implied = found.explained.displacement_mm(measured, Axis.COLUMN)
+
+    error_mm = np.linalg.norm(measured - truth, axis=1)
+    assert np.median(error_mm) > 1
+    assert np.linalg.norm(measured + implied - truth, axis=1).max() < 0.15 * np.median(error_mm)
+
+
+def mirrored(pairs: Correspondences) -> FloatArray:
+    return np.column_stack([639 - pairs.camera_px[:, 0], pairs.camera_px[:, 1]])
+
+
+def exchanged_bits(pairs: Correspondences) -> FloatArray:
+    """Bits 3 and 6 of 10 of the columns."""
+    column = np.floor(pairs.projector_px[:, 0] + 0.5).astype(int)
+    word = column ^ (column >> 1)
+    a, b = 1 << 7, 1 << 4
+    word = np.where(((word & a) > 0) != ((word & b) > 0), word ^ (a | b), word)
+    for shift in (1, 2, 4, 8):
+        word ^= word >> shift
+    return np.column_stack([word, pairs.projector_px[:, 1]])
+
+
+MISTAKES: dict[str, tuple[Callable[[Correspondences], Case], str]] = {
+    "inverse pose": (lambda p: (CAMERA, inverse_pose(PROJECTOR), p), "the inverse pose"),
+    "lenses exchanged": (
+        lambda p: (
+            replace(CAMERA, matrix=PROJECTOR.matrix, distortion=PROJECTOR.distortion),
+            replace(PROJECTOR, matrix=CAMERA.matrix, distortion=CAMERA.distortion),
+            p,
+        ),
+        "the lenses of camera and projector are exchanged",
+    ),
+    "projector turned": (lambda p: (CAMERA, turned(PROJECTOR, (2, 1, -2)), p), "another pose relative to the camera"),
+    "picture mirrored": (lambda p: (CAMERA, PROJECTOR, replace(p, camera_px=mirrored(p))), "mirrored left to right"),
+    "picture upside down": (
+        lambda p: (CAMERA, PROJECTOR, replace(p, camera_px=np.array([639, 511]) - p.camera_px)),
+        "turned by 180°",
+    ),
+    "picture halved": (
+        lambda p: (CAMERA, PROJECTOR, replace(p, camera_px=(p.camera_px + 0.5) / 2 - 0.5)),
+        "another resolution than its matrix: × 0.500",
+    ),
+    "picture cropped": (
+        lambda p: (CAMERA, PROJECTOR, replace(p, camera_px=p.camera_px - np.array([60, 35]))),
+        "shifted by -60, -35 px",
+    ),
+    "code with an offset": (
+        lambda p: (CAMERA, PROJECTOR, replace(p, projector_px=p.projector_px + np.array([112, 6]))),
+        "projected code is shifted by 112, 6 px",
+    ),
+    "bits exchanged": (
+        lambda p: (CAMERA, PROJECTOR, replace(p, projector_px=exchanged_bits(p))),
+        "bits 3 and 6 of 10 of the column code are exchanged",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistake_refutes_the_calibration_and_is_named(pairs: Correspondences, mistake: str) -> None:
+    make, cause = MISTAKES[mistake]
+
+    found = checked(make(pairs))
+
+    assert found.is_refuted
+    assert cause in found.cause
+
+
+def test_unrelated_pixels_are_refuted_without_a_cause(pairs: Correspondences) -> None:
+    order = np.random.default_rng(1).permutation(len(pairs))
+
+    found = checked((CAMERA, PROJECTOR, replace(pairs, projector_px=pairs.projector_px[order])))
+
+    assert found.is_refuted
+    assert found.cause == ""
+
+
+def test_few_pixels_say_nothing(pairs: Correspondences) -> None:
+    assert check_calibration(CAMERA, PROJECTOR, pairs.take(slice(0, 50)), CODES) is None
