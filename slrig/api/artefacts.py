@@ -27,6 +27,7 @@ from slrig.scan.offered import (
     BUNDLE_ZIP,
     CALIBRATION_USED,
     MEDIA_TYPES,
+    agreement_picture,
     causes_picture,
     rejected_picture,
     requested_forms,
@@ -262,6 +263,17 @@ def fetch_causes(
 ) -> Response:
     """Return why each pixel of a camera gave no point: grey values are places in report.json's `causes`."""
     return _file(service, scan_id, causes_picture(camera), "image/png", known)
+
+
+@router.get(f"/{agreement_picture('{camera}')}", response_class=Response, responses=file_answers("image/png"))
+def fetch_agreement(
+    service: Serving,
+    scan_id: UUID,
+    camera: Camera,
+    known: KnownTag = None,
+) -> Response:
+    """Return how far columns and rows disagree at each pixel of a camera; only scans that played both axes have it."""
+    return _file(service, scan_id, agreement_picture(camera), "image/png", known)
 
 
 @router.get(f"/{BUNDLE_ZIP}", response_class=Response, responses={**file_of("application/zip", 409), **_UNCHANGED})

@@ -20,6 +20,7 @@ const PURPOSES = {
 const MADE_LATER = ["mesh.stl", "mesh.obj", "mesh.3mf", "view.glb", "coarse.glb", "scan.mcap", "bundle.zip"];
 const OF_CAMERAS = [
   [/^causes-/, "causes as numbers, for programs"], [/^rejected-/, "why pixels gave no point, as a picture"],
+  [/^agreement-/, "how far columns and rows disagree at each pixel"],
   [/^points-.*npz$/, "a point for each pixel of the camera, for numpy"], [/^points-/, "the same for point-cloud programs"],
   [/^depth-/, "depth at each pixel of the camera, as a picture of 16 bits"],
 ];

@@ -351,7 +351,7 @@ def fit_calibration(camera: Pinhole, projector: Pinhole, pairs: Correspondences,
             break
         turned = float(np.degrees(linalg.norm(solved.x[:3])))
         if found is None or median < 0.9 * found.residual_px:
-            covariance = _clustered_covariance(solved.jac, solved.fun, _cells(pairs.camera_px, camera.size))
+            covariance = _clustered_covariance(np.asarray(solved.jac), solved.fun, _cells(pairs.camera_px, camera.size))
             error_px, sigma_px = _coded_error_px((camera, projector), solved.x, covariance, pairs)
             chi2 = float(solved.x @ linalg.pinv(covariance) @ solved.x)
             shifted = float(linalg.norm(fitted[1].centre_mm - projector.centre_mm))
@@ -420,7 +420,7 @@ def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: Correspondence
     """
     pairs = pairs.thinned(_TRIAL_POINTS)
     limit = _AGREES_PX + float(np.median(pairs.sigma_px))
-    agreeing = []
+    agreeing: list[tuple[float, _Trial]] = []
     for trial in _trials(camera, projector, pairs, code):
         if trial.free > 0 and agreeing and agreeing[0][1].free == 0:
             break  # fitting takes seconds, and could explain the same by a coincidence

@@ -90,20 +90,25 @@ def _refutation(name: str, check: CalibrationCheck, axis: Axis) -> str:
 def leave_out_contradicted(
     camera: CameraResult, curves: SheetCurves, projector: Pinhole, axis: Axis, check: CalibrationCheck | None
 ) -> tuple[CameraResult, SheetCurves]:
-    """Leave out points whose light came from another place than their code says: mirror images, moved objects."""
+    """Leave out points whose light came from another place than their code says: mirror images, moved objects.
+
+    The camera returned has the residual of each pixel.
+    """
     if camera.second is None or check is None or len(curves.points_mm) == 0:
         return camera, curves
     residuals = axis_residuals(curves, camera.second.positions, projector, 1 if axis is Axis.COLUMN else 0)
     contradicted = residuals.contradicted(3 * check.median_px)
-    if not contradicted.any():
-        return camera, curves
+    columns, rows = np.rint(curves.pixels_px).astype(np.intp).T
+    residual_px = np.full(camera.curves.refusal.shape, np.nan, dtype=np.float32)
+    residual_px[rows, columns] = residuals.residual_px
     refusal = camera.curves.refusal.copy()
-    columns, rows = np.rint(curves.pixels_px[contradicted]).astype(np.intp).T
-    refusal[rows, columns] = Refusal.CONTRADICTED
-    return (
-        replace(camera, curves=replace(camera.curves, refusal=refusal)),
-        select_points(curves, ~contradicted),
+    refusal[rows[contradicted], columns[contradicted]] = Refusal.CONTRADICTED
+    camera = replace(
+        camera,
+        curves=replace(camera.curves, refusal=refusal),
+        second=replace(camera.second, residual_px=residual_px),
     )
+    return camera, select_points(curves, ~contradicted)
 
 
 @dataclass(frozen=True, slots=True)

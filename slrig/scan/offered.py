@@ -48,6 +48,15 @@ def causes_picture(camera: str) -> str:
     return f"causes-{camera}.png"
 
 
+def agreement_picture(camera: str) -> str:
+    """The picture of how columns and rows agree, of a scan that played both.
+
+    >>> agreement_picture("left")
+    'agreement-left.png'
+    """
+    return f"agreement-{camera}.png"
+
+
 CLOUDS: Mapping[str, str] = {
     "points-{camera}.npz": "application/octet-stream",
     "points-{camera}.pcd": "application/octet-stream",
@@ -65,20 +74,20 @@ def camera_prefixes() -> tuple[str, ...]:
     """Beginnings of the names of a camera's files.
 
     >>> camera_prefixes()
-    ('rejected-', 'causes-', 'depth-', 'points-')
+    ('rejected-', 'causes-', 'agreement-', 'depth-', 'points-')
     """
     of_cameras = {form.partition("{")[0] for form in requested_forms() if "{camera}" in form}
-    return "rejected-", "causes-", *sorted(of_cameras)
+    return "rejected-", "causes-", "agreement-", *sorted(of_cameras)
 
 
 def camera_files(camera: str) -> tuple[str, ...]:
     """The names of a camera's files.
 
     >>> camera_files("left")[:3]
-    ('rejected-left.png', 'causes-left.png', 'points-left.npz')
+    ('rejected-left.png', 'causes-left.png', 'agreement-left.png')
     """
     clouds = (form.format(camera=camera) for form in requested_forms() if "{camera}" in form)
-    return rejected_picture(camera), causes_picture(camera), *clouds
+    return rejected_picture(camera), causes_picture(camera), agreement_picture(camera), *clouds
 
 
 def missing_for(name: str) -> str | None:

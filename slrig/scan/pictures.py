@@ -41,6 +41,8 @@ _INK = (235, 233, 230)
 _LEGEND_PX = 330
 _REJECTION_WIDTH_PX = 1600 - _LEGEND_PX
 _LEGEND_ROW_PX = 30
+_MEAN_PX = (15, 15)
+_LEAST_LIMIT_PX = 0.05  # of the scale of differences: smaller ones are noise
 _LEAST_ROWS = (len(Refusal) + 2) * _LEGEND_ROW_PX
 
 # Colours, blue, green, red, after Okabe and Ito, "Color universal design": told apart by colour-blind readers too.
@@ -120,6 +122,50 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
     page[: size.height_px, : size.width_px] = picture
     _draw_legend(page, size.width_px + 16, np.bincount(refusals.ravel(), minlength=len(Refusal)))
     return page
+
+
+def agreement_picture(
+    residual_px: NDArray[np.float32], unit: str, white: Pixels | None = None, full_scale: int = 255
+) -> Picture:
+    """A spare measurement minus its prediction at each camera pixel, with a scale of colours.
+
+    Each pixel shows the mean of 15 x 15, since code cells alone displace single pixels.
+
+    residual_px : (H, W) float32, NaN where there is none; there the white frame is shown. unit : of the scale.
+    """
+    known = np.isfinite(residual_px)
+    total, count = (cv2.boxFilter(each, -1, _MEAN_PX, normalize=False) for each in (
+        np.nan_to_num(residual_px), known.astype(np.float32)
+    ))  # fmt: skip
+    mean = np.asarray(total / np.maximum(count, 1), dtype=np.float64)
+    limit = max(float(np.percentile(np.abs(mean[known]), 98)), _LEAST_LIMIT_PX) if known.any() else 1.0
+    share = np.clip(mean / limit, -1, 1)
+    picture = _diverging(share)
+    if white is not None:
+        grey, _ = _displayed(white, full_scale, Size(white.shape[1], white.shape[0]))
+        picture = np.where(known[..., None], picture, grey)
+    size = rejection_size(Size(residual_px.shape[1], residual_px.shape[0]))
+    height = max(size.height_px, _LEAST_ROWS)
+    page = np.full((height, size.width_px + _LEGEND_PX, 3), _PAGE, dtype=np.uint8)
+    page[: size.height_px, : size.width_px] = resized(np.asarray(picture, dtype=np.uint8), size)
+    left, steps = size.width_px + 16, 9
+    _text(page, f"measured - predicted, {unit}", (left, 24))
+    for step in range(steps):
+        value, row = 1 - 2 * step / (steps - 1), 24 + (step + 1) * _LEGEND_ROW_PX
+        colour = _diverging(np.array([[value]]))[0, 0].tolist()
+        cv2.rectangle(page, (left, row - 13), (left + 16, row + 3), colour, cv2.FILLED)
+        _text(page, f"{value * limit:+.2f}", (left + 26, row))
+    median = float(np.median(np.abs(mean[known]))) if known.any() else float("nan")
+    _text(page, f"median {median:.3f} at {known.sum():,} pixels", (left, 24 + (steps + 2) * _LEGEND_ROW_PX))
+    return page
+
+
+def _diverging(share: FloatArray) -> Picture:
+    """Colours of -1 (blue) over 0 (light grey) to 1 (red), (H, W, 3)."""
+    middle, low, high = (np.array(each, dtype=np.float64) for each in ((225, 225, 225), (170, 80, 30), (30, 30, 190)))
+    weight = np.abs(share)[..., None]
+    end = np.where(share[..., None] < 0, low, high)
+    return np.asarray(np.rint(middle + weight * (end - middle)), dtype=np.uint8)
 
 
 def rejection_size(camera: Size) -> Size:

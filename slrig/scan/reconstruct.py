@@ -39,8 +39,16 @@ from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.limited import marked, within
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
+from slrig.scan.offered import agreement_picture as agreement_name
 from slrig.scan.offered import causes_picture, rejected_picture
-from slrig.scan.pictures import described_causes, encode_png, preview, rejection_picture, rejection_size
+from slrig.scan.pictures import (
+    agreement_picture,
+    described_causes,
+    encode_png,
+    preview,
+    rejection_picture,
+    rejection_size,
+)
 from slrig.scan.plan import ProgressCallback, ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
@@ -340,6 +348,9 @@ def _encoded_pictures(mesh: Mesh, cameras: list[CameraResult]) -> dict[str, byte
     first = cameras[0]
     encoded = {"preview.png": encode_png(preview(mesh, first.device, first.white, int(first.full_scale)))}
     for seen in cameras:
+        if seen.second is not None and seen.second.residual_px is not None:
+            residuals = agreement_picture(seen.second.residual_px, "projector px", seen.white, int(seen.full_scale))
+            encoded[agreement_name(seen.name)] = encode_png(residuals)
         picture = rejection_picture(seen.curves.refusal, seen.white, int(seen.full_scale))
         encoded[rejected_picture(seen.name)] = encode_png(picture)
         encoded[causes_picture(seen.name)] = encode_png(seen.curves.refusal)

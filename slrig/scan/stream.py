@@ -106,12 +106,14 @@ class SecondAxisResult:
     """Light of the axis that is not triangulated by, at one camera.
 
     positions : (H, W), projector position along that axis; pairs : camera and projector pixels that both axes give;
-    codes : Gray codes of columns and rows.
+    codes : Gray codes of columns and rows. residual_px : (H, W) float32, position minus its prediction by the
+    calibration at each triangulated point, NaN elsewhere; None before triangulation.
     """
 
     positions: AxisPositions
     pairs: Correspondences
     codes: tuple[Gray, Gray]
+    residual_px: NDArray[np.float32] | None = None
 
 
 class ScanStream:

@@ -33,7 +33,8 @@ PROJECTOR = device(Size(800, 500), 1450.0, (1, 18, 0.5), np.array([210.0, -12.0,
 
 def opencv_pixels(each: Pinhole, points_mm: FloatArray) -> FloatArray:
     vector, _ = cv2.Rodrigues(each.rotation)
-    return cv2.projectPoints(points_mm, vector, each.translation_mm, each.matrix, each.distortion)[0][:, 0]
+    pixels, _ = cv2.projectPoints(points_mm, vector, each.translation_mm, each.matrix, each.distortion)
+    return np.asarray(pixels[:, 0], dtype=np.float64)
 
 
 @pytest.fixture(scope="module")
