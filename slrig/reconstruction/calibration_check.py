@@ -35,6 +35,8 @@ _TRIAL_POINTS = 1_000
 _MIN_POINTS = 200
 _CELLS = 8  # along each side of the image, for the systematic part of the residuals
 _MIN_CELL_POINTS = 30
+_LENS_CELLS = 3  # along each side: errors of lenses are smooth
+_MIN_FLOOR_PX, _FLOOR_RATIO = 0.01, 3.0  # of such errors, relative to what a fit leaves
 _MIN_IN_FRONT = 0.9  # share of points in front of both devices, for a calibration that can be right
 _AGREES_PX = 0.5  # median residual of a right calibration with code cells of one pixel is 0.15 px
 _REFUTED_PX, _REFUTED_SIGMA = 5.0, 20.0
@@ -44,6 +46,7 @@ _MAX_LOG_SCALE, _MAX_SHIFT = np.log(4), 1.0  # of a picture; the shift relative 
 _SCALES = [np.array([each]) for each in np.linspace(-1.3, 1.3, 57)]
 _OUTLIER_SIGMA = 3.0  # scale of the robust loss
 _MAX_CAUSES, _AS_SIMPLE = 2, 4  # causes to name, and free parameters between equally likely ones
+_IMPROVED = 0.7  # ratio of a cause's residual to that of the stated calibration
 _SIMPLER = 1.5  # a cause without free parameters is preferred up to this ratio of residuals
 _MAX_LENS_PX = 2.0  # residual of the best pose beyond which no small change of a lens helps
 _MAX_TURN_DEG = 20.0  # more is no device that moved a little
@@ -242,8 +245,9 @@ class CalibrationCheck:
 
     @property
     def coded_error_px(self) -> float:
-        """Median error of the coded position that the residuals imply: that of the fit if it explains them."""
-        return self.median_px if self.explained is None else self.explained.coded_error_px
+        """Median error of the coded position that the residuals imply: that of a fit, 0 if it is not significant."""
+        fit = self.explained
+        return self.median_px if fit is None else fit.coded_error_px if fit.is_significant else 0.0
 
     @property
     def is_significant(self) -> bool:
@@ -278,11 +282,11 @@ def check_calibration(
     return replace(check, cause=explain_residuals(*devices, pairs, code)) if check.is_refuted else check
 
 
-def _cells(pixels_px: FloatArray, size: Size) -> NDArray[np.intp]:
-    """(n,) index of the image cell of each pixel."""
-    scale = _CELLS / np.array([size.width_px, size.height_px])
-    column, row = np.clip((pixels_px + 0.5) * scale, 0, _CELLS - 1).astype(np.intp).T
-    return np.asarray(row * _CELLS + column)
+def _cells(pixels_px: FloatArray, size: Size, count: int) -> NDArray[np.intp]:
+    """(n,) index of the cell of each pixel, of count x count over the image."""
+    scale = count / np.array([size.width_px, size.height_px])
+    column, row = np.clip((pixels_px + 0.5) * scale, 0, count - 1).astype(np.intp).T
+    return np.asarray(row * count + column)
 
 
 def _systematic_px(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> float:
@@ -290,7 +294,7 @@ def _systematic_px(camera: Pinhole, projector: Pinhole, pairs: Correspondences) 
     residual = epipolar_residual_px(camera, projector, pairs)
     limit = 5 * np.nanmedian(np.abs(residual))
     used = np.abs(residual) <= limit
-    cell, residual = _cells(pairs.camera_px[used], camera.size), residual[used]
+    cell, residual = _cells(pairs.camera_px[used], camera.size, _CELLS), residual[used]
     count = np.bincount(cell, minlength=_CELLS**2)
     enough = count >= _MIN_CELL_POINTS
     if not enough.any():
@@ -351,7 +355,8 @@ def fit_calibration(camera: Pinhole, projector: Pinhole, pairs: Correspondences,
             break
         turned = float(np.degrees(linalg.norm(solved.x[:3])))
         if found is None or median < 0.9 * found.residual_px:
-            covariance = _clustered_covariance(np.asarray(solved.jac), solved.fun, _cells(pairs.camera_px, camera.size))
+            floor_px = max(_MIN_FLOOR_PX, _FLOOR_RATIO * _systematic_px(*fitted, pairs))
+            covariance = _covariance(np.asarray(solved.jac), solved.fun, pairs.camera_px, camera.size, floor_px / scale)
             error_px, sigma_px = _coded_error_px((camera, projector), solved.x, covariance, pairs)
             chi2 = float(solved.x @ linalg.pinv(covariance) @ solved.x)
             shifted = float(linalg.norm(fitted[1].centre_mm - projector.centre_mm))
@@ -365,16 +370,22 @@ def fit_calibration(camera: Pinhole, projector: Pinhole, pairs: Correspondences,
     return found
 
 
-def _clustered_covariance(jacobian: FloatArray, residual: FloatArray, cell: NDArray[np.intp]) -> FloatArray:
-    """Covariance of fitted parameters whose residuals are correlated within image cells.
+def _covariance(
+    jacobian: FloatArray, residual: FloatArray, pixels_px: FloatArray, size: Size, floor: float
+) -> FloatArray:
+    """Covariance of fitted parameters whose residuals are correlated in the image.
 
-    H⁻¹ S H⁻¹ with H = JᵀJ and S the sum of gᵀg over cells, g = Σ Jᵀr of a cell (Huber 1967, with clusters). cell :
-    (n,), of the first n residuals; each further one, a prior, is by itself.
+    H⁻¹ S H⁻¹ with H = JᵀJ and S the sum of gᵀg over image cells, g = Σ Jᵀr of a cell (Huber 1967, with clusters), and
+    of the same for a residual of `floor` in all points of each of 3 x 3 parts of the image: no lens is exactly what
+    its model says. The residuals after the first n are priors, each by itself.
     """
-    cell = np.concatenate([cell, _CELLS**2 + np.arange(len(residual) - len(cell))])
-    score = np.zeros((int(cell.max()) + 1, jacobian.shape[1]))
-    np.add.at(score, cell, jacobian * residual[:, None])
-    inverse = linalg.pinv(jacobian.T @ jacobian)
+    count = len(pixels_px)
+    cell = _cells(pixels_px, size, _CELLS)
+    scores = [np.zeros((_CELLS**2, jacobian.shape[1])), np.zeros((_LENS_CELLS**2, jacobian.shape[1]))]
+    np.add.at(scores[0], cell, jacobian[:count] * residual[:count, None])
+    np.add.at(scores[1], _cells(pixels_px, size, _LENS_CELLS), jacobian[:count] * floor)
+    scores.append(jacobian[count:] * residual[count:, None])
+    score, inverse = np.concatenate(scores), linalg.pinv(jacobian.T @ jacobian)
     return np.asarray(inverse @ score.T @ score @ inverse)
 
 
@@ -420,12 +431,16 @@ def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: Correspondence
     """
     pairs = pairs.thinned(_TRIAL_POINTS)
     limit = _AGREES_PX + float(np.median(pairs.sigma_px))
+    fit = fit_calibration(camera, projector, pairs)
+    if fit is not None:
+        limit = min(limit, _SIMPLER * fit.residual_px + 0.05)
+    stated = _disagreement_px(camera, projector, pairs)
     agreeing: list[tuple[float, _Trial]] = []
-    for trial in _trials(camera, projector, pairs, code):
+    for trial in _trials(camera, projector, pairs, code, fit):
         if trial.free > 0 and agreeing and agreeing[0][1].free == 0:
             break  # fitting takes seconds, and could explain the same by a coincidence
         left = _disagreement_px(trial.camera, trial.projector, trial.pairs)
-        if left <= limit:
+        if left <= limit and left < _IMPROVED * stated:
             agreeing.append((left, trial))
     if not agreeing:
         return ""
@@ -439,7 +454,9 @@ def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: Correspondence
     return f"{names} (both axes then agree to {left:.2f} px)"
 
 
-def _trials(camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray]) -> Iterator[_Trial]:
+def _trials(
+    camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray], fit: CalibrationFit | None
+) -> Iterator[_Trial]:
     """Mistakes to try, from those without a free parameter to the general ones."""
     for name, moved in _other_poses(camera, projector):
         yield _Trial(f"the calibration holds {name}", camera, moved, pairs)
@@ -457,13 +474,12 @@ def _trials(camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: t
     yield from _other_focal_lengths(camera, projector, pairs)
     yield from _scaled(camera, projector, pairs, "camera's picture", of_camera=True)
     yield from _scaled(camera, projector, pairs, "projected code", of_camera=False)
-    fitted = fit_calibration(camera, projector, pairs)
-    if fitted is not None and fitted.turned_deg < _MAX_TURN_DEG:
-        yield _Trial(
-            f"the projector has another pose relative to the camera than the calibration says: turned by "
-            f"{fitted.turned_deg:.2f}° and shifted by {fitted.shifted_mm:.1f} mm",
-            fitted.camera, fitted.projector, pairs, 2,
-        )  # fmt: skip
+    if fit is not None and fit.turned_deg < _MAX_TURN_DEG:
+        cause = (
+            "the projector has another pose relative to the camera than the calibration says: turned by "
+            f"{fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm"
+        )
+        yield _Trial(cause, fit.camera, fit.projector, pairs, 2)
 
 
 def _with_lens_of(device: Pinhole, other: Pinhole) -> Pinhole:

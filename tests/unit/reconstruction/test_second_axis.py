@@ -33,7 +33,8 @@ def blurred_bit(bit: int, *, inverted: bool) -> NDArray[np.float32]:
     kernel = np.exp(-0.5 * (np.arange(-3 * fine, 3 * fine + 1) / (0.6 * fine)) ** 2)
     kernel /= kernel.sum()
     smooth = np.apply_along_axis(lambda each: np.convolve(np.pad(each, 3 * fine, "edge"), kernel, "valid"), 0, lit)
-    return (20 + 180 * smooth.reshape(IMAGE[0], fine, IMAGE[1]).mean(axis=1)).astype(np.float32)
+    light = smooth.reshape(IMAGE[0], fine, IMAGE[1]).mean(axis=1)
+    return np.asarray(20 + 180 * light, dtype=np.float32)
 
 
 @pytest.fixture(scope="module")
