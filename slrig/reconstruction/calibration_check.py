@@ -40,6 +40,7 @@ _MIN_FLOOR_PX, _FLOOR_RATIO = 0.01, 3.0  # of such errors, relative to what a fi
 _MIN_IN_FRONT = 0.9  # share of points in front of both devices, for a calibration that can be right
 _AGREES_PX = 0.5  # median residual of a right calibration with code cells of one pixel is 0.15 px
 _REFUTED_PX, _REFUTED_SIGMA = 5.0, 20.0
+_MAX_SYSTEMATIC_PX = 0.1  # of a right calibration
 _SIGNIFICANT_CHI2 = 10.0  # for each parameter of a fit: by chance once in 10^8 scans
 _PRIOR_FOCAL, _PRIOR_CENTRE, _PRIOR_K1 = 0.03, 0.03, 0.05  # relative to focal length and width; radial distortion
 _MAX_LOG_SCALE, _MAX_SHIFT = np.log(4), 1.0  # of a picture; the shift relative to its width
@@ -235,7 +236,10 @@ class CalibrationCheck:
         fit = self.explained
         camera, projector = self.devices
         pairs = Correspondences(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
-        pairs.projector_px[:, 0 if axis is Axis.COLUMN else 1] += self.median_px if fit is None else fit.coded_sigma_px
+        uncertain_px = self.median_px
+        if fit is not None:
+            uncertain_px = min(fit.coded_sigma_px, max(fit.coded_error_px, self.median_px))
+        pairs.projector_px[:, 0 if axis is Axis.COLUMN else 1] += uncertain_px
         depth = _depth_mm(camera, projector, pairs)
         shifted = camera.centre_mm + depth[:, None] * pixel_rays(camera, pairs.camera_px) - points_mm
         error = np.abs((shifted * normals).sum(axis=1))
@@ -247,12 +251,13 @@ class CalibrationCheck:
     def coded_error_px(self) -> float:
         """Median error of the coded position that the residuals imply: that of a fit, 0 if it is not significant."""
         fit = self.explained
-        return self.median_px if fit is None else fit.coded_error_px if fit.is_significant else 0.0
+        return self.median_px if fit is None else fit.coded_error_px if self.is_significant else 0.0
 
     @property
     def is_significant(self) -> bool:
         """True if the residuals show an error of the calibration rather than noise."""
-        return self.explained is None or self.explained.is_significant
+        fit = self.explained
+        return fit is None or fit.is_significant or self.systematic_px > _MAX_SYSTEMATIC_PX
 
     @property
     def limit_px(self) -> float:
