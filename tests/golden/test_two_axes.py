@@ -1,4 +1,4 @@
-"""Scans of columns and rows by right and wrong calibrations: a wrong one is refused or reported, and its cause named."""
+"""Scans of columns and rows by right and wrong calibrations: a wrong one is refused and its cause named."""
 
 from __future__ import annotations
 
