@@ -1,6 +1,7 @@
 """From curves to a triangle mesh: strips, flips, boundary, quality."""
 
 from slrig.meshing.boundary import smooth_boundary
+from slrig.meshing.facing import Viewpoints
 from slrig.meshing.flips import optimise_edges
 from slrig.meshing.quality import mesh_figures, nearest_on_triangle, score, weighted_percentiles
 from slrig.meshing.rasteriser import merge_depth_buffers, rasterise, rasterise_normals
@@ -27,6 +28,7 @@ __all__ = [
     "MeshStage",
     "MeshingLimits",
     "SurfaceMesh",
+    "Viewpoints",
     "boundary_vertices",
     "build_surface",
     "compact_mesh",

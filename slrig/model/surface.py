@@ -109,6 +109,7 @@ class Refusal(IntEnum):
     NO_INTERSECTION = 12
     SHEET_SEEN_ALONG = 13
     OUTSIDE_REGION = 14
+    MIRROR_IMAGE = 15
 
 
 class FlipRule(StrEnum):

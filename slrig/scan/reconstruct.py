@@ -20,7 +20,7 @@ from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
-from slrig.meshing import MeshingLimits, MeshStage, build_surface, compact_mesh, mesh_figures, score
+from slrig.meshing import MeshingLimits, MeshStage, Viewpoints, build_surface, compact_mesh, mesh_figures, score
 from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region
 from slrig.reconstruction import (
     MergedCurves,
@@ -38,6 +38,7 @@ from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.limited import marked, within
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
+from slrig.scan.mirror_images import mirror_image_notes, without_mirror_images, without_surface
 from slrig.scan.offered import causes_picture, rejected_picture
 from slrig.scan.pictures import described_causes, encode_png, preview, rejection_picture, rejection_size
 from slrig.scan.plan import ProgressCallback, ReconstructionPlan
@@ -242,10 +243,17 @@ def _meshed(
     gap_px = widest_gap_px(projector, axis)
     beside = steps(cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=gap_px)
     sampling = sampling_mm(points.points_mm, first.device, projector, axis, beside.at_points_px)
+    second = cameras[found.second].device if projector is None else projector
+    views = Viewpoints(
+        joined_curves.camera,
+        np.stack([seen.device.centre_mm for seen in cameras]),
+        second.centre_mm,
+        points.deviation_mm,
+    )
     surface = build_surface(
         points.points_mm, points.offsets, points.position_px, points.bridge_after,
         # Two points of one place are as far apart as noise has them.
-        np.hypot(sampling, np.linalg.norm(points.deviation_mm, axis=1)), first.device.centre_mm,
+        np.hypot(sampling, np.linalg.norm(points.deviation_mm, axis=1)), views,
         MeshingLimits(
             widest_step_px=step_px * plan.max_code_gap,
             depth_edge_ratio=plan.depth_edge_ratio,
@@ -256,8 +264,10 @@ def _meshed(
         on_step=lambda stage: entered(stage, 0.68, count),
         runs=beside.runs,
     )  # fmt: skip
-    require_surface(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
+    require_surface(len(surface.faces) > 0, folder, without_surface(surface, projector), cameras)
     entered("vertices", 0.72, count)
+    cameras, joined_curves, surface = without_mirror_images(cameras, joined_curves, surface)
+    points = joined_curves.curves
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
     share = _calibration_share(walked.devices, found, axis, surface.normals)
     if share is not None:
@@ -298,7 +308,7 @@ def _meshed(
         figures=mesh_report(surface, mesh, curves),
         redundancy=redundancy_report(joined_curves, points.source, found.spare),
         albedo=albedo_report(colours, mesh, cameras, lit=projector is not None, mapped=light is not None),
-        notes=() if apart is None else (str(apart),),
+        notes=(*mirror_image_notes(surface, cameras, projector), *(() if apart is None else (str(apart),))),
     )
 
 
