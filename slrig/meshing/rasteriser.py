@@ -11,6 +11,7 @@ from slrig.kernels import in_bands, kernel
 from slrig.model import IntArray, Size
 
 _MAX_BANDS = 4  # each has its own buffers, 8 bytes per pixel
+_ASIDE_PX = (0.37, 0.41)
 _MIN_FACES = 50_000  # of a band: a millisecond of work, as much as merging two buffers
 
 
@@ -40,6 +41,18 @@ def rasterise(placed: NDArray[np.float32], faces: IntArray, size: Size) -> Raste
     inverse[empty] = np.nan
     face[empty] = -1
     return RasterView(np.reciprocal(inverse, out=inverse), face)
+
+
+def layer_counts(placed_px: NDArray[np.floating[Any]], faces: IntArray, size: Size) -> NDArray[np.uint8]:
+    """(H, W) uint8: number of triangles over one place in each pixel, at most 255.
+
+    placed_px : (V, 2), column and row of the vertices. The place is beside the pixel's centre, so that vertices and
+    edges, which often lie on centres, do not count for two triangles.
+    """
+    at_least = max(_MIN_FACES, -(-len(faces) // _MAX_BANDS))
+    given = np.ascontiguousarray(placed_px), np.ascontiguousarray(faces), size.height_px, size.width_px
+    counts = in_bands(_count_layers, len(faces), *given, rows_at_least=at_least)
+    return np.minimum(sum(counts), 255).astype(np.uint8) if counts else np.zeros(size.shape, dtype=np.uint8)
 
 
 def merge_depth_buffers(buffers: list[tuple[Nearness, IntArray]]) -> tuple[Nearness, IntArray]:
@@ -104,6 +117,29 @@ def _z_buffer(
                     inverse[row, column] = near
                     nearest[row, column] = face
     return inverse, nearest
+
+
+@kernel
+def _count_layers(first: int, last: int, placed: Any, faces: Any, height: int, width: int) -> NDArray[np.int32]:
+    counts = np.zeros((height, width), dtype=np.int32)
+    for face in range(first, last):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        ax, bx, cx = placed[a, 0] - _ASIDE_PX[0], placed[b, 0] - _ASIDE_PX[0], placed[c, 0] - _ASIDE_PX[0]
+        left, right = max(np.ceil(min(ax, bx, cx)), 0.0), min(np.floor(max(ax, bx, cx)), width - 1.0)
+        if not left <= right:
+            continue
+        ay, by, cy = placed[a, 1] - _ASIDE_PX[1], placed[b, 1] - _ASIDE_PX[1], placed[c, 1] - _ASIDE_PX[1]
+        top, bottom = max(np.ceil(min(ay, by, cy)), 0.0), min(np.floor(max(ay, by, cy)), height - 1.0)
+        if not top <= bottom:
+            continue
+        turn = 1.0 if (bx - ax) * (cy - ay) > (by - ay) * (cx - ax) else -1.0
+        for row in range(int(top), int(bottom) + 1):
+            for column in range(int(left), int(right) + 1):
+                wa = (bx - column) * (cy - row) - (by - row) * (cx - column)
+                wb = (cx - column) * (ay - row) - (cy - row) * (ax - column)
+                wc = (ax - column) * (by - row) - (ay - row) * (bx - column)
+                counts[row, column] += turn * wa > 0.0 and turn * wb > 0.0 and turn * wc > 0.0
+    return counts
 
 
 @kernel

@@ -34,7 +34,7 @@ from slrig.reconstruction import (
 )
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.colouring import albedo_report, coloured
-from slrig.scan.coverage import coverage_notes, covered_share, require_surface
+from slrig.scan.coverage import coverage_notes, covered_share, layered_share, require_surface
 from slrig.scan.limited import marked, within
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
@@ -52,6 +52,7 @@ from slrig.scan.report import (
     view_report,
     with_seconds,
 )
+from slrig.scan.soundness import fault_notes, layer_notes, truth_notes
 from slrig.scan.stream import CameraResult, LiveScan
 from slrig.scan.triangulated import Triangulated, steps, widest_gap_px
 
@@ -181,18 +182,26 @@ def reconstruct_into(
             encode_points_ply(meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm),
         )
         covered = covered_share(mesh, cameras[0])
-        figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
+        sizes = mesh_figures(mesh.vertices_mm, mesh.faces)
+        figures = {**meshed.figures, "figures": sizes}
         entered("pictures", 0.85, "")
         for name, picture in pictures.result().items():
             place(name, picture)
-        known = _compared_with_truth(bundle, mesh, cameras[0], plan.region, entered)
+        known = _compared_with_truth(bundle, mesh, cameras, plan.region, entered)
         if (turntable := read_turntable_angle(bundle)) is not None:
             known["turntable"] = turntable.document()
         entered("write report", 0.98, "")
         seconds = watch.finished()
         report = {
             **walked.sections,
-            "notes": [*read_notes(bundle), *walked.notes, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
+            "notes": [
+                *read_notes(bundle),
+                *walked.notes,
+                *meshed.notes,
+                *coverage_notes(cameras[0].name, covered),
+                *fault_notes(sizes),
+                *truth_notes(known.get("truth", {})),
+            ],
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_calibration_sigma_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
@@ -293,6 +302,10 @@ def _meshed(
         colour=colours.colour,
         mark=colours.mark,
     )
+    layered = {
+        seen.name: layered_share(points.pixels_px, surface.faces, joined_curves.camera == index, seen.device.size)
+        for index, seen in enumerate(cameras)
+    }
     mesh = compact_mesh(
         surface.faces, points.points_mm, surface.normals, colours.colour, colours.mark, sigma, points.offsets,
         points.position_px,
@@ -305,10 +318,14 @@ def _meshed(
         mesh_calibration_sigma_mm=None if share is None else share[_used(surface.faces, len(share))],
         cameras=cameras,
         stages=surface.stages,
-        figures=mesh_report(surface, mesh, curves),
+        figures={**mesh_report(surface, mesh, curves), "layered": layered},
         redundancy=redundancy_report(joined_curves, points.source, found.spare),
         albedo=albedo_report(colours, mesh, cameras, lit=projector is not None, mapped=light is not None),
-        notes=(*mirror_image_notes(surface, cameras, projector), *(() if apart is None else (str(apart),))),
+        notes=(
+            *mirror_image_notes(surface, cameras, projector),
+            *layer_notes(layered),
+            *(() if apart is None else (str(apart),)),
+        ),
     )
 
 
@@ -350,16 +367,20 @@ def _encoded_pictures(mesh: Mesh, cameras: list[CameraResult]) -> dict[str, byte
 
 
 def _compared_with_truth(
-    bundle: Path, mesh: Mesh, seen: CameraResult, region: Region | None, entered: Callable[[str, float, str], None]
-) -> dict[str, object]:
-    """The report's section on truth, for bundles that bring it. seen : the first camera."""
+    bundle: Path,
+    mesh: Mesh,
+    cameras: list[CameraResult],
+    region: Region | None,
+    entered: Callable[[str, float, str], None],
+) -> dict[str, Mapping[str, object]]:
+    """The report's section on truth, for bundles that bring it; it is of the first camera."""
     truth = read_truth(bundle)
     if truth is None:
         return {}
     entered("compare with truth", 0.9, "")
-    visible = truth.visible_points_mm
+    seen, visible = cameras[0], truth.visible_points_mm
     if region is not None:
         # What nobody asked for is not missing.
         pixels = np.clip(project(seen.device, visible), 0, np.array(seen.curves.refusal.shape[::-1]) - 1)
         visible = visible[within(region, visible, pixels, seen.curves.refusal, seen.device)]
-    return {"truth": score(mesh, truth.surface, visible, seen.device.centre_mm).as_dict()}
+    return {"truth": score(mesh, truth.surface, visible, *(each.device.centre_mm for each in cameras)).as_dict()}

@@ -8,7 +8,7 @@ from numba import config
 from numpy.typing import NDArray
 
 from slrig.meshing import rasteriser
-from slrig.meshing.rasteriser import rasterise, rasterise_normals
+from slrig.meshing.rasteriser import layer_counts, rasterise, rasterise_normals
 from slrig.model import FloatArray, IntArray, Size
 from tests.unit.meshing.plain import grid_faces
 
@@ -121,3 +121,22 @@ def test_no_triangles_are_no_view() -> None:
     view = rasterise(placed, faces, Size(4, 3))
     assert np.isnan(view.depth_mm).all()
     assert not rasterise_normals(view, placed, placed, faces)[0].any()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_layers_are_the_triangles_over_each_other(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    share_out(monkeypatch, threads)
+    placed, faces, _ = random_triangles()
+    place = placed[:, :2].astype(np.float64)
+    beside = np.column_stack((place - (0.37, 0.41), placed[:, 2]))
+    wanted = sum((plain_weights(beside[face], SIZE) > 0).all(axis=0) for face in faces)
+    np.testing.assert_array_equal(layer_counts(place, faces, SIZE), wanted)
+    assert np.max(wanted) > 3
+
+
+def test_vertices_and_edges_on_pixels_make_no_layer() -> None:
+    rows, columns = (index.ravel() for index in np.mgrid[5:35, 5:45])
+    counts = layer_counts(np.column_stack((columns, rows)).astype(np.float64), grid_faces(30, 40), SIZE)
+    assert np.count_nonzero(counts == 1) == 29 * 39
+    assert counts.max() == 1
+    assert layer_counts(np.zeros((0, 2)), grid_faces(2, 2)[:0], SIZE).sum() == 0
