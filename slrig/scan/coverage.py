@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import NothingToReconstructError, setting
-from slrig.meshing import layer_counts, rasterise
-from slrig.model import FloatArray, IntArray, Mesh, Refusal, Size
+from slrig.meshing import depth_ranges, rasterise
+from slrig.model import IntArray, Mesh, Refusal, Size
+from slrig.reconstruction import SheetCurves, optical_depths_mm
 from slrig.scan.placing import placed_vertices, resampled
 from slrig.scan.report import lit_pixels
 from slrig.scan.stream import CameraResult
@@ -42,18 +43,21 @@ def _sampled_every(width_px: int) -> int:
     return max(1, -(-width_px // _PICTURE_PX))
 
 
-def layered_share(pixels_px: FloatArray, faces: IntArray, seen: NDArray[np.bool_], size: Size) -> float:
-    """The share of a mesh's image where two of its triangles lie over each other.
+def layered_share(
+    seen: CameraResult, curves: SheetCurves, mine: NDArray[np.bool_], faces: IntArray, least_mm: float
+) -> float:
+    """The share of a mesh's image in a camera where two of its triangles lie one behind the other.
 
-    Counted at one place in each pixel of a picture of at most 480 pixels' width. faces : (F, 3) int32, into pixels_px,
-    (n, 2), of a camera's image, of extent `size`. seen : (n,) bool, the points that this camera measured: triangles
-    with others do not count.
+    Counted on a picture of at most 480 pixels' width. mine : (n,) bool, the points that this camera measured: triangles
+    with others do not count. faces : (F, 3) int32 into the points. least_mm : smaller distances are folds of noise.
     """
+    size = seen.device.size
     step = _sampled_every(size.width_px)
-    faces = faces if seen.all() else faces[seen[faces].all(axis=1)]
-    counts = layer_counts(pixels_px / step, faces, Size(size.width_px // step, size.height_px // step))
-    covered = int(np.count_nonzero(counts))
-    return int(np.count_nonzero(counts > 1)) / max(covered, 1)
+    faces = faces if mine.all() else faces[mine[faces].all(axis=1)]
+    placed = np.column_stack((curves.pixels_px / step, optical_depths_mm(seen.device, curves.points_mm)))
+    nearest, furthest = depth_ranges(placed, faces, Size(size.width_px // step, size.height_px // step))
+    covered = int(np.count_nonzero(nearest <= furthest))
+    return int(np.count_nonzero(furthest - nearest > least_mm)) / max(covered, 1)
 
 
 def coverage_notes(name: str, share: float | None) -> list[str]:

@@ -24,22 +24,19 @@ def without_mirror_images(
 
     Pixels that the mirror images cover are refused, not only those with a point. The surface's steps have the figures.
     """
-    points = joined.curves
+    points, images = joined.curves, surface.mirror_faces
     count = len(points.points_mm)
-    phantom = used_vertices(surface.mirror_faces, count) & ~used_vertices(surface.faces, count)
-    areas_mm2 = [_area_mm2(points.points_mm, faces) for faces in (surface.mirror_faces, surface.faces)]
-    figures = {
-        "triangles": len(surface.mirror_faces),
-        "points": int(np.count_nonzero(phantom)),
-        "area_share": areas_mm2[0] / max(sum(areas_mm2), 1e-12),
-    }
+    figures = {"triangles": len(images), "points": 0, "area_share": 0.0}
+    if len(images) == 0:
+        return list(cameras), joined, replace(surface, steps={**surface.steps, "mirror_images": figures})
+    phantom = used_vertices(images, count) & ~used_vertices(surface.faces, count)
+    areas_mm2 = [_area_mm2(points.points_mm, faces) for faces in (images, surface.faces)]
+    figures |= {"points": int(np.count_nonzero(phantom)), "area_share": areas_mm2[0] / max(sum(areas_mm2), 1e-12)}
     surface = replace(surface, steps={**surface.steps, "mirror_images": figures})
-    if not phantom.any():
-        return list(cameras), joined, surface
     refused = []
     for index, seen in enumerate(cameras):
         mine = joined.camera == index
-        faces = surface.mirror_faces[mine[surface.mirror_faces].all(axis=1)]
+        faces = images[mine[images].all(axis=1)]
         refusal = _with_phantom(seen.curves.refusal, points.pixels_px, faces, phantom & mine, mine & ~phantom)
         refused.append(replace(seen, curves=replace(seen.curves, refusal=refusal)))
     rest = replace(joined, curves=select_points(points, ~phantom), camera=joined.camera[~phantom])

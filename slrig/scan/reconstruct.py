@@ -302,8 +302,9 @@ def _meshed(
         colour=colours.colour,
         mark=colours.mark,
     )
+    apart_mm = plan.depth_edge_ratio * float(np.median(sampling))
     layered = {
-        seen.name: layered_share(points.pixels_px, surface.faces, joined_curves.camera == index, seen.device.size)
+        seen.name: layered_share(seen, points, joined_curves.camera == index, surface.faces, apart_mm)
         for index, seen in enumerate(cameras)
     }
     mesh = compact_mesh(

@@ -8,7 +8,7 @@ from numba import config
 from numpy.typing import NDArray
 
 from slrig.meshing import rasteriser
-from slrig.meshing.rasteriser import layer_counts, rasterise, rasterise_normals
+from slrig.meshing.rasteriser import depth_ranges, rasterise, rasterise_normals
 from slrig.model import FloatArray, IntArray, Size
 from tests.unit.meshing.plain import grid_faces
 
@@ -124,19 +124,16 @@ def test_no_triangles_are_no_view() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_layers_are_the_triangles_over_each_other(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+def test_the_range_of_depths_is_that_of_all_triangles_at_a_pixel(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
     share_out(monkeypatch, threads)
     placed, faces, _ = random_triangles()
-    place = placed[:, :2].astype(np.float64)
-    beside = np.column_stack((place - (0.37, 0.41), placed[:, 2]))
-    wanted = sum((plain_weights(beside[face], SIZE) > 0).all(axis=0) for face in faces)
-    np.testing.assert_array_equal(layer_counts(place, faces, SIZE), wanted)
-    assert np.max(wanted) > 3
-
-
-def test_vertices_and_edges_on_pixels_make_no_layer() -> None:
-    rows, columns = (index.ravel() for index in np.mgrid[5:35, 5:45])
-    counts = layer_counts(np.column_stack((columns, rows)).astype(np.float64), grid_faces(30, 40), SIZE)
-    assert np.count_nonzero(counts == 1) == 29 * 39
-    assert counts.max() == 1
-    assert layer_counts(np.zeros((0, 2)), grid_faces(2, 2)[:0], SIZE).sum() == 0
+    nearest, furthest = np.full(SIZE.shape, np.inf), np.full(SIZE.shape, -np.inf)
+    for face in faces:
+        weights = plain_weights(placed[face].astype(np.float64), SIZE)
+        inside, depth = (weights >= 0).all(axis=0), np.einsum("irc,i->rc", weights, placed[face, 2])
+        nearest[inside] = np.minimum(nearest, depth)[inside]
+        furthest[inside] = np.maximum(furthest, depth)[inside]
+    found = depth_ranges(placed.astype(np.float64), faces, SIZE)
+    np.testing.assert_allclose(found, (nearest, furthest), rtol=1e-9)
+    empty, _ = depth_ranges(np.zeros((0, 3)), faces[:0], SIZE)
+    assert np.isinf(empty).all()

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from slrig.model import Size
+from slrig.model import Axis
 from slrig.scan.coverage import layered_share
 from slrig.scan.soundness import fault_notes, layer_notes, truth_notes
-from tests.unit.meshing.plain import grid_faces
+from slrig.scan.triangulated import triangulated
+from tests.unit.reconstruction.builders import CAMERA, PROJECTOR
+from tests.unit.scan.test_mirror_images import triangles_between
+from tests.unit.scan.test_triangulated import MANY, curves_in, seen
 
 SOUND = {"nonmanifold_edges": 0, "misoriented_edges": 0, "duplicate_faces": 0}
 
@@ -38,16 +42,23 @@ def test_what_is_off_the_truth_is_a_note(truth: dict[str, Any], words: tuple[str
     assert all(note.startswith(each) for note, each in zip(found, words, strict=True))
 
 
-def test_layers_that_one_camera_sees_are_a_note() -> None:
-    size = Size(1000, 800)
-    rows, columns = (index.ravel() for index in np.mgrid[:21, :31])
-    first = np.column_stack((100.0 + 20 * columns, 100.0 + 20 * rows))
-    # The second layer lies over a quarter of the first, and continues beside it.
-    pixels, faces = np.concatenate([first, first + np.array([300.0, 200.0])]), grid_faces(21, 31)
-    both = np.concatenate([faces, faces + len(first)])
-    share = layered_share(pixels, both, np.ones(len(pixels), dtype=np.bool_), size)
-    assert share == pytest.approx(0.25 / 1.75, abs=0.01)
-    (note,) = layer_notes({"left": share, "right": 0.0005})
-    assert note.startswith("camera 'left' sees two layers of the mesh")
-    seen = np.arange(len(pixels)) < len(first)
-    assert layered_share(pixels, both, seen, size) == 0
+@pytest.mark.parametrize(("behind_mm", "least_mm", "doubled"), [(10.0, 2.0, True), (1.0, 2.0, False)])
+def test_layers_that_one_camera_sees_are_a_note(*, behind_mm: float, least_mm: float, doubled: bool) -> None:
+    found = triangulated([seen("left", CAMERA, curves_in(CAMERA, MANY))], PROJECTOR, Axis.COLUMN)
+    (camera,), curves = found.cameras, found.joined.curves
+    # The ball's points twice, the second time further away.
+    faces = triangles_between(0, 1)
+    both = replace(
+        curves,
+        points_mm=np.concatenate([curves.points_mm, curves.points_mm + behind_mm * CAMERA.rotation[2]]),
+        pixels_px=np.concatenate([curves.pixels_px, curves.pixels_px]),
+    )
+    faces = np.concatenate([faces, faces + np.int32(len(curves.points_mm))])
+    mine = np.ones(len(both.points_mm), dtype=np.bool_)
+    share = layered_share(camera, both, mine, faces, least_mm)
+    assert share == doubled
+    assert [note[:45] for note in layer_notes({"left": share, "right": 0.0005})] == [
+        "camera 'left' sees two layers of the mesh, on"
+    ] * doubled
+    mine[len(curves.points_mm) :] = False
+    assert layered_share(camera, both, mine, faces, least_mm) == 0
