@@ -329,7 +329,7 @@ def _pieces(along_px: FloatArray, begin: int, end: int, widest_gap_px: float) ->
     return [_Piece(begin + a, along[a:b]) for a, b in pairwise(cuts) if b > a]
 
 
-_MIN_COMPONENT = 100
+MIN_COMPONENT = 100
 """Triangles of a component; fewer are dust of stripe points that agreed by chance."""
 
 
@@ -385,7 +385,7 @@ def initial_mesh(
     mirror_faces = strip_faces[front.mirrored]
     connected &= ~front.mirrored
     apart = _between_windings(adjacency, front.turned, connected)
-    remaining = component_sizes(strip_faces, connected & ~apart) >= _MIN_COMPONENT
+    remaining = component_sizes(strip_faces, connected & ~apart) >= MIN_COMPONENT
     faces, across = select_faces(strip_faces, adjacency, remaining)
     turned = front.turned[remaining]
     if turned.all():

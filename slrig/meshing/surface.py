@@ -17,8 +17,8 @@ from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing.boundary import boundary_point_count, max_boundary_edge_mm, shrink_boundary, smooth_boundary
 from slrig.meshing.facing import Viewpoints, facing_sides
 from slrig.meshing.flips import EdgeOptimisation, angle_rad, optimise_edges
-from slrig.meshing.strips import InitialMesh, initial_mesh
-from slrig.meshing.topology import select_faces, used_vertices
+from slrig.meshing.strips import MIN_COMPONENT, InitialMesh, initial_mesh
+from slrig.meshing.topology import component_sizes, select_faces, used_vertices
 from slrig.model import FlipRule, FloatArray, IntArray, Mesh
 
 _BLOCK = 488  # not a power of two: rows of a page each would share cache sets
@@ -168,7 +168,8 @@ class SurfaceMesh:
     faces : (F, 3) int32 into the curves' points, counter-clockwise seen from their cameras; normals : (n, 3) float32,
     unit, NaN for points without a triangle. mirror_faces : (M, 3) int32, dropped mirror images. stages : in order.
     steps : statistics of each step: `initial`, `optimisation` (Fig. 10, round by round), `boundary` if it was smoothed,
-    and `facing`: the triangles dropped in the end because a device that measured them sees their back.
+    and `facing`: the triangles dropped in the end because a device that measured them sees their back, and the dust
+    that they leave.
     """
 
     faces: IntArray
@@ -262,12 +263,14 @@ def build_surface(
         }
         del optimised
     fronts = facing_sides(points_mm, faces, views) > 0
-    backs = len(faces) - int(np.count_nonzero(fronts))
+    backs, dust = len(faces) - int(np.count_nonzero(fronts)), 0
     if backs:
         # Flips of edges cure most of what noise turned, and fold a few others over.
-        faces, adjacency = select_faces(faces, adjacency, fronts)
+        remaining = component_sizes(faces, fronts) >= MIN_COMPONENT
+        faces, adjacency = select_faces(faces, adjacency, remaining)
+        dust = len(fronts) - backs - len(faces)
         stages[-1] = replace(stages[-1], triangles=len(faces), boundary_points=boundary_point_count(faces, adjacency))
-    steps["facing"] = {"dropped_triangles": backs}
+    steps["facing"] = {"dropped_triangles": backs, "dropped_as_dust": dust}
     del adjacency
     on_step("vertex normals")
     return SurfaceMesh(faces, mirror_faces, vertex_normals(points_mm, faces), tuple(stages), steps)

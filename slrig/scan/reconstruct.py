@@ -276,7 +276,7 @@ def _meshed(
     require_surface(len(surface.faces) > 0, folder, without_surface(surface, projector), cameras)
     entered("vertices", 0.72, count)
     cameras, joined_curves, surface = without_mirror_images(cameras, joined_curves, surface)
-    points = joined_curves.curves
+    found, points = replace(found, cameras=cameras, joined=joined_curves), joined_curves.curves
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
     share = _calibration_share(walked.devices, found, axis, surface.normals)
     if share is not None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from slrig.meshing.facing import Viewpoints, facing_sides
 from slrig.meshing.surface import MeshingLimits, SurfaceMesh, build_surface
-from slrig.meshing.topology import topology_counts
+from slrig.meshing.topology import component_sizes, topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
 
 EYE_MM = np.array([0.0, 0.0, -500.0])
@@ -121,6 +121,9 @@ def test_no_triangle_faces_away_in_the_end() -> None:
     dropped = made.steps["facing"]["dropped_triangles"]
     assert isinstance(dropped, int)
     assert dropped > 0
+    # What that cuts off is dust.
+    assert made.steps["facing"]["dropped_as_dust"] != 0
+    assert component_sizes(made.faces, np.ones(len(made.faces), dtype=bool)).min() >= 100
     assert (facing_sides(points, made.faces, views) == 1).all()
     assert made.stages[-1].triangles == len(made.faces)
     assert made.stages[-1].boundary_points == topology_counts(made.faces).boundary_vertices
