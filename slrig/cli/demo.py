@@ -24,6 +24,7 @@ from slrig.client import Client
 from slrig.disk import storage_errors
 from slrig.errors import ConfigError, ServiceError
 from slrig.scan.plan import ProgressCallback
+from slrig.scan.soundness import truth_notes
 
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
@@ -57,6 +58,13 @@ def run_demo(rig: Path | None, output: Path) -> None:
         typer.echo(f"{'removed':<10}{counted(removed, 'earlier demo scan')} of rig '{scan['rig']}' from {data}")
     bundle = data / "scans" / scan["id"] / "bundle"
     _tell_next(rig, bundle, output)
+    require_sound(scan)
+
+
+def require_sound(scan: Mapping[str, Any]) -> None:
+    """End with exit code 1 if the mesh is not the surface that is known to be there. Its notes say what is wrong."""
+    if truth_notes((scan.get("summary") or {}).get("truth") or {}):
+        raise typer.Exit(1)
 
 
 def _rig_file(given: Path | None) -> Path:

@@ -19,8 +19,19 @@ def quality_lines(summary: Mapping[str, Any]) -> list[str]:
     if sigma is not None:
         lines.append(f"{'stated':<10}standard deviation of a point {sigma:.4f} mm (median)")
     truth = summary.get("truth") or {}
-    if truth.get("rms_mm") is not None:
-        complete = truth.get("complete_0.3mm")
-        covered = "" if complete is None else f", {complete:.1%} of the visible surface within 0.3 mm"
-        lines.append(f"{'error':<10}rms {truth['rms_mm']:.4f} mm against the known truth{covered}")
+    if truth:
+        lines.append(f"{'error':<10}{_error(truth)}")
     return lines + [f"{'note':<10}{words}" for words in summary.get("notes") or []]
+
+
+def _error(truth: Mapping[str, Any]) -> str:
+    """The error against the known truth: of what is near it, and how much is not."""
+    rms_mm, beyond, complete = (truth.get(name) for name in ("rms_mm", "gross_fraction", "complete_0.3mm"))
+    words = "nothing within 1 mm of the known truth"
+    if rms_mm is not None:
+        words = f"rms {rms_mm:.4f} mm against the known truth"
+        # Reports of earlier versions have the error alone.
+        words += (
+            "" if beyond is None else f", of the {1 - beyond:.1%} of the area within 1 mm; {beyond:.1%} beyond 1 mm"
+        )
+    return words if complete is None else f"{words}, {complete:.1%} of the visible surface within 0.3 mm"

@@ -1,9 +1,10 @@
 """From curves to a triangle mesh: strips, flips, boundary, quality."""
 
 from slrig.meshing.boundary import smooth_boundary
+from slrig.meshing.facing import Viewpoints
 from slrig.meshing.flips import optimise_edges
 from slrig.meshing.quality import mesh_figures, nearest_on_triangle, score, weighted_percentiles
-from slrig.meshing.rasteriser import merge_depth_buffers, rasterise, rasterise_normals
+from slrig.meshing.rasteriser import depth_ranges, merge_depth_buffers, rasterise, rasterise_normals
 from slrig.meshing.strips import runs_of_curve_parts
 from slrig.meshing.surface import (
     FIRST_STAGE,
@@ -27,10 +28,12 @@ __all__ = [
     "MeshStage",
     "MeshingLimits",
     "SurfaceMesh",
+    "Viewpoints",
     "boundary_vertices",
     "build_surface",
     "compact_mesh",
     "component_sizes",
+    "depth_ranges",
     "merge_depth_buffers",
     "mesh_figures",
     "nearest_on_triangle",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -322,7 +323,7 @@ class TruthScore:
         to the point, and the first hit of the camera's ray to the point is that near to the surface.
     extra_layer_fraction : share of the camera's rays that cross the mesh more than once.
     nonmanifold_edges, misoriented_edges, duplicate_faces, degenerate_faces : after welding vertices at 1 µm.
-    facing_camera_fraction : share of the mesh's area whose front faces the camera.
+    facing_camera_fraction : share of the mesh's area whose front faces a camera.
     error_over_sigma_p68 : 68.27 % of the vertices are at most this many of their own standard deviations from the
         true surface: 1 if the stated σ is right, NaN without one.
     """
@@ -394,18 +395,19 @@ def score(
     surface: Surface,
     visible_points_mm: NDArray[np.floating[Any]],
     eye_mm: FloatArray,
+    *other_eyes_mm: FloatArray,
 ) -> TruthScore:
     """The error of `mesh` against the true `surface`, all in one world frame.
 
     Errors are taken over points spread evenly on the mesh's area, so that extra vertices or dust cannot dilute them.
 
     visible_points_mm : (n, 3), points of the true surface that the camera sees and the projector lights. eye_mm : (3,),
-    the camera's centre of projection.
+    the camera's centre of projection; other_eyes_mm : those of further cameras, which a triangle may face instead.
     """
     vertices, faces = _weld_vertices(np.asarray(mesh.vertices_mm, dtype=np.float64), mesh.faces)
     collapsed = degenerate_faces(faces)
     faces = np.ascontiguousarray(faces[~collapsed])
-    area_mm2, facing = _areas_and_facing(vertices, faces, eye_mm)
+    area_mm2, facing = _areas_and_facing(vertices, faces, (eye_mm, *other_eyes_mm))
     counts = topology_counts(faces)
     random = np.random.default_rng(0)
 
@@ -451,16 +453,18 @@ def _ray_errors(
 
 
 def _areas_and_facing(
-    vertices_mm: FloatArray, faces: IntArray, eye_mm: FloatArray
+    vertices_mm: FloatArray, faces: IntArray, eyes_mm: Sequence[FloatArray]
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """(F,) float64 area of each triangle, and (F,) bool, True if its front faces the eye; in bounded memory."""
+    """(F,) float64 area of each triangle, and (F,) bool, True if its front faces one of the eyes; in bounded memory."""
     area_mm2, facing = np.zeros(len(faces)), np.zeros(len(faces), dtype=bool)
     for start in range(0, len(faces), _FACES_AT_ONCE):
         part = slice(start, start + _FACES_AT_ONCE)
         corners = vertices_mm[faces[part]]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area_mm2[part] = np.linalg.norm(normals, axis=1) / 2
-        facing[part] = np.einsum("ij,ij->i", eye_mm - corners.mean(axis=1), normals) > 0
+        middle = corners.mean(axis=1)
+        for eye_mm in eyes_mm:
+            facing[part] |= np.einsum("ij,ij->i", eye_mm - middle, normals) > 0
     return area_mm2, facing
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
-from slrig.model import IntArray, Size
+from slrig.model import FloatArray, IntArray, Size
 
 _MAX_BANDS = 4  # each has its own buffers, 8 bytes per pixel
 _MIN_FACES = 50_000  # of a band: a millisecond of work, as much as merging two buffers
@@ -40,6 +40,20 @@ def rasterise(placed: NDArray[np.float32], faces: IntArray, size: Size) -> Raste
     inverse[empty] = np.nan
     face[empty] = -1
     return RasterView(np.reciprocal(inverse, out=inverse), face)
+
+
+def depth_ranges(placed: NDArray[np.floating[Any]], faces: IntArray, size: Size) -> tuple[FloatArray, FloatArray]:
+    """(H, W) float64 each: nearest and furthest depth of the triangles at each pixel centre, mm; inf and -inf without
+    a triangle. placed : (V, 3), column and row, pixels, and depth, mm, which counts as linear in the image.
+    """
+    at_least = max(_MIN_FACES, -(-len(faces) // _MAX_BANDS))
+    given = np.ascontiguousarray(placed), np.ascontiguousarray(faces), size.height_px, size.width_px
+    bands = in_bands(_depth_ranges, len(faces), *given, rows_at_least=at_least)
+    nearest, furthest = np.full(size.shape, np.inf), np.full(size.shape, -np.inf)
+    for near, far in bands:
+        np.minimum(nearest, near, out=nearest)
+        np.maximum(furthest, far, out=furthest)
+    return nearest, furthest
 
 
 def merge_depth_buffers(buffers: list[tuple[Nearness, IntArray]]) -> tuple[Nearness, IntArray]:
@@ -104,6 +118,34 @@ def _z_buffer(
                     inverse[row, column] = near
                     nearest[row, column] = face
     return inverse, nearest
+
+
+@kernel
+def _depth_ranges(
+    first: int, last: int, placed: Any, faces: Any, height: int, width: int
+) -> tuple[FloatArray, FloatArray]:
+    nearest, furthest = np.full((height, width), np.inf), np.full((height, width), -np.inf)
+    for face in range(first, last):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        ax, bx, cx = placed[a, 0], placed[b, 0], placed[c, 0]
+        left, right = max(np.ceil(min(ax, bx, cx)), 0.0), min(np.floor(max(ax, bx, cx)), width - 1.0)
+        if not left <= right:
+            continue
+        ay, by, cy = placed[a, 1], placed[b, 1], placed[c, 1]
+        top, bottom = max(np.ceil(min(ay, by, cy)), 0.0), min(np.floor(max(ay, by, cy)), height - 1.0)
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if not top <= bottom or not abs(area) > 0.0:
+            continue
+        for row in range(int(top), int(bottom) + 1):
+            for column in range(int(left), int(right) + 1):
+                wa = ((bx - column) * (cy - row) - (by - row) * (cx - column)) / area
+                wb = ((cx - column) * (ay - row) - (cy - row) * (ax - column)) / area
+                wc = 1.0 - wa - wb
+                if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
+                    depth = wa * placed[a, 2] + wb * placed[b, 2] + wc * placed[c, 2]
+                    nearest[row, column] = min(nearest[row, column], depth)
+                    furthest[row, column] = max(furthest[row, column], depth)
+    return nearest, furthest
 
 
 @kernel

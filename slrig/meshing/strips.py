@@ -1,7 +1,7 @@
 """The initial mesh: a strip of triangles between each two neighbouring curves (Yang & Chen 2010, section 3.2).
 
 `strips` makes exactly I + J - 2 triangles for curves of I and J points. A second, recorded step drops triangles that
-do not belong to the surface: those across a depth edge and, on request, those that use a bridge.
+do not belong to the surface: those across a depth edge, mirror images and, on request, those that use a bridge.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
+from slrig.meshing.facing import Viewpoints, front_sides
 from slrig.meshing.flips import prefers_flip
 from slrig.meshing.topology import component_sizes, select_faces
 from slrig.model import FloatArray, IntArray
@@ -328,21 +329,22 @@ def _pieces(along_px: FloatArray, begin: int, end: int, widest_gap_px: float) ->
     return [_Piece(begin + a, along[a:b]) for a, b in pairwise(cuts) if b > a]
 
 
-_BLOCK = 4096  # faces to a sum; the sums are added up in order, the same for any number of threads
-_MIN_COMPONENT = 100
+MIN_COMPONENT = 100
 """Triangles of a component; fewer are dust of stripe points that agreed by chance."""
 
 
 @dataclass(frozen=True, slots=True)
 class InitialMesh:
-    """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the eye.
+    """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the camera that measured them.
     adjacency : (F, 3) int32, entry k is the face across the edge opposite corner k, -1 at a boundary.
-    strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges overlap, dust are the small
-    components that they leave.
+    mirror_faces : (M, 3) int32, the mirror images among the dropped triangles.
+    strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges overlap, mirror images are counted
+    of what they leave, and dust are the small components that remain then.
     """
 
     faces: IntArray
     adjacency: IntArray
+    mirror_faces: IntArray
     strip_pairs: int
     strip_triangles: int
     dropped_at_depth_edges: int
@@ -357,7 +359,7 @@ def initial_mesh(
     position_px: FloatArray,
     bridge_after: NDArray[np.bool_],
     sampling_mm: FloatArray,
-    eye_mm: FloatArray,
+    views: Viewpoints,
     /,
     *,
     widest_step_px: float,
@@ -368,7 +370,7 @@ def initial_mesh(
     """Mesh between neighbouring curves and drop triangles that are not surface.
 
     points_mm : (n, 3) float64; offsets : (c + 1,) int32; position_px : (c,) float64; bridge_after : (n,) bool;
-    sampling_mm : (n,) float64; eye_mm : (3,) float64, the camera that decides which side is the front.
+    sampling_mm : (n,) float64; views : the devices that decide which side is the front.
     runs : (s, 4) int32, the parts to join, from `runs_of_curve_parts`; by default whole neighbouring curves.
     """
     if runs is None:
@@ -379,15 +381,21 @@ def initial_mesh(
         points_mm, strip_faces, bridge_after, sampling_mm, depth_edge_ratio=depth_edge_ratio, keep_holes=keep_holes
     )
     connected = ~(at_depth_edge | at_bridge)
-    remaining = component_sizes(strip_faces, connected) >= _MIN_COMPONENT
-    areas_mm2 = np.zeros(-(-len(strip_faces) // _BLOCK))
-    in_bands(_facing_areas, len(areas_mm2), np.ascontiguousarray(points_mm), strip_faces, remaining, eye_mm, areas_mm2)
+    front = front_sides(points_mm, strip_faces, views, connected)
+    mirror_faces = strip_faces[front.mirrored]
+    connected &= ~front.mirrored
+    apart = _between_windings(adjacency, front.turned, connected)
+    remaining = component_sizes(strip_faces, connected & ~apart) >= MIN_COMPONENT
     faces, across = select_faces(strip_faces, adjacency, remaining)
-    if areas_mm2.sum() < 0:
+    turned = front.turned[remaining]
+    if turned.all():
         faces, across = np.ascontiguousarray(faces[:, ::-1]), np.ascontiguousarray(across[:, ::-1])
+    elif turned.any():
+        faces[turned], across[turned] = faces[turned, ::-1], across[turned, ::-1]
     return InitialMesh(
         faces=faces,
         adjacency=across,
+        mirror_faces=mirror_faces,
         strip_pairs=len(runs),
         strip_triangles=len(strip_faces),
         dropped_at_depth_edges=int(np.count_nonzero(at_depth_edge)),
@@ -397,19 +405,13 @@ def initial_mesh(
     )
 
 
-@kernel
-def _facing_areas(first: int, last: int, points: Any, faces: Any, mask: Any, eye: Any, areas: Any) -> None:
-    """For each block of faces, twice the area that faces the eye minus the area that faces away."""
-    # Blocks of one size, added up in order: the same sum for any number of threads.
-    for block in range(first, last):
-        total = 0.0
-        for face in range(block * _BLOCK, min((block + 1) * _BLOCK, len(faces))):
-            if not mask[face]:
-                continue
-            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-            ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-            vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
-            x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            towards = x * (eye[0] - points[a, 0]) + y * (eye[1] - points[a, 1]) + z * (eye[2] - points[a, 2])
-            total += np.sign(towards) * np.sqrt(x * x + y * y + z * z)
-        areas[block] = total
+def _between_windings(
+    adjacency: IntArray, turned: NDArray[np.bool_], connected: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """(F,) bool: turned triangles beside one that is not: with both, a mesh has no front."""
+    apart = np.zeros(len(turned), dtype=np.bool_)
+    suspects = np.flatnonzero(turned & connected)
+    if len(suspects) < np.count_nonzero(connected):
+        beyond = adjacency[suspects]
+        apart[suspects] = ((beyond >= 0) & connected[beyond] & ~turned[beyond]).any(axis=1)
+    return apart

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing.boundary import boundary_point_count, max_boundary_edge_mm, shrink_boundary, smooth_boundary
+from slrig.meshing.facing import Viewpoints, facing_sides
 from slrig.meshing.flips import EdgeOptimisation, angle_rad, optimise_edges
-from slrig.meshing.strips import InitialMesh, initial_mesh
-from slrig.meshing.topology import used_vertices
+from slrig.meshing.strips import MIN_COMPONENT, InitialMesh, initial_mesh
+from slrig.meshing.topology import component_sizes, select_faces, used_vertices
 from slrig.model import FlipRule, FloatArray, IntArray, Mesh
 
 _BLOCK = 488  # not a power of two: rows of a page each would share cache sets
@@ -164,15 +165,23 @@ class MeshStage:
 class SurfaceMesh:
     """The surface through the points of all curves.
 
-    faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the eye; normals : (n, 3) float32, unit,
-    NaN for points without a triangle. stages : in order. steps : statistics of each step: `initial`, `optimisation`
-    (Fig. 10, round by round), and `boundary` if it was smoothed.
+    faces : (F, 3) int32 into the curves' points, counter-clockwise seen from their cameras; normals : (n, 3) float32,
+    unit, NaN for points without a triangle. mirror_faces : (M, 3) int32, dropped mirror images. stages : in order.
+    steps : statistics of each step: `initial`, `optimisation` (Fig. 10, round by round), `boundary` if it was smoothed,
+    and `facing`: the triangles dropped in the end because a device that measured them sees their back, and the dust
+    that they leave.
     """
 
     faces: IntArray
+    mirror_faces: IntArray
     normals: NDArray[np.float32]
     stages: tuple[MeshStage, ...]
     steps: Mapping[str, Mapping[str, object]]
+
+    def among_points(self, mask: NDArray[np.bool_], /) -> SurfaceMesh:
+        """The same faces in points without those beside the mask, (n,) bool, which no face uses; no mirror images."""
+        numbers = np.cumsum(mask, dtype=np.int32) - np.int32(1)
+        return replace(self, faces=numbers[self.faces], normals=self.normals[mask], mirror_faces=self.mirror_faces[:0])
 
     def with_points(self, mask: NDArray[np.bool_], step: str, /) -> SurfaceMesh:
         """Keep the triangles whose three points are in the mask, (n,) bool; `step` names this step in `steps`."""
@@ -187,7 +196,7 @@ def build_surface(
     position_px: FloatArray,
     bridge_after: NDArray[np.bool_],
     sampling_mm: FloatArray,
-    eye_mm: FloatArray,
+    views: Viewpoints,
     limits: MeshingLimits,
     /,
     *,
@@ -209,11 +218,11 @@ def build_surface(
 
     on_step(FIRST_STAGE)
     initial = initial_mesh(
-        points_mm, offsets, position_px, bridge_after, sampling_mm, eye_mm,
+        points_mm, offsets, position_px, bridge_after, sampling_mm, views,
         widest_step_px=limits.widest_step_px, depth_edge_ratio=limits.depth_edge_ratio, keep_holes=limits.keep_holes,
         runs=runs,
     )  # fmt: skip
-    faces, adjacency = initial.faces, initial.adjacency
+    faces, adjacency, mirror_faces = initial.faces, initial.adjacency, initial.mirror_faces
     add_stage(FIRST_STAGE, faces, adjacency)
     steps["initial"] = _initial_figures(initial)
     del initial
@@ -243,7 +252,7 @@ def build_surface(
         on_step("optimising boundary")
         # Flips happen only if triangles were added, and then the arrays belong to the smoothing step.
         optimised = optimise_edges(points_mm, faces, rule=limits.flip_rule, among=added, adjacency=adjacency)
-        faces = optimised.faces
+        faces, adjacency = optimised.faces, optimised.adjacency
         add_stage("optimising boundary", faces, None)
         steps["boundary"] = {
             "shrunk_triangles": shrunk_triangles,
@@ -253,9 +262,18 @@ def build_surface(
             "optimisation": _flip_figures(optimised),
         }
         del optimised
+    fronts = facing_sides(points_mm, faces, views) > 0
+    backs, dust = len(faces) - int(np.count_nonzero(fronts)), 0
+    if backs:
+        # Flips of edges cure most of what noise turned, and fold a few others over.
+        remaining = component_sizes(faces, fronts) >= MIN_COMPONENT
+        faces, adjacency = select_faces(faces, adjacency, remaining)
+        dust = len(fronts) - backs - len(faces)
+        stages[-1] = replace(stages[-1], triangles=len(faces), boundary_points=boundary_point_count(faces, adjacency))
+    steps["facing"] = {"dropped_triangles": backs, "dropped_as_dust": dust}
     del adjacency
     on_step("vertex normals")
-    return SurfaceMesh(faces, vertex_normals(points_mm, faces), tuple(stages), steps)
+    return SurfaceMesh(faces, mirror_faces, vertex_normals(points_mm, faces), tuple(stages), steps)
 
 
 def _initial_figures(made: InitialMesh) -> dict[str, object]:
@@ -264,6 +282,7 @@ def _initial_figures(made: InitialMesh) -> dict[str, object]:
         "strip_triangles": made.strip_triangles,
         "dropped_at_depth_edges": made.dropped_at_depth_edges,
         "dropped_at_bridges": made.dropped_at_bridges,
+        "dropped_as_mirror_images": len(made.mirror_faces),
         "dropped_as_dust": made.dropped_as_dust,
         "dropped_triangles": made.dropped_triangles,
         "triangles": len(made.faces),

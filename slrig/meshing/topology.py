@@ -163,14 +163,16 @@ def degenerate_faces(faces: IntArray) -> NDArray[np.bool_]:
     return np.asarray((a == b) | (b == c) | (c == a))
 
 
-def component_sizes(faces: IntArray, among: NDArray[np.bool_]) -> IntArray:
+def component_sizes(faces: IntArray, among: NDArray[np.bool_], *, counted: NDArray[np.bool_] | None = None) -> IntArray:
     """(F,) int32: number of faces in the connected component of each face, in a mesh of those `among` alone.
 
-    among : (F,) bool. 0 for the others. Faces that share a vertex belong together.
+    among : (F,) bool. 0 for the others. Faces that share a vertex belong together. counted : (F,) bool, count these
+    faces of a component only; by default all.
     """
     faces = np.ascontiguousarray(faces)
     piece = _component_roots(faces, among, _vertex_bound(faces))[faces[:, 0]]
-    sizes = np.bincount(piece[among], minlength=_vertex_bound(faces)).astype(np.int32)
+    members = piece[among if counted is None else among & counted]
+    sizes = np.bincount(members, minlength=_vertex_bound(faces)).astype(np.int32)
     return np.where(among, sizes[piece], np.int32(0))
 
 

@@ -109,7 +109,8 @@ class Refusal(IntEnum):
     NO_INTERSECTION = 12
     SHEET_SEEN_ALONG = 13
     OUTSIDE_REGION = 14
-    CONTRADICTED = 15
+    MIRROR_IMAGE = 15
+    CONTRADICTED = 16
 
 
 class FlipRule(StrEnum):

@@ -106,7 +106,8 @@ function Figures({scan, report}) {
       ["Limited to", limits(scan.plan.reconstruction?.region)],
       ["Calibration", calibration && (calibration.solved_at ? `${age === null ? "age not known" : `${Number(age.toPrecision(2))} days old`}` : calibration.absent)],
       ["Its expected error", calibration?.expected_error_mm && length(calibration.expected_error_mm)],
-      ["Against the known truth, rms", summary.truth && length(summary.truth.rms_mm)],
+      ["Against the known truth, rms within 1 mm", summary.truth && length(summary.truth.rms_mm)],
+      ["Area beyond 1 mm of it", Number.isFinite(summary.truth?.gross_fraction) ? percent(summary.truth.gross_fraction) : null],
     ]} />
     <p><a href=${scan.links.files["report.json"]}>The whole report</a></p>`;
 }

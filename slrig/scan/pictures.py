@@ -65,6 +65,7 @@ _CAUSES: Mapping[Refusal, tuple[tuple[int, int, int], str]] = {
     Refusal.NO_INTERSECTION: ((120, 40, 120), "its ray does not meet the light"),
     Refusal.SHEET_SEEN_ALONG: ((90, 90, 200), "its ray runs along the light, so there is no depth"),
     Refusal.OUTSIDE_REGION: ((86, 80, 77), "outside the region that the scan was asked for, or beyond its limits"),
+    Refusal.MIRROR_IMAGE: ((80, 230, 150), "a mirror image: it faces only one of the devices that measured it"),
     Refusal.CONTRADICTED: (
         (60, 20, 220),
         "columns and rows contradict each other: a mirror image, or the object moved between them",

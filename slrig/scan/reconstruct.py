@@ -20,7 +20,7 @@ from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
-from slrig.meshing import MeshingLimits, MeshStage, build_surface, compact_mesh, mesh_figures, score
+from slrig.meshing import MeshingLimits, MeshStage, Viewpoints, build_surface, compact_mesh, mesh_figures, score
 from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region
 from slrig.reconstruction import (
     MergedCurves,
@@ -35,10 +35,11 @@ from slrig.reconstruction import (
 from slrig.scan.agreement import agreement_report, axis_error
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.colouring import albedo_report, coloured
-from slrig.scan.coverage import coverage_notes, covered_share, require_surface
+from slrig.scan.coverage import coverage_notes, covered_share, layered_share, require_surface
 from slrig.scan.limited import marked, within
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
+from slrig.scan.mirror_images import mirror_image_notes, without_mirror_images, without_surface
 from slrig.scan.offered import agreement_picture as agreement_name
 from slrig.scan.offered import causes_picture, rejected_picture
 from slrig.scan.pictures import (
@@ -60,6 +61,7 @@ from slrig.scan.report import (
     view_report,
     with_seconds,
 )
+from slrig.scan.soundness import fault_notes, layer_notes, truth_notes
 from slrig.scan.stream import CameraResult, LiveScan
 from slrig.scan.triangulated import Triangulated, steps, widest_gap_px
 
@@ -189,18 +191,26 @@ def reconstruct_into(
             encode_points_ply(meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm),
         )
         covered = covered_share(mesh, cameras[0])
-        figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
+        sizes = mesh_figures(mesh.vertices_mm, mesh.faces)
+        figures = {**meshed.figures, "figures": sizes}
         entered("pictures", 0.85, "")
         for name, picture in pictures.result().items():
             place(name, picture)
-        known = _compared_with_truth(bundle, mesh, cameras[0], plan.region, entered)
+        known = _compared_with_truth(bundle, mesh, cameras, plan.region, entered)
         if (turntable := read_turntable_angle(bundle)) is not None:
             known["turntable"] = turntable.document()
         entered("write report", 0.98, "")
         seconds = watch.finished()
         report = {
             **walked.sections,
-            "notes": [*read_notes(bundle), *walked.notes, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
+            "notes": [
+                *read_notes(bundle),
+                *walked.notes,
+                *meshed.notes,
+                *coverage_notes(cameras[0].name, covered),
+                *fault_notes(sizes),
+                *truth_notes(known.get("truth", {})),
+            ],
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_calibration_sigma_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
@@ -251,10 +261,17 @@ def _meshed(
     gap_px = widest_gap_px(projector, axis)
     beside = steps(cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=gap_px)
     sampling = sampling_mm(points.points_mm, first.device, projector, axis, beside.at_points_px)
+    second = cameras[found.second].device if projector is None else projector
+    views = Viewpoints(
+        joined_curves.camera,
+        np.stack([seen.device.centre_mm for seen in cameras]),
+        second.centre_mm,
+        points.deviation_mm,
+    )
     surface = build_surface(
         points.points_mm, points.offsets, points.position_px, points.bridge_after,
         # Two points of one place are as far apart as noise has them.
-        np.hypot(sampling, np.linalg.norm(points.deviation_mm, axis=1)), first.device.centre_mm,
+        np.hypot(sampling, np.linalg.norm(points.deviation_mm, axis=1)), views,
         MeshingLimits(
             widest_step_px=step_px * plan.max_code_gap,
             depth_edge_ratio=plan.depth_edge_ratio,
@@ -265,8 +282,10 @@ def _meshed(
         on_step=lambda stage: entered(stage, 0.68, count),
         runs=beside.runs,
     )  # fmt: skip
-    require_surface(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
+    require_surface(len(surface.faces) > 0, folder, without_surface(surface, projector), cameras)
     entered("vertices", 0.72, count)
+    cameras, joined_curves, surface = without_mirror_images(cameras, joined_curves, surface)
+    found, points = replace(found, cameras=cameras, joined=joined_curves), joined_curves.curves
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
     share = _calibration_share(walked.devices, found, axis, surface.normals)
     if share is not None:
@@ -295,6 +314,11 @@ def _meshed(
         colour=colours.colour,
         mark=colours.mark,
     )
+    apart_mm = plan.depth_edge_ratio * float(np.median(sampling))
+    layered = {
+        seen.name: layered_share(seen, points, joined_curves.camera == index, surface.faces, apart_mm)
+        for index, seen in enumerate(cameras)
+    }
     mesh = compact_mesh(
         surface.faces, points.points_mm, surface.normals, colours.colour, colours.mark, sigma, points.offsets,
         points.position_px,
@@ -307,13 +331,18 @@ def _meshed(
         mesh_calibration_sigma_mm=None if share is None else share[_used(surface.faces, len(share))],
         cameras=cameras,
         stages=surface.stages,
-        figures=mesh_report(surface, mesh, curves),
+        figures={**mesh_report(surface, mesh, curves), "layered": layered},
         redundancy={
             **redundancy_report(joined_curves, points.source, found.spare),
             **agreement_report(walked.agreement),
         },
         albedo=albedo_report(colours, mesh, cameras, lit=projector is not None, mapped=light is not None),
-        notes=(*(() if apart is None else (str(apart),)), *(() if tested is None else (tested.note,))),
+        notes=(
+            *mirror_image_notes(surface, cameras, projector),
+            *layer_notes(layered),
+            *(() if apart is None else (str(apart),)),
+            *(() if tested is None else (tested.note,)),
+        ),
     )
 
 
@@ -358,16 +387,20 @@ def _encoded_pictures(mesh: Mesh, cameras: list[CameraResult]) -> dict[str, byte
 
 
 def _compared_with_truth(
-    bundle: Path, mesh: Mesh, seen: CameraResult, region: Region | None, entered: Callable[[str, float, str], None]
-) -> dict[str, object]:
-    """The report's section on truth, for bundles that bring it. seen : the first camera."""
+    bundle: Path,
+    mesh: Mesh,
+    cameras: list[CameraResult],
+    region: Region | None,
+    entered: Callable[[str, float, str], None],
+) -> dict[str, Mapping[str, object]]:
+    """The report's section on truth, for bundles that bring it; it is of the first camera."""
     truth = read_truth(bundle)
     if truth is None:
         return {}
     entered("compare with truth", 0.9, "")
-    visible = truth.visible_points_mm
+    seen, visible = cameras[0], truth.visible_points_mm
     if region is not None:
         # What nobody asked for is not missing.
         pixels = np.clip(project(seen.device, visible), 0, np.array(seen.curves.refusal.shape[::-1]) - 1)
         visible = visible[within(region, visible, pixels, seen.curves.refusal, seen.device)]
-    return {"truth": score(mesh, truth.surface, visible, seen.device.centre_mm).as_dict()}
+    return {"truth": score(mesh, truth.surface, visible, *(each.device.centre_mm for each in cameras)).as_dict()}

@@ -74,3 +74,16 @@ def test_without_its_line_frames_a_bundle_is_reconstructed_from_code_edges(
     assert report["truth"]["rms_mm"] <= 0.12
     assert report["truth"]["complete_0.3mm"] >= 0.70
     assert report["truth"]["nonmanifold_edges"] == 0
+
+
+@pytest.mark.slow
+def test_what_a_wall_shows_in_a_mirror_is_no_surface(shared: Path, tmp_path: Path) -> None:
+    report = reconstructed(shared / "cases" / "mirror_groove", tmp_path / "out")
+    truth = report["truth"]
+    assert truth["false_area_0.5mm"] <= 0.01
+    assert truth["facing_camera_area"] >= 0.999
+    # As much as with the phantom, which was half of the mesh.
+    assert truth["complete_0.1mm"] >= 0.995 * 0.5503
+    assert report["mesh"]["mirror_images"]["area_share"] > 0.5
+    assert report["cameras"]["cam0"]["refused_pixels"]["mirror_image"] > 20_000
+    assert sum(note.startswith("mirror images: 5") for note in report["notes"]) == 1

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -33,7 +34,7 @@ from slrig.calibration.artefacts import Decision
 from slrig.cli import accept as accepting
 from slrig.cli.accept import moving, placed_by_hand, plan_for
 from slrig.cli.commands import INTERRUPTED, app
-from slrig.cli.demo import remove_earlier, still_missing
+from slrig.cli.demo import remove_earlier, require_sound, still_missing
 from slrig.cli.display import ProgressDisplay, print_json, print_table
 from slrig.cli.options import AcceptanceOptions, ServiceOptions
 from slrig.cli.quality import quality_lines
@@ -55,7 +56,7 @@ DEMO = Path(__file__).parents[2] / "config" / "rigs" / "demo.toml"
 SUMMARY = {
     "identity": "28/28 patterns verified, 2 frames shot again",
     "mesh": {"figures": {"vertices": 1200, "triangles": 2301}, "sigma_mm": {"p50": 0.0079}},
-    "truth": {"rms_mm": 0.0123, "complete_0.3mm": 0.97},
+    "truth": {"rms_mm": 0.0123, "gross_fraction": 0.026, "complete_0.3mm": 0.97},
 }
 SERIES = "/scan/series/9"
 
@@ -321,10 +322,34 @@ def test_result_is_shown_with_its_files_and_its_quality(tmp_path: Path, capsys: 
         "frames    28/28 patterns verified, 2 frames shot again",
         "size      1,200 vertices, 2,301 triangles",
         "stated    standard deviation of a point 0.0079 mm (median)",
-        "error     rms 0.0123 mm against the known truth, 97.0% of the visible surface within 0.3 mm",
+        "error     rms 0.0123 mm against the known truth, of the 97.4% of the area within 1 mm; 2.6% beyond 1 mm, "
+        "97.0% of the visible surface within 0.3 mm",
     ]
-    # A summary of an earlier version.
+    # Summaries of earlier versions.
     assert quality_lines({"method": "Gray-only"}) == []
+    earlier = {"truth": {"rms_mm": 0.0123, "complete_0.3mm": 0.97}}
+    assert quality_lines(earlier) == [
+        "error     rms 0.0123 mm against the known truth, 97.0% of the visible surface within 0.3 mm"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("truth", "line", "code"),
+    [
+        ({"rms_mm": 0.0055, "gross_fraction": 0.0}, "of the 100.0% of the area within 1 mm; 0.0% beyond 1 mm", 0),
+        ({"rms_mm": 0.0055, "gross_fraction": 0.026}, "of the 97.4% of the area within 1 mm; 2.6% beyond 1 mm", 1),
+        ({"rms_mm": None, "gross_fraction": 1.0}, "nothing within 1 mm of the known truth", 1),
+        ({"rms_mm": 0.0055, "gross_fraction": 0.0, "facing_camera_area": 0.4}, "0.0% beyond 1 mm", 1),
+        (None, "", 0),
+    ],
+)
+def test_the_error_names_what_is_beyond_its_limit_and_a_demo_ends_accordingly(
+    truth: dict[str, Any] | None, line: str, code: int
+) -> None:
+    assert [each.endswith(line) for each in quality_lines({"truth": truth})] == [True] * (truth is not None)
+    ended = nullcontext() if code == 0 else pytest.raises(typer.Exit, check=lambda end: end.exit_code == code)
+    with ended:
+        require_sound({"summary": {"truth": truth}})
 
 
 def test_series_goes_on_after_a_failure_and_names_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""From curves to the initial mesh: strips, drops that are counted, and a front that faces the camera."""
+"""From curves to the initial mesh: strips, drops that are counted, and a front that faces its devices."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slrig.meshing.facing import Viewpoints
 from slrig.meshing.strips import InitialMesh, initial_mesh
 from slrig.meshing.surface import vertex_normals
 from slrig.meshing.topology import neighbours
 from slrig.model import FloatArray, IntArray
 
-EYE_MM = np.array([5.0, 5.0, -400.0])
+EYE_MM, LAMP_MM = np.array([5.0, 5.0, -400.0]), np.array([90.0, 5.0, -400.0])
 COLUMNS, ROWS = 12, 15
 
 
@@ -24,13 +25,18 @@ def relief(depth_mm: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
 
 
 def meshed(
-    points: FloatArray, offsets: IntArray, position: FloatArray, *, eye_mm: FloatArray = EYE_MM,
+    points: FloatArray, offsets: IntArray, position: FloatArray, *, eyes_mm: FloatArray = EYE_MM,
+    second_mm: FloatArray = LAMP_MM, camera: NDArray[np.int32] | None = None, sigma_mm: float = 0.0,
     bridge_after: NDArray[np.bool_] | None = None, keep_holes: bool = False, widest_step_px: float = 8.0,
 ) -> InitialMesh:  # fmt: skip
     return initial_mesh(
         points, offsets, position,
         np.zeros(len(points), dtype=np.bool_) if bridge_after is None else bridge_after,
-        np.ones(len(points)), eye_mm,
+        np.ones(len(points)),
+        Viewpoints(
+            np.zeros(len(points), dtype=np.int32) if camera is None else camera, np.atleast_2d(eyes_mm), second_mm,
+            np.full((len(points), 3), (0.0, 0.0, sigma_mm)),
+        ),
         widest_step_px=widest_step_px, depth_edge_ratio=6.0, keep_holes=keep_holes,
     )  # fmt: skip
 
@@ -62,8 +68,8 @@ def test_the_front_faces_the_eye(*, mirrored: bool, behind: bool) -> None:
     points, offsets, position = relief(wave())
     if mirrored:
         points = points * [-1, 1, 1]
-    eye = EYE_MM * [1, 1, -1] if behind else EYE_MM
-    mesh = meshed(points, offsets, position, eye_mm=eye)
+    eye, lamp = (each * [1, 1, -1] if behind else each for each in (EYE_MM, LAMP_MM))
+    mesh = meshed(points, offsets, position, eyes_mm=eye, second_mm=lamp)
     assert facing(mesh, points, eye).all()
     towards = ((eye - points) * vertex_normals(points, mesh.faces)).sum(axis=1)
     assert (towards > 0).all()
@@ -114,20 +120,61 @@ def test_the_mesh_knows_its_neighbours_after_the_drop(*, behind: bool) -> None:
     points, offsets, position = relief(depth)
     bridge = np.zeros(len(points), dtype=np.bool_)
     bridge[3 * ROWS + 7] = True
-    eye = EYE_MM * [1, 1, -1] if behind else EYE_MM
-    mesh = meshed(points, offsets, position, eye_mm=eye, bridge_after=bridge, keep_holes=True)
+    eye, lamp = (each * [1, 1, -1] if behind else each for each in (EYE_MM, LAMP_MM))
+    mesh = meshed(points, offsets, position, eyes_mm=eye, second_mm=lamp, bridge_after=bridge, keep_holes=True)
     assert mesh.dropped_triangles > 10
     np.testing.assert_array_equal(mesh.adjacency, neighbours(mesh.faces, vertex_count=len(points)))
 
 
-def test_the_side_with_more_area_towards_the_eye_is_the_front() -> None:
-    # A ridge of which the eye sees both sides, one of them from behind; areas in plain numpy.
+def ridge(fall: float) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Level up to the sixth curve, then away from the eye by `fall` for each."""
     x, y = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS), indexing="ij")
-    points, offsets, position = relief(np.where(x < 5, 4.0 * x, 40.0 - 4 * x) + 0.1 * y)
-    for eye in (np.array([-300.0, 5, 0]), np.array([300.0, 5, 0])):
-        mesh = meshed(points, offsets, position, eye_mm=eye)
-        corners = points[mesh.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        towards = np.sign(((eye - corners.mean(axis=1)) * normal).sum(axis=1))
-        assert (towards * np.linalg.norm(normal, axis=1)).sum() > 0
-        assert not (towards > 0).all()
+    return relief(fall * np.maximum(x - 5.0, 0.0) + 0.1 * y)
+
+
+ASIDE_MM = np.array([-300.0, 5.0, -100.0])
+"""Sees a fall of 4 from behind: the lamp does not."""
+
+
+def test_triangles_that_face_only_one_device_are_mirror_images() -> None:
+    points, offsets, position = ridge(4.0)
+    mesh = meshed(points, offsets, position, eyes_mm=ASIDE_MM)
+    assert len(mesh.mirror_faces) == 6 * (2 * ROWS - 2)
+    assert points[mesh.mirror_faces][..., 0].min() == 5
+    assert len(mesh.faces) == 5 * (2 * ROWS - 2)
+    assert facing(mesh, points, ASIDE_MM).all()
+    np.testing.assert_array_equal(mesh.adjacency, neighbours(mesh.faces, vertex_count=len(points)))
+    assert len(meshed(points, offsets, position).mirror_faces) == 0
+
+
+def test_what_noise_turned_is_no_mirror_image() -> None:
+    # Seen at 1° by the camera; one point is off.
+    points, offsets, position = relief(0 * wave())
+    points[6 * ROWS + 7, 2] += 0.03
+    eye = np.array([-1000.0, 7.0, -17.5])
+    noisy, sharp = (meshed(points, offsets, position, eyes_mm=eye, sigma_mm=each) for each in (0.02, 0.0001))
+    assert len(noisy.mirror_faces) == noisy.dropped_triangles == 0
+    assert not facing(noisy, points, eye).all()
+    assert len(sharp.mirror_faces) == sharp.dropped_triangles == (~facing(noisy, points, eye)).sum()
+    assert facing(sharp, points, eye).all()
+
+
+def test_a_triangle_has_to_face_the_camera_that_measured_it_and_no_other() -> None:
+    points, offsets, position = ridge(4.0)
+    other = np.repeat(np.arange(COLUMNS) >= 5, ROWS)
+    eyes = np.stack([ASIDE_MM, EYE_MM])
+    mesh = meshed(points, offsets, position, eyes_mm=eyes, camera=other.astype(np.int32))
+    assert len(mesh.mirror_faces) == 0
+    mesh = meshed(points, offsets, position, eyes_mm=eyes, camera=(~other).astype(np.int32))
+    assert len(mesh.mirror_faces) == 6 * (2 * ROWS - 2)
+
+
+def test_a_part_that_both_cameras_of_a_pair_see_lit_by_way_of_a_mirror_is_turned_to_them() -> None:
+    # Behind the fifth curve the columns run back again, over a part that lies lower.
+    points, offsets, position = relief(wave())
+    points[5 * ROWS :, 0] = 30.0 - points[5 * ROWS :, 0]
+    mesh = meshed(points, offsets, position)
+    assert len(mesh.mirror_faces) == 0
+    assert len(mesh.faces) == mesh.strip_triangles - (2 * ROWS - 2)
+    assert facing(mesh, points, EYE_MM).all()
+    np.testing.assert_array_equal(mesh.adjacency, neighbours(mesh.faces, vertex_count=len(points)))

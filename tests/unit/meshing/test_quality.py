@@ -195,6 +195,14 @@ def test_a_mesh_turned_inside_out_faces_away() -> None:
     assert scored(replace(mesh, faces=np.ascontiguousarray(mesh.faces[:, ::-1]))).facing_camera_fraction == 0
 
 
+def test_a_mesh_may_face_any_of_the_cameras() -> None:
+    mesh = flat()
+    turned = replace(mesh, faces=np.where(mesh.faces[:, :1] % 2 == 0, mesh.faces, mesh.faces[:, ::-1]))
+    truth = Surface(mesh.vertices_mm.astype(np.float64), mesh.faces)
+    assert score(turned, truth, np.zeros((1, 3)), EYE_MM).facing_camera_fraction == pytest.approx(0.5, abs=0.02)
+    assert score(turned, truth, np.zeros((1, 3)), EYE_MM, -EYE_MM).facing_camera_fraction == 1
+
+
 def test_a_mesh_without_stated_uncertainty_has_no_ratio() -> None:
     mesh = flat(0.1)
     unstated = replace(mesh, sigma_mm=np.full(len(mesh.vertices_mm), np.nan, dtype=np.float32))

@@ -8,7 +8,7 @@ from numba import config
 from numpy.typing import NDArray
 
 from slrig.meshing import rasteriser
-from slrig.meshing.rasteriser import rasterise, rasterise_normals
+from slrig.meshing.rasteriser import depth_ranges, rasterise, rasterise_normals
 from slrig.model import FloatArray, IntArray, Size
 from tests.unit.meshing.plain import grid_faces
 
@@ -121,3 +121,19 @@ def test_no_triangles_are_no_view() -> None:
     view = rasterise(placed, faces, Size(4, 3))
     assert np.isnan(view.depth_mm).all()
     assert not rasterise_normals(view, placed, placed, faces)[0].any()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_range_of_depths_is_that_of_all_triangles_at_a_pixel(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    share_out(monkeypatch, threads)
+    placed, faces, _ = random_triangles()
+    nearest, furthest = np.full(SIZE.shape, np.inf), np.full(SIZE.shape, -np.inf)
+    for face in faces:
+        weights = plain_weights(placed[face].astype(np.float64), SIZE)
+        inside, depth = (weights >= 0).all(axis=0), np.einsum("irc,i->rc", weights, placed[face, 2])
+        nearest[inside] = np.minimum(nearest, depth)[inside]
+        furthest[inside] = np.maximum(furthest, depth)[inside]
+    found = depth_ranges(placed.astype(np.float64), faces, SIZE)
+    np.testing.assert_allclose(found, (nearest, furthest), rtol=1e-9)
+    empty, _ = depth_ranges(np.zeros((0, 3)), faces[:0], SIZE)
+    assert np.isinf(empty).all()

@@ -6,11 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from slrig.meshing.facing import Viewpoints, facing_sides
 from slrig.meshing.surface import MeshingLimits, SurfaceMesh, build_surface
-from slrig.meshing.topology import topology_counts
+from slrig.meshing.topology import component_sizes, topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
 
 EYE_MM = np.array([0.0, 0.0, -500.0])
+
+
+def from_eye(points: FloatArray) -> Viewpoints:
+    """Camera and projector stand in one place."""
+    return Viewpoints(np.zeros(len(points), dtype=np.int32), EYE_MM[None], EYE_MM, np.zeros_like(points))
+
+
 LIMITS = MeshingLimits(
     widest_step_px=1.0,
     depth_edge_ratio=6.0,
@@ -36,8 +44,8 @@ def jagged_curves(*, curves: int = 60, points: int = 80) -> tuple[FloatArray, In
 def meshed(points: FloatArray, offsets: IntArray, limits: MeshingLimits = LIMITS) -> tuple[SurfaceMesh, list[str]]:
     told: list[str] = []
     made = build_surface(
-        points, offsets, np.arange(len(offsets) - 1.0), np.zeros(len(points), dtype=bool), np.ones(len(points)), EYE_MM,
-        limits, on_step=told.append,
+        points, offsets, np.arange(len(offsets) - 1.0), np.zeros(len(points), dtype=bool), np.ones(len(points)),
+        from_eye(points), limits, on_step=told.append,
     )  # fmt: skip
     return made, told
 
@@ -76,7 +84,7 @@ def test_smoothing_leaves_a_shorter_boundary_and_a_sound_mesh() -> None:
 def test_the_boundary_is_left_alone_when_asked() -> None:
     made, told = meshed(*jagged_curves(), replace(LIMITS, smooth_boundary=False))
     assert [stage.name for stage in made.stages] == ["initial meshing", "global optimisation"]
-    assert made.steps.keys() == {"initial", "optimisation"}
+    assert made.steps.keys() == {"initial", "optimisation", "facing"}
     assert "shrinking boundary" not in told
 
 
@@ -92,8 +100,40 @@ def test_a_hole_at_a_bridge_stays_open_when_holes_are_kept() -> None:
     holes = {}
     for keep_holes in (True, False):
         made = build_surface(
-            points[keep], shorter, np.arange(len(offsets) - 1.0), bridge[keep], np.ones(int(keep.sum())), EYE_MM,
+            points[keep], shorter, np.arange(len(offsets) - 1.0), bridge[keep], np.ones(int(keep.sum())),
+            from_eye(points[keep]),
             replace(LIMITS, keep_holes=keep_holes), on_step=lambda _: None,
         )  # fmt: skip
         holes[keep_holes] = 1 - topology_counts(made.faces).euler_characteristic
     assert holes == {True: 1, False: 0}
+
+
+def test_no_triangle_faces_away_in_the_end() -> None:
+    # Deep noise, seen from aside: flips fold some triangles over.
+    points, offsets = jagged_curves()
+    points[:, 2] += np.random.default_rng(0).normal(0, 0.8, len(points))
+    views = replace(from_eye(points), cameras_mm=np.array([[-300.0, 40.0, -150.0]]))
+    views = replace(views, deviation_mm=np.full_like(points, 5.0))
+    made = build_surface(
+        points, offsets, np.arange(len(offsets) - 1.0), np.zeros(len(points), dtype=bool), np.ones(len(points)), views,
+        LIMITS, on_step=lambda _: None,
+    )  # fmt: skip
+    dropped = made.steps["facing"]["dropped_triangles"]
+    assert isinstance(dropped, int)
+    assert dropped > 0
+    # What that cuts off is dust.
+    assert made.steps["facing"]["dropped_as_dust"] != 0
+    assert component_sizes(made.faces, np.ones(len(made.faces), dtype=bool)).min() >= 100
+    assert (facing_sides(points, made.faces, views) == 1).all()
+    assert made.stages[-1].triangles == len(made.faces)
+    assert made.stages[-1].boundary_points == topology_counts(made.faces).boundary_vertices
+
+
+def test_points_are_renumbered_without_those_that_no_face_uses() -> None:
+    points, offsets = jagged_curves()
+    made, _ = meshed(points, offsets)
+    beside = np.zeros(len(points), dtype=bool)
+    beside[made.faces] = True
+    less = made.among_points(beside)
+    np.testing.assert_array_equal(points[beside][less.faces], points[made.faces])
+    np.testing.assert_array_equal(less.normals, made.normals[beside])

@@ -66,6 +66,8 @@ def test_random_faces_agree_with_counting_one_by_one() -> None:
 def test_components_are_joined_by_a_vertex() -> None:
     faces = faces_of((8, 9, 7), (0, 1, 2), (9, 10, 11), (3, 4, 5), (5, 1, 6))
     assert component_sizes(faces, np.ones(5, dtype=np.bool_)).tolist() == [2, 3, 2, 3, 3]
+    counted = np.array([False, True, True, False, True])
+    assert component_sizes(faces, np.ones(5, dtype=np.bool_), counted=counted).tolist() == [1, 2, 1, 2, 2]
     assert topology_counts(faces).components == 2
 
 
