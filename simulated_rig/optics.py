@@ -11,6 +11,7 @@ levels of σ, and each pixel is interpolated between two of them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,6 +148,18 @@ def look_at(position_mm: FloatArray, target_mm: FloatArray, down: FloatArray) ->
     z, x = forward / distance, right / spread
     rotation = np.stack([x, np.cross(z, x), z])
     return rotation, -rotation @ position_mm
+
+
+def vignetting(
+    column_px: NDArray[Any], row_px: NDArray[Any], projector: Pinhole, fall_off: tuple[float, float]
+) -> NDArray[Any]:
+    """Factor of the projector's lens on the light at these positions: see `SimulatedProjectorOptions.fall_off`."""
+    power, corner = fall_off
+    (fx, _, cx), (_, fy, cy), _ = projector.matrix
+    square = ((column_px - cx) / fx) ** 2 + ((row_px - cy) / fy) ** 2
+    width, height = projector.size.width_px, projector.size.height_px
+    farthest = (max(cx, width - cx) / fx) ** 2 + (max(cy, height - cy) / fy) ** 2
+    return np.asarray((1 + square) ** (-power / 2) * np.maximum(1 - corner * square / farthest, 0))
 
 
 def image_positions(points_mm: FloatArray, device: Pinhole) -> FloatArray:

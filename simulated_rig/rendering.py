@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulated_rig import transport
+from simulated_rig.bounces import Bounces, trace_bounces
 from simulated_rig.light import Float32Array, LightTable, blur_image, radiance
-from simulated_rig.optics import ALWAYS_SHARP, LEVELS_PX, Focus, lens_array, level_weights, world_directions
+from simulated_rig.optics import ALWAYS_SHARP, LEVELS_PX, Focus, lens_array, level_weights, vignetting, world_directions
 from simulated_rig.scene import SceneSurface
 from simulated_rig.transport import LightPaths, RayCaster, build_caster
 from slrig.kernels import kernel
@@ -157,6 +158,7 @@ class _ViewCache:
     """Traced results for one scene snapshot and one camera pose.
 
     room : image under ambient light alone; last : image under the last requested projector light.
+    bounces : light by way of two surfaces, None if the scene has none.
     defocus_weights : weight of each level of defocus at every pixel, for the projector and for the camera.
     """
 
@@ -164,6 +166,7 @@ class _ViewCache:
         self.snapshot = snapshot
         self.camera = camera
         self.paths: LightPaths | None = None
+        self.bounces: Bounces | None = None
         self.room: Float32Array | None = None
         self.last: tuple[LightTable, Float32Array] | None = None
         self.defocus_weights: tuple[Weights, Weights] | None = None
@@ -234,17 +237,21 @@ class CameraView:
                 report_progress=report_progress,
             )
             if any(self._scene.fall_off):
-                self._apply_fall_off(cache.paths, cache.snapshot.projector)
+                paths, projector = cache.paths, cache.snapshot.projector
+                paths.weight[:] *= vignetting(paths.column_px, paths.row_px, projector, self._scene.fall_off)
+            cache.bounces = trace_bounces(
+                cache.camera,
+                cache.snapshot.projector,
+                cache.snapshot.surface,
+                cache.snapshot.rays,
+                samples_per_axis=self._samples_per_axis,
+                jitter=self._jitter,
+                seed=self._seed,
+                working_distance_mm=self._scene.working_distance_mm,
+                fall_off=self._scene.fall_off,
+                workers=self._workers,
+            )
         return cache.paths
-
-    def _apply_fall_off(self, paths: LightPaths, projector: Pinhole) -> None:
-        """Apply the vignetting of the projector's lens: see `SimulatedProjectorOptions.fall_off`."""
-        power, corner = self._scene.fall_off
-        (fx, _, cx), (_, fy, cy), _ = projector.matrix
-        square = ((paths.column_px - cx) / fx) ** 2 + ((paths.row_px - cy) / fy) ** 2
-        width, height = projector.size.width_px, projector.size.height_px
-        farthest = (max(cx, width - cx) / fx) ** 2 + (max(cy, height - cy) / fy) ** 2
-        paths.weight[:] *= (1 + square) ** (-power / 2) * np.maximum(1 - corner * square / farthest, 0)
 
     def image(
         self, lights: Sequence[tuple[float | Float32Array, LightTable]], *, ambient: Float32Array | None = None
@@ -299,7 +306,10 @@ class CameraView:
     def _render_light(self, cache: _ViewCache, paths: LightPaths, light: LightTable) -> Float32Array:
         if light.channel is not None:
             paths = paths.for_channel(light.channel)
-        image = self._render_defocused(cache, paths, light) * np.float32(light.power)
+        image = self._render_defocused(cache, paths, light)
+        if cache.bounces is not None:
+            image += blur_image(cache.bounces.image(light, paths.albedo), self._blur_px)
+        image *= np.float32(light.power)
         if light.glow > 0:
             image += blur_image(paths.albedo * np.float32(light.glow), self._blur_px)
         return image

@@ -75,6 +75,18 @@ class Specular(Strict):
     exponent: Annotated[float, Field(ge=1)] = 20.0
 
 
+class Mirror(Strict):
+    """Light that an object reflects as a mirror, in which other objects and other parts of itself appear.
+
+    share : of the light, the same at all angles; albedo and share together are 1 at most. roughness : standard
+    deviation of the slopes of the surface along any direction; 0 is a perfect mirror, 0.05 spreads the reflected light
+    by about 6 degrees. Images of the projector itself are `specular`.
+    """
+
+    share: Fraction = 0.0
+    roughness: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+
+
 class SceneObject(Strict):
     """Object with a pose (rotation about its own x, then y, then z axis as fixed axes) and a gloss."""
 
@@ -82,6 +94,13 @@ class SceneObject(Strict):
     position_mm: Triple = (0.0, 0.0, 0.0)
     rotation_deg: Triple = (0.0, 0.0, 0.0)
     specular: Specular = Specular()
+    mirror: Mirror = Mirror()
+
+    def require_energy(self, albedo: float) -> None:
+        """Raise ValueError if the object would reflect more light than it receives."""
+        if albedo + self.mirror.share > 1:
+            message = f"albedo and mirror.share together must not exceed 1, found {albedo:g} and {self.mirror.share:g}"
+            raise ValueError(message)
 
     def colours(self) -> tuple[Colour, Colour]:
         """Return the colours where a texture is light and where it is dark."""
@@ -95,11 +114,19 @@ class TexturedObject(SceneObject):
     colour: Colour = WHITE
     texture: Texture = Texture()
 
+    @model_validator(mode="after")
+    def _check_energy(self) -> TexturedObject:
+        self.require_energy(self.albedo)
+        return self
+
     def material(self) -> tuple[float, ...]:
-        """Return (6,): albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent."""
-        texture, lobe = self.texture, self.specular
+        """Return (8,): albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent, mirror share,
+        roughness.
+        """
+        texture, lobe, mirror = self.texture, self.specular, self.mirror
         kind = float(TEXTURES.index(texture.kind))
-        return (self.albedo, kind, texture.contrast, texture.scale_mm, lobe.strength, lobe.exponent)
+        paint = (self.albedo, kind, texture.contrast, texture.scale_mm)
+        return (*paint, lobe.strength, lobe.exponent, mirror.share, mirror.roughness)
 
     def colours(self) -> tuple[Colour, Colour]:
         """See `SceneObject`."""
@@ -172,6 +199,7 @@ class PrintedBoard(SceneObject):
         if self.albedo_dark >= self.albedo_light:
             message = "albedo_dark must be below albedo_light"
             raise ValueError(message)
+        self.require_energy(self.albedo_light)
         if self.kind == "charuco":
             if not self._marker_mm < self.square_mm:
                 message = f"marker_mm must be below square_mm, {self.square_mm} mm"
@@ -264,7 +292,8 @@ class PrintedBoard(SceneObject):
 
     def material(self) -> tuple[float, ...]:
         """Return the material of the light paper, see `TexturedObject.material`."""
-        return (self.albedo_light, 0.0, 0.0, 1.0, self.specular.strength, self.specular.exponent)
+        lobe, mirror = self.specular, self.mirror
+        return (self.albedo_light, 0.0, 0.0, 1.0, lobe.strength, lobe.exponent, mirror.share, mirror.roughness)
 
     def print_layout(self) -> BoardPrint:
         """Return the layout of the print."""
@@ -386,6 +415,47 @@ class Stairs(TexturedObject):
         return [shapes.staircase(self.steps, self.tread_mm, self.rise_mm, self.height_mm)]
 
 
+class Groove(TexturedObject):
+    """V groove: two flat walls of `wall_mm` depth that meet along y, `length_mm` long, and open towards -z.
+
+    `opening_deg` is the angle between the walls. The edge is at the object's origin; rotation_deg = [0, 0, 90] turns it
+    across.
+    """
+
+    shape: Literal["groove"]
+    opening_deg: Annotated[float, Field(gt=0, lt=180)] = 90.0
+    wall_mm: Positive
+    length_mm: Positive
+
+    def parts(self, _folder: Path) -> list[MeshPart]:
+        """Return the walls."""
+        return [shapes.groove(np.deg2rad(self.opening_deg), self.wall_mm, self.length_mm)]
+
+
+class Bowl(TexturedObject):
+    """Inside of a spherical cap about the z axis that opens towards -z; its lowest point is the object's origin.
+
+    `half_angle_deg` is the angle at the sphere's centre between the axis and the rim: 90 is half a sphere.
+    """
+
+    shape: Literal["bowl"]
+    radius_mm: Positive
+    half_angle_deg: Annotated[float, Field(gt=0, le=90)] = 80.0
+    step_mm: Positive = 0.5
+
+    @model_validator(mode="after")
+    def _check_cell_count(self) -> Bowl:
+        cells = 2 * np.pi * (self.radius_mm / self.step_mm) ** 2
+        if cells > 4e6:
+            message = f"radius_mm and step_mm give {cells:.0f} cells, the limit is 4000000; use a larger step_mm"
+            raise ValueError(message)
+        return self
+
+    def parts(self, _folder: Path) -> list[MeshPart]:
+        """Return the inside."""
+        return [shapes.bowl(self.radius_mm, np.deg2rad(self.half_angle_deg), self.step_mm)]
+
+
 class Wave(Strict):
     """Sine wave of a relief: amplitude_mm * sin(2 pi s / wavelength_mm + phase), s along `direction_deg` from x."""
 
@@ -486,15 +556,19 @@ class MeshFile(TexturedObject):
 
 
 AnyObject = Annotated[
-    PlaneObject | Sphere | BallBar | Stairs | Relief | Vessel | MeshFile | PrintedBoard,
+    PlaneObject | Sphere | BallBar | Stairs | Groove | Bowl | Relief | Vessel | MeshFile | PrintedBoard,
     Field(discriminator="shape"),
 ]
 
 
 class Scene(Strict):
-    """Scene file: a name and one or more objects."""
+    """Scene file: a name and one or more objects.
+
+    interreflection : diffuse light goes on from each surface to the others, once. Mirrors (`Mirror`) work without it.
+    """
 
     name: str = ""
+    interreflection: bool = False
     object: Annotated[tuple[AnyObject, ...], Field(strict=False), AfterValidator(require_one)]
 
 
@@ -505,9 +579,10 @@ class SceneSurface:
     vertices_mm : (V, 3) float64; faces : (F, 3) int32; corner_normals : (F, 3, 3) float32, unit; part : (F,) int32.
     sphere_mm : (P, 4) float64, centre and radius of a ball; radius 0 for other parts.
     to_object : (P, 3, 4) float64, world to the object's own frame.
-    material : (P, 6) float64: albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent.
+    material : (P, 8) float64: albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent, mirror
+    share, roughness.
     colours : (P, 2, 3) float64, blue, green and red where a texture is light, and where it is dark.
-    prints : print of each part that is a board.
+    prints : print of each part that is a board. interreflection : as in `Scene`.
     """
 
     vertices_mm: FloatArray
@@ -519,6 +594,7 @@ class SceneSurface:
     material: FloatArray
     colours: FloatArray
     prints: Mapping[int, BoardPrint] = field(default_factory=dict)
+    interreflection: bool = False
 
 
 def read_scene(path: Path) -> Scene:
@@ -568,4 +644,5 @@ def build_surface(scene: Scene, folder: Path) -> SceneSurface:
         material=np.array(materials, np.float64),
         colours=np.array(colours, np.float64),
         prints=prints,
+        interreflection=scene.interreflection,
     )

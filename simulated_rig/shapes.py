@@ -106,6 +106,31 @@ def staircase(steps: int, tread_mm: float, rise_mm: float, height_mm: float) -> 
     return _flat_part(vertices, faces)
 
 
+def groove(opening_rad: float, wall_mm: float, length_mm: float) -> MeshPart:
+    """Two walls that meet along y and open towards -z with this angle between them."""
+    across, towards = wall_mm * np.sin(opening_rad / 2), -wall_mm * np.cos(opening_rad / 2)
+    profile = np.array([(-across, towards), (0.0, 0.0), (across, towards)])
+    vertices = np.concatenate(
+        [np.column_stack([profile[:, 0], np.full(3, y), profile[:, 1]]) for y in (-length_mm / 2, length_mm / 2)]
+    )
+    return _flat_part(vertices, _grid_faces(2, 3, closed=False))
+
+
+def bowl(radius_mm: float, half_angle_rad: float, step_mm: float) -> MeshPart:
+    """Inside of a spherical cap about z that opens towards -z, its lowest point at the origin.
+
+    A square grid is bent: a distance from the middle of the square becomes an angle from the axis. Normals are exact.
+    """
+    count = 2 * int(np.ceil(radius_mm * half_angle_rad / step_mm)) + 1
+    x, y = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count))
+    # Squares about the middle become circles: of each, the distance is the larger coordinate.
+    angle = half_angle_rad * np.maximum(np.abs(x), np.abs(y))
+    length = np.maximum(np.hypot(x, y), 1e-300)
+    outwards = np.stack([x / length * np.sin(angle), y / length * np.sin(angle), np.cos(angle)], axis=-1).reshape(-1, 3)
+    faces = _grid_faces(count, count, closed=False)
+    return MeshPart(radius_mm * (outwards - (0.0, 0.0, 1.0)), faces, -outwards[faces])
+
+
 def height_field(
     size_mm: tuple[float, float], step_mm: float, height_mm: Callable[[FloatArray, FloatArray], FloatArray]
 ) -> MeshPart:

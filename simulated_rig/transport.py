@@ -1,7 +1,7 @@
 """Ray-traced light paths projector -> surface -> camera: where each camera sample is lit from, and how strongly.
 
-Each state of the world is traced once; each pattern is then a table look-up (`simulated_rig.light`). Only direct light
-is traced: no light from one surface to another.
+Each state of the world is traced once; each pattern is then a table look-up (`simulated_rig.light`). Light from one
+surface to another is traced by `simulated_rig.bounces`.
 
 Prints are averaged exactly over each sample. A sample stands for a cell of its pixel; the cell's rays meet the sheet in
 a small quadrilateral, whose dark part follows from clipping it at the lines of the print. Edges are therefore
@@ -43,7 +43,7 @@ SHADOW_BIAS_MM = 0.05
 curved surface that they approximate."""
 LUMA = (0.114, 0.587, 0.299)
 """Weights of blue, green and red light in grey (Rec. 601)."""
-_BLOCK_RAYS = 120_000
+BLOCK_RAYS = 120_000
 
 
 class RayCaster(Protocol):
@@ -52,7 +52,7 @@ class RayCaster(Protocol):
     def first_hit(self, origin_mm: FloatArray, directions: FloatArray) -> IntArray:
         """Return (n,) int32: index of the first triangle along each ray, -1 if none.
 
-        origin_mm : (3,) float64; directions : (n, 3) float64, unit.
+        origin_mm : (3,) or (n, 3) float64; directions : (n, 3) float64, unit.
         """
         ...
 
@@ -383,13 +383,16 @@ def texture_value(kind: int, x: float, y: float, z: float) -> float:
 class Hits:
     """Surface points hit by n rays of one camera.
 
-    points_mm : (n, 3) float64, world, NaN for a miss; is_hit, is_lit : (n,) bool, is_lit by the projector's image.
+    points_mm, normals : (n, 3) float64, world, NaN for a miss; the normals are unit and face the camera. triangle :
+    (n,) int32, -1 for a miss. is_hit, is_lit : (n,) bool, is_lit by the projector's image.
     column_px, row_px : (n,) float64, projector image position of the point (may be outside the image), NaN in shadow.
     weight : (n,) float32, light sent to the camera per unit of projector light; albedo : (n,) float32.
     hue : (n, 3) float32, factor on both for blue, green and red light relative to white light.
     """
 
     points_mm: FloatArray
+    normals: FloatArray
+    triangle: IntArray
     is_hit: NDArray[np.bool_]
     is_lit: NDArray[np.bool_]
     column_px: FloatArray
@@ -440,11 +443,38 @@ def trace_rays(
     diffuser at the working distance that faces the projector. footprint_px : side of the square of the image that each
     ray stands for, over which prints are averaged; 0 evaluates prints at the point.
     """
-    eye, lamp = camera.centre_mm, projector.centre_mm
     directions = world_directions(u, v, lens_array(camera), camera.rotation)
-    triangle = rays.first_hit(eye, directions)
+    triangle, points, normals = find_points(camera.centre_mm[None], directions, surface, rays)
+    pigments = print_reflectance(points, normals, triangle, u, v, camera, surface, footprint_px=footprint_px)
+    return light_points(
+        points,
+        normals,
+        directions,
+        triangle,
+        pigments,
+        projector,
+        surface,
+        rays,
+        working_distance_mm=working_distance_mm,
+    )
+
+
+def find_points(
+    origins_mm: FloatArray,
+    directions: FloatArray,
+    surface: SceneSurface,
+    rays: RayCaster,
+    *,
+    starts_mm: FloatArray | None = None,
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the first triangle, point and normal along each ray, as in `Hits`: (n,), (n, 3) and (n, 3).
+
+    origins_mm : (n, 3) float64, or (1, 3) for all rays; starts_mm : the same, where the search for the triangle starts
+    if the origins are on a surface.
+    """
+    triangle = rays.first_hit(origins_mm if starts_mm is None else starts_mm, directions)
     points, normals = _hit_points(
-        eye,
+        origins_mm,
         directions,
         triangle,
         surface.vertices_mm,
@@ -453,16 +483,32 @@ def trace_rays(
         surface.part,
         surface.sphere_mm,
     )
-    pigments = print_reflectance(points, normals, triangle, u, v, camera, surface, footprint_px=footprint_px)
+    return triangle, points, normals
+
+
+def light_points(
+    points: FloatArray,
+    normals: FloatArray,
+    directions: FloatArray,
+    triangle: IntArray,
+    pigments: FloatArray,
+    projector: Pinhole,
+    surface: SceneSurface,
+    rays: RayCaster,
+    *,
+    working_distance_mm: float,
+) -> Hits:
+    """Light points that rays of these directions met, see `trace_rays`. pigments : (n,) float64, factor of prints."""
+    lamp = projector.centre_mm
     is_hit = np.isfinite(points[:, 0])
     to_point = points - lamp
     distance = np.linalg.norm(to_point, axis=1)
     # Rays that missed are cast along x, and ignored.
     towards = np.where(is_hit[:, None], to_point / np.where(distance > 0, distance, 1.0)[:, None], (1.0, 0.0, 0.0))
     blocker = rays.first_hit(lamp, towards)
-    column, row = np.full(len(u), np.nan), np.full(len(u), np.nan)
-    weight, albedo = np.zeros(len(u), np.float32), np.zeros(len(u), np.float32)
-    hue = np.ones((len(u), 3), np.float32)
+    column, row = np.full(len(points), np.nan), np.full(len(points), np.nan)
+    weight, albedo = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
+    hue = np.ones((len(points), 3), np.float32)
     _light_points(
         points,
         normals,
@@ -492,7 +538,7 @@ def trace_rays(
     )
     width, height = projector.size.width_px, projector.size.height_px
     inside = (column >= -0.5) & (column <= width - 0.5) & (row >= -0.5) & (row <= height - 0.5)
-    return Hits(points, is_hit, inside & (weight > 0), column, row, weight, albedo, hue)
+    return Hits(points, normals, triangle, is_hit, inside & (weight > 0), column, row, weight, albedo, hue)
 
 
 def trace_paths(
@@ -521,11 +567,11 @@ def trace_paths(
         albedo=np.zeros((rows, columns), np.float32),
         hue=np.ones((rows, columns, count, 3), np.float32) if (surface.colours != 1).any() else None,
     )
-    block_rows = max(_BLOCK_RAYS // (columns * count), 1)
+    block_rows = max(BLOCK_RAYS // (columns * count), 1)
 
     def fill(first: int) -> None:
         last = min(first + block_rows, rows)
-        u, v = _sample_positions(
+        u, v = sample_positions(
             first, last, columns, samples_per_axis, np.random.default_rng((seed, first)) if jitter else None
         )
         hits = trace_rays(
@@ -558,16 +604,17 @@ def trace_paths(
 def pixel_centres(camera: Pinhole) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
     """Yield blocks of whole rows: (rows, u, v) with the pixel centres, row by row."""
     rows, columns = camera.size.shape
-    block_rows = max(_BLOCK_RAYS // columns, 1)
+    block_rows = max(BLOCK_RAYS // columns, 1)
     for first in range(0, rows, block_rows):
         last = min(first + block_rows, rows)
-        u, v = _sample_positions(first, last, columns, 1, None)
+        u, v = sample_positions(first, last, columns, 1, None)
         yield slice(first, last), u, v
 
 
-def _sample_positions(
+def sample_positions(
     first: int, last: int, columns: int, per_axis: int, jitter: np.random.Generator | None
 ) -> tuple[FloatArray, FloatArray]:
+    """Return u, v of the samples of some rows of pixels, (n,) float64: all samples of a pixel follow each other."""
     shape = (last - first, columns, per_axis, per_axis)
     row, column, cell_row, cell_column = np.meshgrid(
         np.arange(first, last, dtype=np.float64),
@@ -601,7 +648,7 @@ def _plane_distance(
 
 @kernel(in_every_scan=False)
 def _hit_points(
-    origin: FloatArray,
+    origins: FloatArray,
     directions: FloatArray,
     triangle: IntArray,
     vertices: FloatArray,
@@ -612,14 +659,15 @@ def _hit_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Return (points, normals), both (n, 3) float64, NaN for misses; normals are unit and face the origin.
 
-    The point is the intersection with the triangle's plane, or with the exact ball that the triangle approximates.
+    origins : (n, 3), or (1, 3) for all rays. The point is the intersection with the triangle's plane, or with the exact
+    ball that the triangle approximates.
     """
     count = len(triangle)
     points, normals = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
     for i in range(count):
         if triangle[i] < 0:
             continue
-        direction, face = directions[i], faces[triangle[i]]
+        origin, direction, face = origins[min(i, len(origins) - 1)], directions[i], faces[triangle[i]]
         ball = spheres[part[triangle[i]]]
         n = np.zeros(3)
         p = np.zeros(3)

@@ -30,7 +30,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import MIN_RANGE_SIGMA, FloatArray, IntArray, NoiseModel, coarse_bit_count, diagnostic_bits, fit_noise
+from slrig.model import (
+    MIN_RANGE_SIGMA,
+    Axis,
+    FloatArray,
+    IntArray,
+    NoiseModel,
+    coarse_bit_count,
+    diagnostic_bits,
+    fit_noise,
+)
 from slrig.reconstruction.frames import AxisFrames, Images, stack_rows, subsample
 from slrig.reconstruction.surface_fit import stencils
 
@@ -48,6 +57,8 @@ _MEDIAN_SQUARE = 0.4549  # the median of a squared normal, of its variance
 # Correlation.
 _MAX_WINDOWS = 10_000  # whose mean is known to a hundredth
 _MIN_WINDOWS = 200
+_SPACING_PX = 8  # of windows in a line: noise that pixels share reaches less far, blocks of JPEG included
+_DIFFERENCES = tuple(np.array(each, np.float32) for each in ((1, -4, 6, -4, 1), (1, -2, 1), (1,)))
 _MIN_SWING = 0.8  # of the contrast: less is an edge of the code, where gamma breaks the sum
 _MIN_RATIO = 1.1  # accuracy of the noise model: independent noise gives ratios up to 1.08
 _MAX_COUNTED = 200_000  # whose mean is known to a hundredth
@@ -329,11 +340,12 @@ def noise_correlation(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.b
     """Variance of sums of pixels over that of independent noise by `noise`; 1 if it is not larger.
 
     where : (H, W) bool, pixels to use. Of bits and their inverses the coarser half counts, as in `estimate_noise`, away
-    from their edges. Without inverses, two bits that light the same window count, or lines of half their period,
+    from their edges: their sums, and of their differences what changes within `_SPACING_PX` pixels, since light from
+    other surfaces differs from bit to bit, but smoothly. Without inverses, two bits that light the same window count, or lines of half their period,
     whichever give less. Without either, or with few windows, the result is 1.
     """
     count, lines = coarse_bit_count(len(frames.bits)), frames.line_pairs
-    corner = _windows(where, len(pixel_sum.weights))
+    corner = _windows(where, *pixel_sum.weights.shape)
     if len(corner[0]) < _MIN_WINDOWS or len(frames.bits) < _MIN_BITS:
         return 1.0
     if frames.inverses is not None:
@@ -341,7 +353,9 @@ def noise_correlation(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.b
         inverse = _window_pixels(frames.inverses[:count], corner, pixel_sum)
         contrast = _window_pixels([frames.contrast], corner, pixel_sum)
         clear = np.abs(direct - inverse) > _MIN_SWING * contrast
-        ratio = _ratio_of_pairs(frames, noise, corner, pixel_sum, direct, inverse, clear, edges=False)
+        ratio = _ratio_of_differences(frames, noise, where, pixel_sum, count)
+        if not pixel_sum.of_bit_differences:
+            ratio = max(ratio, _ratio_of_sums(frames, noise, corner, pixel_sum, direct, inverse, clear))
     elif frames.lines_light_half:
         ratio = _ratio_of_bits(frames, noise, corner, pixel_sum, count)
         if lines is None:
@@ -349,32 +363,65 @@ def noise_correlation(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.b
         else:
             direct, inverse = (_window_pixels(images, corner, pixel_sum) for images in lines)
             clear = np.minimum(direct, inverse) > 0
-            ratio = min(ratio, _ratio_of_pairs(frames, noise, corner, pixel_sum, direct, inverse, clear, edges=True))
+            ratio = min(ratio, _ratio_of_sums(frames, noise, corner, pixel_sum, direct, inverse, clear))
     else:
         return 1.0
     return ratio if ratio >= _MIN_RATIO else 1.0
 
 
-def _ratio_of_pairs(
+def _ratio_of_sums(
     frames: AxisFrames, noise: NoiseModel, corner: tuple[NDArray[np.intp], NDArray[np.intp]], pixel_sum: PixelSum,
-    direct: NDArray[np.float32], inverse: NDArray[np.float32], clear: NDArray[np.bool_], *, edges: bool,
+    direct: NDArray[np.float32], inverse: NDArray[np.float32], clear: NDArray[np.bool_],
 ) -> float:  # fmt: skip
-    """Ratio from windows of images and their inverses, (images, windows, k²) each, where they are clear; 1 if these are
+    """Ratio from sums of images and their inverses, (images, windows, k²) each, where they are clear; 1 if these are
     few.
-
-    edges : True if windows contain edges, at which an image differs from its inverse by more than noise.
     """
     # If the dark one of both is cut off at zero, pixels and sums lose alike.
-    clear &= np.maximum(direct, inverse) < frames.clipped_at
-    usable = clear.all(axis=(0, 2))
+    usable = (clear & (np.maximum(direct, inverse) < frames.clipped_at)).all(axis=(0, 2))
     if np.count_nonzero(usable) < _MIN_WINDOWS:
         return 1.0
-    variance = _window_pixels([noise.variance(frames.white) + noise.variance(frames.black)], corner, pixel_sum)[
-        0, usable
-    ]
-    direct, inverse = direct[:, usable], inverse[:, usable]
-    ratio = 1.0 if edges else _ratio(np.abs(direct - inverse), variance, pixel_sum)
-    return ratio if pixel_sum.of_bit_differences else max(ratio, _ratio(direct + inverse, variance, pixel_sum))
+    variance = _window_pixels([noise.variance(frames.white) + noise.variance(frames.black)], corner, pixel_sum)
+    return _ratio((direct + inverse)[:, usable], variance[0, usable], pixel_sum)
+
+
+def _ratio_of_differences(
+    frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_], pixel_sum: PixelSum, count: int
+) -> float:
+    """Ratio from differences of two of the first `count` bits and their inverses, away from edges; 1 if there are few.
+
+    In windows in a line along the stripes, weighted by the fourth (or second) difference, light cancels that changes
+    from window to window by a polynomial of third (or first) degree. Without room for these, single windows count, with
+    all such light.
+    """
+    assert frames.inverses is not None
+    side, along_rows = len(pixel_sum.weights), frames.axis is Axis.ROW
+    variance = noise.variance(frames.white) + noise.variance(frames.black)
+    for weights in _DIFFERENCES:
+        long = side + _SPACING_PX * (len(weights) - 1)
+        row, column = _windows(where, side, long) if along_rows else _windows(where, long, side)
+        # As many pixels as of single windows.
+        row, column = row[:: len(weights)], column[:: len(weights)]
+        if len(row) < _MIN_WINDOWS:
+            continue
+        ahead = [_SPACING_PX * step for step in range(len(weights))]
+        line = [(row, column + step) if along_rows else (row + step, column) for step in ahead]
+        direct, inverse, (contrast, of_pixels) = (
+            np.stack([_window_pixels(images, here, pixel_sum) for here in line], axis=1)
+            for images in (frames.bits[:count], frames.inverses[:count], (frames.contrast, variance))
+        )
+        swing = np.abs(direct - inverse)
+        share = swing / np.maximum(contrast, 1)
+        # Light from other surfaces changes the swing of a whole window, an edge that of a part.
+        clear = share.min(axis=(1, 3)) > _MIN_SWING * share.max(axis=(1, 3))
+        clear &= np.maximum(direct, inverse).max(axis=(1, 3)) < frames.clipped_at
+        has_two = np.flatnonzero(np.count_nonzero(clear, axis=0) > 1)
+        if len(has_two) < _MIN_WINDOWS:
+            continue
+        first, last = np.argmax(clear, axis=0)[has_two], count - 1 - np.argmax(clear[::-1], axis=0)[has_two]
+        norm = weights / np.sqrt(np.sum(weights**2))
+        steady = np.stack([np.einsum("l,nlp->np", norm, swing[bit, :, has_two]) for bit in (first, last)])
+        return _ratio(steady, np.einsum("l,lnp->np", norm**2, of_pixels[:, has_two]), pixel_sum)
+    return 1.0
 
 
 def _ratio_of_lines(
@@ -429,11 +476,11 @@ def _ratio(steady: NDArray[np.float32], variance: NDArray[np.float32], pixel_sum
     return max([1.0, *(float(measured / each) for each in (by_pixels, by_model) if each > 0)])
 
 
-def _windows(where: NDArray[np.bool_], side: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _windows(where: NDArray[np.bool_], height: int, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Row and column of the upper left pixels of an even sample of windows within `where`."""
     rows, columns = where.shape
     step = max(1, int(np.sqrt(rows * columns / _MAX_WINDOWS)))
-    whole = cv2.erode(where.view(np.uint8), np.ones((side, side), dtype=np.uint8), anchor=(0, 0), borderValue=0)
+    whole = cv2.erode(where.view(np.uint8), np.ones((height, width), dtype=np.uint8), anchor=(0, 0), borderValue=0)
     row, column = np.nonzero(whole[::step, ::step])
     return row * step, column * step
 

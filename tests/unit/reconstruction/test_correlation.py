@@ -93,6 +93,24 @@ def test_lamps_that_a_bit_shares_with_its_inverse_err_frames_but_not_their_diffe
     assert noise_correlation(lit, noise, EVERYWHERE, PixelSum(STENCIL)) > 10.0
 
 
+def lit_by_walls(frames: AxisFrames) -> AxisFrames:
+    """Up to half as much light again from walls around, of which each bit lights another share."""
+    assert frames.inverses is not None
+    x, y = grid(SHAPE)
+    glow = (60.0 * np.exp(-(((x - 150) / 120) ** 2) - ((y - 100) / 90) ** 2)).astype(np.float32)
+    share = np.random.default_rng(7).uniform(0, 1, (BITS, 1, 1)).astype(np.float32)
+    bits, inverses = frames.bits + share * glow, frames.inverses + (1 - share) * glow
+    return replace(frames, bits=bits, inverses=inverses, white=frames.white + glow)
+
+
+@pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_pixel_sum(1.0)], ids=["phases", "values", "edges"])
+@pytest.mark.parametrize("kernel", [ALONE, SMOOTH], ids=["independent", "interpolated"])
+def test_light_from_walls_around_is_no_noise_that_neighbours_share(kernel: Kernel, summed: PixelSum) -> None:
+    frames = lit_by_walls(noisy(kernel))
+    expected = by_sums(np.array(kernel), summed)
+    assert noise_correlation(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(expected, rel=0.1)
+
+
 def test_a_model_that_is_too_small_is_corrected_and_one_too_large_is_not() -> None:
     frames = noisy(ALONE)
     assert noise_correlation(frames, NoiseModel(2.0, 0.0), EVERYWHERE, PHASES) == pytest.approx(2.0, rel=0.05)

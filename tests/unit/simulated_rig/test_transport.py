@@ -103,7 +103,7 @@ def test_hit_kernel_equals_plain_python(tmp_path: Path) -> None:
     triangle = view._scene.rays.first_hit(EYE, rays)
     triangle[0] = -1
     arguments = (
-        EYE,
+        EYE[None],
         rays,
         triangle,
         surface.vertices_mm,
@@ -124,7 +124,7 @@ def test_hit_kernel_equals_plain_python(tmp_path: Path) -> None:
 @pytest.mark.parametrize("jitter", [False, True])
 def test_samples_stay_in_the_cells_of_their_pixel(jitter: bool) -> None:
     rng = np.random.default_rng(1) if jitter else None
-    u, v = transport._sample_positions(2, 4, 5, 3, rng)
+    u, v = transport.sample_positions(2, 4, 5, 3, rng)
     u, v = u.reshape(2, 5, 3, 3), v.reshape(2, 5, 3, 3)
     for sample in range(3):
         column_cell = u[..., sample] - np.arange(5)[None, :, None]
@@ -139,7 +139,7 @@ def test_samples_stay_in_the_cells_of_their_pixel(jitter: bool) -> None:
 
 
 def test_threads_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport, "_BLOCK_RAYS", 1000)
+    monkeypatch.setattr(transport, "BLOCK_RAYS", 1000)
     one = small_head(tmp_path, workers=1, jitter=True)._views["eye"].prepare()
     many = small_head(tmp_path, workers=3, jitter=True)._views["eye"].prepare()
     np.testing.assert_array_equal(one.column_px, many.column_px)
