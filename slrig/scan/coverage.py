@@ -1,19 +1,12 @@
-"""How much of what a camera decoded the mesh covers. A scan that lost most of it says so; one that lost all fails."""
+"""How much of what a camera decoded the mesh covers."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
-from slrig.errors import NothingToReconstructError, setting
 from slrig.meshing import rasterise
 from slrig.model import Mesh, Refusal, Size
 from slrig.scan.placing import placed_vertices, resampled
-from slrig.scan.report import lit_pixels
 from slrig.scan.stream import CameraResult
 
-FAIR_SHARE = 0.6
-"""Sound scans of real rigs have 0.8 and more, borders of two pixels that are refused included."""
 _PICTURE_PX = 480
 """Wide enough for a share, and a tenth of the work at full size."""
 
@@ -33,36 +26,3 @@ def covered_share(mesh: Mesh, seen: CameraResult) -> float | None:
     coarse = resampled(seen.device, 1 / step, Size(columns, rows))
     view = rasterise(placed_vertices(mesh.vertices_mm, coarse), mesh.faces, coarse.size)
     return float(((view.face >= 0) & decoded).sum() / decoded.sum())
-
-
-def coverage_notes(name: str, share: float | None) -> list[str]:
-    """One sentence if the mesh covers much less than was decoded."""
-    if share is None or share >= FAIR_SHARE:
-        return []
-    return [
-        f"the mesh covers {share:.0%} of what camera '{name}' decoded. Look at the picture of causes: the finest "
-        f"patterns may not resolve (wider cells: {setting('gray_cell_px')}; wider lines: {setting('line_width_px')}), "
-        f"or the limit at depth edges be too low: {setting('depth_edge_ratio')}"
-    ]
-
-
-def require_surface(holds: bool, folder: Path, what: str, cameras: Sequence[CameraResult]) -> None:
-    """Refuse a scan that holds no surface (NothingToReconstructError), with the figures that tell why."""
-    if holds:
-        return
-    figures = "; ".join(
-        f"camera '{seen.name}': white {seen.white.mean():.0f} of {seen.full_scale:.0f} on average, at most "
-        f"{seen.contrast.max():.0f} above black, {lit_pixels(seen.curves).mean():.1%} of the image lit, "
-        f"{seen.curves.decoded_pixels} pixels decoded{_outside(seen)}"
-        for seen in cameras
-    )
-    message = (
-        f"{folder}: {what}. {figures}. Look whether the projector lit the object, the lens cap is off, and the "
-        "exposure leaves white below full scale and well above black"
-    )
-    raise NothingToReconstructError(message)
-
-
-def _outside(seen: CameraResult) -> str:
-    share = float((seen.curves.refusal == Refusal.OUTSIDE_REGION).mean())
-    return f", {share:.1%} of the image outside the region that was asked for" if share else ""

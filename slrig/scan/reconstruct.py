@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle import read_health, read_notes, read_truth, read_turntable_angle, write_file
 from slrig.capture import EvidenceSummary
-from slrig.errors import ScanCancelledError
+from slrig.errors import NothingToReconstructError, ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
@@ -34,8 +34,9 @@ from slrig.reconstruction import (
 )
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.colouring import albedo_report, coloured
-from slrig.scan.coverage import coverage_notes, covered_share, require_surface
+from slrig.scan.coverage import covered_share
 from slrig.scan.limited import marked, within
+from slrig.scan.losses import Stage, coverage_notes, require_coverage, require_surface
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.offered import causes_picture, rejected_picture
@@ -169,6 +170,8 @@ def reconstruct_into(
         walked, found = measured(bundle, calibration, live, entered, axis=plan.axis, region=plan.region, judged=judged)
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
+        covered = covered_share(mesh, cameras[0])
+        require_coverage(bundle, cameras, covered)
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         # One at a time: each is as large as the mesh.
         place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_calibration_sigma_mm))
@@ -179,7 +182,6 @@ def reconstruct_into(
             "points.ply",
             encode_points_ply(meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm),
         )
-        covered = covered_share(mesh, cameras[0])
         figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
         entered("pictures", 0.85, "")
         for name, picture in pictures.result().items():
@@ -191,7 +193,7 @@ def reconstruct_into(
         seconds = watch.finished()
         report = {
             **walked.sections,
-            "notes": [*read_notes(bundle), *walked.notes, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
+            "notes": [*read_notes(bundle), *coverage_notes(cameras, covered), *walked.notes, *meshed.notes],
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_calibration_sigma_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
@@ -236,7 +238,7 @@ def _meshed(
     first, axis, step_px = walked.seen[0], walked.axis, walked.step_px
     cameras, joined_curves = found.cameras, found.joined
     points = joined_curves.curves
-    require_surface(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras)
+    require_surface(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras, stage=Stage.GEOMETRY)
     count = f"{len(points.points_mm)} points"
     projector = walked.devices.projector
     gap_px = widest_gap_px(projector, axis)
@@ -256,7 +258,8 @@ def _meshed(
         on_step=lambda stage: entered(stage, 0.68, count),
         runs=beside.runs,
     )  # fmt: skip
-    require_surface(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
+    what = "no two neighbouring stripes could be meshed"
+    require_surface(len(surface.faces) > 0, folder, what, cameras, stage=Stage.MESH)
     entered("vertices", 0.72, count)
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
     share = _calibration_share(walked.devices, found, axis, surface.normals)
@@ -270,7 +273,12 @@ def _meshed(
         known = sigma <= limit_mm
         surface = surface.with_points(known, "sigma_limit")
         cameras = [_where_known(seen, joined_curves, index, known) for index, seen in enumerate(cameras)]
-        require_surface(len(surface.faces) > 0, folder, f"no surface is known to {limit_mm:g} mm", cameras)
+        if len(surface.faces) == 0:
+            message = (
+                f"{folder}: no surface is known to {limit_mm:g} mm, half of the points to {np.nanmedian(sigma):.2g} "
+                "mm; raise max_sigma_mm, or give the scan more light"
+            )
+            raise NothingToReconstructError(message)
     light = walked.devices.light
     colours = coloured(cameras, joined_curves, surface.normals, projector, axis, light)
     curves = PointCurves(
