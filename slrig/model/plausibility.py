@@ -119,7 +119,28 @@ def device_faults(device: Pinhole, place: str, *, is_projector: bool = False) ->
 
 def imaged_share(device: Pinhole, /) -> float:
     """Return the share of the image that the lens images, of a grid of pixels that includes the border."""
-    return float(imaged_pixels(device, _grid(device.size)).mean())
+    points = _grid(device.size)
+    return 1.0 if _is_weak_lens(device, points) else float(imaged_pixels(device, points).mean())
+
+
+def _is_weak_lens(device: Pinhole, points_px: FloatArray) -> bool:
+    """Return True if bounds of the distortion suffice to tell that the lens images all pixels.
+
+    Where the derivatives are at least 2/3 up to 1.5 times the largest distorted radius, they are so up to the largest
+    undistorted one.
+    """
+    xd, yd = _distorted(device, points_px)
+    radius = 1.5 * float(np.hypot(xd, yd).max())
+    k1, k2, p1, p2, k3 = np.abs(device.distortion)
+    change = 3 * k1 * radius**2 + 5 * k2 * radius**4 + 7 * k3 * radius**6 + 6 * (p1 + p2) * radius
+    return bool(change < 1 / 3)
+
+
+def _distorted(device: Pinhole, points_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return x and y, (n,) each, of pixels (n, 2) in the plane at depth 1, distorted."""
+    matrix = device.matrix
+    yd = (points_px[:, 1] - matrix[1, 2]) / matrix[1, 1]
+    return (points_px[:, 0] - matrix[0, 2] - matrix[0, 1] * yd) / matrix[0, 0], yd
 
 
 def imaged_pixels(device: Pinhole, points_px: FloatArray, /) -> NDArray[np.bool_]:
@@ -128,9 +149,7 @@ def imaged_pixels(device: Pinhole, points_px: FloatArray, /) -> NDArray[np.bool_
     The path from the principal point to the pixel is followed in short steps, each by Newton's method. It ends where
     the determinant of the derivatives is no longer positive: there the lens folds, and no ray arrives beyond.
     """
-    matrix = device.matrix
-    yd = (points_px[:, 1] - matrix[1, 2]) / matrix[1, 1]
-    xd = (points_px[:, 0] - matrix[0, 2] - matrix[0, 1] * yd) / matrix[0, 0]
+    xd, yd = _distorted(device, points_px)
     x, y = np.zeros_like(xd), np.zeros_like(yd)
     with np.errstate(all="ignore"):
         for step in range(1, _PATH_STEPS + 1):
@@ -142,7 +161,7 @@ def imaged_pixels(device: Pinhole, points_px: FloatArray, /) -> NDArray[np.bool_
                 ex, ey = share * xd - gx, share * yd - gy
                 x, y = x + (c * ex - b * ey) * scale, y + (a * ey - b * ex) * scale
         gx, gy, a, b, c = distort(device.distortion, x, y)
-        near = np.hypot(gx - xd, gy - yd) * min(matrix[0, 0], matrix[1, 1]) < 1.0
+        near = np.hypot(gx - xd, gy - yd) * min(device.matrix[0, 0], device.matrix[1, 1]) < 1.0
         ratio = np.hypot(xd, yd) / np.maximum(np.hypot(x, y), 1e-12)
         low, high = _RADIUS_RATIOS
         straight = (np.hypot(xd, yd) < 1e-9) | ((ratio >= low) & (ratio <= high))

@@ -264,7 +264,7 @@ def geometry_fault(
 
     found : the cameras after triangulation; before : with their points.
     """
-    share = 1 - stage_shares(found).get(Stage.GEOMETRY, 1.0)
+    share = _share_off(found)
     if projector is None or share < _MAX_OFF:
         return None
     words = f"{share:.0%} of the points have no place"
@@ -272,9 +272,16 @@ def geometry_fault(
     return words if not fitting else f"{words}; nearly all have one with {' or '.join(fitting)}"
 
 
+def _share_off(cameras: Sequence[CameraResult]) -> float:
+    """Share of the points without an intersection."""
+    low, high = min(_OFF_GEOMETRY), max(_OFF_GEOMETRY)
+    off = sum(np.count_nonzero((seen.curves.refusal >= low) & (seen.curves.refusal <= high)) for seen in cameras)
+    return min(off / max(sum(len(seen.curves.ensemble.bridge_after) for seen in cameras), 1), 1.0)
+
+
 def geometry_notes(cameras: Sequence[CameraResult]) -> list[str]:
     """Return a sentence if more than a few rays do not meet the light."""
-    share = 1 - stage_shares(cameras).get(Stage.GEOMETRY, 1.0)
+    share = _share_off(cameras)
     if share < _NOTED_OFF:
         return []
     return [f"{share:.1%} of the points have no place: {_geometry_words(_counts(cameras))}"]

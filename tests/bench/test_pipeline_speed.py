@@ -28,6 +28,7 @@ from slrig.discovery import open_rig
 from slrig.model import Calibration, Mesh, Region
 from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import capture_frames
+from slrig.scan.losses import code_of
 from slrig.scan.measured import Walked
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import _meshed
@@ -102,7 +103,10 @@ class Run:
         watch.enter("triangulate")
         step, cell = (each(stream.header.displayed_patterns, stream.axis) for each in (step_px, cell_px))
         found = triangulated(seen, calibration.projector, stream.axis, region)
-        walked = Walked(calibration, stream.axis, stream.header.axes, seen, step, cell, {}, [])
+        gray = code_of(stream.header.displayed_patterns, stream.axis)
+        walked = Walked(
+            calibration, stream.axis, stream.header.axes, seen, step, cell, gray, stream.header.projector, {}, []
+        )
         meshed = _meshed(folder, found, walked, plan, lambda stage, _fraction, _detail: watch.enter(stage))
         self.stages_s = watch.finished()
         ended = time.perf_counter()

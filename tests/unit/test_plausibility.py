@@ -14,7 +14,7 @@ import pytest
 from slrig.bundle import check_calibration, read_calibration, write_calibration
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, Pinhole, Size, calibration_faults, rig_layout
-from slrig.model.plausibility import imaged_pixels, imaged_share
+from slrig.model.plausibility import _grid, _is_weak_lens, imaged_pixels, imaged_share
 
 CAMERA, PROJECTOR = Size(640, 512), Size(640, 400)
 
@@ -108,6 +108,19 @@ def test_a_lens_images_what_lies_within_its_fold(lens: tuple[float, float]) -> N
     column_px = 322 + np.array([0.3, 0.98, 1.02]) * limit_px
     points = np.stack([column_px, np.full(3, 251.0)], axis=1)
     assert imaged_pixels(folded, points).tolist() == [True, True, False]
+
+
+def test_the_bound_of_weak_lenses_agrees_with_the_path() -> None:
+    rng = np.random.default_rng(20261129)
+    sizes = np.array([0.4, 0.8, 0.03, 0.03, 2.0])
+    weak = 0
+    for _ in range(200):
+        lens = device(lens=tuple(sizes * rng.uniform(-1, 1, 5)))
+        points = rng.uniform((0, 0), (639, 511), (200, 2))
+        if _is_weak_lens(lens, _grid(CAMERA)):
+            weak += 1
+            assert imaged_pixels(lens, points).all()
+    assert 20 < weak < 180
 
 
 def test_corners_that_no_board_reached_may_fold() -> None:
