@@ -247,6 +247,6 @@ def units_sentence(layout: RigLayout) -> str:
     units = [unit for unit in MM_PER_UNIT if unit != "mm" and layout.is_of_a_bench(unit)]
     likely = "".join(f"{_UNIT_WORDS[unit]}? Then {layout.in_unit(unit)} (--unit {unit}). " for unit in units)
     return (
-        f"{likely[:1].upper()}{likely[1:]}State the unit: slrig import, slrig calibrate import and slrig calibrate "
-        f"export have --unit {', '.join(MM_PER_UNIT)}; to the service, send millimetres"
+        f"{likely[:1].upper()}{likely[1:]}State the unit of a file: slrig import, slrig calibrate import and slrig "
+        f"calibrate export have --unit {', '.join(MM_PER_UNIT)}; send millimetres to the service"
     )

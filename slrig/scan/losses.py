@@ -171,9 +171,9 @@ def remedy(stage: Stage, cameras: Sequence[CameraResult]) -> str:
     if counts[cause] > 0.2 * decoded:
         return f"Light, code and geometry are there, but few points: {_MESH_REMEDIES[cause]}"
     return (
-        "Light, code and geometry are there, but points are too far apart for triangles. Look at the picture of "
-        f"causes: the finest patterns may not resolve (wider cells: {setting('gray_cell_px')}; wider lines: "
-        f"{setting('line_width_px')}), or the limit at depth edges be too low: {setting('depth_edge_ratio')}"
+        "Light, code and geometry are there, but few triangles: the finest patterns may not resolve (wider cells: "
+        f"{setting('gray_cell_px')}; wider lines: {setting('line_width_px')}), or the limit at depth edges be too low: "
+        f"{setting('depth_edge_ratio')}"
     )
 
 
@@ -200,7 +200,8 @@ def coverage_notes(cameras: Sequence[CameraResult], covered: float | None) -> li
     if covered is None or covered >= FAIR_SHARE:
         return []
     words = remedy(_stage_after_code(cameras, covered), cameras)
-    return [f"the mesh covers {covered:.0%} of what camera '{cameras[0].name}' decoded. {words}"]
+    what = f"the mesh covers {covered:.0%} of what camera '{cameras[0].name}' decoded"
+    return [f"{what}: look at the picture of causes. {words}"]
 
 
 def require_coverage(folder: Path, cameras: Sequence[CameraResult], covered: float | None) -> None:

@@ -65,7 +65,7 @@ def camera_with(
         (camera_with(points=0, not_lit=4000, stray_code=6000), None, Stage.CODE, "changes from pixel to pixel"),
         (camera_with(not_lit=4000, behind_device=4900), None, Stage.GEOMETRY, "4900 meet it behind a device"),
         (camera_with(not_lit=4000, no_intersection=4900), 0.01, Stage.GEOMETRY, "does not fit these frames"),
-        (camera_with(not_lit=4000), 0.01, Stage.MESH, "points are too far apart"),
+        (camera_with(not_lit=4000), 0.01, Stage.MESH, "the finest patterns may not resolve"),
         (camera_with(not_lit=4000, depth_edge=5500), 0.01, Stage.MESH, "the code jumps nearly everywhere"),
     ],
 )
