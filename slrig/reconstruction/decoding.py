@@ -202,8 +202,11 @@ def _decode_kernel(
 
 
 def cells_beyond(frames: AxisFrames, code: CodeMap, index_of_word: IntArray, /) -> IntArray:
-    """(n,) int32: the cell that the code names at each pixel that was refused as beyond the projector."""
+    """(n,) int32: the cell of the code at each pixel where it names none of the projector's, after or before them."""
     beyond = code.refusal == _BEYOND_PROJECTOR
+    first_cell = frames.gray.offset_px // frames.gray.cell_px
+    if first_cell > 0:
+        beyond |= (code.refusal == 0) & (code.highest < first_cell)
     word = np.zeros(int(np.count_nonzero(beyond)), dtype=np.int32)
     if len(word) == 0:
         return word

@@ -87,8 +87,8 @@ class CameraCurves:
     unresolved_lines : (H, W) bool, where code edges replace lines that the camera does not resolve; None if nowhere.
     compression_dn : standard deviation of white noise that displaces positions as much as the loss by compression; 0
     for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`. beyond_pixels : number
-    of pixels whose code names a cell that the projector has not; furthest_cell : the last cell that more than a
-    hundredth of them name, -1 without any.
+    of pixels whose code names a cell that the projector has not; furthest_cell : of these cells, the one farthest from
+    the projector's that more than a hundredth of the pixels name, -1 without any.
     """
 
     ensemble: StripeEnsemble
@@ -456,8 +456,15 @@ def _refine_identify_link(
         noise_correlation=image.response.noise_correlation,
         gamma=image.response.gamma,
         beyond_pixels=len(beyond),
-        furthest_cell=int(np.percentile(beyond, 99, method="nearest")) if len(beyond) else -1,
+        furthest_cell=_furthest_cell(beyond, len(tables.cell_position)),
     )
+
+
+def _furthest_cell(beyond: IntArray, cell_count: int) -> int:
+    if len(beyond) == 0:
+        return -1
+    is_after = np.count_nonzero(beyond >= cell_count) >= len(beyond) / 2
+    return int(np.percentile(beyond, 99 if is_after else 1, method="nearest"))
 
 
 def _chain_and_identify(

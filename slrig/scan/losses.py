@@ -235,12 +235,14 @@ def code_extent_notes(cameras: Sequence[CameraResult], gray: Gray, projector: Si
 
 
 def _beyond_words(cameras: Sequence[CameraResult], gray: Gray, projector: Size, share: float) -> str:
-    cell = max(seen.curves.furthest_cell for seen in cameras)
-    named = (cell + 1) * gray.cell_px - gray.offset_px
+    extent = projector.along(gray.axis)
+    cells = [seen.curves.furthest_cell for seen in cameras if seen.curves.beyond_pixels]
+    named = [cell * gray.cell_px - gray.offset_px for cell in (min(cells), max(cells))]
+    last = max(named[1] + gray.cell_px, extent) - 1
     return (
-        f"the code names {gray.axis}s up to {named - 1}, the projector has {projector.along(gray.axis)} ({projector}): "
-        f"{share:.1%} of the pixels whose code was read. Correct the projector's size; if it is right, look for a bit "
-        "that is inverted or in another's place, and for the code's offset"
+        f"the code names {gray.axis}s {min(named[0], 0)} to {last}, the projector has {extent} ({projector}): "
+        f"{share:.1%} of the pixels whose code was read are beyond it. Correct the projector's size or the offset of "
+        "the code; if they are right, look for a bit that is inverted or in another's place"
     )
 
 

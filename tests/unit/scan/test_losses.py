@@ -98,11 +98,14 @@ def test_a_mesh_of_next_to_nothing_is_refused_and_a_thin_one_is_noted() -> None:
 
 def test_a_code_that_names_more_columns_than_there_are_is_refused_with_both_numbers() -> None:
     projector = Size(600, 400)
-    with pytest.raises(NothingToReconstructError, match=r"names columns up to 639, the projector has 600 .*: 14.3%"):
+    with pytest.raises(NothingToReconstructError, match=r"names columns 0 to 639, the projector has 600 .*: 14.3%"):
         require_code_on_projector(HERE, [camera_with(beyond=1000, furthest=639)], GRAY, projector)
     few = [camera_with(beyond=100, furthest=700)]
     require_code_on_projector(HERE, few, GRAY, projector)
-    assert "names columns up to 700" in code_extent_notes(few, GRAY, projector)[0]
+    before = [camera_with(beyond=1000, furthest=50)]
+    with pytest.raises(NothingToReconstructError, match="names columns -142 to 599, the projector has 600"):
+        require_code_on_projector(HERE, before, replace(GRAY, offset_px=192), projector)
+    assert "names columns 0 to 700" in code_extent_notes(few, GRAY, projector)[0]
     assert code_extent_notes([camera_with()], GRAY, projector) == []
 
 

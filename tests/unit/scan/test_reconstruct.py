@@ -234,7 +234,7 @@ def test_a_code_that_names_columns_that_the_projector_has_not_is_refused(recorde
     calibration["projector"]["size_px"][0] = 160
     (tmp_path / "narrow" / "calibration.json").write_text(json.dumps(calibration))
     words = refused(NothingToReconstructError, tmp_path / "narrow", tmp_path / "out")
-    named = re.search(r"names columns up to (\d+), the projector has 160", words)
+    named = re.search(r"names columns 0 to (\d+), the projector has 160", words)
     assert named is not None
     assert 160 < int(named[1]) < 256
     assert "a bit that is inverted" in words
