@@ -47,7 +47,7 @@ from slrig.errors import (
     SlrigError,
     WrongSystemError,
 )
-from slrig.model import Calibration
+from slrig.model import Calibration, require_plausible
 
 GROUPS: Mapping[str, str] = {
     "camera": "slrig.cameras",
@@ -262,6 +262,8 @@ def _calibration(
     else:
         calibration = head.calibration if head is not None else None
         source = f"the head of rig '{config.name}'"
+        if calibration is not None:
+            require_plausible(calibration, source)
     if calibration is not None:
         sizes = {name: camera.info.format.size for name, camera in cameras.items()}
         check_calibration(calibration, projector.info.size, sizes, source)

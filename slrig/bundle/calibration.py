@@ -25,7 +25,16 @@ from slrig.bundle.description import CAMERA_NAME, MAX_SIDE_PX, PROJECTOR, Camera
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.bundle.validation import MAX_FAULTS, AwareMoment, Strict, read_json_model, read_text, shorten
 from slrig.errors import CalibrationError
-from slrig.model import DEVICE_PARAMETERS, Calibration, FloatArray, LightMap, Pinhole, Size, SolveRecord
+from slrig.model import (
+    DEVICE_PARAMETERS,
+    Calibration,
+    FloatArray,
+    LightMap,
+    Pinhole,
+    Size,
+    SolveRecord,
+    require_plausible,
+)
 
 MAX_DEPTH = 8
 MAX_NODES = 4096
@@ -513,6 +522,15 @@ class CalibrationEntry(Strict):
 
 def read_calibration(path: Path) -> Calibration:
     """Return the calibration in a file: slrig's JSON, or OpenCV FileStorage if the name ends in yml, yaml or xml.
+    Raises CalibrationError: as `parse_calibration`, or its numbers cannot be those of a rig (`calibration_faults`).
+    """
+    calibration = parse_calibration(path)
+    require_plausible(calibration, str(path))
+    return calibration
+
+
+def parse_calibration(path: Path) -> Calibration:
+    """Return the calibration in a file as `read_calibration` does, whatever its numbers are.
     Raises CalibrationError: the file is missing, cut, has an unknown key or a number that is not finite; all faults in
     one message.
     """
@@ -550,17 +568,32 @@ def check_calibration(calibration: Calibration, projector: Size, cameras: Mappin
     """
     faults = [
         f"cameras.{name}: expected {size} as the camera's frames are, found {calibration.cameras[name].size}"
+        f"{_scale_words(calibration.cameras[name].size, size)}"
         for name, size in cameras.items()
         if name in calibration.cameras and calibration.cameras[name].size != size
     ]
     if calibration.projector is not None and calibration.projector.size != projector:
-        faults.append(f"projector: expected {projector} as the projector is, found {calibration.projector.size}")
+        found = calibration.projector.size
+        faults.append(
+            f"projector: expected {projector} as the projector is, found {found}{_scale_words(found, projector)}"
+        )
     if not set(cameras) & set(calibration.cameras):
         faults.append(f"cameras: expected {', '.join(cameras)}, found {', '.join(calibration.cameras)}")
     if faults:
         lines = "\n".join(f"  {fault}" for fault in faults)
         message = f"{source}: the calibration is for other devices; calibrate these or name the right file:\n{lines}"
         raise CalibrationError(message)
+
+
+def _scale_words(found: Size, wanted: Size) -> str:
+    """Return what turns a matrix of one size into that of another size of the same shape; nothing for another shape."""
+    scale = wanted.width_px / found.width_px
+    if abs(found.height_px * scale - wanted.height_px) > 1:
+        return ""
+    return (
+        f", the same shape {1 / scale:.4g} times as large. If nothing was cropped, multiply fx and fy by {scale:.4g}, "
+        f"and set cx to {scale:.4g} (cx + 0.5) - 0.5, cy likewise"
+    )
 
 
 def require_two_rays(calibration: Calibration, cameras: Collection[str], source: str) -> None:

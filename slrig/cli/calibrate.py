@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 
 import typer
 
-from slrig.cli.options import AsJson, BoardArguments, ServiceOptions, by_beginning, grouped
+from slrig.cli.options import AsJson, BoardArguments, ServiceOptions, Unit, by_beginning, grouped
 from slrig.errors import CalibrationNotFoundError, ConfigError, ServiceError
 
 if TYPE_CHECKING:
@@ -302,6 +302,7 @@ def export(
         Literal["slrig", "opencv", "ros", "kalibr"] | None,
         typer.Option(help="Whose form. ros: a new folder of camera_info and transforms. Default: by the ending."),
     ] = None,
+    unit: Unit = None,
     *,
     service: ServiceOptions,
 ) -> None:
@@ -309,7 +310,7 @@ def export(
 
     Reads and writes the forms of slrig, OpenCV, ROS and Kalibr.
     """
-    if Path(calibration).exists() or to is not None:
+    if Path(calibration).exists() or to is not None or unit is not None:
         import tempfile
 
         from slrig.importers import read_any_calibration, write_any_calibration
@@ -320,7 +321,7 @@ def export(
                 source = Path(folder) / "calibration.json"
                 with service.client() as client:
                     _fetch(client, calibration, source.name, source)
-            write_any_calibration(file, read_any_calibration(source), to)
+            write_any_calibration(file, read_any_calibration(source, unit=unit), to)
     else:
         name = FILES.get(file.suffix.lower())
         if name is None:
@@ -356,6 +357,7 @@ def submit(
         ),
     ],
     label: Annotated[str | None, typer.Option(help="Free text, to find the calibration again.")] = None,
+    unit: Unit = None,
     service: ServiceOptions,
 ) -> None:
     """Give a service a calibration that was found elsewhere."""
@@ -366,7 +368,7 @@ def submit(
 
     with service.client() as client:
         # Looked at here first, so that faults are told by the file's name; one form travels, whichever the file has.
-        calibration = read_any_calibration(file)
+        calibration = read_any_calibration(file, unit=unit)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "calibration.json"
             write_calibration(path, calibration)

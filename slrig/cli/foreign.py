@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from slrig.cli.options import Unit
 from slrig.errors import ConfigError
 
 
@@ -62,6 +63,7 @@ def import_images(
         Path | None,
         typer.Option(help="Calibration to put into the bundle. Default: FOLDER/calibration.yml, .xml, .json."),
     ] = None,
+    unit: Unit = None,
 ) -> None:
     """Make a bundle of another program's images.
 
@@ -82,7 +84,7 @@ def import_images(
     naming = ImageNaming(program or (None if asked else "opencv"), pattern, names, white, black, listed)
     code = ProjectorCode(parse_size(projector), cell_px=cell_px, offset_px=offset_px)
     found, used = import_capture(
-        folder, output, code, naming, names=camera or (), bit_depth=bit_depth, calibration_file=calibration
+        folder, output, code, naming, names=camera or (), bit_depth=bit_depth, calibration_file=calibration, unit=unit
     )
     for name, files in found.cameras.items():
         typer.echo(f"{'camera':<11}{name}: {len(files)} images, {files[0][0].name} to {files[-1][0].name}")

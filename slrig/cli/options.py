@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 RigFile = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file; examples are in config/rigs.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Unit = Annotated[
+    Literal["mm", "cm", "m", "inch"] | None,
+    typer.Option(help="Unit of the calibration's translations. Default: what its format states, otherwise mm."),
+]
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,7 +21,7 @@ from slrig.bundle import (
     Strict,
     Value,
     five_distortion_terms,
-    read_calibration,
+    parse_calibration,
     read_file_storage,
     read_opencv_calibration,
     read_text,
@@ -33,7 +34,20 @@ from slrig.bundle import (
 )
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import CalibrationError
-from slrig.model import Axis, Calibration, FloatArray, Gray, Pinhole, Size
+from slrig.model import (
+    MM_PER_UNIT,
+    Axis,
+    Calibration,
+    FloatArray,
+    Gray,
+    LengthUnit,
+    Pinhole,
+    Size,
+    require_plausible,
+    rig_layout,
+    units_sentence,
+)
+from slrig.patterns import gray_bits
 from slrig.ros_messages import FRAME, MM_PER_M, PROJECTOR, WORLD, lens, pose
 
 CalibrationFormat = Literal["slrig", "opencv", "ros", "kalibr"]
@@ -424,7 +438,8 @@ def read_program_calibration(
     """Return the calibration of the first of `cameras`, and of the projector or, with two cameras, of the second.
 
     bits : a bit of the code of each axis; scan3d-capture counts projector pixels in cells of its finest bit.
-    Raises CalibrationError: a matrix is missing or has another shape, or the extents are not known.
+    Raises CalibrationError: a matrix is missing or has another shape, the extents are not known, or a camera's matrix
+    is of images of another size.
     """
     program = str(detect_program(root))
     found: list[FloatArray] = []
@@ -453,26 +468,85 @@ def read_program_calibration(
         second_device = Pinhole(size, second, terms, rotation, translation.ravel())
     except CalibrationError as cause:
         raise CalibrationError(f"{path}: {cause}") from cause
+    _require_matrix_of_image(first_device, path, PROGRAM_KEYS[program][0])
     if both_cameras:
+        _require_matrix_of_image(second_device, path, PROGRAM_KEYS[program][2])
         return Calibration({names[0]: first_device, names[1]: second_device}, None)
     return Calibration({names[0]: first_device}, second_device)
 
 
 def _scale_cells_to_pixels(matrix: FloatArray, projector: Size, bits: Mapping[Axis, Gray]) -> FloatArray:
-    """Convert a projector's matrix from cells of the code to pixels.
+    """Convert a projector's matrix from cells of scan3d-capture's code to pixels.
 
-    With cells of c = 2^k px, cell x of n >> k begins at position c (x + offset of cells) - offset of pixels.
+    The program centres the projector in its code, and counts cells of the finest bit that it shows: with cells of
+    c = 2^k px, cell x of n >> k begins at position c (x + offset of cells) - offset of pixels. A capture whose code is
+    not centred is of another program: the calibration is then of all pixels (`ProjectorWidget::make_pattern` and
+    `sl::convert_pattern` of scan3d-capture).
     """
     scaled = np.array(matrix, dtype=np.float64)
+    offsets_px = {axis: centring_offset_px(projector.along(axis)) for axis in Axis}
+    if scaled.shape != (3, 3) or any(bit.offset_px != offsets_px[axis] for axis, bit in bits.items()):
+        return scaled
     for row, axis in enumerate(Axis):
-        if axis not in bits or scaled.shape != (3, 3):
+        if axis not in bits:
             continue
-        cell_px, offset_px = bits[axis].cell_px, bits[axis].offset_px
+        cell_px = bits[axis].cell_px
         cells = projector.along(axis) // cell_px
         first_cell = (2 ** bits[axis].bits - cells) // 2
         scaled[row] *= cell_px
-        scaled[row, 2] += cell_px * first_cell - offset_px + (cell_px - 1) / 2
+        scaled[row, 2] += cell_px * first_cell - offsets_px[axis] + (cell_px - 1) / 2
     return scaled
+
+
+def centring_offset_px(extent_px: int) -> int:
+    """Return the offset that centres so many positions in a code with cells of 1 px."""
+    return int((2 ** gray_bits(extent_px, 1, 0) - extent_px) // 2)
+
+
+_MAX_OFF_CENTRE = 0.12
+"""Distance of a camera's principal point from the middle of its image, in sides of the image."""
+_SAME_SHARE = 0.1
+
+
+def _require_matrix_of_image(device: Pinhole, path: Path, key: str) -> None:
+    """Check a camera whose file does not state the size of its images, by the place of the principal point.
+    Raises CalibrationError: it is that of larger or smaller images of the same shape.
+    """
+    sides = np.array([device.size.width_px, device.size.height_px])
+    shares = (device.matrix[:2, 2] + 0.5) / sides
+    if np.abs(shares - 0.5).max() > _MAX_OFF_CENTRE and np.ptp(shares) < _SAME_SHARE * shares.mean():
+        cx, cy = device.matrix[:2, 2]
+        raise CalibrationError(
+            f"{path}: {key}: expected a principal point near the middle of images of {device.size}, found "
+            f"({cx:g}, {cy:g}), the middle of images about {2 * shares.mean():.2g} times as large; scale fx, fy, cx "
+            "and cy to the size of these images, or import images of the size that was calibrated"
+        )
+
+
+def _require_unit(calibration: Calibration, path: Path) -> None:
+    """Check a calibration whose file does not state the unit of its translations.
+    Raises CalibrationError: in millimetres, it is not of a bench.
+    """
+    layout = rig_layout(calibration)
+    if layout is not None and not layout.is_of_a_bench("mm"):
+        raise CalibrationError(
+            f"{path}: its translation has no unit. In millimetres {layout} (--unit mm). {units_sentence(layout)}"
+        )
+
+
+def _in_unit(calibration: Calibration, scale: float) -> Calibration:
+    """Return the calibration with all translations multiplied, without the statement of its error."""
+
+    def scaled(device: Pinhole) -> Pinhole:
+        return replace(device, translation_mm=scale * device.translation_mm)
+
+    projector = calibration.projector
+    return replace(
+        calibration,
+        cameras={name: scaled(device) for name, device in calibration.cameras.items()},
+        projector=None if projector is None else scaled(projector),
+        solved=None,
+    )
 
 
 def read_any_calibration(
@@ -481,23 +555,40 @@ def read_any_calibration(
     cameras: Mapping[str, Size] | None = None,
     projector: Size | None = None,
     bits: Mapping[Axis, Gray] | None = None,
+    unit: LengthUnit | None = None,
 ) -> Calibration:
     """Return the calibration in a file, or in a folder of ROS files.
 
-    cameras, projector, bits : data that some programs' files lack; see `read_program_calibration`.
-    Raises CalibrationError: the format is unknown, or the file is invalid.
+    cameras, projector, bits : data that some programs' files lack; see `read_program_calibration`. unit : that of the
+    file's translations; None for the one that its format states, metres for ROS and Kalibr, and otherwise mm.
+    Raises CalibrationError: the format is unknown, the file is invalid, its numbers cannot be those of a rig
+    (`slrig.model.calibration_faults`), or it states no unit and in mm it would not be of a bench.
     """
+    calibration, stated = _read_with_unit(path, cameras or {}, projector, bits or {})
+    if unit is None and stated is None:
+        _require_unit(calibration, path)
+    scale = MM_PER_UNIT[unit or stated or "mm"] / MM_PER_UNIT[stated or "mm"]
+    if scale != 1:
+        calibration = _in_unit(calibration, scale)
+    require_plausible(calibration, str(path))
+    return calibration
+
+
+def _read_with_unit(
+    path: Path, cameras: Mapping[str, Size], projector: Size | None, bits: Mapping[Axis, Gray]
+) -> tuple[Calibration, LengthUnit | None]:
+    """Return the calibration in mm, and the unit that its format states; None if it states none and mm were assumed."""
     if path.is_dir():
-        return read_ros(path)
+        return read_ros(path), "m"
     if path.suffix.lower() not in {".yml", ".yaml", ".xml"}:
-        return read_calibration(path)
+        return parse_calibration(path), "mm"
     text = read_text(path, MAX_STORAGE_BYTES, CalibrationError)
     if not text.removeprefix("\ufeff").startswith(("%YAML", "<")):
-        return read_kalibr(path)
+        return read_kalibr(path), "m"
     root = read_file_storage(text, path)
     if detect_program(root) is None:
-        return read_opencv_calibration(path)
-    return read_program_calibration(root, path, cameras=cameras or {}, projector=projector, bits=bits or {})
+        return read_opencv_calibration(path), "mm"
+    return read_program_calibration(root, path, cameras=cameras, projector=projector, bits=bits), None
 
 
 def write_any_calibration(path: Path, calibration: Calibration, form: CalibrationFormat | None = None) -> None:

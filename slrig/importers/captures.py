@@ -22,8 +22,8 @@ from slrig.bundle import (
 )
 from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
-from slrig.importers.calibrations import read_any_calibration
-from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Shot, Size, White
+from slrig.importers.calibrations import centring_offset_px, read_any_calibration
+from slrig.model import Axis, Black, CameraFormat, Gray, LengthUnit, LineShift, Pattern, Pixels, Shot, Size, White
 from slrig.patterns import encode, gray_bits
 
 SLSTUDIO_BITS = {Axis.COLUMN: 10, Axis.ROW: 6}
@@ -76,8 +76,7 @@ class ProjectorCode:
 
     def centring_offset_px(self, axis: Axis) -> int:
         """Return the offset that centres the projector in a code with cells of 1 px."""
-        extent = self.size.along(axis)
-        return int((2 ** gray_bits(extent, 1, 0) - extent) // 2)
+        return centring_offset_px(self.size.along(axis))
 
     def first_bits(self, axis: Axis, count: int, *, inverses: bool, offset_px: int | None = None) -> list[Pattern]:
         """Return the first `count` bits, each followed by its inverse if `inverses`."""
@@ -247,12 +246,13 @@ def import_capture(
     names: Sequence[str] = (),
     bit_depth: int | None = None,
     calibration_file: Path | None = None,
+    unit: LengthUnit | None = None,
 ) -> tuple[ImageAssignment, Path | None]:
     """Write the images of `folder` as the bundle `output`; return the images and the calibration file that was used.
 
     names : new names of the cameras, in the natural order of their names in the folder. bit_depth : of samples in
-    files with 16 bits. Raises BundleError, PatternError, CalibrationError: the images, the naming or the calibration do
-    not fit; StorageError.
+    files with 16 bits. unit : as for `read_any_calibration`. Raises BundleError, PatternError, CalibrationError: the
+    images, the naming or the calibration do not fit; StorageError.
     """
     with storage_errors(folder):
         images = _assign_images(folder, code, naming)
@@ -268,7 +268,7 @@ def import_capture(
     path, calibration = calibration_file or default_file, None
     if path is not None:
         bits = {p.axis: p for files in images.cameras.values() for _, p in files if isinstance(p, Gray)}
-        calibration = read_any_calibration(path, cameras=sizes, projector=code.size, bits=bits)
+        calibration = read_any_calibration(path, cameras=sizes, projector=code.size, bits=bits, unit=unit)
         check_calibration(calibration, code.size, sizes, str(path))
     patterns = list(dict.fromkeys(pattern for files in images.cameras.values() for _, pattern in files))
     with BundleWriter(output, code.size, patterns, formats, calibration) as writer:

@@ -63,6 +63,15 @@ from slrig.model.patterns import (
     has_even_shifts,
     to_gray,
 )
+from slrig.model.plausibility import (
+    MM_PER_UNIT,
+    LengthUnit,
+    RigLayout,
+    calibration_faults,
+    require_plausible,
+    rig_layout,
+    units_sentence,
+)
 from slrig.model.region import MAX_MASK_CHARACTERS, Region
 from slrig.model.surface import (
     AlbedoMark,
@@ -89,6 +98,7 @@ __all__ = [
     "MIN_EXPOSURES",
     "MIN_LINE_STEPS",
     "MIN_RANGE_SIGMA",
+    "MM_PER_UNIT",
     "AlbedoMark",
     "Axis",
     "AxisUpdate",
@@ -104,6 +114,7 @@ __all__ = [
     "Gray",
     "IntArray",
     "Integers",
+    "LengthUnit",
     "LightMap",
     "LineShift",
     "MeasuredAxis",
@@ -118,6 +129,7 @@ __all__ = [
     "Primary",
     "Refusal",
     "Region",
+    "RigLayout",
     "RotationAxis",
     "SequenceName",
     "Shot",
@@ -130,6 +142,7 @@ __all__ = [
     "White",
     "baseline_fraction",
     "bracket_fault",
+    "calibration_faults",
     "coarse_bit_count",
     "depth_sensitive_cameras",
     "diagnostic_bits",
@@ -142,9 +155,12 @@ __all__ = [
     "light_map_coordinates",
     "linear_to_srgb",
     "require_array",
+    "require_plausible",
+    "rig_layout",
     "srgb_to_linear",
     "to_gray",
     "triangulated_axis",
     "trim_incomplete_codes",
+    "units_sentence",
     "update_axis",
 ]

@@ -201,6 +201,21 @@ def _decode_kernel(
                 highest[y, x] = min(high, cell_count - 1)
 
 
+def cells_beyond(frames: AxisFrames, code: CodeMap, index_of_word: IntArray, /) -> IntArray:
+    """(n,) int32: the cell of the code at each pixel where it names none of the projector's, after or before them."""
+    beyond = code.refusal == _BEYOND_PROJECTOR
+    first_cell = frames.gray.offset_px // frames.gray.cell_px
+    if first_cell > 0:
+        beyond |= (code.refusal == 0) & (code.highest < first_cell)
+    word = np.zeros(int(np.count_nonzero(beyond)), dtype=np.int32)
+    if len(word) == 0:
+        return word
+    reference = frames.inverses if frames.inverses is not None else [frames.middle] * len(frames.bits)
+    for bit_image, other in zip(frames.bits, reference, strict=True):
+        word = word << 1 | (bit_image[beyond] > other[beyond])
+    return np.asarray(index_of_word[word], dtype=np.int32)
+
+
 @dataclass(frozen=True, slots=True)
 class RegionMask:
     """Scan region in the image of one camera.

@@ -39,6 +39,7 @@ from slrig.reconstruction.decoded_image import (
 from slrig.reconstruction.decoding import (
     CodeMap,
     RegionMask,
+    cells_beyond,
     decode,
     lit_pixels,
     refuse_outside_region,
@@ -85,7 +86,9 @@ class CameraCurves:
     unresolved : (H, W) uint8, number of finest bits left out at each pixel; None where bits only number lines.
     unresolved_lines : (H, W) bool, where code edges replace lines that the camera does not resolve; None if nowhere.
     compression_dn : standard deviation of white noise that displaces positions as much as the loss by compression; 0
-    for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`.
+    for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`. beyond_pixels : number
+    of pixels whose code names a cell that the projector has not; furthest_cell : of these cells, the one farthest from
+    the projector's that more than a hundredth of the pixels name, -1 without any.
     """
 
     ensemble: StripeEnsemble
@@ -102,6 +105,8 @@ class CameraCurves:
     compression_dn: float = 0.0
     noise_correlation: float = 1.0
     gamma: float = 1.0
+    beyond_pixels: int = 0
+    furthest_cell: int = -1
 
 
 def camera_curves(
@@ -389,6 +394,7 @@ def _refine_identify_link(
     Large data are released as soon as they are not needed: `found`, the refined points and the images in `stacks`.
     """
     frames = image.frames
+    beyond = cells_beyond(frames, image.code, tables.index_of_word)
     report_step("refine stripes")
     aligned = align_points(
         image, found, scale.blur_px, tables, limits, stacks.release_line_images, sampled=scale.sampled
@@ -449,7 +455,16 @@ def _refine_identify_link(
         compression_dn=float(np.sqrt(image.response.loss_variance)),
         noise_correlation=image.response.noise_correlation,
         gamma=image.response.gamma,
+        beyond_pixels=len(beyond),
+        furthest_cell=_furthest_cell(beyond, len(tables.cell_position)),
     )
+
+
+def _furthest_cell(beyond: IntArray, cell_count: int) -> int:
+    if len(beyond) == 0:
+        return -1
+    is_after = np.count_nonzero(beyond >= cell_count) >= len(beyond) / 2
+    return int(np.percentile(beyond, 99 if is_after else 1, method="nearest"))
 
 
 def _chain_and_identify(

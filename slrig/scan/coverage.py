@@ -1,23 +1,16 @@
-"""How much of what a camera decoded the mesh covers. A scan that lost most of it says so; one that lost all fails."""
+"""How much of what a camera decoded the mesh covers."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.errors import NothingToReconstructError, setting
 from slrig.meshing import depth_ranges, rasterise
 from slrig.model import IntArray, Mesh, Refusal, Size
 from slrig.reconstruction import SheetCurves, optical_depths_mm
 from slrig.scan.placing import placed_vertices, resampled
-from slrig.scan.report import lit_pixels
 from slrig.scan.stream import CameraResult
 
-FAIR_SHARE = 0.6
-"""Sound scans of real rigs have 0.8 and more, borders of two pixels that are refused included."""
 _PICTURE_PX = 480
 """Wide enough for a share, and a tenth of the work at full size."""
 
@@ -58,36 +51,3 @@ def layered_share(
     nearest, furthest = depth_ranges(placed, faces, Size(size.width_px // step, size.height_px // step))
     covered = int(np.count_nonzero(nearest <= furthest))
     return int(np.count_nonzero(furthest - nearest > least_mm)) / max(covered, 1)
-
-
-def coverage_notes(name: str, share: float | None) -> list[str]:
-    """One sentence if the mesh covers much less than was decoded."""
-    if share is None or share >= FAIR_SHARE:
-        return []
-    return [
-        f"the mesh covers {share:.0%} of what camera '{name}' decoded. Look at the picture of causes: the finest "
-        f"patterns may not resolve (wider cells: {setting('gray_cell_px')}; wider lines: {setting('line_width_px')}), "
-        f"or the limit at depth edges be too low: {setting('depth_edge_ratio')}"
-    ]
-
-
-def require_surface(holds: bool, folder: Path, what: str, cameras: Sequence[CameraResult]) -> None:
-    """Refuse a scan that holds no surface (NothingToReconstructError), with the figures that tell why."""
-    if holds:
-        return
-    figures = "; ".join(
-        f"camera '{seen.name}': white {seen.white.mean():.0f} of {seen.full_scale:.0f} on average, at most "
-        f"{seen.contrast.max():.0f} above black, {lit_pixels(seen.curves).mean():.1%} of the image lit, "
-        f"{seen.curves.decoded_pixels} pixels decoded{_outside(seen)}"
-        for seen in cameras
-    )
-    message = (
-        f"{folder}: {what}. {figures}. Look whether the projector lit the object, the lens cap is off, and the "
-        "exposure leaves white below full scale and well above black"
-    )
-    raise NothingToReconstructError(message)
-
-
-def _outside(seen: CameraResult) -> str:
-    share = float((seen.curves.refusal == Refusal.OUTSIDE_REGION).mean())
-    return f", {share:.1%} of the image outside the region that was asked for" if share else ""

@@ -74,11 +74,20 @@ def chosen_axis(shown: Collection[Axis], cameras: Sequence[Pinhole], projector: 
     return axis
 
 
-def weakness(axis: Axis, shown: Collection[Axis], share: float) -> str | None:
-    """What to say of a scan whose stripes cross the baseline by so small a share; None where that is well."""
+def weakness(axis: Axis, shown: Collection[Axis], share: float, *, on_request: bool = False) -> str | None:
+    """What to say of a scan whose stripes cross the baseline by so small a share; None where that is well.
+
+    on_request : True if this axis was requested. Then the other one, if it was shown, is the cure.
+    """
     if share >= FAIR_SHARE:
         return None
-    cure = _BOTH if len(shown) == 1 else "Both axes were played: turn the projector about its view by 45°"
+    if len(shown) == 1:
+        cure = _BOTH
+    elif on_request:
+        other = Axis.ROW if axis is Axis.COLUMN else Axis.COLUMN
+        cure = f"The {other}s were played, too, and cross it more steeply: leave out {setting('axis')}"
+    else:
+        cure = "Both axes were played: turn the projector about its view by 45°"
     times = f"{1 / share:.1f}" if share > _NEXT_TO_NONE else f"more than {1 / _NEXT_TO_NONE:.0f}"
     return (
         f"the light of the {axis}s crosses the baseline at {degrees(asin(share)):.0f}° only, and depth is {times} "

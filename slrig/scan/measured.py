@@ -24,13 +24,31 @@ from slrig.bundle import (
 )
 from slrig.capture import Evidence, EvidenceSummary, check_exposures, checked_frames
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
-from slrig.model import MIN_BASELINE_FRACTION, Axis, Calibration, CaptureHeader, Region, Shot, trim_incomplete_codes
+from slrig.model import (
+    MIN_BASELINE_FRACTION,
+    Axis,
+    Calibration,
+    CaptureHeader,
+    Gray,
+    Region,
+    Shot,
+    Size,
+    trim_incomplete_codes,
+)
 from slrig.reconstruction import exposure_count
 from slrig.scan.agreement import AxisAgreement, check_cameras
-from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
-from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
-from slrig.scan.report import capture_notes, capture_report, lit_pixels
+from slrig.scan.losses import FAIR_SHARE as FAIR_DECODED
+from slrig.scan.losses import (
+    Stage,
+    code_extent_notes,
+    code_of,
+    geometry_fault,
+    geometry_notes,
+    require_code_on_projector,
+    require_surface,
+)
+from slrig.scan.report import capture_notes, capture_report, layout_notes, lit_pixels
 from slrig.scan.stream import CameraResult, LiveScan, ScanStream, cell_px, step_px
 from slrig.scan.triangulated import Triangulated, camera_notes, triangulated, unresolved_notes
 
@@ -45,6 +63,7 @@ class Walked:
     """What the frames told along one axis: the curves of every camera, and their part of the report.
 
     step_px : distance of neighbouring curves where all that was shown resolves; cell_px : of neighbouring code edges.
+    gray : a bit of the axis's code; projector : the projector's extent.
     """
 
     devices: Calibration
@@ -53,6 +72,8 @@ class Walked:
     seen: list[CameraResult]
     step_px: float
     cell_px: float
+    gray: Gray
+    projector: Size
     sections: dict[str, object]
     notes: list[str]
     agreement: AxisAgreement
@@ -93,9 +114,11 @@ def measured(
     best, found = max(sound, key=lambda each: _depth_known(*each)) if len(sound) > 1 else sound[0]
     best.notes.extend(_chosen_notes(walked, best, found))
     best.notes.extend(left_out_notes(best.axis, {seen.name: seen.device for seen in best.seen}, best.devices.projector))
-    words = weakness(best.axis, best.shown, found.share_across)
+    words = weakness(best.axis, best.shown, found.share_across, on_request=axis is not None)
     if words is not None:
         if found.share_across < MIN_BASELINE_FRACTION:
+            if isinstance(tries[0], NothingToReconstructError):
+                raise tries[0]
             message = f"{folder}: {words}"
             raise NothingToReconstructError(message)
         best.notes.append(words)
@@ -109,14 +132,20 @@ def _tried(
     seen = walked.seen
     try:
         require_surface(any(each.curves.decoded_pixels > 0 for each in seen), folder, "no pixel could be decoded", seen)
+        require_code_on_projector(folder, seen, walked.gray, walked.projector)
         require_surface(any(each.curves.stripe_count > 0 for each in seen), folder, "no stripe was found", seen)
+        entered("compare axes", 0.58, "")
+        projector = walked.devices.projector
+        agreeing, agreement = check_cameras(folder, seen, projector, walked.axis)
+        walked = replace(walked, seen=agreeing, agreement=agreement, notes=[*walked.notes, *agreement.notes])
+        entered("triangulate", 0.6, "")
+        found = triangulated(agreeing, projector, walked.axis, region, agreement.checks)
+        fault = geometry_fault(found.cameras, agreeing, projector, walked.axis)
+        require_surface(fault is None, folder, str(fault), found.cameras, stage=Stage.GEOMETRY)
     except NothingToReconstructError as error:
         return error
-    entered("compare axes", 0.58, "")
-    agreeing, agreement = check_cameras(folder, seen, walked.devices.projector, walked.axis)
-    walked = replace(walked, seen=agreeing, agreement=agreement, notes=[*walked.notes, *agreement.notes])
-    entered("triangulate", 0.6, "")
-    return walked, triangulated(agreeing, walked.devices.projector, walked.axis, region, agreement.checks)
+    walked.notes[:0] = [*code_extent_notes(seen, walked.gray, walked.projector), *geometry_notes(found.cameras)]
+    return walked, found
 
 
 def _is_weak(tried: tuple[Walked, Triangulated] | NothingToReconstructError) -> bool:
@@ -224,12 +253,17 @@ def _walked(
     step, cell = (each(stream.header.displayed_patterns, stream.axis) for each in (step_px, cell_px))
     notes = [
         *cut_short,
+        *layout_notes(devices),
         *capture_notes(stream.header, stream.axis, evidence),
         *camera_notes(seen),
         *unresolved_notes(seen, step, cell),
     ]
     agreement = AxisAgreement(stream.axis, {})
-    return Walked(devices, stream.axis, stream.header.axes, seen, step, cell, sections, notes, agreement)
+    gray = code_of(stream.header.displayed_patterns, stream.axis)
+    projector = stream.header.projector
+    return Walked(
+        devices, stream.axis, stream.header.axes, seen, step, cell, gray, projector, sections, notes, agreement
+    )
 
 
 def _streamed(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle import read_health, read_notes, read_truth, read_turntable_angle, write_file
 from slrig.capture import EvidenceSummary
-from slrig.errors import ScanCancelledError
+from slrig.errors import NothingToReconstructError, ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
@@ -35,8 +35,9 @@ from slrig.reconstruction import (
 from slrig.scan.agreement import agreement_report, axis_error
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.colouring import albedo_report, coloured
-from slrig.scan.coverage import coverage_notes, covered_share, layered_share, require_surface
+from slrig.scan.coverage import covered_share, layered_share
 from slrig.scan.limited import marked, within
+from slrig.scan.losses import Stage, coverage_notes, require_coverage, require_surface
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.mirror_images import mirror_image_notes, without_mirror_images, without_surface
@@ -180,6 +181,8 @@ def reconstruct_into(
         walked, found = measured(bundle, calibration, live, entered, axis=plan.axis, region=plan.region, judged=judged)
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
+        covered = covered_share(mesh, cameras[0])
+        require_coverage(bundle, cameras, covered)
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         # One at a time: each is as large as the mesh.
         place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_calibration_sigma_mm))
@@ -190,7 +193,6 @@ def reconstruct_into(
             "points.ply",
             encode_points_ply(meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm),
         )
-        covered = covered_share(mesh, cameras[0])
         sizes = mesh_figures(mesh.vertices_mm, mesh.faces)
         figures = {**meshed.figures, "figures": sizes}
         entered("pictures", 0.85, "")
@@ -205,9 +207,9 @@ def reconstruct_into(
             **walked.sections,
             "notes": [
                 *read_notes(bundle),
+                *coverage_notes(cameras, covered),
                 *walked.notes,
                 *meshed.notes,
-                *coverage_notes(cameras[0].name, covered),
                 *fault_notes(sizes),
                 *truth_notes(known.get("truth", {})),
             ],
@@ -255,7 +257,7 @@ def _meshed(
     first, axis, step_px = walked.seen[0], walked.axis, walked.step_px
     cameras, joined_curves = found.cameras, found.joined
     points = joined_curves.curves
-    require_surface(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras)
+    require_surface(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras, stage=Stage.GEOMETRY)
     count = f"{len(points.points_mm)} points"
     projector = walked.devices.projector
     gap_px = widest_gap_px(projector, axis)
@@ -282,7 +284,7 @@ def _meshed(
         on_step=lambda stage: entered(stage, 0.68, count),
         runs=beside.runs,
     )  # fmt: skip
-    require_surface(len(surface.faces) > 0, folder, without_surface(surface, projector), cameras)
+    require_surface(len(surface.faces) > 0, folder, without_surface(surface, projector), cameras, stage=Stage.MESH)
     entered("vertices", 0.72, count)
     cameras, joined_curves, surface = without_mirror_images(cameras, joined_curves, surface)
     found, points = replace(found, cameras=cameras, joined=joined_curves), joined_curves.curves
@@ -301,7 +303,12 @@ def _meshed(
         known = sigma <= limit_mm
         surface = surface.with_points(known, "sigma_limit")
         cameras = [_where_known(seen, joined_curves, index, known) for index, seen in enumerate(cameras)]
-        require_surface(len(surface.faces) > 0, folder, f"no surface is known to {limit_mm:g} mm", cameras)
+        if len(surface.faces) == 0:
+            message = (
+                f"{folder}: no surface is known to {limit_mm:g} mm, half of the points to {np.nanmedian(sigma):.2g} "
+                "mm; raise max_sigma_mm, or give the scan more light"
+            )
+            raise NothingToReconstructError(message)
     light = walked.devices.light
     colours = coloured(cameras, joined_curves, surface.normals, projector, axis, light)
     curves = PointCurves(

@@ -28,6 +28,8 @@ from slrig.model import (
     Size,
     SolveRecord,
     Source,
+    rig_layout,
+    units_sentence,
 )
 from slrig.reconstruction import CameraCurves, ExposureUse, MergedCurves, PairRedundancy, Redundancy
 from slrig.scan.artefacts import REPORT_FORMAT
@@ -216,6 +218,17 @@ def capture_notes(capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary)
     notes += [f"an exposure was left out: {cause}" for cause in evidence.left_out]
     notes += [f"the frames contradict their patterns: {fault}" for fault in evidence.faults]
     return notes
+
+
+def layout_notes(calibration: Calibration) -> list[str]:
+    """Ask for the unit of a calibration of unknown origin whose devices do not stand as those of a bench do."""
+    layout = rig_layout(calibration)
+    if calibration.solved is not None or layout is None or layout.is_of_a_bench("mm"):
+        return []
+    return [
+        f"{layout}. If that is not so, all lengths are in another unit, which no frame can show. "
+        f"{units_sentence(layout)}"
+    ]
 
 
 _SECONDS_PER_DAY = 86_400.0

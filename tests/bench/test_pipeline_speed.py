@@ -29,6 +29,7 @@ from slrig.model import Calibration, Mesh, Region
 from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.agreement import AxisAgreement
+from slrig.scan.losses import code_of
 from slrig.scan.measured import Walked
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import _meshed
@@ -103,8 +104,19 @@ class Run:
         watch.enter("triangulate")
         step, cell = (each(stream.header.displayed_patterns, stream.axis) for each in (step_px, cell_px))
         found = triangulated(seen, calibration.projector, stream.axis, region)
+        gray, agreement = code_of(stream.header.displayed_patterns, stream.axis), AxisAgreement(stream.axis, {})
         walked = Walked(
-            calibration, stream.axis, stream.header.axes, seen, step, cell, {}, [], AxisAgreement(stream.axis, {})
+            calibration,
+            stream.axis,
+            stream.header.axes,
+            seen,
+            step,
+            cell,
+            gray,
+            stream.header.projector,
+            {},
+            [],
+            agreement,
         )
         meshed = _meshed(folder, found, walked, plan, lambda stage, _fraction, _detail: watch.enter(stage))
         self.stages_s = watch.finished()

@@ -231,12 +231,27 @@ def of_cells(matrix: FloatArray) -> FloatArray:
 def test_scan3ds_lens_is_of_its_cells(tmp_path: Path) -> None:
     folder = lay_out(tmp_path / "images", photographed("scan3d"), "cam_{:02}.png", first=1)
     lens, straight = np.array([[400.0, 0, 99], [0, 400, 79], [0, 0, 1]]), np.zeros((1, 5))
-    values = [lens, straight, of_cells(lens), straight, np.eye(3), np.array([[-100.0], [0], [0]]), np.eye(3)]
+    seen = np.array([[80.0, 0, 19.4], [0, 80, 15.4], [0, 0, 1]])
+    values = [seen, straight, of_cells(lens), straight, np.eye(3), np.array([[-100.0], [0], [0]]), np.eye(3)]
     opencv_file(folder / "calibration.yml", SCAN3D, values)
     calibration = read_bundle(imported(folder, tmp_path / "bundle", "--format", "scan3d")).calibration
     assert calibration is not None
     assert calibration.projector is not None
     np.testing.assert_allclose(calibration.projector.matrix, lens)
+
+
+def test_the_unit_of_a_calibration_is_asked_and_taken(tmp_path: Path) -> None:
+    folder = lay_out(tmp_path / "images", photographed("opencv"))
+    lens, straight = np.array([[80.0, 0, 19.4], [0, 80, 15.4], [0, 0, 1]]), np.zeros((1, 5))
+    shift = np.array([[-0.1], [0], [0]])
+    opencv_file(folder / "calibration.yml", SCAN3D, [lens, straight, lens, straight, np.eye(3), shift, np.eye(3)])
+    result = run(folder, "--output", tmp_path / "bundle", "--projector", "200x160")
+    assert result.exit_code == 2
+    assert "stand 0.1 mm apart (--unit mm). Metres?" in " ".join(result.stderr.split())
+    calibration = read_bundle(imported(folder, tmp_path / "bundle", "--unit", "m")).calibration
+    assert calibration is not None
+    assert calibration.projector is not None
+    np.testing.assert_allclose(calibration.projector.translation_mm, (-100, 0, 0))
 
 
 class Recorded:

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slrig.bundle import (
+    parse_calibration,
     read_bundle,
-    read_calibration,
     read_opencv_calibration,
     write_bundle,
     write_calibration,
@@ -167,4 +167,4 @@ def test_a_calibration_comes_back_bit_by_bit(calibration: Calibration, ending: s
         else:
             write_opencv_calibration(path, calibration)
             _same(read_opencv_calibration(path), calibration)
-        _same(read_calibration(path), calibration)
+        _same(parse_calibration(path), calibration)

@@ -145,7 +145,14 @@ def test_opencvs_stereo_sample_is_of_two_cameras_or_of_a_camera_and_the_projecto
     path = tmp_path / "stereo.yml"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     turn = cv2.Rodrigues(np.array([0.0, 0.1, 0.0]))[0]
-    values = (np.diag([50.0, 51, 1]), np.zeros((1, 5)), np.diag([60.0, 61, 1]), np.zeros((1, 8)), turn, np.ones((3, 1)))
+    values = (
+        np.diag([50.0, 51, 1]),
+        np.zeros((1, 5)),
+        np.diag([60.0, 61, 1]),
+        np.zeros((1, 8)),
+        turn,
+        np.full((3, 1), 90.0),
+    )
     for name, value in zip(("M1", "D1", "M2", "D2", "R", "T"), values, strict=True):
         storage.write(name, value)
     storage.release()
@@ -159,6 +166,81 @@ def test_opencvs_stereo_sample_is_of_two_cameras_or_of_a_camera_and_the_projecto
     assert np.allclose(one.projector.rotation, turn)
     with pytest.raises(CalibrationError, match="sizes of its images, found one of OpenCV's sample"):
         read_any_calibration(path)
+
+
+OPENCV_KEYS = ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation")
+SCAN3D_KEYS = ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T")
+SIZES = {"cam0": Size(640, 512)}
+
+
+def program_file(path: Path, keys: tuple[str, ...] = OPENCV_KEYS, **changes: Any) -> Path:
+    """A file of another program: a bench of 240 mm whose projector of 640 x 400 is turned towards the camera."""
+    turn = cv2.Rodrigues(np.array([0.0, 0.38, 0.0]))[0]
+    values: dict[str, Any] = {
+        "camera": [[1375.0, 0, 322], [0, 1376, 251], [0, 0, 1]],
+        "camera_lens": [[-0.08, 0.11, 0, 0, 0]],
+        "projector": [[1450.0, 0, 322], [0, 1451, 195], [0, 0, 1]],
+        "projector_lens": [[0.02, -0.03, 0, 0, 0]],
+        "rotation": turn,
+        "translation": [[-236.0], [12.0], [55.0]],
+    }
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for key, value in zip(keys, (values | changes).values(), strict=True):
+        storage.write(key, np.array(value, dtype=np.float64))
+    storage.release()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [
+        (1e-3, r"stand 0.243 mm apart .*Metres\? Then .* 243 mm apart .*--unit m\)"),
+        (0.1, r"stand 24.3 mm apart .*Centimetres\? .*--unit cm\)"),
+        (1 / 25.4, r"stand 9.55 mm apart .*nches\? .*--unit inch\)"),
+        (1e3, r"stand 2.43e\+05 mm apart .*State the unit"),
+    ],
+)
+def test_a_file_without_unit_is_asked_for_it_where_it_makes_no_bench(tmp_path: Path, scale: float, words: str) -> None:
+    path = program_file(tmp_path / "rig.yml", translation=np.array([[-236.0], [12.0], [55.0]]) * scale)
+    with pytest.raises(CalibrationError, match=words):
+        read_any_calibration(path, cameras=SIZES, projector=Size(640, 400))
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 1e-3), ("inch", 1 / 25.4)])
+def test_translations_are_read_in_the_unit_that_was_stated(tmp_path: Path, unit: Any, scale: float) -> None:
+    path = program_file(tmp_path / "rig.yml", translation=np.array([[-236.0], [12.0], [55.0]]) * scale)
+    read = read_any_calibration(path, cameras=SIZES, projector=Size(640, 400), unit=unit)
+    assert read.projector is not None
+    assert np.allclose(read.projector.translation_mm, (-236, 12, 55))
+
+
+def test_a_stated_unit_replaces_that_of_the_format(tmp_path: Path) -> None:
+    in_mm = CAMCHAIN.replace("-0.11]", "-110.0]").replace("0.02]", "20.0]").replace("0.003]", "3.0]")
+    with pytest.raises(CalibrationError, match="expected devices 2 to 15000 mm apart"):
+        read_any_calibration(written(tmp_path / "camchain.yaml", in_mm))
+    read = read_any_calibration(written(tmp_path / "camchain.yaml", in_mm), unit="mm")
+    assert read.projector is not None
+    assert np.allclose(read.projector.translation_mm, (-110, 20, 3))
+
+
+@pytest.mark.parametrize("scale", [2.0, 0.5])
+def test_a_matrix_of_images_of_another_size_is_refused(tmp_path: Path, scale: float) -> None:
+    matrix = [[1375.0 * scale, 0, 322 * scale], [0, 1376 * scale, 251 * scale], [0, 0, 1]]
+    path = program_file(tmp_path / "rig.yml", camera=matrix)
+    with pytest.raises(CalibrationError, match=f"the middle of images about {scale:g} times as large"):
+        read_any_calibration(path, cameras=SIZES, projector=Size(640, 400))
+
+
+def test_a_projector_of_scan3d_capture_is_in_pixels_unless_the_capture_is_its_own(tmp_path: Path) -> None:
+    """Its own captures of 640 x 400 have 9 bits of columns, in cells of 2 px, centred in the code."""
+    cells = [[725.0, 0, 160.75], [0, 1451, 195], [0, 0, 1]]
+    own = {each.axis: each for each in scan3d_sequence(ProjectorCode(Size(640, 400)), 38) if isinstance(each, Gray)}
+    opencv = {axis: Gray(axis, 0, bits) for axis, bits in ((Axis.COLUMN, 10), (Axis.ROW, 9))}
+    for bits, changes in ((own, {"projector": cells}), (opencv, {})):
+        path = program_file(tmp_path / "rig.yml", SCAN3D_KEYS, **changes)
+        read = read_any_calibration(path, cameras=SIZES, projector=Size(640, 400), bits=bits)
+        assert read.projector is not None
+        assert read.projector.matrix.tolist() == [[1450.0, 0, 322], [0, 1451, 195], [0, 0, 1]]
 
 
 @pytest.mark.parametrize(

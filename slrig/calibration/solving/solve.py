@@ -50,7 +50,7 @@ from slrig.calibration.solving.projection import (
     to_pinhole,
 )
 from slrig.errors import SolveRefusedError
-from slrig.model import LENS_TERMS, Calibration, FloatArray, IntArray, Size
+from slrig.model import LENS_TERMS, Calibration, FloatArray, IntArray, Size, calibration_faults
 
 Progress = Callable[[str, float, str], None]
 """Called with the name of the stage, the completed fraction (0 to 1), and a description."""
@@ -161,6 +161,7 @@ def _build_solution(
     in_order = [residuals[name] for name in problem.devices]
     progress("odd and even", 0.9, "half of the poses against the other half")
     calibration = Calibration({name: devices[name] for name in observations.cameras}, devices.get(PROJECTOR))
+    _refuse_impossible(calibration)
     size = board_size(board, stretch)
     scale = size.scale_sigma * scale_mode(calibration)
     solution = Solution(
@@ -178,6 +179,17 @@ def _build_solution(
     )
     progress("done", 1.0, f"{len(used)} poses used, {len(outliers)} left out")
     return solution
+
+
+def _refuse_impossible(calibration: Calibration) -> None:
+    faults = calibration_faults(calibration)
+    if faults:
+        lines = "\n".join(f"  {fault}" for fault in faults)
+        message = (
+            "the poses lead to numbers that no rig has; shoot poses that reach the corners of every image, tilted "
+            f"differently, and check that the board's sizes are in millimetres:\n{lines}"
+        )
+        raise SolveRefusedError(message)
 
 
 def _held_out_px(problem: AdjustmentProblem, fit: Fit) -> dict[str, float]:

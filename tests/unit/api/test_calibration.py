@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -236,6 +237,13 @@ def test_calibrations_are_imported_compared_and_refused(calibrating: TestClient,
     no_calibration = (422, "/problems/calibration")
     for content in (b"{}", b"[", b"\xff"):
         assert refusal(client, "POST", "/calibration/import", content=content, headers=JSON) == no_calibration
+    in_metres = tame_calibration()
+    assert in_metres.projector is not None
+    there = replace(in_metres.projector, translation_mm=in_metres.projector.translation_mm / 1000)
+    write_calibration(path, replace(in_metres, projector=there))
+    answer = client.post("/calibration/import", content=path.read_bytes(), headers=JSON)
+    assert answer.status_code == 422
+    assert "stand 0.1 mm apart. Metres?" in answer.json()["detail"]
     strange = client.post("/calibration/import", content=b"x", headers={"Content-Type": "text/plain"})
     assert (strange.status_code, strange.headers["content-type"]) == (415, "application/problem+json")
     too_large = (413, "/problems/content-too-large")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from slrig.model import Axis, Gray, IntArray, NoiseModel, Refusal
 from slrig.patterns.codes import index_of_word
-from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
+from slrig.reconstruction.decoding import CodeMap, DecodingLimits, cells_beyond, decode
 from slrig.reconstruction.frames import AxisFrames
 from tests.unit.reconstruction.builders import code_frames
 
@@ -193,3 +194,12 @@ def test_the_centre_of_an_interval_is_nan_where_refused() -> None:
         np.array([[4, -1]], dtype=np.int32), np.array([[5, -1]], dtype=np.int32), np.array([[0, 3]], dtype=np.uint8)
     )
     np.testing.assert_array_equal(code.centre(), [[4.5, np.nan]])
+
+
+@pytest.mark.parametrize(("cell", "offset_px", "beyond"), [(39, 0, []), (40, 0, [40]), (63, 0, [63]), (7, 32, [7])])
+def test_cells_before_and_after_the_projectors_are_counted(cell: int, offset_px: int, beyond: list[int]) -> None:
+    """Cells of 4 px: the first of the projector is that of the offset, and there are 40 in all."""
+    frames = one_pixel(swings_of(cell))
+    frames = replace(frames, gray=replace(frames.gray, offset_px=offset_px))
+    code = decode(frames, QUIET, WORDS, 40, LIMITS)
+    assert cells_beyond(frames, code, WORDS).tolist() == beyond

@@ -109,6 +109,9 @@ def test_a_weak_crossing_is_told_in_degrees_with_its_price_and_its_cure() -> Non
     assert "4.0 times" in told
     assert "Scan with both axes: rows (--rows)" in told
     assert "45°" in (weakness(Axis.ROW, BOTH, MIN_BASELINE_FRACTION) or "")
+    requested = weakness(Axis.ROW, BOTH, 0.1, on_request=True) or ""
+    assert "The columns were played, too" in requested
+    assert "leave out axis (--axis)" in requested
     assert "more than 100 times" in (weakness(Axis.ROW, BOTH, 0.0) or "")
 
 

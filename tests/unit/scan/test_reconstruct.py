@@ -207,7 +207,7 @@ def without(*kinds: str, bit: int | None = None) -> Callable[[Shot, Capture], Sh
     ("change", "error", "words"),
     [
         (flat(0), NothingToReconstructError, "no pixel could be decoded.*lens cap"),
-        (flat(255), NothingToReconstructError, "no pixel could be decoded.*lens cap"),
+        (flat(255), NothingToReconstructError, "no pixel could be decoded.*expose for a shorter time"),
         (without(bit=2), PatternError, r"bits \[2\]"),
         (without("white", "inverse"), PatternError, "bits have no threshold"),
     ],
@@ -224,6 +224,37 @@ def test_frames_that_tell_nothing_are_refused(
     message = refused(error, bundle, tmp_path / "out")
     assert re.search(words, message)
     assert str(bundle) in message
+
+
+def test_a_code_that_names_columns_that_the_projector_has_not_is_refused(recorded: Path, tmp_path: Path) -> None:
+    bundle = read_bundle(recorded)
+    narrow = replace(bundle.capture, projector=Size(160, bundle.capture.projector.height_px))
+    write_bundle(tmp_path / "narrow", narrow, None)
+    calibration = json.loads((recorded / "calibration.json").read_text())
+    calibration["projector"]["size_px"][0] = 160
+    (tmp_path / "narrow" / "calibration.json").write_text(json.dumps(calibration))
+    words = refused(NothingToReconstructError, tmp_path / "narrow", tmp_path / "out")
+    named = re.search(r"names columns 0 to (\d+), the projector has 160", words)
+    assert named is not None
+    assert 160 < int(named[1]) < 256
+    assert "a bit that is inverted" in words
+    assert "lens cap" not in words
+
+
+def test_a_rotation_of_the_inverse_direction_is_no_fault_of_the_light(recorded: Path, tmp_path: Path) -> None:
+    bundle = shutil.copytree(recorded, tmp_path / "bundle")
+    known = read_calibration(bundle / "calibration.json")
+    camera, projector = next(iter(known.cameras.values())), known.projector
+    assert projector is not None
+    turn = projector.rotation @ camera.rotation.T
+    shift = projector.translation_mm - turn @ camera.translation_mm
+    wrong = replace(projector, rotation=turn.T @ camera.rotation, translation_mm=turn.T @ camera.translation_mm + shift)
+    write_calibration(bundle / "calibration.json", replace(known, projector=wrong))
+    words = refused(NothingToReconstructError, bundle, tmp_path / "out")
+    assert "of the points have no place" in words
+    assert "R transposed" in words
+    assert "The calibration does not fit these frames" in words
+    assert "lens cap" not in words
 
 
 def test_lines_that_were_never_shown_are_made_up_for_by_code_edges_and_told(recorded: Path, tmp_path: Path) -> None:
