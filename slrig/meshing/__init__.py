@@ -5,7 +5,7 @@ from slrig.meshing.facing import Viewpoints
 from slrig.meshing.flips import optimise_edges
 from slrig.meshing.quality import mesh_figures, nearest_on_triangle, score, weighted_percentiles
 from slrig.meshing.rasteriser import depth_ranges, merge_depth_buffers, rasterise, rasterise_normals
-from slrig.meshing.strips import runs_of_curve_parts
+from slrig.meshing.strips import initial_mesh, runs_of_curve_parts
 from slrig.meshing.surface import (
     FIRST_STAGE,
     MeshingLimits,
@@ -34,6 +34,7 @@ __all__ = [
     "compact_mesh",
     "component_sizes",
     "depth_ranges",
+    "initial_mesh",
     "merge_depth_buffers",
     "mesh_figures",
     "nearest_on_triangle",

@@ -41,8 +41,9 @@ def layered_share(
 ) -> float:
     """The share of a mesh's image in a camera where two of its triangles lie one behind the other.
 
-    Counted on a picture of at most 480 pixels' width. mine : (n,) bool, the points that this camera measured: triangles
-    with others do not count. faces : (F, 3) int32 into the points. least_mm : smaller distances are folds of noise.
+    Counted on a picture of at most 480 pixels' width. mine : (n,) bool, the points that this camera alone measured
+    (others are moved in its image): triangles with others do not count. faces : (F, 3) int32 into the points.
+    least_mm : smaller distances are folds of noise.
     """
     size = seen.device.size
     step = _sampled_every(size.width_px)

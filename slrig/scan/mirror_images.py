@@ -3,36 +3,89 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.meshing import SurfaceMesh, rasterise, used_vertices
-from slrig.model import FloatArray, IntArray, Pinhole, Refusal, Size
-from slrig.reconstruction import MergedCurves, select_points
+from slrig.meshing import SurfaceMesh, Viewpoints, initial_mesh, rasterise, used_vertices
+from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Size
+from slrig.reconstruction import MergedCurves, SheetCurves, sampling_mm, select_points
+from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.stream import CameraResult
 
 _MIN_SHARE = 0.001
 """Of the area; less are folds beside depth edges."""
 
 
+@dataclass(frozen=True, slots=True)
+class MirrorImages:
+    """Triangles and area of mirror images, and the points that only they use."""
+
+    triangles: int = 0
+    points: int = 0
+    area_mm2: float = 0.0
+
+
+NO_MIRROR_IMAGES = MirrorImages()
+
+
+def refuse_mirror_images(
+    parts: Sequence[SheetCurves], cameras: Sequence[CameraResult], projector: Pinhole, axis: Axis
+) -> tuple[list[SheetCurves], list[CameraResult], MirrorImages]:
+    """The points of each camera, and the cameras, without mirror images, so that none meets what another camera sees.
+
+    A part of the surface may be a mirror image for one camera, and for another not.
+    """
+    found, remaining, refused = NO_MIRROR_IMAGES, list(parts), list(cameras)
+    for index, (part, seen) in enumerate(zip(parts, cameras, strict=True)):
+        filled = part.position_px[np.diff(part.offsets) > 0]
+        if len(filled) < 2:
+            continue
+        step_px = float(np.median(np.diff(filled)))
+        sampling = sampling_mm(part.points_mm, seen.device, projector, axis, step_px)
+        initial = initial_mesh(
+            part.points_mm, part.offsets, part.position_px, part.bridge_after,
+            np.hypot(sampling, np.linalg.norm(part.deviation_mm, axis=1)),
+            Viewpoints(
+                np.zeros(len(part.points_mm), dtype=np.int32), seen.device.centre_mm[None], projector.centre_mm,
+                part.deviation_mm,
+            ),
+            widest_step_px=step_px, depth_edge_ratio=ReconstructionPlan().depth_edge_ratio, keep_holes=False,
+        )  # fmt: skip
+        phantom = _only_used_by(initial.mirror_faces, initial.faces, len(part.points_mm))
+        if not phantom.any():
+            continue
+        images = _added(NO_MIRROR_IMAGES, part.points_mm, initial.mirror_faces, phantom)
+        found = _added(found, part.points_mm, initial.mirror_faces, phantom)
+        refusal = _with_phantom(seen.curves.refusal, part.pixels_px, initial.mirror_faces, phantom, ~phantom)
+        refused[index] = replace(seen, curves=replace(seen.curves, refusal=refusal))
+        own = ~phantom
+        if images.area_mm2 > _MIN_SHARE * _area_mm2(part.points_mm, initial.faces):
+            # Scraps of a mirror image face this way or that: points without a surface of their own may be of one.
+            own = used_vertices(initial.faces, len(phantom))
+        remaining[index] = select_points(part, own)
+    return remaining, refused, found
+
+
 def without_mirror_images(
-    cameras: Sequence[CameraResult], joined: MergedCurves, surface: SurfaceMesh
+    cameras: Sequence[CameraResult], joined: MergedCurves, surface: SurfaceMesh, earlier: MirrorImages
 ) -> tuple[list[CameraResult], MergedCurves, SurfaceMesh]:
     """The cameras, points and surface without the points that only mirror images use.
 
-    Pixels that the mirror images cover are refused, not only those with a point. The surface's steps have the figures.
+    Pixels that the mirror images cover are refused, not only those with a point. The surface's steps have the figures,
+    those of `earlier` included.
     """
     points, images = joined.curves, surface.mirror_faces
-    count = len(points.points_mm)
-    figures = {"triangles": len(images), "points": 0, "area_share": 0.0}
-    if len(images) == 0:
-        return list(cameras), joined, replace(surface, steps={**surface.steps, "mirror_images": figures})
-    phantom = used_vertices(images, count) & ~used_vertices(surface.faces, count)
-    areas_mm2 = [_area_mm2(points.points_mm, faces) for faces in (images, surface.faces)]
-    figures |= {"points": int(np.count_nonzero(phantom)), "area_share": areas_mm2[0] / max(sum(areas_mm2), 1e-12)}
+    phantom = _only_used_by(images, surface.faces, len(points.points_mm))
+    found = _added(earlier, points.points_mm, images, phantom)
+    area_share = 0.0
+    if found.area_mm2 > 0:
+        area_share = found.area_mm2 / (found.area_mm2 + _area_mm2(points.points_mm, surface.faces))
+    figures = {"triangles": found.triangles, "points": found.points, "area_share": area_share}
     surface = replace(surface, steps={**surface.steps, "mirror_images": figures})
+    if not phantom.any():
+        return list(cameras), joined, surface
     refused = []
     for index, seen in enumerate(cameras):
         mine = joined.camera == index
@@ -70,6 +123,21 @@ def without_surface(surface: SurfaceMesh, projector: Pinhole | None) -> str:
 
 def _devices(projector: Pinhole | None) -> str:
     return "the two cameras" if projector is None else "camera and projector"
+
+
+def _only_used_by(images: IntArray, faces: IntArray, count: int) -> NDArray[np.bool_]:
+    """(count,) bool: the points that mirror images use, and no other face."""
+    if len(images) == 0:
+        return np.zeros(count, dtype=np.bool_)
+    return used_vertices(images, count) & ~used_vertices(faces, count)
+
+
+def _added(found: MirrorImages, points_mm: FloatArray, images: IntArray, phantom: NDArray[np.bool_]) -> MirrorImages:
+    return MirrorImages(
+        found.triangles + len(images),
+        found.points + int(np.count_nonzero(phantom)),
+        found.area_mm2 + _area_mm2(points_mm, images),
+    )
 
 
 def _area_mm2(points_mm: FloatArray, faces: IntArray) -> float:

@@ -21,7 +21,7 @@ from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
 from slrig.meshing import MeshingLimits, MeshStage, Viewpoints, build_surface, compact_mesh, mesh_figures, score
-from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region
+from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region, Source
 from slrig.reconstruction import (
     MergedCurves,
     calibration_modes,
@@ -286,7 +286,7 @@ def _meshed(
     )  # fmt: skip
     require_surface(len(surface.faces) > 0, folder, without_surface(surface, projector), cameras, stage=Stage.MESH)
     entered("vertices", 0.72, count)
-    cameras, joined_curves, surface = without_mirror_images(cameras, joined_curves, surface)
+    cameras, joined_curves, surface = without_mirror_images(cameras, joined_curves, surface, found.mirror_images)
     found, points = replace(found, cameras=cameras, joined=joined_curves), joined_curves.curves
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
     share = _calibration_share(walked.devices, found, axis, surface.normals)
@@ -322,8 +322,9 @@ def _meshed(
         mark=colours.mark,
     )
     apart_mm = plan.depth_edge_ratio * float(np.median(sampling))
+    alone = points.source != Source.ALL
     layered = {
-        seen.name: layered_share(seen, points, joined_curves.camera == index, surface.faces, apart_mm)
+        seen.name: layered_share(seen, points, alone & (joined_curves.camera == index), surface.faces, apart_mm)
         for index, seen in enumerate(cameras)
     }
     mesh = compact_mesh(

@@ -30,6 +30,7 @@ from slrig.reconstruction import (
 )
 from slrig.scan.agreement import leave_out_contradicted
 from slrig.scan.limited import limited
+from slrig.scan.mirror_images import NO_MIRROR_IMAGES, MirrorImages, refuse_mirror_images
 from slrig.scan.report import lit_share
 from slrig.scan.stream import CameraResult
 
@@ -44,6 +45,7 @@ class Triangulated:
 
     share_across : 0 to 1, the sine of the angle between the stripes and the baseline: by the calibration, or without a
     projector as the median over the image. second : index of the camera that the first is paired with, without one.
+    mirror_images : those of several cameras, which were left out before their points were merged.
     """
 
     joined: MergedCurves
@@ -51,6 +53,7 @@ class Triangulated:
     cameras: list[CameraResult]
     share_across: float
     second: int = 1
+    mirror_images: MirrorImages = NO_MIRROR_IMAGES
 
 
 def triangulated(
@@ -88,12 +91,14 @@ def triangulated(
         if region is not None:
             for index, seen in enumerate(told):
                 parts[index], told[index] = _limited(region, seen, parts[index])
+        images = NO_MIRROR_IMAGES
+        if len(parts) > 1:
+            parts, told, images = refuse_mirror_images(parts, told, projector, axis)
         gap = widest_gap_px(projector, axis)
         spare = evaluate_redundancy(parts, devices, axis, widest_gap_px=gap)
         joined = merge_curves(parts, projector.centre_mm, widest_gap_px=gap)
-        return Triangulated(
-            joined, spare, _without_points(told), baseline_fraction(axis, list(devices.values()), projector)
-        )
+        share_across = baseline_fraction(axis, list(devices.values()), projector)
+        return Triangulated(joined, spare, _without_points(told), share_across, mirror_images=images)
     first, *others = cameras
     mine = first.curves.ensemble
     crossing = [stripe_crossing(mine, first.device, seen.device) for seen in others]

@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 
 from slrig.meshing import SurfaceMesh
-from slrig.model import Axis, IntArray, Refusal
-from slrig.scan.mirror_images import mirror_image_notes, without_mirror_images, without_surface
+from slrig.model import Axis, IntArray, Refusal, Size
+from slrig.reconstruction import SheetCurves
+from slrig.scan.mirror_images import (
+    MirrorImages,
+    mirror_image_notes,
+    refuse_mirror_images,
+    without_mirror_images,
+    without_surface,
+)
 from slrig.scan.triangulated import Triangulated, triangulated
-from tests.unit.reconstruction.builders import CAMERA, PROJECTOR
+from tests.unit.meshing.test_initial import COLUMNS, ROWS, ridge
+from tests.unit.reconstruction.builders import CAMERA, PROJECTOR, looking
 from tests.unit.scan.test_triangulated import MANY, curves_in, seen
 
 NO_FACES = np.zeros((0, 3), dtype=np.int32)
@@ -31,7 +39,7 @@ def scene(faces: IntArray, mirror_faces: IntArray) -> tuple[Triangulated, Surfac
 
 def test_points_and_pixels_of_mirror_images_are_left_out_with_their_cause() -> None:
     found, surface = scene(triangles_between(0, 1), triangles_between(2, 3))
-    (camera,), joined, rest = without_mirror_images(found.cameras, found.joined, surface)
+    (camera,), joined, rest = without_mirror_images(found.cameras, found.joined, surface, MirrorImages())
     points = found.joined.curves
     np.testing.assert_array_equal(joined.curves.points_mm, points.points_mm[: 2 * len(MANY)])
     np.testing.assert_array_equal(joined.curves.points_mm[rest.faces], points.points_mm[surface.faces])
@@ -52,7 +60,7 @@ def test_points_and_pixels_of_mirror_images_are_left_out_with_their_cause() -> N
 
 def test_a_scan_without_mirror_images_stays_as_it_is() -> None:
     found, surface = scene(triangles_between(0, 1), NO_FACES)
-    cameras, joined, rest = without_mirror_images(found.cameras, found.joined, surface)
+    cameras, joined, rest = without_mirror_images(found.cameras, found.joined, surface, MirrorImages())
     assert (cameras, joined) == (found.cameras, found.joined)
     assert rest.steps["mirror_images"] == {"triangles": 0, "points": 0, "area_share": 0.0}
     assert mirror_image_notes(rest, cameras, PROJECTOR) == []
@@ -64,3 +72,38 @@ def test_a_scan_of_mirror_images_only_says_so() -> None:
     assert "the two cameras" in without_surface(surface, None)
     _, surface = scene(NO_FACES, NO_FACES)
     assert without_surface(surface, PROJECTOR) == "no two neighbouring stripes could be meshed"
+
+
+def test_a_camera_loses_its_mirror_images_before_its_points_meet_those_of_another() -> None:
+    points, offsets, position = ridge(4.0)
+    count = len(points)
+    aside, above, lamp = (
+        looking(position_mm, (5.0, 7.0, 10.0), size=Size(320, 240), focal_px=(focal, focal), distortion=(0.0,) * 5)
+        for position_mm, focal in (
+            ((-300.0, 5.0, -100.0), 300.0),
+            ((5.0, 5.0, -400.0), 400.0),
+            ((90.0, 5.0, -400.0), 3200.0),
+        )
+    )
+    across, down = np.meshgrid(10.0 * np.arange(COLUMNS), 10.0 * np.arange(ROWS), indexing="ij")
+    part = SheetCurves(
+        offsets=offsets,
+        position_px=position,
+        points_mm=points,
+        deviation_mm=np.full((count, 3), 1e-4),
+        along_px=np.tile(np.arange(ROWS, dtype=np.float64), COLUMNS),
+        pixels_px=np.stack([across, down], axis=-1).reshape(-1, 2),
+        stripe=np.repeat(np.arange(COLUMNS, dtype=np.int32), ROWS),
+        bridge_after=np.zeros(count, dtype=np.bool_),
+        source=np.zeros(count, dtype=np.uint8),
+    )
+    both = [seen(name, device, curves_in(CAMERA, MANY)) for name, device in (("aside", aside), ("above", above))]
+    parts, cameras, found = refuse_mirror_images([part, part], both, lamp, Axis.COLUMN)
+    # The sixth curve has the last real triangles.
+    np.testing.assert_array_equal(parts[0].points_mm, points[: 6 * ROWS])
+    assert found.points == count - 6 * ROWS
+    assert found.triangles == 6 * (2 * ROWS - 2)
+    assert (parts[1], cameras[1]) == (part, both[1])
+    refusal = cameras[0].curves.refusal
+    assert set(refusal[:141:10, 60:111:10].ravel()) == {Refusal.MIRROR_IMAGE}
+    assert np.count_nonzero(refusal[:, :50]) == 0
