@@ -105,7 +105,11 @@ def estimate_noise(frames: AxisFrames) -> NoiseModel:
     black frame (Immerkær 1996, DOI 10.1006/cviu.1996.0060) adds the noise of the dark. Without code and lines of this
     kind that scatter of white and black is all there is.
     """
-    return fit_noise([sample_noise(frames)])
+    # In steps of the samples, whose rounding is the least noise.
+    step = frames.sample_step
+    level, variance = sample_noise(frames)
+    noise = fit_noise([(level / np.float32(step), variance / np.float32(step**2))])
+    return NoiseModel(noise.read_variance * step**2, noise.slope * step)
 
 
 def sample_noise(
@@ -171,7 +175,8 @@ def _scatter_of_lines(
     if where is not None:
         usable &= where[::step, ::step]
     difference = (lines.sum(axis=0) - np.float32(half) * reference)[usable]
-    return reference[usable] / 2, _variances(difference, 2 * half + 2 * half**2 / frames.reference_repeats)
+    samples = 2 * half + 2 * half**2 / frames.reference_repeats
+    return reference[usable] / 2, _variances(difference, samples, frames.sample_step)
 
 
 def _scatter_of_pairs(
@@ -195,7 +200,7 @@ def _scatter_of_pairs(
     first, second = (direct + inverse)[:, usable]
     # The level is that of white and black: the means of pairs would be whole or half numbers by their difference.
     level = (frames.white + frames.black)[::step, ::step][usable] / 2
-    return level, _variances(first - second, 4)
+    return level, _variances(first - second, 4, frames.sample_step)
 
 
 def _scatter_of_bits(
@@ -216,15 +221,18 @@ def _scatter_of_bits(
         has_two = usable & (np.count_nonzero(state, axis=0) > 1)
         first_bit, last_bit = (np.take_along_axis(bits, index[None], axis=0)[0][has_two] for index in (first, last))
         levels.append(level[has_two])
-        variances.append(_variances(first_bit - last_bit, 2))
+        variances.append(_variances(first_bit - last_bit, 2, frames.sample_step))
     return np.concatenate(levels), np.concatenate(variances)
 
 
-def _variances(difference: NDArray[np.float32], samples: float) -> NDArray[np.float32]:
-    """(n,) float32: variances of single samples, for a median, from differences over this number of samples."""
+def _variances(difference: NDArray[np.float32], samples: float, step: float) -> NDArray[np.float32]:
+    """(n,) float32: variances of single samples, for a median, from differences over this number of samples.
+
+    step : `SampleFormat.step`.
+    """
     # Whole numbers have a coarse median. Spread over their rounding interval, they have a fine one.
-    spread = difference + np.random.default_rng(0).uniform(-0.5, 0.5, len(difference)).astype(np.float32)
-    return np.asarray((spread**2 / _MEDIAN_SQUARE - 1 / 12) / samples, dtype=np.float32)
+    spread = difference + (step * np.random.default_rng(0).uniform(-0.5, 0.5, len(difference))).astype(np.float32)
+    return np.asarray((spread**2 / _MEDIAN_SQUARE - step**2 / 12) / samples, dtype=np.float32)
 
 
 def _scatter_between_neighbours(

@@ -9,10 +9,10 @@ few rows at a time.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,11 @@ NEAR_SATURATION = 0.97
 
 _NEAR_MIDDLE = 0.3  # of the contrast
 
+_WORD = 1 << 16
+_USUAL_BITS = (8, 10, 12, 14, 16)  # of samples in words of 16
+_MIN_VALUES = 100  # different ones, of which some are then neighbours
+_MIN_PILE = 4  # times the samples of the next value: noise has fewer at its end
+_MAX_COUNTED = 200_000  # samples of an image
 _BAND_BYTES = 2**22
 """Size of what is computed from images at a time: it fits the cache of a core."""
 
@@ -78,6 +83,36 @@ def linearise(image: NDArray[Any], gamma: float, full_scale: float) -> Image:
     return np.asarray(np.float32(full_scale) * share ** np.float32(gamma))
 
 
+class SampleFormat(NamedTuple):
+    """step : difference of neighbouring values of a sample; full_scale : value of a saturated sample."""
+
+    step: float
+    full_scale: float
+
+
+def sample_format(images: Iterable[NDArray[Any]], full_scale: float) -> SampleFormat:
+    """Find how 16-bit images use their words; for other images, or few different values, as `full_scale` says.
+
+    Cameras of 10 to 14 bits fill the upper bits of a word, whose lowest ones are then 0, or the lower ones. The step is
+    the least difference of values. Full scale is that of the fewest usual bits which hold all values, if so many of
+    them are the largest possible that they must be clipped, or if `full_scale` is that of the whole word.
+    """
+    counts = np.zeros(_WORD, dtype=np.int64)
+    for image in images:
+        if image.dtype == np.uint16:
+            counts += np.bincount(image[:: max(1, image.size // _MAX_COUNTED)].ravel(), minlength=_WORD)
+    values = np.flatnonzero(counts)
+    if len(values) < _MIN_VALUES:
+        return SampleFormat(1.0, full_scale)
+    step, brightest = int(np.diff(values).min()), int(values[-1])
+    scales = [step * (2**bits - 1) for bits in _USUAL_BITS]
+    smallest = next((each for each in scales if each >= brightest), int(full_scale))
+    piled = brightest == smallest and counts[brightest] > _MIN_PILE * counts[values[-2]]
+    if piled or full_scale == _WORD - 1:
+        return SampleFormat(float(step), float(min(smallest, full_scale)))
+    return SampleFormat(float(step), full_scale // step * step)
+
+
 @dataclass(frozen=True, slots=True)
 class AxisFrames:
     """Images of the patterns of one axis from one camera, (H, W) in camera units; white and black are float32.
@@ -85,7 +120,7 @@ class AxisFrames:
     bits : B images, most significant first; inverses : the same, or None without. lines : L images, one per shift, of
     the patterns line_patterns. full_scale : value of a saturated sample of one exposure. reference_repeats : number of
     frames that white and black are means of, over that of the others. exposure_ratio : light of the longest exposure of
-    a bracket over that of its shortest; 1 without a bracket.
+    a bracket over that of its shortest; 1 without a bracket. sample_step : as in `SampleFormat`.
     """
 
     axis: Axis
@@ -99,6 +134,7 @@ class AxisFrames:
     full_scale: float
     exposure_ratio: float = 1.0
     reference_repeats: float = 1.0
+    sample_step: float = 1.0
 
     @property
     def clipped_at(self) -> float:
@@ -304,6 +340,7 @@ class FrameStacks:
             "full_scale": full_scale,
             "exposure_ratio": exposure_ratio,
             "reference_repeats": reference_repeats,
+            "sample_step": 1.0,
         }
         bits = patterns.gray.bits
         dark = np.broadcast_to(np.zeros(1, dtype=np.uint8), shape)
@@ -313,6 +350,7 @@ class FrameStacks:
         self._reference: dict[Pattern, Image] = {}
         self._missing = set(patterns.required)
         self._gamma = 1.0
+        self._is_format_known = False
 
     @classmethod
     def from_frames(cls, frames: AxisFrames) -> FrameStacks:
@@ -330,6 +368,8 @@ class FrameStacks:
         stacks._inverses = [] if frames.inverses is None else list(frames.inverses)
         stacks._reference = {White(): frames.white, Black(): frames.black}
         stacks._missing = set()
+        stacks._scales["sample_step"] = frames.sample_step
+        stacks._is_format_known = True
         return stacks
 
     def put(self, pattern: Pattern, image: NDArray[Any]) -> None:
@@ -392,6 +432,7 @@ class FrameStacks:
     def frames(self) -> AxisFrames:
         """Return the frames, once `has_noise_patterns`; missing ones are black until they arrive."""
         patterns = self.patterns
+        self._find_sample_format()
         pairs = sorted(patterns.direct & patterns.inverted)
         white, black = self._reference.get(White()), self._reference.get(Black())
         both = [each for bit in pairs for each in (self._bits[bit], self._inverses[bit])]
@@ -412,6 +453,16 @@ class FrameStacks:
             line_patterns=patterns.lines,
             **self._scales,
         )
+
+    def _find_sample_format(self) -> None:
+        """Set step and full scale by the code images for the noise: the same in any order of frames."""
+        if self._is_format_known:
+            return
+        self._is_format_known = True
+        used = [each for each in self.patterns.noise_patterns if isinstance(each, Gray)]
+        images = [(self._inverses if each.inverted else self._bits)[each.bit] for each in used]
+        step, full_scale = sample_format(images, self._scales["full_scale"])
+        self._scales |= {"sample_step": step, "full_scale": full_scale}
 
 
 def axis_frames(capture: Capture, camera: str, axis: Axis) -> AxisFrames:

@@ -267,6 +267,7 @@ class AlignedPoints:
     """Points of each line frame, or of each bit, and the code with the causes of refused pixels.
 
     near_shadow, near_step : (H, W) bool, where no point counts; refined, disagreement_px : as in `CameraCurves`.
+    frame_sigma_px : as in `refinement.Refinement`, not yet in the points.
     """
 
     points: list[LinePoints]
@@ -275,6 +276,7 @@ class AlignedPoints:
     near_step: NDArray[np.bool_]
     refined: bool
     disagreement_px: FloatArray
+    frame_sigma_px: FloatArray
 
 
 def align_points(
@@ -288,6 +290,7 @@ def align_points(
     `refinement.refine_points`.
     """
     frames, code, disagreement_px, points = image.frames, image.code, np.zeros(0), found
+    frame_sigma_px = np.zeros(len(found))
     measured = position_map(frames, image.position_noise, code, tables.cell_position)
     resolution_px = cell_width_px(image)
     step_px = line_step_px(frames.line_patterns)
@@ -313,12 +316,14 @@ def align_points(
             found, measured, usable, code, tables.position_table, step_px, extra_sigma_px=extra_sigma_px,
             max_disagreement_px=limits.max_disagreement_px, sampled=sampled, release_lines=release_lines,
         )  # fmt: skip
-        points, disagreement_px = refinement.points, refinement.disagreement_px
+        points, disagreement_px, frame_sigma_px = (
+            refinement.points, refinement.disagreement_px, refinement.frame_sigma_px
+        )  # fmt: skip
         if refinement.accepted:
-            return AlignedPoints(points, marked, near_shadow, near_step, True, disagreement_px)
+            return AlignedPoints(points, marked, near_shadow, near_step, True, disagreement_px, frame_sigma_px)
     # A fit leaves out pixels of mixed light; the window of a filter has to be clear of them.
     near_shadow, near_step = near_edges(measured, image.unlit, resolution_px, limits.edges.for_filters(stripe_blur_px))
-    return AlignedPoints(points, code, near_shadow, near_step, False, disagreement_px)
+    return AlignedPoints(points, code, near_shadow, near_step, False, disagreement_px, frame_sigma_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -405,6 +410,8 @@ def _refine_identify_link(
             for index in range(len(frames.lines))
         ]
     points, code, near_shadow, near_step = aligned.points, aligned.code, aligned.near_shadow, aligned.near_step
+    for each, sigma_px in zip(points, aligned.frame_sigma_px, strict=True):
+        np.hypot(each.sigma_px, sigma_px, out=each.sigma_px)
     report_step("identify stripes")
     shortest = limits.stripes.shortest_points
     numbered, refusal, point_count = _chain_and_identify(

@@ -188,11 +188,14 @@ class Refinement:
     disagreement_px : (frames,) float64, median distance from the stripes of each frame to the refined ones, along the
     normals, less three standard deviations of that median; NaN for a frame without any. It is close to 0 if the light
     was the same in all frames. accepted : False if it was not, and the points are those of the filter.
+    frame_sigma_px : (frames,) float64, standard deviation of the error that all points of a frame share, because its
+    lines lie beside those of the others; `sigma_px` of the points does not contain it.
     """
 
     points: list[LinePoints]
     disagreement_px: FloatArray
     accepted: bool
+    frame_sigma_px: FloatArray
 
 
 def refine_points(
@@ -225,6 +228,7 @@ def refine_points(
     arguments = fit_arguments(measured, usable)
     clear = cv2.erode(usable.view(np.uint8), np.ones((7, 7), dtype=np.uint8), borderValue=0)
     refined, targets, disagreement = allocate_points(count), np.zeros(count), np.zeros(len(found))
+    scatter_px = np.zeros(len(found))
     started, landed = _allocate_marks(len(found), usable.shape)
     for index, (points, part) in enumerate(zip(found, parts, strict=True)):
         starts = np.ascontiguousarray(points.points_px)
@@ -237,13 +241,18 @@ def refine_points(
         in_bands(fit_kernel, len(starts), *arguments, starts, targets[part], frame_points, rows_at_least=MIN_POINTS)
         own_sigma = np.ascontiguousarray(points.sigma_px)
         in_bands(_combine_kernel, len(starts), starts, own_sigma, clear, coarsest_px, frame_points, distance)
-        disagreement[index] = _significant_median(_subsample(distance, frame_points.found))
+        distances = _subsample(distance, frame_points.found)
+        disagreement[index] = _significant_median(distances)
+        scatter_px[index] = _excess_scatter(distances, _subsample(own_sigma, frame_points.found))
         if not sampled:
             _mark_points(starts, frame_points, part.start, index, started, landed)
-    if _max_disagreement_px(disagreement) > max_disagreement_px:
+    excess = _excess_disagreement(disagreement)
+    if np.isfinite(excess).any() and np.nanmax(np.abs(excess)) > max_disagreement_px:
         originals = found.copy()
         found.clear()
-        return Refinement(originals, disagreement, accepted=False)
+        moved_px, shared_px = _frame_displacements(disagreement)
+        frame_sigma_px = np.sqrt(moved_px**2 + shared_px**2 + scatter_px**2)
+        return Refinement(originals, disagreement, False, frame_sigma_px)
     release_lines()
     if sampled:
         found[:] = [points.head(0) for points in found]
@@ -269,7 +278,8 @@ def refine_points(
     in_bands(merge, len(found))
     merged = found.copy()
     found.clear()
-    return Refinement(merged, disagreement, accepted=True)
+    moved_px, shared_px = _frame_displacements(excess)
+    return Refinement(merged, disagreement, True, np.hypot(_phase_gains(len(merged)) @ moved_px, shared_px))
 
 
 def _merge_points(
@@ -313,16 +323,44 @@ def _significant_median(distance: FloatArray) -> float:
     return float(np.copysign(max(abs(median) - 3 * error, 0.0), median))
 
 
-def _max_disagreement_px(disagreement: FloatArray) -> float:
-    """Largest disagreement of a frame beyond that of all frames, px.
+def _excess_scatter(distance: FloatArray, sigma_px: FloatArray) -> float:
+    """Standard deviation of the distances about their median beyond their noise, px; 0 without values."""
+    if not len(distance):
+        return 0.0
+    scatter = 1.4826 * float(np.median(np.abs(distance - np.median(distance))))
+    return float(np.sqrt(max(scatter**2 - float(np.median(sigma_px)) ** 2, 0.0)))
+
+
+def _phase_gains(frames: int) -> FloatArray:
+    """(frames, frames) float64: motion of the phase at the lines of each frame for a displacement of those of another.
+
+    With I_k = cos(φ - 2πk/N), the phase of Σ I_k exp(2πik/N) moves by 2/N Σ sin²(φ - 2πk/N) d_k.
+    """
+    angle = np.pi * np.subtract.outer(np.arange(frames), np.arange(frames)) * 2 / frames
+    return np.asarray(2 / frames * np.sin(angle) ** 2)
+
+
+def _frame_displacements(distance_px: FloatArray) -> tuple[FloatArray, float]:
+    """Displacement of the lines of each frame, (frames,) px, and the standard deviation of what they share, px.
+
+    Lines displaced by d move the phase by G d (`_phase_gains`): their distance from it is (1 - G) d, NaN without any.
+    A displacement of all frames alike does not show; if they are independent, its variance is that of one over their
+    number.
+    """
+    frames = len(distance_px)
+    moved = np.linalg.pinv(np.eye(frames) - _phase_gains(frames)) @ np.nan_to_num(distance_px)
+    return np.asarray(moved), float(np.sqrt(np.sum(moved**2) / ((frames - 1) * frames)))
+
+
+def _excess_disagreement(disagreement: FloatArray) -> FloatArray:
+    """Disagreement of each frame beyond that of all frames, (frames,) px.
 
     On a surface that is curved across a line, the middle of the line is displaced from the projector's by width²/8
     times the second derivative of its position, in all frames alike.
     """
-    if not np.isfinite(disagreement).any():
-        return 0.0
-    excess = np.minimum(np.abs(disagreement), np.abs(disagreement - np.nanmedian(disagreement)))
-    return float(np.nanmax(excess))
+    shared = np.nanmedian(disagreement) if np.isfinite(disagreement).any() else 0.0
+    beyond = disagreement - shared
+    return np.where(np.abs(disagreement) < np.abs(beyond), disagreement, beyond)
 
 
 @kernel

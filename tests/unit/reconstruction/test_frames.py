@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,10 @@ from slrig.model import (
     Size,
     White,
 )
-from slrig.reconstruction.frames import Images, axis_frames, stack_rows, subsample
+from slrig.patterns.sequence import scan_patterns
+from slrig.reconstruction.camera_response import estimate_noise
+from slrig.reconstruction.frames import Images, axis_frames, sample_format, stack_rows, subsample
+from tests.unit.reconstruction.builders import grid, seen_by_camera
 
 CAMERA = CameraFormat(Size(3, 2), 8)
 BITS = [Gray(Axis.COLUMN, bit, 2) for bit in range(2)]
@@ -183,3 +187,33 @@ def test_recorded_frames_are_not_modified() -> None:
     axis_frames(capture, "eye", Axis.COLUMN)
     for shot, image in zip(capture.shots, before, strict=True):
         np.testing.assert_array_equal(shot.image, image)
+
+
+@pytest.mark.parametrize(
+    ("bits", "step", "declared"),
+    [(12, 16, 16), (10, 64, 16), (14, 4, 16), (12, 1, 16), (10, 1, 16), (14, 1, 16), (10, 1, 12), (12, 1, 12)],
+)
+def test_the_bits_of_a_word_that_samples_use_are_found(bits: int, step: int, declared: int) -> None:
+    full = 2**bits - 1
+    samples = np.minimum(np.random.default_rng(0).normal(0.8 * full, 0.1 * full, (300, 400)), full)
+    found = sample_format([(samples.astype(np.uint16) * step).astype(np.uint16)], 2.0**declared - 1)
+    assert found == (step, full * step)
+
+
+def test_eight_bits_and_few_values_are_as_declared() -> None:
+    assert sample_format([np.array([[0, 254]], dtype=np.uint8)], 255.0) == (1.0, 255.0)
+    assert sample_format([np.array([[0, 4096]], dtype=np.uint16)], 65535.0) == (1.0, 65535.0)
+
+
+@pytest.mark.parametrize("noise", [0.2, 2.0], ids=["less than a step", "more than a step"])
+def test_left_aligned_samples_have_the_noise_of_the_camera(noise: float) -> None:
+    x, y = grid((200, 300))
+    shown = scan_patterns(
+        Size(256, 192), line_shift=False, period_px=8, line_width_px=1, gray_cell_px=2, gray_offset_px=0, rows=False
+    )
+    capture = seen_by_camera(20 + 0.7 * x + 0.1 * y, shown, Size(256, 192), noise=noise, white=2000.0, bit_depth=12)
+    shots = tuple(replace(shot, image=shot.image << np.uint16(4)) for shot in capture.shots)
+    aligned = replace(capture, cameras={"eye": CameraFormat(Size(300, 200), 16)}, shots=shots)
+    plain, ours = (estimate_noise(axis_frames(each, "eye", Axis.COLUMN)) for each in (capture, aligned))
+    assert ours.read_variance == pytest.approx(256 * plain.read_variance, rel=1e-3)
+    assert ours.read_variance >= 256 / 12

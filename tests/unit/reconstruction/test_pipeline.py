@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from slrig.errors import PatternError
 from slrig.model import (
     Axis,
+    CameraFormat,
     Capture,
     FloatArray,
     Gray,
@@ -459,3 +460,35 @@ def test_without_one_shift_stripes_stand_as_their_frames_show_them() -> None:
     assert len(curves.disagreement_px) == 0
     assert {int(p) % 8 for p in curves.ensemble.position_px} == {0, 1, 2, 3, 4, 6, 7}
     assert rms(misses_px(curves, 0.9, 0.3)) < 0.03
+
+
+def sigma_ratio(curves: CameraCurves, misses: FloatArray) -> float:
+    """68.27 % of the points are at most this many of their standard deviations off."""
+    return float(np.percentile(np.abs(misses) / curves.ensemble.sigma_px, 68.27))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    ("width_px", "most_px"),
+    [pytest.param(1, 0.3, id="narrow"), pytest.param(4, 0.3, id="half"), pytest.param(4, 0.02, id="half, little")],
+)
+def test_lines_of_single_frames_beside_the_others_are_in_sigma(width_px: int, most_px: float, seed: int) -> None:
+    size, pitch = Size(512, 384), 0.9
+    surface = tilted(pitch, 0.1)(*grid((240, 320)))
+    position = surface + 10.0 - surface.min()
+    shown = scan_patterns(
+        size, line_shift=True, period_px=8, line_width_px=width_px, gray_cell_px=None, gray_offset_px=0, rows=False
+    )
+    moved = dict(zip(range(8), most_px * np.random.default_rng(seed).permutation(np.linspace(-1, 1, 8)), strict=True))
+    shots = []
+    for index, pattern in enumerate(shown):
+        by_px = moved[pattern.shift] if isinstance(pattern, LineShift) else 0.0
+        frame = seen_by_camera(position + by_px, (pattern,), size, blur_px=0.7, seed=index).shots[0]
+        shots.append(replace(frame, pattern=index))
+    capture = Capture(size, shown, {"eye": CameraFormat(Size(320, 240), 8)}, tuple(shots))
+    curves, _ = walk(capture)
+    assert curves.refined == (most_px < 0.1)
+    x, y = curves.ensemble.points_px.T
+    column = np.repeat(curves.ensemble.position_px, np.diff(curves.ensemble.offsets))
+    misses = (tilted(pitch, 0.1)(x, y) + 10.0 - surface.min() - column) / pitch
+    assert 0.7 <= sigma_ratio(curves, misses) <= 1.4
