@@ -3,7 +3,7 @@
 from slrig.meshing.boundary import smooth_boundary
 from slrig.meshing.flips import optimise_edges
 from slrig.meshing.quality import mesh_figures, nearest_on_triangle, score, weighted_percentiles
-from slrig.meshing.rasteriser import merge_depth_buffers, rasterise, rasterise_normals
+from slrig.meshing.rasteriser import covered_pixels, merge_depth_buffers, rasterise, rasterise_normals
 from slrig.meshing.strips import runs_of_curve_parts
 from slrig.meshing.surface import (
     FIRST_STAGE,
@@ -31,6 +31,7 @@ __all__ = [
     "build_surface",
     "compact_mesh",
     "component_sizes",
+    "covered_pixels",
     "merge_depth_buffers",
     "mesh_figures",
     "nearest_on_triangle",

@@ -3,36 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from slrig.errors import NothingToReconstructError, setting
-from slrig.meshing import rasterise
-from slrig.model import Mesh, Refusal, Size
-from slrig.scan.placing import placed_vertices, resampled
+from slrig.meshing import covered_pixels
+from slrig.model import Mesh, Refusal
+from slrig.scan.placing import placed_vertices
 from slrig.scan.report import lit_pixels
 from slrig.scan.stream import CameraResult
 
 FAIR_SHARE = 0.6
 """Sound scans of real rigs have 0.8 and more, borders of two pixels that are refused included."""
-_PICTURE_PX = 480
-"""Wide enough for a share, and a tenth of the work at full size."""
 
 
-def covered_share(mesh: Mesh, seen: CameraResult) -> float | None:
-    """The share of the pixels that the camera decoded whose ray meets the mesh; None where it decoded none.
+def with_uncovered_refused(mesh: Mesh, seen: CameraResult) -> CameraResult:
+    """The camera with the decoded pixels that no triangle of the mesh covers among its refusals."""
+    covered = covered_pixels(placed_vertices(mesh.vertices_mm, seen.device), mesh.faces, seen.device.size)
+    refusal = seen.curves.refusal
+    bare = (refusal == Refusal.NONE) & ~covered
+    return replace(seen, curves=replace(seen.curves, refusal=np.where(bare, np.uint8(Refusal.NO_SURFACE), refusal)))
 
-    Counted on a picture of at most 480 pixels' width. A pixel of it is decoded where half of its camera pixels are.
+
+def covered_share(seen: CameraResult) -> float | None:
+    """The share of the pixels without another cause that the mesh covers; None without such pixels. seen : a result of
+    `with_uncovered_refused`.
     """
-    shape = seen.curves.refusal.shape
-    step = max(1, -(-shape[1] // _PICTURE_PX))
-    rows, columns = (extent // step for extent in shape)
-    decoded = seen.curves.refusal[: rows * step, : columns * step] == Refusal.NONE
-    decoded = decoded.reshape(rows, step, columns, step).mean(axis=(1, 3)) >= 0.5
-    if not decoded.any():
-        return None
-    coarse = resampled(seen.device, 1 / step, Size(columns, rows))
-    view = rasterise(placed_vertices(mesh.vertices_mm, coarse), mesh.faces, coarse.size)
-    return float(((view.face >= 0) & decoded).sum() / decoded.sum())
+    covered, bare = (np.count_nonzero(seen.curves.refusal == each) for each in (Refusal.NONE, Refusal.NO_SURFACE))
+    return covered / (covered + bare) if covered + bare else None
 
 
 def coverage_notes(name: str, share: float | None) -> list[str]:

@@ -65,11 +65,13 @@ def measured(
     axis: Axis | None,
     region: Region | None = None,
     judged: EvidenceSummary | None = None,
+    drop_finest_bits: int = 0,
 ) -> tuple[Walked, Triangulated]:
     """The points of a recorded bundle: of the frames that came while it was captured, or else of its files.
 
     axis : the one that was asked for; None for that which tells most of depth. region : what of the scene is asked for.
     judged : what the frames proved as they were captured; without it, files of one exposure are judged again.
+    drop_finest_bits : as in `slrig.scan.plan.ReconstructionPlan`.
 
     Raises
     ------
@@ -78,12 +80,13 @@ def measured(
     NothingToReconstructError
         No pixel could be decoded, no stripe be found, or the light tells no depth.
     """
-    walked = _walked(folder, calibration_file, live, entered, axis=axis, region=region, judged=judged)
+    given = {"region": region, "judged": judged, "drop_finest_bits": drop_finest_bits}
+    walked = _walked(folder, calibration_file, live, entered, axis=axis, **given)
     tries = [_tried(walked, folder, entered, region)]
     others = walked.shown - {walked.axis} if axis is None else frozenset()
     for other in others:
         if _is_weak(tries[0]):
-            again = _walked(folder, calibration_file, None, entered, axis=other, region=region, judged=judged)
+            again = _walked(folder, calibration_file, None, entered, axis=other, **given)
             tries.append(_tried(again, folder, entered, region))
     sound = [each for each in tries if not isinstance(each, NothingToReconstructError)]
     if not sound:
@@ -177,6 +180,7 @@ def _walked(
     axis: Axis | None,
     region: Region | None,
     judged: EvidenceSummary | None,
+    drop_finest_bits: int,
 ) -> Walked:
     """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
     names: list[str] = []
@@ -198,6 +202,7 @@ def _walked(
         and live.one_exposure
         and axis in (None, live.axis)
         and live.region == region
+        and drop_finest_bits == 0
         and _is_of(live, folder, calibration_file)
     ):
         names += live.header.cameras
@@ -210,7 +215,9 @@ def _walked(
         names += files.outline.cameras
         devices = _require_calibration(folder, names, files.calibration)
         try:
-            stream, evidence, cut_short = _streamed(files, devices, stage_entered, axis, region, judged)
+            stream, evidence, cut_short = _streamed(
+                files, devices, stage_entered, axis, region, judged, drop_finest_bits
+            )
             seen = stream.finish()
         except PatternError as cause:
             message = f"{folder}: {cause}"
@@ -221,7 +228,7 @@ def _walked(
         *cut_short,
         *capture_notes(stream.header, stream.axis, evidence),
         *camera_notes(seen),
-        *unresolved_notes(seen, step, cell),
+        *unresolved_notes(seen, step, cell, dropped=drop_finest_bits),
     ]
     return Walked(devices, stream.axis, stream.header.axes, seen, step, cell, sections, notes)
 
@@ -233,6 +240,7 @@ def _streamed(
     axis: Axis | None,
     region: Region | None,
     proven: EvidenceSummary | None,
+    drop_finest_bits: int,
 ) -> tuple[ScanStream, EvidenceSummary, tuple[str, ...]]:
     """The frames of a bundle in a stream, what they prove, and words for each code that was cut short.
 
@@ -260,6 +268,7 @@ def _streamed(
         axis=axis,
         one_exposure=one_exposure,
         region=region,
+        drop_finest_bits=drop_finest_bits,
     )
     evidence = Evidence(capture.patterns, capture.cameras, refused)
     for index, shot in zip(order, shots, strict=True):

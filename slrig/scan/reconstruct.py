@@ -34,7 +34,7 @@ from slrig.reconstruction import (
 )
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.colouring import albedo_report, coloured
-from slrig.scan.coverage import coverage_notes, covered_share, require_surface
+from slrig.scan.coverage import coverage_notes, covered_share, require_surface, with_uncovered_refused
 from slrig.scan.limited import marked, within
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
@@ -52,7 +52,7 @@ from slrig.scan.report import (
     with_seconds,
 )
 from slrig.scan.stream import CameraResult, LiveScan
-from slrig.scan.triangulated import Triangulated, steps, widest_gap_px
+from slrig.scan.triangulated import Triangulated, steps
 
 _BETWEEN = frozenset({"read bundle", "check frames"})
 """What is done with each frame between other stages."""
@@ -166,20 +166,24 @@ def reconstruct_into(
 
     with report_compilations(compiling), ThreadPoolExecutor(1, thread_name_prefix="slrig-pictures") as beside:
         entered("read bundle", 0.0, str(bundle))
-        walked, found = measured(bundle, calibration, live, entered, axis=plan.axis, region=plan.region, judged=judged)
+        walked, found = measured(
+            bundle, calibration, live, entered, axis=plan.axis, region=plan.region, judged=judged,
+            drop_finest_bits=plan.drop_finest_bits,
+        )  # fmt: skip
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         # One at a time: each is as large as the mesh.
         place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_calibration_sigma_mm))
         # The mesh is what somebody waits for; what is left is shared by two threads.
+        cameras = [with_uncovered_refused(mesh, seen) for seen in cameras]
         pictures = beside.submit(_encoded_pictures, mesh, cameras)
         place("mesh.glb", encode_mesh_glb(mesh))
         place(
             "points.ply",
             encode_points_ply(meshed.curves, meshed.normals, sigma_calibration_mm=meshed.calibration_sigma_mm),
         )
-        covered = covered_share(mesh, cameras[0])
+        covered = covered_share(cameras[0])
         figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
         entered("pictures", 0.85, "")
         for name, picture in pictures.result().items():
@@ -239,8 +243,9 @@ def _meshed(
     require_surface(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras)
     count = f"{len(points.points_mm)} points"
     projector = walked.devices.projector
-    gap_px = widest_gap_px(projector, axis)
-    beside = steps(cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=gap_px)
+    beside = steps(
+        cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=found.widest_gap_px
+    )
     sampling = sampling_mm(points.points_mm, first.device, projector, axis, beside.at_points_px)
     surface = build_surface(
         points.points_mm, points.offsets, points.position_px, points.bridge_after,

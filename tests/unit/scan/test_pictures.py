@@ -195,22 +195,22 @@ def test_every_cause_has_a_colour_of_its_own() -> None:
     assert set(_CAUSES) == set(Refusal)
     assert len({colour for colour, _ in _CAUSES.values()}) == len(Refusal)
     described = described_causes()
-    assert [each["name"].upper() for each in described] == [cause.name for cause in Refusal]
-    assert len({each["words"] for each in described}) == len(Refusal)
+    assert [described[cause]["name"].upper() for cause in Refusal] == [cause.name for cause in Refusal]
+    assert len({described[cause]["words"] for cause in Refusal}) == len(Refusal)
 
 
 def test_refused_pixels_have_their_cause_in_colour_and_legend() -> None:
-    refusals = np.zeros((600, 800), dtype=np.uint8)
+    refusals = np.zeros((800, 800), dtype=np.uint8)
     for cause in Refusal:
         refusals[40 * cause : 40 * cause + 30, 100:300] = cause
-    picture = rejection_picture(refusals, np.full((600, 800), 180, dtype=np.uint8), 255)
+    picture = rejection_picture(refusals, np.full((800, 800), 180, dtype=np.uint8), 255)
     legend = picture[:, 800:]
     for cause in Refusal:
         swatch = (legend == np.array(_CAUSES[cause][0], dtype=np.uint8)).all(axis=2)
         assert swatch.sum() >= 100, cause.name
         if cause is not Refusal.NONE:
             assert tuple(picture[40 * cause + 20, 200]) == _CAUSES[cause][0]
-    assert tuple(picture[599, 799]) == (180, 180, 180)
+    assert tuple(picture[799, 799]) == (180, 180, 180)
     # The legend has the counts.
     few, many = np.zeros((500, 500), dtype=np.uint8), np.full((500, 500), Refusal.SATURATED, dtype=np.uint8)
     few[0, 0] = Refusal.SATURATED
