@@ -147,7 +147,8 @@ def cell_width_px(decoded: DecodedImage) -> float | NDArray[np.float32]:
     cell_px = decoded.frames.gray.cell_px
     if decoded.unresolved is None:
         return float(cell_px)
-    return cell_px * np.exp2(cv2.dilate(decoded.unresolved, np.ones((3, 3), np.uint8)), dtype=np.float32)
+    widest = cv2.dilate(decoded.unresolved, np.ones((3, 3), dtype=np.uint8))
+    return np.asarray(cell_px * np.exp2(widest, dtype=np.float32))
 
 
 def line_image(

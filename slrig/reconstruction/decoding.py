@@ -361,7 +361,7 @@ def _mean_swing(
     """(block rows, block columns): mean difference of a bit and its reference, over that of white and black."""
     difference = np.abs(np.subtract(bit_image, reference, dtype=np.float32))
     total, whole = (_add_neighbours(_sum_blocks(np.where(lit, each, np.float32(0)))) for each in (difference, contrast))
-    return total / np.maximum(whole, 1)
+    return np.asarray(total / np.maximum(whole, 1))
 
 
 def _follow_neighbours(unresolved: NDArray[np.uint8], judged: NDArray[np.bool_]) -> NDArray[np.uint8]:
