@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -80,13 +81,16 @@ def measured(
     NothingToReconstructError
         No pixel could be decoded, no stripe be found, or the light tells no depth.
     """
-    given = {"region": region, "judged": judged, "drop_finest_bits": drop_finest_bits}
-    walked = _walked(folder, calibration_file, live, entered, axis=axis, **given)
+    walk = partial(
+        _walked, folder, calibration_file, entered=entered, region=region, judged=judged,
+        drop_finest_bits=drop_finest_bits,
+    )  # fmt: skip
+    walked = walk(live, axis=axis)
     tries = [_tried(walked, folder, entered, region)]
     others = walked.shown - {walked.axis} if axis is None else frozenset()
     for other in others:
         if _is_weak(tries[0]):
-            again = _walked(folder, calibration_file, None, entered, axis=other, **given)
+            again = walk(None, axis=other)
             tries.append(_tried(again, folder, entered, region))
     sound = [each for each in tries if not isinstance(each, NothingToReconstructError)]
     if not sound:
@@ -128,7 +132,18 @@ def _is_weak(tried: tuple[Walked, Triangulated] | NothingToReconstructError) -> 
 def _decoded_share(cameras: Sequence[CameraResult]) -> float:
     """Of the pixels that are lit."""
     lit = sum(np.count_nonzero(lit_pixels(seen.curves)) for seen in cameras)
-    return sum(seen.curves.decoded_pixels for seen in cameras) / max(lit, 1)
+    return _decoded(cameras) / max(lit, 1)
+
+
+def _decoded(cameras: Sequence[CameraResult]) -> float:
+    """Number of decoded pixels. Each bit that a pixel leaves out, more than the best tenth of them, halves its part."""
+    total = 0.0
+    for curves in (seen.curves for seen in cameras):
+        left_out = np.zeros(1) if curves.unresolved is None else curves.unresolved[lit_pixels(curves)]
+        if left_out.size:
+            finest = np.percentile(left_out, 10)
+            total += curves.decoded_pixels * float(np.exp2(np.minimum(finest - left_out, 0)).mean())
+    return total
 
 
 def _depth_known(walked: Walked, found: Triangulated) -> float:
@@ -139,7 +154,7 @@ def _depth_known(walked: Walked, found: Triangulated) -> float:
     if len(deviation_mm) == 0:
         return 0.0
     usual_mm = float(np.median(np.linalg.norm(deviation_mm, axis=1)))
-    return float(sum(seen.curves.decoded_pixels for seen in walked.seen)) ** 2 / usual_mm
+    return _decoded(walked.seen) ** 2 / usual_mm
 
 
 def _chosen_notes(first: Walked, best: Walked, found: Triangulated) -> list[str]:
@@ -175,8 +190,8 @@ def _walked(
     folder: Path,
     calibration_file: Path | None,
     live: LiveScan | None,
-    entered: Entered,
     *,
+    entered: Entered,
     axis: Axis | None,
     region: Region | None,
     judged: EvidenceSummary | None,

@@ -5,13 +5,14 @@ What is covered is compared with the same frames without the bits that are of no
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from slrig.bundle import read_bundle, read_truth, write_bundle, write_truth
+from slrig.bundle import read_bundle, write_bundle
 from slrig.model import Gray
 from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.plan import PatternPlan, ReconstructionPlan
@@ -39,8 +40,7 @@ PROJECTOR: Device = {
 
 def without_bits(bundle: Path, folder: Path, count: int) -> Path:
     """The bundle without the frames of its finest bits."""
-    known, truth = read_bundle(bundle), read_truth(bundle)
-    assert truth is not None
+    known = read_bundle(bundle)
 
     def is_kept(pattern: object) -> bool:
         return not isinstance(pattern, Gray) or pattern.bit < pattern.bits - count
@@ -55,7 +55,8 @@ def without_bits(bundle: Path, folder: Path, count: int) -> Path:
     shots = tuple(replace(each, pattern=used.index(each.pattern)) for each in shots)
     capture = replace(known.capture, patterns=tuple(patterns[index] for index in used), shots=shots)
     write_bundle(folder, capture, known.calibration)
-    write_truth(folder, truth)
+    for name in ("truth.ply", "visible_points.npy"):
+        shutil.copy(bundle / name, folder / name)
     return folder
 
 

@@ -288,7 +288,7 @@ def edge_errors(light: NDArray[np.float64], truth_px: NDArray[np.float64], noise
     points = edge_points(image, np.full(light.shape, noise, np.float32), lit, StripeLimits(), filter_px=1.0)
     columns, rows = np.rint(points.points_px).astype(int).T
     off = truth_px[rows, columns] + points.points_px[:, 0] - columns
-    return off * np.abs(points.normals[:, 0]) / points.sigma_px
+    return np.asarray(off * np.abs(points.normals[:, 0]) / points.sigma_px)
 
 
 @pytest.mark.parametrize(
