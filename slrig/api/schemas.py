@@ -110,6 +110,11 @@ class ReconstructionRequest(Strict):
         "steeply",
     )
     region: RegionTable | None = Field(default=None, description="what of the scene is measured. Default: all of it")
+    drop_finest_bits: Annotated[int, Field(ge=0, le=16)] | None = Field(
+        default=None,
+        description="number of finest bits of the code not to read where its edges give the points: without line-shift "
+        "frames, or where the camera does not resolve lines. Default 0: every bit that the camera resolves",
+    )
 
 
 class ShotRequest(Strict):

@@ -414,6 +414,7 @@ class ScanDefaults(Strict):
     smooth_boundary: bool | None = None
     axis: Annotated[Axis, Field(strict=False)] | None = None
     region: RegionTable | None = None
+    drop_finest_bits: Annotated[int, Field(ge=0)] | None = None
     exposure_s: ExposureSeconds | None = None
     exposures_s: BracketSeconds | None = Field(
         default=None,

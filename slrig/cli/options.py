@@ -117,6 +117,10 @@ class MeshOptions:
         Path | None,
         typer.Option(help="TOML file of what is measured: box_mm, depth_mm and more. Default: all."),
     ] = None
+    drop_finest_bits: Annotated[
+        int | None,
+        typer.Option(help="Finest Gray bits not to read where code edges give the points. Default: as resolved."),
+    ] = None
 
     def asked(self) -> dict[str, Any]:
         """What was given, as a request says it. Raises ConfigError: the file of the region is wrong."""

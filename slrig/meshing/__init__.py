@@ -4,7 +4,13 @@ from slrig.meshing.boundary import smooth_boundary
 from slrig.meshing.facing import Viewpoints
 from slrig.meshing.flips import optimise_edges
 from slrig.meshing.quality import mesh_figures, nearest_on_triangle, score, weighted_percentiles
-from slrig.meshing.rasteriser import depth_ranges, merge_depth_buffers, rasterise, rasterise_normals
+from slrig.meshing.rasteriser import (
+    covered_pixels,
+    depth_ranges,
+    merge_depth_buffers,
+    rasterise,
+    rasterise_normals,
+)
 from slrig.meshing.strips import initial_mesh, runs_of_curve_parts
 from slrig.meshing.surface import (
     FIRST_STAGE,
@@ -33,6 +39,7 @@ __all__ = [
     "build_surface",
     "compact_mesh",
     "component_sizes",
+    "covered_pixels",
     "depth_ranges",
     "initial_mesh",
     "merge_depth_buffers",

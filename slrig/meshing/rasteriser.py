@@ -56,6 +56,14 @@ def depth_ranges(placed: NDArray[np.floating[Any]], faces: IntArray, size: Size)
     return nearest, furthest
 
 
+def covered_pixels(placed: NDArray[np.float32], faces: IntArray, size: Size) -> NDArray[np.bool_]:
+    """(H, W) bool: pixel centres that a triangle covers. Arguments as for `rasterise`."""
+    covered = np.zeros(size.shape, dtype=np.bool_)
+    given = np.ascontiguousarray(placed), np.ascontiguousarray(faces), covered
+    in_bands(_cover, len(faces), *given, rows_at_least=_MIN_FACES)
+    return covered
+
+
 def merge_depth_buffers(buffers: list[tuple[Nearness, IntArray]]) -> tuple[Nearness, IntArray]:
     """Merge pairs of inverse depth and triangle index, (H, W) each; empties the list to save memory."""
     inverse, face = buffers.pop(0)
@@ -146,6 +154,30 @@ def _depth_ranges(
                     nearest[row, column] = min(nearest[row, column], depth)
                     furthest[row, column] = max(furthest[row, column], depth)
     return nearest, furthest
+
+
+@kernel
+def _cover(first: int, last: int, placed: Any, faces: Any, covered: Any) -> None:
+    """Mark the pixels of the triangles from first to last, as `_z_buffer` draws them."""
+    height, width = covered.shape
+    for face in range(first, last):
+        a, b, c = placed[faces[face, 0]], placed[faces[face, 1]], placed[faces[face, 2]]
+        if not (a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0):
+            continue
+        ax, bx, cx = float(a[0]), float(b[0]), float(c[0])
+        left, right = max(np.ceil(min(ax, bx, cx)), 0.0), min(np.floor(max(ax, bx, cx)), width - 1.0)
+        ay, by, cy = float(a[1]), float(b[1]), float(c[1])
+        top, bottom = max(np.ceil(min(ay, by, cy)), 0.0), min(np.floor(max(ay, by, cy)), height - 1.0)
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if not (left <= right and top <= bottom and abs(area) > 0.0):
+            continue
+        share = 1.0 / area
+        for row in range(int(top), int(bottom) + 1):
+            for column in range(int(left), int(right) + 1):
+                wa = ((bx - column) * (cy - row) - (by - row) * (cx - column)) * share
+                wb = ((cx - column) * (ay - row) - (cy - row) * (ax - column)) * share
+                if wa >= -1e-9 and wb >= -1e-9 and 1.0 - wa - wb >= -1e-9:
+                    covered[row, column] = True
 
 
 @kernel

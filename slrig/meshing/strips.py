@@ -256,7 +256,7 @@ class _Runs:
             # Of several strips that end in one point, the furthest.
             order = np.lexsort((sign * self._along_px[other[:, side]], part[:, side]))
             at = part[order, side]
-            furthest = np.append(at[1:] != at[:-1], True)
+            furthest = np.append(at[1:] != at[:-1], True)[: len(at)]
             strip, at = order[furthest], at[furthest]
             free = ~taken[at - (sign < 0)] & ~ends[at]
             strip, at = strip[free], at[free]

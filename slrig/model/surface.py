@@ -92,6 +92,7 @@ class Refusal(IntEnum):
 
     10 to 13 concern the intersection of the viewing ray with the light sheet: outside the projector's image, behind the
     camera or the projector, not found by Newton's method, or undefined because the sheet contains the camera.
+    NO_SURFACE is the cause of decoded pixels without another one that no triangle of the mesh covers.
     """
 
     NONE = 0
@@ -111,6 +112,7 @@ class Refusal(IntEnum):
     OUTSIDE_REGION = 14
     MIRROR_IMAGE = 15
     CONTRADICTED = 16
+    NO_SURFACE = 18
 
 
 class FlipRule(StrEnum):

@@ -14,7 +14,7 @@ export function Causes({camera, told, causes, files}) {
     setShown(true);
     setAt([(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height]);
   };
-  const refused = causes.map(({name, ...rest}) => [name === "none" ? told.decoded_pixels : told.refused_pixels[name] ?? 0, rest]).filter(([pixels]) => pixels > 0);
+  const refused = causes.map(({name, ...rest}) => [name === "none" ? told.measured_pixels ?? told.decoded_pixels : told.refused_pixels[name] ?? 0, rest]).filter(([pixels]) => pixels > 0);
   const all = refused.reduce((sum, [pixels]) => sum + pixels, 0);
   const [width, height] = told.rejected_png_px;
   return html`<section aria-label=${`Causes, camera ${camera}`}>

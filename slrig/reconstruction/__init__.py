@@ -22,7 +22,7 @@ from slrig.reconstruction.calibration_check import (
 from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
 from slrig.reconstruction.decoded_image import CodeTables, ReconstructionLimits
-from slrig.reconstruction.decoding import DecodingLimits, RegionMask, decode, lit_pixels, unresolved_bits
+from slrig.reconstruction.decoding import DecodingLimits, RegionMask, decode_edges, lit_pixels
 from slrig.reconstruction.frames import (
     NEAR_SATURATION,
     AxisFrames,
@@ -108,7 +108,7 @@ __all__ = [
     "calibration_sigma",
     "camera_curves",
     "check_calibration",
-    "decode",
+    "decode_edges",
     "decode_second_axis",
     "distorted_from_pixel",
     "estimate_albedo",
@@ -139,7 +139,6 @@ __all__ = [
     "stripe_tangents",
     "triangulate_camera_pair",
     "triangulate_camera_projector",
-    "unresolved_bits",
     "used_frames",
     "used_shots",
 ]

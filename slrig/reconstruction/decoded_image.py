@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -142,9 +143,12 @@ def linearise_frames(stacks: FrameStacks, limits: DecodingLimits) -> tuple[AxisF
 
 
 def cell_width_px(decoded: DecodedImage) -> float | NDArray[np.float32]:
-    """Width of a decoded cell, px: one value, or (H, W)."""
+    """Width of the widest cell decoded at a pixel and its neighbours, px: one value, or (H, W)."""
     cell_px = decoded.frames.gray.cell_px
-    return float(cell_px) if decoded.unresolved is None else cell_px * np.exp2(decoded.unresolved, dtype=np.float32)
+    if decoded.unresolved is None:
+        return float(cell_px)
+    widest = cv2.dilate(decoded.unresolved, np.ones((3, 3), dtype=np.uint8))
+    return np.asarray(cell_px * np.exp2(widest, dtype=np.float32))
 
 
 def line_image(

@@ -4,6 +4,9 @@ A bit is 1 where its frame is brighter than its inverse (without inverses: than 
 difference is below a margin, the larger of a multiple of the noise and a fraction of the contrast, both values are
 tried, and the pixel has an interval of cells. An uncertain bit at its own code edge gives two neighbouring cells and
 does no harm; a finest bit lost in blur costs resolution only; otherwise the interval is wide and the pixel is refused.
+
+Where the code itself gives the positions (`decode_edges`), the finest bits that a camera does not resolve are not read
+(`unresolved_bits`), and a pixel with a wide interval leaves out further ones: it loses resolution, and stays.
 """
 
 from __future__ import annotations
@@ -15,15 +18,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.errors import PatternError, setting
 from slrig.kernels import in_bands, kernel
 from slrig.model import FloatArray, IntArray, NoiseModel, Refusal
 from slrig.reconstruction.frames import AxisFrames, rows_per_band, stack_rows
 
+_NONE = int(Refusal.NONE)
 _NOT_LIT = int(Refusal.NOT_LIT)
 _SATURATED = int(Refusal.SATURATED)
 _AMBIGUOUS_BIT = int(Refusal.AMBIGUOUS_BIT)
 _BEYOND_PROJECTOR = int(Refusal.BEYOND_PROJECTOR)
 _MAX_UNCERTAIN_BITS = 4  # each doubles the number of words to look up
+_MIN_BITS_LEFT = 3
+_MAX_LEFT_OUT_BITS = 3  # at a pixel, beyond those that its block does not resolve
 
 _REACH_PX = 8
 """Distance of pixels on which a point depends. A filter reaches 9 px, but its outermost pixel has hardly any weight."""
@@ -32,14 +39,18 @@ _REACH_PX = 8
 BLOCK_PX = 32
 """Size of a block: small enough for an even density of the code, with hundreds of passages of each bit."""
 _MIN_PASSAGES = 48
-"""With fewer passages, a bit counts as resolved."""
+"""With fewer passages, a block does not tell whether it resolves a bit, and its neighbours do."""
 _MIN_CORRECT = 0.7
 """Least share of passages (runs of pixels of one cell between its neighbours) in which the bit changes once, the right
 way. Random bits do in a quarter."""
 _MIN_PASSAGE_PX = 2.0
-"""Least mean width of a cell in camera pixels, so that no pixel holds two code edges."""
-_MAX_UNRESOLVED_BITS = 3
-"""If more bits were left out, the image does not show the code."""
+"""Least mean width of a stripe of the bit in camera pixels, so that no pixel holds two code edges."""
+_MAX_STRIPE_PX = 32.0
+"""Greatest mean width of a stripe of the finest bit that is read, if finer ones are not."""
+_MIN_SWING = 0.05
+"""Least mean difference of a bit and its inverse, over the contrast: stripes too fine for the camera leave a beat with
+its pixels that swings less.
+"""
 _MIN_FOUND = 0.5
 """Share of the points of lines; chosen between 0.9 where lines are resolved and 0.15 where they blur into each other.
 """
@@ -55,8 +66,11 @@ class DecodingLimits:
 
     lit_sigma : white must exceed black by this many standard deviations of their difference, lit_fraction : and by this
     fraction of full scale. bit_sigma : a bit must differ from its inverse by this many standard deviations of the
-    difference, bit_fraction : and by this fraction of the pixel's contrast. widest_interval : largest hi - lo, in
-    cells, that counts as decoded.
+    difference, bit_fraction : and by this fraction of the pixel's contrast. Without inverses it must differ from the
+    middle of white and black by as many standard deviations of that difference, and by half of that fraction.
+    widest_interval : largest hi - lo, in cells, that counts as decoded.
+    drop_finest_bits : number of finest bits not to read where the code gives the positions, whether they resolve or
+    not.
     """
 
     lit_sigma: float = 6.0
@@ -64,6 +78,7 @@ class DecodingLimits:
     bit_sigma: float = 3.0
     bit_fraction: float = 0.08
     widest_interval: int = 3
+    drop_finest_bits: int = 0
 
 
 class CodeMap(NamedTuple):
@@ -94,6 +109,17 @@ def lit_pixels(frames: AxisFrames, noise: NoiseModel, limits: DecodingLimits, /)
 
 
 def decode(
+    frames: AxisFrames, noise: NoiseModel, index_of_word: IntArray, cell_count: int, limits: DecodingLimits, /
+) -> CodeMap:
+    """Decode the Gray code of one axis.
+
+    index_of_word : (2^bits,) int32, cell index of each Gray word; cell_count : number of cells of the projector.
+    """
+    unread = np.zeros(frames.white.shape, dtype=np.uint8)
+    return _decode(frames, noise, index_of_word, cell_count, limits, unread, most_left_out=0)
+
+
+def decode_edges(
     frames: AxisFrames,
     noise: NoiseModel,
     index_of_word: IntArray,
@@ -102,20 +128,48 @@ def decode(
     /,
     *,
     unresolved: NDArray[np.uint8] | None = None,
-) -> CodeMap:
-    """Decode the Gray code of one axis.
+) -> tuple[CodeMap, NDArray[np.uint8]]:
+    """Decode the Gray code of one axis for positions on its edges. Arguments as for `decode`.
 
-    index_of_word : (2^bits,) int32, cell index of each Gray word; cell_count : number of cells of the projector.
-    unresolved : (H, W) uint8, number of finest bits not to read at each pixel; None to read all.
+    Where bits are uncertain elsewhere than at their own edges, a pixel leaves out up to 3 further finest bits until one
+    or two neighbouring cells are left. unresolved : (H, W) uint8, number of finest bits not to read at each pixel; None
+    for `unresolved_bits`. Also returns (H, W) uint8, number of finest bits that were not read at each pixel.
+
+    Raises
+    ------
+    PatternError
+        `limits.drop_finest_bits` leaves fewer than 3 bits of the code.
     """
+    _require_bits_left(len(frames.bits), limits.drop_finest_bits)
+    if unresolved is None:
+        unresolved = unresolved_bits(frames, lit_pixels(frames, noise, limits))
+    unread = np.maximum(unresolved, np.uint8(limits.drop_finest_bits))
+    return _decode(frames, noise, index_of_word, cell_count, limits, unread, most_left_out=_MAX_LEFT_OUT_BITS), unread
+
+
+def _require_bits_left(bits: int, dropped: int) -> None:
+    """Raises PatternError: too few bits are left."""
+    if dropped and bits - dropped < _MIN_BITS_LEFT:
+        message = (
+            f"{setting('drop_finest_bits')}: expected at most {max(bits - _MIN_BITS_LEFT, 0)} for a code of {bits} "
+            f"bits, found {dropped}; {_MIN_BITS_LEFT} bits at least say where a pixel is"
+        )
+        raise PatternError(message)
+
+
+def _decode(
+    frames: AxisFrames, noise: NoiseModel, index_of_word: IntArray, cell_count: int, limits: DecodingLimits,
+    unread: NDArray[np.uint8], *, most_left_out: int,
+) -> CodeMap:  # fmt: skip
+    """Decode without the finest bits that `unread` counts; it is raised where a pixel leaves out more."""
     shape = frames.white.shape
     code = CodeMap(np.full(shape, -1, np.int32), np.full(shape, -1, np.int32), np.zeros(shape, np.uint8))
-    unread = np.zeros(shape, dtype=np.uint8) if unresolved is None else unresolved
     words = index_of_word.astype(np.int32)
 
     def band(first: int, last: int) -> None:
         rows = slice(first, last)
-        _decode_rows(frames.rows(rows), noise.rows(rows), words, cell_count, limits, unread[rows], code.rows(rows))
+        part = frames.rows(rows), noise.rows(rows), words, cell_count, limits
+        _decode_rows(*part, unread[rows], most_left_out, code.rows(rows))
 
     in_bands(band, shape[0], rows_at_most=rows_per_band(frames.bits, 2 * shape[1]))
     return code
@@ -123,23 +177,25 @@ def decode(
 
 def _decode_rows(
     frames: AxisFrames, noise: NoiseModel, words: IntArray, cell_count: int, limits: DecodingLimits,
-    unread: NDArray[np.uint8], code: CodeMap,
+    unread: NDArray[np.uint8], most_left_out: int, code: CodeMap,
 ) -> None:  # fmt: skip
-    """Decode some rows into `code`."""
+    """Decode some rows into `code` and `unread`."""
     paired = frames.inverses is not None
     reference = stack_rows(frames.inverses) if frames.inverses is not None else frames.middle[None]
-    spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))
+    both = noise.variance(frames.white) + noise.variance(frames.black)
+    if paired:
+        variance = both
+    elif frames.lines_light_half:
+        variance = noise.variance(frames.white) + noise.variance(reference[0]) / np.float32(len(frames.lines))
+    else:
+        # Of a bit close to the middle, and of the middle, which is half the sum of white and black.
+        variance = both * np.float32(1 / 2 + 1 / (4 * frames.reference_repeats))
     # Against the middle of white and black a bit has half the swing that it has against its inverse.
     swing = 1.0 if paired else 0.5
-    margin = np.maximum(limits.bit_sigma * swing * spread, limits.bit_fraction * swing * frames.contrast)
-    if not paired and frames.lines_light_half:
-        line_spread = np.sqrt(
-            noise.variance(frames.white) + noise.variance(reference[0]) / np.float32(len(frames.lines))
-        )
-        margin = np.maximum(limits.bit_sigma * line_spread, limits.bit_fraction * swing * frames.contrast)
+    margin = np.maximum(limits.bit_sigma * np.sqrt(variance), limits.bit_fraction * swing * frames.contrast)
     _decode_kernel(
         0, len(unread), stack_rows(frames.bits), reference, paired, frames.white,
-        lit_pixels(frames, noise, limits), unread,
+        lit_pixels(frames, noise, limits), unread, most_left_out,
         margin.astype(np.float32), np.float32(frames.clipped_at), words, cell_count, limits.widest_interval, *code,
     )  # fmt: skip
 
@@ -147,12 +203,12 @@ def _decode_rows(
 @kernel
 def _decode_kernel(
     first: int, last: int, bit_images: Any, reference: Any, paired: bool, white: Any, lit: Any, unread: Any,
-    margin: Any, clipped_at: Any, index_of_word: Any, cell_count: int, widest: int, lowest: Any, highest: Any,
-    refusal: Any,
+    most_left_out: int, margin: Any, clipped_at: Any, index_of_word: Any, cell_count: int, widest: int, lowest: Any,
+    highest: Any, refusal: Any,
 ) -> None:  # fmt: skip
     bits, _, columns = bit_images.shape
     for y in range(first, last):
-        uncertain = np.zeros(2 * _MAX_UNCERTAIN_BITS, dtype=np.int32)
+        uncertain = np.zeros(_MAX_UNCERTAIN_BITS, dtype=np.int32)
         for x in range(columns):
             if not lit[y, x]:
                 refusal[y, x] = _NOT_LIT
@@ -161,8 +217,7 @@ def _decode_kernel(
                 refusal[y, x] = _SATURATED
                 continue
             word = 0
-            count = 0
-            read = bits - unread[y, x]
+            in_doubt = 0
             clipped = False
             for b in range(bits):
                 value = bit_images[b, y, x]
@@ -171,34 +226,44 @@ def _decode_kernel(
                     word |= 1 << (bits - 1 - b)
                 if paired and value >= clipped_at and other >= clipped_at:
                     clipped = True
-                if b >= read or abs(value - other) < margin[y, x]:
-                    if count < len(uncertain):
-                        uncertain[count] = bits - 1 - b
-                    count += 1
+                if abs(value - other) < margin[y, x]:
+                    in_doubt |= 1 << (bits - 1 - b)
             if clipped:
                 refusal[y, x] = _SATURATED
                 continue
-            if count > min(_MAX_UNCERTAIN_BITS + unread[y, x], len(uncertain)):
-                refusal[y, x] = _AMBIGUOUS_BIT
-                continue
-            low = index_of_word[word]
-            high = low
-            for choice in range(1, 1 << count):
-                other_word = word
-                for k in range(count):
-                    if choice >> k & 1:
-                        other_word ^= 1 << uncertain[k]
-                index = index_of_word[other_word]
-                low = min(low, index)
-                high = max(high, index)
-            # In cells of the bits that are read.
-            if (high >> unread[y, x]) - (low >> unread[y, x]) > widest:
-                refusal[y, x] = _AMBIGUOUS_BIT
-            elif low >= cell_count:
-                refusal[y, x] = _BEYOND_PROJECTOR
-            else:
-                lowest[y, x] = low
-                highest[y, x] = min(high, cell_count - 1)
+            refusal[y, x] = _AMBIGUOUS_BIT
+            left_out = min(np.int64(unread[y, x]), bits - 1)
+            for more in range(max(min(most_left_out, bits - _MIN_BITS_LEFT - left_out), 0) + 1):
+                skipped = left_out + more
+                count = 0
+                for k in range(skipped, bits):
+                    if in_doubt >> k & 1:
+                        if count < _MAX_UNCERTAIN_BITS:
+                            uncertain[count] = k
+                        count += 1
+                if count > _MAX_UNCERTAIN_BITS:
+                    continue
+                # In cells of the bits that are read, which the others do not change.
+                low = index_of_word[word] >> skipped
+                high = low
+                for choice in range(1, 1 << count):
+                    other_word = word
+                    for k in range(count):
+                        if choice >> k & 1:
+                            other_word ^= 1 << uncertain[k]
+                    index = index_of_word[other_word] >> skipped
+                    low = min(low, index)
+                    high = max(high, index)
+                if high - low > (widest if more == 0 else 1):
+                    continue
+                if low << skipped >= cell_count:
+                    refusal[y, x] = _BEYOND_PROJECTOR
+                else:
+                    refusal[y, x] = _NONE
+                    unread[y, x] = skipped
+                    lowest[y, x] = low << skipped
+                    highest[y, x] = min(((high + 1) << skipped) - 1, cell_count - 1)
+                break
 
 
 def cells_beyond(frames: AxisFrames, code: CodeMap, index_of_word: IntArray, /) -> IntArray:
@@ -261,8 +326,11 @@ def refuse_outside_region(code: CodeMap, region: NDArray[np.bool_]) -> CodeMap:
 def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np.uint8]:
     """(H, W) uint8: number of finest bits that the camera does not resolve.
 
-    lit : (H, W) bool, pixels that the projector lights. It is 0 where more than 3 would be left out: such pixels do not
-    show the code, but light from elsewhere.
+    lit : (H, W) bool, pixels that the projector lights. A block of pixels resolves a bit if stripes of it are wide
+    enough, swing, and change where the coarser bits say. The finest bit that it and the next coarser one pass is the
+    first that is read: stripes too fine may beat with the pixels and pass by chance. It is 0 where no bit passes, or
+    only one of stripes so wide that the lens does not explain it: such pixels do not show the code, but light from
+    elsewhere.
     """
     lit = lit & (frames.white < frames.clipped_at)
     bits = len(frames.bits)
@@ -271,23 +339,60 @@ def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np
     for bit_image, other in zip(frames.bits, reference, strict=True):
         word <<= 1
         word |= bit_image > other
+    contrast = frames.contrast * np.float32(1.0 if frames.inverses is not None else 0.5)
     blocks = tuple(-(-extent // BLOCK_PX) for extent in lit.shape)
-    unresolved = np.zeros(blocks, dtype=np.uint8)
+    unresolved, judged = np.zeros(blocks, dtype=np.uint8), np.zeros(blocks, dtype=np.bool_)
+    open_blocks, finer_lost = np.ones(blocks, dtype=np.bool_), np.ones(blocks, dtype=np.bool_)
+    stripe_px = np.full(blocks, np.inf)
     # Columns of a transposed copy are contiguous in memory.
     directions = (word, lit), (np.ascontiguousarray(word.T), np.ascontiguousarray(lit.T))
-    for finest in range(min(_MAX_UNRESOLVED_BITS + 1, bits - 1)):
+    for finest in range(bits):
         along_rows, along_columns = (_count_passages(*each, finest) for each in directions)
         passages, pixels, long_passages, correct = (
             _add_neighbours(each) for each in along_rows + along_columns.swapaxes(1, 2)
         )
-        is_unresolved = (correct < _MIN_CORRECT * long_passages) | (pixels < _MIN_PASSAGE_PX * passages)
-        is_unresolved &= (passages >= _MIN_PASSAGES) & (unresolved == finest)
-        if not is_unresolved.any():
+        swing = _mean_swing(frames.bits[-1 - finest], reference[-1 - finest], contrast, lit)
+        enough = passages >= _MIN_PASSAGES
+        lost = enough & (
+            (correct < _MIN_CORRECT * long_passages) | (pixels < _MIN_PASSAGE_PX * passages) | (swing < _MIN_SWING)
+        )
+        judged |= enough & open_blocks
+        open_blocks &= lost | finer_lost
+        unresolved[open_blocks & lost] = finest + 1
+        first_read = open_blocks & ~lost & enough
+        stripe_px[first_read] = pixels[first_read] / passages[first_read]
+        if not open_blocks.any():
             break
-        unresolved[is_unresolved] += 1
-    unresolved[unresolved > _MAX_UNRESOLVED_BITS] = 0
+        finer_lost = lost
+    is_lens = ~open_blocks & ((unresolved == 0) | (stripe_px <= _MAX_STRIPE_PX))
+    unresolved[~is_lens] = 0
     rows, columns = (np.arange(extent) // BLOCK_PX for extent in lit.shape)
-    return unresolved[np.ix_(rows, columns)]
+    return _follow_neighbours(unresolved, judged & is_lens)[np.ix_(rows, columns)]
+
+
+def _mean_swing(
+    bit_image: NDArray[Any], reference: NDArray[Any], contrast: NDArray[np.float32], lit: NDArray[np.bool_]
+) -> FloatArray:
+    """(block rows, block columns): mean difference of a bit and its reference, over that of white and black."""
+    difference = np.abs(np.subtract(bit_image, reference, dtype=np.float32))
+    total, whole = (_add_neighbours(_sum_blocks(np.where(lit, each, np.float32(0)))) for each in (difference, contrast))
+    return np.asarray(total / np.maximum(whole, 1))
+
+
+def _follow_neighbours(unresolved: NDArray[np.uint8], judged: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Counts of the blocks, (rows, columns): a block that does not tell takes those of the blocks around it, and none
+    has more, or fewer, than all its neighbours.
+    """
+    if not judged.any() or judged.size == 1:
+        return unresolved
+    around = np.ones((3, 3), dtype=np.uint8)
+    known, counts = judged.view(np.uint8), np.where(judged, unresolved, np.uint8(0))
+    while not known.all():
+        near, filled = cv2.dilate(known, around), cv2.dilate(counts, around)
+        counts = np.where(known > 0, counts, filled)
+        known = near
+    around[1, 1] = 0
+    return np.clip(counts, cv2.erode(counts, around), cv2.dilate(counts, around))
 
 
 def unresolved_lines(
@@ -325,19 +430,24 @@ def _cells_per_block(code: CodeMap, usable: NDArray[np.bool_]) -> FloatArray:
         known = usable[rows] & (code.refusal[rows] == 0)
         cell = np.where(known, (code.lowest[rows] + code.highest[rows]).astype(np.float32) / 2, np.float32(np.nan))
         band_cells = cell[begin - above :]
-        across[first:last] = _sum_blocks(np.diff(band_cells, axis=1, prepend=np.float32(np.nan)))
-        down[first:last] = _sum_blocks(np.diff(cell, axis=0) if begin else np.diff(cell, axis=0, prepend=cell[:1]))
+        across[first:last] = _sum_steps(np.diff(band_cells, axis=1, prepend=np.float32(np.nan)))
+        down[first:last] = _sum_steps(np.diff(cell, axis=0) if begin else np.diff(cell, axis=0, prepend=cell[:1]))
 
     in_bands(band, blocks[0], rows_at_most=_BLOCK_ROWS_PER_BAND)
     return np.maximum(across, down)
 
 
-def _sum_blocks(steps: NDArray[np.float32]) -> FloatArray:
+def _sum_steps(steps: NDArray[np.float32]) -> FloatArray:
     """(block rows, block columns): code cells passed by steps between pixels, in each block."""
     steps = np.abs(steps, out=steps)
     steps[~(steps <= _MAX_STEP_CELLS)] = 0
-    rows, columns = (np.arange(0, extent, BLOCK_PX) for extent in steps.shape)
-    return np.add.reduceat(np.add.reduceat(steps, rows, axis=0), columns, axis=1).astype(np.float64)
+    return _sum_blocks(steps)
+
+
+def _sum_blocks(values: NDArray[np.float32]) -> FloatArray:
+    """(block rows, block columns): sums over blocks of pixels."""
+    rows, columns = (np.arange(0, extent, BLOCK_PX) for extent in values.shape)
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1).astype(np.float64)
 
 
 def _count_passages(word: NDArray[np.int32], lit: NDArray[np.bool_], finest: int) -> NDArray[np.int64]:

@@ -41,6 +41,7 @@ from slrig.reconstruction.decoding import (
     RegionMask,
     cells_beyond,
     decode,
+    decode_edges,
     lit_pixels,
     refuse_outside_region,
     unresolved_bits,
@@ -215,11 +216,14 @@ class CameraStream:
         self._report_step("decode")
         self._has_code = True
         frames, tables = image.frames, self._tables
-        unresolved = None if self._stacks.patterns.lines else unresolved_bits(frames, ~image.unlit)
-        code = decode(
-            frames, image.response.noise, tables.index_of_word, len(tables.cell_position), self._limits.decoding,
-            unresolved=unresolved,
+        unresolved = None
+        given = (
+            frames, image.response.noise, tables.index_of_word, len(tables.cell_position), self._limits.decoding
         )  # fmt: skip
+        if self._stacks.patterns.lines:
+            code = decode(*given)
+        else:
+            code, unresolved = decode_edges(*given)
         region = None
         if self._region is not None:
             region = self._region.mask(frames, code, tables.cell_position)
@@ -498,12 +502,13 @@ def _decode_fewer_bits(
     """Decode without unresolved bits where lines are lost. Returns the image and `code`, both with the new cells."""
     frames, noise = image.frames, image.response.noise
     bits = unresolved_bits(frames, lit_pixels(frames, noise, limits.decoding))
-    bits[~without_lines] = 0
     rows, cells = _rows_around(without_lines, 0), len(tables.cell_position)
     inside = without_lines[rows]
-    fewer = decode(
+    fewer, unread = decode_edges(
         frames.rows(rows), noise.rows(rows), tables.index_of_word, cells, limits.decoding, unresolved=bits[rows]
     )
+    bits[rows] = unread
+    bits[~without_lines] = 0
 
     # Elsewhere all bits are read, as before. Both maps have the same cells and differ in the causes alone.
     lowest, highest = code.lowest.copy(), code.highest.copy()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slrig.model import FloatArray, NoiseModel, Pinhole
 from slrig.reconstruction.decoded_image import CodeTables
-from slrig.reconstruction.decoding import DecodingLimits, decode, lit_pixels, unresolved_bits
+from slrig.reconstruction.decoding import DecodingLimits, decode, decode_edges
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.triangulation import SheetCurves, project
@@ -131,15 +131,15 @@ def decode_second_axis(
     frames: AxisFrames, noise: NoiseModel, tables: CodeTables, limits: DecodingLimits, /
 ) -> SecondAxis:
     """Decode the projector position of each pixel along the axis of `frames`, which are in proportion to light."""
-    lit = lit_pixels(frames, noise, limits)
-    unresolved = unresolved_bits(frames, lit)
-    code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), limits, unresolved=unresolved)
-    by_phase = has_phase(frames) and not unresolved.any()
-    positions = AxisPositions(*position_map(frames, noise, code, tables.cell_position, by_phase=by_phase))
-    if not by_phase:
-        cells = (code.highest - code.lowest + 1).astype(np.float32) * np.exp2(unresolved, dtype=np.float32)
-        cells[np.isnan(positions.position_px)] = np.nan
-        positions = AxisPositions(positions.position_px, np.float32(frames.gray.cell_px * _UNIFORM) * cells)
+    given = frames, noise, tables.index_of_word, len(tables.cell_position), limits
+    if has_phase(frames):
+        positions = AxisPositions(*position_map(frames, noise, decode(*given), tables.cell_position))
+    else:
+        code, unread = decode_edges(*given)
+        position, _ = position_map(frames, noise, code, tables.cell_position, by_phase=False)
+        cells = (code.highest - code.lowest + 1).astype(np.float32) * np.exp2(unread, dtype=np.float32)
+        cells[np.isnan(position)] = np.nan
+        positions = AxisPositions(position, np.float32(frames.gray.cell_px * _UNIFORM) * cells)
     table = tables.position_table if tables.edge_table is None else tables.edge_table
     return SecondAxis(frames, positions, tuple(np.unique(each[np.isfinite(each)]) for each in table))
 

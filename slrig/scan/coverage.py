@@ -2,34 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.meshing import depth_ranges, rasterise
+from slrig.meshing import covered_pixels, depth_ranges
 from slrig.model import IntArray, Mesh, Refusal, Size
 from slrig.reconstruction import SheetCurves, optical_depths_mm
-from slrig.scan.placing import placed_vertices, resampled
+from slrig.scan.placing import placed_vertices
 from slrig.scan.stream import CameraResult
 
 _PICTURE_PX = 480
 """Wide enough for a share, and a tenth of the work at full size."""
 
 
-def covered_share(mesh: Mesh, seen: CameraResult) -> float | None:
-    """The share of the pixels that the camera decoded whose ray meets the mesh; None where it decoded none.
+def with_uncovered_refused(mesh: Mesh, seen: CameraResult) -> CameraResult:
+    """The camera with the decoded pixels that no triangle of the mesh covers among its refusals."""
+    covered = covered_pixels(placed_vertices(mesh.vertices_mm, seen.device), mesh.faces, seen.device.size)
+    refusal = seen.curves.refusal
+    bare = (refusal == Refusal.NONE) & ~covered
+    return replace(seen, curves=replace(seen.curves, refusal=np.where(bare, np.uint8(Refusal.NO_SURFACE), refusal)))
 
-    Counted on a picture of at most 480 pixels' width. A pixel of it is decoded where half of its camera pixels are.
+
+def covered_share(seen: CameraResult) -> float | None:
+    """The share of the pixels without another cause that the mesh covers; None without such pixels. seen : a result of
+    `with_uncovered_refused`.
     """
-    shape = seen.curves.refusal.shape
-    step = _sampled_every(shape[1])
-    rows, columns = (extent // step for extent in shape)
-    decoded = seen.curves.refusal[: rows * step, : columns * step] == Refusal.NONE
-    decoded = decoded.reshape(rows, step, columns, step).mean(axis=(1, 3)) >= 0.5
-    if not decoded.any():
-        return None
-    coarse = resampled(seen.device, 1 / step, Size(columns, rows))
-    view = rasterise(placed_vertices(mesh.vertices_mm, coarse), mesh.faces, coarse.size)
-    return float(((view.face >= 0) & decoded).sum() / decoded.sum())
+    covered, bare = (np.count_nonzero(seen.curves.refusal == each) for each in (Refusal.NONE, Refusal.NO_SURFACE))
+    return covered / (covered + bare) if covered + bare else None
 
 
 def _sampled_every(width_px: int) -> int:

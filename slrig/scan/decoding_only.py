@@ -24,13 +24,12 @@ from slrig.reconstruction import (
     AxisFrames,
     DecodingLimits,
     axis_frames,
-    decode,
+    decode_edges,
     estimate_noise,
     exposure_count,
     fuse_exposures,
     lit_pixels,
     position_map,
-    unresolved_bits,
 )
 from slrig.scan.artefacts import REPORT, REPORT_FORMAT, staged_folder, write_report
 from slrig.scan.pictures import encode_png, rejection_picture
@@ -115,9 +114,8 @@ def _decoded(capture: Capture, camera: str, axis: Axis, folder: Path) -> Decoded
     frames, noise = _frames(capture, camera, axis)
     limits = DecodingLimits()
     lit = lit_pixels(frames, noise, limits)
-    unresolved = unresolved_bits(frames, lit)
     cells = cell_positions(frames.gray, capture.projector)
-    code = decode(frames, noise, index_of_word(frames.gray), len(cells), limits, unresolved=unresolved)
+    code, unresolved = decode_edges(frames, noise, index_of_word(frames.gray), len(cells), limits)
     position = position_map(frames, noise, code, cells).position
     name = f"{camera}-{axis.value}"
     with storage_errors(folder):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -88,11 +89,13 @@ def measured(
     axis: Axis | None,
     region: Region | None = None,
     judged: EvidenceSummary | None = None,
+    drop_finest_bits: int = 0,
 ) -> tuple[Walked, Triangulated]:
     """The points of a recorded bundle: of the frames that came while it was captured, or else of its files.
 
     axis : the one that was asked for; None for that which tells most of depth. region : what of the scene is asked for.
     judged : what the frames proved as they were captured; without it, files of one exposure are judged again.
+    drop_finest_bits : as in `slrig.scan.plan.ReconstructionPlan`.
 
     Raises
     ------
@@ -101,12 +104,16 @@ def measured(
     NothingToReconstructError
         No pixel could be decoded, no stripe be found, or the light tells no depth.
     """
-    walked = _walked(folder, calibration_file, live, entered, axis=axis, region=region, judged=judged)
+    walk = partial(
+        _walked, folder, calibration_file, entered=entered, region=region, judged=judged,
+        drop_finest_bits=drop_finest_bits,
+    )  # fmt: skip
+    walked = walk(live, axis=axis)
     tries = [_tried(walked, folder, entered, region)]
     others = walked.shown - {walked.axis} if axis is None else frozenset()
     for other in others:
         if _is_weak(tries[0]):
-            again = _walked(folder, calibration_file, None, entered, axis=other, region=region, judged=judged)
+            again = walk(None, axis=other)
             tries.append(_tried(again, folder, entered, region))
     sound = [each for each in tries if not isinstance(each, NothingToReconstructError)]
     if not sound:
@@ -159,7 +166,18 @@ def _is_weak(tried: tuple[Walked, Triangulated] | NothingToReconstructError) -> 
 def _decoded_share(cameras: Sequence[CameraResult]) -> float:
     """Of the pixels that are lit."""
     lit = sum(np.count_nonzero(lit_pixels(seen.curves)) for seen in cameras)
-    return sum(seen.curves.decoded_pixels for seen in cameras) / max(lit, 1)
+    return _decoded(cameras) / max(lit, 1)
+
+
+def _decoded(cameras: Sequence[CameraResult]) -> float:
+    """Number of decoded pixels. Each bit that a pixel leaves out, more than the best tenth of them, halves its part."""
+    total = 0.0
+    for curves in (seen.curves for seen in cameras):
+        left_out = np.zeros(1) if curves.unresolved is None else curves.unresolved[lit_pixels(curves)]
+        if left_out.size:
+            finest = np.percentile(left_out, 10)
+            total += curves.decoded_pixels * float(np.exp2(np.minimum(finest - left_out, 0)).mean())
+    return total
 
 
 def _depth_known(walked: Walked, found: Triangulated) -> float:
@@ -170,7 +188,7 @@ def _depth_known(walked: Walked, found: Triangulated) -> float:
     if len(deviation_mm) == 0:
         return 0.0
     usual_mm = float(np.median(np.linalg.norm(deviation_mm, axis=1)))
-    return float(sum(seen.curves.decoded_pixels for seen in walked.seen)) ** 2 / usual_mm
+    return _decoded(walked.seen) ** 2 / usual_mm
 
 
 def _chosen_notes(first: Walked, best: Walked, found: Triangulated) -> list[str]:
@@ -206,11 +224,12 @@ def _walked(
     folder: Path,
     calibration_file: Path | None,
     live: LiveScan | None,
-    entered: Entered,
     *,
+    entered: Entered,
     axis: Axis | None,
     region: Region | None,
     judged: EvidenceSummary | None,
+    drop_finest_bits: int,
 ) -> Walked:
     """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
     names: list[str] = []
@@ -232,6 +251,7 @@ def _walked(
         and live.one_exposure
         and axis in (None, live.axis)
         and live.region == region
+        and drop_finest_bits == 0
         and _is_of(live, folder, calibration_file)
     ):
         names += live.header.cameras
@@ -244,7 +264,9 @@ def _walked(
         names += files.outline.cameras
         devices = _require_calibration(folder, names, files.calibration)
         try:
-            stream, evidence, cut_short = _streamed(files, devices, stage_entered, axis, region, judged)
+            stream, evidence, cut_short = _streamed(
+                files, devices, stage_entered, axis, region, judged, drop_finest_bits
+            )
             seen = stream.finish()
         except PatternError as cause:
             message = f"{folder}: {cause}"
@@ -256,7 +278,7 @@ def _walked(
         *layout_notes(devices),
         *capture_notes(stream.header, stream.axis, evidence),
         *camera_notes(seen),
-        *unresolved_notes(seen, step, cell),
+        *unresolved_notes(seen, step, cell, dropped=drop_finest_bits),
     ]
     agreement = AxisAgreement(stream.axis, {})
     gray = code_of(stream.header.displayed_patterns, stream.axis)
@@ -273,6 +295,7 @@ def _streamed(
     axis: Axis | None,
     region: Region | None,
     proven: EvidenceSummary | None,
+    drop_finest_bits: int,
 ) -> tuple[ScanStream, EvidenceSummary, tuple[str, ...]]:
     """The frames of a bundle in a stream, what they prove, and words for each code that was cut short.
 
@@ -300,6 +323,7 @@ def _streamed(
         axis=axis,
         one_exposure=one_exposure,
         region=region,
+        drop_finest_bits=drop_finest_bits,
     )
     evidence = Evidence(capture.patterns, capture.cameras, refused)
     for index, shot in zip(order, shots, strict=True):

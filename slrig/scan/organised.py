@@ -15,14 +15,11 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing import merge_depth_buffers
-from slrig.model import IntArray, Mesh, Pinhole
+from slrig.model import IntArray, Mesh, Pinhole, Refusal
 from slrig.model.lens_kernels import distort, undistort
 from slrig.reconstruction import CONVERGED, distorted_from_pixel, pack_device, project
 
-NO_SURFACE = "no_surface"
-"""Why a pixel has no point that the camera's map of causes has none for: no triangle lies on its ray. A hole of the
-mesh, a border that was cut, or a triangle that was dropped at a step in depth."""
-
+_NO_SURFACE = Refusal.NO_SURFACE.name.lower()
 _MOST_BANDS = 4  # each has a picture of its own, which is 12 bytes a pixel
 _FACES_AT_LEAST = 50_000
 _ROWS_AT_LEAST = 16
@@ -60,6 +57,7 @@ def organised(
     refused : (H, W) uint8, the camera's causes; where there is one there is no point, even if a triangle, seen by
     another camera or closed over a gap, covers the pixel. causes : their names.
     """
+    causes = causes if _NO_SURFACE in causes else [*causes, _NO_SURFACE]
     high, wide = device.size.shape
     seen = np.ascontiguousarray(mesh.vertices_mm.astype(np.float64) @ device.rotation.T + device.translation_mm)
     at_home = replace(device, rotation=np.eye(3), translation_mm=np.zeros(3))
@@ -68,7 +66,8 @@ def organised(
     given = pack_device(at_home), seen, project(at_home, seen), faces, sight
     at_least = max(_FACES_AT_LEAST, -(-len(faces) // _MOST_BANDS))
     _, face = merge_depth_buffers(in_bands(_nearest, len(faces), *given, rows_at_least=at_least))
-    cause = np.where((refused == 0) & (face < 0), np.uint8(len(causes)), refused)
+    # The map of causes was made of triangles in the image, whose edges a lens bends; and older ones do not say it.
+    cause = np.where((refused == 0) & (face < 0), np.uint8(causes.index(_NO_SURFACE)), refused)
     points_mm, normals = (np.full((high, wide, 3), np.nan, dtype=np.float32) for _ in range(2))
     cloud = OrganisedCloud(
         camera=camera,
@@ -79,7 +78,7 @@ def organised(
         colour=np.zeros((high, wide, 3), dtype=np.uint8),
         mark=np.zeros((high, wide), dtype=np.uint8),
         cause=cause,
-        causes=(*causes, NO_SURFACE),
+        causes=tuple(causes),
     )
     of_mesh = mesh.vertices_mm, mesh.normals, mesh.sigma_mm, mesh.colour, mesh.mark
     of_cloud = cloud.points_mm, cloud.normals, cloud.sigma_mm, cloud.colour, cloud.mark

@@ -70,6 +70,7 @@ _CAUSES: Mapping[Refusal, tuple[tuple[int, int, int], str]] = {
         (60, 20, 220),
         "columns and rows contradict each other: a mirror image, or the object moved between them",
     ),
+    Refusal.NO_SURFACE: ((60, 200, 150), "decoded, but outside the mesh: a hole, or a border that was cut"),
 }
 
 
@@ -111,7 +112,9 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
     refusals : (H, W) uint8, `Refusal`.
     white : (H, W) the white frame, shown where a pixel was not refused; `full_scale` its saturated value.
     """
-    palette = np.array([_CAUSES[cause][0] for cause in Refusal], dtype=np.uint8)
+    palette = np.zeros((max(Refusal) + 1, 3), dtype=np.uint8)
+    for cause in Refusal:
+        palette[cause] = _CAUSES[cause][0]
     picture = np.take(palette, refusals, axis=0)
     if white is not None:
         grey, _ = _displayed(white, full_scale, Size(white.shape[1], white.shape[0]))
@@ -121,7 +124,7 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
     height = max(size.height_px, _LEAST_ROWS)
     page = np.full((height, size.width_px + _LEGEND_PX, 3), _PAGE, dtype=np.uint8)
     page[: size.height_px, : size.width_px] = picture
-    _draw_legend(page, size.width_px + 16, np.bincount(refusals.ravel(), minlength=len(Refusal)))
+    _draw_legend(page, size.width_px + 16, np.bincount(refusals.ravel(), minlength=max(Refusal) + 1))
     return page
 
 
@@ -182,10 +185,10 @@ def described_causes() -> list[dict[str, str]]:
     >>> described_causes()[Refusal.SATURATED]["colour"]
     '#f0e442'
     """
-    return [
-        {"name": cause.name.lower(), "words": words, "colour": f"#{red:02x}{green:02x}{blue:02x}"}
-        for cause, ((blue, green, red), words) in sorted(_CAUSES.items())
-    ]
+    described = [{"name": "", "words": "not in use", "colour": "#000000"} for _ in range(max(Refusal) + 1)]
+    for cause, ((blue, green, red), words) in _CAUSES.items():
+        described[cause] = {"name": cause.name.lower(), "words": words, "colour": f"#{red:02x}{green:02x}{blue:02x}"}
+    return described
 
 
 def encode_png(image: Picture) -> bytes:

@@ -85,12 +85,14 @@ class ReconstructionPlan:
     smooth_boundary : shrink and smooth the boundary of the mesh (paper, section 3.4).
     axis : of the light to triangulate by, `Axis` or its value; None the one that crosses the baseline more steeply.
     region : what of the scene is measured; None for all that the devices see.
+    drop_finest_bits : number of finest bits of the code not to read where its edges give the points, beside those that
+    the camera does not resolve.
 
     Raises
     ------
     ConfigError
-        depth_edge_ratio is not above 1 and finite, max_code_gap is below 1, flip_rule is none of `FlipRule`, or axis
-        none of `Axis`.
+        depth_edge_ratio is not above 1 and finite, max_code_gap is below 1, flip_rule is none of `FlipRule`, axis none
+        of `Axis`, or drop_finest_bits below 0.
     """
 
     keep_holes: bool = False
@@ -100,6 +102,7 @@ class ReconstructionPlan:
     smooth_boundary: bool = True
     axis: Axis | None = None
     region: Region | None = None
+    drop_finest_bits: int = 0
 
     def __post_init__(self) -> None:
         if not 1 < self.depth_edge_ratio < math.inf:
@@ -111,6 +114,12 @@ class ReconstructionPlan:
         if self.max_code_gap < 1:
             message = (
                 f"max_code_gap: expected 1 or more, found {self.max_code_gap}; 1 meshes each curve with the next one"
+            )
+            raise ConfigError(message)
+        if self.drop_finest_bits < 0:
+            message = (
+                f"drop_finest_bits: expected 0 or more, found {self.drop_finest_bits}; 0 reads every bit that the "
+                "camera resolves"
             )
             raise ConfigError(message)
         try:

@@ -35,7 +35,7 @@ from slrig.reconstruction import (
 from slrig.scan.agreement import agreement_report, axis_error
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.colouring import albedo_report, coloured
-from slrig.scan.coverage import covered_share, layered_share
+from slrig.scan.coverage import covered_share, layered_share, with_uncovered_refused
 from slrig.scan.limited import marked, within
 from slrig.scan.losses import Stage, coverage_notes, require_coverage, require_surface
 from slrig.scan.measured import Walked, measured
@@ -64,7 +64,7 @@ from slrig.scan.report import (
 )
 from slrig.scan.soundness import fault_notes, layer_notes, truth_notes
 from slrig.scan.stream import CameraResult, LiveScan
-from slrig.scan.triangulated import Triangulated, steps, widest_gap_px
+from slrig.scan.triangulated import Triangulated, steps
 
 _BETWEEN = frozenset({"read bundle", "check frames"})
 """What is done with each frame between other stages."""
@@ -178,10 +178,14 @@ def reconstruct_into(
 
     with report_compilations(compiling), ThreadPoolExecutor(1, thread_name_prefix="slrig-pictures") as beside:
         entered("read bundle", 0.0, str(bundle))
-        walked, found = measured(bundle, calibration, live, entered, axis=plan.axis, region=plan.region, judged=judged)
+        walked, found = measured(
+            bundle, calibration, live, entered, axis=plan.axis, region=plan.region, judged=judged,
+            drop_finest_bits=plan.drop_finest_bits,
+        )  # fmt: skip
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
-        covered = covered_share(mesh, cameras[0])
+        cameras = [with_uncovered_refused(mesh, seen) for seen in cameras]
+        covered = covered_share(cameras[0])
         require_coverage(bundle, cameras, covered)
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         # One at a time: each is as large as the mesh.
@@ -260,8 +264,9 @@ def _meshed(
     require_surface(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras, stage=Stage.GEOMETRY)
     count = f"{len(points.points_mm)} points"
     projector = walked.devices.projector
-    gap_px = widest_gap_px(projector, axis)
-    beside = steps(cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=gap_px)
+    beside = steps(
+        cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=found.widest_gap_px
+    )
     sampling = sampling_mm(points.points_mm, first.device, projector, axis, beside.at_points_px)
     second = cameras[found.second].device if projector is None else projector
     views = Viewpoints(

@@ -62,7 +62,7 @@ class Stopwatch:
 
 def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -> dict[str, object]:
     """One camera's part: pixels by cause, stripes, noise; and what each exposure of a bracket gave to good pixels."""
-    counts = np.bincount(curves.refusal.ravel(), minlength=len(Refusal))
+    counts = np.bincount(curves.refusal.ravel(), minlength=max(Refusal) + 1)
     bracket: dict[str, object] = {"exposures": [asdict(each) for each in exposures]} if exposures else {}
     if any(abs(each.light - 1) > _MOST_OFF for each in exposures):
         bracket["exposures_note"] = (
@@ -71,6 +71,7 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
         )
     return bracket | {
         "decoded_pixels": curves.decoded_pixels,
+        "measured_pixels": int(counts[Refusal.NONE]),
         "refused_pixels": {cause.name.lower(): int(counts[cause]) for cause in Refusal if cause is not Refusal.NONE},
         "lit_by_unresolved_bits": share_by_bits(curves),
         "lit_without_lines": round(lit_share(curves, curves.unresolved_lines), 4),

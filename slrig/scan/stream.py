@@ -45,6 +45,7 @@ from slrig.reconstruction import (
     CameraStream,
     CodeTables,
     Correspondences,
+    DecodingLimits,
     ExposureUse,
     FrameStacks,
     FusedFrames,
@@ -120,7 +121,8 @@ class ScanStream:
     """Reconstructs the curves of every camera while frames come, along `axis` or the one that `chosen_axis` chooses.
 
     Frames that are not needed are let go. one_exposure : every camera takes all frames with one; otherwise all wait for
-    the end. region : what of the scene is asked for; None for all.
+    the end. region : what of the scene is asked for; None for all. drop_finest_bits : as in
+    `slrig.scan.plan.ReconstructionPlan`.
 
     Raises
     ------
@@ -139,7 +141,9 @@ class ScanStream:
         axis: Axis | None = None,
         one_exposure: bool = True,
         region: Region | None = None,
+        drop_finest_bits: int = 0,
     ) -> None:
+        limits = ReconstructionLimits(decoding=DecodingLimits(drop_finest_bits=drop_finest_bits))
         self.header = header
         self.region = region
         devices = [calibration.cameras[name] for name in header.cameras]
@@ -153,7 +157,9 @@ class ScanStream:
             if region is not None:
                 device, projector = calibration.cameras[name], calibration.projector
                 part = frame_part(region, name, form, device, projector, self.axis)
-            self._cameras[name] = _CameraFrames(name, header, self.axis, entered, part, one_exposure=one_exposure)
+            self._cameras[name] = _CameraFrames(
+                name, header, self.axis, entered, limits, part, one_exposure=one_exposure
+            )
 
     def take(self, shot: Shot) -> None:
         """Take one frame."""
@@ -221,6 +227,7 @@ class _CameraFrames:
         header: CaptureHeader,
         axis: Axis,
         entered: Entered,
+        limits: ReconstructionLimits,
         part: FramePart | None = None,
         *,
         one_exposure: bool,
@@ -230,6 +237,7 @@ class _CameraFrames:
         if part is not None:
             header = replace(header, cameras={**header.cameras, name: part.form})
         self._name = name
+        self._limits = limits
         self._axis = axis
         self._header = header
         self._entered = lambda stage: entered(stage, name)
@@ -255,9 +263,7 @@ class _CameraFrames:
                 reference_repeats=reference_repeats(used, axis),
             )
             tables = _tables(patterns.gray, patterns.lines, header.projector)
-            self._stream = CameraStream(
-                stacks, tables, ReconstructionLimits(), report_step=self._entered, region=self._asked
-            )
+            self._stream = CameraStream(stacks, tables, self._limits, report_step=self._entered, region=self._asked)
             if (second := self._second_patterns()) is not None:
                 self._second = FrameStacks(second, form.size.shape, full_scale=float(form.full_scale))
 
@@ -311,9 +317,7 @@ class _CameraFrames:
             if second is not None:
                 self._second = FrameStacks.from_frames(axis_frames(capture, self._name, second.gray.axis))
         tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
-        curves = camera_curves(
-            frames, tables, ReconstructionLimits(), report_step=self._entered, noise=noise, region=self._asked
-        )
+        curves = camera_curves(frames, tables, self._limits, report_step=self._entered, noise=noise, region=self._asked)
         return curves, frames, fused
 
     def _second_patterns(self) -> AxisPatterns | None:

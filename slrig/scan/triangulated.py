@@ -31,10 +31,11 @@ from slrig.reconstruction import (
 from slrig.scan.agreement import leave_out_contradicted
 from slrig.scan.limited import limited
 from slrig.scan.mirror_images import NO_MIRROR_IMAGES, MirrorImages, refuse_mirror_images
-from slrig.scan.report import lit_share
+from slrig.scan.report import lit_pixels, lit_share
 from slrig.scan.stream import CameraResult
 
 _WIDEST_GAP_PX = 4.0
+_WIDEST_GAP_STEPS = 2.5  # of the usual distance of two points along a curve
 _STEEP_ENOUGH = 0.5  # of the pair whose stripes cross its epipolar lines most steeply: errors twice its at most
 
 
@@ -46,6 +47,7 @@ class Triangulated:
     share_across : 0 to 1, the sine of the angle between the stripes and the baseline: by the calibration, or without a
     projector as the median over the image. second : index of the camera that the first is paired with, without one.
     mirror_images : those of several cameras, which were left out before their points were merged.
+    widest_gap_px : of the function of that name.
     """
 
     joined: MergedCurves
@@ -54,6 +56,7 @@ class Triangulated:
     share_across: float
     second: int = 1
     mirror_images: MirrorImages = NO_MIRROR_IMAGES
+    widest_gap_px: float = _WIDEST_GAP_PX
 
 
 def triangulated(
@@ -94,11 +97,11 @@ def triangulated(
         images = NO_MIRROR_IMAGES
         if len(parts) > 1:
             parts, told, images = refuse_mirror_images(parts, told, projector, axis)
-        gap = widest_gap_px(projector, axis)
+        gap = widest_gap_px(projector, axis, parts)
         spare = evaluate_redundancy(parts, devices, axis, widest_gap_px=gap)
         joined = merge_curves(parts, projector.centre_mm, widest_gap_px=gap)
         share_across = baseline_fraction(axis, list(devices.values()), projector)
-        return Triangulated(joined, spare, _without_points(told), share_across, mirror_images=images)
+        return Triangulated(joined, spare, _without_points(told), share_across, mirror_images=images, widest_gap_px=gap)
     first, *others = cameras
     mine = first.curves.ensemble
     crossing = [stripe_crossing(mine, first.device, seen.device) for seen in others]
@@ -109,10 +112,10 @@ def triangulated(
     if region is not None:
         best, first = _limited(region, first, best)
         cameras = [first, *others]
-    gap = widest_gap_px(None, axis)
+    gap = widest_gap_px(None, axis, [best])
     spare = evaluate_redundancy([best], devices, axis, widest_gap_px=gap)
     joined = merge_curves([best], first.device.centre_mm, widest_gap_px=gap)
-    return Triangulated(joined, spare, _without_points(cameras), crossing[second], 1 + second)
+    return Triangulated(joined, spare, _without_points(cameras), crossing[second], 1 + second, widest_gap_px=gap)
 
 
 def _without_points(cameras: Sequence[CameraResult]) -> list[CameraResult]:
@@ -121,16 +124,19 @@ def _without_points(cameras: Sequence[CameraResult]) -> list[CameraResult]:
     ]
 
 
-def widest_gap_px(projector: Pinhole | None, axis: Axis) -> float:
+def widest_gap_px(projector: Pinhole | None, axis: Axis, parts: Sequence[SheetCurves]) -> float:
     """Steps along a light sheet between two points of one camera up to which the curve between them counts as seen;
     without a projector, camera pixels.
 
-    Where the projector is addressed more finely along the sheet than across it, a camera's pixel covers more of them.
+    Where the projector is addressed more finely along the sheet than across it, or than a camera resolves, a pixel of
+    the camera covers more of them.
     """
-    if projector is None:
-        return _WIDEST_GAP_PX
-    across, along = (0, 1) if axis is Axis.COLUMN else (1, 0)
-    return _WIDEST_GAP_PX * max(1.0, float(projector.matrix[along, along] / projector.matrix[across, across]))
+    widest = _WIDEST_GAP_PX
+    if projector is not None:
+        across, along = (0, 1) if axis is Axis.COLUMN else (1, 0)
+        widest *= max(1.0, float(projector.matrix[along, along] / projector.matrix[across, across]))
+    usual = [float(np.median(np.abs(np.diff(part.along_px)))) for part in parts if len(part.along_px) > 1]
+    return max([widest, *(_WIDEST_GAP_STEPS * each for each in usual)])
 
 
 def _on_sheets(
@@ -247,8 +253,10 @@ def camera_notes(cameras: Sequence[CameraResult]) -> list[str]:
     return notes
 
 
-def unresolved_notes(cameras: Sequence[CameraResult], step_px: float, cell_px: float) -> list[str]:
-    """One sentence for each camera that does not resolve the finest patterns on a part of what is lit."""
+def unresolved_notes(cameras: Sequence[CameraResult], step_px: float, cell_px: float, *, dropped: int = 0) -> list[str]:
+    """One sentence for each camera that does not resolve the finest patterns on a part of what is lit, and one for
+    finest bits that were dropped by hand.
+    """
     notes = []
     for seen in cameras:
         share = lit_share(seen.curves, seen.curves.unresolved_lines)
@@ -260,11 +268,19 @@ def unresolved_notes(cameras: Sequence[CameraResult], step_px: float, cell_px: f
                 f"{setting('line_shift_period_px')}"
             )
         elif seen.curves.unresolved is not None and seen.curves.unresolved_lines is None:
-            share = lit_share(seen.curves, seen.curves.unresolved > 0)
+            share = lit_share(seen.curves, seen.curves.unresolved > dropped)
             if share >= _WORTH_TELLING:
+                here = lit_pixels(seen.curves) & (seen.curves.unresolved > dropped)
+                bits = int(np.median(seen.curves.unresolved[here]))
+                which, them = ("finest Gray bit", "it is") if bits == 1 else (f"{bits} finest Gray bits", "they are")
                 notes.append(
-                    f"camera '{seen.name}' does not resolve the finest Gray bit on {share:.0%} of what is lit: "
-                    f"it is left out there, and the surface is sampled every {2 * step_px:g} projector pixels or "
-                    f"wider. Look at focus and resolution, or play wider cells: {setting('gray_cell_px')}"
+                    f"camera '{seen.name}' does not resolve the {which} on {share:.0%} of what is lit: "
+                    f"{them} left out there, and the surface is sampled every {2**bits * step_px:g} projector pixels "
+                    f"or wider. Look at focus and resolution, or play wider cells: {setting('gray_cell_px')}"
                 )
+    if dropped and any(seen.curves.unresolved is not None for seen in cameras):
+        notes.append(
+            f"the {dropped} finest bits of the code were not read, as {setting('drop_finest_bits')} asks: points lie "
+            f"every {2**dropped * cell_px:g} projector pixels or wider where the code gives them"
+        )
     return notes

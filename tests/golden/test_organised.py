@@ -22,7 +22,7 @@ import trimesh
 from slrig.bundle.calibration import read_calibration
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import read_bundle
-from slrig.model import FloatArray, Pinhole, White
+from slrig.model import FloatArray, Pinhole, Refusal, White
 from slrig.scan.artefacts import decode_mesh_ply, write_converted
 from slrig.scan.cloud_files import cloud_file
 from slrig.scan.offered import requested_forms
@@ -84,11 +84,12 @@ def test_a_point_is_there_where_there_is_no_cause_against_it(scan: Clouds, camer
         assert (np.isnan(cloud[name]).all(axis=2) == (cloud["cause"] != 0)).all(), name
     assert (np.isfinite(cloud["sigma_mm"]) == (cloud["cause"] == 0)).all()
     refused = np.asarray(cv2.imread(str(scan.folder / f"causes-{camera}.png"), cv2.IMREAD_UNCHANGED))
-    assert cloud["causes"].tolist() == [*(each["name"] for each in scan.report["causes"]), "no_surface"]
+    assert cloud["causes"].tolist() == [each["name"] for each in scan.report["causes"]]
     np.testing.assert_array_equal(cloud["cause"][refused != 0], refused[refused != 0])
-    assert set(np.unique(cloud["cause"][refused == 0])) == {0, len(scan.report["causes"])}
+    # Only at borders of the mesh, whose edges the lens bends, do the two differ.
+    assert (cloud["cause"][refused == 0] == 0).mean() > 0.999
     # The mesh covers what was measured but for its borders.
-    assert (cloud["cause"] == 0).sum() > 0.97 * (refused == 0).sum()
+    assert (cloud["cause"] == 0).sum() > 0.97 * np.isin(refused, (Refusal.NONE, Refusal.NO_SURFACE)).sum()
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

@@ -71,7 +71,7 @@ def test_both_halves_are_covered(tmp_path: Path) -> None:
     assert truth["false_area_0.5mm"] == 0
     assert truth["nonmanifold_edges"] == truth["misoriented_edges"] == 0
     assert report["mesh"]["covers_of_decoded"] >= 0.95
-    assert any("does not resolve the finest Gray bit" in note for note in report["notes"])
+    assert any("does not resolve the 2 finest Gray bits" in note for note in report["notes"])
     assert not any("the mesh covers" in note for note in report["notes"])
     # A limit at depth edges that takes most triangles for such makes a thin mesh, which is told.
     report = reconstructed(rig.parent / "bundle", tmp_path / "thin", ReconstructionPlan(depth_edge_ratio=1.2))

@@ -261,6 +261,7 @@ def requests(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
             {"reconstruction": {"depth_edge_ratio": 9.0, "max_code_gap": 2}},
         ),
         (["--axis", "row"], {"reconstruction": {"axis": "row"}}),
+        (["--drop-finest-bits", "2"], {"reconstruction": {"drop_finest_bits": 2}}),
         (["--exposure-s", "0.02"], {"exposure_s": 0.02}),
         (["--exposure-s", "0.02", "--exposure-s", "0.08"], {"exposures_s": [0.02, 0.08]}),
     ],

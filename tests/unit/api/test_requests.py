@@ -159,6 +159,7 @@ def test_plan_is_the_request_over_the_rig_file_over_the_default(client: TestClie
         "flip_rule": "delaunay",
         "smooth_boundary": True,
         "axis": None,
+        "drop_finest_bits": 0,
     }
     # The rig file's exposure belongs to its cameras, not to the plan.
     assert (plan["exposures_s"], plan["exposure_s"]) == ([0.08, 0.02], None)

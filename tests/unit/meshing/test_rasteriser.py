@@ -8,7 +8,7 @@ from numba import config
 from numpy.typing import NDArray
 
 from slrig.meshing import rasteriser
-from slrig.meshing.rasteriser import depth_ranges, rasterise, rasterise_normals
+from slrig.meshing.rasteriser import covered_pixels, depth_ranges, rasterise, rasterise_normals
 from slrig.model import FloatArray, IntArray, Size
 from tests.unit.meshing.plain import grid_faces
 
@@ -63,6 +63,16 @@ def test_the_view_is_that_of_trying_every_triangle_at_every_pixel(
     assert 0.2 < (which >= 0).mean() < 1
     assert view.depth_mm == pytest.approx(depth, nan_ok=True)
     assert np.array_equal(view.face, which)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_pixel_is_covered_if_any_triangle_is_seen_there(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    share_out(monkeypatch, threads)
+    placed, faces, _ = random_triangles()
+    placed[faces[3, 0], 2] = -1.0
+    covered = covered_pixels(placed, faces, SIZE)
+    assert 0.2 < covered.mean() < 1
+    assert np.array_equal(covered, rasterise(placed, faces, SIZE).face >= 0)
 
 
 def test_normals_are_those_of_the_triangle_that_is_seen_on_the_side_that_is_seen() -> None:

@@ -34,6 +34,11 @@ def test_where_a_curve_ends_its_neighbours_are_joined() -> None:
     assert parts(places, places[:3], places, widest_step_px=1.0) == [[0, 5, 6, 8], [6, 8, 9, 14]]
 
 
+def test_curves_without_neighbours_have_no_runs() -> None:
+    assert parts([0.0, 1.0, 2.0]) == []
+    assert parts([0.0, 4.0, 8.0], [0.0, 4.0, 8.0]) == []
+
+
 def test_a_gap_in_a_curve_is_closed_by_its_neighbours() -> None:
     places = [float(k) for k in range(10)]
     torn = [0.0, 1.0, 2.0, 7.0, 8.0, 9.0]

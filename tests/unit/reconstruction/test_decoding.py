@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slrig.errors import PatternError
 from slrig.model import Axis, Gray, IntArray, NoiseModel, Refusal
 from slrig.patterns.codes import index_of_word
-from slrig.reconstruction.decoding import CodeMap, DecodingLimits, cells_beyond, decode
+from slrig.reconstruction.decoding import CodeMap, DecodingLimits, cells_beyond, decode, decode_edges
 from slrig.reconstruction.frames import AxisFrames
 from tests.unit.reconstruction.builders import code_frames
 
@@ -79,7 +80,8 @@ def expected(frames: AxisFrames, noise: NoiseModel, cells: int, limits: Decoding
                 other = float(frames.inverses[b][y, x])
                 difference = seen - other
                 clipped |= min(seen, other) >= frames.full_scale
-            margin = max(limits.bit_sigma * spread, limits.bit_fraction * (white - black))
+            deviation = spread if frames.inverses is not None else 2 * (0.75 * spread**2) ** 0.5
+            margin = max(limits.bit_sigma * deviation, limits.bit_fraction * (white - black))
             choices.append((0, 1) if abs(difference) < margin else (int(difference > 0),))
         possible = sorted(cell_of[word] for word in product(*choices))
         if clipped:
@@ -187,6 +189,51 @@ READ: dict[str, tuple[AxisFrames, tuple[int, int], Refusal]] = {
 def test_a_pixel_is_read_as_an_interval_or_refused_for_one_cause(case: str) -> None:
     frames, interval, refusal = READ[case]
     assert read(frames, cells=40) == (*interval, refusal)
+
+
+@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "threshold"])
+def test_a_bit_is_certain_from_three_standard_deviations_of_what_it_is_compared_by(*, paired: bool) -> None:
+    # Of a bit and its inverse, or of a bit and of the middle of white and black.
+    deviation = (1 + (1 if paired else 1 / 2)) ** 0.5
+    cell = 20
+    for sigmas, wide in ((2.9, True), (3.1, False)):
+        swings = swings_of(cell)
+        half_contrast = 15.0
+        off = sigmas * deviation / half_contrast / (2 if paired else 1)
+        swings[5] = off if swings[5] > 0 else -off
+        seen = one_pixel(swings, white=50.0, black=20.0, paired=paired)
+        low, high, _ = read(seen)
+        assert (high > low) == wide
+
+
+def spread_of_read(frames: AxisFrames, limits: DecodingLimits = LIMITS) -> tuple[int, int, Refusal, int]:
+    """(lowest, highest, refusal, bits not read) of the only pixel, for positions on code edges."""
+    code, unread = decode_edges(frames, QUIET, WORDS, 64, limits)
+    return int(code.lowest[0, 0]), int(code.highest[0, 0]), Refusal(int(code.refusal[0, 0])), int(unread[0, 0])
+
+
+def test_a_pixel_leaves_out_the_finest_bits_until_its_interval_is_narrow() -> None:
+    # Bit 3 changes between cells 19 and 20, not at 21, so that cell 18 is possible, too.
+    doubtful = with_bits(21, b3=0.0)
+    assert read(doubtful) == (18, 21, Refusal.NONE)
+    assert spread_of_read(doubtful) == (18, 21, Refusal.NONE, 0)
+    # Bit 2: cell 21, or 26 beyond its edge at 24.
+    doubtful = with_bits(21, b2=0.0)
+    assert read(doubtful) == (*REFUSED, Refusal.AMBIGUOUS_BIT)
+    assert spread_of_read(doubtful) == (20, 27, Refusal.NONE, 2)
+    # Bits coarser than that say nothing of the place.
+    assert spread_of_read(with_bits(5, b0=0.0)) == (*REFUSED, Refusal.AMBIGUOUS_BIT, 0)
+    # One in doubt at its own edge leaves nothing out.
+    assert spread_of_read(with_bits(31, b0=0.0)) == (31, 32, Refusal.NONE, 0)
+
+
+def test_bits_dropped_by_hand_are_not_read() -> None:
+    limits = DecodingLimits(bit_fraction=0.0813, drop_finest_bits=2)
+    assert spread_of_read(with_bits(21), limits) == (20, 23, Refusal.NONE, 2)
+    assert spread_of_read(with_bits(21, b4=0.0, b5=0.0), limits) == (20, 23, Refusal.NONE, 2)
+    assert decode(with_bits(21), QUIET, WORDS, 64, limits).highest[0, 0] == 21
+    with pytest.raises(PatternError, match="expected at most 3 for a code of 6 bits, found 4"):
+        spread_of_read(with_bits(21), DecodingLimits(drop_finest_bits=4))
 
 
 def test_the_centre_of_an_interval_is_nan_where_refused() -> None:

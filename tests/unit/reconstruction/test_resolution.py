@@ -15,6 +15,7 @@ from slrig.reconstruction.decoding import (
     CodeMap,
     _cells_per_block,
     _count_passages,
+    _follow_neighbours,
     unresolved_bits,
     unresolved_lines,
 )
@@ -58,9 +59,29 @@ def ramp(*columns_per_px: float, rows: int = 128, width: int = 192) -> NDArray[n
 LIT = np.ones((128, 192), dtype=np.bool_)
 
 
-@pytest.mark.parametrize(("columns_per_px", "bits"), [(0.3, 0), (0.8, 0), (1.4, 1), (2.6, 2)])
+@pytest.mark.parametrize(
+    ("columns_per_px", "bits"), [(0.3, 0), (0.8, 0), (1.4, 1), (2.6, 2), (6.7, 3), (8.4, 4), (12.0, 4)]
+)
 def test_a_bit_is_resolved_where_two_of_its_edges_have_two_pixels(columns_per_px: float, bits: int) -> None:
-    assert (unresolved_bits(frames(ramp(columns_per_px)), LIT) == bits).mean() > 0.95
+    seen = ramp(columns_per_px, width=min(192, int(900 / columns_per_px)))
+    assert (unresolved_bits(frames(seen), np.ones(seen.shape, dtype=np.bool_)) == bits).mean() > 0.95
+
+
+def test_a_bit_that_hardly_swings_is_unresolved_however_right_it_is() -> None:
+    seen = frames(ramp(0.5), noise=0.0)
+    assert seen.inverses is not None
+    for images in (seen.bits, seen.inverses):
+        images[-1][:] = 85 + 0.04 * (images[-1] - 85)
+    assert (unresolved_bits(seen, LIT) == 1).all()
+
+
+def test_a_block_is_judged_as_its_neighbours_are() -> None:
+    counts = np.array([[3, 3, 3, 1], [3, 0, 3, 1], [3, 3, 3, 1], [0, 0, 1, 1]], dtype=np.uint8)
+    judged = counts > 0
+    judged[1, 1] = True
+    found = _follow_neighbours(counts, judged)
+    assert found.tolist() == [[3, 3, 3, 1], [3, 3, 3, 1], [3, 3, 3, 1], [3, 3, 1, 1]]
+    assert not _follow_neighbours(np.zeros_like(counts), np.zeros_like(judged)).any()
 
 
 def test_a_bit_in_noise_is_unresolved_for_any_width_of_cells() -> None:

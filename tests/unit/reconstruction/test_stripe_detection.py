@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, gaussian_filter
+from scipy.special import ndtr
 
 from slrig.model import FloatArray
 from slrig.reconstruction.stripes import (
@@ -21,6 +22,7 @@ from slrig.reconstruction.stripes import (
     StripeLimits,
     Stripes,
     chain_stripes,
+    edge_points,
     gaussian_kernels,
     newton_step,
     stripe_points,
@@ -148,7 +150,8 @@ def test_the_second_step_is_a_correlation_with_kernels_centred_on_the_point(kind
     offset = rng.uniform(-0.6, 0.6, (40, 50, 2)).astype(np.float32)
     drawn = rng.permutation(2000)[:900]
     columns, rows = (drawn % 50).astype(np.int32), (drawn // 50).astype(np.int32)
-    x, y, normals, strength, kept = newton_step(image, offset, columns, rows, sigma, kind)
+    x, y, normals, strength, bend, kept = newton_step(image, offset, columns, rows, sigma, kind)
+    assert (bend != 0).any() == (kind == EDGE)
     for i in range(900):
         pixel = (int(columns[i]), int(rows[i]))
         start = np.array(pixel) + offset[pixel[1], pixel[0]].astype(np.float64)
@@ -186,13 +189,13 @@ def test_second_step_ends_with_the_image(kind: int, beyond: tuple[int, int]) -> 
     rows, columns = np.arange(10, 30, dtype=np.int32), rng.integers(10, 30, 20).astype(np.int32)
     offset = np.zeros((40, 40, 2), dtype=np.float32)
     wanted = newton_step(wide, offset, columns, rows, 1.3, kind)
-    assert wanted[4].any()
+    assert wanted[5].any()
     for i in range(len(rows)):
         top, left = rows[i] - 5 - beyond[0], columns[i] - 5 - beyond[1]
         cut = np.ascontiguousarray(wide[top : rows[i] + 6, left : columns[i] + 6])
         at = np.array([5 + beyond[1]], dtype=np.int32), np.array([5 + beyond[0]], dtype=np.int32)
-        x, y, normals, response, kept = newton_step(cut, offset[: len(cut), : cut.shape[1]].copy(), *at, 1.3, kind)
-        assert kept[0] == wanted[4][i]
+        x, y, normals, response, _, kept = newton_step(cut, offset[: len(cut), : cut.shape[1]].copy(), *at, 1.3, kind)
+        assert kept[0] == wanted[5][i]
         if kept[0]:
             np.testing.assert_allclose([x[0] + left, y[0] + top], [wanted[0][i], wanted[1][i]], atol=1e-10)
             np.testing.assert_allclose(normals[0], wanted[2][i], atol=1e-10)
@@ -271,3 +274,44 @@ def test_stripes_of_several_frames_stand_in_the_frames_order() -> None:
     }
     for point, normal, sigma in zip(stripes.points_px, stripes.normals, stripes.sigma_px, strict=True):
         assert every[tuple(point)] == (*normal, sigma)
+
+
+def edge_errors(light: NDArray[np.float64], truth_px: NDArray[np.float64], noise: float) -> FloatArray:
+    """Errors of the edges of a bit less its inverse, (n,), over their standard deviations: across, px.
+
+    light : (H, W), -1 to 1; truth_px : (H, W), distance of each pixel centre from the nearest edge along the row.
+    """
+    rng = np.random.default_rng(8)
+    image = (light + rng.normal(0, noise, light.shape)).astype(np.float32)
+    lit = np.zeros(light.shape, dtype=np.bool_)
+    lit[6:-6, 6:-6] = True
+    points = edge_points(image, np.full(light.shape, noise, np.float32), lit, StripeLimits(), filter_px=1.0)
+    columns, rows = np.rint(points.points_px).astype(int).T
+    off = truth_px[rows, columns] + points.points_px[:, 0] - columns
+    return np.asarray(off * np.abs(points.normals[:, 0]) / points.sigma_px)
+
+
+@pytest.mark.parametrize(
+    ("first_px", "growth", "blur_px"),
+    [(40.0, 0.0, 0.6), (40.0, 0.0, 0.1), (3.0, 0.0, 0.6), (3.3, 0.0, 0.2), (6.0, 0.02, 0.6), (2.4, 0.01, 0.3)],
+    ids=["wide", "sharp", "narrow", "narrow and sharp", "wider and wider", "narrow, wider and wider"],
+)
+def test_the_deviation_of_an_edge_holds_for_narrow_sharp_and_uneven_stripes(
+    first_px: float, growth: float, blur_px: float
+) -> None:
+    columns = np.arange(200.0)
+    edges = np.cumsum(first_px * (1 + growth) ** np.arange(200)) - 20.0
+    edges = edges[edges < 240]
+    # Slightly slanted, so that edges pass through all parts of a pixel.
+    off = columns[:, None] - edges - 0.06 * np.arange(160)[:, None, None]
+
+    def integral(u: FloatArray) -> FloatArray:
+        """Of the normal distribution."""
+        return u * ndtr(u) + np.exp(-(u**2) / 2) / math.sqrt(2 * math.pi)
+
+    passed = blur_px * (integral((off + 0.5) / blur_px) - integral((off - 0.5) / blur_px))
+    light = 2 * passed @ (-1.0) ** np.arange(len(edges)) - 1
+    truth_px = np.take_along_axis(off, np.abs(off).argmin(axis=2)[..., None], axis=2)[..., 0]
+    error = edge_errors(light, truth_px, 0.012)
+    assert 0.5 <= np.percentile(np.abs(error), 68.27) <= 1.4
+    assert np.percentile(np.abs(error), 95.45) <= 3.0

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
 from slrig.scan import organised as module
 from slrig.scan.cloud_formats import encode_depth_tiff, encode_npz, encode_pcd
-from slrig.scan.organised import NO_SURFACE, OrganisedCloud, organised
+from slrig.scan.organised import OrganisedCloud, organised
+from slrig.scan.pictures import described_causes
 
 SIZE = Size(48, 40)
-CAUSES = [cause.name.lower() for cause in Refusal]
+CAUSES = [each["name"] for each in described_causes()]
 BARREL = (-0.35, 0.12, 0.004, -0.003, 0.01)
 LENSES = [(0.0,) * 5, BARREL, (0.25, 0.05, -0.002, 0.001, 0.0)]
 
@@ -77,7 +78,7 @@ def plain_cloud(mesh: Mesh, device: Pinhole, refused: NDArray[np.uint8]) -> dict
         met = (u >= 0) & (v >= 0) & (u + v <= 1) & (depth > 0) & (depth < nearest)
         nearest[met], which[met] = depth[met], number
         weights[met] = np.stack((1 - u - v, u, v), axis=1)[met]
-    cause = np.where(refused.ravel() != 0, refused.ravel(), np.where(which < 0, len(CAUSES), 0))
+    cause = np.where(refused.ravel() != 0, refused.ravel(), np.where(which < 0, int(Refusal.NO_SURFACE), 0))
     weights[cause != 0] = np.nan
     corners = mesh.faces[which]
     normals = np.einsum("nk,nkc->nc", weights, mesh.normals[corners].astype(np.float64))
@@ -149,9 +150,9 @@ def test_a_hole_is_told_apart_from_what_the_camera_refused() -> None:
     refused = np.zeros(SIZE.shape, dtype=np.uint8)
     refused[:, :4] = Refusal.NOT_LIT
     cloud = organised(mesh, "left", camera(), refused, CAUSES)
-    assert cloud.causes == (*CAUSES, NO_SURFACE)
+    assert cloud.causes == tuple(CAUSES)
     assert set(np.unique(cloud.cause[:, :4])) == {Refusal.NOT_LIT}
-    assert {cloud.causes[number] for number in np.unique(cloud.cause[:, 4:])} == {"none", NO_SURFACE}
+    assert {cloud.causes[number] for number in np.unique(cloud.cause[:, 4:])} == {"none", "no_surface"}
 
 
 def test_what_lies_behind_or_beside_the_camera_is_not_met() -> None:
@@ -164,7 +165,7 @@ def test_what_lies_behind_or_beside_the_camera_is_not_met() -> None:
     only = mesh_of(around[1:])
     assert (organised(only, "left", camera(), refused, CAUSES).cause == cloud.cause).all()
     empty = mesh_of(np.zeros((0, 3, 3)))
-    assert (organised(empty, "left", camera(), refused, CAUSES).cause == len(CAUSES)).all()
+    assert (organised(empty, "left", camera(), refused, CAUSES).cause == int(Refusal.NO_SURFACE)).all()
 
 
 def test_a_normal_that_is_not_known_stays_unknown() -> None:

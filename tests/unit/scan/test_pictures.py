@@ -195,8 +195,8 @@ def test_every_cause_has_a_colour_of_its_own() -> None:
     assert set(_CAUSES) == set(Refusal)
     assert len({colour for colour, _ in _CAUSES.values()}) == len(Refusal)
     described = described_causes()
-    assert [each["name"].upper() for each in described] == [cause.name for cause in Refusal]
-    assert len({each["words"] for each in described}) == len(Refusal)
+    assert [described[cause]["name"].upper() for cause in Refusal] == [cause.name for cause in Refusal]
+    assert len({described[cause]["words"] for cause in Refusal}) == len(Refusal)
 
 
 def test_refused_pixels_have_their_cause_in_colour_and_legend() -> None:

@@ -11,7 +11,9 @@ from slrig.meshing.surface import compact_mesh
 from slrig.model import AlbedoMark, Axis, FloatArray, Mesh, NoiseModel, Pinhole, Refusal, Size
 from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.pipeline import CameraCurves
+from slrig.reconstruction.triangulation import triangulate_camera_projector
 from slrig.scan.colouring import Coloured, albedo_report, coloured
+from slrig.scan.coverage import covered_share, with_uncovered_refused
 from slrig.scan.stream import CameraResult
 from slrig.scan.triangulated import Triangulated, triangulated, widest_gap_px
 from tests.unit.reconstruction.builders import (
@@ -62,6 +64,41 @@ def seen(name: str, device: Pinhole, ensemble: StripeEnsemble) -> CameraResult:
 
 
 FEW, MANY = np.arange(100.0, 140.0, 1.5), np.arange(80.0, 160.0, 1.5)
+
+
+def test_the_gap_that_counts_as_seen_is_wider_where_a_camera_pixel_covers_many_rows() -> None:
+    def gap_px(row_px: float) -> float:
+        part, _ = triangulate_camera_projector(
+            curves_in(CAMERA, np.arange(80.0, 160.0, row_px)), CAMERA, PROJECTOR, Axis.COLUMN
+        )
+        return widest_gap_px(PROJECTOR, Axis.COLUMN, [part])
+
+    assert gap_px(1.5) == pytest.approx(widest_gap_px(PROJECTOR, Axis.COLUMN, []))
+    assert gap_px(12.0) == pytest.approx(30.0, rel=0.05)
+
+
+def test_decoded_pixels_outside_the_mesh_are_refused_for_that() -> None:
+    at = Size(40, 30)
+    device = looking((0.0, 0.0, -500.0), (0.0, 0.0, 0.0), size=at, focal_px=(100.0, 100.0), distortion=(0,) * 5)
+    camera = seen("left", device, curves_in(CAMERA, FEW))
+    refusal = np.zeros(at.shape, dtype=np.uint8)
+    refusal[:, :10] = Refusal.NOT_LIT
+    refusal[10:20, 15:25] = Refusal.SHADOW_EDGE
+    camera = replace(camera, curves=replace(camera.curves, refusal=refusal))
+    corners = np.array([[-500.0, -500.0, 0.0], [0.0, -500.0, 0.0], [0.0, 500.0, 0.0], [-500.0, 500.0, 0.0]])
+    unseen = np.zeros((4, 3), dtype=np.float32)
+    mesh = compact_mesh(
+        np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32), corners, unseen, unseen.astype(np.uint8),
+        np.zeros(4, dtype=np.uint8), np.ones(4), np.array([0, 4], dtype=np.int32), np.zeros(1),
+    )  # fmt: skip
+    marked = with_uncovered_refused(mesh, camera)
+    expected = refusal.copy()
+    right = np.arange(at.width_px) > 19.5
+    expected[:, right] = np.where(refusal[:, right] == Refusal.NONE, Refusal.NO_SURFACE, refusal[:, right])
+    np.testing.assert_array_equal(marked.curves.refusal, expected)
+    assert covered_share(marked) == (expected == Refusal.NONE).sum() / (refusal == Refusal.NONE).sum()
+    nothing = replace(camera, curves=replace(camera.curves, refusal=np.full_like(refusal, Refusal.NOT_LIT)))
+    assert covered_share(nothing) is None
 
 
 @pytest.mark.slow
@@ -136,9 +173,9 @@ def test_with_a_projector_the_crossing_is_that_of_the_calibration(axis: Axis) ->
 @pytest.mark.parametrize(("axis", "gap_px"), [(Axis.COLUMN, 8.0), (Axis.ROW, 4.0)])
 def test_a_gap_is_as_wide_on_the_surface_where_rows_are_finer(axis: Axis, gap_px: float) -> None:
     fine_rows = replace(PROJECTOR, matrix=np.array([[700.0, 0, 160], [0, 1400.0, 240], [0, 0, 1]]))
-    assert widest_gap_px(fine_rows, axis) == gap_px
+    assert widest_gap_px(fine_rows, axis, []) == gap_px
     square = replace(PROJECTOR, matrix=np.array([[700.0, 0, 160], [0, 700.0, 120], [0, 0, 1]]))
-    assert widest_gap_px(square, axis) == 4.0
+    assert widest_gap_px(square, axis, []) == 4.0
 
 
 # What is made of the albedo of the points: colours, marks at the border of the projector, words in the report
