@@ -38,6 +38,8 @@ CHECK_CABLE = "check the cable"
 
 _MIN_LIT_SAMPLES = 40
 
+_MAX_CHANGE, _MAX_CHANGED_FRACTION = 0.1, 0.01  # of the range of a frame; of the pixels
+
 _REPEAT_TOLERANCE = 0.02
 """Fraction of a frame's own variation. Lines blurred to three times their width differ by more from step to step."""
 
@@ -385,6 +387,14 @@ def reference_change_fault(
         f"{where} changed since this pattern was first shown: the object, the projector or a camera moved, or one of "
         "the two frames was damaged or shows another pattern; hold them still, check the cable, and scan again"
     )
+
+
+def are_exposures_alike(first: Samples, again: Samples) -> bool:
+    """True if two exposures of one pattern differ by noise only, at pixels of the whole image."""
+    change = np.abs(again - first)
+    noise = max(NOISE_FLOOR_DN, 1.4826 * float(np.median(change)))
+    limit = max(8 * noise, _MAX_CHANGE * float(np.ptp(np.percentile(first, (1, 99)))))
+    return bool(np.mean(change > limit) < _MAX_CHANGED_FRACTION)
 
 
 def describe_worst_tested(

@@ -91,13 +91,12 @@ class RetryPolicy:
         return shot if not found or index not in self._resolve(shot, found) else None
 
     def _is_constant(self, found: Contradiction) -> bool:
-        """True if frames differ in light for the third time by the same amount, and none of them is proven wrong: then
-        the rig or the scene is so. They count, and the summary has the contradiction.
+        """True if frames differ in light for the third time, came alike, and none of them is proven wrong: then the rig
+        or the scene is so. They count, and the summary has the contradiction.
         """
-        earlier = [self._causes[found.camera, each] for each in found.suspects]
-        return found.is_doubt and all(
-            len(causes) == MAX_FAILURES - 1 and have_same_cause([*causes, found.cause]) for causes in earlier
-        )
+        failures = [len(self._causes[found.camera, each]) for each in found.suspects]
+        is_last = max(failures, default=0) >= MAX_FAILURES - 1
+        return found.is_doubt and is_last and self.evidence.came_alike(found.camera, found.suspects)
 
     def report_missing(self, camera: str, index: int, cause: str) -> None:
         """Record that no frame came. Raises FrameTimeoutError: none came three times in a row."""

@@ -16,7 +16,7 @@ import numpy as np
 from slrig.bundle import RefusedFrame
 from slrig.capture.frame_checks import Contradiction, describe_frame, describe_pattern
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
-from slrig.capture.retries import RetryPolicy, describe_causes, have_same_cause
+from slrig.capture.retries import RetryPolicy, describe_causes
 from slrig.devices import AppliedSettings, DisplayedPattern, Rig, Trigger
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import Frame, Gray, PatternSequence, Primary, Shot
@@ -204,7 +204,6 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
     lit_s, period_s = play_times_s(session)
     last: dict[str, Frame] = {}
     causes: list[str] = []
-    doubts: list[list[Contradiction]] = []
     timed_out = 0
     for number in range(1, MAX_PLAYS + 1):
         for camera in rig.cameras.values():
@@ -213,10 +212,10 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
         play = _Play({name: [] for name in rig.cameras}, lit_s, period_s)
         yield from _read_play(session, retries, play, last)
         rig.projector.stop()
-        if not play.faults and len(doubts) == MAX_PLAYS - 1:
-            # What differs in the same way in each play is how the rig or the scene is.
-            play.doubts = [each for each in play.doubts if not all(_recurs(each, earlier) for earlier in doubts)]
-        doubts.append(play.doubts)
+        if len(causes) == MAX_PLAYS - 1:
+            # What came alike in each play is how the rig or the scene is.
+            alike = retries.evidence.came_alike
+            play.doubts = [each for each in play.doubts if not alike(each.camera, each.suspects)]
         play.faults += map(str, play.doubts)
         if not play.faults:
             return
@@ -233,14 +232,6 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
             retries.refuse(RefusedFrame(shot.pattern, shot.camera, number, causes[-1], shot))
     message = f"the sequence was played {MAX_PLAYS} times by wire: {describe_causes(causes)}"
     raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
-
-
-def _recurs(found: Contradiction, earlier: Sequence[Contradiction]) -> bool:
-    """True if an earlier play had the same contradiction."""
-    return any(
-        (each.camera, each.where) == (found.camera, found.where) and have_same_cause([each.cause, found.cause])
-        for each in earlier
-    )
 
 
 def play_times_s(session: CaptureSession) -> tuple[float, float]:

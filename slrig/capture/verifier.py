@@ -48,6 +48,7 @@ _MAX_WRONG_FRACTION, _MAX_WRONG_FRACTION_IN_BAND = 0.01, 0.03  # of the pixels
 _SAME_PIXELS_FRACTION = 0.7  # of the pixels wrong in either of two exposures, those wrong in both
 _MAX_NAMED_SUSPECTS = 3  # in a message
 _MAX_SCENE_FRACTION = 0.25  # of the compared pixels; a frame of another pattern is wrong at half of them
+_MAX_SATURATED_FRACTION = 0.25  # of the tested pixels, in white
 _MIN_LISTED = 3  # frames of one cause, to list them together
 _COMPARED = re.compile(r"compared with pattern \d+ \([^)]*\), ")
 
@@ -149,6 +150,7 @@ class FrameVerifier:
         self._references: tuple[int, ...] = ()
         self._reference_rejected = False
         self._unreported: list[Contradiction] = []
+        self._rejected: dict[int, Samples] = {}
         self._disputed: dict[Axis, SampleMask] = {}
 
     @property
@@ -178,7 +180,8 @@ class FrameVerifier:
         self.pattern_indices -= set(removed)
         for each in removed:
             self._pending.pop(each, None)
-            self._overview.pop(each, None)
+            if each in self._overview:
+                self._rejected[each] = self._overview.pop(each)
             self._samples.pop(each, None)
         if removes_reference:
             self._sampler, self._reference, self._references, self.lighting = None, None, (), None
@@ -238,6 +241,19 @@ class FrameVerifier:
                     factors[_kind_of_light(family[0])] += frame_light.line_factors(frames, ref, duty=duty)
         return {kind: LightFactor(min(v), float(np.median(v)), max(v)) for kind, v in factors.items()}
 
+    def take_rejected(self, previous: FrameVerifier) -> None:
+        """Regard all frames of a verifier as the rejected exposures before those to come."""
+        self._rejected = previous._rejected | previous._overview
+
+    def came_alike(self, patterns: Iterable[int]) -> bool:
+        """True if the frames of these patterns equal their rejected exposures, up to noise; chance, as damage in
+        transfer, differs each time.
+        """
+        return all(
+            each in self._rejected and frame_checks.are_exposures_alike(self._rejected[each], self._overview[each])
+            for each in patterns
+        )
+
     def _recheck(self) -> list[Contradiction]:
         """Check the remaining frames again in their original order."""
         waiting, frames = self._pending, self._samples
@@ -290,6 +306,8 @@ class FrameVerifier:
         wrong: Iterable[int] = (),
     ) -> Contradiction:
         where, rest = describe_frame(self.name, index, self._patterns[index]), set(further) - set(suspects)
+        # Light beyond the camera's range is a wrong exposure, and no unusual light.
+        is_doubt = is_doubt and not self._is_overexposed
         every = tuple(sorted(set(suspects)))
         return Contradiction(self.name, where, fault, every, tuple(sorted(rest)), is_doubt, tuple(wrong))
 
@@ -297,6 +315,14 @@ class FrameVerifier:
         """Return the samples of a frame with its own light undone."""
         samples, ref = self._samples[index], self._reference
         return samples if ref is None else self.findings.lights.get(index, STEADY).undo(samples, ref.black)
+
+    @property
+    def _is_overexposed(self) -> bool:
+        """True if white is saturated at many of the tested pixels, because few others are lit: no measure of light."""
+        if self._reference is None:
+            return False
+        white = self._reference.white[self._reference.tested]
+        return bool(np.mean(white >= frame_checks.NEAR_SATURATION * self._format.full_scale) > _MAX_SATURATED_FRACTION)
 
     @property
     def _unconfirmed_references(self) -> tuple[int, ...]:
@@ -412,7 +438,9 @@ class FrameVerifier:
         pair = (self._samples[index], self._samples[partner])
         found: list[Contradiction] = []
         # What is left after one factor of light for each frame counts.
-        for lights in frame_light.pair_lights(*pair, ref, usual=self.findings.usual_factor):
+        usual = self.findings.usual_factor
+        possible = [(STEADY, STEADY)] if self._is_overexposed else frame_light.pair_lights(*pair, ref, usual=usual)
+        for lights in possible:
             frame, other = (light.undo(each, ref.black) for light, each in zip(lights, pair, strict=True))
             found = self._check_pair(index, partner, frame, other, ref)
             if not found:
@@ -881,12 +909,19 @@ class Evidence:
         """
         return self._verifiers[camera].retract(patterns)
 
+    def came_alike(self, camera: str, patterns: Iterable[int]) -> bool:
+        """True if the frames of these patterns equal their rejected exposures, up to noise."""
+        return self._verifiers[camera].came_alike(patterns)
+
     def clear(self) -> None:
         """Remove all frames. The record of rejected exposures remains."""
+        previous = self._verifiers
         self._verifiers = {
             name: FrameVerifier(name, form, self._patterns, self._frame_names.get(name))
             for name, form in self._cameras.items()
         }
+        for name, each in previous.items():
+            self._verifiers[name].take_rejected(each)
 
     def record_refused(self, refused: RefusedFrame) -> None:
         """Record a rejected exposure."""
