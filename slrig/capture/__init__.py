@@ -13,6 +13,7 @@ from slrig.capture.exposure import (
     round_to_refresh_s,
 )
 from slrig.capture.frame_checks import NEAR_SATURATION, NOISE_FLOOR_DN, SampleMask, Samples
+from slrig.capture.frame_order import describe_indices
 from slrig.capture.latency import (
     DEFAULT_SEARCH_S,
     STEADY_TOLERANCE,
@@ -24,7 +25,7 @@ from slrig.capture.latency import (
 from slrig.capture.sequencer import capture, choose_triggers
 from slrig.capture.streaming import earliest_change_s
 from slrig.capture.triggering import SETTINGS_TOLERANCE, differs_from_request
-from slrig.capture.verifier import Evidence, EvidenceSummary, Sampler, checked_frames
+from slrig.capture.verifier import Evidence, EvidenceSummary, LightFactor, Sampler, checked_frames
 
 __all__ = [
     "DEFAULT_SEARCH_S",
@@ -41,6 +42,7 @@ __all__ = [
     "ExposureSamples",
     "ExposureVerdict",
     "LatencyMeasurement",
+    "LightFactor",
     "SampleMask",
     "Sampler",
     "Samples",
@@ -49,6 +51,7 @@ __all__ = [
     "check_exposures",
     "checked_frames",
     "choose_triggers",
+    "describe_indices",
     "detect_movement",
     "differs_from_request",
     "earliest_change_s",

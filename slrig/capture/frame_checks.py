@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import Black, Gray, Integers, LineShift, Pattern, Primary, White, from_gray, gray_index, to_gray
+from slrig.model import Black, Gray, Integers, LineShift, Pattern, Primary, White, gray_index, to_gray
 
 Samples = NDArray[np.float32]
 SampleMask = NDArray[np.bool_]
@@ -33,7 +33,12 @@ BAND_SAMPLES = 300
 NEAR_SATURATION = 0.97
 """Fraction of full scale above which a sample counts as saturated, because some sensors saturate below full scale."""
 
+CHECK_CABLE = "check the cable"
+"""Words of all faults that chance causes."""
+
 _MIN_LIT_SAMPLES = 40
+
+_MAX_CHANGE, _MAX_CHANGED_FRACTION = 0.1, 0.01  # of the range of a frame; of the pixels
 
 _REPEAT_TOLERANCE = 0.02
 """Fraction of a frame's own variation. Lines blurred to three times their width differ by more from step to step."""
@@ -67,7 +72,6 @@ _MIN_CROSSINGS = 12  # pairs across an edge, for a median of their steps
 _MIN_SPAN_PERIODS = 3  # between the 5th and the 95th percentile of the positions
 _MIN_BAND_LINES = 4
 _BLAME_MARGIN = 0.1  # of the wrong pixels, between frames that count as equally suspect
-_MAX_WORSENED_FRACTION = 0.25  # ratio of worsened to improved pairs when two bits are exchanged back
 _MIN_EXPLAINED_FRACTION = 0.5  # of the wrong pixels, for a single bit to be the cause
 _MIN_SHAPE_FRAMES = 5  # three line frames determine a wave's position, height and level without redundancy
 _MIN_WAVE_HEIGHT = 0.15  # relative to white − black; sharp lines have 0.64
@@ -87,7 +91,9 @@ class Contradiction:
 
     where : camera and pattern of the frame that revealed it. cause : the fault and the remedy. suspects : patterns
     whose frames it concerns. further_suspects : patterns to blame if it remains after the suspects were captured again:
-    those that the check depends on and that no other frame has confirmed.
+    those that the check depends on and that no other frame has confirmed. is_doubt : the frames differ in light, as an
+    unusual rig or scene may cause it; none of them is proven wrong. wrong : those of the suspects that are proven
+    wrong.
     """
 
     camera: str
@@ -95,6 +101,8 @@ class Contradiction:
     cause: str
     suspects: tuple[int, ...]
     further_suspects: tuple[int, ...] = ()
+    is_doubt: bool = False
+    wrong: tuple[int, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.where}: {self.cause}"
@@ -381,6 +389,14 @@ def reference_change_fault(
     )
 
 
+def are_exposures_alike(first: Samples, again: Samples) -> bool:
+    """True if two exposures of one pattern differ by noise only, at pixels of the whole image."""
+    change = np.abs(again - first)
+    noise = max(NOISE_FLOOR_DN, 1.4826 * float(np.median(change)))
+    limit = max(8 * noise, _MAX_CHANGE * float(np.ptp(np.percentile(first, (1, 99)))))
+    return bool(np.mean(change > limit) < _MAX_CHANGED_FRACTION)
+
+
 def describe_worst_tested(
     wrong: SampleMask, ref: ReferenceFrames, *, max_total: float, max_in_band: float = 0.25
 ) -> str | None:
@@ -459,8 +475,7 @@ def pair_fault(bit: Samples, inverse: Samples, ref: ReferenceFrames, *, noise: f
         worst = describe_worst_tested(wrong, ref, max_total=0.1 + at_edges, max_in_band=0.25 + at_edges)
     if worst is None:
         return None
-    difference = float(np.median(np.abs((bit - inverse)[ref.tested]) / ref.contrast[ref.tested]))
-    if difference < 0.25:
+    if are_alike(bit, inverse, ref):
         return f"the frame and its inverse show the same on {worst}: one of them is stale; scan again"
     total = float(np.median(u + v))
     if float(np.median(np.abs(u + v - total))) < _EVEN_SPREAD * total:
@@ -473,6 +488,11 @@ def pair_fault(bit: Samples, inverse: Samples, ref: ReferenceFrames, *, noise: f
         f"the frame and its inverse do not add up to white and black on {worst}: one of them shows another pattern or "
         f"was damaged, or something moved, or {describe_contrast(ref)}; scan again"
     )
+
+
+def are_alike(bit: Samples, inverse: Samples, ref: ReferenceFrames) -> bool:
+    """True if a frame and its inverse show nearly the same on most of the tested pixels."""
+    return bool(np.median(np.abs((bit - inverse)[ref.tested]) / ref.contrast[ref.tested]) < 0.25)
 
 
 def _dark_band_mask(u: Samples, v: Samples, ref: ReferenceFrames) -> SampleMask:
@@ -552,37 +572,6 @@ def decode_samples(differences: Sequence[Samples], ref: ReferenceFrames) -> Deco
     return DecodedCode(gray_index(stack > 0), certain, len(stack), stack)
 
 
-def find_inverted_bit(code: DecodedCode) -> int | None:
-    """Return the bit that was exchanged with its inverse; None if there is none.
-
-    The second half of the sampled pixels are neighbours of the first half. Indices of neighbours are close, also where
-    a coarse bit changes, unless a finer bit is inverted: that mirrors the indices within each of its blocks, and
-    mirroring them back closes the gap. This cannot find an exchange of the most significant bit, which mirrors
-    everything without a gap, or of the last two or three, whose gap is as small as a normal step. Line frames reveal
-    these (`line_fault`).
-    """
-    index, neighbour = code.index.reshape(2, -1)
-    certain = code.certain.reshape(2, -1).all(axis=0)
-    if not certain.any():
-        return None
-    index, neighbour = index[certain], neighbour[certain]
-    step = max(1.0, float(np.percentile(np.abs(index - neighbour), 75)))
-    words = to_gray(index) ^ to_gray(neighbour)
-    for coarse in range(code.bits - 1):
-        # Pairs whose most significant difference is this bit.
-        crossing = words >> (code.bits - 1 - coarse) == 1
-        if np.count_nonzero(crossing) < _MIN_CROSSINGS:
-            continue
-        a, b = index[crossing], neighbour[crossing]
-        if np.median(np.abs(a - b)) <= 4 * step:
-            continue
-        for fine in range(coarse + 1, code.bits):
-            mirror = 2 ** (code.bits - fine) - 1
-            if np.median(np.abs((a ^ mirror) - (b ^ mirror))) <= 1.5 * step:
-                return fine
-    return None
-
-
 @dataclass(frozen=True, slots=True)
 class LineExpectation:
     """Predicted light of one line frame.
@@ -601,36 +590,6 @@ class LineExpectation:
         low, high = np.percentile(self.position[mask], (5, 95))
         # A line that straddles two cells of half a period lights all cells equally.
         return bool(high - low >= _MIN_SPAN_PERIODS and np.ptp(self.light[mask]) > 0)
-
-
-def find_exchanged_bits(code: DecodedCode) -> tuple[int, int] | None:
-    """Return two bits that were exchanged with each other; None if there are none.
-
-    Exchanging them back brings the indices of many pairs of neighbours closer together, and of few further apart. This
-    cannot find an exchange of two bits that are both constant over the lit area.
-    """
-    index, neighbour = code.index.reshape(2, -1)
-    certain = code.certain.reshape(2, -1).all(axis=0)
-    certain &= index != neighbour
-    words = [to_gray(each[certain]) for each in (index, neighbour)]
-    distance = np.abs(index - neighbour)[certain]
-    # A table is faster than computing each index, twice for each pair of bits.
-    index_of = from_gray(np.arange(2**code.bits))
-    for one in range(code.bits):
-        for other in range(one + 1, code.bits):
-            first, second = code.bits - 1 - one, code.bits - 1 - other
-            a, b = (index_of[_exchange_bits(word, first, second)] for word in words)
-            change = np.abs(a - b) - distance
-            improved = np.count_nonzero(change < 0)
-            if improved >= _MIN_CROSSINGS and np.count_nonzero(change > 0) < _MAX_WORSENED_FRACTION * improved:
-                return one, other
-    return None
-
-
-def _exchange_bits(word: Integers, first: int, second: int) -> Integers:
-    """Exchange two bits, counted from the least significant one, of each code word."""
-    unlike = ((word >> first) ^ (word >> second)) & 1
-    return np.asarray(word ^ (unlike << first) ^ (unlike << second))
 
 
 @dataclass(frozen=True, slots=True)
@@ -792,7 +751,9 @@ def line_fault(
             f"the frame holds {fraction:.1%} of white's light, the other line frames {typical:.1%}: it shows another "
             "pattern or was damaged; scan again"
         )
-    roughness = roughness_fault(frame, others, ref, noise=noise) if others else None
+    # A lamp that flickers makes all of a frame brighter, and so its steps.
+    matched = np.asarray(ref.black + (frame - ref.black) * np.float32(typical / fraction), dtype=np.float32)
+    roughness = roughness_fault(matched, others, ref, noise=noise) if others else None
     if roughness is not None:
         return True, roughness
     # Lines hidden by noise or blur cannot be checked. Sharp ones would vary by duty · (1 − duty).

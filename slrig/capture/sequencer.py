@@ -6,9 +6,10 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 
 from slrig.bundle import RefusedFrame
+from slrig.capture.retries import RetryPolicy
 from slrig.capture.streaming import FrameReader, capture_streaming, earliest_change_s
 from slrig.capture.triggering import CaptureSession, capture_by_software, capture_by_wire, differs_from_request
-from slrig.capture.verifier import Evidence, RetryPolicy
+from slrig.capture.verifier import Evidence
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Rig, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence, Shot

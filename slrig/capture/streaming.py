@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
+from slrig.capture.retries import RetryPolicy
 from slrig.capture.triggering import CaptureSession, with_camera_name
-from slrig.capture.verifier import RetryPolicy
 from slrig.devices import Camera, DisplayedPattern, Rig, Trigger
 from slrig.errors import FrameTimeoutError
 from slrig.model import Frame, Shot

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from slrig.bundle import RefusedFrame
-from slrig.capture.frame_checks import describe_frame, describe_pattern
+from slrig.capture.frame_checks import Contradiction, describe_frame, describe_pattern
 from slrig.capture.latency import shutter_skew_s, stable_from_ns
-from slrig.capture.verifier import RetryPolicy, describe_causes
+from slrig.capture.retries import RetryPolicy, describe_causes
 from slrig.devices import AppliedSettings, DisplayedPattern, Rig, Trigger
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import Frame, Gray, PatternSequence, Primary, Shot
@@ -166,7 +166,8 @@ def _read_frame(
 @dataclass(slots=True)
 class _Play:
     """One play of the sequence. levels : mean of each frame, by camera. delivered : pattern and camera of each frame
-    that was yielded. withheld : frames after the first fault. missing : number of faults that are missing frames.
+    that was yielded. withheld : frames after the first fault. doubts : frames that differ in light, none of which is
+    proven wrong. missing : number of faults that are missing frames.
     """
 
     levels: dict[str, list[float]]
@@ -176,6 +177,7 @@ class _Play:
     delivered: list[tuple[int, str]] = field(default_factory=list)
     withheld: list[Shot] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
+    doubts: list[Contradiction] = field(default_factory=list)
     missing: int = 0
 
     def misses_every_second_pulse(self, camera: str) -> bool:
@@ -210,6 +212,11 @@ def capture_by_wire(session: CaptureSession, retries: RetryPolicy) -> Iterator[S
         play = _Play({name: [] for name in rig.cameras}, lit_s, period_s)
         yield from _read_play(session, retries, play, last)
         rig.projector.stop()
+        if len(causes) == MAX_PLAYS - 1:
+            # What came alike in each play is how the rig or the scene is.
+            alike = retries.evidence.came_alike
+            play.doubts = [each for each in play.doubts if not alike(each.camera, each.suspects)]
+        play.faults += map(str, play.doubts)
         if not play.faults:
             return
         for camera in rig.cameras.values():
@@ -296,7 +303,9 @@ def _read_play(session: CaptureSession, retries: RetryPolicy, play: _Play, last:
                 faulty.add(name)
             elif not play.faults:
                 # After the first fault, frames are only recorded.
-                play.faults += map(str, retries.evidence.add_shot(shot))
+                found = retries.evidence.add_shot(shot)
+                play.faults += [str(each) for each in found if not each.is_doubt]
+                play.doubts += [each for each in found if each.is_doubt]
             if play.faults:
                 play.withheld.append(shot)
             else:

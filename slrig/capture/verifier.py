@@ -1,18 +1,18 @@
-"""Verification of the frames of a sequence against one another, and retries of frames that contradict."""
+"""Verification of the frames of a sequence against one another."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle import RefusedFrame
-from slrig.capture import frame_checks
+from slrig.capture import frame_checks, frame_light, frame_order
 from slrig.capture.frame_checks import (
     Contradiction,
     DecodedCode,
@@ -23,17 +23,15 @@ from slrig.capture.frame_checks import (
     describe_frame,
     describe_pattern,
 )
-from slrig.errors import FrameTimeoutError, ScanEvidenceError
+from slrig.capture.frame_light import STEADY, STEADY_LIGHT, FrameLight
 from slrig.model import (
     Axis,
     Black,
     CameraFormat,
     Capture,
-    Frame,
     Gray,
     LineShift,
     Pattern,
-    PatternSequence,
     Pixels,
     Primary,
     Shot,
@@ -45,14 +43,14 @@ from slrig.model import (
 
 _SAMPLES = 12_000
 _NEIGHBOUR_PX = 3  # along rows and along columns
+_ADJACENT_PX = 1  # the same, to see the finest bits of a code change
 _MAX_WRONG_FRACTION, _MAX_WRONG_FRACTION_IN_BAND = 0.01, 0.03  # of the pixels
 _SAME_PIXELS_FRACTION = 0.7  # of the pixels wrong in either of two exposures, those wrong in both
 _MAX_NAMED_SUSPECTS = 3  # in a message
 _MAX_SCENE_FRACTION = 0.25  # of the compared pixels; a frame of another pattern is wrong at half of them
-MAX_FAILURES = 3
-"""Number of failures of one pattern that ends the scan."""
-
-_ORDINALS = ("first", "second", "third")
+_MAX_SATURATED_FRACTION = 0.25  # of the tested pixels, in white
+_MIN_LISTED = 3  # frames of one cause, to list them together
+_COMPARED = re.compile(r"compared with pattern \d+ \([^)]*\), ")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,15 +65,17 @@ class Sampler:
     row: NDArray[np.intp]
 
     @classmethod
-    def from_size(cls, size: Size, candidates: NDArray[np.intp] | None = None) -> Sampler:
+    def from_size(
+        cls, size: Size, candidates: NDArray[np.intp] | None = None, *, neighbour_px: int = _NEIGHBOUR_PX
+    ) -> Sampler:
         """Draw samples from the flat indices `candidates`, or from the whole image."""
         rng = np.random.default_rng(0)
         height, width = size.shape
         # Drop duplicates, which a small image has.
         drawn = np.unique(rng.integers(0, height * width if candidates is None else len(candidates), _SAMPLES))
         rows, columns = np.divmod(drawn if candidates is None else candidates[drawn], width)
-        all_rows = np.concatenate([rows, np.minimum(rows + _NEIGHBOUR_PX, height - 1)])
-        all_columns = np.concatenate([columns, np.minimum(columns + _NEIGHBOUR_PX, width - 1)])
+        all_rows = np.concatenate([rows, np.minimum(rows + neighbour_px, height - 1)])
+        all_columns = np.concatenate([columns, np.minimum(columns + neighbour_px, width - 1)])
         return cls(all_rows * width + all_columns, all_rows)
 
     def take(self, image: Pixels) -> Samples:
@@ -93,7 +93,8 @@ class CameraFindings:
     line frames that wait for the code. light_drift : largest change of the light between two frames of one pattern,
     relative to white. reference_confirmed : a pair of a bit or lines and their inverses added up to white and black,
     which confirms these two. verified_axes : axes with a line frame that agreed with the Gray code, which confirms the
-    code.
+    code. lights : light of frames that agree only after it is undone; measured_factors : factor of the light of all
+    frames that determine it. linear_edges : for each pair with edges, whether they show a linear response.
     """
 
     first_seen_index: dict[Pattern, int] = field(default_factory=dict)
@@ -105,6 +106,14 @@ class CameraFindings:
     light_drift: float | None = None
     reference_confirmed: bool = False
     verified_axes: set[Axis] = field(default_factory=set)
+    lights: dict[int, FrameLight] = field(default_factory=dict)
+    measured_factors: dict[int, float] = field(default_factory=dict)
+    linear_edges: list[bool] = field(default_factory=list)
+
+    @property
+    def usual_factor(self) -> float:
+        """Median factor of the light of the frames whose inverses determine it; 1 without such frames."""
+        return float(np.median(list(self.measured_factors.values()))) if self.measured_factors else 1.0
 
     @property
     def noise_dn(self) -> float | None:
@@ -121,14 +130,17 @@ class FrameVerifier:
     Images are kept whole until white and black are known, and afterwards only at sampled lit pixels.
     """
 
-    def __init__(self, name: str, form: CameraFormat, patterns: Sequence[Pattern]) -> None:
+    def __init__(
+        self, name: str, form: CameraFormat, patterns: Sequence[Pattern], frame_names: Sequence[str] | None = None
+    ) -> None:
         self.name = name
+        self._frame_names = frame_names
         self.lighting: Lighting | None = None
         self.reported: list[Contradiction] = []
         self.pattern_indices: set[int] = set()
         self._format = form
         self._patterns = patterns
-        self._whole_image = Sampler.from_size(form.size)
+        self._whole_image = Sampler.from_size(form.size, neighbour_px=_ADJACENT_PX)
         self.findings = CameraFindings()
         self._pending: dict[int, Pixels] = {}
         self._overview: dict[int, Samples] = {}
@@ -138,6 +150,7 @@ class FrameVerifier:
         self._references: tuple[int, ...] = ()
         self._reference_rejected = False
         self._unreported: list[Contradiction] = []
+        self._rejected: dict[int, Samples] = {}
         self._disputed: dict[Axis, SampleMask] = {}
 
     @property
@@ -167,7 +180,8 @@ class FrameVerifier:
         self.pattern_indices -= set(removed)
         for each in removed:
             self._pending.pop(each, None)
-            self._overview.pop(each, None)
+            if each in self._overview:
+                self._rejected[each] = self._overview.pop(each)
             self._samples.pop(each, None)
         if removes_reference:
             self._sampler, self._reference, self._references, self.lighting = None, None, (), None
@@ -176,6 +190,69 @@ class FrameVerifier:
         self._unreported = [each for each in remaining if each not in self.reported]
         self.reported = [each for each in remaining if each in self.reported]
         return removed
+
+    def findings_summary(self) -> CameraSummary:
+        """Return what all frames prove: each cause once, and the frames that are proven wrong."""
+        order = self._order_fault() if self.reported else None
+        if order is not None and order.is_sequence:
+            return CameraSummary((f"camera '{self.name}': {order.cause}",), frozenset(), order.cause)
+        if order is None:
+            wrong = {index for each in self.reported for index in each.wrong}
+            return CameraSummary(summarise(self.reported, self._patterns), frozenset(wrong))
+        # Whatever else contradicts these frames is wrong because of them.
+        others = [each for each in self.reported if order.shows.keys().isdisjoint(each.suspects)]
+        wrong = {*order.shows, *(index for each in others for index in each.wrong)}
+        faults = (f"camera '{self.name}': {order.cause}", *summarise(others, self._patterns))
+        return CameraSummary(faults, frozenset(wrong))
+
+    def _order_fault(self) -> frame_order.OrderFault | None:
+        """Return the order of the frames that explains their contradictions, once all of them are there."""
+        if self._overview.keys() != set(range(len(self._patterns))):
+            return None
+        relations = frame_order.relate_frames([self._overview[i] for i in range(len(self._patterns))])
+        if relations is None:
+            return None
+        names = self._frame_names
+        return frame_order.find_order_fault(
+            self._patterns,
+            relations,
+            lambda index: describe_pattern(index, self._patterns[index]) if names is None else names[index],
+        )
+
+    def light_factors(self) -> dict[str, LightFactor]:
+        """Return the light of each kind of frames relative to the first white and black frame, as far as it is known.
+
+        Lines have one only if the camera responds linearly and several of their periods are visible.
+        """
+        factors: defaultdict[str, list[float]] = defaultdict(list)
+        findings, ref = self.findings, self._reference
+        known = findings.measured_factors | {i: each.factor for i, each in findings.lights.items()}
+        for index, factor in known.items():
+            pattern = self._patterns[index]
+            if not isinstance(pattern, LineShift) or index in findings.measured_factors:
+                factors[_kind_of_light(pattern)].append(factor)
+        is_linear = sum(findings.linear_edges) > len(findings.linear_edges) / 2
+        if ref is not None and is_linear:
+            for family in map(self._lines, findings.codes):
+                indices = [findings.first_seen_index.get(line, -1) for line in family]
+                if family and not family[0].is_half_lit and all(index in self._samples for index in indices):
+                    duty = family[0].line_width_px / family[0].period_px
+                    frames = [self._samples[index] for index in indices]
+                    factors[_kind_of_light(family[0])] += frame_light.line_factors(frames, ref, duty=duty)
+        return {kind: LightFactor(min(v), float(np.median(v)), max(v)) for kind, v in factors.items()}
+
+    def take_rejected(self, previous: FrameVerifier) -> None:
+        """Regard all frames of a verifier as the rejected exposures before those to come."""
+        self._rejected = previous._rejected | previous._overview
+
+    def came_alike(self, patterns: Iterable[int]) -> bool:
+        """True if the frames of these patterns equal their rejected exposures, up to noise; chance, as damage in
+        transfer, differs each time.
+        """
+        return all(
+            each in self._rejected and frame_checks.are_exposures_alike(self._rejected[each], self._overview[each])
+            for each in patterns
+        )
 
     def _recheck(self) -> list[Contradiction]:
         """Check the remaining frames again in their original order."""
@@ -196,8 +273,7 @@ class FrameVerifier:
     def _add_samples(self, index: int, image: Pixels) -> list[Contradiction]:
         pattern = self._patterns[index]
         self.findings.first_seen_index.setdefault(pattern, index)
-        if isinstance(pattern, White | Black) or (isinstance(pattern, LineShift) and pattern.is_half_lit):
-            self._overview[index] = self._whole_image.take(image)
+        self._overview[index] = self._whole_image.take(image)
         if self._sampler is None:
             self._pending[index] = image
             return [] if self._reference_rejected else self._set_reference()
@@ -220,10 +296,33 @@ class FrameVerifier:
         return None
 
     def _contradiction(
-        self, index: int, fault: str, suspects: Iterable[int], further: Iterable[int] = ()
+        self,
+        index: int,
+        fault: str,
+        suspects: Iterable[int],
+        further: Iterable[int] = (),
+        *,
+        is_doubt: bool = False,
+        wrong: Iterable[int] = (),
     ) -> Contradiction:
         where, rest = describe_frame(self.name, index, self._patterns[index]), set(further) - set(suspects)
-        return Contradiction(self.name, where, fault, tuple(sorted(set(suspects))), tuple(sorted(rest)))
+        # Light beyond the camera's range is a wrong exposure, and no unusual light.
+        is_doubt = is_doubt and not self._is_overexposed
+        every = tuple(sorted(set(suspects)))
+        return Contradiction(self.name, where, fault, every, tuple(sorted(rest)), is_doubt, tuple(wrong))
+
+    def _corrected(self, index: int) -> Samples:
+        """Return the samples of a frame with its own light undone."""
+        samples, ref = self._samples[index], self._reference
+        return samples if ref is None else self.findings.lights.get(index, STEADY).undo(samples, ref.black)
+
+    @property
+    def _is_overexposed(self) -> bool:
+        """True if white is saturated at many of the tested pixels, because few others are lit: no measure of light."""
+        if self._reference is None:
+            return False
+        white = self._reference.white[self._reference.tested]
+        return bool(np.mean(white >= frame_checks.NEAR_SATURATION * self._format.full_scale) > _MAX_SATURATED_FRACTION)
 
     @property
     def _unconfirmed_references(self) -> tuple[int, ...]:
@@ -277,11 +376,18 @@ class FrameVerifier:
         return found
 
     def _check_repeat(self, index: int, first: int, ref: ReferenceFrames) -> list[Contradiction]:
-        noise = self.findings.noise_dn
-        drift = frame_checks.measure_drift(self._samples[first], self._samples[index], ref, noise=noise)
+        noise, before, repeat = self.findings.noise_dn, self._corrected(first), self._samples[index]
+        drift = frame_checks.measure_drift(before, repeat, ref, noise=noise)
         if self.findings.light_drift is None or abs(drift.light_change) > abs(self.findings.light_drift):
             self.findings.light_drift = drift.light_change
-        fault = frame_checks.drift_fault(drift) or self._reference_change(index, first)
+        fault = frame_checks.drift_fault(drift) or self._reference_change(index, first, STEADY)
+        if fault is not None:
+            light = frame_light.repeat_light(before, repeat, ref)
+            drift = frame_checks.measure_drift(before, light.undo(repeat, ref.black), ref, noise=noise)
+            left = frame_checks.drift_fault(drift) or self._reference_change(index, first, light)
+            if left is None:
+                self.findings.lights[index] = light
+            fault = left
         if fault is not None:
             # Never suspect the first frame: a repetition after the change would hide the change.
             return [self._contradiction(index, fault, [index])]
@@ -289,20 +395,35 @@ class FrameVerifier:
             self.findings.verified.add(index)
         return []
 
-    def _reference_change(self, index: int, first: int) -> str | None:
-        if index not in self._overview or self.lighting is None:
+    def _reference_change(self, index: int, first: int, light: FrameLight) -> str | None:
+        if not isinstance(self._patterns[index], White | Black) or self.lighting is None:
             return None
         white, black = (self._overview[i] for i in self._references)
-        repeat, noise, row = self._overview[index], self.findings.noise_dn, self._whole_image.row
+        repeat, noise, row = light.undo(self._overview[index], black), self.findings.noise_dn, self._whole_image.row
         contrasts = (white - black, repeat - black if first == self._references[0] else white - repeat)
         return frame_checks.reference_change_fault(
             self._overview[first], repeat, contrasts, threshold_dn=self.lighting.threshold_dn, noise=noise, row=row
         )
 
-    def _check_range(self, indices: Sequence[int], ref: ReferenceFrames) -> list[Contradiction]:
-        noise, further = self.findings.noise_dn, self._unconfirmed_references
-        faults = ((i, frame_checks.range_fault(self._samples[i], ref, noise=noise)) for i in indices)
-        return [self._contradiction(i, fault, [i], further) for i, fault in faults if fault is not None]
+    def _check_range(
+        self, frames: Mapping[int, Samples], ref: ReferenceFrames, further: Iterable[int] | None = None
+    ) -> list[Contradiction]:
+        noise = self.findings.noise_dn
+        further = self._unconfirmed_references if further is None else further
+        faults = ((i, frame_checks.range_fault(frame, ref, noise=noise)) for i, frame in frames.items())
+        found = []
+        for index, fault in faults:
+            if fault is not None:
+                rough = self._is_rough(index, frames[index], ref)
+                wrong = [index] if rough else []
+                found.append(self._contradiction(index, fault, [index], further, is_doubt=not rough, wrong=wrong))
+        return found
+
+    def _is_rough(self, index: int, frame: Samples, ref: ReferenceFrames) -> bool:
+        """True if a frame is rougher than every other frame so far, as one that was damaged in transfer."""
+        others = [self._corrected(i) for i in self._samples if i != index]
+        faults = (frame_checks.roughness_fault(frame, [other], ref, noise=self._noise) for other in others)
+        return bool(others) and all(fault is not None for fault in faults)
 
     def _check_pair_or_single(self, index: int, pattern: Pattern, ref: ReferenceFrames) -> list[Contradiction]:
         """Check a frame together with its inverse, or alone if its pattern has none."""
@@ -314,35 +435,90 @@ class FrameVerifier:
         if partner is None or not isinstance(pattern, Gray | LineShift):
             # The first frame of a pair waits for the second, because the other checks need the noise of a pair.
             return [] if inverse in self._patterns else self._check_single(index, pattern, ref)
-        frame, other = self._samples[index], self._samples[partner]
-        fault = frame_checks.pair_fault(frame, other, ref, noise=self._noise, run_px=_run_px(pattern))
-        if fault is not None:
-            fault = f"compared with {describe_pattern(partner, self._patterns[partner])}, {fault}"
-            return [self._contradiction(index, fault, [index, partner], self._unconfirmed_references)]
-        self.findings.noises.append(frame_checks.pair_noise_dn(frame, other, ref, sums=self.findings.sums))
-        self.findings.sums = [frame + other]
-        found = self._check_range([partner, index], ref)
-        if not found:
-            if isinstance(pattern, Gray):
-                self.findings.verified |= {index, partner}
-            self.findings.reference_confirmed = True
+        pair = (self._samples[index], self._samples[partner])
+        found: list[Contradiction] = []
+        # What is left after one factor of light for each frame counts.
+        usual = self.findings.usual_factor
+        possible = [(STEADY, STEADY)] if self._is_overexposed else frame_light.pair_lights(*pair, ref, usual=usual)
+        for lights in possible:
+            frame, other = (light.undo(each, ref.black) for light, each in zip(lights, pair, strict=True))
+            found = self._check_pair(index, partner, frame, other, ref)
+            if not found:
+                self._accept_pair((index, partner), lights, (frame, other), ref)
+                break
         return found
+
+    def _check_pair(
+        self, index: int, partner: int, frame: Samples, other: Samples, ref: ReferenceFrames
+    ) -> list[Contradiction]:
+        pattern = self._patterns[index]
+        run_px = _run_px(pattern) if isinstance(pattern, Gray | LineShift) else 1
+        fault = frame_checks.pair_fault(frame, other, ref, noise=self._noise, run_px=run_px)
+        if fault is None:
+            return self._check_range({partner: other, index: frame}, ref)
+        fault = f"compared with {describe_pattern(partner, self._patterns[partner])}, {fault}"
+        rough = [
+            i for i, one, two in ((index, frame, other), (partner, other, frame))
+            if frame_checks.roughness_fault(one, [two], ref, noise=self._noise) is not None
+        ]  # fmt: skip
+        is_doubt = not rough and not frame_checks.are_alike(frame, other, ref)
+        suspects, further = [index, partner], self._unconfirmed_references
+        return [self._contradiction(index, fault, suspects, further, is_doubt=is_doubt, wrong=rough)]
+
+    def _accept_pair(
+        self,
+        indices: tuple[int, int],
+        lights: tuple[FrameLight, FrameLight],
+        frames: tuple[Samples, Samples],
+        ref: ReferenceFrames,
+    ) -> None:
+        """Record what a pair proves that adds up to white and black."""
+        pattern = self._patterns[indices[0]]
+        self.findings.lights.update((i, each) for i, each in zip(indices, lights, strict=True) if each != STEADY)
+        self.findings.noises.append(frame_checks.pair_noise_dn(*frames, ref, sums=self.findings.sums))
+        self.findings.sums = [frames[0] + frames[1]]
+        self.findings.reference_confirmed = True
+        if isinstance(pattern, Gray):
+            self.findings.verified |= set(indices)
+        is_coarse = isinstance(pattern, Gray) and pattern.bit < coarse_bit_count(pattern.bits)
+        if lights == (STEADY, STEADY) and is_coarse:
+            # Small changes need no correction; coarse bits have few edges, which would bias their factor.
+            raw = (self._samples[indices[0]], self._samples[indices[1]])
+            lights = frame_light.fit_pair_light(*raw, ref, is_exposure=False) or lights
+        if is_coarse or lights != (STEADY, STEADY):
+            self.findings.measured_factors.update((i, each.factor) for i, each in zip(indices, lights, strict=True))
+        linear = frame_light.is_linear_at_edges(*frames, ref)
+        if linear is not None:
+            self.findings.linear_edges.append(linear)
 
     def _check_single(self, index: int, pattern: Pattern, ref: ReferenceFrames) -> list[Contradiction]:
         """Check a frame whose pattern has no inverse in the sequence."""
-        found = self._check_range([index], ref)
+        raw, found = self._samples[index], list[Contradiction]()
+        light = STEADY
+        for light in frame_light.single_lights(raw, ref, usual=self.findings.usual_factor):
+            found = self._check_range({index: light.undo(raw, ref.black)}, ref)
+            if not found:
+                break
         if found or not isinstance(pattern, Gray):
             return found
+        is_coarse = pattern.bit < coarse_bit_count(pattern.bits)
+        if is_coarse:
+            factor = frame_light.coarse_bit_factor(raw, ref)
+            self.findings.measured_factors[index] = factor
+            light = FrameLight(factor) if abs(factor - 1) > frame_light.STEADY_LIGHT else light
+        if light != STEADY:
+            self.findings.lights[index] = light
+        frame = self._corrected(index)
         lines = [
             self._samples[i] for p, i in self.findings.first_seen_index.items()
             if isinstance(p, LineShift) and p.axis is pattern.axis and p.is_half_lit
         ]  # fmt: skip
         # Bits have fewer edges than lines. Edges of narrow lines are less high, so they cannot be compared.
-        rough = frame_checks.roughness_fault(self._samples[index], lines, ref, noise=self._noise) if lines else None
+        rough = frame_checks.roughness_fault(frame, lines, ref, noise=self._noise) if lines else None
         if rough is not None:
-            return [self._contradiction(index, rough, [index], self._unconfirmed_references)]
-        if pattern.bit < coarse_bit_count(pattern.bits):
-            self.findings.noises.append(frame_checks.bit_noise_dn(self._samples[index], ref))
+            return [self._contradiction(index, rough, [index], self._unconfirmed_references, wrong=[index])]
+        if is_coarse:
+            self.findings.noises.append(frame_checks.bit_noise_dn(frame, ref))
         return []
 
     def _code_bits(self, pattern: Gray) -> list[Gray]:
@@ -375,7 +551,7 @@ class FrameVerifier:
         if any(first_index.get(line) not in self._samples for line in proving_lines):
             return []
         middle = np.asarray((ref.white + ref.black) / 2, dtype=np.float32)
-        line_samples = [self._samples[first_index[line]] for line in proving_lines]
+        line_samples = [self._corrected(first_index[line]) for line in proving_lines]
         if line_samples and lines[0].is_half_lit:
             fault = self._reference_level_fault([first_index[line] for line in lines])
             if fault is not None:
@@ -383,7 +559,7 @@ class FrameVerifier:
             middle = np.mean(np.stack(line_samples), axis=0).astype(np.float32)
         differences = [self._difference(bit, family, middle) for bit in range(gray.bits)]
         code = frame_checks.decode_samples(differences, ref)
-        found = self._check_bit_order(code, family, single=single)
+        found = self._check_bit_order(family)
         if not found and line_samples:
             pairs = list(zip(proving_lines, line_samples, strict=True))
             found, wrong = self._check_against_lines(code, family, pairs, ref)
@@ -409,27 +585,41 @@ class FrameVerifier:
             full_scale=self._format.full_scale, row=self._whole_image.row,
         )  # fmt: skip
 
-    def _check_bit_order(self, code: DecodedCode, family: Sequence[Gray], *, single: bool) -> list[Contradiction]:
-        """Check that no bit is exchanged, from the order of the bits alone."""
+    def _check_bit_order(self, family: Sequence[Gray]) -> list[Contradiction]:
+        """Check that no bit is exchanged, from the order of the code at adjacent pixels of the whole image."""
         first_index = self.findings.first_seen_index
-        order = "check that the projector shows the patterns in the order they were loaded"
-        if single:
-            both = frame_checks.find_exchanged_bits(code)
-            if both is None:
-                return []
-            blamed: tuple[int, ...] = both
-            fault = f"bits {both[0]} and {both[1]} of the {family[0].axis} code are exchanged: codes jump; {order}"
+        if self.lighting is None or any(first_index[p] not in self._overview for p in family):
+            return []
+        white, black = (self._overview[index] for index in self._references)
+        lit = np.tile((white - black >= self.lighting.threshold_dn).reshape(2, -1).all(axis=0), 2)
+        middle = np.asarray((white + black) / 2, dtype=np.float32)
+        differences = [self._overview_difference(bit, family, middle)[lit] for bit in range(family[0].bits)]
+        fault = frame_order.find_code_fault(np.stack(differences))
+        if fault is None:
+            return []
+        axis, bits = family[0].axis, fault.inverted
+        words = [f"bits {one} and {other} of the {axis} code are exchanged" for one, other in fault.exchanged]
+        if len(bits) == family[0].bits:
+            words.append(f"every bit of the {axis} code is exchanged with its inverse")
         else:
-            exchanged = frame_checks.find_inverted_bit(code)
-            if exchanged is None:
-                return []
-            blamed = (exchanged,)
-            fault = (
-                f"bit {exchanged} of the {family[0].axis} code is exchanged with its inverse: codes jump where coarser "
-                f"bits change; {order}"
-            )
+            words += [f"bit {bit} of the {axis} code is exchanged with its inverse" for bit in bits]
+        blamed = {*bits, *(bit for pair in fault.exchanged for bit in pair)}
         pair = [first_index[p] for p in family if p.bit in blamed]
-        return [self._contradiction(pair[0], fault, pair, [first_index[p] for p in family])]
+        cause = (
+            f"{' and '.join(words)}: the code jumps from pixel to pixel, and exchanged back it does not; check that "
+            "the projector shows the patterns in the order they were loaded"
+        )
+        return [self._contradiction(pair[0], cause, pair, [first_index[p] for p in family], wrong=pair)]
+
+    def _overview_difference(self, bit: int, family: Sequence[Gray], middle: Samples) -> Samples:
+        """Return a bit less its inverse, or less the middle of white and black, on the whole image."""
+        findings, black = self.findings, self._overview[self._references[1]]
+        frames = {}
+        for pattern in family:
+            if pattern.bit == bit:
+                index = findings.first_seen_index[pattern]
+                frames[pattern.inverted] = findings.lights.get(index, STEADY).undo(self._overview[index], black)
+        return np.asarray(frames.get(False, middle) - frames.get(True, middle))
 
     def _check_against_lines(
         self, code: DecodedCode, family: Sequence[Gray], lines: list[tuple[LineShift, Samples]], ref: ReferenceFrames
@@ -472,7 +662,7 @@ class FrameVerifier:
         return [self._contradiction(suspects[0], fault, suspects, members)], agreement.wrong
 
     def _difference(self, bit: int, family: Sequence[Gray], middle: Samples) -> Samples:
-        frames = {p.inverted: self._samples[self.findings.first_seen_index[p]] for p in family if p.bit == bit}
+        frames = {p.inverted: self._corrected(self.findings.first_seen_index[p]) for p in family if p.bit == bit}
         return np.asarray(frames.get(False, middle) - frames.get(True, middle)) * (1 if len(frames) == 2 else 2)
 
     def _check_repetition(self, index: int, pattern: Pattern, ref: ReferenceFrames) -> list[Contradiction]:
@@ -486,8 +676,8 @@ class FrameVerifier:
         ]  # fmt: skip
         # Wide lines move by a small part of their width, which only low noise allows to distinguish.
         factor = max(40.0, 4.0 * pattern.line_width_px) if isinstance(pattern, LineShift) else 40.0
-        frames = [self._samples[i] for i in earlier]
-        found = frame_checks.find_repeated(self._samples[index], frames, ref, noise=self._noise, factor=factor)
+        frames = [self._corrected(i) for i in earlier]
+        found = frame_checks.find_repeated(self._corrected(index), frames, ref, noise=self._noise, factor=factor)
         if found is None:
             return []
         twin = earlier[found]
@@ -495,7 +685,7 @@ class FrameVerifier:
             f"the frame equals that of {describe_pattern(twin, self._patterns[twin])}: it was not exposed while its "
             "own pattern was shown; check the trigger and the projector's latency, and scan again"
         )
-        return [self._contradiction(index, fault, [index], [twin, *self._unconfirmed_references])]
+        return [self._contradiction(index, fault, [index], [twin, *self._unconfirmed_references], wrong=[index])]
 
     def _check_line(self, index: int, pattern: LineShift, ref: ReferenceFrames) -> list[Contradiction]:
         known = self.findings.codes.get(pattern.axis)
@@ -506,10 +696,10 @@ class FrameVerifier:
         first_index = self.findings.first_seen_index
         expected = frame_checks.predict_lines(code, gray, pattern, ref)
         lines = (i for p, i in first_index.items() if isinstance(p, LineShift) and p.axis is pattern.axis)
-        others = [self._samples[i] for i in lines if i != index]
+        others = [self._corrected(i) for i in lines if i != index]
         duty = pattern.line_width_px / pattern.period_px
         compared, fault = frame_checks.line_fault(
-            self._samples[index], others, ref, expected, noise=self._noise, duty=duty
+            self._corrected(index), others, ref, expected, noise=self._noise, duty=duty
         )
         if fault is not None:
             is_code_verified = pattern.axis in self.findings.verified_axes
@@ -520,6 +710,23 @@ class FrameVerifier:
             self.findings.verified_axes.add(pattern.axis)
         return []
 
+    def _check_line_light(
+        self, family: Sequence[LineShift], members: Sequence[int], frames: Sequence[Samples], ref: ReferenceFrames
+    ) -> list[Contradiction]:
+        """Check the sum and the shape of the light of all line frames of an axis."""
+        half = family[0].is_half_lit
+        unequal = frame_checks.line_sum_fault(frames, ref, noise=self._noise, half=half)
+        if unequal is not None:
+            blamed, fault = unequal
+            suspects = [members[each] for each in blamed]
+            rough = [i for i in suspects if self._is_rough(i, frames[members.index(i)], ref)]
+            return [self._contradiction(max(members), fault, suspects, members, is_doubt=not rough, wrong=rough)]
+        odd = frame_checks.line_shape_fault(family, frames, ref, noise=self._noise) if half else None
+        if odd is not None:
+            at, fault = odd
+            return [self._contradiction(members[at], fault, [members[at]], members, is_doubt=True)]
+        return []
+
     def _check_line_set(self, axis: Axis, ref: ReferenceFrames) -> list[Contradiction]:
         """Check the sum, shape and order of all line frames of an axis as soon as they and the code are known."""
         family, first_index = self._lines(axis), self.findings.first_seen_index
@@ -527,17 +734,18 @@ class FrameVerifier:
             return []
         if any(first_index.get(line) not in self._samples for line in family):
             return []
-        frames = [self._samples[first_index[line]] for line in family]
         members = [first_index[line] for line in family]
-        index, half = max(members), family[0].is_half_lit
-        unequal = frame_checks.line_sum_fault(frames, ref, noise=self._noise, half=half)
-        if unequal is not None:
-            blamed, fault = unequal
-            return [self._contradiction(index, fault, [members[each] for each in blamed], members)]
-        odd = frame_checks.line_shape_fault(family, frames, ref, noise=self._noise) if half else None
-        if odd is not None:
-            at, fault = odd
-            return [self._contradiction(members[at], fault, [members[at]], members)]
+        frames = [self._corrected(each) for each in members]
+        found = self._check_line_light(family, members, frames, ref)
+        if found:
+            lights = frame_light.line_lights(frames, ref)
+            matched = [light.undo(frame, ref.black) for light, frame in zip(lights, frames, strict=True)]
+            if not self._check_line_light(family, members, matched, ref):
+                self.findings.lights.update(zip(members, lights, strict=True))
+                found, frames = [], matched
+        if found:
+            return found
+        index = max(members)
         shows, shift = frame_checks.check_line_order(frames, ref, noise=self._noise)
         if shift is None:
             # One frame that agrees with the code, and the right order, verify all lines.
@@ -569,6 +777,61 @@ def _code_parameters(pattern: Gray) -> tuple[Axis, int, int, int]:
     return (pattern.axis, pattern.bits, pattern.cell_px, pattern.offset_px)
 
 
+def _kind_of_light(pattern: Pattern) -> str:
+    if isinstance(pattern, Gray):
+        return f"{pattern.axis} Gray code"
+    return f"{pattern.axis} lines" if isinstance(pattern, LineShift) else pattern.kind
+
+
+def summarise(found: Sequence[Contradiction], patterns: Sequence[Pattern]) -> tuple[str, ...]:
+    """Describe the contradictions of one camera, those of one cause together."""
+    groups: defaultdict[str, list[Contradiction]] = defaultdict(list)
+    for each in found:
+        groups[re.sub(r"[\d.]+", "", _COMPARED.sub("", each.cause))].append(each)
+    words: list[str] = []
+    for group in groups.values():
+        suspects = sorted({index for each in group for index in each.suspects})
+        if len(group) == 1 or len(suspects) < _MIN_LISTED:
+            words += map(str, group)
+            continue
+        worst = max(group, key=lambda each: float((re.findall(r"(\d+)%", each.cause) or ["0"])[0]))
+        words.append(
+            f"camera '{worst.camera}', patterns {frame_order.describe_indices(suspects)}, most of all "
+            f"{describe_pattern(worst.suspects[0], patterns[worst.suspects[0]])}: {_COMPARED.sub('', worst.cause)}"
+        )
+    return tuple(words)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSummary:
+    """Faults of the frames of one camera, each cause once. wrong : patterns whose frames are proven wrong. misordered :
+    why the whole sequence is of no use, or None.
+    """
+
+    faults: tuple[str, ...]
+    wrong: frozenset[int]
+    misordered: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LightFactor:
+    """Light of the frames of one kind relative to white and black: the least, the median and the largest factor."""
+
+    least: float
+    median: float
+    most: float
+
+    def __str__(self) -> str:
+        if self.most - self.least <= STEADY_LIGHT:
+            return f"{self.median:.2f} times"
+        return f"{self.least:.2f} to {self.most:.2f} times"
+
+    @property
+    def is_steady(self) -> bool:
+        """True if no frame of this kind needs a note."""
+        return max(abs(self.least - 1), abs(self.most - 1)) <= STEADY_LIGHT
+
+
 @dataclass(frozen=True, slots=True)
 class EvidenceSummary:
     """Result of verifying the frames of one sequence.
@@ -576,7 +839,9 @@ class EvidenceSummary:
     patterns : number of patterns with frames. verified : number of patterns that passed, in every camera, a test that
     another pattern would fail. lit, light_drift, noise_dn : by camera, fraction of the image that the projector lights,
     largest change of the light relative to white, noise of a frame in DN; missing if unknown. faults : unresolved
-    contradictions. shot_again : number of rejected and repeated exposures; causes : their distinct reasons. left_out :
+    contradictions, each cause once. wrong : by camera, patterns whose frames are proven wrong. misordered : why the
+    frames of a camera cannot be used in their order, or None. light : by camera and kind of pattern, the light of its
+    frames. shot_again : number of rejected and repeated exposures; causes : their distinct reasons. left_out :
     distinct reasons why exposures of a bracket were left out.
     """
 
@@ -589,6 +854,9 @@ class EvidenceSummary:
     shot_again: int = 0
     causes: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    wrong: Mapping[str, frozenset[int]] = field(default_factory=dict)
+    misordered: str | None = None
+    light: Mapping[str, Mapping[str, LightFactor]] = field(default_factory=dict)
 
     def __str__(self) -> str:
         again = f", {self.shot_again} frame{'s' * (self.shot_again != 1)} shot again" if self.shot_again else ""
@@ -610,12 +878,19 @@ class EvidenceSummary:
 class Evidence:
     """Verification of one sequence by all its frames, in any order; starting with white and black saves memory.
 
-    patterns : the whole sequence. cameras : all cameras. refused : exposures already rejected.
+    patterns : the whole sequence. cameras : all cameras. refused : exposures already rejected. frame_names : by camera,
+    what messages on the order of the frames call the frame of each pattern; None: the pattern.
     """
 
     def __init__(
-        self, patterns: Sequence[Pattern], cameras: Mapping[str, CameraFormat], refused: Sequence[RefusedFrame] = ()
+        self,
+        patterns: Sequence[Pattern],
+        cameras: Mapping[str, CameraFormat],
+        refused: Sequence[RefusedFrame] = (),
+        *,
+        frame_names: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
+        self._frame_names = frame_names or {}
         self._patterns = tuple(patterns)
         self._cameras = dict(cameras)
         self._refused = [replace(each, shot=None) for each in refused if each.pattern < len(self._patterns)]
@@ -634,9 +909,19 @@ class Evidence:
         """
         return self._verifiers[camera].retract(patterns)
 
+    def came_alike(self, camera: str, patterns: Iterable[int]) -> bool:
+        """True if the frames of these patterns equal their rejected exposures, up to noise."""
+        return self._verifiers[camera].came_alike(patterns)
+
     def clear(self) -> None:
         """Remove all frames. The record of rejected exposures remains."""
-        self._verifiers = {name: FrameVerifier(name, form, self._patterns) for name, form in self._cameras.items()}
+        previous = self._verifiers
+        self._verifiers = {
+            name: FrameVerifier(name, form, self._patterns, self._frame_names.get(name))
+            for name, form in self._cameras.items()
+        }
+        for name, each in previous.items():
+            self._verifiers[name].take_rejected(each)
 
     def record_refused(self, refused: RefusedFrame) -> None:
         """Record a rejected exposure."""
@@ -648,13 +933,17 @@ class Evidence:
         added = {index for each in verifiers for index in each.pattern_indices}
         unverified = {index for each in verifiers for index in each.pattern_indices - each.findings.verified}
         found = {each.name: each.findings for each in verifiers}
+        results = {each.name: each.findings_summary() for each in verifiers}
         summary = EvidenceSummary(
             patterns=len(added),
             verified=len(added - unverified),
             lit={each.name: each.lighting.lit for each in verifiers if each.lighting is not None},
             light_drift={name: each.light_drift for name, each in found.items() if each.light_drift is not None},
             noise_dn={name: each.noise_dn for name, each in found.items() if each.noise_dn is not None},
-            faults=tuple(str(fault) for each in verifiers for fault in each.reported),
+            faults=tuple(fault for each in results.values() for fault in each.faults),
+            wrong={name: each.wrong for name, each in results.items() if each.wrong},
+            misordered=next((each.misordered for each in results.values() if each.misordered is not None), None),
+            light={each.name: factors for each in verifiers if (factors := each.light_factors())},
         )
         return summary.with_refused(self._refused, self._patterns)
 
@@ -687,140 +976,3 @@ def checked_frames(capture: Capture) -> list[int]:
         chosen += [by_pattern[i] for i in opening if i in by_pattern]
         chosen += [index for i, index in by_pattern.items() if i not in opening]
     return chosen
-
-
-class RetryPolicy:
-    """Decides which frames of a capture count, and which patterns to show again to which cameras.
-
-    refused : called for each rejected exposure. since_ns : zero of `Shot.time_s`; None is the start of the first frame.
-    colour : cameras whose white and black frames are also stored in colour.
-    """
-
-    def __init__(
-        self,
-        sequence: PatternSequence,
-        evidence: Evidence,
-        refused: Callable[[RefusedFrame], None],
-        *,
-        since_ns: int | None = None,
-        colour: Collection[str] = (),
-    ) -> None:
-        self.evidence = evidence
-        self.pending: dict[int, list[str]] = {}
-        self._sequence = sequence
-        self._on_refused = refused
-        self._attempts: Counter[tuple[str, int]] = Counter()
-        self._exposures: Counter[str] = Counter()
-        self._causes: defaultdict[tuple[str, int], list[str]] = defaultdict(list)
-        self._missing: defaultdict[tuple[str, int], list[str]] = defaultdict(list)
-        self._t_first_ns = since_ns
-        self._colour = colour
-        self._last_cause = ""
-
-    @property
-    def max_exposures(self) -> int:
-        """Maximum number of exposures of one camera."""
-        return MAX_FAILURES * len(self._sequence)
-
-    def start_exposure(self, camera: str, index: int) -> None:
-        """Count an exposure before it is made. Raises ScanEvidenceError: there were too many."""
-        self._attempts[camera, index] += 1
-        self._exposures[camera] += 1
-        if self._exposures[camera] > self.max_exposures:
-            raise ScanEvidenceError(
-                f"camera '{camera}': {self.max_exposures} exposures gave no {len(self._sequence)} frames that agree "
-                f"with one another; the last cause: {self._last_cause}"
-            )
-
-    def make_shot(self, index: int, frame: Frame) -> Shot:
-        """Return a frame as a shot, with its time since the start of the first frame."""
-        if self._t_first_ns is None:
-            self._t_first_ns = frame.t_start_ns
-        time_s = (frame.t_start_ns - self._t_first_ns) / 1e9
-        wanted = frame.camera in self._colour and isinstance(self._sequence.patterns[index], White | Black)
-        colour = frame.colour() if wanted and frame.colour is not None else None
-        return Shot(index, frame.camera, frame.image, frame.exposure_s, time_s, colour)
-
-    def submit(self, index: int, frame: Frame, fault: str | None) -> Shot | None:
-        """Check a frame; return it as a shot if it counts. fault : reason to reject the frame that is already known.
-        Raises ScanEvidenceError: the pattern failed for the third time.
-        """
-        shot = self.make_shot(index, frame)
-        # Only consecutive losses count.
-        self._missing[shot.camera, index].clear()
-        if fault is not None:
-            self._causes[shot.camera, index].append(fault)
-            self._request_again(RefusedFrame(index, shot.camera, self._attempts[shot.camera, index], fault, shot))
-            self._raise_after_max_failures(shot.camera, [index])
-            return None
-        found = self.evidence.add_shot(shot)
-        return shot if not found or index not in self._resolve(shot, found) else None
-
-    def report_missing(self, camera: str, index: int, cause: str) -> None:
-        """Record that no frame came. Raises FrameTimeoutError: none came three times in a row."""
-        missing = self._missing[camera, index]
-        missing.append(cause)
-        self._request_again(RefusedFrame(index, camera, self._attempts[camera, index], cause))
-        if len(missing) >= MAX_FAILURES:
-            raise FrameTimeoutError(self._failure_message(camera, index, missing))
-
-    def _resolve(self, shot: Shot, found: tuple[Contradiction, ...]) -> frozenset[int]:
-        """Request the suspects again; return the patterns whose frames no longer count."""
-        camera = shot.camera
-        suspects: dict[int, str] = {}
-        for each in found:
-            for suspect in each.suspects:
-                suspects.setdefault(suspect, each.cause)
-        for suspect, cause in suspects.items():
-            self._causes[camera, suspect].append(cause)
-        further_suspects = {
-            pattern: each.cause
-            for each in found
-            if any(len(self._causes[camera, suspect]) > 1 for suspect in each.suspects)
-            for pattern in each.further_suspects
-        }
-        removed = self.evidence.retract(camera, {*suspects, *further_suspects})
-        for pattern in removed:
-            cause = suspects.get(pattern) or further_suspects.get(pattern) or found[0].cause
-            is_current = pattern == shot.pattern
-            attempt = self._attempts[camera, pattern]
-            self._request_again(
-                RefusedFrame(pattern, camera, attempt, cause, shot if is_current else None, delivered=not is_current)
-            )
-        self._raise_after_max_failures(camera, suspects)
-        return frozenset(removed)
-
-    def refuse(self, refused: RefusedFrame) -> None:
-        """Record a rejected exposure and report it."""
-        self.evidence.record_refused(refused)
-        self._on_refused(refused)
-
-    def _request_again(self, refused: RefusedFrame) -> None:
-        cameras = self.pending.setdefault(refused.pattern, [])
-        if refused.camera not in cameras:
-            cameras.append(refused.camera)
-        self._last_cause = refused.cause
-        self.refuse(refused)
-
-    def _raise_after_max_failures(self, camera: str, patterns: Iterable[int]) -> None:
-        for index in patterns:
-            causes = self._causes[camera, index]
-            if len(causes) >= MAX_FAILURES:
-                raise ScanEvidenceError(self._failure_message(camera, index, causes))
-
-    def _failure_message(self, camera: str, index: int, causes: list[str]) -> str:
-        return f"{describe_frame(camera, index, self._sequence.patterns[index])}: {describe_causes(causes)}"
-
-
-def describe_causes(causes: list[str]) -> str:
-    """Describe several failures of one thing; causes that differ only in numbers are given once.
-
-    >>> describe_causes(["frame 7 is dark", "frame 9 is dark"])
-    'it failed 2 times, each time alike: frame 9 is dark'
-    >>> describe_causes(["it is dark", "it came twice"])
-    'it failed 2 times. The first time: it is dark. The second time: it came twice'
-    """
-    if len({re.sub(r"\d+", "", cause) for cause in causes}) == 1:
-        return f"it failed {len(causes)} times, each time alike: {causes[-1]}"
-    listed = [f"The {_ORDINALS[number]} time: {cause}" for number, cause in enumerate(causes)]
-    return f"it failed {len(causes)} times. {'. '.join(listed)}"

@@ -88,6 +88,8 @@ def import_images(
     )
     for name, files in found.cameras.items():
         typer.echo(f"{'camera':<11}{name}: {len(files)} images, {files[0][0].name} to {files[-1][0].name}")
+    for fault in found.faults:
+        typer.echo(f"{'doubtful':<11}{fault}")
     if found.unassigned:
         some = ", ".join(found.unassigned[:5]) + (" …" if len(found.unassigned) > 5 else "")
         typer.echo(f"{'left out':<11}{len(found.unassigned)} images that no pattern is known of: {some}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
@@ -20,6 +21,7 @@ from slrig.bundle import (
     read_text,
     read_with_colour,
 )
+from slrig.capture import Evidence
 from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
 from slrig.importers.calibrations import centring_offset_px, read_any_calibration
@@ -34,6 +36,8 @@ CALIBRATIONS = ("calibration.yml", "calibration.yaml", "calibration.xml", "calib
 MAX_LIST_BYTES = 2**20
 
 _MIN_DIFFERENCE = 0.02  # of full scale, between white and black where the projector's light falls
+_MIN_DIFFERENCE_TO_NOISE = 5.0  # of the same
+_NOISE_ROWS = 128  # of an image, whose adjacent pixels show the noise of a difference
 _MIN_DIFFERING_FRACTION = 0.002  # of all pixels, for a comparison of two images
 _MIN_AGREEING_FRACTION = 0.98  # of the differing pixels, brighter in the same image
 _MIN_BRIGHTEST_OF_16_BITS = 2**14
@@ -231,10 +235,13 @@ class ImageNaming:
 
 @dataclass(slots=True)
 class ImageAssignment:
-    """Images of each camera with their patterns. unassigned : names of images without a known pattern."""
+    """Images of each camera with their patterns. unassigned : names of images without a known pattern. faults : images
+    that contradict one another, each cause once.
+    """
 
     cameras: dict[str, list[tuple[Path, Pattern]]] = field(default_factory=dict)
     unassigned: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
 
 
 def import_capture(
@@ -249,6 +256,9 @@ def import_capture(
     unit: LengthUnit | None = None,
 ) -> tuple[ImageAssignment, Path | None]:
     """Write the images of `folder` as the bundle `output`; return the images and the calibration file that was used.
+
+    The images are checked against one another. Those that contradict are named, and reconstruction does not use what is
+    proven wrong; if they do not come in the order of their patterns, nothing is written.
 
     names : new names of the cameras, in the natural order of their names in the folder. bit_depth : of samples in
     files with 16 bits. unit : as for `read_any_calibration`. Raises BundleError, PatternError, CalibrationError: the
@@ -273,7 +283,9 @@ def import_capture(
     patterns = list(dict.fromkeys(pattern for files in images.cameras.values() for _, pattern in files))
     with BundleWriter(output, code.size, patterns, formats, calibration) as writer:
         for name, files in images.cameras.items():
-            _write_camera(writer, name, files, formats[name], patterns, is_depth_given=bit_depth is not None)
+            images.faults += _write_camera(
+                writer, name, files, formats[name], patterns, is_depth_given=bit_depth is not None
+            )
     return images, path
 
 
@@ -312,6 +324,9 @@ def _pattern_sequence(code: ProjectorCode, naming: ImageNaming, files: Sequence[
             if brighter is not None:
                 references: tuple[Pattern, ...] = (White(), Black()) if brighter else (Black(), White())
                 return opencv_sequence(code, count, references, references_first=references_first)
+        # With white and black elsewhere the images are shifted, which their comparison names.
+        with suppress(BundleError):
+            return opencv_sequence(code, count, (White(), Black()), references_first=False)
         return opencv_sequence(code, count, (), references_first=False)
     return (scan3d_sequence if naming.program == "scan3d" else slstudio_sequence)(code, count)
 
@@ -428,20 +443,36 @@ def _write_camera(
     patterns: Sequence[Pattern],
     *,
     is_depth_given: bool,
-) -> None:
+) -> tuple[str, ...]:
+    """Write the images of a camera; return how they contradict one another, each cause once. Raises BundleError."""
+    first = {pattern: path for path, pattern in reversed(files)}
+    shown = list(dict.fromkeys(pattern for _, pattern in files))
+    evidence = Evidence(shown, {name: form}, frame_names={name: [f"image {first[pattern].name}" for pattern in shown]})
     reference_frames: dict[str, tuple[Path, Pixels]] = {}
     brightest = 0
+    # White and black come first, so that the other images need not wait for them.
+    references: tuple[White | Black, ...] = (White(), Black())
+    for reference in (each for each in references if each in first):
+        image = read_with_colour(first[reference], (0,), form)[0][0]
+        reference_frames[reference.kind] = (first[reference], image)
+        evidence.add_shot(Shot(shown.index(reference), name, image))
     for path, pattern in files:
         coloured = (0,) if isinstance(pattern, White | Black) else ()
         grey, colour = read_with_colour(path, (0,), form, colour_pages=coloured)
         writer.add(Shot(patterns.index(pattern), name, grey[0], colour=colour.get(0)))
         brightest = max(brightest, int(grey[0].max()))
-        if isinstance(pattern, White | Black):
-            reference_frames[pattern.kind] = (path, grey[0])
+        if path == first[pattern] and not isinstance(pattern, White | Black):
+            evidence.add_shot(Shot(shown.index(pattern), name, grey[0]))
     if form.bit_depth > 8 and not is_depth_given and brightest < _MIN_BRIGHTEST_OF_16_BITS:
         raise BundleError(
             f"{files[0][0].parent}, {name}: expected samples over all of 16 bits, found {brightest} at most, so that "
             "the saturation level is unknown; give the camera's number of bits, such as --bit-depth 12"
+        )
+    summary = evidence.summary()
+    if summary.misordered is not None:
+        raise BundleError(
+            f"{files[0][0].parent}: {summary.misordered}; rename the images in the order of their patterns, or list "
+            "them with --list"
         )
     if len(reference_frames) == 2:
         (white, lit), (black, dark) = reference_frames["white"], reference_frames["black"]
@@ -450,12 +481,15 @@ def _write_camera(
                 f"{white}: expected white, and {black.name} black, found it not brighter wherever they differ; correct "
                 "the order. These may be phase shifts, not supported: slrig reads Gray codes and shifted lines"
             )
+    return summary.faults
 
 
 def _first_is_brighter(first: Pixels, second: Pixels, full_scale: int) -> bool | None:
     """Return True or False if one of two images is brighter wherever they differ; None if neither is."""
     difference = first.astype(np.int32) - second
-    differs = np.abs(difference) > _MIN_DIFFERENCE * full_scale
+    step = np.diff(difference[:: max(1, len(difference) // _NOISE_ROWS)], axis=1)
+    noise = 1.4826 * float(np.median(np.abs(step))) / 2**0.5 if step.size else 0.0
+    differs = np.abs(difference) > max(_MIN_DIFFERENCE * full_scale, _MIN_DIFFERENCE_TO_NOISE * noise)
     if differs.mean() < _MIN_DIFFERING_FRACTION:
         return None
     fraction = float((difference[differs] > 0).mean())

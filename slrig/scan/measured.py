@@ -52,6 +52,7 @@ from slrig.scan.losses import (
 from slrig.scan.report import capture_notes, capture_report, layout_notes, lit_pixels
 from slrig.scan.stream import CameraResult, LiveScan, ScanStream, cell_px, step_px
 from slrig.scan.triangulated import Triangulated, camera_notes, triangulated, unresolved_notes
+from slrig.scan.usable_frames import UsableFiles, usable_files
 
 _STAGES = ("measure noise", "decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
 
@@ -258,7 +259,11 @@ def _walked(
         devices, evidence = live.calibration, live.evidence
         stream: ScanStream = live
         _require_calibration(folder, names, devices)
-        seen = live.finished(stage_entered)
+        usable = None
+        if evidence.wrong or evidence.misordered is not None:
+            usable = _usable(folder, open_bundle(folder, calibration_file=calibration_file), evidence)
+        if usable is None:
+            seen = live.finished(stage_entered)
     else:
         files = open_bundle(folder, calibration_file=calibration_file)
         names += files.outline.cameras
@@ -267,16 +272,27 @@ def _walked(
             stream, evidence, cut_short = _streamed(
                 files, devices, stage_entered, axis, region, judged, drop_finest_bits
             )
-            seen = stream.finish()
+            usable = _usable(folder, files, evidence)
+            if usable is None:
+                seen = stream.finish()
         except PatternError as cause:
             message = f"{folder}: {cause}"
+            raise PatternError(message) from cause
+    if usable is not None:
+        try:
+            stream, _, cut_short = _streamed(
+                usable, devices, stage_entered, stream.axis, region, evidence, drop_finest_bits
+            )
+            seen = stream.finish()
+        except PatternError as cause:
+            message = f"{folder}: {'; '.join(evidence.faults)}; {usable.note}. {cause}"
             raise PatternError(message) from cause
     sections = capture_report(stream.header, stream.axis, evidence)
     step, cell = (each(stream.header.displayed_patterns, stream.axis) for each in (step_px, cell_px))
     notes = [
         *cut_short,
         *layout_notes(devices),
-        *capture_notes(stream.header, stream.axis, evidence),
+        *capture_notes(stream.header, stream.axis, evidence, None if usable is None else usable.note),
         *camera_notes(seen),
         *unresolved_notes(seen, step, cell, dropped=drop_finest_bits),
     ]
@@ -288,8 +304,18 @@ def _walked(
     )
 
 
+def _usable(folder: Path, files: BundleFiles, evidence: EvidenceSummary) -> UsableFiles | None:
+    """The bundle without frames that are proven wrong; None if all are of use. Raises
+    NothingToReconstructError: the frames do not come in the order of their patterns.
+    """
+    if evidence.misordered is not None:
+        message = f"{folder}: {evidence.misordered}; nothing is measured from frames of other patterns"
+        raise NothingToReconstructError(message)
+    return usable_files(files, evidence, None)
+
+
 def _streamed(
-    files: BundleFiles,
+    files: BundleFiles | UsableFiles,
     devices: Calibration,
     entered: Callable[[str, str], None],
     axis: Axis | None,

@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -200,7 +201,11 @@ def capture_report(capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary
             "shot_again": evidence.shot_again,
             "shot_again_because": list(evidence.causes),
             "light_drift": dict(evidence.light_drift),
+            "light": {
+                name: {kind: asdict(factor) for kind, factor in kinds.items()} for name, kinds in evidence.light.items()
+            },
             "contradictions": list(evidence.faults),
+            "wrong_frames": {name: sorted(each) for name, each in evidence.wrong.items()},
         },
     }
 
@@ -209,15 +214,33 @@ def _has_lines(capture: CaptureHeader, axis: Axis) -> bool:
     return any(isinstance(pattern, LineShift) and pattern.axis is axis for pattern in capture.displayed_patterns)
 
 
-def capture_notes(capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary) -> list[str]:
-    """What a person should know of the frames, one sentence each."""
+def capture_notes(
+    capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary, not_used: str | None = None
+) -> list[str]:
+    """What a person should know of the frames, one sentence each. not_used : which wrong frames are not used."""
     notes = []
     if not _has_lines(capture, axis):
         notes.append(
             "Gray-only: no line-shift frames, so points lie on the edges of the Gray code, located to sub-pixel"
         )
     notes += [f"an exposure was left out: {cause}" for cause in evidence.left_out]
-    notes += [f"the frames contradict their patterns: {fault}" for fault in evidence.faults]
+    # Wrong frames come first, and what became of them is said with them.
+    fates = [f"; {not_used}"] if not_used is not None else []
+    notes += [
+        f"the frames contradict their patterns: {fault}{fate}"
+        for fault, fate in zip_longest(evidence.faults, fates[: len(evidence.faults)], fillvalue="")
+    ]
+    unsteady = [
+        f"camera '{name}': {', '.join(f'{kind} {factor}' for kind, factor in of.items())}"
+        for name, of in evidence.light.items()
+        if not all(factor.is_steady for factor in of.values())
+    ]
+    if unsteady:
+        notes.append(
+            f"the light is not the same in all frames ({'; '.join(unsteady)} the light of white): the projector's lamp "
+            "follows the picture (dynamic contrast) or flickers, or the camera sets its exposure by itself. Each frame "
+            "was checked after one factor for its light; switch off what changes the light for the least error"
+        )
     return notes
 
 

@@ -345,3 +345,50 @@ def test_real_captures_are_imported_as_they_were_by_hand(
         assert one.pattern == other.pattern
         assert (one.image == other.image).all()
     assert (found.calibration is None) == (manual.calibration is None)
+
+
+# ---- images that contradict one another
+
+
+def by_hand(images: list[Pixels], kind: str) -> list[Pixels]:
+    """The images of a folder with a fault."""
+    found = list(images)
+    if kind == "first to the end":
+        return [*found[1:], found[0]]
+    if kind == "copy":
+        found[7] = found[6]
+    if kind == "exchanged":
+        found[15], found[17] = found[17], found[15]
+    if kind == "noise":
+        chance = np.random.default_rng(1)
+        return [np.clip(np.rint(image + chance.normal(0, 2, image.shape)), 0, 255).astype(np.uint8) for image in found]
+    return found
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("right", ""),
+        ("noise", ""),
+        ("copy", "image graycode_07.png is a copy of image graycode_06.png"),
+        ("exchanged", "image graycode_15.png and image graycode_17.png are exchanged"),
+        (
+            "first to the end",
+            "all frames are one frame ahead of their patterns: with the last frame moved to the front",
+        ),
+    ],
+)
+def test_images_that_contradict_are_named_at_import(shared: Path, tmp_path: Path, kind: str, words: str) -> None:
+    capture = shared / "cases" / "two_axes" / "capture"
+    if not capture.is_dir():
+        pytest.skip(f"no {capture}")
+    folder = tmp_path / "images"
+    folder.mkdir()
+    images = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted(capture.glob("*.png"))]
+    for index, image in enumerate(by_hand(images, kind)):
+        assert cv2.imwrite(str(folder / f"graycode_{index:02}.png"), image)
+    result = slrig("import", folder, "--output", tmp_path / "bundle", "--projector", "640x400")
+    assert words in " ".join(result.output.split())
+    assert ("doubtful" in result.output) is (kind in ("copy", "exchanged"))
+    assert (result.exit_code, (tmp_path / "bundle").exists()) == ((2, False) if "ahead" in words else (0, True))

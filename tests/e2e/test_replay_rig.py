@@ -87,6 +87,26 @@ def test_a_scan_of_another_programs_recording_gives_its_mesh(shared: Path, tmp_p
     assert meshes(again, tmp_path / "new") == meshes(bundle, tmp_path / "old")
 
 
+@pytest.mark.shared
+@pytest.mark.slow
+def test_a_scan_in_light_that_follows_the_picture_gives_the_mesh_of_its_recording(shared: Path, tmp_path: Path) -> None:
+    bundle = shared / "cases" / "dynamic_contrast"
+    if not bundle.is_dir():
+        pytest.skip(f"no {bundle}")
+    rig = tmp_path / "replayed.toml"
+    rig.write_text(REPLAYED.format(bundle=bundle, speed=0))
+    with serving(rig, tmp_path / "data") as service, service.client() as client:
+        scan = scanned(client)
+        assert scan["state"] == "succeeded", scan["error"]
+    again = service.data / "scans" / scan["id"]
+    report = json.loads((again / "report.json").read_text())
+    assert written(again) == meshes(bundle, tmp_path / "reconstructed")
+    assert report["evidence"]["shot_again"] == 0
+    assert report["evidence"]["light"]["left"]["column Gray code"]["median"] == pytest.approx(4 / 3, rel=0.03)
+    assert report["evidence"]["light"]["left"]["column lines"]["median"] == pytest.approx(1.6 * 4 / 3, rel=0.05)
+    assert len([note for note in report["notes"] if "light" in note]) == 1
+
+
 def libraries(process: int) -> set[str]:
     mapped = Path(f"/proc/{process}/maps").read_text()
     return {name for name in MATHEMATICS if f"/{name}/" in mapped}

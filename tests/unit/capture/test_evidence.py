@@ -358,8 +358,8 @@ BIT_0, BIT_4 = (PATTERNS.index(Gray(Axis.COLUMN, bit, 5, 4)) for bit in (0, 4))
             rf"lines, shift 3 of 8.*equals that of pattern {FIRST_LINE + 2} ",
         ),
         (
-            [*SHOTS[:-2], replace(SCENE, white=0.75).shots(PATTERNS)[-2]],
-            r"the light changed by \+25% of white",
+            [*SHOTS[:-2], replace(SCENE, white=0.12).shots(PATTERNS)[-2]],
+            r"the light changed by -\d+% of white",
         ),
         (
             with_image(SHOTS, COUNT - 2, np.roll(SHOTS[-2].image, 25, axis=1)),

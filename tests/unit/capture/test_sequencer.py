@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from slrig.bundle.sidecars import RefusedFrame
+from slrig.capture.retries import MAX_FAILURES, RetryPolicy
 from slrig.capture.sequencer import capture
 from slrig.capture.triggering import frame_shift
-from slrig.capture.verifier import MAX_FAILURES, Evidence, EvidenceSummary, RetryPolicy
+from slrig.capture.verifier import Evidence, EvidenceSummary
 from slrig.devices import CameraSettings, Synchronisation, Trigger
 from slrig.errors import (
     DeviceGoneError,
