@@ -109,6 +109,9 @@ class Refusal(IntEnum):
     NO_INTERSECTION = 12
     SHEET_SEEN_ALONG = 13
     OUTSIDE_REGION = 14
+    MIRROR_IMAGE = 15
+    CONTRADICTED = 16
+    ONE_CAMERA_ONLY = 17
 
 
 class FlipRule(StrEnum):

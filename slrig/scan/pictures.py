@@ -63,6 +63,12 @@ _CAUSES: Mapping[Refusal, tuple[tuple[int, int, int], str]] = {
     Refusal.NO_INTERSECTION: ((120, 40, 120), "its ray does not meet the light"),
     Refusal.SHEET_SEEN_ALONG: ((90, 90, 200), "its ray runs along the light, so there is no depth"),
     Refusal.OUTSIDE_REGION: ((86, 80, 77), "outside the region that the scan was asked for, or beyond its limits"),
+    Refusal.MIRROR_IMAGE: ((80, 230, 150), "a mirror image: it faces only one of the devices that measured it"),
+    Refusal.CONTRADICTED: ((140, 60, 255), "the second axis of patterns contradicts it"),
+    Refusal.ONE_CAMERA_ONLY: (
+        (220, 180, 200),
+        "no partner in the other camera, or left out because the cameras contradict each other",
+    ),
 }
 
 

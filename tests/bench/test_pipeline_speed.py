@@ -33,7 +33,7 @@ from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import _meshed
 from slrig.scan.report import Stopwatch
 from slrig.scan.stream import ScanStream, cell_px, step_px
-from slrig.scan.triangulated import triangulated
+from slrig.scan.triangulated import triangulate_cameras
 
 RUNS = 5
 WHOLE = ReconstructionPlan()
@@ -101,7 +101,7 @@ class Run:
         seen = stream.finish()
         watch.enter("triangulate")
         step, cell = (each(stream.header.displayed_patterns, stream.axis) for each in (step_px, cell_px))
-        found = triangulated(seen, calibration.projector, stream.axis, region)
+        found = triangulate_cameras(seen, calibration, stream.axis, region)
         walked = Walked(calibration, stream.axis, stream.header.axes, seen, step, cell, {}, [])
         meshed = _meshed(folder, found, walked, plan, lambda stage, _fraction, _detail: watch.enter(stage))
         self.stages_s = watch.finished()

@@ -202,14 +202,14 @@ def test_every_cause_has_a_colour_of_its_own() -> None:
 def test_refused_pixels_have_their_cause_in_colour_and_legend() -> None:
     refusals = np.zeros((600, 800), dtype=np.uint8)
     for cause in Refusal:
-        refusals[40 * cause : 40 * cause + 30, 100:300] = cause
+        refusals[30 * cause : 30 * cause + 20, 100:300] = cause
     picture = rejection_picture(refusals, np.full((600, 800), 180, dtype=np.uint8), 255)
     legend = picture[:, 800:]
     for cause in Refusal:
         swatch = (legend == np.array(_CAUSES[cause][0], dtype=np.uint8)).all(axis=2)
         assert swatch.sum() >= 100, cause.name
         if cause is not Refusal.NONE:
-            assert tuple(picture[40 * cause + 20, 200]) == _CAUSES[cause][0]
+            assert tuple(picture[30 * cause + 10, 200]) == _CAUSES[cause][0]
     assert tuple(picture[599, 799]) == (180, 180, 180)
     # The legend has the counts.
     few, many = np.zeros((500, 500), dtype=np.uint8), np.full((500, 500), Refusal.SATURATED, dtype=np.uint8)
