@@ -1,7 +1,8 @@
 """From camera frames to curves in space.
 
 `pipeline` runs the steps of one camera: noise, decoding, stripes, refinement, identification and links. Then follow
-`triangulation`, `merging` of cameras and `uncertainty`; `fusion` comes before for several exposures, `albedo` after.
+`triangulation`, comparison (`redundancy`) and `merging` of cameras, and `uncertainty`. `fusion` comes before for
+several exposures, `albedo` after.
 """
 
 from slrig.reconstruction.albedo import (

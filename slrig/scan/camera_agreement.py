@@ -5,9 +5,9 @@ calibration (`slrig.reconstruction.redundancy`). The rule, in this order:
 
 1. If two cameras agree with their names exchanged or a picture mirrored, this is the cause, and there is no mesh.
 2. Of three cameras or more, one that contradicts all others, while these agree, is the one that is wrong.
-3. The pose of each device that can have moved, camera or projector, is refined. That which leaves the smallest residual
-   has moved, if then the cameras agree and the move is small: it was bumped. Others that leave as little are named,
-   and the distance between the two surfaces, less a rigid motion, widens the standard deviations.
+3. The pose of each device that can have moved, camera or projector, is refined. That which leaves the smallest misfit
+   has moved, if it leaves no more than noise and the move is small: it was bumped. Others that leave as little are
+   named, and the distance between the two surfaces, less a rigid motion, widens the standard deviations.
 4. Otherwise one camera is used alone: the one that agrees with the second axis of patterns, or else the one with the
    larger number of points over their standard deviation. Unless the second axis or other cameras show it to be right,
    the distance between the cameras widens the standard deviations.
@@ -51,6 +51,7 @@ from slrig.reconstruction import (
 
 _REFUTED_PX = 5.0
 _REFUTED_SIGMA, _LENS_PX = 20.0, 1.0  # a lens model may leave up to 1 px, however small the noise is
+_MAX_MISFIT = 2.0  # of a pose that explains the contradiction: 1 is noise alone, 2 noise and 2 % of other surfaces
 _SAME_FIT = 1.2  # residuals of two devices in this ratio do not show which of them moved
 _SAMPLE = 5000
 _AGREES_SIGMA = 3.0
@@ -128,9 +129,17 @@ class _Trial:
     parts: list[SheetCurves]
     pairs: Mapping[tuple[int, int], PairRedundancy]
 
+    def misfit(self, count: int) -> float:
+        """Root mean square of the equations over their noise, 12 at most; of `count` equations those that are missing
+        count as 12.
+        """
+        squares = [_capped_squares(pair) for pair in self.pairs.values()]
+        missing = max(count - self.count, 0)
+        return float(np.sqrt((sum(float(each.sum()) for each in squares) + OUTLIER_SIGMA**2 * missing) / count))
+
     @property
-    def rms_px(self) -> float:
-        return max((pair.rms_px for pair in self.pairs.values()), default=np.inf)
+    def count(self) -> int:
+        return sum(len(pair.residuals.residual_px) for pair in self.pairs.values())
 
     @property
     def agrees(self) -> bool:
@@ -181,15 +190,24 @@ def check_agreement(
         for moved in [scan.with_pose(found)]
         for moved_parts in [moved.parts()]
     ]
-    best = min(trials, key=lambda each: each.rms_px, default=None)
-    if best is not None and best.agrees and best.refined.is_small:
-        rivals = [each for each in trials if each is not best and each.agrees and each.rms_px < _SAME_FIT * best.rms_px]
+    count = max((each.count for each in trials), default=0)
+    best = min(trials, key=lambda each: each.misfit(count), default=None)
+    if best is not None and best.agrees and best.refined.is_small and best.misfit(count) <= _MAX_MISFIT:
+        same = _SAME_FIT * best.misfit(count)
+        rivals = [each for each in trials if each is not best and each.agrees and each.misfit(count) <= same]
         return _with_refined_pose(scan, redundancy, usable, worst, best, rivals)
     return _with_one_camera(scan, parts, redundancy, usable, worst, odd, agreeing)
 
 
 def _by_index(names: Sequence[str], redundancy: Redundancy) -> dict[tuple[int, int], PairRedundancy]:
     return {(names.index(each.reference), names.index(each.camera)): each for each in redundancy.pairs}
+
+
+def _capped_squares(pair: PairRedundancy) -> FloatArray:
+    """(m,) float64: square of each equation over its noise, 144 at most."""
+    median, _ = cell_medians(pair.residuals)
+    sigma_px = noise_px(pair.residuals, median, np.hypot(pair.residuals.sigma_px, pair.calibration_px))
+    return np.asarray(np.minimum((pair.residuals.residual_px / sigma_px) ** 2, OUTLIER_SIGMA**2))
 
 
 def _odd_camera(
