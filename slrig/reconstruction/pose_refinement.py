@@ -62,6 +62,11 @@ class RefinedPose:
     scatter_sigma: float
 
     @property
+    def move(self) -> float:
+        """Turn and shift in the standard deviations of a bump."""
+        return float(np.hypot(np.deg2rad(self.turn_deg) / _TURN_RAD, self.shift_mm / (_SHIFT * self.baseline_mm)))
+
+    @property
     def is_small(self) -> bool:
         """True if the device can have been bumped so far."""
         return _is_small(np.deg2rad([self.turn_deg]), np.array([self.shift_mm]), self.baseline_mm)

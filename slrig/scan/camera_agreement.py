@@ -6,8 +6,9 @@ calibration (`slrig.reconstruction.redundancy`). The rule, in this order:
 1. If two cameras agree with their names exchanged or a picture mirrored, this is the cause, and there is no mesh.
 2. Of three cameras or more, one that contradicts all others, while these agree, is the one that is wrong.
 3. The pose of each device that can have moved, camera or projector, is refined. That which leaves the smallest misfit
-   has moved, if it leaves no more than noise and the move is small: it was bumped. Others that leave as little are
-   named, and the distance between the two surfaces, less a rigid motion, widens the standard deviations.
+   has moved, if it leaves no more than noise and the move is small: it was bumped. Of those that leave as little
+   the one with the smallest move is taken, the others are named, and the distance between their surfaces widens the
+   standard deviations.
 4. Otherwise one camera is used alone: the one that agrees with the second axis of patterns, or else the one with the
    larger number of points over their standard deviation. Unless the second axis or other cameras show it to be right,
    the distance between the cameras widens the standard deviations.
@@ -191,10 +192,12 @@ def check_agreement(
         for moved_parts in [moved.parts()]
     ]
     count = max((each.count for each in trials), default=0)
-    best = min(trials, key=lambda each: each.misfit(count), default=None)
-    if best is not None and best.agrees and best.refined.is_small and best.misfit(count) <= _MAX_MISFIT:
-        same = _SAME_FIT * best.misfit(count)
-        rivals = [each for each in trials if each is not best and each.agrees and each.misfit(count) <= same]
+    fitting = min(trials, key=lambda each: each.misfit(count), default=None)
+    if fitting is not None and fitting.agrees and fitting.refined.is_small and fitting.misfit(count) <= _MAX_MISFIT:
+        same = _SAME_FIT * fitting.misfit(count)
+        rivals = [each for each in trials if each.agrees and each.refined.is_small and each.misfit(count) <= same]
+        best = min(rivals, key=lambda each: each.refined.move)
+        rivals.remove(best)
         return _with_refined_pose(scan, redundancy, usable, worst, best, rivals)
     return _with_one_camera(scan, parts, redundancy, usable, worst, odd, agreeing)
 
@@ -259,7 +262,7 @@ def _with_refined_pose(
 ) -> Agreement:
     refined, before, after = best.refined, _by_index(scan.names, redundancy)[worst], best.pairs[worst]
     left_mm = _unexplained_mm(best.scan, best.parts, worst, after)
-    apart_mm = max((_surface_distance_mm(best, each, worst[0]) for each in rivals), default=0.0)
+    apart_mm, in_shape_mm = max((_surface_distance_mm(best, each, worst[0]) for each in rivals), default=(0.0, 0.0))
     name = scan.device_name(refined.device)
     note = (
         f"{name} was turned by {refined.turn_deg:.2f}° and shifted by {refined.shift_mm:.2f} mm since its "
@@ -270,7 +273,8 @@ def _with_refined_pose(
         others = " or ".join(scan.device_name(each.refined.device) for each in rivals)
         note += (
             f". Had {others} moved instead, the cameras would agree as well: the surface would be {apart_mm:.3f} mm "
-            "from this one (median), which was added to the standard deviations, in squares"
+            f"from this one (median), {in_shape_mm:.3f} mm of it in shape. This distance was added to the standard "
+            "deviations, in squares"
         )
     names = list(best.scan.calibration.cameras)
     covariance = np.zeros((DEVICE_PARAMETERS * (len(names) + 1),) * 2)
@@ -297,6 +301,8 @@ def _with_refined_pose(
             "after_px": after.median_absolute_px,
             "after_over_stated": after.over_stated,
             "could_be_instead": [scan.device_name(each.refined.device) for each in rivals],
+            "apart_mm": apart_mm,
+            "apart_in_shape_mm": in_shape_mm,
             "sigma_added_mm": float(np.hypot(left_mm, apart_mm)),
         },
     )
@@ -406,8 +412,8 @@ def _unexplained_mm(scan: _Scan, parts: list[SheetCurves], pair: tuple[int, int]
     return DEVIATIONS_PER_MEDIAN * scan.distance_mm(parts, pair) * float(np.sqrt((1 - found.over_stated**-2) / 2))
 
 
-def _surface_distance_mm(trial: _Trial, other: _Trial, camera: int) -> float:
-    """Median distance between the points of a camera in two trials, less the rigid motion between them."""
+def _surface_distance_mm(trial: _Trial, other: _Trial, camera: int) -> tuple[float, float]:
+    """Median distance between the points of a camera in two trials, and the same less the rigid motion between them."""
     (a, _, _, refused), (b, _, _, refused_too) = (
         intersect_light_sheets(scan.stripes[camera], scan.cameras[camera], scan.projector, scan.axis)
         for scan in (trial.scan, other.scan)
@@ -418,7 +424,8 @@ def _surface_distance_mm(trial: _Trial, other: _Trial, camera: int) -> float:
     middle_a, middle_b = a.mean(axis=0), b.mean(axis=0)
     u, _, vt = np.linalg.svd((b - middle_b).T @ (a - middle_a))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return float(np.median(np.linalg.norm((b - middle_b) @ turn - (a - middle_a), axis=1)))
+    in_shape = (b - middle_b) @ turn - (a - middle_a)
+    return float(np.median(np.linalg.norm(b - a, axis=1))), float(np.median(np.linalg.norm(in_shape, axis=1)))
 
 
 def _contradiction(found: PairRedundancy) -> str:
