@@ -41,7 +41,6 @@ from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.pipeline import CameraCurves, CameraStream, camera_curves
 from slrig.reconstruction.pose_refinement import MAX_SHIFT, MAX_TURN_DEG, RefinedPose, refine_pose
 from slrig.reconstruction.redundancy import (
-    DEVIATIONS_PER_MEDIAN,
     OUTLIER_SIGMA,
     PairRedundancy,
     Redundancy,
@@ -78,7 +77,6 @@ __all__ = [
     "BRIGHT_ALBEDO",
     "BRIGHT_PERCENT",
     "CONVERGED",
-    "DEVIATIONS_PER_MEDIAN",
     "MAX_SHIFT",
     "MAX_TURN_DEG",
     "NEAR_SATURATION",

@@ -30,7 +30,6 @@ from scipy.ndimage import label
 from slrig.errors import CalibrationError
 from slrig.model import DEVICE_PARAMETERS, Axis, Calibration, FloatArray, Pinhole, Refusal, SolveRecord
 from slrig.reconstruction import (
-    DEVIATIONS_PER_MEDIAN,
     MAX_SHIFT,
     MAX_TURN_DEG,
     OUTLIER_SIGMA,
@@ -46,6 +45,7 @@ from slrig.reconstruction import (
     merge_curves,
     noise_px,
     refine_pose,
+    select_points,
     sheet_coordinates,
     triangulate_camera_projector,
 )
@@ -55,6 +55,7 @@ _REFUTED_SIGMA, _LENS_PX = 20.0, 1.0  # a lens model may leave up to 1 px, howev
 _MAX_MISFIT = 2.0  # of a pose that explains the contradiction: 1 is noise alone, 2 noise and 2 % of other surfaces
 _SAME_FIT = 1.2  # residuals of two devices in this ratio do not show which of them moved
 _SAMPLE = 5000
+_ONE_DEVIATION = 68.3  # percent of a normal distribution
 _AGREES_SIGMA = 3.0
 
 
@@ -79,10 +80,11 @@ class Agreement:
 
 @dataclass(frozen=True, slots=True)
 class _Scan:
-    """Stripes of every camera, by the devices that a calibration states. names : of the cameras."""
+    """Stripes of every camera, by the devices that a calibration states. usable : cameras that measure depth."""
 
     names: tuple[str, ...]
     stripes: tuple[StripeEnsemble, ...]
+    usable: tuple[bool, ...]
     calibration: Calibration
     projector: Pinhole
     axis: Axis
@@ -93,9 +95,13 @@ class _Scan:
         return [self.calibration.cameras[name] for name in self.names]
 
     def parts(self) -> list[SheetCurves]:
-        return [
+        triangulated = (
             triangulate_camera_projector(stripes, camera, self.projector, self.axis)[0]
             for stripes, camera in zip(self.stripes, self.cameras, strict=True)
+        )
+        return [
+            select_points(part, np.full(len(part.points_mm), usable))
+            for part, usable in zip(triangulated, self.usable, strict=True)
         ]
 
     def pairs(self, parts: list[SheetCurves]) -> dict[tuple[int, int], PairRedundancy]:
@@ -106,9 +112,9 @@ class _Scan:
         return evaluate_redundancy(parts, devices, self.axis, widest_gap_px=self.gap_px, calibration=self.calibration)
 
     def distance_mm(self, parts: list[SheetCurves], pair: tuple[int, int]) -> float:
-        """Median distance of the points of two cameras on one projector ray."""
+        """Distance of the points of two cameras on one projector ray, within which 68 % of them lie: one deviation."""
         merged = merge_curves([parts[k] for k in pair], self.projector.centre_mm, widest_gap_px=self.gap_px)
-        return float(np.median(np.abs(merged.residual_mm))) if len(merged.residual_mm) else 0.0
+        return float(np.percentile(np.abs(merged.residual_mm), _ONE_DEVIATION)) if len(merged.residual_mm) else 0.0
 
     def with_pose(self, refined: RefinedPose) -> _Scan:
         if refined.device == len(self.names):
@@ -170,10 +176,10 @@ def check_agreement(
     CalibrationError
         The cameras refute the calibration, and nothing shows which one is right.
     """
-    scan = _Scan(tuple(names), tuple(stripes), calibration, projector, axis, widest_gap_px)
+    usable = tuple(len(part.points_mm) > 0 for part in parts)
+    scan = _Scan(tuple(names), tuple(stripes), usable, calibration, projector, axis, widest_gap_px)
     redundancy = scan.redundancy(parts)
     pairs = _by_index(scan.names, redundancy)
-    usable = tuple(len(part.points_mm) > 0 for part in parts)
     contradicting = {pair: found for pair, found in pairs.items() if found.is_contradicted}
     if not contradicting:
         scattered = [pair for pair, found in pairs.items() if found.over_stated > _AGREES_SIGMA]
@@ -187,7 +193,7 @@ def check_agreement(
     agreeing = {name for name, ratio in (second_axis or {}).items() if ratio <= _AGREES_SIGMA}
     trials = [
         _Trial(found, moved, moved_parts, moved.pairs(moved_parts))
-        for found in _refined_poses(scan, pairs, odd, agreeing, usable)
+        for found in _refined_poses(scan, pairs, odd, agreeing)
         for moved in [scan.with_pose(found)]
         for moved_parts in [moved.parts()]
     ]
@@ -198,8 +204,8 @@ def check_agreement(
         rivals = [each for each in trials if each.agrees and each.refined.is_small and each.misfit(count) <= same]
         best = min(rivals, key=lambda each: each.refined.move)
         rivals.remove(best)
-        return _with_refined_pose(scan, redundancy, usable, worst, best, rivals)
-    return _with_one_camera(scan, parts, redundancy, usable, worst, odd, agreeing)
+        return _with_refined_pose(scan, redundancy, worst, best, rivals)
+    return _with_one_camera(scan, parts, redundancy, worst, odd, agreeing)
 
 
 def _by_index(names: Sequence[str], redundancy: Redundancy) -> dict[tuple[int, int], PairRedundancy]:
@@ -233,13 +239,12 @@ def _refined_poses(
     pairs: Mapping[tuple[int, int], PairRedundancy],
     odd: int | None,
     agreeing: set[str],
-    usable: Sequence[bool],
 ) -> list[RefinedPose]:
     """The refined pose of every device that can have moved."""
     if odd is not None:
         devices = [odd]
     else:
-        devices = [k for k, name in enumerate(scan.names) if usable[k] and name not in agreeing]
+        devices = [k for k, name in enumerate(scan.names) if scan.usable[k] and name not in agreeing]
         # A camera that agrees with both axes of the projector shows that the projector is where it was.
         devices += [] if agreeing else [len(scan.names)]
     found = []
@@ -255,7 +260,6 @@ def _refined_poses(
 def _with_refined_pose(
     scan: _Scan,
     redundancy: Redundancy,
-    usable: tuple[bool, ...],
     worst: tuple[int, int],
     best: _Trial,
     rivals: list[_Trial],
@@ -273,8 +277,8 @@ def _with_refined_pose(
         others = " or ".join(scan.device_name(each.refined.device) for each in rivals)
         note += (
             f". Had {others} moved instead, the cameras would agree as well: the surface would be {apart_mm:.3f} mm "
-            f"from this one (median), {in_shape_mm:.3f} mm of it in shape. This distance was added to the standard "
-            "deviations, in squares"
+            f"from this one (68 % of it nearer), {in_shape_mm:.3f} mm of it in shape. This distance was added to the "
+            "standard deviations, in squares"
         )
     names = list(best.scan.calibration.cameras)
     covariance = np.zeros((DEVICE_PARAMETERS * (len(names) + 1),) * 2)
@@ -286,7 +290,7 @@ def _with_refined_pose(
     solved = SolveRecord("refined", "", covariance, np.stack([points.min(axis=0), points.max(axis=0)]), 0.0)
     return Agreement(
         best.scan.calibration,
-        usable,
+        scan.usable,
         redundancy,
         float(np.hypot(left_mm, apart_mm)),
         pose_error=replace(best.scan.calibration, solved=solved),
@@ -312,18 +316,17 @@ def _with_one_camera(
     scan: _Scan,
     parts: list[SheetCurves],
     redundancy: Redundancy,
-    usable: tuple[bool, ...],
     worst: tuple[int, int],
     odd: int | None,
     agreeing: set[str],
 ) -> Agreement:
     pairs = _by_index(scan.names, redundancy)
     found = pairs[worst]
-    shown = [k for k, name in enumerate(scan.names) if usable[k] and name in agreeing]
+    shown = [k for k, name in enumerate(scan.names) if scan.usable[k] and name in agreeing]
     distance_mm = scan.distance_mm(parts, worst)
     if odd is not None:
         best = max(
-            (k for k in range(len(parts)) if usable[k] and k != odd), key=lambda k: _worth(parts[k].deviation_mm)
+            (k for k in range(len(parts)) if scan.usable[k] and k != odd), key=lambda k: _worth(parts[k].deviation_mm)
         )
         why, added_mm = "the others agree with each other", 0.0
     elif shown:
@@ -333,21 +336,21 @@ def _with_one_camera(
         far = found.over_stated > _REFUTED_SIGMA and found.median_absolute_px > _LENS_PX
         if far or found.median_absolute_px > _REFUTED_PX:
             raise CalibrationError(_refuted(found))
-        best = max((k for k in range(len(parts)) if usable[k]), key=lambda k: _worth(parts[k].deviation_mm))
+        best = max((k for k in range(len(parts)) if scan.usable[k]), key=lambda k: _worth(parts[k].deviation_mm))
         why = "it has more points for their standard deviation"
         added_mm = distance_mm
     against = {k for pair in pairs if best in pair and pairs[pair].is_contradicted for k in pair} - {best}
     left_out = [name for k, name in enumerate(scan.names) if k in against or k == odd]
     note = (
-        f"{_contradiction(found)}, {distance_mm:.3f} mm on the surface (median), and no small move of one device "
-        f"explains it. The points of {_listed(left_out)} were left out, and those of camera '{scan.names[best]}' "
+        f"{_contradiction(found)}, {distance_mm:.3f} mm on the surface (68 % of it nearer), and no small move of one "
+        f"device explains it. The points of {_listed(left_out)} were left out, and those of camera '{scan.names[best]}' "
         f"used: {why}"
     )
     if added_mm:
         note += ". The other may be right: the distance was added to the standard deviations, in squares"
     return Agreement(
         scan.calibration,
-        tuple(each and name not in left_out for each, name in zip(usable, scan.names, strict=True)),
+        tuple(each and name not in left_out for each, name in zip(scan.usable, scan.names, strict=True)),
         redundancy,
         added_mm,
         notes=(f"{note}. Verify the calibration (slrig verify), and calibrate again",),
@@ -409,11 +412,13 @@ def _unexplained_mm(scan: _Scan, parts: list[SheetCurves], pair: tuple[int, int]
     """Standard deviation of either camera's points beyond what is stated: each has half of the pair's variance."""
     if found.over_stated <= 1:
         return 0.0
-    return DEVIATIONS_PER_MEDIAN * scan.distance_mm(parts, pair) * float(np.sqrt((1 - found.over_stated**-2) / 2))
+    return scan.distance_mm(parts, pair) * float(np.sqrt((1 - found.over_stated**-2) / 2))
 
 
 def _surface_distance_mm(trial: _Trial, other: _Trial, camera: int) -> tuple[float, float]:
-    """Median distance between the points of a camera in two trials, and the same less the rigid motion between them."""
+    """Distance between the points of a camera in two trials that 68 % of them have at most; and the same less the rigid
+    motion between them.
+    """
     (a, _, _, refused), (b, _, _, refused_too) = (
         intersect_light_sheets(scan.stripes[camera], scan.cameras[camera], scan.projector, scan.axis)
         for scan in (trial.scan, other.scan)
@@ -425,7 +430,8 @@ def _surface_distance_mm(trial: _Trial, other: _Trial, camera: int) -> tuple[flo
     u, _, vt = np.linalg.svd((b - middle_b).T @ (a - middle_a))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     in_shape = (b - middle_b) @ turn - (a - middle_a)
-    return float(np.median(np.linalg.norm(b - a, axis=1))), float(np.median(np.linalg.norm(in_shape, axis=1)))
+    whole, shape = (float(np.percentile(np.linalg.norm(each, axis=1), _ONE_DEVIATION)) for each in (b - a, in_shape))
+    return whole, shape
 
 
 def _contradiction(found: PairRedundancy) -> str:

@@ -88,6 +88,19 @@ def test_of_pairs_across_the_stripes_the_one_with_most_points_is_used() -> None:
     assert triangulate([first, many, few], None, Axis.COLUMN).second == 1
 
 
+def test_points_without_a_partner_in_the_other_camera_have_their_cause() -> None:
+    first = seen("first", CAMERA, curves_in(CAMERA, MANY))
+    found = triangulate([first, seen("other", OTHER_CAMERA, curves_in(OTHER_CAMERA, FEW))], None, Axis.COLUMN)
+    columns, lines = np.rint(first.curves.ensemble.points_px).astype(int).T
+    inside = np.tile((FEW[0] + 3 < MANY) & (FEW[-1] - 3 > MANY), len(COLUMNS))
+    outside = np.tile((FEW[0] - 3 > MANY) | (FEW[-1] + 3 < MANY), len(COLUMNS))
+    causes = found.cameras[0].curves.refusal[lines, columns]
+    assert set(causes[inside].tolist()) == {Refusal.NONE}
+    assert set(causes[outside].tolist()) == {Refusal.ONE_CAMERA_ONLY}
+    (note,) = found.notes
+    assert "of the points of camera 'first' have no partner in camera 'other'" in note
+
+
 def test_points_left_out_are_refused_pixels_with_their_own_cause() -> None:
     rows = np.arange(60.0, 180.0, 5.0)
     straight = replace(PROJECTOR, distortion=np.zeros(5))
