@@ -112,6 +112,7 @@ class Refusal(IntEnum):
     OUTSIDE_REGION = 14
     MIRROR_IMAGE = 15
     CONTRADICTED = 16
+    ONE_CAMERA_ONLY = 17
     NO_SURFACE = 18
 
 

@@ -1,7 +1,8 @@
 """From camera frames to curves in space.
 
 `pipeline` runs the steps of one camera: noise, decoding, stripes, refinement, identification and links. Then follow
-`triangulation`, `merging` of cameras and `uncertainty`; `fusion` comes before for several exposures, `albedo` after.
+`triangulation`, comparison (`redundancy`) and `merging` of cameras, and `uncertainty`. `fusion` comes before for
+several exposures, `albedo` after.
 """
 
 from slrig.reconstruction.albedo import (
@@ -39,21 +40,31 @@ from slrig.reconstruction.frames import (
     used_shots,
 )
 from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fuse_colour, fuse_exposures
+from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.merging import (
     MergedCurves,
-    PairRedundancy,
-    Redundancy,
-    evaluate_redundancy,
-    find_disagreement,
     merge_curves,
 )
 from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.pipeline import CameraCurves, CameraStream, camera_curves
+from slrig.reconstruction.pose_refinement import MAX_SHIFT, MAX_TURN_DEG, RefinedPose, refine_pose
+from slrig.reconstruction.redundancy import (
+    OUTLIER_SIGMA,
+    PairRedundancy,
+    Redundancy,
+    StripeResiduals,
+    cell_medians,
+    cell_numbers,
+    evaluate_redundancy,
+    noise_px,
+    sheet_coordinates,
+)
 from slrig.reconstruction.second_axis import AxisPositions, axis_residuals, decode_second_axis
 from slrig.reconstruction.triangulation import (
     CONVERGED,
     SheetCurves,
     distorted_from_pixel,
+    intersect_light_sheets,
     optical_depths_mm,
     pack_device,
     pixel_rays,
@@ -75,7 +86,10 @@ __all__ = [
     "BRIGHT_ALBEDO",
     "BRIGHT_PERCENT",
     "CONVERGED",
+    "MAX_SHIFT",
+    "MAX_TURN_DEG",
     "NEAR_SATURATION",
+    "OUTLIER_SIGMA",
     "Albedo",
     "AlbedoSamples",
     "AxisFrames",
@@ -99,14 +113,19 @@ __all__ = [
     "ProjectorPositions",
     "ReconstructionLimits",
     "Redundancy",
+    "RefinedPose",
     "RegionMask",
     "SheetCurves",
+    "StripeEnsemble",
+    "StripeResiduals",
     "axis_frames",
     "axis_patterns",
     "axis_residuals",
     "calibration_modes",
     "calibration_sigma",
     "camera_curves",
+    "cell_medians",
+    "cell_numbers",
     "check_calibration",
     "decode_edges",
     "decode_second_axis",
@@ -117,14 +136,15 @@ __all__ = [
     "exposure_count",
     "exposure_use",
     "find_correspondences",
-    "find_disagreement",
     "fuse_colour",
     "fuse_exposures",
     "has_phase",
+    "intersect_light_sheets",
     "linearise",
     "lit_pixels",
     "mean_image",
     "merge_curves",
+    "noise_px",
     "optical_depths_mm",
     "pack_device",
     "pixel_rays",
@@ -132,8 +152,10 @@ __all__ = [
     "project",
     "projector_positions",
     "reference_repeats",
+    "refine_pose",
     "sampling_mm",
     "select_points",
+    "sheet_coordinates",
     "sigma_along_normal",
     "stripe_crossing",
     "stripe_tangents",

@@ -420,12 +420,13 @@ def triangulate_camera_projector(
 
 def triangulate_camera_pair(
     first: StripeEnsemble, second: StripeEnsemble, camera: Pinhole, other: Pinhole, /
-) -> SheetCurves:
+) -> tuple[SheetCurves, NDArray[np.bool_]]:
     """Triangulate points of `first` with the curve of the same position in `second`, without projector calibration.
 
     The epipolar line of each point is intersected with the other camera's curve between two consecutive points that no
     bridge separates. The two rays then meet in the least-squares sense. Curves run by the rows of `camera`, or by its
-    columns if the stripes run rather across the image than down.
+    columns if the stripes run rather across the image than down. Also returns (n,) bool: points of the ensemble that
+    have a partner.
     """
     shared, own_index, other_index = np.intersect1d(first.position_px, second.position_px, return_indices=True)
     del shared
@@ -451,7 +452,7 @@ def triangulate_camera_pair(
         bridge_after=first.bridge_after,
         source=np.full(len(points), Source.CAMERA_CAMERA, dtype=np.uint8),
     )
-    return order_along_sheet(select_points(curves, valid))
+    return order_along_sheet(select_points(curves, valid)), valid
 
 
 @kernel_part

@@ -31,14 +31,14 @@ def with_light_map(bundle: Path, entered: Entered) -> Calibration:
         little of the projector's image. Further as `measured`.
     """
     walked, found = measured(bundle, None, None, entered, axis=None)
-    projector, curves = walked.devices.projector, found.joined.curves
+    projector, curves = found.agreement.calibration.projector, found.merged.curves
     if projector is None:
         message = f"{bundle}: expected a scan by a calibrated projector, found none; calibrate the rig with it"
         raise CalibrationError(message)
     away = curves.points_mm - curves.points_mm.mean(axis=0)
     extents, axes = np.linalg.eigh(away.T @ away)
     normals = np.tile(axes[:, 0] * np.sign(axes[:, 0] @ (projector.centre_mm - curves.points_mm[0])), (len(away), 1))
-    seen = coloured(found.cameras, found.joined, normals.astype(np.float32), projector, walked.axis)
+    seen = coloured(found.cameras, found.merged, normals.astype(np.float32), projector, walked.axis)
     places = places_px(curves, walked.axis)
     value, good = seen.found.value, (seen.mark == AlbedoMark.NONE) & (seen.found.value > 0).all(axis=1)
     # Of each cell of the image: the mean place, and the mean logarithm of what the board sends back.

@@ -37,7 +37,7 @@ from slrig.model import (
     trim_incomplete_codes,
 )
 from slrig.reconstruction import exposure_count
-from slrig.scan.agreement import AxisAgreement, check_cameras
+from slrig.scan.axis_agreement import AxisAgreement, check_cameras
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
 from slrig.scan.losses import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.losses import (
@@ -51,7 +51,7 @@ from slrig.scan.losses import (
 )
 from slrig.scan.report import capture_notes, capture_report, layout_notes, lit_pixels
 from slrig.scan.stream import CameraResult, LiveScan, ScanStream, cell_px, step_px
-from slrig.scan.triangulated import Triangulated, camera_notes, triangulated, unresolved_notes
+from slrig.scan.triangulated import Triangulated, camera_notes, triangulate_cameras, unresolved_notes
 from slrig.scan.usable_frames import UsableFiles, usable_files
 
 _STAGES = ("measure noise", "decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
@@ -122,9 +122,9 @@ def measured(
     best, found = max(sound, key=lambda each: _depth_known(*each)) if len(sound) > 1 else sound[0]
     best.notes.extend(_chosen_notes(walked, best, found))
     best.notes.extend(left_out_notes(best.axis, {seen.name: seen.device for seen in best.seen}, best.devices.projector))
-    words = weakness(best.axis, best.shown, found.share_across, on_request=axis is not None)
+    words = weakness(best.axis, best.shown, found.baseline_sine, on_request=axis is not None)
     if words is not None:
-        if found.share_across < MIN_BASELINE_FRACTION:
+        if found.baseline_sine < MIN_BASELINE_FRACTION:
             if isinstance(tries[0], NothingToReconstructError):
                 raise tries[0]
             message = f"{folder}: {words}"
@@ -147,7 +147,7 @@ def _tried(
         agreeing, agreement = check_cameras(folder, seen, projector, walked.axis)
         walked = replace(walked, seen=agreeing, agreement=agreement, notes=[*walked.notes, *agreement.notes])
         entered("triangulate", 0.6, "")
-        found = triangulated(agreeing, projector, walked.axis, region, agreement.checks)
+        found = triangulate_cameras(agreeing, walked.devices, walked.axis, region, checks=agreement.checks)
         fault = geometry_fault(found.cameras, agreeing, projector, walked.axis)
         require_surface(fault is None, folder, str(fault), found.cameras, stage=Stage.GEOMETRY)
     except NothingToReconstructError as error:
@@ -161,7 +161,7 @@ def _is_weak(tried: tuple[Walked, Triangulated] | NothingToReconstructError) -> 
     if isinstance(tried, NothingToReconstructError):
         return True
     walked, found = tried
-    return found.share_across < FAIR_SHARE or _decoded_share(walked.seen) < FAIR_DECODED
+    return found.baseline_sine < FAIR_SHARE or _decoded_share(walked.seen) < FAIR_DECODED
 
 
 def _decoded_share(cameras: Sequence[CameraResult]) -> float:
@@ -185,7 +185,7 @@ def _depth_known(walked: Walked, found: Triangulated) -> float:
     """The square of the decoded pixels over the usual standard deviation of a point: half of a surface is worth the
     whole only where it is four times as precise. Coarse bits alone are precise, too.
     """
-    deviation_mm = found.joined.curves.deviation_mm
+    deviation_mm = found.merged.curves.deviation_mm
     if len(deviation_mm) == 0:
         return 0.0
     usual_mm = float(np.median(np.linalg.norm(deviation_mm, axis=1)))
@@ -196,7 +196,7 @@ def _chosen_notes(first: Walked, best: Walked, found: Triangulated) -> list[str]
     """What to say where the calibration with a projector had named another axis than the one that is used."""
     if best.axis is first.axis or best.devices.projector is None:
         return []
-    usual_mm = float(np.median(np.linalg.norm(found.joined.curves.deviation_mm, axis=1)))
+    usual_mm = float(np.median(np.linalg.norm(found.merged.curves.deviation_mm, axis=1)))
     return [
         f"triangulated by {best.axis}s, which decode {_decoded_share(best.seen):.0%} of what is lit ({usual_mm:.3g} mm "
         f"of noise): the {first.axis}s, which cross the baseline more steeply, decode {_decoded_share(first.seen):.0%}"

@@ -70,6 +70,10 @@ _CAUSES: Mapping[Refusal, tuple[tuple[int, int, int], str]] = {
         (60, 20, 220),
         "columns and rows contradict each other: a mirror image, or the object moved between them",
     ),
+    Refusal.ONE_CAMERA_ONLY: (
+        (220, 180, 200),
+        "no partner in the other camera, or left out because the cameras contradict each other",
+    ),
     Refusal.NO_SURFACE: ((60, 200, 150), "decoded, but outside the mesh: a hole, or a border that was cut"),
 }
 

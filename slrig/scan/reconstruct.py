@@ -21,19 +21,15 @@ from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
 from slrig.kernels import KernelCount, report_compilations, trim_malloc
 from slrig.meshing import MeshingLimits, MeshStage, Viewpoints, build_surface, compact_mesh, mesh_figures, score
-from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region, Source
+from slrig.model import FloatArray, IntArray, Mesh, PointCurves, Region, Source
 from slrig.reconstruction import (
     MergedCurves,
-    calibration_modes,
-    calibration_sigma,
-    find_disagreement,
     project,
     sampling_mm,
     sigma_along_normal,
-    stripe_tangents,
 )
-from slrig.scan.agreement import agreement_report, axis_error
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
+from slrig.scan.axis_agreement import agreement_report, axis_error
 from slrig.scan.colouring import albedo_report, coloured
 from slrig.scan.coverage import covered_share, layered_share, with_uncovered_refused
 from slrig.scan.limited import marked, within
@@ -64,7 +60,7 @@ from slrig.scan.report import (
 )
 from slrig.scan.soundness import fault_notes, layer_notes, truth_notes
 from slrig.scan.stream import CameraResult, LiveScan
-from slrig.scan.triangulated import Triangulated, steps
+from slrig.scan.triangulated import Triangulated, calibration_sigma_mm, curve_spacing, disagreement_sigma_mm
 
 _BETWEEN = frozenset({"read bundle", "check frames"})
 """What is done with each frame between other stages."""
@@ -258,20 +254,20 @@ def _meshed(
     entered: Callable[[str, float, str], None],
 ) -> _Meshed:
     """From points to the mesh."""
-    first, axis, step_px = walked.seen[0], walked.axis, walked.step_px
-    cameras, joined_curves = found.cameras, found.joined
-    points = joined_curves.curves
+    axis, step_px = walked.axis, walked.step_px
+    cameras, merged, devices = found.cameras, found.merged, found.agreement.calibration
+    points = merged.curves
     require_surface(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras, stage=Stage.GEOMETRY)
     count = f"{len(points.points_mm)} points"
-    projector = walked.devices.projector
-    beside = steps(
-        cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=found.widest_gap_px
+    projector, first = devices.projector, cameras[0]
+    spacing = curve_spacing(
+        cameras, merged, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=found.widest_gap_px
     )
-    sampling = sampling_mm(points.points_mm, first.device, projector, axis, beside.at_points_px)
+    sampling = sampling_mm(points.points_mm, first.device, projector, axis, spacing.at_points_px)
     second = cameras[found.second].device if projector is None else projector
     views = Viewpoints(
-        joined_curves.camera,
-        np.stack([seen.device.centre_mm for seen in cameras]),
+        merged.camera,
+        np.stack([camera.device.centre_mm for camera in cameras]),
         second.centre_mm,
         points.deviation_mm,
     )
@@ -287,27 +283,27 @@ def _meshed(
             smooth_boundary=plan.smooth_boundary,
         ),
         on_step=lambda stage: entered(stage, 0.68, count),
-        runs=beside.runs,
+        runs=spacing.runs,
     )  # fmt: skip
     require_surface(len(surface.faces) > 0, folder, without_surface(surface, projector), cameras, stage=Stage.MESH)
     entered("vertices", 0.72, count)
-    cameras, joined_curves, surface = without_mirror_images(cameras, joined_curves, surface, found.mirror_images)
-    found, points = replace(found, cameras=cameras, joined=joined_curves), joined_curves.curves
+    cameras, merged, surface = without_mirror_images(cameras, merged, surface, found.mirror_images)
+    found, points = replace(found, cameras=cameras, merged=merged), merged.curves
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
-    share = _calibration_share(walked.devices, found, axis, surface.normals)
+    share = calibration_sigma_mm(found, walked.devices, surface.normals, axis)
     if share is not None:
         sigma = np.hypot(sigma, share)
-    apart = find_disagreement(joined_curves, share)
-    if apart is not None:
-        sigma = np.hypot(sigma, apart.sigma_mm)
-    tested = axis_error(walked.agreement, joined_curves, [each.name for each in cameras], surface.normals, sigma)
+    disagreement = disagreement_sigma_mm(found, surface.normals, axis)
+    if disagreement is not None:
+        sigma = np.hypot(sigma, disagreement)
+    tested = axis_error(walked.agreement, merged, [each.name for each in cameras], surface.normals, sigma)
     if tested is not None:
         sigma = np.hypot(sigma, tested.sigma_mm)
     limit_mm = None if plan.region is None else plan.region.max_sigma_mm
     if limit_mm is not None:
         known = sigma <= limit_mm
         surface = surface.with_points(known, "sigma_limit")
-        cameras = [_where_known(seen, joined_curves, index, known) for index, seen in enumerate(cameras)]
+        cameras = [_where_known(seen, merged, index, known) for index, seen in enumerate(cameras)]
         if len(surface.faces) == 0:
             message = (
                 f"{folder}: no surface is known to {limit_mm:g} mm, half of the points to {np.nanmedian(sigma):.2g} "
@@ -315,7 +311,7 @@ def _meshed(
             )
             raise NothingToReconstructError(message)
     light = walked.devices.light
-    colours = coloured(cameras, joined_curves, surface.normals, projector, axis, light)
+    colours = coloured(cameras, merged, surface.normals, projector, axis, light)
     curves = PointCurves(
         offsets=points.offsets,
         column_px=points.position_px,
@@ -329,7 +325,7 @@ def _meshed(
     apart_mm = plan.depth_edge_ratio * float(np.median(sampling))
     alone = points.source != Source.ALL
     layered = {
-        seen.name: layered_share(seen, points, alone & (joined_curves.camera == index), surface.faces, apart_mm)
+        seen.name: layered_share(seen, points, alone & (merged.camera == index), surface.faces, apart_mm)
         for index, seen in enumerate(cameras)
     }
     mesh = compact_mesh(
@@ -346,23 +342,23 @@ def _meshed(
         stages=surface.stages,
         figures={**mesh_report(surface, mesh, curves), "layered": layered},
         redundancy={
-            **redundancy_report(joined_curves, points.source, found.spare),
+            **redundancy_report(merged, points.source, found.agreement.redundancy, found.agreement.report),
             **agreement_report(walked.agreement),
         },
         albedo=albedo_report(colours, mesh, cameras, lit=projector is not None, mapped=light is not None),
         notes=(
             *mirror_image_notes(surface, cameras, projector),
             *layer_notes(layered),
-            *(() if apart is None else (str(apart),)),
+            *found.notes,
             *(() if tested is None else (tested.note,)),
         ),
     )
 
 
-def _where_known(seen: CameraResult, joined: MergedCurves, index: int, known: NDArray[np.bool_]) -> CameraResult:
+def _where_known(seen: CameraResult, merged: MergedCurves, index: int, known: NDArray[np.bool_]) -> CameraResult:
     """A camera with those of its points among its refusals that are not `known`, (n,) bool, well enough."""
-    mine = joined.camera == index
-    refusal = marked(seen.curves.refusal, joined.curves.pixels_px[mine], known[mine])
+    mine = merged.camera == index
+    refusal = marked(seen.curves.refusal, merged.curves.pixels_px[mine], known[mine])
     return replace(seen, curves=replace(seen.curves, refusal=refusal))
 
 
@@ -371,18 +367,6 @@ def _used(faces: IntArray, count: int) -> NDArray[np.bool_]:
     used = np.zeros(count, dtype=np.bool_)
     used[faces] = True
     return used
-
-
-def _calibration_share(
-    calibration: Calibration, found: Triangulated, axis: Axis, normals: NDArray[np.float32]
-) -> FloatArray | None:
-    """(n,) float64: the calibration's part of each point's standard deviation; None where it states no error."""
-    modes = calibration_modes(calibration, [seen.name for seen in found.cameras], axis, second=found.second)
-    if modes is None:
-        return None
-    points = found.joined.curves
-    tangents = stripe_tangents(points.points_mm, points.offsets, points.bridge_after)
-    return calibration_sigma(modes, points.points_mm, normals, points.source, found.joined.camera, tangents)
 
 
 def _encoded_pictures(mesh: Mesh, cameras: list[CameraResult]) -> dict[str, bytes]:

@@ -126,14 +126,22 @@ def lit_share(curves: CameraCurves, where: NDArray[np.bool_] | None) -> float:
     return float((lit & where).sum() / max(lit.sum(), 1))
 
 
-def redundancy_report(curves: MergedCurves, source: NDArray[np.uint8], spare: Redundancy) -> dict[str, object]:
+def redundancy_report(
+    curves: MergedCurves,
+    source: NDArray[np.uint8],
+    spare: Redundancy,
+    disagreement: Mapping[str, object] | None,
+) -> dict[str, object]:
     """What several cameras say of one another: points by source, and how far their points of one ray are apart.
 
-    `residual_px` has one entry per pair of cameras, or is null, and then `residual_px_absent` says why.
+    `residual_px` has one entry per pair of cameras, or is null, and then `residual_px_absent` says why. It is of the
+    calibration as stated; `disagreement` says what was done where it exceeds that.
     """
     counts = np.bincount(source, minlength=len(Source))
     report: dict[str, object] = {"points_by_source": {kind.name.lower(): int(counts[kind]) for kind in Source}}
     report["residual_px"] = [_pair_report(pair) for pair in spare.pairs] or None
+    if disagreement is not None:
+        report["disagreement"] = dict(disagreement)
     if spare.reason is not None:
         report["residual_px_absent"] = spare.reason
     if len(curves.residual_mm):
@@ -158,6 +166,9 @@ def _pair_report(pair: PairRedundancy) -> dict[str, object]:
         "rms": pair.rms_px,
         "median_absolute": pair.median_absolute_px,
         "stated_rms": pair.stated_rms_px,
+        "stated_calibration": pair.calibration_px,
+        "over_stated": pair.over_stated,
+        "contradiction": pair.contradiction,
         "map": {
             "mean": pair.map_mean_px.tolist(),
             "rms": pair.map_rms_px.tolist(),

@@ -1,34 +1,47 @@
-"""From the curves of every camera to one set of points: with the projector's light sheets, or in pairs of cameras.
+"""From the curves of every camera to one set of points: with the projector's light sheets, or from a pair of cameras.
 
-And what follows where a camera does not resolve the finest patterns: wider steps between curves, and only there.
+Also the distance between curves where a camera does not resolve the finest patterns.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import setting
 from slrig.meshing import runs_of_curve_parts
-from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Region, baseline_fraction, depth_sensitive_cameras
+from slrig.model import (
+    Axis,
+    Calibration,
+    FloatArray,
+    IntArray,
+    Pinhole,
+    Refusal,
+    Region,
+    baseline_fraction,
+    depth_sensitive_cameras,
+)
 from slrig.reconstruction import (
     CalibrationCheck,
     CameraCurves,
     MergedCurves,
-    Redundancy,
     SheetCurves,
+    calibration_modes,
+    calibration_sigma,
     evaluate_redundancy,
     merge_curves,
     select_points,
     stripe_crossing,
+    stripe_tangents,
     triangulate_camera_pair,
     triangulate_camera_projector,
 )
-from slrig.scan.agreement import leave_out_contradicted
+from slrig.scan.axis_agreement import leave_out_contradicted
+from slrig.scan.camera_agreement import Agreement, check_agreement, drop_contradicting_areas
 from slrig.scan.limited import limited
 from slrig.scan.mirror_images import NO_MIRROR_IMAGES, MirrorImages, refuse_mirror_images
 from slrig.scan.report import lit_pixels, lit_share
@@ -37,95 +50,175 @@ from slrig.scan.stream import CameraResult
 _WIDEST_GAP_PX = 4.0
 _WIDEST_GAP_STEPS = 2.5  # of the usual distance of two points along a curve
 _STEEP_ENOUGH = 0.5  # of the pair whose stripes cross its epipolar lines most steeply: errors twice its at most
+_MANY_ALONE = 0.4  # of one camera's points, that the other should see if calibration and overlap are right
 
 
 @dataclass(frozen=True, slots=True)
 class Triangulated:
-    """The curves of all cameras, what they say of one another, and the cameras with the points that were left out
-    among their refusals, and no points in their own curves.
+    """Points of all cameras in the world.
 
-    share_across : 0 to 1, the sine of the angle between the stripes and the baseline: by the calibration, or without a
-    projector as the median over the image. second : index of the camera that the first is paired with, without one.
-    mirror_images : those of several cameras, which were left out before their points were merged.
-    widest_gap_px : of the function of that name.
+    merged : the points. cameras : without stripes, and with the points that were left out in their maps of causes;
+    their devices are those of `agreement.calibration`. baseline_sine : 0 to 1, the sine of the angle between the
+    stripes and the baseline: by the calibration, or without a projector as the median over the image. agreement : what
+    the cameras say of the calibration, and the devices that the points were made with. notes : sentences for a person.
+    second : index of the camera that the first is paired with, without a projector. mirror_images : those of several
+    cameras, which were left out before their points were merged. widest_gap_px : of the function of that name.
     """
 
-    joined: MergedCurves
-    spare: Redundancy
+    merged: MergedCurves
     cameras: list[CameraResult]
-    share_across: float
+    baseline_sine: float
+    agreement: Agreement
+    notes: tuple[str, ...]
     second: int = 1
     mirror_images: MirrorImages = NO_MIRROR_IMAGES
     widest_gap_px: float = _WIDEST_GAP_PX
 
 
-def triangulated(
+def triangulate_cameras(
     cameras: list[CameraResult],
-    projector: Pinhole | None,
+    calibration: Calibration,
     axis: Axis,
     region: Region | None = None,
-    checks: Mapping[str, CalibrationCheck | None] = MappingProxyType({}),
+    *,
+    checks: Mapping[str, CalibrationCheck | None] | None = None,
 ) -> Triangulated:
-    """Triangulate the curves of an axis; without a projector, of at least two cameras. region : what of it counts.
+    """Triangulate the curves of an axis; without a projector, of at least two cameras.
 
-    With a projector, a camera is left out whose baseline lies along the stripes: it sees them edge on, and where others
-    measure, its errors of depth are no use.
+    region : part of the scene that is used. checks : what the second axis of patterns shows of each camera.
+
+    With a projector, a camera is left out whose baseline lies along the stripes: it sees the light sheets edge on.
+    Cameras that contradict each other are not merged, see `slrig.scan.camera_agreement`.
 
     Without a projector one pair of cameras is used, since the light sheet has no rows to merge several by: of the pairs
     with the first camera whose stripes cross the epipolar lines steeply, the one that gives most points.
+
+    Raises
+    ------
+    CalibrationError
+        The cameras refute the calibration, and nothing shows which one is right.
     """
-    devices = {seen.name: seen.device for seen in cameras}
-    if projector is not None:
-        met = [
-            _on_sheets(seen, projector, axis, told=told)
-            for seen, told in zip(
-                cameras, depth_sensitive_cameras(axis, list(devices.values()), projector), strict=True
-            )
-        ]
-        told = [
-            replace(seen, curves=replace(seen.curves, refusal=_with_left_out(seen.curves, part, cause)))
-            for seen, (part, cause) in zip(cameras, met, strict=True)
-        ]
-        parts = [part for part, _ in met]
-        for index, seen in enumerate(told):
-            told[index], parts[index] = leave_out_contradicted(
-                seen, parts[index], projector, axis, checks.get(seen.name)
-            )
+    projector = calibration.projector
+    if projector is None:
+        return _triangulate_pair(cameras, calibration, axis, region)
+    names = [camera.name for camera in cameras]
+    checks = checks or {}
+    second_axis = {name: np.inf if each.is_significant else 1.0 for name, each in checks.items() if each is not None}
+    parts, marked, images = _triangulate_sheets(cameras, projector, axis, region, checks)
+    gap = widest_gap_px(projector, axis, parts)
+    stripes = [camera.curves.ensemble for camera in cameras]
+    agreement = check_agreement(
+        names, stripes, parts, calibration, projector, axis, widest_gap_px=gap, second_axis=second_axis or None
+    )
+    redundancy = agreement.redundancy
+    if agreement.calibration is not calibration:
+        projector = agreement.calibration.projector or projector
+        cameras = [replace(camera, device=agreement.calibration.cameras[camera.name]) for camera in cameras]
+        parts, marked, images = _triangulate_sheets(cameras, projector, axis, region, checks)
+        redundancy = evaluate_redundancy(
+            parts, {camera.name: camera.device for camera in cameras}, axis, widest_gap_px=gap, calibration=calibration
+        )
+    used, area_notes = drop_contradicting_areas(names, parts, redundancy, agreement.usable)
+    for index, points in enumerate(used):
+        if not points.all():
+            marked[index] = _with_cause(marked[index], parts[index].pixels_px, points)
+            parts[index] = select_points(parts[index], points)
+    return Triangulated(
+        merge_curves(parts, projector.centre_mm, widest_gap_px=gap),
+        _without_points(marked),
+        baseline_fraction(axis, [camera.device for camera in cameras], projector),
+        agreement,
+        (*agreement.notes, *area_notes),
+        mirror_images=images,
+        widest_gap_px=gap,
+    )
+
+
+def _triangulate_sheets(
+    cameras: Sequence[CameraResult],
+    projector: Pinhole,
+    axis: Axis,
+    region: Region | None,
+    checks: Mapping[str, CalibrationCheck | None],
+) -> tuple[list[SheetCurves], list[CameraResult], MirrorImages]:
+    """Points of each camera on the light sheets, the cameras with the other points in their maps of causes, and the
+    mirror images of several cameras.
+    """
+    parts, marked = [], []
+    sensitive = depth_sensitive_cameras(axis, [camera.device for camera in cameras], projector)
+    for camera, measures_depth in zip(cameras, sensitive, strict=True):
+        part, cause = triangulate_camera_projector(camera.curves.ensemble, camera.device, projector, axis)
+        if not measures_depth:
+            part = select_points(part, np.zeros(len(part.points_mm), dtype=np.bool_))
+            cause = np.where(cause == Refusal.NONE, np.uint8(Refusal.SHEET_SEEN_ALONG), cause)
+        refusal = _with_left_out(camera.curves, part, cause)
         if region is not None:
-            for index, seen in enumerate(told):
-                parts[index], told[index] = _limited(region, seen, parts[index])
-        images = NO_MIRROR_IMAGES
-        if len(parts) > 1:
-            parts, told, images = refuse_mirror_images(parts, told, projector, axis)
-        gap = widest_gap_px(projector, axis, parts)
-        spare = evaluate_redundancy(parts, devices, axis, widest_gap_px=gap)
-        joined = merge_curves(parts, projector.centre_mm, widest_gap_px=gap)
-        share_across = baseline_fraction(axis, list(devices.values()), projector)
-        return Triangulated(joined, spare, _without_points(told), share_across, mirror_images=images, widest_gap_px=gap)
+            part, refusal = limited(region, part, refusal, camera.device)
+        camera, part = leave_out_contradicted(
+            replace(camera, curves=replace(camera.curves, refusal=refusal)), part, projector, axis,
+            checks.get(camera.name),
+        )  # fmt: skip
+        parts.append(part)
+        marked.append(camera)
+    if len(parts) == 1:
+        return parts, marked, NO_MIRROR_IMAGES
+    return refuse_mirror_images(parts, marked, projector, axis)
+
+
+def _triangulate_pair(
+    cameras: Sequence[CameraResult], calibration: Calibration, axis: Axis, region: Region | None
+) -> Triangulated:
+    """Points of the first camera and the one that it is paired with, without a projector."""
     first, *others = cameras
-    mine = first.curves.ensemble
-    crossing = [stripe_crossing(mine, first.device, seen.device) for seen in others]
-    steep = [index for index, share in enumerate(crossing) if share >= _STEEP_ENOUGH * max(crossing)]
-    pairs = {i: triangulate_camera_pair(mine, others[i].curves.ensemble, first.device, others[i].device) for i in steep}
-    second = max(pairs, key=lambda index: len(pairs[index].points_mm))
-    best = pairs[second]
+    stripes = first.curves.ensemble
+    crossing = [stripe_crossing(stripes, first.device, other.device) for other in others]
+    steep = [index for index, sine in enumerate(crossing) if sine >= _STEEP_ENOUGH * max(crossing)]
+    pairs = {
+        index: triangulate_camera_pair(stripes, others[index].curves.ensemble, first.device, others[index].device)
+        for index in steep
+    }
+    partner = max(pairs, key=lambda index: len(pairs[index][0].points_mm))
+    points, matched = pairs[partner]
+    second = others[partner]
+    _, matched_back = triangulate_camera_pair(second.curves.ensemble, stripes, second.device, first.device)
+    marked = [_with_cause(first, stripes.points_px, matched)]
+    for index, other in enumerate(others):
+        is_matched = (
+            matched_back if index == partner else np.zeros(len(other.curves.ensemble.points_px), dtype=np.bool_)
+        )
+        marked.append(_with_cause(other, other.curves.ensemble.points_px, is_matched))
     if region is not None:
-        best, first = _limited(region, first, best)
-        cameras = [first, *others]
-    gap = widest_gap_px(None, axis, [best])
-    spare = evaluate_redundancy([best], devices, axis, widest_gap_px=gap)
-    joined = merge_curves([best], first.device.centre_mm, widest_gap_px=gap)
-    return Triangulated(joined, spare, _without_points(cameras), crossing[second], 1 + second, widest_gap_px=gap)
+        points, refusal = limited(region, points, marked[0].curves.refusal, first.device)
+        marked[0] = replace(marked[0], curves=replace(marked[0].curves, refusal=refusal))
+    gap = widest_gap_px(None, axis, [points])
+    devices = {camera.name: camera.device for camera in cameras}
+    redundancy = evaluate_redundancy([points], devices, axis, widest_gap_px=gap)
+    notes = []
+    if len(matched) and (alone := 1 - float(matched.mean())) > _MANY_ALONE:
+        notes.append(
+            f"{alone:.0%} of the points of camera '{first.name}' have no partner in camera '{second.name}': the "
+            "cameras see too little of the same surface, or their calibration is wrong (verify it: slrig verify)"
+        )
+    return Triangulated(
+        merge_curves([points], first.device.centre_mm, widest_gap_px=gap),
+        _without_points(marked),
+        crossing[partner],
+        Agreement(calibration, (True,) * len(cameras), redundancy),
+        tuple(notes),
+        1 + partner,
+        widest_gap_px=gap,
+    )
 
 
 def _without_points(cameras: Sequence[CameraResult]) -> list[CameraResult]:
     return [
-        replace(seen, curves=replace(seen.curves, ensemble=seen.curves.ensemble.without_points())) for seen in cameras
+        replace(camera, curves=replace(camera.curves, ensemble=camera.curves.ensemble.without_points()))
+        for camera in cameras
     ]
 
 
 def widest_gap_px(projector: Pinhole | None, axis: Axis, parts: Sequence[SheetCurves]) -> float:
-    """Steps along a light sheet between two points of one camera up to which the curve between them counts as seen;
+    """Steps along a light sheet between two points of one camera up to which the curve between them counts as measured;
     without a projector, camera pixels.
 
     Where the projector is addressed more finely along the sheet than across it, or than a camera resolves, a pixel of
@@ -139,27 +232,32 @@ def widest_gap_px(projector: Pinhole | None, axis: Axis, parts: Sequence[SheetCu
     return max([widest, *(_WIDEST_GAP_STEPS * each for each in usual)])
 
 
-def _on_sheets(
-    seen: CameraResult, projector: Pinhole, axis: Axis, *, told: bool
-) -> tuple[SheetCurves, NDArray[np.uint8]]:
-    """`triangulate_camera_projector`, with nothing kept of a camera that the axis tells no depth."""
-    part, cause = triangulate_camera_projector(seen.curves.ensemble, seen.device, projector, axis)
-    if told:
-        return part, cause
-    return (
-        select_points(part, np.zeros(len(part.points_mm), dtype=np.bool_)),
-        np.where(cause == Refusal.NONE, np.uint8(Refusal.SHEET_SEEN_ALONG), cause),
-    )
+def disagreement_sigma_mm(found: Triangulated, normals: NDArray[np.float32], axis: Axis) -> FloatArray | None:
+    """(n,) float64: standard deviation of each point by what the cameras show beyond what is stated; None for nothing.
+
+    normals : (n, 3) of the points.
+    """
+    agreement = found.agreement
+    if agreement.pose_error is None:
+        return np.full(len(normals), agreement.distance_mm) if agreement.distance_mm else None
+    pose_mm = calibration_sigma_mm(found, agreement.pose_error, normals, axis)
+    return None if pose_mm is None else np.hypot(pose_mm, agreement.distance_mm)
 
 
-def _limited(region: Region, seen: CameraResult, part: SheetCurves) -> tuple[SheetCurves, CameraResult]:
-    """The points of a camera that a region holds, and the camera with the others among its refusals."""
-    part, refusal = limited(region, part, seen.curves.refusal, seen.device)
-    return part, replace(seen, curves=replace(seen.curves, refusal=refusal))
+def calibration_sigma_mm(
+    found: Triangulated, calibration: Calibration, normals: NDArray[np.float32], axis: Axis
+) -> FloatArray | None:
+    """(n,) float64: the calibration's part of the standard deviation of each point; None if it states no error."""
+    modes = calibration_modes(calibration, [camera.name for camera in found.cameras], axis, second=found.second)
+    if modes is None:
+        return None
+    points = found.merged.curves
+    tangents = stripe_tangents(points.points_mm, points.offsets, points.bridge_after)
+    return calibration_sigma(modes, points.points_mm, normals, points.source, found.merged.camera, tangents)
 
 
 def _with_left_out(curves: CameraCurves, triangulated: SheetCurves, cause: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The refusals with the points among them that triangulation left out, where it kept none in the same pixel.
+    """The map of causes with the points that triangulation left out, where no other point is in the same pixel.
 
     cause : (n,) uint8, `Refusal` of every point of the ensemble.
     """
@@ -176,56 +274,73 @@ def _with_left_out(curves: CameraCurves, triangulated: SheetCurves, cause: NDArr
     return refusal
 
 
-_WORTH_TELLING = 0.02
+def _with_cause(camera: CameraResult, pixels_px: FloatArray, used: NDArray[np.bool_]) -> CameraResult:
+    """The camera with its measured pixels marked whose nearest point, (n, 2), is not `used`, (n,) bool."""
+    if used.all():
+        return camera
+    nearest = np.ones(camera.curves.refusal.shape, dtype=np.uint8)
+    is_used = np.zeros(nearest.shape, dtype=np.bool_)
+    columns, rows = np.rint(pixels_px).astype(int).T
+    nearest[rows, columns] = 0
+    is_used[rows[used], columns[used]] = True
+    _, labels = cv2.distanceTransformWithLabels(nearest, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    used_label = np.zeros(int(labels.max()) + 1, dtype=np.bool_)
+    used_label[labels[is_used]] = True
+    refusal = camera.curves.refusal.copy()
+    refusal[(refusal == Refusal.NONE) & ~used_label[labels]] = Refusal.ONE_CAMERA_ONLY
+    return replace(camera, curves=replace(camera.curves, refusal=refusal))
+
+
+_MIN_UNRESOLVED = 0.02  # of what is lit
 _WIDEST_BRIDGES = 2.5
-"""Of the gaps up to which a curve counts as seen: what strips still bridge at the usual limit of a depth edge."""
+"""Of the gaps up to which a curve counts as measured: what strips still bridge at the usual limit of a depth edge."""
 
 
 @dataclass(frozen=True, slots=True)
-class Steps:
-    """at_points_px : (n,) float64, distance of neighbouring curves where each point lies, or one for all; runs : the
-    parts of curves to be joined, None where they are whole curves.
+class CurveSpacing:
+    """at_points_px : (n,) float64, distance of neighbouring curves at each point, or one for all, projector px; runs :
+    the parts of curves to be joined to strips, None for whole curves.
     """
 
     at_points_px: FloatArray | float
     runs: IntArray | None
 
 
-def steps(
+def curve_spacing(
     cameras: Sequence[CameraResult],
-    joined: MergedCurves,
+    merged: MergedCurves,
     step_px: float,
     cell_px: float,
     *,
     max_gap: int,
     widest_gap_px: float,
-) -> Steps:
-    """How far apart curves lie, and which are neighbours.
+) -> CurveSpacing:
+    """Distance between curves, and which of them are neighbours.
 
-    step_px : where all that was shown resolves. cell_px : of the code. max_gap : neighbours are at most so many steps
-    apart. widest_gap_px : along a curve, up to which it is there between two points.
+    step_px : distance of curves where every pattern resolves. cell_px : width of a cell of the code. max_gap : largest
+    distance of neighbours, in steps. widest_gap_px : as `widest_gap_px` returns it.
     """
-    maps = [_steps_px(seen.curves, step_px, cell_px) for seen in cameras]
+    maps = [_spacing_px(camera.curves, step_px, cell_px) for camera in cameras]
     if all(each is None for each in maps):
-        return Steps(step_px, None)
-    curves = joined.curves
+        return CurveSpacing(step_px, None)
+    curves = merged.curves
     columns, rows = np.rint(curves.pixels_px).astype(int).T
     at_points = np.full(len(rows), step_px)
     for index, each in enumerate(maps):
-        mine = joined.camera == index
+        own = merged.camera == index
         if each is not None:
-            at_points[mine] = each[rows[mine], columns[mine]]
+            at_points[own] = each[rows[own], columns[own]]
     # A curve may have a neighbour that another camera does not resolve.
     widest_px = max(float(each.max()) for each in maps if each is not None)
     runs = runs_of_curve_parts(
         curves.position_px, curves.offsets, curves.along_px,
         widest_step_px=max(step_px * max_gap, widest_px), widest_gap_px=_WIDEST_BRIDGES * widest_gap_px,
     )  # fmt: skip
-    return Steps(at_points, runs)
+    return CurveSpacing(at_points, runs)
 
 
-def _steps_px(curves: CameraCurves, step_px: float, cell_px: float) -> NDArray[np.float32] | None:
-    """(H, W): how far apart curves lie at each pixel; None if as usual everywhere."""
+def _spacing_px(curves: CameraCurves, step_px: float, cell_px: float) -> NDArray[np.float32] | None:
+    """(H, W): distance of neighbouring curves at each pixel, projector px; None if every pattern resolves."""
     if curves.unresolved is None:
         return None
     edges_px = np.float32(cell_px) * np.exp2(curves.unresolved, dtype=np.float32)
@@ -235,20 +350,20 @@ def _steps_px(curves: CameraCurves, step_px: float, cell_px: float) -> NDArray[n
 
 
 def camera_notes(cameras: Sequence[CameraResult]) -> list[str]:
-    """A sentence for each camera whose frames were JPEG once, and for each whose values were bent."""
+    """A sentence for each camera whose frames were compressed as JPEG, and for each with a gamma."""
     notes = []
-    for seen in cameras:
-        if seen.curves.compression_dn > 0:
+    for camera in cameras:
+        if camera.curves.compression_dn > 0:
             notes.append(
-                f"camera '{seen.name}': its frames were compressed as JPEG, which errs by as much as "
-                f"{seen.curves.compression_dn:.1f} grey levels of noise in every pixel would: take frames without "
+                f"camera '{camera.name}': its frames were compressed as JPEG, which errs by as much as "
+                f"{camera.curves.compression_dn:.1f} grey levels of noise in every pixel would: take frames without "
                 "compression (GREY, YUYV; PNG, TIFF or BMP files) for a finer surface"
             )
-        if seen.curves.gamma != 1:
+        if camera.curves.gamma != 1:
             notes.append(
-                f"camera '{seen.name}': its values are made for a display (gamma {seen.curves.gamma:.1f}), as edges of "
-                "the code tell; they were made proportional to light again. Switch its gamma correction off to keep "
-                "the levels that it costs"
+                f"camera '{camera.name}': its values are made for a display (gamma {camera.curves.gamma:.1f}), as "
+                "edges of the code show; they were made proportional to light again. Switch its gamma correction off "
+                "to keep the levels that it costs"
             )
     return notes
 
@@ -258,27 +373,27 @@ def unresolved_notes(cameras: Sequence[CameraResult], step_px: float, cell_px: f
     finest bits that were dropped by hand.
     """
     notes = []
-    for seen in cameras:
-        share = lit_share(seen.curves, seen.curves.unresolved_lines)
-        if share >= _WORTH_TELLING:
+    for camera in cameras:
+        share = lit_share(camera.curves, camera.curves.unresolved_lines)
+        if share >= _MIN_UNRESOLVED:
             notes.append(
-                f"camera '{seen.name}' does not resolve the shifted lines on {share:.0%} of what is lit: the edges of "
-                f"the code stand for them there, every {cell_px:g} projector pixels or wider instead of every "
+                f"camera '{camera.name}' does not resolve the shifted lines on {share:.0%} of what is lit: the edges "
+                f"of the code stand for them there, every {cell_px:g} projector pixels or wider instead of every "
                 f"{step_px:g}. Look at focus and resolution, or play lines further apart: "
                 f"{setting('line_shift_period_px')}"
             )
-        elif seen.curves.unresolved is not None and seen.curves.unresolved_lines is None:
-            share = lit_share(seen.curves, seen.curves.unresolved > dropped)
-            if share >= _WORTH_TELLING:
-                here = lit_pixels(seen.curves) & (seen.curves.unresolved > dropped)
-                bits = int(np.median(seen.curves.unresolved[here]))
+        elif camera.curves.unresolved is not None and camera.curves.unresolved_lines is None:
+            share = lit_share(camera.curves, camera.curves.unresolved > dropped)
+            if share >= _MIN_UNRESOLVED:
+                here = lit_pixels(camera.curves) & (camera.curves.unresolved > dropped)
+                bits = int(np.median(camera.curves.unresolved[here]))
                 which, them = ("finest Gray bit", "it is") if bits == 1 else (f"{bits} finest Gray bits", "they are")
                 notes.append(
-                    f"camera '{seen.name}' does not resolve the {which} on {share:.0%} of what is lit: "
+                    f"camera '{camera.name}' does not resolve the {which} on {share:.0%} of what is lit: "
                     f"{them} left out there, and the surface is sampled every {2**bits * step_px:g} projector pixels "
                     f"or wider. Look at focus and resolution, or play wider cells: {setting('gray_cell_px')}"
                 )
-    if dropped and any(seen.curves.unresolved is not None for seen in cameras):
+    if dropped and any(camera.curves.unresolved is not None for camera in cameras):
         notes.append(
             f"the {dropped} finest bits of the code were not read, as {setting('drop_finest_bits')} asks: points lie "
             f"every {2**dropped * cell_px:g} projector pixels or wider where the code gives them"

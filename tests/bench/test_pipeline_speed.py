@@ -28,14 +28,14 @@ from slrig.discovery import open_rig
 from slrig.model import Calibration, Mesh, Region
 from slrig.model.capture import CaptureHeader
 from slrig.scan.acquisition import capture_frames
-from slrig.scan.agreement import AxisAgreement
+from slrig.scan.axis_agreement import AxisAgreement
 from slrig.scan.losses import code_of
 from slrig.scan.measured import Walked
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import _meshed
 from slrig.scan.report import Stopwatch
 from slrig.scan.stream import ScanStream, cell_px, step_px
-from slrig.scan.triangulated import triangulated
+from slrig.scan.triangulated import triangulate_cameras
 
 RUNS = 5
 WHOLE = ReconstructionPlan()
@@ -103,21 +103,12 @@ class Run:
         seen = stream.finish()
         watch.enter("triangulate")
         step, cell = (each(stream.header.displayed_patterns, stream.axis) for each in (step_px, cell_px))
-        found = triangulated(seen, calibration.projector, stream.axis, region)
+        found = triangulate_cameras(seen, calibration, stream.axis, region)
         gray, agreement = code_of(stream.header.displayed_patterns, stream.axis), AxisAgreement(stream.axis, {})
         walked = Walked(
-            calibration,
-            stream.axis,
-            stream.header.axes,
-            seen,
-            step,
-            cell,
-            gray,
-            stream.header.projector,
-            {},
-            [],
+            calibration, stream.axis, stream.header.axes, seen, step, cell, gray, stream.header.projector, {}, [],
             agreement,
-        )
+        )  # fmt: skip
         meshed = _meshed(folder, found, walked, plan, lambda stage, _fraction, _detail: watch.enter(stage))
         self.stages_s = watch.finished()
         ended = time.perf_counter()

@@ -1,7 +1,4 @@
-"""Curves of two cameras merged along the light sheet: fused, filled, never doubled; the kernels against plain numpy.
-
-Cameras that contradict each other are told from cameras that are as good as they say.
-"""
+"""Curves of two cameras merged along the light sheet: fused, filled, never doubled; the kernels against plain numpy."""
 
 from __future__ import annotations
 
@@ -14,12 +11,9 @@ from numpy.typing import NDArray
 
 from slrig.model import Axis, FloatArray, Pinhole, Source
 from slrig.reconstruction.merging import (
-    MIN_POINTS,
-    Disagreement,
     MergedCurves,
     _fuse_kernel,
     _unmatched_kernel,
-    find_disagreement,
     merge_curves,
 )
 from slrig.reconstruction.triangulation import SheetCurves, triangulate_camera_projector
@@ -217,49 +211,3 @@ def test_points_are_unmatched_where_the_first_camera_has_no_stretch(pair: tuple[
             stretch = (rows[:-1] <= row) & (row <= rows[1:]) & (np.diff(rows) <= GAP_PX) & ~bridge[:-1]
             assert alone[i] == (not stretch.any() and not (np.abs(rows - row) < 0.5).any())
     assert 0 < alone.sum() < len(alone)
-
-
-NOISE_MM = 0.02
-
-
-def met(offset_mm: float, *, points: int = 5000, outlying: float = 0.0) -> MergedCurves:
-    """Two cameras whose noise is stated, and whose points are offset_mm apart; some see two different things."""
-    rng = np.random.default_rng(4)
-    apart = offset_mm + rng.normal(0, NOISE_MM, points)
-    apart[: round(outlying * points)] = 20.0
-    none: SheetCurves = None  # type: ignore[assignment] # nothing of the curves is asked
-    return MergedCurves(none, np.zeros(0, dtype=np.int32), apart / NOISE_MM, apart)
-
-
-def share(value_mm: float) -> FloatArray:
-    return np.full(100, value_mm)
-
-
-@pytest.mark.parametrize("outlying", [0.0, 0.2])
-def test_cameras_that_agree_within_their_noise_have_no_disagreement(outlying: float) -> None:
-    assert find_disagreement(met(0.0, outlying=outlying), None) is None
-    assert find_disagreement(met(0.0, outlying=outlying), share(0.1)) is None
-
-
-@pytest.mark.parametrize("offset_mm", [0.5, -0.5])
-def test_the_disagreement_of_cameras_is_measured(offset_mm: float) -> None:
-    found = find_disagreement(met(offset_mm, outlying=0.1), None)
-    assert found is not None
-    assert found.distance_mm == pytest.approx(0.5, rel=0.02)
-    # 25 deviations apart, on the scale on which noise alone has 1.
-    assert found.sigma_ratio == pytest.approx(1.4826 * 25, rel=0.03)
-    assert found.sigma_mm == found.distance_mm
-    assert "0.50" in str(found)
-    assert "calibrate again" in str(found)
-
-
-def test_a_stated_error_of_the_calibration_is_not_a_disagreement() -> None:
-    assert find_disagreement(met(0.2), share(0.15)) is None
-    assert isinstance(find_disagreement(met(0.2), share(0.02)), Disagreement)
-
-
-def test_few_common_points_give_no_disagreement() -> None:
-    assert find_disagreement(met(0.5, points=MIN_POINTS - 1), None) is None
-    nothing = met(0.0)
-    same = MergedCurves(nothing.curves, nothing.camera, 0 * nothing.residual_sigma, 0 * nothing.residual_mm)
-    assert find_disagreement(same, None) is None

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.model import Axis, FloatArray, Pinhole, Size, Source
-from slrig.reconstruction.merging import (
+from slrig.model import Axis, Calibration, FloatArray, Pinhole, Size, SolveRecord, Source
+from slrig.reconstruction.redundancy import (
     MAP_CELLS,
     MIN_PAIRS,
     PairRedundancy,
@@ -159,8 +159,15 @@ def test_sheets_of_a_single_camera_are_left_out() -> None:
 
 
 def figures(residual: FloatArray, pixels: FloatArray, sigma: float = 0.02) -> PairRedundancy:
-    spare = StripeResiduals(residual, np.full(len(residual), sigma), pixels)
-    return summarise_pair(spare, "left", "right", Size(600, 480))
+    return summarise_pair(residuals_of(residual, pixels, sigma), "left", "right", Size(600, 480))
+
+
+def residuals_of(residual: FloatArray, pixels: FloatArray, sigma: float = 0.02) -> StripeResiduals:
+    """Residuals where the projector's pixels are the camera's."""
+    count = len(residual)
+    return StripeResiduals(
+        residual, np.full(count, sigma), pixels, pixels, np.arange(count), np.tile([1.0, 0.0], (count, 1))
+    )
 
 
 def test_the_map_has_each_cell_of_the_reference_image() -> None:
@@ -196,6 +203,66 @@ def test_points_of_two_different_things_are_counted_and_left_out() -> None:
     made = figures(residual, np.tile([300.0, 200.0], (1000, 1)))
     assert (made.outlying, made.pairs) == (7, 993)
     assert made.mean_px == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("noise_px", "offset_px", "calibration_px", "contradicted"),
+    [
+        (0.02, 0.0, 0.0, False),
+        (0.2, 0.0, 0.0, False),  # noise that is ten times as large as stated is no contradiction
+        (0.02, 0.1, 0.0, True),
+        (0.2, 0.1, 0.0, False),  # and an offset far below it makes no difference
+        (0.2, 1.0, 0.0, True),
+        (0.02, 0.1, 0.1, False),  # nor one that the calibration states
+        (3.0, 40.0, 0.0, True),  # what scatters by more than half a pixel is not noise
+    ],
+)
+def test_cameras_contradict_each_other_by_the_median_of_areas(
+    noise_px: float, offset_px: float, calibration_px: float, contradicted: bool
+) -> None:
+    rng = np.random.default_rng(3)
+    pixels = rng.uniform(0, 200, (20_000, 2))
+    # The offset changes its sign over the image, so that the mean of all shows nothing.
+    residual = rng.normal(0, noise_px, len(pixels)) + offset_px * np.where(pixels[:, 0] > 100, 1.0, -1.0)
+    found = summarise_pair(
+        residuals_of(residual, pixels), "left", "right", Size(200, 200), calibration_px=calibration_px
+    )
+    assert found.is_contradicted == contradicted
+    stated = np.hypot(0.02, calibration_px)
+    assert found.over_stated == pytest.approx(1.4826 * np.median(np.abs(residual)) / stated)
+
+
+def test_few_common_points_contradict_nothing() -> None:
+    assert figures(np.full(99, 5.0), np.full((99, 2), 8.0)).contradiction == 0
+    assert figures(np.full(101, 5.0), np.full((101, 2), 8.0)).is_contradicted
+
+
+@by_kernel
+def test_the_calibrations_part_of_a_residual_is_that_of_its_covariance() -> None:
+    # The second camera's place and the projector's focal length, each with its oracle: the residuals with that
+    # parameter changed by its standard deviation.
+    sigmas = {15 + 12: 0.3, 30: 0.7}
+    covariance = np.diag([sigmas.get(index, 0.0) ** 2 for index in range(45)])
+    box = np.array([[-60.0, -60.0, -10.0], [60.0, 60.0, 40.0]])
+    solved = SolveRecord("it", "2026-01-01T00:00:00+00:00", covariance, box, 0.1)
+    devices = {"left": CAMERA, "right": OTHER_CAMERA}
+    found = evaluate_redundancy(
+        [seen(CAMERA), seen(OTHER_CAMERA)], devices, Axis.COLUMN, widest_gap_px=GAP_PX,
+        calibration=Calibration(devices, PROJECTOR, solved),
+    ).pairs[0]  # fmt: skip
+    moved = replace(OTHER_CAMERA, translation_mm=OTHER_CAMERA.translation_mm + np.array([0.3, 0.0, 0.0]))
+    zoomed = replace(PROJECTOR, matrix=PROJECTOR.matrix + np.diag([0.7, 0.0, 0.0]))
+    through_zoomed = (
+        triangulate_camera_projector(seen_on_ball(camera, COLUMNS, ROWS), camera, zoomed, Axis.COLUMN)[0]
+        for camera in (CAMERA, OTHER_CAMERA)
+    )
+    changed = [
+        both(seen(CAMERA), seen(OTHER_CAMERA), other=moved),
+        both(*through_zoomed),
+    ]
+    wanted = math.hypot(*(float(np.median(np.abs(each.residual_px))) for each in changed))
+    assert wanted > 0.3
+    assert found.calibration_px == pytest.approx(wanted, rel=0.1)
 
 
 @by_kernel

@@ -33,14 +33,14 @@ OBLIQUE_CAMERA = looking(
 
 def test_the_other_curve_is_crossed_between_its_points() -> None:
     other = seen_on_ball(OTHER_CAMERA, COLUMNS, ROWS + 0.55)
-    curves = triangulate_camera_pair(seen_on_ball(CAMERA, COLUMNS, ROWS), other, CAMERA, OTHER_CAMERA)
+    curves, _ = triangulate_camera_pair(seen_on_ball(CAMERA, COLUMNS, ROWS), other, CAMERA, OTHER_CAMERA)
     assert len(curves.points_mm) == len(COLUMNS) * (len(ROWS) - 1)
     assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 2e-3
 
 
 def test_curves_run_by_the_rows_of_the_first_camera() -> None:
     backwards = seen_on_ball(CAMERA, COLUMNS, ROWS[::-1].copy())
-    curves = triangulate_camera_pair(backwards, seen_on_ball(OTHER_CAMERA, COLUMNS, ROWS), CAMERA, OTHER_CAMERA)
+    curves, _ = triangulate_camera_pair(backwards, seen_on_ball(OTHER_CAMERA, COLUMNS, ROWS), CAMERA, OTHER_CAMERA)
     assert (np.diff(curves.along_px)[np.diff(curves.curve_of_point()) == 0] > 0).all()
     np.testing.assert_array_equal(curves.along_px, curves.pixels_px[:, 1])
 
@@ -50,7 +50,7 @@ def test_codes_of_a_single_camera_give_no_points() -> None:
         seen_on_ball(CAMERA, [110.0, 138.5, 166.0], ROWS),
         seen_on_ball(OTHER_CAMERA, [138.5, 150.0, 166.0, 190.0], ROWS),
     )
-    curves = triangulate_camera_pair(first, second, CAMERA, OTHER_CAMERA)
+    curves, _ = triangulate_camera_pair(first, second, CAMERA, OTHER_CAMERA)
     assert curves.position_px.tolist() == [110.0, 138.5, 166.0]
     assert np.diff(curves.offsets)[0] == 0
     assert (np.diff(curves.offsets)[1:] > 80).all()
@@ -60,7 +60,7 @@ def test_codes_of_a_single_camera_give_no_points() -> None:
 def test_bridges_are_not_crossed() -> None:
     gap = (ROWS < 100) | (ROWS > 130)
     second = seen_on_ball(OTHER_CAMERA, [138.5], ROWS[gap])
-    curves = triangulate_camera_pair(seen_on_ball(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
+    curves, _ = triangulate_camera_pair(seen_on_ball(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
     met = opencv_pixels(CAMERA, lit_rows(138.5, ROWS, BALL))[:, 1]
     hidden = met[~gap]
     assert len(curves.points_mm) > 50
@@ -69,21 +69,22 @@ def test_bridges_are_not_crossed() -> None:
 
 def test_beyond_the_other_cameras_curve_there_is_no_point() -> None:
     second = seen_on_ball(OTHER_CAMERA, [138.5], ROWS[30:60])
-    curves = triangulate_camera_pair(seen_on_ball(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
+    curves, matched = triangulate_camera_pair(seen_on_ball(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
     assert 28 <= len(curves.points_mm) <= 30
+    assert np.count_nonzero(matched) == np.count_nonzero(matched[30:60]) == len(curves.points_mm)
 
 
 @pytest.mark.parametrize("other", [OTHER_CAMERA, OBLIQUE_CAMERA], ids=["beside", "oblique"])
 def test_the_deviation_adds_the_errors_of_both_cameras(other: Pinhole) -> None:
     first = seen_on_ball(CAMERA, COLUMNS, ROWS[2:-2], sigma_px=0.02)
     second = seen_on_ball(other, COLUMNS, ROWS + 0.2, sigma_px=0.02)
-    curves = triangulate_camera_pair(first, second, CAMERA, other)
+    curves, _ = triangulate_camera_pair(first, second, CAMERA, other)
     assert len(curves.points_mm) == len(first.points_px)
 
     def moved(mine: float, theirs: float) -> FloatArray:
         a = first._replace(points_px=first.points_px + mine * first.normals)
         b = second._replace(points_px=second.points_px + theirs * second.normals)
-        return triangulate_camera_pair(a, b, CAMERA, other).points_mm
+        return triangulate_camera_pair(a, b, CAMERA, other)[0].points_mm
 
     own = (moved(0.02, 0.0) - moved(-0.02, 0.0)) / 2
     others = (moved(0.0, 0.02) - moved(0.0, -0.02)) / 2
@@ -97,7 +98,7 @@ def test_the_deviation_adds_the_errors_of_both_cameras(other: Pinhole) -> None:
 def test_a_camera_without_parallax_gives_nothing() -> None:
     # Both at one place: every ray meets every other at the centre only.
     turned = replace(CAMERA, matrix=CAMERA.matrix * [[1.05], [1.05], [1.0]])
-    curves = triangulate_camera_pair(
+    curves, _ = triangulate_camera_pair(
         seen_on_ball(CAMERA, COLUMNS, ROWS), seen_on_ball(turned, COLUMNS, ROWS), CAMERA, turned
     )
     assert len(curves.points_mm) == 0

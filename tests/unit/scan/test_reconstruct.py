@@ -563,7 +563,7 @@ def test_the_axis_that_decodes_far_more_is_used_and_told(slanted: Path, tmp_path
     assert walked.axis is Axis.ROW
     (note,) = (note for note in walked.notes if note.startswith("triangulated by rows"))
     assert "the columns, which cross the baseline more steeply, decode" in note
-    assert len(found.joined.curves.points_mm) > 1000
+    assert len(found.merged.curves.points_mm) > 1000
     asked, _ = measured(worse, None, None, lambda *_: None, axis=Axis.COLUMN)
     assert asked.axis is Axis.COLUMN
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from slrig.meshing.surface import compact_mesh
-from slrig.model import AlbedoMark, Axis, FloatArray, Mesh, NoiseModel, Pinhole, Refusal, Size
+from slrig.model import AlbedoMark, Axis, Calibration, FloatArray, Mesh, NoiseModel, Pinhole, Refusal, Size
 from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.pipeline import CameraCurves
 from slrig.reconstruction.triangulation import triangulate_camera_projector
 from slrig.scan.colouring import Coloured, albedo_report, coloured
 from slrig.scan.coverage import covered_share, with_uncovered_refused
 from slrig.scan.stream import CameraResult
-from slrig.scan.triangulated import Triangulated, triangulated, widest_gap_px
+from slrig.scan.triangulated import Triangulated, triangulate_cameras, widest_gap_px
 from tests.unit.reconstruction.builders import (
     CAMERA,
     OTHER_CAMERA,
@@ -63,6 +63,10 @@ def seen(name: str, device: Pinhole, ensemble: StripeEnsemble) -> CameraResult:
     return CameraResult(name, device, curves, white, contrast, clipped, 255.0)
 
 
+def triangulate(cameras: list[CameraResult], projector: Pinhole | None, axis: Axis) -> Triangulated:
+    return triangulate_cameras(cameras, Calibration({each.name: each.device for each in cameras}, projector), axis)
+
+
 FEW, MANY = np.arange(100.0, 140.0, 1.5), np.arange(80.0, 160.0, 1.5)
 
 
@@ -106,19 +110,32 @@ def test_a_pair_along_the_stripes_is_passed_over_however_many_points_it_gives() 
     first = seen("first", CAMERA, curves_in(CAMERA, MANY))
     beside = seen("beside", OTHER_CAMERA, curves_in(OTHER_CAMERA, FEW))
     above = seen("above", ABOVE, curves_in(ABOVE, MANY))
-    found = triangulated([first, above, beside], None, Axis.COLUMN)
+    found = triangulate([first, above, beside], None, Axis.COLUMN)
     assert found.second == 2
-    assert found.share_across > 0.9
-    assert np.abs(BALL.distance_mm(found.joined.curves.points_mm)).max() < 0.01
-    assert triangulated([first, above], None, Axis.COLUMN).share_across < 0.2
+    assert found.baseline_sine > 0.9
+    assert np.abs(BALL.distance_mm(found.merged.curves.points_mm)).max() < 0.01
+    assert triangulate([first, above], None, Axis.COLUMN).baseline_sine < 0.2
 
 
 def test_of_pairs_across_the_stripes_the_one_with_most_points_is_used() -> None:
     first = seen("first", CAMERA, curves_in(CAMERA, MANY))
     few = seen("few", OTHER_CAMERA, curves_in(OTHER_CAMERA, FEW))
     many = seen("many", OTHER_CAMERA, curves_in(OTHER_CAMERA, MANY))
-    assert triangulated([first, few, many], None, Axis.COLUMN).second == 2
-    assert triangulated([first, many, few], None, Axis.COLUMN).second == 1
+    assert triangulate([first, few, many], None, Axis.COLUMN).second == 2
+    assert triangulate([first, many, few], None, Axis.COLUMN).second == 1
+
+
+def test_points_without_a_partner_in_the_other_camera_have_their_cause() -> None:
+    first = seen("first", CAMERA, curves_in(CAMERA, MANY))
+    found = triangulate([first, seen("other", OTHER_CAMERA, curves_in(OTHER_CAMERA, FEW))], None, Axis.COLUMN)
+    columns, lines = np.rint(first.curves.ensemble.points_px).astype(int).T
+    inside = np.tile((FEW[0] + 3 < MANY) & (FEW[-1] - 3 > MANY), len(COLUMNS))
+    outside = np.tile((FEW[0] - 3 > MANY) | (FEW[-1] + 3 < MANY), len(COLUMNS))
+    causes = found.cameras[0].curves.refusal[lines, columns]
+    assert set(causes[inside].tolist()) == {Refusal.NONE}
+    assert set(causes[outside].tolist()) == {Refusal.ONE_CAMERA_ONLY}
+    (note,) = found.notes
+    assert "of the points of camera 'first' have no partner in camera 'other'" in note
 
 
 def test_points_left_out_are_refused_pixels_with_their_own_cause() -> None:
@@ -133,9 +150,9 @@ def test_points_left_out_are_refused_pixels_with_their_own_cause() -> None:
         [*np.split(ensemble.points_px, ensemble.offsets[1:-1]), aside], [*COLUMNS, 2500.0]
     )  # fmt: skip
     cut = replace(straight, size=replace(straight.size, height_px=121))
-    found = triangulated([seen("only", CAMERA, with_behind)], cut, Axis.COLUMN)
+    found = triangulate([seen("only", CAMERA, with_behind)], cut, Axis.COLUMN)
     (camera,) = found.cameras
-    assert len(found.joined.curves.points_mm) == len(COLUMNS) * ahead
+    assert len(found.merged.curves.points_mm) == len(COLUMNS) * ahead
     refusal = camera.curves.refusal
     columns, lines = np.rint(aside).astype(int).T
     assert refusal[lines, columns].tolist() == [Refusal.BEHIND_DEVICE]
@@ -153,21 +170,21 @@ def test_a_camera_that_sees_the_sheets_edge_on_is_left_out(first: str) -> None:
         (x + 5.0, y - 240.0, z), (0.0, 0.0, 0.0), size=CAMERA.size, focal_px=(1380.0, 1390.0), distortion=(0.0,) * 5
     )
     cameras = [seen("above", above, curves_in(above, MANY)), seen("beside", CAMERA, curves_in(CAMERA, FEW))]
-    found = triangulated(cameras if first == "above" else cameras[::-1], PROJECTOR, Axis.COLUMN)
-    assert len(found.joined.curves.points_mm) == len(FEW) * len(COLUMNS)
-    assert np.abs(BALL.distance_mm(found.joined.curves.points_mm)).max() < 0.01
+    found = triangulate(cameras if first == "above" else cameras[::-1], PROJECTOR, Axis.COLUMN)
+    assert len(found.merged.curves.points_mm) == len(FEW) * len(COLUMNS)
+    assert np.abs(BALL.distance_mm(found.merged.curves.points_mm)).max() < 0.01
     refused = {each.name: set(np.unique(each.curves.refusal)) for each in found.cameras}
     assert refused == {"above": {Refusal.NONE, Refusal.SHEET_SEEN_ALONG}, "beside": {Refusal.NONE}}
-    (alone,) = triangulated(cameras[:1], PROJECTOR, Axis.COLUMN).cameras
+    (alone,) = triangulate(cameras[:1], PROJECTOR, Axis.COLUMN).cameras
     assert not alone.curves.refusal.any()
 
 
 @pytest.mark.parametrize("axis", list(Axis))
 def test_with_a_projector_the_crossing_is_that_of_the_calibration(axis: Axis) -> None:
-    found = triangulated([seen("only", CAMERA, curves_in(CAMERA, FEW))], PROJECTOR, axis)
+    found = triangulate([seen("only", CAMERA, curves_in(CAMERA, FEW))], PROJECTOR, axis)
     beside, above, _ = PROJECTOR.rotation @ (CAMERA.centre_mm - PROJECTOR.centre_mm)
     across = beside if axis is Axis.COLUMN else above
-    assert found.share_across == pytest.approx(abs(across) / np.hypot(beside, above))
+    assert found.baseline_sine == pytest.approx(abs(across) / np.hypot(beside, above))
 
 
 @pytest.mark.parametrize(("axis", "gap_px"), [(Axis.COLUMN, 8.0), (Axis.ROW, 4.0)])
@@ -188,17 +205,17 @@ def lit(name: str, device: Pinhole, projector: Pinhole = PROJECTOR) -> CameraRes
 
 
 def normals_of(found: Triangulated) -> FloatArray:
-    outward = found.joined.curves.points_mm - np.array(BALL.centre_mm)
+    outward = found.merged.curves.points_mm - np.array(BALL.centre_mm)
     return np.asarray(outward / np.linalg.norm(outward, axis=1, keepdims=True), dtype=np.float32)
 
 
 def colours_of(cameras: list[CameraResult], projector: Pinhole | None) -> tuple[Coloured, Triangulated]:
-    found = triangulated(cameras, projector, Axis.COLUMN)
-    return coloured(cameras, found.joined, normals_of(found).astype(np.float32), projector, Axis.COLUMN), found
+    found = triangulate(cameras, projector, Axis.COLUMN)
+    return coloured(cameras, found.merged, normals_of(found).astype(np.float32), projector, Axis.COLUMN), found
 
 
 def mesh_of(made: Coloured, found: Triangulated) -> Mesh:
-    curves, count = found.joined.curves, len(made.mark)
+    curves, count = found.merged.curves, len(made.mark)
     faces = np.arange(count - count % 3, dtype=np.int32).reshape(-1, 3)
     return compact_mesh(
         faces, curves.points_mm, normals_of(found).astype(np.float32), made.colour, made.mark, np.zeros(count),
@@ -209,7 +226,7 @@ def mesh_of(made: Coloured, found: Triangulated) -> Mesh:
 def test_what_is_as_bright_and_farther_away_has_the_lighter_colour() -> None:
     camera = lit("camera", CAMERA)
     made, found = colours_of([camera], PROJECTOR)
-    towards = PROJECTOR.centre_mm - found.joined.curves.points_mm
+    towards = PROJECTOR.centre_mm - found.merged.curves.points_mm
     distance = np.linalg.norm(towards, axis=1)
     cosine = (normals_of(found) * towards).sum(axis=1) / distance
     expected = distance**2 / cosine
@@ -239,7 +256,7 @@ def test_without_a_calibrated_projector_the_colour_is_brightness_and_says_so() -
 def test_points_in_the_outermost_pixels_of_the_projector_are_marked(width_px: int, height_px: int) -> None:
     projector = replace(PROJECTOR, size=Size(width_px, height_px))
     made, found = colours_of([lit("camera", CAMERA)], projector)
-    curves = found.joined.curves
+    curves = found.merged.curves
     beyond = (np.repeat(curves.position_px, np.diff(curves.offsets)) > width_px - 3) | (curves.along_px > height_px - 3)
     assert max(COLUMNS) > 172 - 3
     assert 0 < beyond.mean() < 0.4
@@ -248,10 +265,10 @@ def test_points_in_the_outermost_pixels_of_the_projector_are_marked(width_px: in
 
 def test_a_point_without_a_normal_is_neither_dark_nor_light() -> None:
     camera = lit("camera", CAMERA)
-    found = triangulated([camera], PROJECTOR, Axis.COLUMN)
+    found = triangulate([camera], PROJECTOR, Axis.COLUMN)
     normals = normals_of(found).astype(np.float32)
     normals[3] = np.nan
-    made = coloured([camera], found.joined, normals, PROJECTOR, Axis.COLUMN)
+    made = coloured([camera], found.merged, normals, PROJECTOR, Axis.COLUMN)
     assert made.colour[3].tolist() == [128, 128, 128]
     assert np.flatnonzero(made.mark).tolist() == [3]
     assert made.mark[3] == AlbedoMark.UNKNOWN
