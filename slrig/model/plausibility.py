@@ -19,7 +19,7 @@ from slrig.model.lens import distort
 
 LengthUnit = Literal["mm", "cm", "m", "inch"]
 MM_PER_UNIT: Mapping[LengthUnit, float] = {"mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0}
-_UNIT_WORDS: Mapping[LengthUnit, str] = {"mm": "millimetres", "cm": "centimetres", "inch": "inches", "m": "metres"}
+_UNIT_WORDS: Mapping[LengthUnit, str] = {"mm": "Millimetres", "cm": "Centimetres", "inch": "Inches", "m": "Metres"}
 
 _GRID = 15  # pixels to examine along each side of the image, the border included
 _PATH_STEPS = 16  # from the principal point to a pixel
@@ -249,6 +249,6 @@ def units_sentence(layout: RigLayout) -> str:
     units = [unit for unit in MM_PER_UNIT if unit != "mm" and layout.is_of_a_bench(unit)]
     likely = "".join(f"{_UNIT_WORDS[unit]}? Then {layout.in_unit(unit)} (--unit {unit}). " for unit in units)
     return (
-        f"{likely[:1].upper()}{likely[1:]}State the unit of a file: slrig import, slrig calibrate import and slrig "
+        f"{likely}State the unit of a file: slrig import, slrig calibrate import and slrig "
         f"calibrate export have --unit {', '.join(MM_PER_UNIT)}; send millimetres to the service"
     )
