@@ -19,7 +19,7 @@ from slrig.model.lens import distort
 
 LengthUnit = Literal["mm", "cm", "m", "inch"]
 MM_PER_UNIT: Mapping[LengthUnit, float] = {"mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0}
-_UNIT_WORDS: Mapping[LengthUnit, str] = {"mm": "millimetres", "cm": "centimetres", "inch": "inches", "m": "metres"}
+_UNIT_WORDS: Mapping[LengthUnit, str] = {"mm": "Millimetres", "cm": "Centimetres", "inch": "Inches", "m": "Metres"}
 
 _GRID = 15  # pixels to examine along each side of the image, the border included
 _PATH_STEPS = 16  # from the principal point to a pixel
@@ -27,8 +27,10 @@ _NEWTON_STEPS = 2  # for each step of the path, which is short
 _MIN_IMAGED = 0.85
 """Least share of the image that a lens images. Polynomials of real wide lenses fold in the corners, which no board
 reached; there a scan has no points."""
-_RADIUS_RATIOS = (0.3, 1.5)
-"""Distorted radius over undistorted radius. A fisheye has 0.44 at 70° from its axis, a pincushion lens up to 1.2."""
+_MAX_PINCUSHION = 1.2
+"""Distorted radius over undistorted radius; pincushion lenses have up to 1.1."""
+_MAX_BELOW_FISHEYE = 0.15
+"""The same ratio is cos θ for the strongest fisheye, the orthographic one, at the angle θ; so much less is no lens."""
 
 _FOCAL_PER_SIDE = (0.1, 200.0)
 """Focal length over the longer side of the image: fields of view of 157° and 0.3°."""
@@ -109,9 +111,8 @@ def device_faults(device: Pinhole, place: str, *, is_projector: bool = False) ->
         if imaged < _MIN_IMAGED:
             faults.append(
                 f"{place}.distortion: expected a lens that images all of {device.size}, found one that folds within "
-                f"it: {1 - imaged:.0%} of the image lies beyond the radius where the distorted radius stops rising or "
-                f"is {_RADIUS_RATIOS[0]:g} or {_RADIUS_RATIOS[1]:g} of the undistorted one ("
-                f"{', '.join(f'{term:g}' for term in device.distortion)}). A calibration from too few views has such "
+                f"it, or bends rays more than any lens: {1 - imaged:.0%} of the image lies beyond "
+                f"({', '.join(f'{term:g}' for term in device.distortion)}). A calibration from too few views has such "
                 "numbers: solve with fewer terms, or with views that reach the corners"
             )
     return faults
@@ -126,14 +127,14 @@ def imaged_share(device: Pinhole, /) -> float:
 def _is_weak_lens(device: Pinhole, points_px: FloatArray) -> bool:
     """Return True if bounds of the distortion suffice to tell that the lens images all pixels.
 
-    Where the derivatives are at least 2/3 up to 1.5 times the largest distorted radius, they are so up to the largest
-    undistorted one.
+    Where the derivatives are at least 0.7 up to 1.5 times the largest distorted radius, they are so up to the largest
+    undistorted one, and the radius changes by half of the bound of their change at the most.
     """
     xd, yd = _distorted(device, points_px)
     radius = 1.5 * float(np.hypot(xd, yd).max())
     k1, k2, p1, p2, k3 = np.abs(device.distortion)
     change = 3 * k1 * radius**2 + 5 * k2 * radius**4 + 7 * k3 * radius**6 + 6 * (p1 + p2) * radius
-    return bool(change < 1 / 3)
+    return bool(change < 0.3)
 
 
 def _distorted(device: Pinhole, points_px: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -147,7 +148,8 @@ def imaged_pixels(device: Pinhole, points_px: FloatArray, /) -> NDArray[np.bool_
     """(n,) bool: True for pixels (n, 2) that the lens images by the branch of the distortion that begins at the axis.
 
     The path from the principal point to the pixel is followed in short steps, each by Newton's method. It ends where
-    the determinant of the derivatives is no longer positive: there the lens folds, and no ray arrives beyond.
+    the determinant of the derivatives is no longer positive: there the lens folds, and no ray arrives beyond. Nor is a
+    pixel imaged whose ray is bent more than by any lens (`_MAX_PINCUSHION`, `_MAX_BELOW_FISHEYE`).
     """
     xd, yd = _distorted(device, points_px)
     x, y = np.zeros_like(xd), np.zeros_like(yd)
@@ -162,10 +164,10 @@ def imaged_pixels(device: Pinhole, points_px: FloatArray, /) -> NDArray[np.bool_
                 x, y = x + (c * ex - b * ey) * scale, y + (a * ey - b * ex) * scale
         gx, gy, a, b, c = distort(device.distortion, x, y)
         near = np.hypot(gx - xd, gy - yd) * min(device.matrix[0, 0], device.matrix[1, 1]) < 1.0
-        ratio = np.hypot(xd, yd) / np.maximum(np.hypot(x, y), 1e-12)
-        low, high = _RADIUS_RATIOS
-        straight = (np.hypot(xd, yd) < 1e-9) | ((ratio >= low) & (ratio <= high))
-        return np.asarray(near & (a * c - b * b > 0) & straight)
+        radius = np.hypot(x, y)
+        ratio = np.where(radius > 1e-9, np.hypot(xd, yd) / radius, 1.0)
+        is_lens = (ratio <= _MAX_PINCUSHION) & (ratio >= 1 / np.sqrt(1 + radius**2) - _MAX_BELOW_FISHEYE)
+        return np.asarray(near & (a * c - b * b > 0) & is_lens)
 
 
 def _grid(size: Size) -> FloatArray:
@@ -247,6 +249,6 @@ def units_sentence(layout: RigLayout) -> str:
     units = [unit for unit in MM_PER_UNIT if unit != "mm" and layout.is_of_a_bench(unit)]
     likely = "".join(f"{_UNIT_WORDS[unit]}? Then {layout.in_unit(unit)} (--unit {unit}). " for unit in units)
     return (
-        f"{likely[:1].upper()}{likely[1:]}State the unit of a file: slrig import, slrig calibrate import and slrig "
+        f"{likely}State the unit of a file: slrig import, slrig calibrate import and slrig "
         f"calibrate export have --unit {', '.join(MM_PER_UNIT)}; send millimetres to the service"
     )

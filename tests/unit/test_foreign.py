@@ -196,7 +196,7 @@ def program_file(path: Path, keys: tuple[str, ...] = OPENCV_KEYS, **changes: Any
     [
         (1e-3, r"stand 0.243 mm apart .*Metres\? Then .* 243 mm apart .*--unit m\)"),
         (0.1, r"stand 24.3 mm apart .*Centimetres\? .*--unit cm\)"),
-        (1 / 25.4, r"stand 9.55 mm apart .*nches\? .*--unit inch\)"),
+        (1 / 25.4, r"stand 9.55 mm apart .*Inches\? .*--unit inch\)"),
         (1e3, r"stand 2.43e\+05 mm apart .*State the unit"),
     ],
 )

@@ -73,7 +73,8 @@ def test_a_rig_that_exists_passes(calibration: Calibration) -> None:
         (rig(camera={"lens": (-22.0, 0, 0, 0, 0)}), "cameras.cam0.distortion: .* folds within it"),
         (rig(camera={"lens": (-4.0, 0, 0, 0, 0)}), "cameras.cam0.distortion: .* folds within it"),
         (rig(projector={"lens": (27.6, -2344.6, 7.97, 10.36, 0)}), "projector.distortion: .* folds within it"),
-        (rig(projector={"lens": (27.6, 0, 0, 0, 0)}), "projector.distortion: .* folds within it"),
+        (rig(projector={"lens": (15.0, 0, 0, 0, 0)}), "projector.distortion: .* bends rays more than any lens"),
+        (rig(camera={"lens": (-2.5, 0, 0, 0, 0)}), "cameras.cam0.distortion: .* bends rays more than any lens"),
         (rig(camera={"focal": (870.0, 1376.0)}), "cameras.cam0.matrix: .* found 0.632"),
         (rig(projector={"focal": (400.0, 1451.0)}), "projector.matrix: expected fx / fy"),
         (rig(camera={"focal": (8.0, 8.0)}), "cameras.cam0.matrix: expected focal lengths .* in millimetres?"),
@@ -105,9 +106,9 @@ def test_a_lens_images_what_lies_within_its_fold(lens: tuple[float, float]) -> N
     radius = np.linspace(0, 1, 1_000_001)
     first = np.flatnonzero(1 + 3 * k1 * radius**2 + 5 * k2 * radius**4 <= 0)[0]
     limit_px = 1375 * radius[first] * (1 + k1 * radius[first] ** 2 + k2 * radius[first] ** 4)
-    column_px = 322 + np.array([0.3, 0.98, 1.02]) * limit_px
-    points = np.stack([column_px, np.full(3, 251.0)], axis=1)
-    assert imaged_pixels(folded, points).tolist() == [True, True, False]
+    column_px = 322 + np.array([0.3, 1.02]) * limit_px
+    points = np.stack([column_px, np.full(2, 251.0)], axis=1)
+    assert imaged_pixels(folded, points).tolist() == [True, False]
 
 
 def test_the_bound_of_weak_lenses_agrees_with_the_path() -> None:
@@ -125,7 +126,7 @@ def test_the_bound_of_weak_lenses_agrees_with_the_path() -> None:
 
 def test_corners_that_no_board_reached_may_fold() -> None:
     lens = device(lens=(-2.0, 0, 0, 0, 0))
-    assert 0.9 < imaged_share(lens) < 1
+    assert 0.85 < imaged_share(lens) < 1
     assert calibration_faults(Calibration({"cam0": lens}, None)) == []
 
 
