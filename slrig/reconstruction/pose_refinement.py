@@ -110,19 +110,20 @@ def refine_pose(
         )  # fmt: skip
         before, parameters = left, found.x
         left = DEVIATIONS_PER_MEDIAN * float(np.median(np.abs(system.residuals(parameters)[:-6])))
-        if left > _LEAST_GAIN * before or not _is_small(*np.split(parameters * scale, 2), baseline_mm, factor=2.0):
+        turn, shift_mm = np.split(parameters * scale, 2)
+        if left > _LEAST_GAIN * before or not _is_small(turn, shift_mm, baseline_mm, factor=2.0):
             break
     slopes = system.derivatives(parameters)
     slopes[:-6] /= max(1.0, left)
     pose = poses(parameters)[moved]
-    turn, shift_mm = np.split(parameters * scale, 2)
+    covariance: FloatArray = np.asarray(np.linalg.inv(slopes.T @ slopes) * np.outer(scale, scale), dtype=np.float64)
     return RefinedPose(
         device=moved,
         pose=pose,
         turn_deg=float(np.rad2deg(np.linalg.norm(turn))),
         shift_mm=float(np.linalg.norm(shift_mm)),
         baseline_mm=baseline_mm,
-        covariance=_parameter_covariance(pose, np.linalg.inv(slopes.T @ slopes) * np.outer(scale, scale)),
+        covariance=_parameter_covariance(pose, covariance),
         equations=len(system.start),
         scatter_sigma=left,
     )

@@ -343,8 +343,8 @@ def _with_one_camera(
     left_out = [name for k, name in enumerate(scan.names) if k in against or k == odd]
     note = (
         f"{_contradiction(found)}, {distance_mm:.3f} mm on the surface (68 % of it nearer), and no small move of one "
-        f"device explains it. The points of {_listed(left_out)} were left out, and those of camera '{scan.names[best]}' "
-        f"used: {why}"
+        f"device explains it. The points of {_listed(left_out)} were left out, and those of camera "
+        f"'{scan.names[best]}' used: {why}"
     )
     if added_mm:
         note += ". The other may be right: the distance was added to the standard deviations, in squares"
