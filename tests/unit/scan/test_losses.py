@@ -26,8 +26,8 @@ from slrig.scan.losses import (
 )
 from slrig.scan.report import layout_notes
 from slrig.scan.stream import CameraResult
-from slrig.scan.triangulated import triangulated
 from tests.unit.reconstruction.builders import BALL, CAMERA, PROJECTOR, ensemble_of, lit_rows, opencv_pixels
+from tests.unit.scan.test_triangulated import triangulate
 from tests.unit.test_plausibility import rig
 
 HERE = Path("here")
@@ -139,11 +139,11 @@ def test_a_right_pose_has_a_place_for_every_point_and_the_usual_mistakes_are_nam
     seen = ball_seen()
     turn = PROJECTOR.rotation @ CAMERA.rotation.T
     shift = PROJECTOR.translation_mm - turn @ CAMERA.translation_mm
-    right = triangulated([seen], PROJECTOR, Axis.COLUMN)
+    right = triangulate([seen], PROJECTOR, Axis.COLUMN)
     assert geometry_fault(right.cameras, [seen], PROJECTOR, Axis.COLUMN) is None
     assert geometry_notes(right.cameras) == []
     wrong = replace(PROJECTOR, translation_mm=turn @ CAMERA.translation_mm - shift)
-    found = triangulated([seen], wrong, Axis.COLUMN)
+    found = triangulate([seen], wrong, Axis.COLUMN)
     words = geometry_fault(found.cameras, [seen], wrong, Axis.COLUMN)
     assert words is not None
     assert "have no place; nearly all have one with" in words

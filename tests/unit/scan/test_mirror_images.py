@@ -15,10 +15,10 @@ from slrig.scan.mirror_images import (
     without_mirror_images,
     without_surface,
 )
-from slrig.scan.triangulated import Triangulated, triangulated
+from slrig.scan.triangulated import Triangulated
 from tests.unit.meshing.test_initial import COLUMNS, ROWS, ridge
 from tests.unit.reconstruction.builders import CAMERA, PROJECTOR, looking
-from tests.unit.scan.test_triangulated import MANY, curves_in, seen
+from tests.unit.scan.test_triangulated import MANY, curves_in, seen, triangulate
 
 NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
@@ -32,15 +32,15 @@ def triangles_between(first: int, second: int) -> IntArray:
 
 
 def scene(faces: IntArray, mirror_faces: IntArray) -> tuple[Triangulated, SurfaceMesh]:
-    found = triangulated([seen("left", CAMERA, curves_in(CAMERA, MANY))], PROJECTOR, Axis.COLUMN)
-    normals = np.zeros((len(found.joined.curves.points_mm), 3), dtype=np.float32)
+    found = triangulate([seen("left", CAMERA, curves_in(CAMERA, MANY))], PROJECTOR, Axis.COLUMN)
+    normals = np.zeros((len(found.merged.curves.points_mm), 3), dtype=np.float32)
     return found, SurfaceMesh(faces, mirror_faces, normals, (), {})
 
 
 def test_points_and_pixels_of_mirror_images_are_left_out_with_their_cause() -> None:
     found, surface = scene(triangles_between(0, 1), triangles_between(2, 3))
-    (camera,), joined, rest = without_mirror_images(found.cameras, found.joined, surface, MirrorImages())
-    points = found.joined.curves
+    (camera,), joined, rest = without_mirror_images(found.cameras, found.merged, surface, MirrorImages())
+    points = found.merged.curves
     np.testing.assert_array_equal(joined.curves.points_mm, points.points_mm[: 2 * len(MANY)])
     np.testing.assert_array_equal(joined.curves.points_mm[rest.faces], points.points_mm[surface.faces])
     assert np.diff(joined.curves.offsets).tolist() == [len(MANY), len(MANY), 0, 0]
@@ -60,8 +60,8 @@ def test_points_and_pixels_of_mirror_images_are_left_out_with_their_cause() -> N
 
 def test_a_scan_without_mirror_images_stays_as_it_is() -> None:
     found, surface = scene(triangles_between(0, 1), NO_FACES)
-    cameras, joined, rest = without_mirror_images(found.cameras, found.joined, surface, MirrorImages())
-    assert (cameras, joined) == (found.cameras, found.joined)
+    cameras, joined, rest = without_mirror_images(found.cameras, found.merged, surface, MirrorImages())
+    assert (cameras, joined) == (found.cameras, found.merged)
     assert rest.steps["mirror_images"] == {"triangles": 0, "points": 0, "area_share": 0.0}
     assert mirror_image_notes(rest, cameras, PROJECTOR) == []
 

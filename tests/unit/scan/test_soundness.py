@@ -11,10 +11,9 @@ import pytest
 from slrig.model import Axis
 from slrig.scan.coverage import layered_share
 from slrig.scan.soundness import fault_notes, layer_notes, truth_notes
-from slrig.scan.triangulated import triangulated
 from tests.unit.reconstruction.builders import CAMERA, PROJECTOR
 from tests.unit.scan.test_mirror_images import triangles_between
-from tests.unit.scan.test_triangulated import MANY, curves_in, seen
+from tests.unit.scan.test_triangulated import MANY, curves_in, seen, triangulate
 
 SOUND = {"nonmanifold_edges": 0, "misoriented_edges": 0, "duplicate_faces": 0}
 
@@ -44,8 +43,8 @@ def test_what_is_off_the_truth_is_a_note(truth: dict[str, Any], words: tuple[str
 
 @pytest.mark.parametrize(("behind_mm", "least_mm", "doubled"), [(10.0, 2.0, True), (1.0, 2.0, False)])
 def test_layers_that_one_camera_sees_are_a_note(*, behind_mm: float, least_mm: float, doubled: bool) -> None:
-    found = triangulated([seen("left", CAMERA, curves_in(CAMERA, MANY))], PROJECTOR, Axis.COLUMN)
-    (camera,), curves = found.cameras, found.joined.curves
+    found = triangulate([seen("left", CAMERA, curves_in(CAMERA, MANY))], PROJECTOR, Axis.COLUMN)
+    (camera,), curves = found.cameras, found.merged.curves
     # The ball's points twice, the second time further away.
     faces = triangles_between(0, 1)
     both = replace(
