@@ -41,6 +41,7 @@ from slrig.reconstruction.stripes import (
 _ALL_ROWS = slice(None)
 _MAX_SAMPLES = 50_000  # whose median is known to a hundredth
 _RANK = 3
+_DARK_SHARE = 0.5  # of white less black: a bit with less leaves the pixel dark
 _UNEQUAL_SIGMA = 3.0  # noise alone gives 1.2 to 1.7
 _CROSS = np.array([(0, 1, 0), (1, 1, 1), (0, 1, 0)], np.uint8)
 _SIDES_PX = 7  # both sides of an edge of the code, which blur and filter spread over some 3 px each way
@@ -202,6 +203,27 @@ def code_edge_points(
             difference, deviation = difference - middle, np.sqrt(deviation**2 + scatter**2)
         parts.append(edge_points(difference, deviation, read, limits, filter_px=scale_px))
     return parts
+
+
+def light_from_surfaces(decoded: DecodedImage) -> tuple[float, float]:
+    """Return the share of white's light that comes by way of other surfaces: median and 95 % of the lit pixels.
+
+    Each bit, and its inverse, lights half of the scene. Where it leaves a pixel dark, half of that light remains on
+    average (Nayar et al. 2006, DOI 10.1145/1141911.1141977): the share is twice the median of the dark values. Where
+    other surfaces give more light than the projector, it is a lower limit.
+    """
+    frames, step = decoded.frames, math.ceil(math.sqrt(decoded.frames.white.size / _MAX_SAMPLES))
+    lit = decoded.search_mask[::step, ::step]
+    if not lit.any():
+        return 0.0, 0.0
+    stacks = [frames.bits] if frames.inverses is None else [frames.bits, frames.inverses]
+    values = np.concatenate([subsample(images, step, step) for images in stacks])
+    black, contrast = (each[::step, ::step][lit] for each in (frames.black, frames.contrast))
+    share = np.sort((values[:, lit] - black) / contrast, axis=0)
+    middle = np.count_nonzero(share < _DARK_SHARE, axis=0) // 2
+    of_surfaces = np.clip(2 * np.take_along_axis(share, middle[None], axis=0)[0], 0, 1)
+    median, most = np.quantile(of_surfaces, (0.5, 0.95))
+    return round(float(median), 3), round(float(most), 3)
 
 
 def _surfaces_light_each_other(decoded: DecodedImage) -> bool:

@@ -32,6 +32,7 @@ from slrig.reconstruction.decoded_image import (
     ReconstructionLimits,
     cell_width_px,
     code_edge_points,
+    light_from_surfaces,
     line_image,
     linearise_frames,
     undecoded_image,
@@ -85,7 +86,8 @@ class CameraCurves:
     unresolved : (H, W) uint8, number of finest bits left out at each pixel; None where bits only number lines.
     unresolved_lines : (H, W) bool, where code edges replace lines that the camera does not resolve; None if nowhere.
     compression_dn : standard deviation of white noise that displaces positions as much as the loss by compression; 0
-    for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`.
+    for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`. light_from_surfaces : as
+    `decoded_image.light_from_surfaces` returns it.
     """
 
     ensemble: StripeEnsemble
@@ -102,6 +104,7 @@ class CameraCurves:
     compression_dn: float = 0.0
     noise_correlation: float = 1.0
     gamma: float = 1.0
+    light_from_surfaces: tuple[float, float] = (0.0, 0.0)
 
 
 def camera_curves(
@@ -388,7 +391,7 @@ def _refine_identify_link(
 
     Large data are released as soon as they are not needed: `found`, the refined points and the images in `stacks`.
     """
-    frames = image.frames
+    frames, from_surfaces = image.frames, light_from_surfaces(image)
     report_step("refine stripes")
     aligned = align_points(
         image, found, scale.blur_px, tables, limits, stacks.release_line_images, sampled=scale.sampled
@@ -449,6 +452,7 @@ def _refine_identify_link(
         compression_dn=float(np.sqrt(image.response.loss_variance)),
         noise_correlation=image.response.noise_correlation,
         gamma=image.response.gamma,
+        light_from_surfaces=from_surfaces,
     )
 
 
