@@ -349,8 +349,8 @@ def noise_correlation(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.b
 
     where : (H, W) bool, pixels to use. Of bits and their inverses the coarser half counts, as in `estimate_noise`, away
     from their edges: their sums, and of their differences what changes within `_SPACING_PX` pixels, since light from
-    other surfaces differs from bit to bit, but smoothly. Without inverses, two bits that light the same window count, or lines of half their period,
-    whichever give less. Without either, or with few windows, the result is 1.
+    other surfaces differs from bit to bit, but smoothly. Without inverses, two bits that light the same window count,
+    or lines of half their period, whichever give less. Without either, or with few windows, the result is 1.
     """
     count, lines = coarse_bit_count(len(frames.bits)), frames.line_pairs
     corner = _windows(where, *pixel_sum.weights.shape)
@@ -361,7 +361,7 @@ def noise_correlation(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.b
         inverse = _window_pixels(frames.inverses[:count], corner, pixel_sum)
         contrast = _window_pixels([frames.contrast], corner, pixel_sum)
         clear = np.abs(direct - inverse) > _MIN_SWING * contrast
-        ratio = _ratio_of_differences(frames, noise, where, pixel_sum, count)
+        ratio = _ratio_of_differences(frames, frames.inverses, noise, where, pixel_sum)
         if not pixel_sum.of_bit_differences:
             ratio = max(ratio, _ratio_of_sums(frames, noise, corner, pixel_sum, direct, inverse, clear))
     elif frames.lines_light_half:
@@ -393,15 +393,15 @@ def _ratio_of_sums(
 
 
 def _ratio_of_differences(
-    frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_], pixel_sum: PixelSum, count: int
+    frames: AxisFrames, inverses: Images, noise: NoiseModel, where: NDArray[np.bool_], pixel_sum: PixelSum
 ) -> float:
-    """Ratio from differences of two of the first `count` bits and their inverses, away from edges; 1 if there are few.
+    """Ratio from differences of two coarse bits and their inverses, away from edges; 1 if there are few.
 
     In windows in a line along the stripes, weighted by the fourth (or second) difference, light cancels that changes
     from window to window by a polynomial of third (or first) degree. Without room for these, single windows count, with
     all such light.
     """
-    assert frames.inverses is not None
+    count = coarse_bit_count(len(frames.bits))
     side, along_rows = len(pixel_sum.weights), frames.axis is Axis.ROW
     variance = noise.variance(frames.white) + noise.variance(frames.black)
     for weights in _DIFFERENCES:
@@ -415,7 +415,7 @@ def _ratio_of_differences(
         line = [(row, column + step) if along_rows else (row + step, column) for step in ahead]
         direct, inverse, (contrast, of_pixels) = (
             np.stack([_window_pixels(images, here, pixel_sum) for here in line], axis=1)
-            for images in (frames.bits[:count], frames.inverses[:count], (frames.contrast, variance))
+            for images in (frames.bits[:count], inverses[:count], (frames.contrast, variance))
         )
         swing = np.abs(direct - inverse)
         share = swing / np.maximum(contrast, 1)

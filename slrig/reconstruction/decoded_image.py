@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands
-from slrig.model import FloatArray, IntArray, NoiseModel, Refusal
+from slrig.model import FloatArray, IntArray, NoiseModel, Refusal, coarse_bit_count
 from slrig.reconstruction.camera_response import (
     CameraResponse,
     PixelSum,
@@ -18,7 +19,15 @@ from slrig.reconstruction.camera_response import (
     frame_compression_loss,
 )
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, lit_pixels
-from slrig.reconstruction.frames import AxisFrames, FrameStacks, Images, rows_per_band, select_rows, stack_rows
+from slrig.reconstruction.frames import (
+    AxisFrames,
+    FrameStacks,
+    Images,
+    rows_per_band,
+    select_rows,
+    stack_rows,
+    subsample,
+)
 from slrig.reconstruction.phase import EdgeLimits, near_shadows
 from slrig.reconstruction.stripes import (
     LinePoints,
@@ -30,6 +39,14 @@ from slrig.reconstruction.stripes import (
 )
 
 _ALL_ROWS = slice(None)
+_MAX_SAMPLES = 50_000  # whose median is known to a hundredth
+_RANK = 3
+_DARK_SHARE = 0.5  # of white less black: a bit with less leaves the pixel dark
+_UNEQUAL_SIGMA = 3.0  # noise alone gives 1.2 to 1.7
+_CROSS = np.array([(0, 1, 0), (1, 1, 1), (0, 1, 0)], np.uint8)
+_SIDES_PX = 7  # both sides of an edge of the code, which blur and filter spread over some 3 px each way
+_AROUND_PX = 17  # light from other surfaces is alike so far
+_MIN_EDGE_SWING = 0.5  # of a contrast that is twice 1; with less, the levels are uncertain
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,13 +194,83 @@ def code_edge_points(
     all.
     """
     frames, lit = decoded.frames, decoded.search_mask
+    surfaces_light_each_other = _surfaces_light_each_other(decoded)
     parts = []
     for index in range(len(frames.bits)):
         read = lit if decoded.unresolved is None else lit & (index < len(frames.bits) - decoded.unresolved)
         if within is not None:
             read &= within
-        parts.append(edge_points(*_bit_difference(decoded, index), read, limits, filter_px=scale_px))
+        difference, deviation = _bit_difference(decoded, index)
+        if surfaces_light_each_other:
+            middle, scatter = _edge_middle(difference, deviation, read, scale_px)
+            difference, deviation = difference - middle, np.sqrt(deviation**2 + scatter**2)
+        parts.append(edge_points(difference, deviation, read, limits, filter_px=scale_px))
     return parts
+
+
+def light_from_surfaces(decoded: DecodedImage) -> tuple[float, float]:
+    """Return the share of white's light that comes by way of other surfaces: median and 95 % of the lit pixels.
+
+    Each bit, and its inverse, lights half of the scene. Where it leaves a pixel dark, half of that light remains on
+    average (Nayar et al. 2006, DOI 10.1145/1141911.1141977): the share is twice the median of the dark values. Where
+    other surfaces give more light than the projector, it is a lower limit.
+    """
+    frames, step = decoded.frames, math.ceil(math.sqrt(decoded.frames.white.size / _MAX_SAMPLES))
+    lit = decoded.search_mask[::step, ::step]
+    if not lit.any():
+        return 0.0, 0.0
+    stacks = [frames.bits] if frames.inverses is None else [frames.bits, frames.inverses]
+    values = np.concatenate([subsample(images, step, step) for images in stacks])
+    black, contrast = (each[::step, ::step][lit] for each in (frames.black, frames.contrast))
+    share = np.sort((values[:, lit] - black) / contrast, axis=0)
+    middle = np.count_nonzero(share < _DARK_SHARE, axis=0) // 2
+    of_surfaces = np.clip(2 * np.take_along_axis(share, middle[None], axis=0)[0], 0, 1)
+    median, most = np.quantile(of_surfaces, (0.5, 0.95))
+    return round(float(median), 3), round(float(most), 3)
+
+
+def _surfaces_light_each_other(decoded: DecodedImage) -> bool:
+    """True if, at most pixels, coarse bits that are clear of edges differ from their inverses by unequal light.
+
+    The third largest difference of all is clear of edges: a pixel is rarely near edges of several coarse bits.
+    """
+    frames, noise = decoded.frames, decoded.response.noise
+    count, step = coarse_bit_count(len(frames.bits)), math.ceil(math.sqrt(frames.white.size / _MAX_SAMPLES))
+    if frames.inverses is None or count < _RANK:
+        return False
+    lit = decoded.search_mask[::step, ::step]
+    direct, inverse = (subsample(images[:count], step, step)[:, lit] for images in (frames.bits, frames.inverses))
+    swing = np.sort(np.abs(direct - inverse), axis=0)
+    deviation = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))[::step, ::step][lit]
+    return swing.size > 0 and bool(np.median((swing[-1] - swing[-_RANK]) / deviation) > _UNEQUAL_SIGMA)
+
+
+def _edge_middle(
+    difference: NDArray[np.float32], deviation: NDArray[np.float32], lit: NDArray[np.bool_], scale_px: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the value of a bit less its inverse at the middle of edges nearby, and its error, (H, W) float32 each.
+
+    Light from other surfaces adds to a bit or to its inverse, smoothly, and moves the point where both are alike away
+    from the edge. The middle is that of the levels on both sides of an edge, averaged over the edges around; 0 without.
+    Its error is the scatter of these edges beyond noise, as noise of pixels that displaces points as much.
+    """
+    smooth = cv2.GaussianBlur(difference, (0, 0), scale_px)
+    box = np.ones((_SIDES_PX, _SIDES_PX), np.uint8)
+    high, low = cv2.dilate(smooth, box), cv2.erode(smooth, box)
+    swing, middle = high - low, (high + low) / 2
+    inside = cv2.erode(lit.view(np.uint8), box, borderValue=0) > 0
+    # Pixels beside the point where the bit crosses the middle.
+    crossing = cv2.morphologyEx((smooth > middle).view(np.uint8), cv2.MORPH_GRADIENT, _CROSS) > 0
+    weight = (inside & crossing & (swing > _MIN_EDGE_SWING)).astype(np.float32)
+    count = np.maximum(cv2.blur(weight, (_AROUND_PX, _AROUND_PX)), np.float32(1e-6))
+    mean = cv2.blur(middle * weight, (_AROUND_PX, _AROUND_PX)) / count
+    # Of the pixels on both sides together: the levels that each finds are a little different.
+    both = cv2.blur(middle * weight, (3, 3)) / np.maximum(cv2.blur(weight, (3, 3)), np.float32(1e-6))
+    scatter = cv2.blur((both - mean) ** 2 * weight, (_AROUND_PX, _AROUND_PX)) / count
+    # A Gaussian filter has this share of the variance of a pixel.
+    share = np.float32(1 / (4 * np.pi * scale_px**2))
+    beyond = np.maximum(scatter / share - deviation**2, 0)
+    return np.asarray(mean, np.float32), np.asarray(np.sqrt(beyond), np.float32)
 
 
 def _bit_difference(decoded: DecodedImage, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -32,6 +32,7 @@ from slrig.reconstruction.decoded_image import (
     ReconstructionLimits,
     cell_width_px,
     code_edge_points,
+    light_from_surfaces,
     line_image,
     linearise_frames,
     undecoded_image,
@@ -89,7 +90,8 @@ class CameraCurves:
     compression_dn : standard deviation of white noise that displaces positions as much as the loss by compression; 0
     for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`. beyond_pixels : number
     of pixels whose code names a cell that the projector has not; furthest_cell : of these cells, the one farthest from
-    the projector's that more than a hundredth of the pixels name, -1 without any.
+    the projector's that more than a hundredth of the pixels name, -1 without any. light_from_surfaces : as
+    `decoded_image.light_from_surfaces` returns it.
     """
 
     ensemble: StripeEnsemble
@@ -108,6 +110,7 @@ class CameraCurves:
     gamma: float = 1.0
     beyond_pixels: int = 0
     furthest_cell: int = -1
+    light_from_surfaces: tuple[float, float] = (0.0, 0.0)
 
 
 def camera_curves(
@@ -402,7 +405,7 @@ def _refine_identify_link(
 
     Large data are released as soon as they are not needed: `found`, the refined points and the images in `stacks`.
     """
-    frames = image.frames
+    frames, from_surfaces = image.frames, light_from_surfaces(image)
     beyond = cells_beyond(frames, image.code, tables.index_of_word)
     report_step("refine stripes")
     aligned = align_points(
@@ -468,6 +471,7 @@ def _refine_identify_link(
         gamma=image.response.gamma,
         beyond_pixels=len(beyond),
         furthest_cell=_furthest_cell(beyond, len(tables.cell_position)),
+        light_from_surfaces=from_surfaces,
     )
 
 

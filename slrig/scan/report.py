@@ -83,6 +83,7 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
             "shared_by_neighbours": curves.noise_correlation,
         },
         "gamma": round(curves.gamma, 2),
+        "light_from_other_surfaces": dict(zip(("p50", "p95"), curves.light_from_surfaces, strict=True)),
         "stripe_scale_px": curves.scale_px,
         "stripe_points_found": curves.stripe_points,
         "stripe_points_coded": len(curves.ensemble.bridge_after),
