@@ -101,10 +101,8 @@ def mirror_image_notes(surface: SurfaceMesh, cameras: Sequence[CameraResult], pr
     share = surface.steps["mirror_images"]["area_share"]
     if not isinstance(share, float) or share < _MIN_SHARE:
         return []
-    pixels = " and ".join(
-        f"{np.count_nonzero(seen.curves.refusal == Refusal.MIRROR_IMAGE):,} pixels of camera '{seen.name}'"
-        for seen in cameras
-    )
+    counts = {seen.name: np.count_nonzero(seen.curves.refusal == Refusal.MIRROR_IMAGE) for seen in cameras}
+    pixels = " and ".join(f"{count:,} pixels of camera '{name}'" for name, count in counts.items() if count)
     return [
         f"mirror images: {share:.1%} of the area, {pixels}, faces only one of {_devices(projector)}, as what a shiny "
         "part shows of another one does. It is not in the mesh. Spray the shiny part matt, or turn the object"
