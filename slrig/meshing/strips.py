@@ -337,7 +337,8 @@ MIN_COMPONENT = 100
 class InitialMesh:
     """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the camera that measured them.
     adjacency : (F, 3) int32, entry k is the face across the edge opposite corner k, -1 at a boundary.
-    mirror_faces : (M, 3) int32, the mirror images among the dropped triangles.
+    mirror_faces : (M, 3) int32, the mirror images among the dropped triangles; few of them, as folds beside a depth
+    edge are, count as dust.
     strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges overlap, mirror images are counted
     of what they leave, and dust are the small components that remain then.
     """
@@ -382,7 +383,9 @@ def initial_mesh(
     )
     connected = ~(at_depth_edge | at_bridge)
     front = front_sides(points_mm, strip_faces, views, connected)
-    mirror_faces = strip_faces[front.mirrored]
+    images = strip_faces[front.mirrored]
+    mirror_faces = images[component_sizes(images, np.ones(len(images), dtype=np.bool_)) >= MIN_COMPONENT]
+    linked = int(np.count_nonzero(connected)) - len(mirror_faces)
     connected &= ~front.mirrored
     apart = _between_windings(adjacency, front.turned, connected)
     remaining = component_sizes(strip_faces, connected & ~apart) >= MIN_COMPONENT
@@ -400,7 +403,7 @@ def initial_mesh(
         strip_triangles=len(strip_faces),
         dropped_at_depth_edges=int(np.count_nonzero(at_depth_edge)),
         dropped_at_bridges=int(np.count_nonzero(at_bridge)),
-        dropped_as_dust=int(np.count_nonzero(connected)) - len(faces),
+        dropped_as_dust=linked - len(faces),
         dropped_triangles=len(strip_faces) - len(faces),
     )
 

@@ -35,12 +35,15 @@ def refuse_mirror_images(
 ) -> tuple[list[SheetCurves], list[CameraResult], MirrorImages]:
     """The points of each camera, and the cameras, without mirror images, so that none meets what another camera sees.
 
-    A part of the surface may be a mirror image for one camera, and for another not.
+    A part of the surface may be a mirror image for one camera, and for another not. Where there are any, points of
+    which a camera alone makes no surface are left out, too.
     """
-    found, remaining, refused = NO_MIRROR_IMAGES, list(parts), list(cameras)
+    found, refused, own = NO_MIRROR_IMAGES, list(cameras), []
     for index, (part, seen) in enumerate(zip(parts, cameras, strict=True)):
+        count = len(part.points_mm)
         filled = part.position_px[np.diff(part.offsets) > 0]
         if len(filled) < 2:
+            own.append(np.ones(count, dtype=np.bool_))
             continue
         step_px = float(np.median(np.diff(filled)))
         sampling = sampling_mm(part.points_mm, seen.device, projector, axis, step_px)
@@ -48,23 +51,20 @@ def refuse_mirror_images(
             part.points_mm, part.offsets, part.position_px, part.bridge_after,
             np.hypot(sampling, np.linalg.norm(part.deviation_mm, axis=1)),
             Viewpoints(
-                np.zeros(len(part.points_mm), dtype=np.int32), seen.device.centre_mm[None], projector.centre_mm,
-                part.deviation_mm,
+                np.zeros(count, dtype=np.int32), seen.device.centre_mm[None], projector.centre_mm, part.deviation_mm
             ),
             widest_step_px=step_px, depth_edge_ratio=ReconstructionPlan().depth_edge_ratio, keep_holes=False,
         )  # fmt: skip
-        phantom = _only_used_by(initial.mirror_faces, initial.faces, len(part.points_mm))
-        if not phantom.any():
-            continue
-        images = _added(NO_MIRROR_IMAGES, part.points_mm, initial.mirror_faces, phantom)
+        own.append(used_vertices(initial.faces, count))
+        phantom = used_vertices(initial.mirror_faces, count) & ~own[-1]
         found = _added(found, part.points_mm, initial.mirror_faces, phantom)
-        refusal = _with_phantom(seen.curves.refusal, part.pixels_px, initial.mirror_faces, phantom, ~phantom)
-        refused[index] = replace(seen, curves=replace(seen.curves, refusal=refusal))
-        own = ~phantom
-        if images.area_mm2 > _MIN_SHARE * _area_mm2(part.points_mm, initial.faces):
-            # Scraps of a mirror image face this way or that: points without a surface of their own may be of one.
-            own = used_vertices(initial.faces, len(phantom))
-        remaining[index] = select_points(part, own)
+        if phantom.any():
+            refusal = _with_phantom(seen.curves.refusal, part.pixels_px, initial.mirror_faces, phantom, ~phantom)
+            refused[index] = replace(seen, curves=replace(seen.curves, refusal=refusal))
+    if found.points == 0:
+        return list(parts), list(cameras), NO_MIRROR_IMAGES
+    # Scraps of mirror images face this way or that: without a surface of its own, a point may be of one.
+    remaining = [select_points(part, each) for part, each in zip(parts, own, strict=True)]
     return remaining, refused, found
 
 
@@ -101,10 +101,8 @@ def mirror_image_notes(surface: SurfaceMesh, cameras: Sequence[CameraResult], pr
     share = surface.steps["mirror_images"]["area_share"]
     if not isinstance(share, float) or share < _MIN_SHARE:
         return []
-    pixels = " and ".join(
-        f"{np.count_nonzero(seen.curves.refusal == Refusal.MIRROR_IMAGE):,} pixels of camera '{seen.name}'"
-        for seen in cameras
-    )
+    counts = {seen.name: np.count_nonzero(seen.curves.refusal == Refusal.MIRROR_IMAGE) for seen in cameras}
+    pixels = " and ".join(f"{count:,} pixels of camera '{name}'" for name, count in counts.items() if count)
     return [
         f"mirror images: {share:.1%} of the area, {pixels}, faces only one of {_devices(projector)}, as what a shiny "
         "part shows of another one does. It is not in the mesh. Spray the shiny part matt, or turn the object"

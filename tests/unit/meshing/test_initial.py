@@ -155,7 +155,9 @@ def test_what_noise_turned_is_no_mirror_image() -> None:
     noisy, sharp = (meshed(points, offsets, position, eyes_mm=eye, sigma_mm=each) for each in (0.02, 0.0001))
     assert len(noisy.mirror_faces) == noisy.dropped_triangles == 0
     assert not facing(noisy, points, eye).all()
-    assert len(sharp.mirror_faces) == sharp.dropped_triangles == (~facing(noisy, points, eye)).sum()
+    # A few beyond noise are a fold, and dropped as dust.
+    assert len(sharp.mirror_faces) == 0
+    assert sharp.dropped_as_dust == sharp.dropped_triangles == (~facing(noisy, points, eye)).sum()
     assert facing(sharp, points, eye).all()
 
 

@@ -103,7 +103,7 @@ def test_a_camera_loses_its_mirror_images_before_its_points_meet_those_of_anothe
     np.testing.assert_array_equal(parts[0].points_mm, points[: 6 * ROWS])
     assert found.points == count - 6 * ROWS
     assert found.triangles == 6 * (2 * ROWS - 2)
-    assert (parts[1], cameras[1]) == (part, both[1])
+    assert (len(parts[1].points_mm), cameras[1]) == (count, both[1])
     refusal = cameras[0].curves.refusal
     assert set(refusal[:141:10, 60:111:10].ravel()) == {Refusal.MIRROR_IMAGE}
     assert np.count_nonzero(refusal[:, :50]) == 0
