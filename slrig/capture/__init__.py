@@ -13,6 +13,7 @@ from slrig.capture.exposure import (
     round_to_refresh_s,
 )
 from slrig.capture.frame_checks import NEAR_SATURATION, NOISE_FLOOR_DN, SampleMask, Samples
+from slrig.capture.frame_light import FrameLight
 from slrig.capture.frame_order import describe_indices
 from slrig.capture.latency import (
     DEFAULT_SEARCH_S,
@@ -41,6 +42,7 @@ __all__ = [
     "ExposureFault",
     "ExposureSamples",
     "ExposureVerdict",
+    "FrameLight",
     "LatencyMeasurement",
     "LightFactor",
     "SampleMask",

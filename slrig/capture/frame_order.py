@@ -157,8 +157,8 @@ class _CodeDistance:
 
 def _is_closer(after: FloatArray, before: FloatArray) -> bool:
     """True if many adjacent pixels came closer together, and few further apart."""
-    closer = np.count_nonzero(after < before)
-    return closer >= _MIN_CLOSER and bool(np.count_nonzero(after > before) < _MAX_FURTHER_FRACTION * closer)
+    closer, further = int(np.count_nonzero(after < before)), int(np.count_nonzero(after > before))
+    return closer >= _MIN_CLOSER and further < _MAX_FURTHER_FRACTION * closer
 
 
 @dataclass(frozen=True, slots=True)

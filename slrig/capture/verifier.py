@@ -94,7 +94,8 @@ class CameraFindings:
     relative to white. reference_confirmed : a pair of a bit or lines and their inverses added up to white and black,
     which confirms these two. verified_axes : axes with a line frame that agreed with the Gray code, which confirms the
     code. lights : light of frames that agree only after it is undone; measured_factors : factor of the light of all
-    frames that determine it. linear_edges : for each pair with edges, whether they show a linear response.
+    frames that determine it. fitted_lights : as well as it is known, for comparison within a pair or the line frames of
+    an axis. linear_edges : for each pair with edges, whether they show a linear response.
     """
 
     first_seen_index: dict[Pattern, int] = field(default_factory=dict)
@@ -108,6 +109,7 @@ class CameraFindings:
     verified_axes: set[Axis] = field(default_factory=set)
     lights: dict[int, FrameLight] = field(default_factory=dict)
     measured_factors: dict[int, float] = field(default_factory=dict)
+    fitted_lights: dict[int, FrameLight] = field(default_factory=dict)
     linear_edges: list[bool] = field(default_factory=list)
 
     @property
@@ -481,12 +483,13 @@ class FrameVerifier:
         if isinstance(pattern, Gray):
             self.findings.verified |= set(indices)
         is_coarse = isinstance(pattern, Gray) and pattern.bit < coarse_bit_count(pattern.bits)
-        if lights == (STEADY, STEADY) and is_coarse:
-            # Small changes need no correction; coarse bits have few edges, which would bias their factor.
-            raw = (self._samples[indices[0]], self._samples[indices[1]])
-            lights = frame_light.fit_pair_light(*raw, ref, is_exposure=False) or lights
-        if is_coarse or lights != (STEADY, STEADY):
-            self.findings.measured_factors.update((i, each.factor) for i, each in zip(indices, lights, strict=True))
+        raw = (self._samples[indices[0]], self._samples[indices[1]])
+        fitted = frame_light.fit_pair_light(*raw, ref, is_exposure=lights[0].is_exposure)
+        if fitted is not None and not self._is_overexposed:
+            self.findings.fitted_lights.update(zip(indices, fitted, strict=True))
+            # Coarse bits have few edges, which bias the factors of both frames of a pair.
+            if is_coarse or lights != (STEADY, STEADY):
+                self.findings.measured_factors.update((i, each.factor) for i, each in zip(indices, fitted, strict=True))
         linear = frame_light.is_linear_at_edges(*frames, ref)
         if linear is not None:
             self.findings.linear_edges.append(linear)
@@ -742,6 +745,7 @@ class FrameVerifier:
             matched = [light.undo(frame, ref.black) for light, frame in zip(lights, frames, strict=True)]
             if not self._check_line_light(family, members, matched, ref):
                 self.findings.lights.update(zip(members, lights, strict=True))
+                self.findings.fitted_lights.update(zip(members, lights, strict=True))
                 found, frames = [], matched
         if found:
             return found
@@ -839,10 +843,11 @@ class EvidenceSummary:
     patterns : number of patterns with frames. verified : number of patterns that passed, in every camera, a test that
     another pattern would fail. lit, light_drift, noise_dn : by camera, fraction of the image that the projector lights,
     largest change of the light relative to white, noise of a frame in DN; missing if unknown. faults : unresolved
-    contradictions, each cause once. wrong : by camera, patterns whose frames are proven wrong. misordered : why the
-    frames of a camera cannot be used in their order, or None. light : by camera and kind of pattern, the light of its
-    frames. shot_again : number of rejected and repeated exposures; causes : their distinct reasons. left_out :
-    distinct reasons why exposures of a bracket were left out.
+    contradictions, each cause once. shot_again : number of rejected and repeated exposures; causes : their distinct
+    reasons. left_out : distinct reasons why exposures of a bracket were left out. wrong : by camera, patterns whose
+    frames are proven wrong. misordered : why the frames of a camera cannot be used in their order, or None. light : by
+    camera and kind of pattern, the light of its frames; frame_light : by camera and pattern, for comparison within a
+    pair or the line frames of an axis.
     """
 
     patterns: int
@@ -857,6 +862,7 @@ class EvidenceSummary:
     wrong: Mapping[str, frozenset[int]] = field(default_factory=dict)
     misordered: str | None = None
     light: Mapping[str, Mapping[str, LightFactor]] = field(default_factory=dict)
+    frame_light: Mapping[str, Mapping[int, FrameLight]] = field(default_factory=dict)
 
     def __str__(self) -> str:
         again = f", {self.shot_again} frame{'s' * (self.shot_again != 1)} shot again" if self.shot_again else ""
@@ -931,9 +937,10 @@ class Evidence:
         """Return the summary of all frames so far."""
         verifiers = self._verifiers.values()
         added = {index for each in verifiers for index in each.pattern_indices}
-        unverified = {index for each in verifiers for index in each.pattern_indices - each.findings.verified}
         found = {each.name: each.findings for each in verifiers}
         results = {each.name: each.findings_summary() for each in verifiers}
+        unverified = {index for each in verifiers for index in each.pattern_indices - each.findings.verified}
+        unverified |= {index for each in results.values() for index in each.wrong}
         summary = EvidenceSummary(
             patterns=len(added),
             verified=len(added - unverified),
@@ -943,6 +950,7 @@ class Evidence:
             faults=tuple(fault for each in results.values() for fault in each.faults),
             wrong={name: each.wrong for name, each in results.items() if each.wrong},
             misordered=next((each.misordered for each in results.values() if each.misordered is not None), None),
+            frame_light={each.name: dict(each.findings.fitted_lights) for each in verifiers},
             light={each.name: factors for each in verifiers if (factors := each.light_factors())},
         )
         return summary.with_refused(self._refused, self._patterns)

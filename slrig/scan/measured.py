@@ -235,6 +235,7 @@ def _walked(
     """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
     names: list[str] = []
     cut_short: tuple[str, ...] = ()
+    not_used: str | None = None
     last, share = "", 0.0
 
     def stage_entered(stage: str, name: str) -> None:
@@ -259,9 +260,7 @@ def _walked(
         devices, evidence = live.calibration, live.evidence
         stream: ScanStream = live
         _require_calibration(folder, names, devices)
-        usable = None
-        if evidence.wrong or evidence.misordered is not None:
-            usable = _usable(folder, open_bundle(folder, calibration_file=calibration_file), evidence)
+        usable = _usable(folder, open_bundle(folder, calibration_file=calibration_file), evidence)
         if usable is None:
             seen = live.finished(stage_entered)
     else:
@@ -280,10 +279,10 @@ def _walked(
             raise PatternError(message) from cause
     if usable is not None:
         try:
-            stream, _, cut_short = _streamed(
+            stream, _, shortened = _streamed(
                 usable, devices, stage_entered, stream.axis, region, evidence, drop_finest_bits
             )
-            seen = stream.finish()
+            seen, not_used, cut_short = stream.finish(), "; ".join(filter(None, [usable.note, *shortened])) or None, ()
         except PatternError as cause:
             message = f"{folder}: {'; '.join(evidence.faults)}; {usable.note}. {cause}"
             raise PatternError(message) from cause
@@ -292,7 +291,9 @@ def _walked(
     notes = [
         *cut_short,
         *layout_notes(devices),
-        *capture_notes(stream.header, stream.axis, evidence, None if usable is None else usable.note),
+        *capture_notes(
+            stream.header, stream.axis, evidence, not_used, is_evened=usable is not None and bool(usable.evened)
+        ),
         *camera_notes(seen),
         *unresolved_notes(seen, step, cell, dropped=drop_finest_bits),
     ]

@@ -227,9 +227,16 @@ def _has_lines(capture: CaptureHeader, axis: Axis) -> bool:
 
 
 def capture_notes(
-    capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary, not_used: str | None = None
+    capture: CaptureHeader,
+    axis: Axis,
+    evidence: EvidenceSummary,
+    not_used: str | None = None,
+    *,
+    is_evened: bool = False,
 ) -> list[str]:
-    """What a person should know of the frames, one sentence each. not_used : which wrong frames are not used."""
+    """What a person should know of the frames, one sentence each. not_used : which wrong frames are not used.
+    is_evened : light that changed between a bit and its inverse, or between line frames, was undone.
+    """
     notes = []
     if not _has_lines(capture, axis):
         notes.append(
@@ -251,7 +258,8 @@ def capture_notes(
         notes.append(
             f"the light is not the same in all frames ({'; '.join(unsteady)} the light of white): the projector's lamp "
             "follows the picture (dynamic contrast) or flickers, or the camera sets its exposure by itself. Each frame "
-            "was checked after one factor for its light; switch off what changes the light for the least error"
+            f"was checked after one factor for its light{', and brought to the light of white' * is_evened}; switch "
+            "off what changes the light for the least error"
         )
     return notes
 

@@ -385,7 +385,9 @@ def test_images_that_contradict_are_named_at_import(shared: Path, tmp_path: Path
         pytest.skip(f"no {capture}")
     folder = tmp_path / "images"
     folder.mkdir()
-    images = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted(capture.glob("*.png"))]
+    images = [
+        np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.uint8) for path in sorted(capture.glob("*.png"))
+    ]
     for index, image in enumerate(by_hand(images, kind)):
         assert cv2.imwrite(str(folder / f"graycode_{index:02}.png"), image)
     result = slrig("import", folder, "--output", tmp_path / "bundle", "--projector", "640x400")

@@ -19,7 +19,7 @@ from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence
 from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for
 
-COUNT = 4000
+COUNT = 12_000
 RNG = np.random.default_rng(8)
 CONTRAST = RNG.uniform(60, 200, COUNT).astype(np.float32)
 BLACK = (0.2 * CONTRAST + RNG.uniform(5, 30, COUNT)).astype(np.float32)

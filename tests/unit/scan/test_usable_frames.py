@@ -69,6 +69,26 @@ def test_wrong_frames_of_the_other_axis_do_not_matter(tmp_path: Path) -> None:
     assert usable_files(right, nothing_wrong, None) is None
 
 
+def test_light_that_changes_within_a_pair_is_evened_out(tmp_path: Path) -> None:
+    shots = tuple(
+        replace(shot, image=np.rint(shot.image * (0.7 if shot.pattern % 2 else 1.0)).astype(np.uint8))
+        if isinstance(PATTERNS[shot.pattern], Gray)
+        else shot
+        for shot in Scene().shots(PATTERNS)
+    )
+    capture = Capture(PROJECTOR, PATTERNS, {"left": SCENE.format}, shots)
+    write_bundle(tmp_path / "b", capture, None)
+    evidence = check_capture(capture)
+    assert evidence.faults == ()
+    usable = usable_files(open_bundle(tmp_path / "b"), evidence, Axis.COLUMN)
+    assert usable is not None
+    assert usable.note == ""
+    found, right = images(usable), Scene().shots(PATTERNS)
+    for index in usable.evened:
+        assert np.abs(found[index].astype(int) - right[index].image).mean() < 1.5
+    assert {index for index in usable.evened if index % 2}
+
+
 @pytest.mark.parametrize("light", [0.7, 1.0, 1.33])
 def test_a_rebuilt_bit_has_the_light_of_its_inverse(light: float) -> None:
     white, black = np.full((2, 3), 150, np.uint8), np.full((2, 3), 20, np.uint8)
