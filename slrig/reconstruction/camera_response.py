@@ -336,7 +336,10 @@ def noise_correlation(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.b
     corner = _windows(where, len(pixel_sum.weights))
     if len(corner[0]) < _MIN_WINDOWS or len(frames.bits) < _MIN_BITS:
         return 1.0
-    if frames.inverses is not None:
+    if frames.inverses is not None and pixel_sum.of_bit_differences:
+        pairs = frames.bits[:_MIN_BITS], frames.inverses[:_MIN_BITS]
+        ratio = max(_ratio_of_steps(frames, pairs, noise, where, pixel_sum, down=down) for down in (False, True))
+    elif frames.inverses is not None:
         direct = _window_pixels(frames.bits[:count], corner, pixel_sum)
         inverse = _window_pixels(frames.inverses[:count], corner, pixel_sum)
         contrast = _window_pixels([frames.contrast], corner, pixel_sum)
@@ -353,6 +356,41 @@ def noise_correlation(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.b
     else:
         return 1.0
     return ratio if ratio >= _MIN_RATIO else 1.0
+
+
+def _ratio_of_steps(
+    frames: AxisFrames, pairs: tuple[Images, Images], noise: NoiseModel, where: NDArray[np.bool_],
+    pixel_sum: PixelSum, *, down: bool,
+) -> float:  # fmt: skip
+    """Ratio from `pairs`, the coarsest bits and their inverses, which are the same however many finer ones there are;
+    1 if windows are few.
+
+    Light between the walls of a hollow, or scattered in a lens, is another one for each bit, but smooth. So each window
+    is compared with the mean of those on both sides of it, along the rows of pixels or down the columns: pixels of one
+    row or column may share noise, which cancels in one of the two.
+    """
+    side = len(pixel_sum.weights)
+    row, column = _windows(where, 3 * side)
+    swings, variances, sides, usable = [], [], [], np.ones(len(row), dtype=np.bool_)
+    for place in range(3):
+        corner = (row + place * side, column + side) if down else (row + side, column + place * side)
+        direct, inverse, (white, black) = (
+            _window_pixels(images, corner, pixel_sum) for images in (*pairs, (frames.white, frames.black))
+        )
+        swing = np.abs(direct - inverse)
+        # All windows on one side of each edge: such light is added to one of both, and taken off the other.
+        is_lit = (direct > inverse).all(axis=2)
+        sides.append(is_lit)
+        usable &= (is_lit == sides[0]).all(axis=0)
+        clear = (swing > _MIN_SWING * (white - black)) & (np.maximum(direct, inverse) < frames.clipped_at)
+        usable &= clear.all(axis=(0, 2))
+        swings.append(swing)
+        variances.append(noise.variance(white) + noise.variance(black))
+    if np.count_nonzero(usable) < _MIN_WINDOWS:
+        return 1.0
+    steady = np.asarray(swings[1] - (swings[0] + swings[2]) / 2, dtype=np.float32)
+    variance = np.asarray(variances[1] + (variances[0] + variances[2]) / 4, dtype=np.float32)
+    return _ratio(steady[:, usable], variance[usable], pixel_sum)
 
 
 def _ratio_of_pairs(
