@@ -401,7 +401,7 @@ def _ratio_of_differences(
     from window to window by a polynomial of third (or first) degree. Without room for these, single windows count, with
     all such light.
     """
-    count = coarse_bit_count(len(frames.bits))
+    count = _MIN_BITS  # the same ones, however many finer bits were played
     side, along_rows = len(pixel_sum.weights), frames.axis is Axis.ROW
     variance = noise.variance(frames.white) + noise.variance(frames.black)
     for weights in _DIFFERENCES:

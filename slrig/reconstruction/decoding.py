@@ -47,6 +47,8 @@ _MIN_PASSAGE_PX = 2.0
 """Least mean width of a stripe of the bit in camera pixels, so that no pixel holds two code edges."""
 _MAX_STRIPE_PX = 32.0
 """Greatest mean width of a stripe of the finest bit that is read, if finer ones are not."""
+_MAX_MORE_BITS = 3
+"""Most bits that a block leaves out, more than the block of median light: more is light from elsewhere."""
 _MIN_SWING = 0.05
 """Least mean difference of a bit and its inverse, over the contrast: stripes too fine for the camera leave a beat with
 its pixels that swings less.
@@ -342,32 +344,48 @@ def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np
     contrast = frames.contrast * np.float32(1.0 if frames.inverses is not None else 0.5)
     blocks = tuple(-(-extent // BLOCK_PX) for extent in lit.shape)
     unresolved, judged = np.zeros(blocks, dtype=np.uint8), np.zeros(blocks, dtype=np.bool_)
-    open_blocks, finer_lost = np.ones(blocks, dtype=np.bool_), np.ones(blocks, dtype=np.bool_)
+    open_blocks, finer_lost, finer_enough = (np.ones(blocks, dtype=np.bool_) for _ in range(3))
     stripe_px = np.full(blocks, np.inf)
     # Columns of a transposed copy are contiguous in memory.
     directions = (word, lit), (np.ascontiguousarray(word.T), np.ascontiguousarray(lit.T))
     for finest in range(bits):
         along_rows, along_columns = (_count_passages(*each, finest) for each in directions)
-        passages, pixels, long_passages, correct = (
-            _add_neighbours(each) for each in along_rows + along_columns.swapaxes(1, 2)
+        across, down = (
+            np.array([_add_neighbours(each) for each in counts])
+            for counts in (along_rows, along_columns.swapaxes(1, 2))
         )
+        # Across the stripes rather than along them.
+        passages, pixels, long_passages, correct = np.where(across[0] >= down[0], across, down)
         swing = _mean_swing(frames.bits[-1 - finest], reference[-1 - finest], contrast, lit)
         enough = passages >= _MIN_PASSAGES
         lost = enough & (
             (correct < _MIN_CORRECT * long_passages) | (pixels < _MIN_PASSAGE_PX * passages) | (swing < _MIN_SWING)
         )
+        # Stripes of the next finer bit, where it does not tell by itself, are half as wide.
+        finer_narrow = enough & ~lost & ~finer_enough & (pixels < 2 * _MIN_PASSAGE_PX * passages)
         judged |= enough & open_blocks
-        open_blocks &= lost | finer_lost
+        open_blocks &= lost | finer_lost | finer_narrow
+        unresolved[open_blocks & finer_narrow] = finest
         unresolved[open_blocks & lost] = finest + 1
         first_read = open_blocks & ~lost & enough
         stripe_px[first_read] = pixels[first_read] / passages[first_read]
         if not open_blocks.any():
             break
-        finer_lost = lost
-    is_lens = ~open_blocks & ((unresolved == 0) | (stripe_px <= _MAX_STRIPE_PX))
+        finer_lost, finer_enough = lost, enough
+    is_lens = judged & ~open_blocks & ((unresolved == 0) | (stripe_px <= _MAX_STRIPE_PX))
+    if is_lens.any():
+        light = _sum_blocks(np.where(lit, contrast, np.float32(0)))
+        is_lens &= unresolved <= _weighted_median(unresolved[is_lens], light[is_lens]) + _MAX_MORE_BITS
     unresolved[~is_lens] = 0
     rows, columns = (np.arange(extent) // BLOCK_PX for extent in lit.shape)
-    return _follow_neighbours(unresolved, judged & is_lens)[np.ix_(rows, columns)]
+    return _follow_neighbours(unresolved, is_lens)[np.ix_(rows, columns)]
+
+
+def _weighted_median(values: NDArray[np.uint8], weights: FloatArray) -> int:
+    """The value below and above which half of the weight is."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return int(values[order[np.searchsorted(total, total[-1] / 2)]])
 
 
 def _mean_swing(

@@ -109,6 +109,21 @@ def test_light_from_walls_around_is_no_noise_that_neighbours_share(kernel: Kerne
     frames = lit_by_walls(noisy(kernel))
     expected = by_sums(np.array(kernel), summed)
     assert noise_correlation(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(expected, rel=0.1)
+def test_light_from_elsewhere_is_no_noise_of_edges_whichever_bits_there_are() -> None:
+    x, y = grid(SHAPE)
+    frames = noisy(SMOOTH)
+    assert frames.inverses is not None
+    # A tenth of white, and smooth: another one for each bit.
+    glow = [12.0 * np.sin(x / 300 + bit) * np.cos(y / 240 - bit) for bit in range(BITS)]
+    lit = replace(frames, bits=(frames.bits + np.array(glow)).astype(np.float32))
+    summed, noise = edge_pixel_sum(1.0), estimate_noise(frames)
+    expected = noise_correlation(frames, noise, EVERYWHERE, summed)
+    assert noise_correlation(lit, noise, EVERYWHERE, summed) == pytest.approx(expected, rel=0.1)
+    assert lit.inverses is not None
+    fewer = replace(
+        lit, bits=lit.bits[:5], inverses=lit.inverses[:5], gray=replace(lit.gray, bits=5, cell_px=16 * lit.gray.cell_px)
+    )
+    assert noise_correlation(fewer, noise, EVERYWHERE, summed) == noise_correlation(lit, noise, EVERYWHERE, summed)
 
 
 def test_a_model_that_is_too_small_is_corrected_and_one_too_large_is_not() -> None:

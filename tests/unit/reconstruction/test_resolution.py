@@ -67,6 +67,12 @@ def test_a_bit_is_resolved_where_two_of_its_edges_have_two_pixels(columns_per_px
     assert (unresolved_bits(frames(seen), np.ones(seen.shape, dtype=np.bool_)) == bits).mean() > 0.95
 
 
+def test_the_width_of_a_stripe_counts_across_it() -> None:
+    # Down the columns slanted stripes are 20 times as wide.
+    seen = ramp(1.4) + 0.07 * np.arange(128)[:, None]
+    assert (unresolved_bits(frames(seen), LIT) == 1).mean() > 0.95
+
+
 def test_a_bit_that_hardly_swings_is_unresolved_however_right_it_is() -> None:
     seen = frames(ramp(0.5), noise=0.0)
     assert seen.inverses is not None
