@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,9 +27,11 @@ from slrig.reconstruction.stripes import (
     normalise,
     normalise_kernel,
     normalise_line,
+    smoothing_shift_px,
 )
 
 _ALL_ROWS = slice(None)
+_CLIPPED_SHIFT = 1.5  # over the shift by the smoothed second derivative, which is smaller than that of the light
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,11 +177,17 @@ def code_edge_points(
     """
     frames, lit = decoded.frames, decoded.search_mask
     parts = []
+    # A flank that is cut off at full scale is not like the other one.
+    reach = 2 * int(np.ceil(3 * scale_px)) + 1
+    near_clipped = cv2.dilate((frames.white >= frames.clipped_at).view(np.uint8), np.ones((reach, reach), np.uint8)) > 0
     for index in range(len(frames.bits)):
         read = lit if decoded.unresolved is None else lit & (index < len(frames.bits) - decoded.unresolved)
         if within is not None:
             read &= within
-        parts.append(edge_points(*_bit_difference(decoded, index), read, limits, filter_px=scale_px))
+        light, deviation = _bit_difference(decoded, index)
+        points = edge_points(light, deviation, read, limits, filter_px=scale_px)
+        shift_px = _CLIPPED_SHIFT * smoothing_shift_px(light, points, near_clipped, scale_px)
+        parts.append(points._replace(sigma_px=np.hypot(points.sigma_px, shift_px)))
     return parts
 
 

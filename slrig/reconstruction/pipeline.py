@@ -85,7 +85,9 @@ class CameraCurves:
     unresolved : (H, W) uint8, number of finest bits left out at each pixel; None where bits only number lines.
     unresolved_lines : (H, W) bool, where code edges replace lines that the camera does not resolve; None if nowhere.
     compression_dn : standard deviation of white noise that displaces positions as much as the loss by compression; 0
-    for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`.
+    for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`. clipped_white,
+    clipped_code : number of lit pixels that are clipped in white, and in a frame of the code. sample_step, full_scale :
+    as in `frames.SampleFormat`.
     """
 
     ensemble: StripeEnsemble
@@ -102,6 +104,10 @@ class CameraCurves:
     compression_dn: float = 0.0
     noise_correlation: float = 1.0
     gamma: float = 1.0
+    clipped_white: int = 0
+    clipped_code: int = 0
+    sample_step: float = 1.0
+    full_scale: float = 0.0
 
 
 def camera_curves(
@@ -300,7 +306,7 @@ def align_points(
         )  # fmt: skip
         near_step = near_steps(centred, resolution_px, limits.edges)
         usable = np.isfinite(centred.position) & ~near_shadow & ~near_step
-        residual_px = centroid_residual_px(measured, centred, usable, blur_px, period_px)
+        residual_px = centroid_residual_px(measured, centred, usable, blur_px, period_px, near_shadow)
         measured = correct_curvature(centred, usable, blur_px**2, period_px)
         extra_sigma_px = np.hypot(step_sigma_px(near_step), residual_px)
         del centred, residual_px
@@ -394,6 +400,7 @@ def _refine_identify_link(
     Large data are released as soon as they are not needed: `found`, the refined points and the images in `stacks`.
     """
     frames = image.frames
+    clipped_white, clipped_code = _count_clipped(frames, ~image.unlit)
     report_step("refine stripes")
     aligned = align_points(
         image, found, scale.blur_px, tables, limits, stacks.release_line_images, sampled=scale.sampled
@@ -456,7 +463,23 @@ def _refine_identify_link(
         compression_dn=float(np.sqrt(image.response.loss_variance)),
         noise_correlation=image.response.noise_correlation,
         gamma=image.response.gamma,
+        clipped_white=clipped_white,
+        clipped_code=clipped_code,
+        sample_step=frames.sample_step,
+        full_scale=frames.full_scale,
     )
+
+
+def _count_clipped(frames: AxisFrames, lit: NDArray[np.bool_]) -> tuple[int, int]:
+    """Number of lit pixels that are clipped in white, and in at least one frame of the code."""
+    in_white = lit & (frames.white >= frames.clipped_at)
+    count = int(np.count_nonzero(in_white))
+    if not count:
+        return 0, 0
+    in_code = np.zeros_like(lit)
+    for each in (*frames.bits, *(frames.inverses or ())):
+        in_code |= each >= frames.clipped_at
+    return count, int(np.count_nonzero(in_code & lit))
 
 
 def _chain_and_identify(

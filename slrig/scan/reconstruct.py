@@ -295,7 +295,7 @@ def _meshed(
         mesh_calibration_sigma_mm=None if share is None else share[_used(surface.faces, len(share))],
         cameras=cameras,
         stages=surface.stages,
-        figures=mesh_report(surface, mesh, curves),
+        figures=mesh_report(surface, mesh, curves, has_calibration=share is not None),
         redundancy=redundancy_report(joined_curves, points.source, found.spare),
         albedo=albedo_report(colours, mesh, cameras, lit=projector is not None, mapped=light is not None),
         notes=() if apart is None else (str(apart),),

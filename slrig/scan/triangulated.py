@@ -27,7 +27,7 @@ from slrig.reconstruction import (
     triangulate_camera_projector,
 )
 from slrig.scan.limited import limited
-from slrig.scan.report import lit_share
+from slrig.scan.report import lit_pixels, lit_share
 from slrig.scan.stream import CameraResult
 
 _WIDEST_GAP_PX = 4.0
@@ -213,9 +213,23 @@ def _steps_px(curves: CameraCurves, step_px: float, cell_px: float) -> NDArray[n
 
 
 def camera_notes(cameras: Sequence[CameraResult]) -> list[str]:
-    """A sentence for each camera whose frames were JPEG once, and for each whose values were bent."""
+    """Sentences on each camera whose frames are clipped, compressed, not linear, or not alike."""
     notes = []
     for seen in cameras:
+        share = seen.curves.clipped_white / max(int(np.count_nonzero(lit_pixels(seen.curves))), 1)
+        if share >= _WORTH_TELLING:
+            notes.append(
+                f"camera '{seen.name}': white is clipped at full scale ({seen.curves.full_scale:.0f}) on "
+                f"{share:.0%} of what is lit. Shifted lines give no points there, and edges of the code are less exact "
+                "(σ contains this). Expose shorter, lower the gain, or take several exposures"
+            )
+        apart_px = np.abs(seen.curves.disagreement_px)
+        if not seen.curves.refined and np.isfinite(apart_px).any():
+            notes.append(
+                f"camera '{seen.name}': lines of single frames lie up to {np.nanmax(apart_px):.2f} px beside where all "
+                "frames put them, so each frame counts by itself, and σ contains this. Keep object and rig still, lock "
+                "exposure and gain, and show patterns pixel for pixel in the projector's own resolution"
+            )
         if seen.curves.compression_dn > 0:
             notes.append(
                 f"camera '{seen.name}': its frames were compressed as JPEG, which errs by as much as "

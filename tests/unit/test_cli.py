@@ -46,6 +46,7 @@ from slrig.errors import InvalidInputError, ScanCancelledError, ServiceError, Sl
 from slrig.model import Region
 from slrig.scan.offered import MEDIA_TYPES
 from slrig.scan.records import report_summary
+from slrig.scan.report import sigma_words
 from tests.unit.capture.fake_rig import fake_rig
 from tests.unit.client.service import SCAN, Walk, client_of, failing
 from tests.unit.command import done, refused, slrig
@@ -322,6 +323,11 @@ def test_result_is_shown_with_its_files_and_its_quality(tmp_path: Path, capsys: 
         "size      1,200 vertices, 2,301 triangles",
         "stated    standard deviation of a point 0.0079 mm (median)",
         "error     rms 0.0123 mm against the known truth, 97.0% of the visible surface within 0.3 mm",
+    ]
+    holds = sigma_words(has_calibration=False)
+    assert quality_lines({"mesh": {"sigma_mm": {"p50": 0.014}, "sigma_holds": holds}}) == [
+        "stated    standard deviation of a point 0.0140 mm (median); noise only: this calibration states no error, and "
+        "this scan cannot test it"
     ]
     # A summary of an earlier version.
     assert quality_lines({"method": "Gray-only"}) == []
