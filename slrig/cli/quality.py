@@ -17,7 +17,9 @@ def quality_lines(summary: Mapping[str, Any]) -> list[str]:
         lines.append(f"{'size':<10}{figures['vertices']:,} vertices, {figures['triangles']:,} triangles")
     sigma = (mesh.get("sigma_mm") or {}).get("p50")
     if sigma is not None:
-        lines.append(f"{'stated':<10}standard deviation of a point {sigma:.4f} mm (median)")
+        holds = mesh.get("sigma_holds")
+        words = "" if holds is None else f"; {holds}"
+        lines.append(f"{'stated':<10}standard deviation of a point {sigma:.4f} mm (median){words}")
     truth = summary.get("truth") or {}
     if truth:
         lines.append(f"{'error':<10}{_error(truth)}")

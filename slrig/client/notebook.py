@@ -39,6 +39,8 @@ def _facts(scan: Mapping[str, Any]) -> list[tuple[str, str]]:
         facts.append(("triangles", f"{figures['triangles']:,} on {figures['area_mm2'] / 100:,.1f} cm²"))
     if sigma and sigma["p50"] is not None:
         facts.append(("standard deviation", f"{sigma['p50']:.4f} mm, of 5 in 100 points above {sigma['p95']:.4f} mm"))
+        if mesh.get("sigma_holds"):
+            facts.append(("it holds", mesh["sigma_holds"]))
     if covers is not None:
         facts.append(("of the decoded pixels", f"{covers:.1%} are on the mesh"))
     return [*facts, *(("note", note) for note in (scan["summary"] or {}).get("notes", ()))]

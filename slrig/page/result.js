@@ -102,6 +102,7 @@ function Figures({scan, report}) {
     <h3>Figures</h3>
     <${Facts} of=${[
       ...figures(scan).map(([name, value, written]) => [name, value === undefined ? null : written(value)]),
+      ["σ holds", summary.mesh.sigma_holds],
       ["Patterns", summary.identity],
       ["Limited to", limits(scan.plan.reconstruction?.region)],
       ["Calibration", calibration && (calibration.solved_at ? `${age === null ? "age not known" : `${Number(age.toPrecision(2))} days old`}` : calibration.absent)],

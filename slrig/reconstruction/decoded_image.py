@@ -36,6 +36,7 @@ from slrig.reconstruction.stripes import (
     normalise,
     normalise_kernel,
     normalise_line,
+    smoothing_shift_px,
 )
 
 _ALL_ROWS = slice(None)
@@ -47,6 +48,7 @@ _CROSS = np.array([(0, 1, 0), (1, 1, 1), (0, 1, 0)], np.uint8)
 _SIDES_PX = 7  # both sides of an edge of the code, which blur and filter spread over some 3 px each way
 _AROUND_PX = 17  # light from other surfaces is alike so far
 _MIN_EDGE_SWING = 0.5  # of a contrast that is twice 1; with less, the levels are uncertain
+_CLIPPED_SHIFT = 1.5  # over the shift by the smoothed second derivative, which is smaller than that of the light
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,15 +198,20 @@ def code_edge_points(
     frames, lit = decoded.frames, decoded.search_mask
     surfaces_light_each_other = _surfaces_light_each_other(decoded)
     parts = []
+    # A flank that is cut off at full scale is not like the other one.
+    reach = 2 * int(np.ceil(3 * scale_px)) + 1
+    near_clipped = cv2.dilate((frames.white >= frames.clipped_at).view(np.uint8), np.ones((reach, reach), np.uint8)) > 0
     for index in range(len(frames.bits)):
         read = lit if decoded.unresolved is None else lit & (index < len(frames.bits) - decoded.unresolved)
         if within is not None:
             read &= within
-        difference, deviation = _bit_difference(decoded, index)
+        light, deviation = _bit_difference(decoded, index)
         if surfaces_light_each_other:
-            middle, scatter = _edge_middle(difference, deviation, read, scale_px)
-            difference, deviation = difference - middle, np.sqrt(deviation**2 + scatter**2)
-        parts.append(edge_points(difference, deviation, read, limits, filter_px=scale_px))
+            middle, scatter = _edge_middle(light, deviation, read, scale_px)
+            light, deviation = light - middle, np.sqrt(deviation**2 + scatter**2)
+        points = edge_points(light, deviation, read, limits, filter_px=scale_px)
+        shift_px = _CLIPPED_SHIFT * smoothing_shift_px(light, points, near_clipped, scale_px)
+        parts.append(points._replace(sigma_px=np.hypot(points.sigma_px, shift_px)))
     return parts
 
 

@@ -20,7 +20,7 @@ from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, LineShift, NoiseModel, has_even_shifts
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames, rows_per_band, stack_rows
-from slrig.reconstruction.surface_fit import stencils
+from slrig.reconstruction.surface_fit import MIN_GRADIENT, stencils
 
 _FITTED_PX = 5  # pixels along each side of the window of a fit
 _MAX_BEND_PX = 1.0  # projector px of second difference over six pixels: more is a step between two surfaces
@@ -43,6 +43,8 @@ _STEP_SIGMA_PX = (0.04, 0.015)
 """Standard deviation by light of the other surface in the first and second pixel next to a depth step; chosen for edges
 of terraces and boxes.
 """
+
+_SHADOW_SHARE = 0.5  # of the displacement by fading light, chosen for shadows of posts on plates 8 and 40 mm behind
 
 _SHADOW_SIGMA = 3.0
 """Standard deviations of the camera's blur within which light fades out at a border."""
@@ -247,19 +249,31 @@ def resample_to_pixel_centres(
 
 
 def centroid_residual_px(
-    measured: PositionMap, centred: PositionMap, usable: NDArray[np.bool_], blur_px: float, period_px: float, /
-) -> NDArray[np.float32]:
+    measured: PositionMap, centred: PositionMap, usable: NDArray[np.bool_], blur_px: float, period_px: float,
+    near_shadow: NDArray[np.bool_], /,
+) -> NDArray[np.float32]:  # fmt: skip
     """(H, W): standard deviation, camera px, of the error after first-order correction of points fitted to 5 x 5
     pixels.
 
     It is the third order where brightness changes as sharply as the blur allows, ∂³ ln L = ∂ ln L / σ²: the share
-    σ²ω²s²/6 of the first-order displacement, with either sign.
+    σ²ω²s²/6 of the first-order displacement, with either sign. Beside shadows it is at least `_SHADOW_SHARE` of it,
+    since the light of the projector fades there by itself, too.
     """
     down, across = np.gradient(measured.position)
     share = (blur_px * 2 * np.pi / period_px) ** 2 / 6  # over s², and in projector px over s
-    squared = share**2 * (down * down + across * across) * (centred.position - measured.position) ** 2
+    slope_squared = down * down + across * across
+    displaced_squared = (centred.position - measured.position) ** 2
+    squared = share**2 * slope_squared * displaced_squared
     squared[~(usable & np.isfinite(squared))] = 0
-    mean = cv2.blur(squared, (_FITTED_PX, _FITTED_PX))
+    window = (_FITTED_PX, _FITTED_PX)
+    mean = cv2.blur(squared, window)
+    if near_shadow.any():
+        # A fit beside a border has pixels on one side only.
+        beside = cv2.dilate(near_shadow.view(np.uint8), np.ones((2 * _FITTED_PX - 1,) * 2, np.uint8)) > 0
+        beside &= usable & np.isfinite(displaced_squared) & (slope_squared > MIN_GRADIENT**2)
+        of_shadow = np.divide(displaced_squared, slope_squared, out=np.zeros_like(squared), where=beside)
+        pixels = cv2.blur(beside.astype(np.float32), window)
+        mean += _SHADOW_SHARE**2 * cv2.blur(of_shadow, window) / np.maximum(pixels, np.float32(1 / _FITTED_PX**2))
     return np.asarray(np.sqrt(np.maximum(mean, 0)), dtype=np.float32)  # running sums may round to below 0
 
 

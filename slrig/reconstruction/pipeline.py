@@ -91,7 +91,8 @@ class CameraCurves:
     for frames without loss. noise_correlation, gamma : as in `camera_response.CameraResponse`. beyond_pixels : number
     of pixels whose code names a cell that the projector has not; furthest_cell : of these cells, the one farthest from
     the projector's that more than a hundredth of the pixels name, -1 without any. light_from_surfaces : as
-    `decoded_image.light_from_surfaces` returns it.
+    `decoded_image.light_from_surfaces` returns it. clipped_white, clipped_code : number of lit pixels that are clipped
+    in white, and in a frame of the code. sample_step, full_scale : as in `frames.SampleFormat`.
     """
 
     ensemble: StripeEnsemble
@@ -111,6 +112,10 @@ class CameraCurves:
     beyond_pixels: int = 0
     furthest_cell: int = -1
     light_from_surfaces: tuple[float, float] = (0.0, 0.0)
+    clipped_white: int = 0
+    clipped_code: int = 0
+    sample_step: float = 1.0
+    full_scale: float = 0.0
 
 
 def camera_curves(
@@ -312,7 +317,7 @@ def align_points(
         )  # fmt: skip
         near_step = near_steps(centred, resolution_px, limits.edges)
         usable = np.isfinite(centred.position) & ~near_shadow & ~near_step
-        residual_px = centroid_residual_px(measured, centred, usable, blur_px, period_px)
+        residual_px = centroid_residual_px(measured, centred, usable, blur_px, period_px, near_shadow)
         measured = correct_curvature(centred, usable, blur_px**2, period_px)
         extra_sigma_px = np.hypot(step_sigma_px(near_step), residual_px)
         del centred, residual_px
@@ -407,6 +412,7 @@ def _refine_identify_link(
     """
     frames, from_surfaces = image.frames, light_from_surfaces(image)
     beyond = cells_beyond(frames, image.code, tables.index_of_word)
+    clipped_white, clipped_code = _count_clipped(frames, ~image.unlit)
     report_step("refine stripes")
     aligned = align_points(
         image, found, scale.blur_px, tables, limits, stacks.release_line_images, sampled=scale.sampled
@@ -472,6 +478,10 @@ def _refine_identify_link(
         beyond_pixels=len(beyond),
         furthest_cell=_furthest_cell(beyond, len(tables.cell_position)),
         light_from_surfaces=from_surfaces,
+        clipped_white=clipped_white,
+        clipped_code=clipped_code,
+        sample_step=frames.sample_step,
+        full_scale=frames.full_scale,
     )
 
 
@@ -480,6 +490,18 @@ def _furthest_cell(beyond: IntArray, cell_count: int) -> int:
         return -1
     is_after = np.count_nonzero(beyond >= cell_count) >= len(beyond) / 2
     return int(np.percentile(beyond, 99 if is_after else 1, method="nearest"))
+
+
+def _count_clipped(frames: AxisFrames, lit: NDArray[np.bool_]) -> tuple[int, int]:
+    """Number of lit pixels that are clipped in white, and in at least one frame of the code."""
+    in_white = lit & (frames.white >= frames.clipped_at)
+    count = int(np.count_nonzero(in_white))
+    if not count:
+        return 0, 0
+    in_code = np.zeros_like(lit)
+    for each in (*frames.bits, *(frames.inverses or ())):
+        in_code |= each >= frames.clipped_at
+    return count, int(np.count_nonzero(in_code & lit))
 
 
 def _chain_and_identify(

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
@@ -801,6 +802,29 @@ stripe_points = partial(line_points, RIDGE)
 
 edge_points = partial(line_points, EDGE)
 """Zero crossings of a bit minus its inverse."""
+
+
+def smoothing_shift_px(
+    image: NDArray[np.float32], points: LinePoints, inside: NDArray[np.bool_], filter_px: float, /
+) -> FloatArray:
+    """(n,) float64: how far the filter may move the zero crossings of an image, px; 0 for points not `inside`.
+
+    A Gaussian of variance σ² adds σ²/2 of the second derivative across the edge to the image, which is 0 where its two
+    flanks are alike. inside : (H, W) bool.
+    """
+    columns, rows = np.rint(points.points_px).astype(np.intp).T
+    shift_px, chosen = np.zeros(len(rows)), inside[rows, columns]
+    if not chosen.any():
+        return shift_px
+    zero, one, two = gaussian_kernels(filter_px)
+    at = points.points_px[chosen, ::-1].T
+    pairs = ((one, zero), (zero, one), (two, zero), (one, one), (zero, two))
+    derivatives = (cv2.sepFilter2D(image, cv2.CV_32F, across, down) for across, down in pairs)
+    rx, ry, rxx, rxy, ryy = (map_coordinates(each, at, order=1) for each in derivatives)
+    nx, ny = points.normals[chosen].T
+    slope, bend = nx * rx + ny * ry, nx * nx * rxx + 2 * nx * ny * rxy + ny * ny * ryy
+    shift_px[chosen] = filter_px**2 / 2 * np.abs(bend) / np.maximum(np.abs(slope), 1e-9)
+    return shift_px
 
 
 @kernel

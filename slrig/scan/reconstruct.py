@@ -340,7 +340,7 @@ def _meshed(
         mesh_calibration_sigma_mm=None if share is None else share[_used(surface.faces, len(share))],
         cameras=cameras,
         stages=surface.stages,
-        figures={**mesh_report(surface, mesh, curves), "layered": layered},
+        figures={**mesh_report(surface, mesh, curves, has_calibration=share is not None), "layered": layered},
         redundancy={
             **redundancy_report(merged, points.source, found.agreement.redundancy, found.agreement.report),
             **agreement_report(walked.agreement),

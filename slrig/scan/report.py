@@ -74,6 +74,8 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
         "decoded_pixels": curves.decoded_pixels,
         "measured_pixels": int(counts[Refusal.NONE]),
         "refused_pixels": {cause.name.lower(): int(counts[cause]) for cause in Refusal if cause is not Refusal.NONE},
+        "clipped_pixels": {"white": curves.clipped_white, "code": curves.clipped_code},
+        "samples": {"step": curves.sample_step, "full_scale": curves.full_scale},
         "lit_by_unresolved_bits": share_by_bits(curves),
         "lit_without_lines": round(lit_share(curves, curves.unresolved_lines), 4),
         "noise": {
@@ -178,14 +180,24 @@ def _pair_report(pair: PairRedundancy) -> dict[str, object]:
     }
 
 
-def mesh_report(surface: SurfaceMesh, mesh: Mesh, curves: PointCurves) -> dict[str, object]:
-    """What each step did to the mesh, and its stated error."""
+def sigma_words(*, has_calibration: bool) -> str:
+    """What the stated standard deviations hold. has_calibration : whether the calibration states its error."""
+    if has_calibration:
+        return "noise, and the error that the calibration states"
+    return "noise only: this calibration states no error, and this scan cannot test it"
+
+
+def mesh_report(
+    surface: SurfaceMesh, mesh: Mesh, curves: PointCurves, *, has_calibration: bool
+) -> dict[str, object]:  # fmt: skip
+    """What each step did to the mesh, and its stated error; has_calibration : as for `sigma_words`."""
     sigma = np.percentile(mesh.sigma_mm, (5, 50, 95))
     return {
         "points": len(curves.points_mm),
         "curves": len(curves.column_px),
         **surface.steps,
         "sigma_mm": {"p5": float(sigma[0]), "p50": float(sigma[1]), "p95": float(sigma[2])},
+        "sigma_holds": sigma_words(has_calibration=has_calibration),
     }
 
 

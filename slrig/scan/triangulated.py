@@ -350,9 +350,23 @@ def _spacing_px(curves: CameraCurves, step_px: float, cell_px: float) -> NDArray
 
 
 def camera_notes(cameras: Sequence[CameraResult]) -> list[str]:
-    """A sentence for each camera whose frames were compressed as JPEG, and for each with a gamma."""
+    """Sentences on each camera whose frames are clipped, compressed, not linear, or not alike."""
     notes = []
     for camera in cameras:
+        share = camera.curves.clipped_white / max(int(np.count_nonzero(lit_pixels(camera.curves))), 1)
+        if share >= _MIN_UNRESOLVED:
+            notes.append(
+                f"camera '{camera.name}': white is clipped at full scale ({camera.curves.full_scale:.0f}) on "
+                f"{share:.0%} of what is lit. Shifted lines give no points there, and edges of the code are less exact "
+                "(σ contains this). Expose shorter, lower the gain, or take several exposures"
+            )
+        apart_px = np.abs(camera.curves.disagreement_px)
+        if not camera.curves.refined and np.isfinite(apart_px).any():
+            notes.append(
+                f"camera '{camera.name}': lines of single frames lie up to {np.nanmax(apart_px):.2f} px beside where all "
+                "frames put them, so each frame counts by itself, and σ contains this. Keep object and rig still, lock "
+                "exposure and gain, and show patterns pixel for pixel in the projector's own resolution"
+            )
         if camera.curves.compression_dn > 0:
             notes.append(
                 f"camera '{camera.name}': its frames were compressed as JPEG, which errs by as much as "

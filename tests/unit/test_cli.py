@@ -47,6 +47,7 @@ from slrig.errors import InvalidInputError, ScanCancelledError, ServiceError, Sl
 from slrig.model import Region
 from slrig.scan.offered import MEDIA_TYPES
 from slrig.scan.records import report_summary
+from slrig.scan.report import sigma_words
 from tests.unit.capture.fake_rig import fake_rig
 from tests.unit.client.service import SCAN, Walk, client_of, failing
 from tests.unit.command import done, refused, slrig
@@ -325,6 +326,11 @@ def test_result_is_shown_with_its_files_and_its_quality(tmp_path: Path, capsys: 
         "stated    standard deviation of a point 0.0079 mm (median)",
         "error     rms 0.0123 mm against the known truth, of the 97.4% of the area within 1 mm; 2.6% beyond 1 mm, "
         "97.0% of the visible surface within 0.3 mm",
+    ]
+    holds = sigma_words(has_calibration=False)
+    assert quality_lines({"mesh": {"sigma_mm": {"p50": 0.014}, "sigma_holds": holds}}) == [
+        "stated    standard deviation of a point 0.0140 mm (median); noise only: this calibration states no error, and "
+        "this scan cannot test it"
     ]
     # Summaries of earlier versions.
     assert quality_lines({"method": "Gray-only"}) == []

@@ -114,12 +114,12 @@ def test_the_residual_at_an_edge_out_of_focus_is_stated(blur_px: float, slope: f
     seen = PositionMap(as_map(measured), as_map(0 * measured))
     centred = resample_to_pixel_centres(seen, as_map(20 * white), NOISELESS, blur_px)
     usable = np.ones(seen.position.shape, dtype=np.bool_)
-    stated = centroid_residual_px(seen, centred, usable, blur_px, PERIOD_PX)[2]
+    stated = centroid_residual_px(seen, centred, usable, blur_px, PERIOD_PX, ~usable)[2]
     left = (centred.position[2] - position[FINE // 2 :: FINE]) / slope
     at_edge = slice(24, 37)
     assert 0.5 < np.sqrt(np.mean(stated[at_edge] ** 2) / np.mean(left[at_edge] ** 2)) < 1.2
     assert stated[45:].max() < 1e-3
-    assert not centroid_residual_px(seen, centred, ~usable, blur_px, PERIOD_PX).any()
+    assert not centroid_residual_px(seen, centred, ~usable, blur_px, PERIOD_PX, ~usable).any()
 
 
 @pytest.mark.parametrize("blur_px", [0.4, 0.65, 0.9])

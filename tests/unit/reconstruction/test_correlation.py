@@ -109,6 +109,8 @@ def test_light_from_walls_around_is_no_noise_that_neighbours_share(kernel: Kerne
     frames = lit_by_walls(noisy(kernel))
     expected = by_sums(np.array(kernel), summed)
     assert noise_correlation(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(expected, rel=0.1)
+
+
 def test_light_from_elsewhere_is_no_noise_of_edges_whichever_bits_there_are() -> None:
     x, y = grid(SHAPE)
     frames = noisy(SMOOTH)

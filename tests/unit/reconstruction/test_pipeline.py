@@ -492,3 +492,16 @@ def test_lines_of_single_frames_beside_the_others_are_in_sigma(width_px: int, mo
     column = np.repeat(curves.ensemble.position_px, np.diff(curves.ensemble.offsets))
     misses = (tilted(pitch, 0.1)(x, y) + 10.0 - surface.min() - column) / pitch
     assert 0.7 <= sigma_ratio(curves, misses) <= 1.4
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_edges_whose_white_is_clipped_are_within_sigma_and_counted(seed: int) -> None:
+    surface = tilted(0.9, 0.2)
+    shown = patterns(line_shift=False, cell_px=2, projector=WIDE)
+    capture = seen_by_camera(
+        surface(*grid((200, 240))), shown, WIDE, blur_px=0.7, smear_px=0.5, white=320.0, noise=1.0, seed=seed
+    )
+    curves, _ = walk(capture)
+    assert 0.5 < curves.clipped_white / curves.decoded_pixels < 1.0
+    assert curves.clipped_code >= 0.9 * curves.clipped_white
+    assert 0.7 <= sigma_ratio(curves, misses_px(curves, 0.9, 0.2)) <= 1.4
