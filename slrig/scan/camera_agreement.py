@@ -6,9 +6,10 @@ calibration (`slrig.reconstruction.redundancy`). The rule, in this order:
 1. If two cameras agree with their names exchanged or a picture mirrored, this is the cause, and there is no mesh.
 2. Of three cameras or more, one that contradicts all others, while these agree, is the one that is wrong.
 3. The pose of each device that can have moved, camera or projector, is refined. That which leaves the smallest misfit
-   has moved, if it leaves no more than noise and the move is small: it was bumped. Of those that leave as little
-   the one with the smallest move is taken, the others are named, and the distance between their surfaces widens the
-   standard deviations.
+   has moved, if it leaves no more than noise and the move is small: it was bumped. Of those that leave as little,
+   or of all that are possible if none leaves noise alone, the one with the smallest move is taken, the others are
+   named, and the distance between their surfaces widens the standard deviations. One device is taken to have moved:
+   where several did, no residual shows it, and the sentence says to calibrate again.
 4. Otherwise one camera is used alone: the one that agrees with the second axis of patterns, or else the one with the
    larger number of points over their standard deviation. Unless the second axis or other cameras show it to be right,
    the distance between the cameras widens the standard deviations.
@@ -53,7 +54,8 @@ from slrig.reconstruction import (
 _REFUTED_PX = 5.0
 _REFUTED_SIGMA, _LENS_PX = 20.0, 1.0  # a lens model may leave up to 1 px, however small the noise is
 _MAX_MISFIT = 2.0  # of a pose that explains the contradiction: 1 is noise alone, 2 noise and 2 % of other surfaces
-_SAME_FIT = 1.2  # residuals of two devices in this ratio do not show which of them moved
+_NOISE_ALONE = 1.2
+_SAME_FIT = 1.03  # misfits of two devices in this ratio do not show which of them moved
 _SAMPLE = 5000
 _ONE_DEVIATION = 68.3  # percent of a normal distribution
 _AGREES_SIGMA = 3.0
@@ -200,7 +202,9 @@ def check_agreement(
     count = max((each.count for each in trials), default=0)
     fitting = min(trials, key=lambda each: each.misfit(count), default=None)
     if fitting is not None and fitting.agrees and fitting.refined.is_small and fitting.misfit(count) <= _MAX_MISFIT:
-        same = _SAME_FIT * fitting.misfit(count)
+        misfit = fitting.misfit(count)
+        # Beside errors of a lens, small differences of the misfit show nothing.
+        same = _SAME_FIT * misfit if misfit <= _NOISE_ALONE else _MAX_MISFIT
         rivals = [each for each in trials if each.agrees and each.refined.is_small and each.misfit(count) <= same]
         best = min(rivals, key=lambda each: each.refined.move)
         rivals.remove(best)
@@ -271,7 +275,7 @@ def _with_refined_pose(
     note = (
         f"{name} was turned by {refined.turn_deg:.2f}° and shifted by {refined.shift_mm:.2f} mm since its "
         f"calibration: {_contradiction(before)}. Its pose was refined from {refined.equations} correspondences of the "
-        f"cameras, which leaves {after.median_absolute_px:.3f} px"
+        f"cameras, which leaves {after.median_absolute_px:.3f} px, if no other device moved"
     )
     if rivals:
         others = " or ".join(scan.device_name(each.refined.device) for each in rivals)
