@@ -32,7 +32,7 @@ _MAX_POINTS = 20_000  # of a check; their mean is known to a hundredth of their 
 _EDGE_SIGMA_PX = 0.1  # of a code edge along a stripe
 _FIT_POINTS = 8_000
 _TRIAL_POINTS = 1_000
-_MIN_POINTS = 200
+_MIN_POINTS, _MIN_READ = 200, 0.3  # points, and share of the stripe points whose second code is read
 _CELLS = 8  # along each side of the image, for the systematic part of the residuals
 _MIN_CELL_POINTS = 30
 _LENS_CELLS = 3  # along each side: errors of lenses are smooth
@@ -81,10 +81,13 @@ class Correspondences:
 def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axis) -> Correspondences:
     """Projector pixels of stripe points: by phase at up to 20 000 points, otherwise where stripes cross code edges.
 
-    axis : the one that numbers the stripes.
+    axis : the one that numbers the stripes. None are returned where the second code is read at few of the points: what
+    is read there may be noise.
     """
     points = ensemble.points_px
     coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))
+    if len(points) == 0 or np.isfinite(second.positions.sample(points)[0]).mean() < _MIN_READ:
+        return Correspondences(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), axis)
     if has_phase(second.frames):
         step = max(1, len(points) // _MAX_POINTS)
         points, coded = points[::step], coded[::step]

@@ -27,6 +27,7 @@ _UNIFORM = 12**-0.5  # standard deviation of a uniform distribution of width 1
 _MAX_STEP_CELLS = 3.0  # between neighbouring pixels of one surface
 _MIN_LIMIT_PX = 1.0  # smaller differences are errors of the calibration, not light from elsewhere
 _MAX_SIGMA = 6.0  # beyond this many standard deviations light comes from elsewhere
+_MAX_UNREAD = 1  # bits: blur that hides more displaces the edges of the others
 _MAX_SPACING_PX = 2.0  # of neighbouring points of a stripe
 
 
@@ -137,6 +138,7 @@ def decode_second_axis(
     else:
         code, unread = decode_edges(*given)
         position, _ = position_map(frames, noise, code, tables.cell_position, by_phase=False)
+        position[unread > _MAX_UNREAD] = np.nan
         cells = (code.highest - code.lowest + 1).astype(np.float32) * np.exp2(unread, dtype=np.float32)
         cells[np.isnan(position)] = np.nan
         positions = AxisPositions(position, np.float32(frames.gray.cell_px * _UNIFORM) * cells)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -311,7 +312,9 @@ class _CameraFrames:
             fused = fuse_exposures(capture, self._name, self._axis)
             frames, noise = fused.frames, fused.noise
             if second is not None:
-                self._second = FrameStacks.from_frames(fuse_exposures(capture, self._name, second.gray.axis).frames)
+                # The axes may have been taken with different exposures, of which no bracket can be made.
+                with suppress(PatternError):
+                    self._second = FrameStacks.from_frames(fuse_exposures(capture, self._name, second.gray.axis).frames)
         else:
             frames, noise = axis_frames(capture, self._name, self._axis), None
             if second is not None:

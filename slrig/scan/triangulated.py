@@ -364,8 +364,8 @@ def camera_notes(cameras: Sequence[CameraResult]) -> list[str]:
         if not camera.curves.refined and np.isfinite(apart_px).any():
             notes.append(
                 f"camera '{camera.name}': lines of single frames lie up to {np.nanmax(apart_px):.2f} px beside where "
-                "all frames put them, so each frame counts by itself, and σ contains this. Keep object and rig still, lock "
-                "exposure and gain, and show patterns pixel for pixel in the projector's own resolution"
+                "all frames put them, so each frame counts by itself, and σ contains this. Keep object and rig still, "
+                "lock exposure and gain, and show patterns pixel for pixel in the projector's own resolution"
             )
         if camera.curves.compression_dn > 0:
             notes.append(
