@@ -134,7 +134,7 @@ def decode_edges(
     """Decode the Gray code of one axis for positions on its edges. Arguments as for `decode`.
 
     Where bits are uncertain elsewhere than at their own edges, a pixel leaves out up to 3 further finest bits until one
-    or two neighbouring cells are left. unresolved : (H, W) uint8, number of finest bits not to read at each pixel; None
+    cell is left. unresolved : (H, W) uint8, number of finest bits not to read at each pixel; None
     for `unresolved_bits`. Also returns (H, W) uint8, number of finest bits that were not read at each pixel.
 
     Raises
@@ -256,7 +256,7 @@ def _decode_kernel(
                     index = index_of_word[other_word] >> skipped
                     low = min(low, index)
                     high = max(high, index)
-                if high - low > (widest if more == 0 else 1):
+                if high - low > (widest if more == 0 else 0):
                     continue
                 if low << skipped >= cell_count:
                     refusal[y, x] = _BEYOND_PROJECTOR

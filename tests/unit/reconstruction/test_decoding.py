@@ -217,10 +217,10 @@ def test_a_pixel_leaves_out_the_finest_bits_until_its_interval_is_narrow() -> No
     doubtful = with_bits(21, b3=0.0)
     assert read(doubtful) == (18, 21, Refusal.NONE)
     assert spread_of_read(doubtful) == (18, 21, Refusal.NONE, 0)
-    # Bit 2: cell 21, or 26 beyond its edge at 24.
-    doubtful = with_bits(21, b2=0.0)
+    # At 23 it is further from its edge: cell 23, or 16.
+    doubtful = with_bits(23, b3=0.0)
     assert read(doubtful) == (*REFUSED, Refusal.AMBIGUOUS_BIT)
-    assert spread_of_read(doubtful) == (20, 27, Refusal.NONE, 2)
+    assert spread_of_read(doubtful) == (16, 23, Refusal.NONE, 3)
     # Bits coarser than that say nothing of the place.
     assert spread_of_read(with_bits(5, b0=0.0)) == (*REFUSED, Refusal.AMBIGUOUS_BIT, 0)
     # One in doubt at its own edge leaves nothing out.
