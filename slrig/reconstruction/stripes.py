@@ -29,7 +29,7 @@ EDGE = 1
 _SUPPORT = 3.6  # kernel radius in sigmas
 _TAYLOR_BOX = 0.6  # a point this far from the pixel centre still belongs to it; chaining drops double responses
 _NEWTON_BOX = 1.1  # half a pixel more than in the first step
-_BEND_SHARE = 0.4  # see `_points_kernel`
+_BEND_SHARE, _MIN_BEND_SIGMA = 0.4, 2.5  # see `_points_kernel`
 _VECTOR = 4  # numbers of double precision in a vector register
 _MIN_ROWS, _MIN_POINTS = 32, 1024  # least number for one call of a kernel
 
@@ -857,7 +857,8 @@ def _points_kernel(
     A clean edge has no second derivative where it crosses zero. What displaces it (neighbouring edges at unequal
     distances, curvature, uneven light, pixels too coarse for its slope) bends it, too: an edge of width S and bend b is
     displaced by q S² b, with q = 1 for a curved edge alone, 1/4 for narrow stripes whose width changes evenly. Without
-    knowing the cause, the displacement counts as a standard deviation, with q = 0.4, after noise is taken off.
+    knowing the cause, the displacement counts as a standard deviation, with q = 0.4, where noise does not explain the
+    bend.
     """
     total = 0
     for i in range(len(valid)):
@@ -875,8 +876,10 @@ def _points_kernel(
             if bend[i] != 0:
                 # S², by the slope of a smoothed step from -1 to 1.
                 squared_width = 2 / (np.pi * response[i] * response[i])
-                squared = bend[i] * bend[i] - (noise[rows[i], columns[i]] * bend_noise / response[i]) ** 2
-                sigma[at] = np.sqrt(sigma[at] ** 2 + (_BEND_SHARE * squared_width) ** 2 * max(squared, 0.0))
+                by_noise = noise[rows[i], columns[i]] * bend_noise / response[i]
+                if abs(bend[i]) > _MIN_BEND_SIGMA * by_noise:
+                    squared = bend[i] * bend[i] - by_noise * by_noise
+                    sigma[at] = np.sqrt(sigma[at] ** 2 + (_BEND_SHARE * squared_width) ** 2 * squared)
             strong[at] = response[i] > noise[int(np.rint(y[i])), int(np.rint(x[i]))] * weakest
             at += 1
     return points, across, strength, strong, sigma
