@@ -31,6 +31,7 @@ from slrig.model import (
     Calibration,
     CaptureHeader,
     Gray,
+    Pattern,
     Region,
     Shot,
     Size,
@@ -286,6 +287,10 @@ def _walked(
         except PatternError as cause:
             message = f"{folder}: {'; '.join(evidence.faults)}; {usable.note}. {cause}"
             raise PatternError(message) from cause
+    wrong = {getattr(pattern, "axis", None) for pattern in _wrong_patterns(folder, evidence)}
+    if wrong - {None, stream.axis}:
+        # Frames of the other axis that show something else prove nothing against the calibration.
+        seen = [replace(each, second=None) for each in seen]
     sections = capture_report(stream.header, stream.axis, evidence)
     step, cell = (each(stream.header.displayed_patterns, stream.axis) for each in (step_px, cell_px))
     notes = [
@@ -303,6 +308,13 @@ def _walked(
     return Walked(
         devices, stream.axis, stream.header.axes, seen, step, cell, gray, projector, sections, notes, agreement
     )
+
+
+def _wrong_patterns(folder: Path, evidence: EvidenceSummary) -> set[Pattern]:
+    """Patterns of a bundle of which a frame is proven wrong."""
+    indices = {index for each in evidence.wrong.values() for index in each}
+    patterns = read_description(folder).pattern_list() if indices else ()
+    return {patterns[index] for index in indices}
 
 
 def _usable(folder: Path, files: BundleFiles, evidence: EvidenceSummary) -> UsableFiles | None:
