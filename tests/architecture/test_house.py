@@ -40,6 +40,7 @@ FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 OF_THE_COMMAND_LINE = (
     "slrig/cli", "slrig/api", "slrig/doctor", "slrig/jobs/data_folder.py", "slrig/jobs/database.py",
     "slrig/calibration/printing.py", "slrig/importers", "slrig/errors.py",
+    "slrig/model/plausibility.py",  # names the commands that have the option
     "drivers/screen/randr.py",  # options of xrandr
 )  # fmt: skip
 OF_OTHER_PROGRAMS = ("v4l2-ctl", "xrandr", "udevadm", "{command}")

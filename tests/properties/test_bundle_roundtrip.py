@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +108,8 @@ def _solved_calibrations(draw: st.DrawFn) -> Calibration:
     root = np.random.default_rng(draw(st.integers(0, 99))).normal(size=(count, count))
     root *= np.geomspace(1e-12, draw(st.floats(1e-3, 1e12)), count)[:, None]
     box = np.array(draw(st.tuples(*[finite] * 6))).reshape(2, 3)
-    moment = draw(st.datetimes(timezones=st.timezones())).isoformat()
+    # Offsets of whole minutes, as ISO 8601 has them: local mean times before 1972 have seconds.
+    moment = draw(st.datetimes(min_value=datetime(1972, 2, 1), timezones=st.timezones())).isoformat()  # noqa: DTZ001
     solved = SolveRecord(draw(texts), moment, root @ root.T, box, draw(st.floats(0, 1e300)))
     return replace(calibration, solved=solved)
 

@@ -425,7 +425,7 @@ def test_ctrl_c_cancels_the_scan_or_the_whole_series(
         (
             "rejected-top.png",
             ["left"],
-            "There are: .*, rejected-left.png, causes-left.png, points-left.npz, .*bundle.zip",
+            "There are: .*, rejected-left.png, causes-left.png, agreement-left.png, points-left.npz, .*bundle.zip",
         ),
         ("rejected-top.png", [], None),
         ("rejected-left.png", ["left"], None),
