@@ -92,12 +92,15 @@ def fit_pair_light(
 
 def _fit_factors(u: Samples, v: Samples) -> tuple[float, float]:
     """Return a and b of the straight line u/a + v/b = 1 through most pixels, by iterated weighted least squares with
-    Tukey's weights; infinite if there is no such line.
+    Tukey's weights; infinite if there is no such line, and 1 where the frames add up to white and black as they are.
     """
     # A third of the pixels tells two numbers as well.
     u, v = u[::3], v[::3]
     # Pixels that one frame lights and the other does not; both kinds count alike, however few the rarer ones are.
     kinds = [mask for mask in (u > v, u <= v) if np.mean(mask) >= _MIN_CLASS_FRACTION]
+    # Where few pixels are lit by one of the frames, a line through blurred edges may fit as well.
+    if all(abs(float(np.median((u + v)[mask])) - 1) < _MIN_RESIDUAL for mask in kinds):
+        return 1.0, 1.0
     share = np.ones(len(u))
     for mask in kinds:
         share[mask] = 1 / (len(kinds) * np.mean(mask))

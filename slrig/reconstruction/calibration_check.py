@@ -233,20 +233,22 @@ class CalibrationCheck:
     def error_mm(self, points_mm: FloatArray, normals: FloatArray, axis: Axis) -> FloatArray:
         """(n,) float64: error along the normals (n, 3) that the residuals imply, as a standard deviation.
 
-        That of the fit, with its own standard deviation; without one that explains the residuals, the effect of their
-        median on the coded position.
+        That of the fit, with its own standard deviation; for a fit that is not significant, its standard deviation
+        alone; without one that explains the residuals, the effect of their median on the coded position.
         """
         fit = self.explained
         camera, projector = self.devices
         pairs = Correspondences(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
         uncertain_px = self.median_px
         if fit is not None:
-            uncertain_px = min(fit.coded_sigma_px, max(fit.coded_error_px, self.median_px))
+            uncertain_px = fit.coded_sigma_px
+            if self.is_significant:
+                uncertain_px = min(uncertain_px, max(fit.coded_error_px, self.median_px))
         pairs.projector_px[:, 0 if axis is Axis.COLUMN else 1] += uncertain_px
         depth = _depth_mm(camera, projector, pairs)
         shifted = camera.centre_mm + depth[:, None] * pixel_rays(camera, pairs.camera_px) - points_mm
         error = np.abs((shifted * normals).sum(axis=1))
-        if fit is not None:
+        if fit is not None and self.is_significant:
             error = np.hypot(error, (fit.displacement_mm(points_mm, axis) * normals).sum(axis=1))
         return np.asarray(error)
 

@@ -112,45 +112,55 @@ def leave_out_contradicted(
 
 
 @dataclass(frozen=True, slots=True)
-class AxisError:
-    """Error of the calibration that the second axis shows.
+class AxisTest:
+    """Error of the calibration that the second axis shows, or would not show.
 
-    sigma_mm : (n,) float64, to add to the standard deviation of each point, in squares; note : for the report.
+    sigma_mm : (n,) float64, to add to the standard deviation of each point, in squares; notes : for the report.
+    result : for `report.sigma_words`, None where nothing was tested.
     """
 
     sigma_mm: FloatArray
-    note: str
+    notes: tuple[str, ...]
+    result: str | None
 
 
-def axis_error(
+def axis_test(
     agreement: AxisAgreement,
     merged: MergedCurves,
     names: Sequence[str],
     normals: NDArray[np.float32],
     stated_mm: FloatArray,
-) -> AxisError | None:
-    """Compare what the second axis shows with the stated errors; None if it is not larger than three times these.
+) -> AxisTest:
+    """Compare what the second axis shows with the stated errors; errors beyond three times these are added.
 
     names : cameras in the order of `merged.camera`; stated_mm : (n,) float64.
     """
-    points, added, notes = merged.curves.points_mm, np.zeros(len(stated_mm)), []
+    points, added, notes, results = merged.curves.points_mm, np.zeros(len(stated_mm)), [], []
     other = Axis.ROW if agreement.axis is Axis.COLUMN else Axis.COLUMN
     for index, name in enumerate(names):
         check, own = agreement.checks.get(name), merged.camera == index
-        if check is None or not own.any() or not check.is_significant:
+        if check is None or not own.any():
             continue
         error = check.error_mm(points[own], normals[own], agreement.axis)
-        error[~np.isfinite(error)] = np.nanmedian(error) if np.isfinite(error).any() else 0.0
-        typical, stated = float(np.median(error)), float(np.median(stated_mm[own]))
-        if typical <= _MAX_OVER_STATED * stated:
+        known = error[np.isfinite(error)]
+        typical, stated = float(np.median(known)) if len(known) else 0.0, float(np.nanmedian(stated_mm[own]))
+        if not check.is_significant:
+            results.append(
+                f"{other}s agree with the calibration to {check.median_px:.2g} px; errors of it below "
+                f"{2 * typical:.2g} mm would not show"
+            )
             continue
-        added[own] = error
+        if typical <= _MAX_OVER_STATED * stated:
+            results.append(f"{other}s are {check.median_px:.2g} px from where the calibration puts them")
+            continue
+        added[own] = np.where(np.isfinite(error), error, typical)
+        results.append(f"the error of {typical:.2g} mm that {other}s show")
         notes.append(
             f"the {other}s contradict the calibration of camera '{name}': they are {check.median_px:.2f} px (median) "
             f"from where it puts them, so that points are {typical:.3g} mm off (median), {typical / stated:.0f} times "
             f"what is stated. This was added to the standard deviations, in squares; {_motion(check)}calibrate again"
         )
-    return AxisError(added, "; ".join(notes)) if notes else None
+    return AxisTest(added, tuple(notes), "; ".join(results) or None)
 
 
 def _motion(check: CalibrationCheck) -> str:

@@ -29,7 +29,7 @@ from slrig.reconstruction import (
     sigma_along_normal,
 )
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
-from slrig.scan.axis_agreement import agreement_report, axis_error
+from slrig.scan.axis_agreement import agreement_report, axis_test
 from slrig.scan.colouring import albedo_report, coloured
 from slrig.scan.coverage import covered_share, layered_share, with_uncovered_refused
 from slrig.scan.limited import marked, within
@@ -55,6 +55,7 @@ from slrig.scan.report import (
     camera_report,
     mesh_report,
     redundancy_report,
+    sigma_words,
     view_report,
     with_seconds,
 )
@@ -296,9 +297,8 @@ def _meshed(
     disagreement = disagreement_sigma_mm(found, surface.normals, axis)
     if disagreement is not None:
         sigma = np.hypot(sigma, disagreement)
-    tested = axis_error(walked.agreement, merged, [each.name for each in cameras], surface.normals, sigma)
-    if tested is not None:
-        sigma = np.hypot(sigma, tested.sigma_mm)
+    tested = axis_test(walked.agreement, merged, [each.name for each in cameras], surface.normals, sigma)
+    sigma = np.hypot(sigma, tested.sigma_mm)
     limit_mm = None if plan.region is None else plan.region.max_sigma_mm
     if limit_mm is not None:
         known = sigma <= limit_mm
@@ -332,6 +332,7 @@ def _meshed(
         surface.faces, points.points_mm, surface.normals, colours.colour, colours.mark, sigma, points.offsets,
         points.position_px,
     )  # fmt: skip
+    holds = sigma_words(tested.result, has_calibration=share is not None)
     return _Meshed(
         mesh=mesh,
         curves=curves,
@@ -340,7 +341,7 @@ def _meshed(
         mesh_calibration_sigma_mm=None if share is None else share[_used(surface.faces, len(share))],
         cameras=cameras,
         stages=surface.stages,
-        figures={**mesh_report(surface, mesh, curves, has_calibration=share is not None), "layered": layered},
+        figures={**mesh_report(surface, mesh, curves, holds), "layered": layered},
         redundancy={
             **redundancy_report(merged, points.source, found.agreement.redundancy, found.agreement.report),
             **agreement_report(walked.agreement),
@@ -350,7 +351,7 @@ def _meshed(
             *mirror_image_notes(surface, cameras, projector),
             *layer_notes(layered),
             *found.notes,
-            *(() if tested is None else (tested.note,)),
+            *tested.notes,
         ),
     )
 

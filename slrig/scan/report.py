@@ -180,24 +180,30 @@ def _pair_report(pair: PairRedundancy) -> dict[str, object]:
     }
 
 
-def sigma_words(*, has_calibration: bool) -> str:
-    """What the stated standard deviations hold. has_calibration : whether the calibration states its error."""
+def sigma_words(second_axis: str | None = None, *, has_calibration: bool) -> str:
+    """What the stated standard deviations hold.
+
+    second_axis : what the other axis shows of the calibration, None if it was not played. has_calibration : True if the
+    calibration states its error.
+    """
     if has_calibration:
-        return "noise, and the error that the calibration states"
-    return "noise only: this calibration states no error, and this scan cannot test it"
+        words = "noise, and the error that the calibration states"
+    elif second_axis is None:
+        return "noise only: this calibration states no error, and this scan cannot test it"
+    else:
+        words = "noise; this calibration states no error"
+    return words if second_axis is None else f"{words}; {second_axis}"
 
 
-def mesh_report(
-    surface: SurfaceMesh, mesh: Mesh, curves: PointCurves, *, has_calibration: bool
-) -> dict[str, object]:  # fmt: skip
-    """What each step did to the mesh, and its stated error; has_calibration : as for `sigma_words`."""
+def mesh_report(surface: SurfaceMesh, mesh: Mesh, curves: PointCurves, sigma_holds: str) -> dict[str, object]:
+    """What each step did to the mesh, and its stated error; sigma_holds : result of `sigma_words`."""
     sigma = np.percentile(mesh.sigma_mm, (5, 50, 95))
     return {
         "points": len(curves.points_mm),
         "curves": len(curves.column_px),
         **surface.steps,
         "sigma_mm": {"p5": float(sigma[0]), "p50": float(sigma[1]), "p95": float(sigma[2])},
-        "sigma_holds": sigma_words(has_calibration=has_calibration),
+        "sigma_holds": sigma_holds,
     }
 
 
