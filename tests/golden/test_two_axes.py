@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from scipy.spatial.transform import Rotation
 
+from slrig.bundle import CALIBRATION, read_calibration, write_calibration
 from tests.golden.test_bundles import reconstructed
 from tests.unit.command import slrig
 
 pytestmark = [pytest.mark.shared, pytest.mark.slow]
 
 
-@pytest.fixture(scope="module")
-def bundle(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The foreign capture with its right calibration."""
-    folder, case = tmp_path_factory.mktemp("axes") / "bundle", shared / "cases" / "two_axes"
+def imported(shared: Path, folder: Path, calibration: str) -> Path:
+    """The foreign capture with one of its calibrations and the truth."""
+    case = shared / "cases" / "two_axes"
     made = slrig(
         "import", str(case / "capture"), "--output", str(folder), "--projector", "640x400",
-        "--calibration", str(case / "calibrations" / "right.yml"),
+        "--calibration", str(case / "calibrations" / f"{calibration}.yml"),
     )  # fmt: skip
     assert made.exit_code == 0, made.output
+    for name in ("truth.ply", "visible_points.npy"):
+        shutil.copy(case / name, folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def bundle(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return imported(shared, tmp_path_factory.mktemp("axes") / "bundle", "right")
 
 
 def test_right_calibration_agrees(bundle: Path, tmp_path: Path) -> None:
@@ -42,14 +52,28 @@ def test_right_calibration_agrees(bundle: Path, tmp_path: Path) -> None:
         ("projector_turned_1_degree", "turned by 0.99° and shifted by 4.2 mm"),
     ],
 )
-def test_wrong_calibration_gives_no_mesh(
-    shared: Path, bundle: Path, tmp_path: Path, calibration: str, cause: str
-) -> None:
-    wrong = shared / "cases" / "two_axes" / "calibrations" / f"{calibration}.yml"
+def test_wrong_calibration_gives_no_mesh(shared: Path, tmp_path: Path, calibration: str, cause: str) -> None:
+    bundle = imported(shared, tmp_path / "bundle", calibration)
 
-    refused = slrig("reconstruct", str(bundle), "--calibration", str(wrong), "--output", str(tmp_path / "mesh"))
+    refused = slrig("reconstruct", str(bundle), "--output", str(tmp_path / "mesh"))
 
     assert refused.exit_code == 2
     assert "contradicts the frames of camera 'cam0'" in refused.output
     assert cause in " ".join(refused.output.split())
     assert not (tmp_path / "mesh").exists()
+
+
+def test_small_error_is_reported_and_added_to_the_standard_deviations(bundle: Path, tmp_path: Path) -> None:
+    right = read_calibration(bundle / CALIBRATION)
+    assert right.projector is not None
+    turn = Rotation.from_euler("y", 0.1, degrees=True).as_matrix() @ right.projector.rotation
+    moved = replace(right.projector, rotation=turn, translation_mm=-turn @ right.projector.centre_mm)
+    write_calibration(tmp_path / "turned.json", replace(right, projector=moved))
+
+    report = reconstructed(bundle, tmp_path / "mesh", calibration=tmp_path / "turned.json")
+
+    (note,) = (each for each in report["notes"] if "contradict the calibration" in each)
+    assert "turned by 0.10°" in note
+    assert report["truth"]["p95_mm"] > 1
+    assert 0.7 < report["truth"]["error_over_sigma_p68"] < 1.4
+    assert "that rows show" in report["mesh"]["sigma_holds"]
