@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.errors import ScanEvidenceError
 from slrig.scan.plan import PatternPlan
 from tests.golden.test_bundles import reconstructed
 from tests.golden.test_light_axis import BALL, LEFT, PROJECTOR, rig_file, scanned
@@ -204,9 +203,10 @@ def test_light_of_a_bench_is_not_shot_again_and_the_surface_is_as_good(tmp_path:
     assert truth["complete_0.3mm"] >= ideal.truth["complete_0.3mm"] - light.complete
 
 
-def test_automatic_exposure_is_refused_in_words(tmp_path: Path) -> None:
+def test_automatic_exposure_is_measured_and_noted(tmp_path: Path) -> None:
     stepped = Light(faults="[head.faults]\nexposure_step_frames = [9]\nexposure_step = 0.75\n")
-    with pytest.raises(
-        ScanEvidenceError, match=r"light changed by -2[3-7]% of white since this pattern .* automatic exposure"
-    ):
-        scanned(rig_of(tmp_path / "rig", stepped), plan=PatternPlan())
+    report = scanned(rig_of(tmp_path / "rig", stepped), plan=PatternPlan())
+    assert any("the light is not the same in all frames" in note for note in report["notes"])
+    # A step between line frames displaces points; what it does is in σ.
+    assert report["truth"]["rms_mm"] < 0.05
+    assert report["truth"]["error_over_sigma_p68"] <= 1.25
