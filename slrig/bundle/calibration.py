@@ -530,7 +530,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def parse_calibration(path: Path) -> Calibration:
-    """Return the calibration in a file as `read_calibration` does, whatever its numbers are.
+    """Return the calibration in a file as `read_calibration` does, even if its numbers are those of no rig.
     Raises CalibrationError: the file is missing, cut, has an unknown key or a number that is not finite; all faults in
     one message.
     """

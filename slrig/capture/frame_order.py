@@ -198,7 +198,7 @@ def find_order_fault(patterns: Sequence[Pattern], relations: FrameRelations, nam
         return OrderFault(f"{listed}: with them exchanged back, {checks.agreement(order)}", shows, is_sequence=whole)
     if len(failures) >= _MIN_SHIFTED:
         for orders in (_shifted_orders(len(patterns)), _orders_with_a_gap(len(patterns), name)):
-            # Whoever labels a shifted sequence may take white for black.
+            # The labels of a shifted sequence may take white for black.
             fitting = [
                 (order, cause)
                 for order, cause in orders

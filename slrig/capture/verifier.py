@@ -201,7 +201,7 @@ class FrameVerifier:
         if order is None:
             wrong = {index for each in self.reported for index in each.wrong}
             return CameraSummary(summarise(self.reported, self._patterns), frozenset(wrong))
-        # Whatever else contradicts these frames is wrong because of them.
+        # Other contradictions of these frames are caused by them.
         others = [each for each in self.reported if order.shows.keys().isdisjoint(each.suspects)]
         wrong = {*order.shows, *(index for each in others for index in each.wrong)}
         faults = (f"camera '{self.name}': {order.cause}", *summarise(others, self._patterns))

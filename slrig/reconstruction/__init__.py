@@ -16,7 +16,7 @@ from slrig.reconstruction.albedo import (
 from slrig.reconstruction.calibration_check import (
     CalibrationCheck,
     CalibrationFit,
-    Correspondences,
+    PixelPairs,
     check_calibration,
     find_correspondences,
 )
@@ -101,7 +101,6 @@ __all__ = [
     "CameraStream",
     "CodeTables",
     "CorrespondenceLimits",
-    "Correspondences",
     "DecodingLimits",
     "ExposureUse",
     "FrameStacks",
@@ -110,6 +109,7 @@ __all__ = [
     "Image",
     "MergedCurves",
     "PairRedundancy",
+    "PixelPairs",
     "ProjectorPositions",
     "ReconstructionLimits",
     "Redundancy",

@@ -54,7 +54,7 @@ _MAX_TURN_DEG = 20.0  # more is no device that moved a little
 
 
 @dataclass(frozen=True, slots=True)
-class Correspondences:
+class PixelPairs:
     """Pixels of a camera and of the projector that show the same point.
 
     camera_px, projector_px : (n, 2) float64, (column, row); sigma_px : (n,) float64, standard deviation of the
@@ -69,16 +69,16 @@ class Correspondences:
     def __len__(self) -> int:
         return len(self.camera_px)
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Correspondences:
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> PixelPairs:
         """Select some."""
-        return Correspondences(self.camera_px[index], self.projector_px[index], self.sigma_px[index], self.axis)
+        return PixelPairs(self.camera_px[index], self.projector_px[index], self.sigma_px[index], self.axis)
 
-    def thinned(self, count: int) -> Correspondences:
+    def thinned(self, count: int) -> PixelPairs:
         """At most about `count`, evenly from all."""
         return self.take(slice(None, None, max(1, len(self) // count)))
 
 
-def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axis) -> Correspondences:
+def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axis) -> PixelPairs:
     """Projector pixels of stripe points: by phase at up to 20 000 points, otherwise where stripes cross code edges.
 
     axis : the one that numbers the stripes. None are returned where the second code is read at few of the points: what
@@ -87,7 +87,7 @@ def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axi
     points = ensemble.points_px
     coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))
     if len(points) == 0 or np.isfinite(second.positions.sample(points)[0]).mean() < _MIN_READ:
-        return Correspondences(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), axis)
+        return PixelPairs(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), axis)
     if has_phase(second.frames):
         step = max(1, len(points) // _MAX_POINTS)
         points, coded = points[::step], coded[::step]
@@ -101,7 +101,7 @@ def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axi
         points = points[index] + share[:, None] * (points[index + 1] - points[index])
         coded, sigma = coded[index], np.full(len(index), _EDGE_SIGMA_PX)
     pair = (coded, other) if axis is Axis.COLUMN else (other, coded)
-    return Correspondences(points, np.column_stack(pair), sigma, axis)
+    return PixelPairs(points, np.column_stack(pair), sigma, axis)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ class _RayPairs:
     focal_px: float
 
     @classmethod
-    def from_devices(cls, camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> _RayPairs:
+    def from_devices(cls, camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> _RayPairs:
         return cls(
             pixel_rays(camera, pairs.camera_px),
             pixel_rays(projector, pairs.projector_px),
@@ -142,12 +142,12 @@ class _RayPairs:
             return float(np.mean((pp * cb - cp * pb > 0) & (cp * cb - cc * pb > 0)))
 
 
-def epipolar_residual_px(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> FloatArray:
+def epipolar_residual_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> FloatArray:
     """(n,) float64: distance of each projector pixel from the epipolar line of its camera pixel."""
     return _RayPairs.from_devices(camera, projector, pairs).residual_px()
 
 
-def _disagreement_px(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> float:
+def _disagreement_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> float:
     """Median distance from the epipolar line; infinite if points are behind a device or lenses image no such pixels."""
     rays = _RayPairs.from_devices(camera, projector, pairs)
     distance = np.abs(rays.residual_px())
@@ -156,7 +156,7 @@ def _disagreement_px(camera: Pinhole, projector: Pinhole, pairs: Correspondences
     return float(np.nanmedian(distance))
 
 
-def _depth_mm(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> FloatArray:
+def _depth_mm(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> FloatArray:
     """(n,) depth along each camera ray at which it meets the light sheet of the coded position."""
     along = 1 if pairs.axis is Axis.COLUMN else 0
     step = np.zeros(2)
@@ -194,7 +194,7 @@ class CalibrationFit:
         Both have the camera pixel of the point and its position along `axis`.
         """
         camera, projector = self.stated
-        pairs = Correspondences(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
+        pairs = PixelPairs(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
         ray = pixel_rays(self.camera, pairs.camera_px)
         depth = _depth_mm(self.camera, self.projector, pairs)
         return np.asarray(self.camera.centre_mm + depth[:, None] * ray - points_mm)
@@ -238,7 +238,7 @@ class CalibrationCheck:
         """
         fit = self.explained
         camera, projector = self.devices
-        pairs = Correspondences(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
+        pairs = PixelPairs(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
         uncertain_px = self.median_px
         if fit is not None:
             uncertain_px = fit.coded_sigma_px
@@ -276,7 +276,7 @@ class CalibrationCheck:
 
 
 def check_calibration(
-    camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray], /
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, Gray], /
 ) -> CalibrationCheck | None:
     """Test the calibration of a camera and the projector; None for fewer than 200 correspondences.
 
@@ -299,7 +299,7 @@ def _cells(pixels_px: FloatArray, size: Size, count: int) -> NDArray[np.intp]:
     return np.asarray(row * count + column)
 
 
-def _systematic_px(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> float:
+def _systematic_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> float:
     """Rms of the mean residuals of image cells, less what their noise adds."""
     residual = epipolar_residual_px(camera, projector, pairs)
     limit = 5 * np.nanmedian(np.abs(residual))
@@ -343,7 +343,7 @@ def _changed(camera: Pinhole, projector: Pinhole, x: FloatArray) -> tuple[Pinhol
     return (camera, moved) if len(x) == 5 else (_with_lens(camera, x[5:9]), _with_lens(moved, x[9:]))
 
 
-def fit_calibration(camera: Pinhole, projector: Pinhole, pairs: Correspondences, /) -> CalibrationFit | None:
+def fit_calibration(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, /) -> CalibrationFit | None:
     """Fit the pose of the projector, then also both lenses if the pose alone leaves a systematic residual.
 
     None if no small change brings the points in front of both devices.
@@ -400,7 +400,7 @@ def _covariance(
 
 
 def _coded_error_px(
-    stated: tuple[Pinhole, Pinhole], x: FloatArray, covariance: FloatArray, pairs: Correspondences
+    stated: tuple[Pinhole, Pinhole], x: FloatArray, covariance: FloatArray, pairs: PixelPairs
 ) -> tuple[float, float]:
     """Median error of the coded position that a fit x implies, and its median standard deviation."""
     camera, projector = stated
@@ -423,17 +423,17 @@ def _coded_error_px(
 
 
 @dataclass(frozen=True, slots=True)
-class _Trial:
+class _Mistake:
     """A mistake, and the devices and correspondences without it. free : number of parameters that were fitted."""
 
     cause: str
     camera: Pinhole
     projector: Pinhole
-    pairs: Correspondences
+    pairs: PixelPairs
     free: int = 0
 
 
-def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray], /) -> str:
+def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, Gray], /) -> str:
     """Name the mistake that brings the two axes into agreement, with the residual that it leaves; empty if none does.
 
     Of several, the one with fewest free parameters, unless its residual is 1.5 times that of another.
@@ -445,7 +445,7 @@ def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: Correspondence
     if fit is not None:
         limit = min(limit, _SIMPLER * fit.residual_px + 0.05)
     stated = _disagreement_px(camera, projector, pairs)
-    agreeing: list[tuple[float, _Trial]] = []
+    agreeing: list[tuple[float, _Mistake]] = []
     for trial in _trials(camera, projector, pairs, code, fit):
         if trial.free > 0 and agreeing and agreeing[0][1].free == 0:
             break  # fitting takes seconds, and could explain the same by a coincidence
@@ -465,21 +465,21 @@ def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: Correspondence
 
 
 def _trials(
-    camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray], fit: CalibrationFit | None
-) -> Iterator[_Trial]:
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, Gray], fit: CalibrationFit | None
+) -> Iterator[_Mistake]:
     """Mistakes to try, from those without a free parameter to the general ones."""
     for name, moved in _other_poses(camera, projector):
-        yield _Trial(f"the calibration holds {name}", camera, moved, pairs)
+        yield _Mistake(f"the calibration holds {name}", camera, moved, pairs)
     lenses = _with_lens_of(camera, projector), _with_lens_of(projector, camera)
-    yield _Trial("the lenses of camera and projector are exchanged in the calibration", *lenses, pairs)
+    yield _Mistake("the lenses of camera and projector are exchanged in the calibration", *lenses, pairs)
     for name, moved in _other_poses(*lenses):
-        yield _Trial(
+        yield _Mistake(
             f"camera and projector are exchanged in the calibration, which holds {name}", lenses[0], moved, pairs
         )
     for name, transformed in _other_images(pairs.camera_px, camera.size):
-        yield _Trial(f"the camera's picture is {name}", camera, projector, replace(pairs, camera_px=transformed))
+        yield _Mistake(f"the camera's picture is {name}", camera, projector, replace(pairs, camera_px=transformed))
     for name, transformed in _other_images(pairs.projector_px, projector.size):
-        yield _Trial(f"the projected image is {name}", camera, projector, replace(pairs, projector_px=transformed))
+        yield _Mistake(f"the projected image is {name}", camera, projector, replace(pairs, projector_px=transformed))
     yield from _exchanged_bits(camera, projector, pairs, code)
     yield from _other_focal_lengths(camera, projector, pairs)
     yield from _scaled(camera, projector, pairs, "camera's picture", of_camera=True)
@@ -489,7 +489,7 @@ def _trials(
             "the projector has another pose relative to the camera than the calibration says: turned by "
             f"{fit.turned_deg:.2f}° and shifted by {fit.shifted_mm:.1f} mm"
         )
-        yield _Trial(cause, fit.camera, fit.projector, pairs, 2)
+        yield _Mistake(cause, fit.camera, fit.projector, pairs, 2)
 
 
 def _with_lens_of(device: Pinhole, other: Pinhole) -> Pinhole:
@@ -528,8 +528,8 @@ def _other_images(pixels: FloatArray, size: Size) -> Iterator[tuple[str, FloatAr
 
 
 def _exchanged_bits(
-    camera: Pinhole, projector: Pinhole, pairs: Correspondences, code: tuple[Gray, Gray]
-) -> Iterator[_Trial]:
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, Gray]
+) -> Iterator[_Mistake]:
     """Two bits of the code exchanged, or one inverted."""
     for column, gray in enumerate(code):
         position = pairs.projector_px[:, column]
@@ -548,10 +548,10 @@ def _exchanged_bits(
         for name, changed in changes:
             moved = pairs.projector_px.copy()
             moved[:, column] = from_gray(changed) * gray.cell_px - gray.offset_px + within
-            yield _Trial(name, camera, projector, replace(pairs, projector_px=moved))
+            yield _Mistake(name, camera, projector, replace(pairs, projector_px=moved))
 
 
-def _other_focal_lengths(camera: Pinhole, projector: Pinhole, pairs: Correspondences) -> Iterator[_Trial]:
+def _other_focal_lengths(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> Iterator[_Mistake]:
     """Another focal length of one device."""
     for name, of_camera in (("camera", True), ("projector", False)):
 
@@ -567,7 +567,7 @@ def _other_focal_lengths(camera: Pinhole, projector: Pinhole, pairs: Corresponde
 
         found = _minimise(residual, _SCALES)
         cause = f"the focal length of the {name} is × {np.exp(found[0]):.3f} that of the calibration"
-        yield _Trial(cause, *changed(found), pairs, 1)
+        yield _Mistake(cause, *changed(found), pairs, 1)
 
 
 def _minimise(residual: Callable[[FloatArray], FloatArray], starts: Sequence[FloatArray]) -> FloatArray:
@@ -582,14 +582,14 @@ def _minimise(residual: Callable[[FloatArray], FloatArray], starts: Sequence[Flo
 
 
 def _scaled(
-    camera: Pinhole, projector: Pinhole, pairs: Correspondences, name: str, *, of_camera: bool
-) -> Iterator[_Trial]:
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, name: str, *, of_camera: bool
+) -> Iterator[_Mistake]:
     """A picture of another resolution, zoomed, shifted, or both: p' = s (p + ½) - ½ + shift."""
     pixels = pairs.camera_px if of_camera else pairs.projector_px
     size = camera.size if of_camera else projector.size
     extent, middle = float(size.width_px), np.array([size.width_px, size.height_px]) / 2
 
-    def transformed(scale: float, shift: FloatArray) -> Correspondences:
+    def transformed(scale: float, shift: FloatArray) -> PixelPairs:
         moved = (pixels + 0.5) * scale - 0.5 + shift
         return replace(pairs, camera_px=moved) if of_camera else replace(pairs, projector_px=moved)
 
@@ -608,13 +608,13 @@ def _scaled(
     shifts = [np.array([x, y]) for x in np.linspace(-0.5, 0.5, 9) for y in np.linspace(-0.5, 0.5, 9)]
     scale, shift = fit(lambda x: (float(np.exp(x[0])), np.zeros(2)), _SCALES)
     what = f"of another resolution than its matrix: × {1 / scale:.3f}"
-    yield _Trial(f"the {name} is {what}", camera, projector, transformed(scale, shift), 1)
+    yield _Mistake(f"the {name} is {what}", camera, projector, transformed(scale, shift), 1)
     scale, shift = fit(lambda x: (float(np.exp(x[0])), (1 - float(np.exp(x[0]))) * middle), _SCALES)
     what = f"zoomed about its middle: × {1 / scale:.3f}"
-    yield _Trial(f"the {name} is {what}", camera, projector, transformed(scale, shift), 1)
+    yield _Mistake(f"the {name} is {what}", camera, projector, transformed(scale, shift), 1)
     scale, shift = fit(lambda x: (1.0, extent * x), shifts)
     what = f"shifted by {-shift[0]:.0f}, {-shift[1]:.0f} px: another region, crop or offset"
-    yield _Trial(f"the {name} is {what}", camera, projector, transformed(scale, shift), 2)
+    yield _Mistake(f"the {name} is {what}", camera, projector, transformed(scale, shift), 2)
     scale, shift = fit(lambda x: (float(np.exp(x[0])), extent * x[1:]), [np.zeros(3)])
     what = f"zoomed × {1 / scale:.3f} and shifted by {-shift[0]:.0f}, {-shift[1]:.0f} px"
-    yield _Trial(f"the {name} is {what}", camera, projector, transformed(scale, shift), 9)
+    yield _Mistake(f"the {name} is {what}", camera, projector, transformed(scale, shift), 9)

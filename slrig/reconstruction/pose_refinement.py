@@ -102,7 +102,7 @@ def refine_pose(
         equations = _match(ensembles, poses(parameters), axis, pairs, widest_gap_px)
         if sum(len(each.feet_px) for each in equations) < MIN_POINTS:
             return None
-        system = _Equations(equations, pairs, poses, axis, parameters)
+        system = _PoseEquations(equations, pairs, poses, axis, parameters)
         scatter = DEVIATIONS_PER_MEDIAN * float(np.median(np.abs(system.start - np.median(system.start))))
         found = least_squares(
             system.residuals, parameters, system.derivatives, loss="soft_l1", f_scale=max(1.0, scatter), max_nfev=10,
@@ -129,7 +129,7 @@ def refine_pose(
     )
 
 
-class _Equations:
+class _PoseEquations:
     """The equations of matched curves over their standard deviations, (m,), and the six parameters themselves, as
     functions of the parameters.
     """

@@ -81,7 +81,7 @@ class Agreement:
 
 
 @dataclass(frozen=True, slots=True)
-class _TriangulatedScan:
+class _ScanData:
     """Stripes of every camera, by the devices that a calibration states. usable : cameras that measure depth."""
 
     names: tuple[str, ...]
@@ -118,7 +118,7 @@ class _TriangulatedScan:
         merged = merge_curves([parts[k] for k in pair], self.projector.centre_mm, widest_gap_px=self.gap_px)
         return float(np.percentile(np.abs(merged.residual_mm), _ONE_DEVIATION)) if len(merged.residual_mm) else 0.0
 
-    def with_pose(self, refined: RefinedPose) -> _TriangulatedScan:
+    def with_pose(self, refined: RefinedPose) -> _ScanData:
         if refined.device == len(self.names):
             calibration = replace(self.calibration, projector=refined.pose)
             return replace(self, calibration=calibration, projector=refined.pose)
@@ -134,7 +134,7 @@ class _Trial:
     """A refined pose, and what the cameras say of each other with it."""
 
     refined: RefinedPose
-    scan: _TriangulatedScan
+    scan: _ScanData
     parts: list[SheetCurves]
     pairs: Mapping[tuple[int, int], PairRedundancy]
 
@@ -179,7 +179,7 @@ def check_agreement(
         The cameras refute the calibration, and nothing shows which one is right.
     """
     usable = tuple(len(part.points_mm) > 0 for part in parts)
-    scan = _TriangulatedScan(tuple(names), tuple(stripes), usable, calibration, projector, axis, widest_gap_px)
+    scan = _ScanData(tuple(names), tuple(stripes), usable, calibration, projector, axis, widest_gap_px)
     redundancy = scan.redundancy(parts)
     pairs = _by_index(scan.names, redundancy)
     contradicting = {pair: found for pair, found in pairs.items() if found.is_contradicted}
@@ -239,7 +239,7 @@ def _odd_camera(
 
 
 def _refined_poses(
-    scan: _TriangulatedScan,
+    scan: _ScanData,
     pairs: Mapping[tuple[int, int], PairRedundancy],
     odd: int | None,
     agreeing: set[str],
@@ -262,7 +262,7 @@ def _refined_poses(
 
 
 def _with_refined_pose(
-    scan: _TriangulatedScan,
+    scan: _ScanData,
     redundancy: Redundancy,
     worst: tuple[int, int],
     best: _Trial,
@@ -317,7 +317,7 @@ def _with_refined_pose(
 
 
 def _with_one_camera(
-    scan: _TriangulatedScan,
+    scan: _ScanData,
     parts: list[SheetCurves],
     redundancy: Redundancy,
     worst: tuple[int, int],
@@ -412,9 +412,7 @@ def _worth(deviation_mm: FloatArray) -> float:
     return len(deviation_mm) / float(np.median(np.linalg.norm(deviation_mm, axis=1))) if len(deviation_mm) else 0.0
 
 
-def _unexplained_mm(
-    scan: _TriangulatedScan, parts: list[SheetCurves], pair: tuple[int, int], found: PairRedundancy
-) -> float:
+def _unexplained_mm(scan: _ScanData, parts: list[SheetCurves], pair: tuple[int, int], found: PairRedundancy) -> float:
     """Standard deviation of either camera's points beyond what is stated: each has half of the pair's variance."""
     if found.over_stated <= 1:
         return 0.0
@@ -464,11 +462,11 @@ def _refuted(found: PairRedundancy) -> str:
     )
 
 
-def _likely_cause(scan: _TriangulatedScan, pair: tuple[int, int]) -> str | None:
+def _likely_cause(scan: _ScanData, pair: tuple[int, int]) -> str | None:
     """The mistake without which the two cameras agree, None if no usual one."""
     a, b = (scan.names[k] for k in pair)
     devices = scan.calibration.cameras
-    causes: list[tuple[str, _TriangulatedScan]] = []
+    causes: list[tuple[str, _ScanData]] = []
     if devices[a].size == devices[b].size:
         exchanged = {**devices, a: devices[b], b: devices[a]}
         causes.append((f"cameras '{a}' and '{b}' are exchanged", replace(

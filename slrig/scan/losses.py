@@ -67,7 +67,7 @@ _MESH_REMEDIES = {
 }
 
 
-class ScanStage(StrEnum):
+class LossStage(StrEnum):
     """A stage of a scan that can lose what it is given."""
 
     LIGHT = "light"
@@ -76,7 +76,7 @@ class ScanStage(StrEnum):
     MESH = "mesh"
 
 
-def stage_shares(cameras: Sequence[CameraResult], *, covered: float | None = None) -> dict[ScanStage, float]:
+def stage_shares(cameras: Sequence[CameraResult], *, covered: float | None = None) -> dict[LossStage, float]:
     """Return the share, 0 to 1, that each stage kept of what it was given, of all cameras together, in their order.
 
     covered : share of the decoded pixels under the mesh; None if there is no mesh yet. A stage that was given nothing
@@ -88,24 +88,24 @@ def stage_shares(cameras: Sequence[CameraResult], *, covered: float | None = Non
     decoded = sum(seen.curves.decoded_pixels for seen in cameras)
     coded = sum(len(seen.curves.ensemble.bridge_after) for seen in cameras)
     given = {
-        ScanStage.LIGHT: (lit, asked),
-        ScanStage.CODE: (decoded if coded else 0, lit),
-        ScanStage.GEOMETRY: (coded - sum(counts[cause] for cause in _OFF_GEOMETRY), coded),
+        LossStage.LIGHT: (lit, asked),
+        LossStage.CODE: (decoded if coded else 0, lit),
+        LossStage.GEOMETRY: (coded - sum(counts[cause] for cause in _OFF_GEOMETRY), coded),
     }
     shares = {stage: float(np.clip(kept / of, 0, 1)) for stage, (kept, of) in given.items() if of}
-    return shares if covered is None else shares | {ScanStage.MESH: covered}
+    return shares if covered is None else shares | {LossStage.MESH: covered}
 
 
-def losing_stage(shares: Mapping[ScanStage, float]) -> ScanStage:
+def losing_stage(shares: Mapping[LossStage, float]) -> LossStage:
     """Return the first stage that lost all; if none did, the one that kept least, light aside: objects may be small."""
-    lost = next((stage for stage, share in shares.items() if share < _LOST and stage is not ScanStage.LIGHT), None)
-    if shares.get(ScanStage.LIGHT, 0.0) < _NO_LIGHT:
-        return ScanStage.LIGHT
-    return lost or min((stage for stage in shares if stage is not ScanStage.LIGHT), key=shares.__getitem__)
+    lost = next((stage for stage, share in shares.items() if share < _LOST and stage is not LossStage.LIGHT), None)
+    if shares.get(LossStage.LIGHT, 0.0) < _NO_LIGHT:
+        return LossStage.LIGHT
+    return lost or min((stage for stage in shares if stage is not LossStage.LIGHT), key=shares.__getitem__)
 
 
 def require_surface(
-    holds: bool, folder: Path, what: str, cameras: Sequence[CameraResult], *, stage: ScanStage | None = None
+    holds: bool, folder: Path, what: str, cameras: Sequence[CameraResult], *, stage: LossStage | None = None
 ) -> None:
     """Refuse a scan without a surface, with its figures, the cause and the remedy.
 
@@ -144,10 +144,10 @@ def _outside(seen: CameraResult) -> str:
     return f", {share:.1%} of the image outside the region that was asked for" if share else ""
 
 
-def remedy(stage: ScanStage, cameras: Sequence[CameraResult]) -> str:
+def remedy(stage: LossStage, cameras: Sequence[CameraResult]) -> str:
     """Return what most likely caused the loss of a stage, and what to do."""
     counts = _counts(cameras)
-    if stage is ScanStage.LIGHT:
+    if stage is LossStage.LIGHT:
         if all(seen.white.mean() > 0.9 * seen.full_scale for seen in cameras):
             return (
                 "White is at the camera's limit, and black too: expose for a shorter time, and look whether other "
@@ -157,12 +157,12 @@ def remedy(stage: ScanStage, cameras: Sequence[CameraResult]) -> str:
             "Look whether the projector lit the object, the lens cap is off, and the exposure leaves white well above "
             "black"
         )
-    if stage is ScanStage.CODE:
+    if stage is LossStage.CODE:
         cause = max(_CODE_REMEDIES, key=lambda each: counts[each])
         decoded = sum(seen.curves.decoded_pixels for seen in cameras)
         words = _CODE_REMEDIES[cause] if counts[cause] >= decoded else _UNSTEADY_CODE
         return f"The light is there, but the code is not: {words}"
-    if stage is ScanStage.GEOMETRY:
+    if stage is LossStage.GEOMETRY:
         if counts[Refusal.OUTSIDE_REGION] and not any(counts[cause] for cause in _OFF_GEOMETRY):
             return "The points are outside the region that was asked for: widen it"
         return f"Light and code are there, but not the geometry: {_geometry_words(counts)}"
@@ -211,9 +211,9 @@ def require_coverage(folder: Path, cameras: Sequence[CameraResult], covered: flo
         require_surface(False, folder, what, cameras, stage=_stage_after_code(cameras, covered))
 
 
-def _stage_after_code(cameras: Sequence[CameraResult], covered: float) -> ScanStage:
+def _stage_after_code(cameras: Sequence[CameraResult], covered: float) -> LossStage:
     shares = stage_shares(cameras, covered=covered)
-    return min((ScanStage.GEOMETRY, ScanStage.MESH), key=lambda stage: shares.get(stage, 0.0))
+    return min((LossStage.GEOMETRY, LossStage.MESH), key=lambda stage: shares.get(stage, 0.0))
 
 
 def code_extent_notes(cameras: Sequence[CameraResult], gray: Gray, projector: Size) -> list[str]:

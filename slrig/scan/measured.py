@@ -42,7 +42,7 @@ from slrig.scan.axis_agreement import AxisAgreement, check_cameras
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
 from slrig.scan.losses import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.losses import (
-    ScanStage,
+    LossStage,
     code_extent_notes,
     code_of,
     geometry_fault,
@@ -150,7 +150,7 @@ def _tried(
         entered("triangulate", 0.6, "")
         found = triangulate_cameras(agreeing, walked.devices, walked.axis, region, checks=agreement.checks)
         fault = geometry_fault(found.cameras, agreeing, projector, walked.axis)
-        require_surface(fault is None, folder, str(fault), found.cameras, stage=ScanStage.GEOMETRY)
+        require_surface(fault is None, folder, str(fault), found.cameras, stage=LossStage.GEOMETRY)
     except NothingToReconstructError as error:
         return error
     walked.notes[:0] = [*code_extent_notes(seen, walked.gray, walked.projector), *geometry_notes(found.cameras)]

@@ -33,7 +33,7 @@ from slrig.scan.axis_agreement import agreement_report, axis_test
 from slrig.scan.colouring import albedo_report, coloured
 from slrig.scan.coverage import covered_share, layered_share, with_uncovered_refused
 from slrig.scan.limited import marked, within
-from slrig.scan.losses import ScanStage, coverage_notes, require_coverage, require_surface
+from slrig.scan.losses import LossStage, coverage_notes, require_coverage, require_surface
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.mirror_images import mirror_image_notes, without_mirror_images, without_surface
@@ -259,7 +259,7 @@ def _meshed(
     cameras, merged, devices = found.cameras, found.merged, found.agreement.calibration
     points = merged.curves
     require_surface(
-        len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras, stage=ScanStage.GEOMETRY
+        len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras, stage=LossStage.GEOMETRY
     )
     count = f"{len(points.points_mm)} points"
     projector, first = devices.projector, cameras[0]
@@ -288,7 +288,7 @@ def _meshed(
         on_step=lambda stage: entered(stage, 0.68, count),
         runs=spacing.runs,
     )  # fmt: skip
-    require_surface(len(surface.faces) > 0, folder, without_surface(surface, projector), cameras, stage=ScanStage.MESH)
+    require_surface(len(surface.faces) > 0, folder, without_surface(surface, projector), cameras, stage=LossStage.MESH)
     entered("vertices", 0.72, count)
     cameras, merged, surface = without_mirror_images(cameras, merged, surface, found.mirror_images)
     found, points = replace(found, cameras=cameras, merged=merged), merged.curves

@@ -45,12 +45,12 @@ from slrig.reconstruction import (
     CameraCurves,
     CameraStream,
     CodeTables,
-    Correspondences,
     DecodingLimits,
     ExposureUse,
     FrameStacks,
     FusedFrames,
     Image,
+    PixelPairs,
     ReconstructionLimits,
     RegionMask,
     axis_frames,
@@ -113,7 +113,7 @@ class SecondAxisResult:
     """
 
     positions: AxisPositions
-    pairs: Correspondences
+    pairs: PixelPairs
     codes: tuple[Gray, Gray]
     residual_px: NDArray[np.float32] | None = None
 

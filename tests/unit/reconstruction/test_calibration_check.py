@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slrig.model import Axis, FloatArray, Gray, Pinhole, Size
-from slrig.reconstruction import CalibrationCheck, Correspondences, check_calibration
+from slrig.reconstruction import CalibrationCheck, PixelPairs, check_calibration
 
 CODES = Gray(Axis.COLUMN, 0, 10), Gray(Axis.ROW, 0, 9)
 Turn = tuple[float, float, float]
-Case = tuple[Pinhole, Pinhole, Correspondences]
+Case = tuple[Pinhole, Pinhole, PixelPairs]
 NOISE_PX = 0.05
 
 
@@ -38,7 +38,7 @@ def opencv_pixels(each: Pinhole, points_mm: FloatArray) -> FloatArray:
 
 
 @pytest.fixture(scope="module")
-def pairs() -> Correspondences:
+def pairs() -> PixelPairs:
     """Pixels of a wavy surface 600 mm away that both devices image, with noise of the row."""
     random = np.random.default_rng(7)
     x, y = random.uniform(-130, 130, 3000), random.uniform(-100, 100, 3000)
@@ -48,7 +48,7 @@ def pairs() -> Correspondences:
     inside &= (camera < (638, 510)).all(axis=1)
     light[:, 1] += random.normal(0, NOISE_PX, len(light))
     assert inside.sum() > 2000
-    return Correspondences(camera[inside], light[inside], np.full(inside.sum(), NOISE_PX), Axis.COLUMN)
+    return PixelPairs(camera[inside], light[inside], np.full(inside.sum(), NOISE_PX), Axis.COLUMN)
 
 
 def turned(each: Pinhole, degrees: Turn) -> Pinhole:
@@ -66,7 +66,7 @@ def checked(case: Case) -> CalibrationCheck:
     return found
 
 
-def test_right_calibration_agrees(pairs: Correspondences) -> None:
+def test_right_calibration_agrees(pairs: PixelPairs) -> None:
     found = checked((CAMERA, PROJECTOR, pairs))
 
     assert not found.is_refuted
@@ -76,7 +76,7 @@ def test_right_calibration_agrees(pairs: Correspondences) -> None:
 
 
 @pytest.mark.parametrize("degrees", [(0, 0.05, 0), (0, 0.15, 0), (0.1, 0, 0), (0, 0, 0.2)])
-def test_small_turn_of_projector_is_measured(pairs: Correspondences, degrees: Turn) -> None:
+def test_small_turn_of_projector_is_measured(pairs: PixelPairs, degrees: Turn) -> None:
     found = checked((CAMERA, turned(PROJECTOR, degrees), pairs))
 
     assert not found.is_refuted
@@ -86,7 +86,7 @@ def test_small_turn_of_projector_is_measured(pairs: Correspondences, degrees: Tu
     assert found.explained.residual_px < 2 * NOISE_PX
 
 
-def test_displacement_is_that_of_the_true_surface(pairs: Correspondences) -> None:
+def test_displacement_is_that_of_the_true_surface(pairs: PixelPairs) -> None:
     wrong = turned(PROJECTOR, (0, 0.1, 0))
     found = checked((CAMERA, wrong, pairs))
     # Points by the wrong calibration: where the camera ray meets the sheet of light of the wrong projector.
@@ -109,11 +109,11 @@ def test_displacement_is_that_of_the_true_surface(pairs: Correspondences) -> Non
     assert np.linalg.norm(measured + implied - truth, axis=1).max() < 0.15 * np.median(error_mm)
 
 
-def mirrored(pairs: Correspondences) -> FloatArray:
+def mirrored(pairs: PixelPairs) -> FloatArray:
     return np.column_stack([639 - pairs.camera_px[:, 0], pairs.camera_px[:, 1]])
 
 
-def exchanged_bits(pairs: Correspondences) -> FloatArray:
+def exchanged_bits(pairs: PixelPairs) -> FloatArray:
     """Bits 3 and 6 of 10 of the columns."""
     column = np.floor(pairs.projector_px[:, 0] + 0.5).astype(int)
     word = column ^ (column >> 1)
@@ -124,7 +124,7 @@ def exchanged_bits(pairs: Correspondences) -> FloatArray:
     return np.column_stack([word, pairs.projector_px[:, 1]])
 
 
-MISTAKES: dict[str, tuple[Callable[[Correspondences], Case], str]] = {
+MISTAKES: dict[str, tuple[Callable[[PixelPairs], Case], str]] = {
     "inverse pose": (lambda p: (CAMERA, inverse_pose(PROJECTOR), p), "the inverse pose"),
     "lenses exchanged": (
         lambda p: (
@@ -160,7 +160,7 @@ MISTAKES: dict[str, tuple[Callable[[Correspondences], Case], str]] = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistake_refutes_the_calibration_and_is_named(pairs: Correspondences, mistake: str) -> None:
+def test_mistake_refutes_the_calibration_and_is_named(pairs: PixelPairs, mistake: str) -> None:
     make, cause = MISTAKES[mistake]
 
     found = checked(make(pairs))
@@ -169,7 +169,7 @@ def test_mistake_refutes_the_calibration_and_is_named(pairs: Correspondences, mi
     assert cause in found.cause
 
 
-def test_unrelated_pixels_are_refuted_without_a_cause(pairs: Correspondences) -> None:
+def test_unrelated_pixels_are_refuted_without_a_cause(pairs: PixelPairs) -> None:
     order = np.random.default_rng(1).permutation(len(pairs))
 
     found = checked((CAMERA, PROJECTOR, replace(pairs, projector_px=pairs.projector_px[order])))
@@ -178,5 +178,5 @@ def test_unrelated_pixels_are_refuted_without_a_cause(pairs: Correspondences) ->
     assert found.cause == ""
 
 
-def test_few_pixels_say_nothing(pairs: Correspondences) -> None:
+def test_few_pixels_say_nothing(pairs: PixelPairs) -> None:
     assert check_calibration(CAMERA, PROJECTOR, pairs.take(slice(0, 50)), CODES) is None

@@ -12,7 +12,7 @@ from slrig.errors import NothingToReconstructError
 from slrig.model import Axis, FloatArray, Gray, NoiseModel, Refusal, Size
 from slrig.reconstruction.pipeline import CameraCurves
 from slrig.scan.losses import (
-    ScanStage,
+    LossStage,
     code_extent_notes,
     coverage_notes,
     geometry_fault,
@@ -58,24 +58,24 @@ def camera_with(
 @pytest.mark.parametrize(
     ("seen", "covered", "stage", "words"),
     [
-        (camera_with(points=0, decoded=0, not_lit=10_000), None, ScanStage.LIGHT, "lens cap"),
+        (camera_with(points=0, decoded=0, not_lit=10_000), None, LossStage.LIGHT, "lens cap"),
         (
             camera_with(points=0, decoded=0, not_lit=10_000, white=255),
             None,
-            ScanStage.LIGHT,
+            LossStage.LIGHT,
             "expose for a shorter time",
         ),
-        (camera_with(points=0, decoded=0, not_lit=5000, ambiguous_bit=5000), None, ScanStage.CODE, "differ too little"),
-        (camera_with(points=0, decoded=0, not_lit=5000, saturated=4900), None, ScanStage.CODE, "at the camera's limit"),
-        (camera_with(points=0, not_lit=4000, stray_code=6000), None, ScanStage.CODE, "changes from pixel to pixel"),
-        (camera_with(not_lit=4000, behind_device=4900), None, ScanStage.GEOMETRY, "4900 meet it behind a device"),
-        (camera_with(not_lit=4000, no_intersection=4900), 0.01, ScanStage.GEOMETRY, "does not fit these frames"),
-        (camera_with(not_lit=4000), 0.01, ScanStage.MESH, "the finest patterns may not resolve"),
-        (camera_with(not_lit=4000, depth_edge=5500), 0.01, ScanStage.MESH, "the code jumps nearly everywhere"),
+        (camera_with(points=0, decoded=0, not_lit=5000, ambiguous_bit=5000), None, LossStage.CODE, "differ too little"),
+        (camera_with(points=0, decoded=0, not_lit=5000, saturated=4900), None, LossStage.CODE, "at the camera's limit"),
+        (camera_with(points=0, not_lit=4000, stray_code=6000), None, LossStage.CODE, "changes from pixel to pixel"),
+        (camera_with(not_lit=4000, behind_device=4900), None, LossStage.GEOMETRY, "4900 meet it behind a device"),
+        (camera_with(not_lit=4000, no_intersection=4900), 0.01, LossStage.GEOMETRY, "does not fit these frames"),
+        (camera_with(not_lit=4000), 0.01, LossStage.MESH, "the finest patterns may not resolve"),
+        (camera_with(not_lit=4000, depth_edge=5500), 0.01, LossStage.MESH, "the code jumps nearly everywhere"),
     ],
 )
 def test_the_first_stage_that_lost_all_is_the_cause(
-    seen: CameraResult, covered: float | None, stage: ScanStage, words: str
+    seen: CameraResult, covered: float | None, stage: LossStage, words: str
 ) -> None:
     assert losing_stage(stage_shares([seen], covered=covered)) is stage
     assert words in remedy(stage, [seen])
@@ -87,7 +87,7 @@ def test_the_first_stage_that_lost_all_is_the_cause(
 def test_pixels_outside_the_region_are_nobodys_loss() -> None:
     small = camera_with(points=500, decoded=600, outside_region=9400, not_lit=0)
     assert stage_shares([small], covered=0.9) == {
-        ScanStage.LIGHT: 1.0, ScanStage.CODE: 1.0, ScanStage.GEOMETRY: 1.0, ScanStage.MESH: 0.9
+        LossStage.LIGHT: 1.0, LossStage.CODE: 1.0, LossStage.GEOMETRY: 1.0, LossStage.MESH: 0.9
     }  # fmt: skip
 
 
