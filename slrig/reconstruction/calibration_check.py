@@ -156,7 +156,7 @@ def _disagreement_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> 
     return float(np.nanmedian(distance))
 
 
-def _depth_mm(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> FloatArray:
+def coded_depth_mm(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> FloatArray:
     """(n,) depth along each camera ray at which it meets the light sheet of the coded position."""
     along = 1 if pairs.axis is Axis.COLUMN else 0
     step = np.zeros(2)
@@ -196,7 +196,7 @@ class CalibrationFit:
         camera, projector = self.stated
         pairs = PixelPairs(project(camera, points_mm), project(projector, points_mm), np.zeros(0), axis)
         ray = pixel_rays(self.camera, pairs.camera_px)
-        depth = _depth_mm(self.camera, self.projector, pairs)
+        depth = coded_depth_mm(self.camera, self.projector, pairs)
         return np.asarray(self.camera.centre_mm + depth[:, None] * ray - points_mm)
 
 
@@ -245,7 +245,7 @@ class CalibrationCheck:
             if self.is_significant:
                 uncertain_px = min(uncertain_px, max(fit.coded_error_px, self.median_px))
         pairs.projector_px[:, 0 if axis is Axis.COLUMN else 1] += uncertain_px
-        depth = _depth_mm(camera, projector, pairs)
+        depth = coded_depth_mm(camera, projector, pairs)
         shifted = camera.centre_mm + depth[:, None] * pixel_rays(camera, pairs.camera_px) - points_mm
         error = np.abs((shifted * normals).sum(axis=1))
         if fit is not None and self.is_significant:
@@ -409,7 +409,7 @@ def _coded_error_px(
     def error(at: FloatArray) -> FloatArray:
         devices = _changed(camera, projector, at)
         ray = pixel_rays(devices[0], pairs.camera_px)
-        points = devices[0].centre_mm + _depth_mm(*devices, pairs)[:, None] * ray
+        points = devices[0].centre_mm + coded_depth_mm(*devices, pairs)[:, None] * ray
         return np.asarray(project(projector, points)[:, axis] - pairs.projector_px[:, axis])
 
     here = error(x)
