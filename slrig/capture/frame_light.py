@@ -66,7 +66,8 @@ def pair_lights(
         yield FrameLight(usual), FrameLight(usual)
     for is_exposure in (False, True):
         fitted = fit_pair_light(bit, inverse, ref, is_exposure=is_exposure)
-        if fitted is not None:
+        # A smaller change passes as it is; a damaged frame may fit one.
+        if fitted is not None and max(abs(each.factor - 1) for each in fitted) > STEADY_LIGHT:
             yield fitted
 
 

@@ -145,10 +145,8 @@ def axis_test(
         known = error[np.isfinite(error)]
         typical, stated = float(np.median(known)) if len(known) else 0.0, float(np.nanmedian(stated_mm[own]))
         if not check.is_significant:
-            results.append(
-                f"{other}s agree with the calibration to {check.median_px:.2g} px; errors of it below "
-                f"{2 * typical:.2g} mm would not show"
-            )
+            hidden = f"; errors of it below {2 * typical:.2g} mm would not show" if len(known) else ""
+            results.append(f"{other}s agree with the calibration to {check.median_px:.2g} px{hidden}")
             continue
         if typical <= _MAX_OVER_STATED * stated:
             results.append(f"{other}s are {check.median_px:.2g} px from where the calibration puts them")
