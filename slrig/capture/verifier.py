@@ -745,7 +745,8 @@ class FrameVerifier:
             matched = [light.undo(frame, ref.black) for light, frame in zip(lights, frames, strict=True)]
             # Shifted lines are alike to a lamp. A frame of which a part is damaged fits a factor of its own, too.
             factors = [light.factor for light in lights]
-            if max(factors) <= (1 + STEADY_LIGHT) * min(factors) and not self._check_line_light(family, members, matched, ref):
+            is_even = max(factors) <= (1 + STEADY_LIGHT) * min(factors)
+            if is_even and not self._check_line_light(family, members, matched, ref):
                 self.findings.lights.update(zip(members, lights, strict=True))
                 self.findings.fitted_lights.update(zip(members, lights, strict=True))
                 found, frames = [], matched

@@ -229,7 +229,8 @@ class CalibrationCheck:
             _REFUTED_PX if self.explained else min(_REFUTED_PX, max(self.limit_px, _REFUTED_SIGMA * self.sigma_px))
         )
         # Residuals that real lenses leave may imply any error where light sheets hardly cross the baseline.
-        implied_px = self.coded_error_px if self.systematic_px > _MAX_SYSTEMATIC_PX else 0.0
+        is_large = self.systematic_px > _MAX_SYSTEMATIC_PX or self.median_px > 2 * self.sigma_px
+        implied_px = self.coded_error_px if is_large else 0.0
         return not max(self.median_px, implied_px) <= limit_px
 
     def error_mm(self, points_mm: FloatArray, normals: FloatArray, axis: Axis) -> FloatArray:

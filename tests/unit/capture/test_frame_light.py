@@ -163,6 +163,10 @@ ONE_CHANGE = [CHANGES[0], *(pytest.param(*each, marks=pytest.mark.slow) for each
 @pytest.mark.parametrize(("factor", "is_exposure"), CHANGES)
 def test_light_that_changes_is_no_fault(factor: Factor, is_exposure: bool, patterns: Sequence[Pattern]) -> None:
     found = summary(patterns, shots(patterns, factor, is_exposure=is_exposure))
+    if patterns is SINGLE and factor is halves:
+        # A step among the lines cannot be told from damage of one of them.
+        assert found.faults
+        return
     assert found.faults == ()
     if patterns is LINES:
         assert found.verified == len(patterns)
