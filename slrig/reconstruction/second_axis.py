@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from slrig.model import FloatArray, NoiseModel, Pinhole
 from slrig.reconstruction.decoded_image import CodeTables
@@ -33,14 +34,7 @@ _MAX_SPACING_PX = 2.0  # of neighbouring points of a stripe
 
 def sample_image(image: NDArray[Any], points_px: FloatArray) -> FloatArray:
     """(n,) float64: an image at (x, y) points, interpolated between the four pixels around each."""
-    height, width = image.shape
-    x, y = np.clip(points_px[:, 0], 0, width - 1), np.clip(points_px[:, 1], 0, height - 1)
-    left, top = np.minimum(x.astype(np.intp), max(width - 2, 0)), np.minimum(y.astype(np.intp), max(height - 2, 0))
-    dx, dy = x - left, y - top
-    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    upper = image[top, left] * (1 - dx) + image[top, right] * dx
-    lower = image[bottom, left] * (1 - dx) + image[bottom, right] * dx
-    return np.asarray(upper * (1 - dy) + lower * dy, dtype=np.float64)
+    return np.asarray(map_coordinates(image, points_px.T[::-1], output=np.float64, order=1, mode="nearest"))
 
 
 @dataclass(frozen=True, slots=True)
