@@ -21,7 +21,7 @@ from drivers.pattern_engine.options import LightOptions, UsbLightOptions
 from drivers.pattern_engine.usb import UsbCommand, UsbEngine
 from slrig.devices import Clock, DisplayedPattern, ProjectorInfo, ProjectorState, SystemClock
 from slrig.errors import DeviceGoneError, SlrigError, UnsupportedByDeviceError
-from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
+from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, Primary, Sine, White
 
 MAX_UNATTENDED_S = 2.0
 """Time after the death of its host in which a shown pattern becomes dark."""
@@ -106,6 +106,8 @@ def describe_pattern(pattern: Pattern) -> str:
         case LineShift():
             width = f", {pattern.line_width_px} px wide" if pattern.line_width_px > 1 else ""
             return f"{pattern.axis} lines {pattern.shift} of {pattern.period_px}{width}"
+        case Sine():
+            return f"{pattern.axis} sinusoid, period {pattern.period_px:g} px, shift {pattern.shift} of {pattern.steps}"
 
 
 WAKE_TIMEOUT_S = 10.0

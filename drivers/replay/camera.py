@@ -22,7 +22,7 @@ from slrig.devices import (
     Trigger,
 )
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError, setting
-from slrig.model import Black, Frame, Gray, LineShift, Pattern, PatternSequence, Primary, Shot, White
+from slrig.model import Black, Frame, Gray, LineShift, Pattern, PatternSequence, Primary, Shot, Sine, White
 
 _TICK_NS = 1_000
 _GLANCE_S = 0.05
@@ -377,7 +377,7 @@ def _describe_pattern(pattern: Pattern) -> str:
     match pattern:
         case Gray():
             return f"bit {pattern.bit} of {_describe_family(pattern)}"
-        case LineShift():
+        case LineShift() | Sine():
             return f"shift {pattern.shift} of {_describe_family(pattern)}"
         case _:
             return _describe_family(pattern)
@@ -398,3 +398,5 @@ def _describe_family(pattern: Pattern) -> str:
             )
         case LineShift():
             return f"{pattern.axis} lines of {pattern.line_width_px} px, period {pattern.period_px} px"
+        case Sine():
+            return f"{pattern.axis} sinusoids in {pattern.steps} steps, period {pattern.period_px:g} px"

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import Black, Gray, Integers, LineShift, Pattern, Primary, White, gray_index, to_gray
+from slrig.model import Black, Gray, Integers, LineShift, Pattern, Primary, Sine, White, gray_index, to_gray
 
 Samples = NDArray[np.float32]
 SampleMask = NDArray[np.bool_]
@@ -127,6 +127,10 @@ def describe_pattern(index: int, pattern: Pattern) -> str:
             )
         case LineShift():
             description = f"{pattern.axis} lines, shift {pattern.shift} of {pattern.period_px}"
+        case Sine():
+            description = (
+                f"{pattern.axis} sinusoid of {pattern.period_px:g} px, shift {pattern.shift} of {pattern.steps}"
+            )
     return f"pattern {index} ({description})"
 
 

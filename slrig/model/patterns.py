@@ -18,6 +18,9 @@ Integers = NDArray[np.integer[Any]]
 MIN_LINE_STEPS = 3
 """Shifts of a line within a period: with two, the direction is ambiguous."""
 
+MIN_SINE_PERIOD_PX = 4.0
+"""Of a sinusoid: shorter ones are not sampled as such by whole pixels."""
+
 
 def to_gray(index: ArrayLike) -> Integers:
     """Return the code word g = i ^ (i >> 1) of each cell index; integers of any shape.
@@ -156,6 +159,34 @@ class LineShift:
         return replace(self, shift=(self.shift + self.line_width_px) % self.period_px) if self.is_half_lit else None
 
 
+@dataclass(frozen=True, slots=True)
+class Sine:
+    """One frame of a shifted sinusoid: lights position c by ½ + ½ cos 2π(c/period_px − shift/steps).
+
+    steps : equal parts of the period in which `shift` counts; 1 for a period that is played without shifts.
+    """
+
+    axis: Axis
+    period_px: float
+    shift: int
+    steps: int
+    kind: Literal["sine"] = "sine"
+
+    def __post_init__(self) -> None:
+        if not self.period_px >= MIN_SINE_PERIOD_PX or self.steps < 1 or not 0 <= self.shift < self.steps:
+            raise PatternError(
+                f"sine pattern: need period ≥ {MIN_SINE_PERIOD_PX:g} px, steps ≥ 1, 0 ≤ shift < steps; found period "
+                f"{self.period_px:g} px, shift {self.shift} of {self.steps} steps"
+            )
+
+    @property
+    def inverse(self) -> Sine | None:
+        """The sinusoid half a period further; None if that is no whole number of steps."""
+        if self.steps % 2:
+            return None
+        return replace(self, shift=(self.shift + self.steps // 2) % self.steps)
+
+
 def has_even_shifts(lines: Sequence[LineShift]) -> bool:
     """True if the shifts divide the period evenly into three or more steps. lines : sorted by shift."""
     count = len(lines)
@@ -192,7 +223,7 @@ def diagnostic_line_pairs(lines: Sequence[LineShift]) -> tuple[tuple[LineShift, 
     return (pairs[0], pairs[len(pairs) // 2]) if len(pairs) > 1 else ()
 
 
-Pattern = White | Black | Primary | Gray | LineShift
+Pattern = White | Black | Primary | Gray | LineShift | Sine
 
 
 @dataclass(frozen=True, slots=True)

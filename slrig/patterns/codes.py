@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Size, from_gray, to_gray
+from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Sine, Size, from_gray, to_gray
 
 MIN_BORDER_DISTANCE_PX = 3.0
 """Least distance of a line's centre from the projector's first and last position, px: see `line_positions`."""
@@ -77,9 +77,9 @@ def gray_profile(pattern: Gray, size: Size) -> NDArray[np.uint8]:
     return along_axis(lit, pattern.axis)
 
 
-def along_axis(lit: NDArray[np.bool_], axis: Axis) -> NDArray[np.uint8]:
-    """Spread a (n,) bool profile to (1, n) for columns or (n, 1) for rows, uint8, 255 where lit."""
-    profile = np.where(lit, np.uint8(255), np.uint8(0))
+def along_axis(light: NDArray[np.bool_ | np.float64], axis: Axis) -> NDArray[np.uint8]:
+    """Spread a (n,) profile, 0 dark to 1 lit, to (1, n) for columns or (n, 1) for rows, uint8, 0 dark to 255 lit."""
+    profile: NDArray[np.uint8] = np.rint(np.round(255.0 * light, 9)).astype(np.uint8)
     return profile[np.newaxis, :] if axis is Axis.COLUMN else profile[:, np.newaxis]
 
 
@@ -130,6 +130,17 @@ def line_profile(pattern: LineShift, size: Size) -> NDArray[np.uint8]:
         )
     lit = (np.arange(extent_px) - pattern.shift) % pattern.period_px < pattern.line_width_px
     return along_axis(lit, pattern.axis)
+
+
+def sine_profile(pattern: Sine, size: Size) -> NDArray[np.uint8]:
+    """Light of one frame of a sinusoid: (1, Wp) uint8 for columns, (Hp, 1) for rows; 255 is lit, 0 dark.
+
+    >>> from slrig.model import Axis, Sine, Size
+    >>> sine_profile(Sine(Axis.COLUMN, 8.0, 0, 4), Size(8, 1))
+    array([[255, 218, 128,  37,   0,  37, 128, 218]], dtype=uint8)
+    """
+    turns = np.arange(size.along(pattern.axis)) / pattern.period_px - pattern.shift / pattern.steps
+    return along_axis(0.5 + 0.5 * np.cos(2 * np.pi * turns), pattern.axis)
 
 
 def line_number(code_centre_px: ArrayLike, pattern: LineShift) -> NDArray[np.int64]:

@@ -20,12 +20,13 @@ from slrig.model import (
     PatternSequence,
     Primary,
     SequenceName,
+    Sine,
     Size,
     White,
     diagnostic_bits,
     diagnostic_line_pairs,
 )
-from slrig.patterns.codes import gray_bits, gray_profile, line_profile
+from slrig.patterns.codes import gray_bits, gray_profile, line_profile, sine_profile
 
 GRAY_ONLY_CELL_PX = 2
 """Chosen: without lines edges are all that is measured, and those of cells of 1 px blur into each other."""
@@ -159,6 +160,8 @@ def profile(pattern: Pattern, size: Size) -> NDArray[np.uint8]:
             return gray_profile(pattern, size)
         case LineShift():
             return line_profile(pattern, size)
+        case Sine():
+            return sine_profile(pattern, size)
 
 
 def encode(patterns: Sequence[Pattern], size: Size) -> PatternSequence:
