@@ -46,6 +46,14 @@ of terraces and boxes.
 
 _SHADOW_SHARE = 0.5  # of the displacement by fading light, chosen for shadows of posts on plates 8 and 40 mm behind
 
+_MEAN_PX = 17  # window over which the squared displacements by asymmetric light are averaged
+_MIN_EXCESS = 2.5  # standard deviations of that average beyond its noise
+_USUAL_SHARE = 0.25  # of the lit pixels have no light from other surfaces, as far as one scan can say
+_MIN_HARMONIC = 0.2  # of the amplitude of narrow lines: below, the harmonic says nothing of the line
+
+_QUANTILE_STEP = 7  # of the pixels
+_TINY = np.float32(1e-6)
+
 _SHADOW_SIGMA = 3.0
 """Standard deviations of the camera's blur within which light fades out at a border."""
 
@@ -275,6 +283,63 @@ def centroid_residual_px(
         pixels = cv2.blur(beside.astype(np.float32), window)
         mean += _SHADOW_SHARE**2 * cv2.blur(of_shadow, window) / np.maximum(pixels, np.float32(1 / _FITTED_PX**2))
     return np.asarray(np.sqrt(np.maximum(mean, 0)), dtype=np.float32)  # running sums may round to below 0
+
+
+def asymmetry_sigma_px(
+    frames: AxisFrames, measured: PositionMap, usable: NDArray[np.bool_], noise: NoiseModel, /
+) -> NDArray[np.float32]:
+    """(H, W): standard deviation, projector px, by which light from other surfaces displaces points fitted to 5 x 5
+    pixels.
+
+    A line that lights a pixel straight from the projector is symmetric about its centre, whatever blur and response:
+    the phases of its harmonics agree. Light that comes by way of another surface displaces each harmonic in its own
+    way; the difference between the positions by a higher and by the first one is about as large as the displacement
+    by the first. Counted where noise does not explain it, beyond what most of the image shows.
+    """
+    patterns = frames.line_patterns
+    period_px, width_px, count = patterns[0].period_px, patterns[0].line_width_px, len(patterns)
+    amplitudes = {order: np.sin(np.pi * order * width_px / period_px) for order in (2, 3) if 2 * order < count}
+    order = next((each for each, amplitude in amplitudes.items() if abs(amplitude) > _MIN_HARMONIC), None)
+    difference, variance = (np.zeros(usable.shape, dtype=np.float32) for _ in range(2))
+    if order is None or not usable.any():
+        return difference
+    turn = 2 * np.pi * order / period_px
+    angle = turn * np.array([each.centre_px for each in patterns])
+    # A line wider than half a wave of the harmonic has it upside down.
+    offset = 0.0 if amplitudes[order] > 0 else np.pi
+
+    sums = np.array([np.cos(angle), np.sin(angle), np.full(count, 1 / count)], dtype=np.float32)
+
+    def band(first: int, last: int) -> None:
+        rows = slice(first, last)
+        lines = stack_rows(frames.lines, rows)
+        real, imaginary, level = (sums @ lines.reshape(count, -1)).reshape(3, *lines.shape[1:])
+        apart = np.arctan2(imaginary, real) - np.float32(offset) - np.float32(turn) * measured.position[rows]
+        apart -= np.float32(2 * np.pi) * np.rint(apart / np.float32(2 * np.pi))
+        by_harmonic = noise.rows(rows).variance(level)
+        by_harmonic *= np.float32(count / (2 * turn * turn)) / np.maximum(real * real + imaginary * imaginary, _TINY)
+        by_harmonic += measured.sigma[rows] ** 2
+        np.copyto(difference[rows], apart / np.float32(turn), where=usable[rows])
+        np.copyto(variance[rows], by_harmonic, where=usable[rows])
+
+    in_bands(band, len(usable), rows_at_most=rows_per_band(frames.lines, usable.shape[1]))
+    # The points follow the positions as the fit weighs its pixels.
+    weights = stencils()[0][0, : _FITTED_PX**2].reshape(_FITTED_PX, _FITTED_PX)
+    whole = cv2.erode(usable.view(np.uint8), np.ones_like(weights, dtype=np.uint8), borderValue=0)
+    squared = cv2.filter2D(difference, -1, weights) ** 2
+    noise_squared = cv2.filter2D(variance, -1, weights**2)
+    squared -= noise_squared
+    pixels = cv2.blur(whole.astype(np.float32), (_MEAN_PX, _MEAN_PX))
+    known = usable & (pixels > 0)
+    if not known.any():
+        return np.zeros_like(difference)
+    squared, noise_squared = (
+        cv2.blur(each * whole, (_MEAN_PX, _MEAN_PX)) / np.maximum(pixels, _TINY) for each in (squared, noise_squared)
+    )
+    squared -= max(float(np.quantile(squared[known][::_QUANTILE_STEP], _USUAL_SHARE)), 0.0)
+    independent = np.maximum(pixels * (_MEAN_PX / _FITTED_PX) ** 2, 1)
+    squared[~(known & (squared > _MIN_EXCESS * noise_squared * np.sqrt(2 / independent)))] = 0
+    return np.asarray(np.sqrt(squared), dtype=np.float32)
 
 
 def _estimate_variance(

@@ -57,6 +57,7 @@ from slrig.reconstruction.identification import (
     mark_refused_pixels,
 )
 from slrig.reconstruction.phase import (
+    asymmetry_sigma_px,
     centroid_residual_px,
     line_step_px,
     near_edges,
@@ -320,6 +321,11 @@ def align_points(
         residual_px = centroid_residual_px(measured, centred, usable, blur_px, period_px, near_shadow)
         measured = correct_curvature(centred, usable, blur_px**2, period_px)
         extra_sigma_px = np.hypot(step_sigma_px(near_step), residual_px)
+        asymmetry_px = asymmetry_sigma_px(frames, measured, usable, image.position_noise)
+        if asymmetry_px.any():
+            slope = np.hypot(*np.gradient(measured.position))
+            along = np.divide(asymmetry_px, slope, out=np.zeros_like(asymmetry_px), where=asymmetry_px > 0)
+            extra_sigma_px = np.hypot(extra_sigma_px, np.nan_to_num(along))
         del centred, residual_px
         marked = mark_refused_pixels(
             code, frames, measured.position, tables.position_table, near_shadow, near_step

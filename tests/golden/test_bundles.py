@@ -82,8 +82,9 @@ def test_what_a_wall_shows_in_a_mirror_is_no_surface(shared: Path, tmp_path: Pat
     truth = report["truth"]
     assert truth["false_area_0.5mm"] <= 0.01
     assert truth["facing_camera_area"] >= 0.999
+    assert 0.8 <= truth["error_over_sigma_p68"] <= 1.25
     # As much as with the phantom, which was half of the mesh.
     assert truth["complete_0.1mm"] >= 0.995 * 0.5503
     assert report["mesh"]["mirror_images"]["area_share"] > 0.4
     assert report["cameras"]["cam0"]["refused_pixels"]["mirror_image"] > 15_000
-    assert sum(note.startswith("mirror images: 5") for note in report["notes"]) == 1
+    assert sum(note.startswith("mirror images: ") for note in report["notes"]) == 1

@@ -11,6 +11,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.stats import chi2
 
 from slrig.kernels import in_bands
@@ -21,11 +22,12 @@ from slrig.reconstruction.phase import (
     FittedPoints,
     PositionMap,
     allocate_points,
+    asymmetry_sigma_px,
     fit_arguments,
     has_phase,
     position_map,
 )
-from slrig.reconstruction.surface_fit import MIN_POINTS, fit_kernel
+from slrig.reconstruction.surface_fit import MIN_POINTS, fit_kernel, stencils
 from tests.unit.reconstruction.builders import bars, cells_of, code_frames, grid, nearest_lines
 
 SHAPE = (60, 80)
@@ -122,6 +124,36 @@ def test_the_projectors_response_and_albedo_do_not_bend_the_map(gamma: float) ->
     middle, _ = nearest_lines(lines(), 4, 100)
     beside = position_map(frames_of(images, lines()), QUIET, cells_of(position, 4), middle)
     np.testing.assert_allclose(beside.position, position, atol=2e-3)
+
+
+@pytest.mark.parametrize(("width_px", "steps"), [(1, 8), (4, 8), (2, 4)])
+def test_light_by_way_of_a_mirror_widens_the_deviation_by_what_it_displaces(width_px: int, steps: int) -> None:
+    x, y = grid((120, 240))
+    position = 60.0 + 1.1 * x + 0.05 * y
+    patterns = tuple(LineShift(Axis.COLUMN, shift, 8, width_px) for shift in range(0, 8, 8 // steps))
+    noise = NoiseModel(0.7, 0.01)
+    # The right half also shows the lines in a mirror, which reverses their order.
+    share = np.where(x < 120, 0.0, 0.15)
+    images = 10 + 150 * np.stack(
+        [bars(position, line, 0.9) + share * bars(400.0 - 0.9 * x, line, 0.9) for line in patterns]
+    )
+    noisy = images + np.sqrt(noise.read_variance + noise.slope * images) * np.random.default_rng(5).normal(
+        0, 1, images.shape
+    )
+    middle, _ = nearest_lines(patterns, 4, 500)
+    code, usable = cells_of(position, 4), np.ones(x.shape, dtype=np.bool_)
+    exact, measured = (position_map(frames_of(each, patterns), noise, code, middle) for each in (images, noisy))
+    stated = asymmetry_sigma_px(frames_of(noisy, patterns), measured, usable, noise)
+    weights = stencils()[0][0, :25].reshape(5, 5)
+    displaced = ndimage.correlate((exact.position - position).astype(np.float64), weights.astype(np.float64))
+    inside = (x > 140) & (x < 230) & (y > 10) & (y < 110)
+    assert (stated[x < 100] > 0).mean() < 0.02
+    if steps == 4:
+        # Four steps have no harmonic beside the first.
+        assert not stated.any()
+        return
+    ratio = np.sqrt(np.mean(displaced[inside] ** 2) / np.mean(stated[inside].astype(np.float64) ** 2))
+    assert 0.6 < ratio < 1.5
 
 
 def test_a_pixel_with_a_clipped_line_has_no_position() -> None:
