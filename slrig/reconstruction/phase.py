@@ -52,6 +52,8 @@ _USUAL_SHARE = 0.25  # of the lit pixels have no light from other surfaces, as f
 _MIN_HARMONIC = 0.2  # of the amplitude of narrow lines: below, the harmonic says nothing of the line
 
 _QUANTILE_STEP = 7  # of the pixels
+_MAX_MOVED_PX = 0.02  # projector px, by changes of brightness; a harmonic of threefold frequency moves as much again
+_MIN_KNOWN = 0.1  # share of a window whose pixels say something
 _TINY = np.float32(1e-6)
 
 _SHADOW_SIGMA = 3.0
@@ -286,7 +288,7 @@ def centroid_residual_px(
 
 
 def asymmetry_sigma_px(
-    frames: AxisFrames, measured: PositionMap, usable: NDArray[np.bool_], noise: NoiseModel, /
+    frames: AxisFrames, measured: PositionMap, centred: PositionMap, usable: NDArray[np.bool_], noise: NoiseModel, /
 ) -> NDArray[np.float32]:
     """(H, W): standard deviation, projector px, by which light from other surfaces displaces points fitted to 5 x 5
     pixels.
@@ -294,7 +296,8 @@ def asymmetry_sigma_px(
     A line that lights a pixel straight from the projector is symmetric about its centre, whatever blur and response:
     the phases of its harmonics agree. Light that comes by way of another surface displaces each harmonic in its own
     way; the difference between the positions by a higher and by the first one is about as large as the displacement
-    by the first. Counted where noise does not explain it, beyond what most of the image shows.
+    by the first. Counted where noise does not explain it, beyond what most of the image shows. Pixels whose brightness
+    changes sharply, as `centred` (from `resample_to_pixel_centres`) tells, say nothing: it makes lines asymmetric, too.
     """
     patterns = frames.line_patterns
     period_px, width_px, count = patterns[0].period_px, patterns[0].line_width_px, len(patterns)
@@ -325,12 +328,13 @@ def asymmetry_sigma_px(
     in_bands(band, len(usable), rows_at_most=rows_per_band(frames.lines, usable.shape[1]))
     # The points follow the positions as the fit weighs its pixels.
     weights = stencils()[0][0, : _FITTED_PX**2].reshape(_FITTED_PX, _FITTED_PX)
-    whole = cv2.erode(usable.view(np.uint8), np.ones_like(weights, dtype=np.uint8), borderValue=0)
+    even = usable & (np.abs(centred.position - measured.position) < _MAX_MOVED_PX)
+    whole = cv2.erode(even.view(np.uint8), np.ones_like(weights, dtype=np.uint8), borderValue=0)
     squared = cv2.filter2D(difference, -1, weights) ** 2
     noise_squared = cv2.filter2D(variance, -1, weights**2)
     squared -= noise_squared
     pixels = cv2.blur(whole.astype(np.float32), (_MEAN_PX, _MEAN_PX))
-    known = usable & (pixels > 0)
+    known = usable & (pixels > _MIN_KNOWN)
     if not known.any():
         return np.zeros_like(difference)
     squared, noise_squared = (
@@ -338,7 +342,7 @@ def asymmetry_sigma_px(
     )
     squared -= max(float(np.quantile(squared[known][::_QUANTILE_STEP], _USUAL_SHARE)), 0.0)
     independent = np.maximum(pixels * (_MEAN_PX / _FITTED_PX) ** 2, 1)
-    squared[~(known & (squared > _MIN_EXCESS * noise_squared * np.sqrt(2 / independent)))] = 0
+    squared[~(known & (squared > _MIN_EXCESS * np.maximum(noise_squared, _TINY) * np.sqrt(2 / independent)))] = 0
     return np.asarray(np.sqrt(squared), dtype=np.float32)
 
 

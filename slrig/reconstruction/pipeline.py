@@ -319,9 +319,9 @@ def align_points(
         near_step = near_steps(centred, resolution_px, limits.edges)
         usable = np.isfinite(centred.position) & ~near_shadow & ~near_step
         residual_px = centroid_residual_px(measured, centred, usable, blur_px, period_px, near_shadow)
+        asymmetry_px = asymmetry_sigma_px(frames, measured, centred, usable, image.position_noise)
         measured = correct_curvature(centred, usable, blur_px**2, period_px)
         extra_sigma_px = np.hypot(step_sigma_px(near_step), residual_px)
-        asymmetry_px = asymmetry_sigma_px(frames, measured, usable, image.position_noise)
         if asymmetry_px.any():
             slope = np.hypot(*np.gradient(measured.position))
             along = np.divide(asymmetry_px, slope, out=np.zeros_like(asymmetry_px), where=asymmetry_px > 0)

@@ -143,7 +143,7 @@ def test_light_by_way_of_a_mirror_widens_the_deviation_by_what_it_displaces(widt
     middle, _ = nearest_lines(patterns, 4, 500)
     code, usable = cells_of(position, 4), np.ones(x.shape, dtype=np.bool_)
     exact, measured = (position_map(frames_of(each, patterns), noise, code, middle) for each in (images, noisy))
-    stated = asymmetry_sigma_px(frames_of(noisy, patterns), measured, usable, noise)
+    stated = asymmetry_sigma_px(frames_of(noisy, patterns), measured, measured, usable, noise)
     weights = stencils()[0][0, :25].reshape(5, 5)
     displaced = ndimage.correlate((exact.position - position).astype(np.float64), weights.astype(np.float64))
     inside = (x > 140) & (x < 230) & (y > 10) & (y < 110)
