@@ -693,7 +693,12 @@ class FrameVerifier:
     def _check_line(self, index: int, pattern: LineShift, ref: ReferenceFrames) -> list[Contradiction]:
         known = self.findings.codes.get(pattern.axis)
         if known is None:
-            self.findings.pending_lines.append(index)
+            has_code = any(isinstance(each, Gray) and each.axis is pattern.axis for each in self._patterns)
+            if has_code:
+                self.findings.pending_lines.append(index)
+            elif frame_checks.is_partly_lit(self._samples[index], ref):
+                # Nothing numbers lines that cross those of the scan. That they repeat no other frame is known here.
+                self.findings.verified.add(index)
             return []
         code, gray = known
         first_index = self.findings.first_seen_index

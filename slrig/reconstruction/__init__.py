@@ -19,6 +19,7 @@ from slrig.reconstruction.calibration_check import (
     PixelPairs,
     check_calibration,
     find_correspondences,
+    find_cross_line_pairs,
 )
 from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
@@ -136,6 +137,7 @@ __all__ = [
     "exposure_count",
     "exposure_use",
     "find_correspondences",
+    "find_cross_line_pairs",
     "fuse_colour",
     "fuse_exposures",
     "has_phase",

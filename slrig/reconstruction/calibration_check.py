@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from slrig.model import Axis, FloatArray, Gray, Pinhole, Size, from_gray, to_gray
+from slrig.model import Axis, FloatArray, Gray, LineShift, Pinhole, Size, from_gray, to_gray
 from slrig.reconstruction.identification import StripeEnsemble
 from slrig.reconstruction.phase import has_phase
-from slrig.reconstruction.second_axis import SecondAxis
+from slrig.reconstruction.second_axis import SecondAxis, find_crossings, sample_image
 from slrig.reconstruction.triangulation import pixel_rays, project
 
 _MAX_POINTS = 20_000  # of a check; their mean is known to a hundredth of their scatter
@@ -58,20 +58,27 @@ class PixelPairs:
     """Pixels of a camera and of the projector that show the same point.
 
     camera_px, projector_px : (n, 2) float64, (column, row); sigma_px : (n,) float64, standard deviation of the
-    coordinate of the second axis; axis : the one that numbers the stripes, whose coordinate is exact.
+    coordinate of the second axis; axis : the one that numbers the stripes, whose coordinate is exact. period_px : the
+    second coordinate is known but for multiples of it; infinite if it is known.
     """
 
     camera_px: FloatArray
     projector_px: FloatArray
     sigma_px: FloatArray
     axis: Axis
+    period_px: float = np.inf
 
     def __len__(self) -> int:
         return len(self.camera_px)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> PixelPairs:
         """Select some."""
-        return PixelPairs(self.camera_px[index], self.projector_px[index], self.sigma_px[index], self.axis)
+        return replace(
+            self,
+            camera_px=self.camera_px[index],
+            projector_px=self.projector_px[index],
+            sigma_px=self.sigma_px[index],
+        )
 
     def thinned(self, count: int) -> PixelPairs:
         """At most about `count`, evenly from all."""
@@ -104,6 +111,34 @@ def find_correspondences(ensemble: StripeEnsemble, second: SecondAxis, axis: Axi
     return PixelPairs(points, np.column_stack(pair), sigma, axis)
 
 
+def find_cross_line_pairs(
+    ensemble: StripeEnsemble, difference: NDArray[np.float32], lines: LineShift, camera: Pinhole, projector: Pinhole, /,
+    *, origin_px: tuple[int, int] = (0, 0),
+) -> PixelPairs:  # fmt: skip
+    """Projector pixels where stripes cross the edges of half-lit lines along the other axis, played once.
+
+    difference : (H, W), light of that frame minus the middle of white and black. Which of the edges a crossing belongs
+    to is not known: it gets the one nearest to the calibration's prediction.
+    """
+    axis = Axis.COLUMN if lines.axis is Axis.ROW else Axis.ROW
+    ends = ensemble.bridge_after.copy()
+    ends[ensemble.offsets[1:] - 1] = True
+    index, share = find_crossings(ensemble.points_px, ends, sample_image(difference, ensemble.points_px))
+    points = ensemble.points_px[index]
+    points = points + share[:, None] * (ensemble.points_px[index + 1] - points) + np.array(origin_px)
+    coded = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))[index]
+    along = 1 if axis is Axis.COLUMN else 0
+    middle_px = np.full(len(index), (projector.size.along(lines.axis) - 1) / 2)
+    pair = np.column_stack((coded, middle_px) if along else (middle_px, coded))
+    pairs = PixelPairs(points, pair, np.full(len(index), _EDGE_SIGMA_PX), axis, float(lines.line_width_px))
+    depth = coded_depth_mm(camera, projector, pairs)[:, None]
+    predicted = project(projector, camera.centre_mm + depth * pixel_rays(camera, points))[:, along]
+    first_px = lines.shift - 0.5
+    steps = np.rint((np.where(np.isfinite(predicted), predicted, middle_px) - first_px) / lines.line_width_px)
+    pair[:, along] = first_px + steps * lines.line_width_px
+    return pairs
+
+
 @dataclass(frozen=True, slots=True)
 class _RayPairs:
     """Rays of both devices in the world, (n, 3) each, and what the epipolar distance needs."""
@@ -113,6 +148,8 @@ class _RayPairs:
     baseline_mm: FloatArray
     rotation: FloatArray
     focal_px: float
+    along: int
+    period_px: float
 
     @classmethod
     def from_devices(cls, camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> _RayPairs:
@@ -122,6 +159,8 @@ class _RayPairs:
             projector.centre_mm - camera.centre_mm,
             projector.rotation,
             float(np.sqrt(projector.matrix[0, 0] * projector.matrix[1, 1])),
+            1 if pairs.axis is Axis.COLUMN else 0,
+            pairs.period_px,
         )
 
     def residual_px(self) -> FloatArray:
@@ -129,8 +168,12 @@ class _RayPairs:
         line = np.cross(self.baseline_mm, self.camera) @ self.rotation.T
         pixel = self.projector @ self.rotation.T
         with np.errstate(invalid="ignore", divide="ignore"):
-            distance = (line * pixel).sum(axis=1) / pixel[:, 2] / np.hypot(line[:, 0], line[:, 1])
-        return np.asarray(distance * self.focal_px)
+            length = np.hypot(line[:, 0], line[:, 1])
+            distance = (line * pixel).sum(axis=1) / pixel[:, 2] / length * self.focal_px
+            if np.isfinite(self.period_px):
+                period = self.period_px * np.abs(line[:, self.along]) / length
+                distance -= period * np.rint(distance / period)
+        return np.asarray(distance)
 
     def in_front(self) -> float:
         """Share of the points in front of both devices."""
@@ -279,11 +322,11 @@ class CalibrationCheck:
 
 
 def check_calibration(
-    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, Gray], /
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...], /
 ) -> CalibrationCheck | None:
     """Test the calibration of a camera and the projector; None for fewer than 200 correspondences.
 
-    code : Gray codes of columns and rows, to try exchanged bits.
+    code : Gray codes of the axes, to try exchanged bits.
     """
     if len(pairs) < _MIN_POINTS:
         return None
@@ -436,11 +479,11 @@ class _Mistake:
     free: int = 0
 
 
-def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, Gray], /) -> str:
+def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...], /) -> str:
     """Name the mistake that brings the two axes into agreement, with the residual that it leaves; empty if none does.
 
     Of several, the one with fewest free parameters, unless its residual is 1.5 times that of another.
-    code : Gray codes of columns and rows.
+    code : Gray codes of the axes.
     """
     pairs = pairs.thinned(_TRIAL_POINTS)
     limit = _AGREES_PX + float(np.median(pairs.sigma_px))
@@ -468,7 +511,7 @@ def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, co
 
 
 def _trials(
-    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, Gray], fit: CalibrationFit | None
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...], fit: CalibrationFit | None
 ) -> Iterator[_Mistake]:
     """Mistakes to try, from those without a free parameter to the general ones."""
     for name, moved in _other_poses(camera, projector):
@@ -531,10 +574,11 @@ def _other_images(pixels: FloatArray, size: Size) -> Iterator[tuple[str, FloatAr
 
 
 def _exchanged_bits(
-    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, Gray]
+    camera: Pinhole, projector: Pinhole, pairs: PixelPairs, code: tuple[Gray, ...]
 ) -> Iterator[_Mistake]:
     """Two bits of the code exchanged, or one inverted."""
-    for column, gray in enumerate(code):
+    for gray in code:
+        column = 0 if gray.axis is Axis.COLUMN else 1
         position = pairs.projector_px[:, column]
         cell = np.floor((position + 0.5 + gray.offset_px) / gray.cell_px).astype(np.int64)
         word = np.asarray(to_gray(np.clip(cell, 0, 2**gray.bits - 1)), dtype=np.int64)

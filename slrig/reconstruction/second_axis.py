@@ -90,28 +90,16 @@ class SecondAxis:
 
         points_px : (n, 2) float64, points of stripes in order; ends : (n,) bool, True where the next point is no
         neighbour. A crossing belongs to the edge nearest to what `positions` says there.
-
-        A bit less its inverse is sampled at each point. Its root is that of the straight line between two points,
-        corrected by the second differences around them.
         """
         frames = self.frames
         approximate, _ = self.positions.sample(points_px)
         reference = [frames.middle] * len(frames.bits) if frames.inverses is None else frames.inverses
-        ends = ends.copy()
-        ends[:-1] |= np.linalg.norm(np.diff(points_px, axis=0), axis=1) > _MAX_SPACING_PX
-        inner = ~(ends[:-3] | ends[1:-2] | ends[2:-1])
         found = [AxisEdges(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
         for bit, other, positions in zip(frames.bits, reference, self.edges_px, strict=True):
-            value = sample_image(bit, points_px) - sample_image(other, points_px)
-            before, a, b, after = value[:-3], value[1:-2], value[2:-1], value[3:]
-            at = np.flatnonzero(inner & (a * b < 0) & (before * a > 0) & (b * after > 0))
-            if len(positions) == 0 or len(at) == 0:
+            if len(positions) == 0:
                 continue
-            before, a, b, after = (each[at] for each in (before, a, b, after))
-            share = a / (a - b)
-            second = (before - 2 * a + b) * (1 - share) + (a - 2 * b + after) * share
-            share = np.clip(share + second / 2 * share * (1 - share) / (b - a), 0, 1)
-            index = at + 1
+            value = sample_image(bit, points_px) - sample_image(other, points_px)
+            index, share = find_crossings(points_px, ends, value)
             expected = approximate[index] + share * (approximate[index + 1] - approximate[index])
             known = np.isfinite(expected)
             index, share, expected = index[known], share[known], expected[known]
@@ -120,6 +108,27 @@ class SecondAxis:
             nearest = np.where(np.abs(low - expected) <= np.abs(high - expected), low, high)
             found.append(AxisEdges(index, share, nearest))
         return AxisEdges(*(np.concatenate(each) for each in zip(*found, strict=True)))
+
+
+def find_crossings(
+    points_px: FloatArray, ends: NDArray[np.bool_], value: FloatArray
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Find where a value along stripes changes its sign: index of the point before, (n,), and share of the way to the
+    next point, (n,) from 0 to 1.
+
+    points_px : (N, 2); ends : (N,) bool, True where the next point is no neighbour; value : (N,). Two points on either
+    side have to agree. The root is that of the straight line between two points, corrected by the second differences
+    around them.
+    """
+    ends = ends.copy()
+    ends[:-1] |= np.linalg.norm(np.diff(points_px, axis=0), axis=1) > _MAX_SPACING_PX
+    inner = ~(ends[:-3] | ends[1:-2] | ends[2:-1])
+    before, a, b, after = value[:-3], value[1:-2], value[2:-1], value[3:]
+    at = np.flatnonzero(inner & (a * b < 0) & (before * a > 0) & (b * after > 0))
+    before, a, b, after = (each[at] for each in (before, a, b, after))
+    share = a / (a - b)
+    second = (before - 2 * a + b) * (1 - share) + (a - 2 * b + after) * share
+    return at + 1, np.clip(share + second / 2 * share * (1 - share) / (b - a), 0, 1)
 
 
 def decode_second_axis(

@@ -94,7 +94,7 @@ def leave_out_contradicted(
 
     The camera returned has the residual of each pixel.
     """
-    if camera.second is None or check is None or len(curves.points_mm) == 0:
+    if camera.second is None or camera.second.positions is None or check is None or len(curves.points_mm) == 0:
         return camera, curves
     residuals = axis_residuals(curves, camera.second.positions, projector, 1 if axis is Axis.COLUMN else 0)
     contradicted = residuals.contradicted(3 * check.median_px)

@@ -60,6 +60,7 @@ from slrig.reconstruction import (
     exposure_count,
     exposure_use,
     find_correspondences,
+    find_cross_line_pairs,
     fuse_colour,
     fuse_exposures,
     linearise,
@@ -107,14 +108,15 @@ class CameraResult:
 class SecondAxisResult:
     """Light of the axis that is not triangulated by, at one camera.
 
-    positions : (H, W), projector position along that axis; pairs : camera and projector pixels that both axes give;
-    codes : Gray codes of columns and rows. residual_px : (H, W) float32, position minus its prediction by the
-    calibration at each triangulated point, NaN elsewhere; None before triangulation.
+    positions : (H, W), projector position along that axis; None where only one frame of lines was played of it. pairs :
+    camera and projector pixels that both axes give; codes : Gray codes of the axes that have one. residual_px : (H, W)
+    float32, position minus its prediction by the calibration at each triangulated point, NaN elsewhere; None before
+    triangulation and without positions.
     """
 
-    positions: AxisPositions
+    positions: AxisPositions | None
     pairs: PixelPairs
-    codes: tuple[Gray, Gray]
+    codes: tuple[Gray, ...]
     residual_px: NDArray[np.float32] | None = None
 
 
@@ -180,7 +182,7 @@ class ScanStream:
             camera = self._cameras.pop(name)
             curves, frames, fused = camera.finish()
             part, used = camera.part, curves.refusal == Refusal.NONE
-            second = camera.second_axis(curves)
+            second = camera.second_axis(curves, frames, self.calibration)
             white, black = (camera.colour(each, fused) for each in (White(), Black()))
             clipped = frames.white >= NEAR_SATURATION * frames.clipped_at
             if white is None or black is None:
@@ -254,6 +256,8 @@ class _CameraFrames:
         self._wanted = Counter(used)
         self._stream: CameraStream | None = None
         self._second: FrameStacks | None = None
+        self._cross_lines = _single_cross_lines(self._wanted, axis)
+        self._cross_image: NDArray[Any] | None = None
         patterns = axis_patterns(self._wanted, name, axis)
         if one_exposure and all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift)):
             form = header.cameras[name]
@@ -295,6 +299,8 @@ class _CameraFrames:
         repeats.append(shot.image)
         if len(repeats) == self._wanted[pattern]:
             image = mean_image(self._repeats.pop(pattern))
+            if pattern == self._cross_lines:
+                self._cross_image = image
             self._stream.take(pattern, image)
             if self._second is not None:
                 self._second.put(pattern, image)
@@ -331,10 +337,12 @@ class _CameraFrames:
         except PatternError:
             return None
 
-    def second_axis(self, curves: CameraCurves) -> SecondAxisResult | None:
-        """Decode the other axis, if it was played. curves : of the first, in the pixels of `part`."""
+    def second_axis(
+        self, curves: CameraCurves, frames: AxisFrames, calibration: Calibration
+    ) -> SecondAxisResult | None:
+        """Decode the other axis, if it was played. curves, frames : of the first, in the pixels of `part`."""
         if self._second is None or self._second.missing:
-            return None
+            return self._by_cross_lines(curves, frames, calibration)
         stacks, self._second = self._second, None
         if curves.gamma != 1:
             stacks.linearise(curves.gamma)
@@ -352,6 +360,39 @@ class _CameraFrames:
         mine = axis_patterns(self._wanted, self._name, self._axis).gray
         codes = (mine, frames.gray) if self._axis is Axis.COLUMN else (frames.gray, mine)
         return SecondAxisResult(positions, pairs, codes)
+
+    def _by_cross_lines(
+        self, curves: CameraCurves, frames: AxisFrames, calibration: Calibration
+    ) -> SecondAxisResult | None:
+        """Correspondences by one frame of lines of the other axis, if it was played."""
+        projector, difference = calibration.projector, self._cross_difference(curves.gamma, frames)
+        if difference is None or self._cross_lines is None or projector is None:
+            return None
+        origin = (0, 0) if self.part is None else (self.part.columns.start, self.part.rows.start)
+        pairs = find_cross_line_pairs(
+            curves.ensemble, difference, self._cross_lines, calibration.cameras[self._name], projector, origin_px=origin
+        )
+        return SecondAxisResult(None, pairs, (frames.gray,))
+
+    def _cross_difference(self, gamma: float, frames: AxisFrames) -> NDArray[np.float32] | None:
+        """(H, W): light of the lines of the other axis less the middle of white and black, summed over exposures."""
+        sets = [] if self._cross_image is None else [(self._cross_image, frames.white, frames.black)]
+        clipped_at = NEAR_SATURATION * min(frames.full_scale, float(self._header.cameras[self._name].full_scale))
+        for exposure_s in {shot.exposure_s for shot in self._kept}:
+            shots = [shot for shot in self._kept if shot.exposure_s == exposure_s]
+            images = [
+                [shot.image for shot in shots if self._header.patterns[shot.pattern] == wanted]
+                for wanted in (self._cross_lines, White(), Black())
+            ]
+            if all(images):
+                lit, white, black = map(mean_image, images)
+                sets.append((lit, white, black))
+        total: NDArray[np.float32] | None = None
+        for each in sets:
+            lit, white, black = (linearise(image, gamma, frames.full_scale) for image in each)
+            difference = np.where(each[1] < clipped_at, lit - (white + black) / 2, 0)
+            total = np.asarray(difference if total is None else total + difference, dtype=np.float32)
+        return total
 
     def _keep_colour(self, shot: Shot) -> None:
         pattern = self._header.patterns[shot.pattern]
@@ -440,6 +481,12 @@ def step_px(shown: Collection[Pattern], axis: Axis) -> float:
 def cell_px(shown: Collection[Pattern], axis: Axis) -> float:
     """Width of a cell of the code."""
     return float(next(p.cell_px for p in shown if isinstance(p, Gray) and p.axis is axis))
+
+
+def _single_cross_lines(patterns: Collection[Pattern], axis: Axis) -> LineShift | None:
+    """The one frame of half-lit lines of the other axis, None without it."""
+    lines = [each for each in patterns if isinstance(each, LineShift) and each.axis is not axis]
+    return lines[0] if len(lines) == 1 and lines[0].is_half_lit else None
 
 
 def _tables(gray: Gray, lines: tuple[LineShift, ...], size: Size) -> CodeTables:

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slrig.bundle import CALIBRATION, read_calibration, write_calibration
+from slrig.bundle import CALIBRATION, read_bundle, read_calibration, write_bundle, write_calibration
+from slrig.model import Axis, Gray, Pattern
 from tests.golden.test_bundles import reconstructed
 from tests.unit.command import slrig
 
@@ -77,3 +78,29 @@ def test_small_error_is_reported_and_added_to_the_standard_deviations(bundle: Pa
     assert report["truth"]["p95_mm"] > 1
     assert 0.7 < report["truth"]["error_over_sigma_p68"] < 1.4
     assert "that rows show" in report["mesh"]["sigma_holds"]
+
+
+def test_one_frame_of_rows_tests_the_calibration(shared: Path, bundle: Path, tmp_path: Path) -> None:
+    files = read_bundle(bundle)
+    # Of the row code, only the bit whose stripes are 16 rows wide.
+    used: dict[int, Pattern] = {}
+    for index, pattern in enumerate(files.capture.patterns):
+        if not isinstance(pattern, Gray) or pattern.axis is Axis.COLUMN:
+            used[index] = pattern
+        elif not pattern.inverted and (lines := pattern.as_lines) is not None and lines.line_width_px == 16:
+            used[index] = lines
+    place = {index: place for place, index in enumerate(used)}
+    shots = tuple(replace(shot, pattern=place[shot.pattern]) for shot in files.capture.shots if shot.pattern in used)
+    capture = replace(files.capture, patterns=tuple(used.values()), shots=shots)
+    write_bundle(tmp_path / "right", capture, files.calibration)
+    wrong = read_bundle(imported(shared, tmp_path / "inverse", "inverse_pose")).calibration
+    write_bundle(tmp_path / "wrong", capture, wrong)
+
+    report = reconstructed(tmp_path / "right", tmp_path / "mesh")
+    refused = slrig("reconstruct", str(tmp_path / "wrong"), "--output", str(tmp_path / "none"))
+
+    assert report["redundancy"]["second_axis"]["cam0"]["median_px"] < 0.1
+    assert "rows agree with the calibration" in report["mesh"]["sigma_holds"]
+    assert report["identity"] == "23/23 patterns verified"
+    assert refused.exit_code == 2
+    assert "the inverse pose" in " ".join(refused.output.split())

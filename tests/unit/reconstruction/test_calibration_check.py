@@ -8,10 +8,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.interpolate import griddata
 from scipy.spatial.transform import Rotation
 
-from slrig.model import Axis, FloatArray, Gray, Pinhole, Size
-from slrig.reconstruction import CalibrationCheck, PixelPairs, check_calibration
+from slrig.model import Axis, FloatArray, Gray, LineShift, Pinhole, Size
+from slrig.reconstruction import CalibrationCheck, PixelPairs, check_calibration, find_cross_line_pairs
+from slrig.reconstruction.identification import StripeEnsemble
 
 CODES = Gray(Axis.COLUMN, 0, 10), Gray(Axis.ROW, 0, 9)
 Turn = tuple[float, float, float]
@@ -180,3 +183,74 @@ def test_unrelated_pixels_are_refuted_without_a_cause(pairs: PixelPairs) -> None
 
 def test_few_pixels_say_nothing(pairs: PixelPairs) -> None:
     assert check_calibration(CAMERA, PROJECTOR, pairs.take(slice(0, 50)), CODES) is None
+
+
+LINES = LineShift(Axis.ROW, 0, 32, 16)
+
+
+@pytest.fixture(scope="module")
+def crossed_stripes() -> tuple[StripeEnsemble, NDArray[np.float32]]:
+    """Stripes of every tenth column on a slanted plane, and the image of lines along the rows, from -1 to 1."""
+    columns, rows = np.arange(40.0, 760, 10), np.arange(20.0, 480, 0.8)
+    light = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1).reshape(-1, 2)
+    rays = cv2.undistortPoints(light[:, None], PROJECTOR.matrix, PROJECTOR.distortion)[:, 0]
+    rays = np.column_stack([rays, np.ones(len(rays))]) @ PROJECTOR.rotation
+    normal, centre = np.array([0.2, -0.1, 1.0]), PROJECTOR.centre_mm
+    points = centre + rays * ((620 - normal @ centre) / (rays @ normal))[:, None]
+    pixels = opencv_pixels(CAMERA, points)
+    inside = ((pixels > 4) & (pixels < (635, 507))).all(axis=1)
+    light, pixels = light[inside], pixels[inside]
+    y, x = np.mgrid[:512, :640]
+    row = griddata(pixels, light[:, 1], (x, y), method="linear")
+    image = np.nan_to_num(np.tanh(3 * np.sin(np.pi * (row + 0.5) / 16))).astype(np.float32)
+    counts = np.array([np.count_nonzero(light[:, 0] == each) for each in columns])
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    count, nothing = len(pixels), np.zeros(len(pixels))
+    stripes = StripeEnsemble(
+        offsets, columns, pixels, np.zeros((count, 2)), nothing, nothing.astype(np.int32), nothing > 0
+    )  # fmt: skip
+    return stripes, image
+
+
+def checked_by_one_frame(
+    stripes: tuple[StripeEnsemble, NDArray[np.float32]], projector: Pinhole
+) -> tuple[PixelPairs, CalibrationCheck]:
+    found = find_cross_line_pairs(*stripes, LINES, CAMERA, projector)
+    check = check_calibration(CAMERA, projector, found, CODES[:1])
+    assert check is not None
+    return found, check
+
+
+def test_one_frame_of_rows_agrees_with_the_right_calibration(
+    crossed_stripes: tuple[StripeEnsemble, NDArray[np.float32]],
+) -> None:
+    found, check = checked_by_one_frame(crossed_stripes, PROJECTOR)
+
+    assert len(found) > 1000
+    assert not check.is_refuted
+    assert not check.is_significant
+    assert check.median_px < 0.05
+
+
+@pytest.mark.parametrize(
+    ("wrong", "cause"),
+    [
+        (inverse_pose(PROJECTOR), "the inverse pose"),
+        (turned(PROJECTOR, (2, 1, -2)), "another pose relative to the camera"),
+    ],
+    ids=["inverse pose", "turned"],
+)
+def test_one_frame_of_rows_refutes_a_wrong_calibration(
+    crossed_stripes: tuple[StripeEnsemble, NDArray[np.float32]], wrong: Pinhole, cause: str
+) -> None:
+    _, check = checked_by_one_frame(crossed_stripes, wrong)
+
+    assert check.is_refuted
+    assert cause in check.cause
+
+
+def test_one_frame_of_rows_shows_a_small_turn(crossed_stripes: tuple[StripeEnsemble, NDArray[np.float32]]) -> None:
+    _, check = checked_by_one_frame(crossed_stripes, turned(PROJECTOR, (0, 0.15, 0)))
+
+    assert not check.is_refuted
+    assert check.is_significant
