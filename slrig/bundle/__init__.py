@@ -1,9 +1,9 @@
 """Scan bundles: folders with a description, frames, and a calibration, from slrig or from other programs."""
 
 from slrig.bundle.calibration import (
+    DEVICE_KEYS,
     MAX_CALIBRATION_BYTES,
     check_calibration,
-    five_distortion_terms,
     parse_calibration,
     read_calibration,
     read_opencv_calibration,
@@ -110,6 +110,7 @@ __all__ = [
     "CALIBRATION",
     "CAMERA_NAME",
     "DESCRIPTION",
+    "DEVICE_KEYS",
     "EXPOSURE_KEYS",
     "MAX_CALIBRATION_BYTES",
     "MAX_CAMERA_PX",
@@ -152,7 +153,6 @@ __all__ = [
     "embed_masks",
     "encode_poses",
     "encode_turntable",
-    "five_distortion_terms",
     "json_bytes",
     "model_keys",
     "natural_sort_key",

@@ -313,7 +313,7 @@ def export(
     if Path(calibration).exists() or to is not None or unit is not None:
         import tempfile
 
-        from slrig.importers import read_any_calibration, write_any_calibration
+        from slrig.importers import import_calibration, write_any_calibration
 
         with tempfile.TemporaryDirectory() as folder:
             source = Path(calibration)
@@ -321,7 +321,7 @@ def export(
                 source = Path(folder) / "calibration.json"
                 with service.client() as client:
                     _fetch(client, calibration, source.name, source)
-            write_any_calibration(file, read_any_calibration(source, unit=unit), to)
+            write_any_calibration(file, import_calibration(source, unit=unit).calibration, to)
     else:
         name = FILES.get(file.suffix.lower())
         if name is None:
@@ -364,11 +364,11 @@ def submit(
     import tempfile
 
     from slrig.bundle import write_calibration
-    from slrig.importers import read_any_calibration
+    from slrig.importers import import_calibration
 
     with service.client() as client:
         # Looked at here first, so that faults are told by the file's name; one form travels, whichever the file has.
-        calibration = read_any_calibration(file, unit=unit)
+        calibration = import_calibration(file, unit=unit).calibration
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "calibration.json"
             write_calibration(path, calibration)

@@ -18,7 +18,9 @@ from slrig.reconstruction.calibration_check import (
     CalibrationFit,
     PixelPairs,
     check_calibration,
+    disagreement_px,
     find_correspondences,
+    share_in_front,
 )
 from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
@@ -129,6 +131,7 @@ __all__ = [
     "check_calibration",
     "decode_edges",
     "decode_second_axis",
+    "disagreement_px",
     "distorted_from_pixel",
     "estimate_albedo",
     "estimate_noise",
@@ -155,6 +158,7 @@ __all__ = [
     "refine_pose",
     "sampling_mm",
     "select_points",
+    "share_in_front",
     "sheet_coordinates",
     "sigma_along_normal",
     "stripe_crossing",

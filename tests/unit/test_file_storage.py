@@ -137,7 +137,7 @@ def test_all_that_opencv_writes_is_read(ending: str) -> None:
     points = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
     storage.write("empty", np.zeros((0, 0)))
     storage.write("points", points)
-    storage.write("bytes", np.uint8([[1, 255]]))
+    storage.write("bytes", np.array([[1, 255]], dtype=np.uint8))
     storage.write("texts", ["a", "b c"])
     for kind in (cv2.FileNode_SEQ, cv2.FileNode_SEQ | cv2.FileNode_FLOW):
         storage.startWriteStruct(f"sequence{kind}", kind)

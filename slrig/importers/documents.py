@@ -1,0 +1,279 @@
+"""Files of numbers of other programs, as one tree of names: OpenCV, MATLAB, NumPy, JSON, YAML, text.
+
+Strangers write these files: sizes are checked before anything is unpacked, and what could run code is refused.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+
+from slrig.bundle import MAX_CALIBRATION_BYTES, MAX_STORAGE_BYTES, natural_sort_key, read_file_storage, read_text
+from slrig.disk import storage_errors
+from slrig.errors import CalibrationError
+
+MAX_YAML_BYTES = 2**18
+MAX_YAML_DEPTH = 12
+MAX_BINARY_BYTES = 2**26
+"""Of NumPy's and MATLAB's files, packed and unpacked."""
+MAX_NUMBERS = 2**16
+_MAX_DEPTH = 16
+_MAX_ENTRIES = 2**16
+_MAX_FILES = 32
+
+DOCUMENT_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".mat", ".npz", ".npy", ".txt", ".csv")
+
+_PICKLE = (
+    "a Python object in pickle's form, which can run code; save plain arrays: "
+    "np.savez('rig.npz', K1=K1, D1=D1, K2=K2, D2=D2, R=R, T=T)"
+)
+_HDF5 = (
+    "HDF5, which slrig does not read; in MATLAB save it again with save('rig.mat', '-v7'), or write its arrays with "
+    "NumPy's savez"
+)
+_OBJECT = (
+    "a MATLAB object, which only MATLAB can open; save it as a struct: s = toStruct(stereoParams); "
+    "save('rig.mat', 's', '-v7')"
+)
+
+_Loader: Any = type("_Loader", (yaml.SafeLoader,), {})
+# YAML 1.1 requires a point in a number with an exponent; other programs write 1e-05.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+
+Leaf = np.ndarray[Any, np.dtype[np.float64]] | float | str
+Path_ = tuple[str, ...]
+
+
+def read_document(path: Path) -> dict[Path_, Leaf]:
+    """Return the numbers, arrays (float64) and texts of a file by the path of their names; lists have names 0, 1, ...
+    A folder has the names of its files in front. Raises CalibrationError: the format is unknown, or the file is
+    damaged, too large, or could run code.
+    """
+    if not path.is_dir():
+        return dict(_leaves(_read_file(path), (), path))
+    with storage_errors(path):
+        files = sorted((e for e in path.iterdir() if e.suffix.lower() in DOCUMENT_SUFFIXES), key=natural_sort_key)
+    if not 1 <= len(files) <= _MAX_FILES:
+        raise CalibrationError(
+            f"{path}: expected 1 to {_MAX_FILES} files of a calibration ({', '.join(DOCUMENT_SUFFIXES)}), found "
+            f"{len(files)}; give the file"
+        )
+    leaves: dict[Path_, Leaf] = {}
+    for file in files:
+        document = _read_file(file)
+        # An array alone is called as its file.
+        leaves |= _leaves(document, (file.stem,), file)
+    return leaves
+
+
+def _read_file(path: Path) -> Any:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BINARY_BYTES + 1)
+    except OSError as cause:
+        raise CalibrationError(f"{path}: expected a readable file, found: {cause.strerror}; check the path") from cause
+    if len(data) > MAX_BINARY_BYTES:
+        raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes, found a larger file")
+    if data.startswith((b"\x89HDF", b"MATLAB 7.3")):
+        raise CalibrationError(f"{path}: expected numbers, found {_HDF5}")
+    if data.startswith((b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")):
+        raise CalibrationError(f"{path}: expected numbers, found {_PICKLE}")
+    readers = {b"PK\x03\x04": _read_npz, b"\x93NUMPY": _read_npy, b"MATLAB 5.0": _read_mat}
+    reader = next((each for head, each in readers.items() if data.startswith(head)), None)
+    if reader is not None:
+        try:
+            return reader(data, path)
+        except CalibrationError:
+            raise
+        except Exception as cause:  # The decoders raise many kinds for damaged files.
+            raise CalibrationError(
+                f"{path}: expected a sound file, found {type(cause).__name__}: {str(cause)[:80]}; save it again"
+            ) from cause
+    return _read_text_document(path)
+
+
+def _read_text_document(path: Path) -> Any:
+    text = read_text(path, MAX_STORAGE_BYTES, CalibrationError).removeprefix("\ufeff")
+    start = text.lstrip()[:1]
+    if text.startswith("%YAML") or start == "<":
+        return read_file_storage(text.lstrip(), path)
+    if start in ("{", "[") and path.suffix.lower() not in (".yml", ".yaml"):
+        try:
+            # OpenCV writes comments into JSON.
+            return json.loads(re.sub(r"(?m)^\s*//.*$", "", text[:MAX_CALIBRATION_BYTES]))
+        except (ValueError, RecursionError) as cause:
+            raise CalibrationError(f"{path}: expected JSON, found {str(cause)[:80]}; save it again") from cause
+    numbers = _read_numbers(text)
+    return read_yaml(path) if numbers is None else numbers
+
+
+def _read_numbers(text: str) -> Any | None:
+    """Return the array of a text that holds rows of numbers and nothing else, as `np.savetxt` writes; else None."""
+    lines = [line for line in (each.partition("#")[0].strip() for each in text.splitlines()) if line]
+    try:
+        rows = [[float(word) for word in re.split(r"[\s,;]+", line.strip(",; "))] for line in lines]
+    except ValueError:
+        return None
+    return np.array(rows) if rows and len({len(row) for row in rows}) == 1 else None
+
+
+def read_yaml(path: Path) -> Any:
+    """Return the data of a YAML file. Raises CalibrationError, with the line: the file is truncated, too large, nested
+    too deep, or has anchors, which can expand a short file without limit.
+    """
+    text = read_text(path, MAX_YAML_BYTES, CalibrationError)
+    depth = 0
+    try:
+        # Check all events before anything is built from them.
+        for event in yaml.parse(text, _Loader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_YAML_DEPTH or isinstance(event, yaml.AliasEvent):
+                mark: Any = event.start_mark
+                message = (
+                    f"{path}: expected YAML without anchors, nested at most {MAX_YAML_DEPTH} deep, found otherwise"
+                )
+                raise CalibrationError(f"{message} at line {mark.line + 1}; export it again")
+        _require_single_keys(yaml.compose(text, _Loader), path)
+        return yaml.load(text, _Loader)  # noqa: S506 - a safe loader
+    except (yaml.YAMLError, ValueError) as cause:
+        mark = getattr(cause, "problem_mark", None)
+        where = "" if mark is None else f" at line {mark.line + 1}"
+        problem = getattr(cause, "problem", None) or str(cause)
+        raise CalibrationError(f"{path}: expected YAML, found {problem}{where}; correct it") from cause
+
+
+def _require_single_keys(node: Any, path: Path) -> None:
+    """Reject duplicate keys in a map, of which PyYAML would keep the last."""
+    if isinstance(node, yaml.MappingNode):
+        keys = [str(key.value) for key, _ in node.value]
+        if len(set(keys)) < len(keys):
+            line = node.start_mark.line + 1
+            raise CalibrationError(f"{path}: expected each key once, found one twice in the map at line {line}")
+    for part in node.value if isinstance(node, yaml.CollectionNode) else ():
+        for each in part if isinstance(part, tuple) else (part,):
+            _require_single_keys(each, path)
+
+
+def _read_npy(data: bytes, path: Path) -> Any:
+    try:
+        return np.load(io.BytesIO(data), allow_pickle=False)
+    except ValueError as cause:
+        if "pickle" in str(cause):
+            raise CalibrationError(f"{path}: expected an array, found {_PICKLE}") from cause
+        raise
+
+
+def _read_npz(data: bytes, path: Path) -> dict[str, Any]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(each.file_size for each in archive.infolist()) > MAX_BINARY_BYTES:
+            raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes of arrays, found more")
+        found: dict[str, Any] = {}
+        pickled = 0
+        for each in archive.infolist():
+            if each.filename.endswith(".npy"):
+                try:
+                    found[each.filename.removesuffix(".npy")] = _read_npy(archive.read(each), path)
+                except CalibrationError:
+                    pickled += 1
+    if pickled and not found:
+        raise CalibrationError(f"{path}: expected arrays, found {_PICKLE}")
+    return found
+
+
+def _read_mat(data: bytes, path: Path) -> dict[str, Any]:
+    from scipy import io as scipy_io
+
+    _require_small_mat(data, path)
+    file: Any = io.BytesIO(data)
+    names = [(name, kind) for name, _, kind in scipy_io.whosmat(file)]
+    wanted = [name for name, kind in names if kind not in ("opaque", "function", "unknown")]
+    found = scipy_io.loadmat(file, variable_names=wanted, simplify_cells=True) if wanted else {}
+    found = {name: value for name, value in found.items() if name in wanted}
+    if not found and any(kind == "opaque" for _, kind in names):
+        raise CalibrationError(f"{path}: expected numbers, found {_OBJECT}")
+    return found
+
+
+def _require_small_mat(data: bytes, path: Path) -> None:
+    """Check how large the packed elements of a MATLAB file of version 5 become. Raises CalibrationError."""
+    order: Literal["little", "big"] = "little" if data[126:128] == b"IM" else "big"
+    at, total = 128, 0
+    while at + 8 <= len(data):
+        kind, count = (int.from_bytes(data[at + i : at + i + 4], order) for i in (0, 4))
+        if kind == 15:  # miCOMPRESSED
+            unpacker = zlib.decompressobj()
+            total += len(unpacker.decompress(data[at + 8 : at + 8 + count], MAX_BINARY_BYTES))
+            if total >= MAX_BINARY_BYTES:
+                raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes of arrays, found more")
+        at += 8 + count
+
+
+def _leaves(value: Any, path: Path_, file: Path) -> Iterator[tuple[Path_, Leaf]]:
+    """Yield numbers, arrays and texts. Lists of numbers of one length, and maps of rows, cols and data, are arrays."""
+    count = 0
+    pending = [(path, value)]
+    while pending:
+        path, value = pending.pop()
+        count += 1
+        if count > _MAX_ENTRIES:
+            message = f"{file}: expected at most {_MAX_ENTRIES} entries, found more; leave out all but the calibration"
+            raise CalibrationError(message)
+        if isinstance(value, Mapping):
+            array = _matrix(value)
+            if array is not None:
+                yield path, array
+            elif len(path) < _MAX_DEPTH:
+                pending += [((*path, str(key)), each) for key, each in reversed(list(value.items()))]
+        elif isinstance(value, bool) or value is None:
+            continue
+        elif isinstance(value, str):
+            yield path, value
+        elif isinstance(value, int | float):
+            yield path, float(value)
+        elif isinstance(value, list | tuple | np.ndarray):
+            array = _array(value)
+            if array is not None:
+                yield path, array if array.ndim else float(array)
+            elif isinstance(value, list | tuple) or value.dtype == object:
+                items = list(np.ravel(np.asarray(value, dtype=object)) if isinstance(value, np.ndarray) else value)
+                pending += [((*path, str(n)), each) for n, each in reversed(list(enumerate(items)))]
+            elif value.dtype.kind == "U" and value.size == 1:
+                yield path, str(value.item())
+
+
+def _matrix(value: Mapping[Any, Any]) -> Any | None:
+    """Return the array of a map of rows, cols and data, as OpenCV's JSON and ROS have it; None for another map."""
+    if not {"rows", "cols", "data"} <= set(value):
+        return None
+    array = _array(value["data"])
+    if array is None:
+        return None
+    rows, columns = value["rows"], value["cols"]
+    fits = isinstance(rows, int) and isinstance(columns, int) and rows > 0 and rows * columns == array.size
+    return array.reshape(rows, columns) if fits else array
+
+
+def _array(value: Any) -> Any | None:
+    """Return numbers as float64; None for what is no array of at most `MAX_NUMBERS` numbers."""
+    if isinstance(value, list | tuple):
+        flat: list[Any] = [*value]
+        while flat and isinstance(flat[0], list | tuple) and len(flat) <= MAX_NUMBERS:
+            flat = [each for part in flat for each in (part if isinstance(part, list | tuple) else [None])]
+        if not flat or not all(isinstance(each, int | float) and not isinstance(each, bool) for each in flat):
+            return None
+        try:
+            value = np.array(value, dtype=np.float64)
+        except (ValueError, OverflowError):
+            return None
+    return value.astype(np.float64) if value.dtype.kind in "fiu" and 1 <= value.size <= MAX_NUMBERS else None
