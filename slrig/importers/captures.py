@@ -33,7 +33,7 @@ SLSTUDIO_BITS = {Axis.COLUMN: 10, Axis.ROW: 6}
 """Number of first bits that SLStudio shows on any projector."""
 
 IMAGES = {".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"}
-CALIBRATIONS = ("calibration.yml", "calibration.yaml", "calibration.xml", "calibration.json")
+CALIBRATIONS = tuple(f"calibration.{each}" for each in ("yml", "yaml", "xml", "json", "npz", "mat"))
 MAX_LIST_BYTES = 2**20
 
 _MIN_DIFFERENCE = 0.02  # of full scale, between white and black where the projector's light falls
@@ -283,7 +283,9 @@ def import_capture(
     path, calibration = calibration_file or default_file, None
     if path is not None:
         bits = {p.axis: p for files in images.cameras.values() for _, p in files if isinstance(p, Gray)}
-        capture = CodedImages(images.cameras, formats, code.size)
+        capture = CodedImages(
+            images.cameras, formats, code.size, lambda image, form: read_with_colour(image, (0,), form)[0][0]
+        )
         read = import_calibration(
             path, cameras=sizes, projector=code.size, bits=bits, capture=capture, unit=unit, keys=keys
         )

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
-from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 
-from slrig.bundle import read_with_colour
 from slrig.model import (
     Axis,
     Black,
@@ -18,6 +17,7 @@ from slrig.model import (
     Gray,
     Pattern,
     Pinhole,
+    Pixels,
     Size,
     White,
     from_gray,
@@ -30,16 +30,23 @@ _LIT = 0.25  # of the contrast that few pixels exceed
 _CERTAIN = 0.2  # difference of a bit over the contrast
 
 
-class CodedImages:
-    """Gray codes of a capture, as `slrig.importers.recognition.CodedCapture`. Images are read when they are needed."""
+Image = TypeVar("Image")
+
+
+class CodedImages(Generic[Image]):
+    """Gray codes of a capture, as `slrig.importers.recognition.CodedCapture`. Images are read when they are needed.
+
+    read : returns the (H, W) pixels of an image in the format of its camera.
+    """
 
     def __init__(
         self,
-        cameras: Mapping[str, Sequence[tuple[Path, Pattern]]],
+        cameras: Mapping[str, Sequence[tuple[Image, Pattern]]],
         formats: Mapping[str, CameraFormat],
         projector: Size,
+        read: Callable[[Image, CameraFormat], Pixels],
     ) -> None:
-        self._cameras, self._formats, self._projector = cameras, formats, projector
+        self._cameras, self._formats, self._projector, self._read_image = cameras, formats, projector, read
         self._read: dict[str, tuple[FloatArray, FloatArray]] = {}
 
     def disagreement_px(self, calibration: Calibration) -> float | None:
@@ -82,9 +89,9 @@ class CodedImages:
             files, form = self._cameras[name], self._formats[name]
             step = int(np.ceil(np.sqrt(form.size.width_px * form.size.height_px / _MAX_PIXELS)))
             images: dict[Pattern, FloatArray] = {}
-            for path, pattern in files:
+            for image, pattern in files:
                 if isinstance(pattern, White | Black | Gray) and pattern not in images:
-                    images[pattern] = read_with_colour(path, (0,), form)[0][0][::step, ::step].astype(np.float64)
+                    images[pattern] = self._read_image(image, form)[::step, ::step].astype(np.float64)
             self._read[name] = _decode(images, step, self._projector)
         return self._read[name]
 

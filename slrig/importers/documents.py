@@ -45,6 +45,8 @@ _OBJECT = (
     "save('rig.mat', 's', '-v7')"
 )
 
+_ALONE = "save the calibration alone"
+
 _Loader: Any = type("_Loader", (yaml.SafeLoader,), {})
 # YAML 1.1 requires a point in a number with an exponent; other programs write 1e-05.
 _Loader.add_implicit_resolver(
@@ -61,7 +63,8 @@ def read_document(path: Path) -> dict[Path_, Leaf]:
     damaged, too large, or could run code.
     """
     if not path.is_dir():
-        return dict(_leaves(_read_file(path), (), path))
+        document = _read_file(path)
+        return dict(_leaves(document, () if isinstance(document, Mapping) else (path.stem,), path))
     with storage_errors(path):
         files = sorted((e for e in path.iterdir() if e.suffix.lower() in DOCUMENT_SUFFIXES), key=natural_sort_key)
     if not 1 <= len(files) <= _MAX_FILES:
@@ -84,7 +87,7 @@ def _read_file(path: Path) -> Any:
     except OSError as cause:
         raise CalibrationError(f"{path}: expected a readable file, found: {cause.strerror}; check the path") from cause
     if len(data) > MAX_BINARY_BYTES:
-        raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes, found a larger file")
+        raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes, found a larger file; {_ALONE}")
     if data.startswith((b"\x89HDF", b"MATLAB 7.3")):
         raise CalibrationError(f"{path}: expected numbers, found {_HDF5}")
     if data.startswith((b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")):
@@ -177,7 +180,7 @@ def _read_npy(data: bytes, path: Path) -> Any:
 def _read_npz(data: bytes, path: Path) -> dict[str, Any]:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if sum(each.file_size for each in archive.infolist()) > MAX_BINARY_BYTES:
-            raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes of arrays, found more")
+            raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes of arrays, found more; {_ALONE}")
         found: dict[str, Any] = {}
         pickled = 0
         for each in archive.infolist():
@@ -215,7 +218,9 @@ def _require_small_mat(data: bytes, path: Path) -> None:
             unpacker = zlib.decompressobj()
             total += len(unpacker.decompress(data[at + 8 : at + 8 + count], MAX_BINARY_BYTES))
             if total >= MAX_BINARY_BYTES:
-                raise CalibrationError(f"{path}: expected at most {MAX_BINARY_BYTES} bytes of arrays, found more")
+                raise CalibrationError(
+                    f"{path}: expected at most {MAX_BINARY_BYTES} bytes of arrays, found more; {_ALONE}"
+                )
         at += 8 + count
 
 

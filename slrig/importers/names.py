@@ -96,8 +96,10 @@ class Entry:
         words = split_words(self.path[-1])
         if len(words) == 1 and len(words[0]) > 1 and words[0] not in _SHORT and words[0][:-1] in _SHORT:
             words = [words[0][:-1]]
-        return frozenset(word for word in words if word not in _DEVICES and not word.isdigit()) - (
-            frozenset(_LETTERS) if len(words) > 1 and words[0] not in _LETTERS else frozenset()
+        # A letter that says the device: R_p, c_dist.
+        letters = {n for n, word in enumerate(words) if word in _LETTERS and len(words) > 1 and (n or word != "r")}
+        return frozenset(
+            word for n, word in enumerate(words) if n not in letters and word not in _DEVICES and not word.isdigit()
         )
 
     @property

@@ -59,7 +59,7 @@ _UNITS: Mapping[str, LengthUnit] = {
 _AGREES = 0.35
 """Residual of the best reading of a file over that of the next best, for the capture to decide between them."""
 _MAX_AGREEING_PX = 20.0
-_CONTRADICTS_PX = 5.0  # residual of the usual reading from which another one may take its place
+_CONTRADICTS_PX = 1.0  # residual of the usual reading from which another one may take its place
 _IN_FRONT, _BEHIND = 0.9, 0.5  # shares of points
 
 
@@ -585,7 +585,6 @@ class _Recognition:
         """Return the reading that the capture agrees with, or the usual one if names state it; and how it was decided.
         Raises CalibrationError: the direction of the pose is open.
         """
-        readings = [each for each in readings if all(map(is_centred, each.calibration.cameras.values()))] or readings
         usual = readings[0]
         if len(readings) == 1:
             return usual, ""
@@ -595,8 +594,9 @@ class _Recognition:
             if len(known) > 1 and not (usual.is_stated and known and (scores[0] or 0.0) <= _CONTRADICTS_PX):
                 (best, place), (second, _) = known[:2]
                 if best <= min(_MAX_AGREEING_PX, _AGREES * second):
-                    agreement = f"columns and rows of the images agree with it to {best:.2g} px (median)"
-                    return readings[place], f"decided by the capture: {agreement}, otherwise {second:.2g} px"
+                    otherwise = f"otherwise to {second:.2g} px" if np.isfinite(second) else "otherwise rays do not meet"
+                    agreement = f"columns and rows of the images agree with it to {best:.2g} px (median), {otherwise}"
+                    return readings[place], f"decided by the capture: {agreement}"
             if not usual.is_stated:
                 shares = [self._capture.share_in_front(each.calibration) for each in readings]
                 front = [n for n, share in enumerate(shares) if share is not None and share >= _IN_FRONT]
@@ -613,6 +613,12 @@ class _Recognition:
             self._refuse(
                 "a pose whose direction is known", usual.poses, f"{why}. Say --keys 'pose={pose}' if x_projector = "
                 f"R x_camera + T, as OpenCV has it, or --keys 'pose={pose},inverse' if x_camera = R x_projector + T",
+            )  # fmt: skip
+        centred = [each for each in readings if all(map(is_centred, each.calibration.cameras.values()))]
+        if centred and usual not in centred:
+            self._refuse(
+                "the camera before the projector", f"{usual.words[0]}: not in the middle of its principal point, which "
+                "that of the other device is", f"say which is which, as {KEYS_HELP}",
             )  # fmt: skip
         return usual, ""
 
