@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from slrig.bundle import (
     CAMERA_NAME,
     DEVICE_KEYS,
-    MAX_CALIBRATION_BYTES,
     MAX_SIDE_PX,
     MAX_STORAGE_BYTES,
     Strict,
@@ -58,7 +56,6 @@ CalibrationFormat = Literal["slrig", "opencv", "ros", "kalibr"]
 FORMAT_BY_SUFFIX: Mapping[str, CalibrationFormat] = {".json": "slrig", ".yml": "opencv", ".xml": "opencv"}
 
 TRANSFORMS = "transforms.yaml"
-_OWN_KEYS = {"format", "version", "cameras", "projector", "solved", "light"}
 
 _PROGRAMS = {
     "scan3d-capture": ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
@@ -554,23 +551,17 @@ def _format(path: Path) -> CalibrationFormat | None:
             names = [each for each in path.iterdir() if each.suffix.lower() in DOCUMENT_SUFFIXES]
             infos = [each for each in names if each.suffix == ".yaml" and b"distortion_model:" in each.read_bytes()]
         return "ros" if infos or not names or (path / TRANSFORMS).is_file() else None
-    suffix = path.suffix.lower()
-    if suffix in (".mat", ".npz", ".npy", ".txt", ".csv", ".h5", ".pkl", ".pickle"):
+    try:
+        text = read_text(path, MAX_STORAGE_BYTES, CalibrationError).removeprefix("\ufeff")
+    except CalibrationError:
         return None
-    if suffix not in (".yml", ".yaml", ".xml"):
-        try:
-            data = json.loads(read_text(path, MAX_CALIBRATION_BYTES, CalibrationError))
-        except (ValueError, CalibrationError, RecursionError):
-            return "slrig"
-        own = isinstance(data, dict) and isinstance(data.get("cameras"), dict) and set(data) <= _OWN_KEYS
-        return "slrig" if own or (isinstance(data, dict) and "format" in data) or not data else None
-    text = read_text(path, MAX_STORAGE_BYTES, CalibrationError)
-    if text.removeprefix("\ufeff").startswith(("%YAML", "<")):
+    if text.startswith(("%YAML", "<")):
         root = read_file_storage(text, path)
         devices = [each for each in root.values() if isinstance(each, dict) and len(set(each) & set(DEVICE_KEYS)) >= 4]
         return "opencv" if devices or not root else None
-    data = read_yaml(path)
-    return "kalibr" if isinstance(data, dict) and re.search(r"(?m)^cam\d+:", text) and "intrinsics" in text else None
+    if path.suffix.lower() in (".yml", ".yaml"):
+        return "kalibr" if re.search(r"(?m)^cam\d+:", text) and "intrinsics" in text else None
+    return "slrig" if not text.strip() or re.search(r'"(format|size_px)"\s*:', text) else None
 
 
 def _read(

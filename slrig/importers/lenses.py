@@ -113,7 +113,7 @@ def _fit(matrix: FloatArray, terms: FloatArray, size: Size, *, equidistant: bool
 def _undistort(lens: Callable[[FloatArray], FloatArray], distorted: FloatArray) -> FloatArray:
     """Return the rays (n, 2) of distorted points by the branch that begins at the axis; NaN where the lens folds.
 
-    As `slrig.model.imaged_pixels`: short steps from the axis, each by Newton's method.
+    As `slrig.model.plausibility.imaged_pixels`: short steps from the axis, each by Newton's method.
     """
     rays = np.zeros_like(distorted)
     with np.errstate(all="ignore"):

@@ -326,8 +326,8 @@ class _Recognition:
             return np.array([k[0], k[1], p[0], p[1], k[2]]), ", ".join(e.name for e, _ in radial[:1] + tangential[:1])
         known = ROTATION_WORDS | TRANSLATION_WORDS | SIZE_WORDS
         by_shape = [(e, v) for e, v in vectors if v.size >= 4 and not known & e.words]
-        by_shape = [(e, v) for e, v in by_shape if np.abs(v[:2]).max() < 10]
-        found = named or by_shape
+        # Whole numbers are flags and regions.
+        found = named or [(e, v) for e, v in by_shape if not v.any() or (v % 1).any()]
         nearest = [(e, v) for e, v in found if e.path[:-1] == matrix.path[:-1]] or found
         nearest = [
             each for n, each in enumerate(nearest) if not any(np.array_equal(each[1], b[1]) for b in nearest[:n])
@@ -538,7 +538,7 @@ class _Recognition:
                     f"{pose.names}: " + (f"x_{start} = R x_{role} + T" if inverse else f"x_{role} = R x_{start} + T")
                     for role, pose in moved
                 ),
-                is_given or (all(pose.is_stated for _, pose in moved) and len(moved) < len(devices)),
+                is_given or (all(pose.is_stated for _, pose in moved) and placed[0] is None),
             )
 
     def _size(self, role: str, device: Device, roles: Sequence[str]) -> Size:

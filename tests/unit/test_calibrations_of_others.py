@@ -323,7 +323,7 @@ REFUSED: dict[str, tuple[str, Callable[[Path], Path], Sequence[str]]] = {
     ),
     "no pose": ("rig.npz", lambda p: without("R")(p, {}), ["expected a pose", "T (3 x 1)", "--keys 'camera="]),
     "words": ("rig.txt", lambda p: written(p, "focal length 12 mm\n"), ["two devices", "found no arrays"]),
-    "cut JSON": ("rig.json", lambda p: written(p, '{"K1": [[1,'), ["expected JSON, found a fault"]),
+    "cut JSON": ("rig.json", lambda p: written(p, '{"K1": [[1,'), ["expected JSON, found", "save it again"]),
     "another lens": (
         "rig.json",
         lambda p: written(p, json.dumps(plain({"camera": {**CAMERA_MAP, "model": "double sphere"},
