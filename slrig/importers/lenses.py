@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from slrig.errors import CalibrationError
 from slrig.model import FloatArray, Size
@@ -79,6 +78,8 @@ def as_lens(matrix: FloatArray, terms: FloatArray, size: Size, name: str, *, equ
 
 def _fit(matrix: FloatArray, terms: FloatArray, size: Size, *, equidistant: bool) -> Lens | None:
     """Return the least-squares fit; None if the lens has no ray for some pixels."""
+    from scipy.optimize import least_squares
+
     sides = [np.linspace(0, side - 1, _GRID) for side in (size.width_px, size.height_px)]
     pixels = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     distorted = np.asarray(np.linalg.solve(matrix, np.column_stack([pixels, np.ones(len(pixels))]).T)[:2].T, float)

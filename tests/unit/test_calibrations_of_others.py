@@ -221,13 +221,8 @@ def test_rounded_rotations_are_read_as_the_nearest_one(tmp_path: Path) -> None:
 # ---- What names leave open: the capture decides, or it is asked
 
 
-def codes(*axes: Axis) -> CodedImages[Any]:
-    """Images of a bent surface in the codes of these axes, with noise; nothing of it is slrig's geometry."""
-    v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px].astype(np.float64)
-    rays = cv2.undistortPoints(np.stack([u, v], axis=-1).reshape(-1, 1, 2), K1, D1).reshape(-1, 2)
-    depth = 600 + 60 * np.sin(u / 25) + 40 * np.cos(v / 17)
-    points = np.column_stack([rays, np.ones(len(rays))]) * depth.reshape(-1, 1)
-    lit = cv2.projectPoints(points, TURN, T, K2, D2)[0].reshape(*u.shape, 2)
+def pattern_images(lit: FloatArray, axes: Sequence[Axis]) -> list[tuple[Any, Pattern]]:
+    """Images of the codes of these axes, with noise, by the projector pixel (column, row) that lights each pixel."""
     chance = np.random.default_rng(1)
     images: list[tuple[Any, Pattern]] = []
     for axis in axes:
@@ -238,7 +233,23 @@ def codes(*axes: Axis) -> CodedImages[Any]:
             for inverted in (False, True):
                 light = 60 + 120 * (on ^ inverted) + chance.normal(0, 2, on.shape)
                 images.append((light.clip(0, 255).astype(np.uint8), Gray(axis, bit, 7, inverted=inverted)))
-    return CodedImages({"cam0": images}, {"cam0": CameraFormat(CAMERA, 8)}, PROJECTOR, lambda image, _: image)
+    return images
+
+
+def camera_rays() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Columns and rows of the camera's pixels, and its rays (n, 3) at depth 1."""
+    v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px].astype(np.float64)
+    rays = cv2.undistortPoints(np.stack([u, v], axis=-1).reshape(-1, 1, 2), K1, D1).reshape(-1, 2)
+    return u, v, np.column_stack([rays, np.ones(len(rays))])
+
+
+def codes(*axes: Axis) -> CodedImages[Any]:
+    """The capture of a bent surface; nothing of it is slrig's geometry."""
+    u, v, rays = camera_rays()
+    points = rays * (600 + 60 * np.sin(u / 25) + 40 * np.cos(v / 17)).reshape(-1, 1)
+    lit = cv2.projectPoints(points, TURN, T, K2, D2)[0].reshape(*u.shape, 2)
+    form = CameraFormat(CAMERA, 8)
+    return CodedImages({"cam0": pattern_images(lit, axes)}, {"cam0": form}, PROJECTOR, lambda image, _: image)
 
 
 BACK: FloatArray = -R.T @ T
@@ -262,6 +273,31 @@ def test_columns_and_rows_decide_what_names_leave_open(tmp_path: Path, case: str
     found = import_calibration(path, **CAPTURE, capture=codes(*Axis))
     require_numbers(found.calibration)
     assert "decided by the capture: columns and rows" in found.notes[-1]
+
+
+def test_the_codes_of_two_cameras_decide_the_pose_between_them(tmp_path: Path) -> None:
+    """Both see a plane in the first one's axes, n x = 600 mm; the projector stands anywhere."""
+    normal = np.array([0.2, -0.1, 1.0])
+    _, _, rays = camera_rays()
+    behind = R @ normal, 600 + float(R @ normal @ T.ravel())
+    surfaces = {
+        "left": rays * (600 / (rays @ normal))[:, None],
+        "right": (rays * (behind[1] / (rays @ behind[0]))[:, None] - T.ravel()) @ R,
+    }
+    images = {}
+    for name, points in surfaces.items():
+        lit = cv2.projectPoints(points, np.zeros(3), np.array([20.0, -120, 0]), K2, D2)[0]
+        images[name] = pattern_images(lit.reshape(*CAMERA.shape, 2), list(Axis))
+    sizes = dict.fromkeys(images, CAMERA)
+    form = CameraFormat(CAMERA, 8)
+    capture = CodedImages[Any](images, dict.fromkeys(images, form), PROJECTOR, lambda image, _: image)
+    for pose in (POSE, np.linalg.inv(POSE)):
+        data = {"left": {"K": K1, "D": D1}, "right": {"K": K1, "D": D1}, "extrinsics": pose}
+        path = written(tmp_path / "rig.json", json.dumps(plain(data)))
+        found = read(path, cameras=sizes, projector=PROJECTOR, capture=capture)
+        assert found.projector is None
+        np.testing.assert_allclose(found.cameras["right"].rotation, R, atol=1e-9)
+        np.testing.assert_allclose(found.cameras["right"].translation_mm, T.ravel(), atol=1e-9)
 
 
 @pytest.mark.parametrize("case", list(OPEN)[:3])
