@@ -462,6 +462,7 @@ def centring_offset_px(extent_px: int) -> int:
 
 
 _SAME_SHARE = 0.1
+_MIN_SHARE = 1 / 32  # of images; less is a matrix in millimetres
 
 
 def _require_matrix_of_image(device: Pinhole, path: Path, name: str) -> None:
@@ -470,7 +471,7 @@ def _require_matrix_of_image(device: Pinhole, path: Path, name: str) -> None:
     """
     sides = np.array([device.size.width_px, device.size.height_px])
     shares = (device.matrix[:2, 2] + 0.5) / sides
-    if not is_centred(device) and np.ptp(shares) < _SAME_SHARE * shares.mean():
+    if not is_centred(device) and np.ptp(shares) < _SAME_SHARE * shares.mean() and shares.mean() > _MIN_SHARE:
         cx, cy = device.matrix[:2, 2]
         raise CalibrationError(
             f"{path}: camera '{name}': expected a principal point near the middle of images of {device.size}, found "

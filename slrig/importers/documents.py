@@ -20,6 +20,7 @@ import yaml
 from slrig.bundle import MAX_CALIBRATION_BYTES, MAX_STORAGE_BYTES, natural_sort_key, read_file_storage, read_text
 from slrig.disk import storage_errors
 from slrig.errors import CalibrationError
+from slrig.model import FloatArray
 
 MAX_YAML_BYTES = 2**18
 MAX_YAML_DEPTH = 12
@@ -29,8 +30,11 @@ MAX_NUMBERS = 2**16
 _MAX_DEPTH = 16
 _MAX_ENTRIES = 2**16
 _MAX_FILES = 32
+_MAX_STACKED = 16  # matrices in one array
+_MAX_WORDS = 3  # of a name
+_REAL = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 
-DOCUMENT_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".mat", ".npz", ".npy", ".txt", ".csv")
+DOCUMENT_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".mat", ".npz", ".npy", ".txt", ".csv", ".m", ".slcalib")
 
 _PICKLE = (
     "a Python object in pickle's form, which can run code; save plain arrays: "
@@ -53,7 +57,7 @@ _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
 )
 
-Leaf = np.ndarray[Any, np.dtype[np.float64]] | float | str
+Leaf = FloatArray | float | str
 Path_ = tuple[str, ...]
 
 
@@ -116,19 +120,43 @@ def _read_text_document(path: Path) -> Any:
             # OpenCV writes comments into JSON.
             return json.loads(re.sub(r"(?m)^\s*//.*$", "", text[:MAX_CALIBRATION_BYTES]))
         except (ValueError, RecursionError) as cause:
-            raise CalibrationError(f"{path}: expected JSON, found {str(cause)[:80]}; save it again") from cause
-    numbers = _read_numbers(text)
+            # Sections of other texts begin with a bracket, too.
+            if start == "{" or _read_numbers(text) is None:
+                raise CalibrationError(f"{path}: expected JSON, found {str(cause)[:80]}; save it again") from cause
+    numbers = None if path.suffix.lower() in (".yml", ".yaml") else _read_numbers(text)
     return read_yaml(path) if numbers is None else numbers
 
 
-def _read_numbers(text: str) -> Any | None:
-    """Return the array of a text that holds rows of numbers and nothing else, as `np.savetxt` writes; else None."""
-    lines = [line for line in (each.partition("#")[0].strip() for each in text.splitlines()) if line]
-    try:
-        rows = [[float(word) for word in re.split(r"[\s,;]+", line.strip(",; "))] for line in lines]
-    except ValueError:
-        return None
-    return np.array(rows) if rows and len({len(row) for row in rows}) == 1 else None
+def _read_numbers(text: str) -> dict[str, Any] | FloatArray | None:
+    """Return the arrays of a text of names, each with rows of numbers behind or below it, or of one array without a
+    name; None for another text.
+
+    So write SLStudio (.slcalib, .m), ROS (ost.txt), `np.savetxt` and people. Brackets and punctuation are left out; a
+    name without numbers is that of a section.
+    """
+    found: dict[tuple[str, ...], list[list[float]]] = {("",): []}
+    section: tuple[str, ...] = ()
+    name: tuple[str, ...] = ("",)
+    for line in text.splitlines():
+        words = re.sub(r"[\[\](){}=:,;]|[#%].*", " ", line).split()
+        first = next((n for n, word in enumerate(words) if _REAL.fullmatch(word)), len(words))
+        if not all(map(_REAL.fullmatch, words[first:])) or first > _MAX_WORDS:
+            return None
+        if first:
+            if any(name) and not found[name]:
+                del found[name]
+                section = name[-1:]
+            name = (*section, "_".join(words[:first]))
+            found[name] = []
+        if words[first:]:
+            found[name].append([float(word) for word in words[first:]])
+    arrays: dict[str, Any] = {}
+    for (*around, last), rows in found.items():
+        if rows:
+            is_even = len({len(row) for row in rows}) == 1
+            group = arrays.setdefault(around[0], {}) if around else arrays
+            group[last] = np.array(rows) if is_even else np.concatenate(rows)
+    return arrays[""] if list(arrays) == [""] else arrays or None
 
 
 def read_yaml(path: Path) -> Any:
@@ -153,6 +181,9 @@ def read_yaml(path: Path) -> Any:
         mark = getattr(cause, "problem_mark", None)
         where = "" if mark is None else f" at line {mark.line + 1}"
         problem = getattr(cause, "problem", None) or str(cause)
+        if "python/" in problem:
+            raise CalibrationError(f"{path}: expected numbers, found python/object{where}, which can run code; write "
+                                   "lists: K1.tolist()") from cause  # fmt: skip
         raise CalibrationError(f"{path}: expected YAML, found {problem}{where}; correct it") from cause
 
 
@@ -248,7 +279,9 @@ def _leaves(value: Any, path: Path_, file: Path) -> Iterator[tuple[Path_, Leaf]]
             yield path, float(value)
         elif isinstance(value, list | tuple | np.ndarray):
             array = _array(value)
-            if array is not None:
+            if array is not None and array.ndim > 2 and 1 < len(array) <= _MAX_STACKED:
+                pending += [((*path, str(n)), each) for n, each in reversed(list(enumerate(array)))]
+            elif array is not None:
                 yield path, array if array.ndim else float(array)
             elif isinstance(value, list | tuple) or value.dtype == object:
                 items = list(np.ravel(np.asarray(value, dtype=object)) if isinstance(value, np.ndarray) else value)

@@ -127,7 +127,7 @@ def entries_of(leaves: Mapping[tuple[str, ...], object]) -> list[Entry]:
             around = (*entry.path[:-1], *(each for each in (part[1], part[3]) if each))
             groups.setdefault(around, {})[part[2].replace("ppx", "cx").replace("ppy", "cy")] = entry
     for around, parts in groups.items():
-        numbers = {name: float(entry.values[0]) for name, entry in parts.items()}
+        numbers = {name: float(entry.values.item()) for name, entry in parts.items()}
         names = {name: entry.name for name, entry in parts.items()}
         if {"fx", "fy", "cx", "cy"} <= set(parts):
             matrix = np.array([

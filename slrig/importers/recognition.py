@@ -49,11 +49,11 @@ _MODEL_WORDS = {"model", "type", "distortion", "lens", "projection"}
 _FISHEYE = re.compile(r"fisheye|equi(distant)?(?![a-z])|kannala", re.IGNORECASE)
 _OTHER_MODELS = re.compile(r"\b(omni\w*|ds|eucm|double.?sphere|inverse\w*|scaramuzza|fov|mei)\b", re.IGNORECASE)
 _NOT_IMAGES = {"board", "square", "pattern", "chess", "chessboard", "checkerboard", "marker", "grid", "roi", "cell"}
-_SIDES = re.compile(r"(.*?)[_.\- ]?(width|height|cols|rows|nx|ny|resx|resy|w|h)", re.IGNORECASE)
+_SIDES = re.compile(r"(.*?)(width|height|cols|rows|nx|ny|resx|resy|w|h)")
 _WIDTHS = ("width", "cols", "nx", "resx", "w")
 _UNITS: Mapping[str, LengthUnit] = {
     "mm": "mm", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm", "cm": "cm",
-    "centimeters": "cm", "centimetres": "cm", "meter": "m", "meters": "m", "metres": "m", "inches": "inch",
+    "centimeters": "cm", "centimetres": "cm", "meter": "m", "meters": "m", "metres": "m", "inches": "inch", "m": "m",
 }  # fmt: skip
 
 _AGREES = 0.35
@@ -278,8 +278,15 @@ class _Recognition:
                 self._refuse(f"one matrix of each device, here {' '.join(sorted(labels)) or 'the first'}", names,
                              f"say which, as {KEYS_HELP}")  # fmt: skip
         if len(groups) < 2:
-            self._refuse_numbers("the matrices of two devices")
+            self._refuse_numbers("the matrices of two devices, each [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
         devices = [self._device(labels, common, group[0], list(groups)) for labels, group in groups.items()]
+        lacking = [n for n, device in enumerate(devices) if not device.lens_name]
+        free = [e for e in self._entries if _owner(e.labels - common, list(groups)) is None and LENS_WORDS & e.words]
+        terms, name = self._terms([e for e in free if e.is_raw], matrices[0][0]) if lacking else (np.zeros(5), "")
+        if name and len(lacking) > 1:
+            self._refuse("the distortion of each device", f"{name} alone", f"say of which it is, as {KEYS_HELP}")
+        if name:
+            devices[lacking[0]] = replace(devices[lacking[0]], terms=terms, lens_name=name)
         sizes = self._sizes(devices, common)
         devices = [replace(device, size=sizes.get(n)) for n, device in enumerate(devices)]
         return sorted(devices, key=lambda device: (PROJECTOR in device.labels, _order(device.labels)))
@@ -288,10 +295,8 @@ class _Recognition:
         shapes = ", ".join(
             f"{e.name} ({' x '.join(map(str, e.values.shape))})" for e in self._entries if e.values.size > 1
         )
-        self._refuse(
-            f"{expected} (3 x 3, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), their distortions, a rotation, a translation",
-            f"{shapes[:300] or 'no arrays'}", f"name them, as {KEYS_HELP}, or export a file that has them",
-        )  # fmt: skip
+        self._refuse(expected, f"{shapes[:300] or 'no arrays'}",
+                     f"name them, as {KEYS_HELP}, or export a file that has them")  # fmt: skip
 
     def _device(
         self, labels: Labels, common: Labels, matrix: tuple[Entry, FloatArray, bool], others: Sequence[Labels]
@@ -343,7 +348,7 @@ class _Recognition:
         sides: dict[tuple[str, ...], dict[bool, float]] = {}
         for entry in self._entries:
             words = set(split_words(entry.path[-1]))
-            part = _SIDES.fullmatch(entry.path[-1])
+            part = _SIDES.fullmatch(re.sub(r"[_.\- ]", "", entry.path[-1].lower()))
             if words & _NOT_IMAGES:
                 continue
             if entry.values.size == 2 and SIZE_WORDS & (words | entry.words):
@@ -351,7 +356,7 @@ class _Recognition:
                 pairs.append((entry.labels, a, b, "shape" in words or self._is_matlab))
             elif part is not None and entry.values.size == 1:
                 around = (*entry.path[:-1], part[1])
-                sides.setdefault(around, {})[part[2].lower() in _WIDTHS] = float(entry.values[0])
+                sides.setdefault(around, {})[part[2] in _WIDTHS] = float(entry.values.item())
         pairs += [(labels_of(a), both[True], both[False], False) for a, both in sides.items() if len(both) == 2]
         labels = [device.labels for device in devices]
         found: dict[int, tuple[float, float, bool]] = {}
@@ -407,10 +412,13 @@ class _Recognition:
             if not lens and len(rest) == 1 and rest[0].vector is not None:
                 terms, lens = rest[0].values.ravel(), rest[0].name
             equidistant = terms.size == 4 and any(_FISHEYE.search(e.name) for e in own)
-            labels = frozenset({PROJECTOR}) if name == PROJECTOR else frozenset({"camera", name})
+            is_only = sum(each != PROJECTOR for each in self._keys.devices) == 1
+            labels = frozenset({name if name == PROJECTOR or not is_only else "camera"})
             devices.append(Device(labels, values, _names(entry), terms, lens, equidistant, is_transposed=transposed))
         if len(devices) < 2:
             self._refuse("two devices in --keys", "one", f"name both, as {KEYS_HELP}")
+        sizes = self._sizes(devices, frozenset())
+        devices = [replace(device, size=sizes.get(n)) for n, device in enumerate(devices)]
         return sorted(devices, key=lambda device: PROJECTOR in device.labels)
 
     def _named(self, item: str) -> list[Entry]:
@@ -505,7 +513,8 @@ class _Recognition:
 
     def _camera_names(self, known: Sequence[str], count: int) -> list[str]:
         if count > len(known):
-            self._refuse(f"{len(known)} cameras as the capture has", f"{count}", f"name them, as {KEYS_HELP}")
+            self._refuse(f"as many cameras as the capture has ({', '.join(known)})", f"{count}",
+                         f"say which to use, as {KEYS_HELP}")  # fmt: skip
         return list(known[:count])
 
     def _readings(self, devices: Sequence[Device], roles: tuple[str, ...], poses: Sequence[Pose]) -> Iterator[Reading]:
@@ -577,7 +586,11 @@ class _Recognition:
             names = "; ".join(pose.names for pose in poses)
             self._refuse("one pose between the devices", names, f"say which, as {KEYS_HELP}")
         if sum(not each for each in own) > 1:
-            self._refuse_numbers("a pose of each device but one, of" if len(devices) > 2 else "a pose, besides")
+            of = "the pose of each device but one" if len(devices) > 2 else "the pose between the devices"
+            self._refuse_numbers(
+                f"{of}: a rotation (3 x 3, orthonormal, determinant 1, or a rotation vector) and a translation, or "
+                "both as 3 x 4 or 4 x 4"
+            )
         # A device at the origin needs none.
         return [None if not each or each[0].is_identity else each[0] for each in own]
 
@@ -624,7 +637,8 @@ class _Recognition:
 
     def _unit(self) -> LengthUnit | None:
         words = [text.lower() for path, text in self._texts.items() if "unit" in path[-1].lower()]
-        words += [word for e in self._entries if e.words & TRANSLATION_WORDS for word in split_words(e.path[-1])]
+        words += [word for e in self._entries if e.words & TRANSLATION_WORDS for word in split_words(e.path[-1])
+                  if word != "m"]  # fmt: skip
         return next((_UNITS[word] for word in words if word in _UNITS), None)
 
 

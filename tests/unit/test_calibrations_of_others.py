@@ -16,6 +16,7 @@ import pytest
 import scipy.io
 import yaml
 
+from slrig.bundle import check_calibration
 from slrig.errors import CalibrationError
 from slrig.importers import import_calibration
 from slrig.importers.coded_images import CodedImages
@@ -92,7 +93,13 @@ WRITERS: dict[str, tuple[str, Write]] = {
     "PyYAML": ("rig.yaml", lambda path, data: written(path, yaml.safe_dump(plain(data)))),
     "np.save": ("rig", folder_of(np.save, ".npy")),
     "np.savetxt": ("rig", folder_of(np.savetxt, ".txt")),
-}
+    "a MATLAB script": ("rig.m", lambda path, data: written(path, "".join(
+        f"{name} = [{'; '.join(', '.join(map(str, row)) for row in value.tolist())}];\n" for name, value in data.items()
+    ))),
+    "rows below names": ("rig.slcalib", lambda path, data: written(path, "#V1.0 SLStudio calibration\n" + "".join(
+        "\n".join([name, *(" ".join(map(str, row)) for row in value.tolist()), "\n"]) for name, value in data.items()
+    ))),
+}  # fmt: skip
 NAMES = [
     ("K1", "D1", "K2", "D2", "R", "T"),
     ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", "R", "T"),
@@ -102,6 +109,7 @@ NAMES = [
     ("mtxL", "distL", "mtxR", "distR", "R", "T"),
     ("camera_matrix", "camera_distortion", "projector_matrix", "projector_distortion", "R_cam2proj", "t_cam2proj"),
     ("A1", "k1", "A2", "k2", "rot", "trans"),
+    ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),
 ]
 
 
@@ -208,6 +216,35 @@ def test_sizes_and_the_unit_are_those_of_the_file(tmp_path: Path) -> None:
     path = written(tmp_path / "rig.json", json.dumps(plain({**SCALARS, "R": R, "translation_cm": T / 10})))
     require_numbers(read(path))
     assert "fx, camera.fy" in import_calibration(path).notes[0]
+
+
+def test_slstudio_states_the_sizes_of_both(tmp_path: Path) -> None:
+    six = dict(zip(("Kc", "kc", "Kp", "kp", "Rp", "Tp"), SIX, strict=True))
+    for n, names in enumerate((("frameWidth", "frameHeight", "screenResX", "screenResY"),
+                               ("frame_width", "frame_height", "screen_res_x", "screen_res_y"))):  # fmt: skip
+        path = file_storage(tmp_path / f"{n}.xml", six | dict(zip(names, (160, 128, 128, 96), strict=True)))
+        require_numbers(read(path))
+        found = read(path, cameras={"cam0": Size(80, 64)}, projector=PROJECTOR)
+        with pytest.raises(CalibrationError, match="for other devices"):
+            check_calibration(found, PROJECTOR, {"cam0": Size(80, 64)}, "here")
+
+
+def test_sections_of_a_text_are_devices(tmp_path: Path) -> None:
+    lines = [
+        f"[{device}]\n" + "".join(f"{name} = {value}\n" for name, value in numbers.items())
+        for device, numbers in SCALARS.items()
+    ]
+    pose = f"[stereo]\nR = {' '.join(map(str, R.ravel()))}\nT = {' '.join(map(str, T.ravel()))}\n"
+    require_numbers(read(written(tmp_path / "rig.ini", "".join(lines) + pose)))
+
+
+def test_an_array_of_both_and_one_distortion_without_a_device(tmp_path: Path) -> None:
+    stacked = {"K": np.stack([K1, K2]), "D": np.stack([D1, D2]), "R": R, "T": T}
+    require_numbers(read(npz(tmp_path / "stacked.npz", stacked), **CAPTURE))
+    loose = {"cameraMatrix": K1, "distCoeffs": D1, "projectorMatrix": K2, "projectorDistCoeffs": D2, "R": R, "T": T}
+    require_numbers(read(npz(tmp_path / "loose.npz", loose), **CAPTURE))
+    with pytest.raises(CalibrationError, match="expected the distortion of each device, found distCoeffs alone"):
+        read(npz(tmp_path / "one.npz", {k: v for k, v in loose.items() if k != "projectorDistCoeffs"}), **CAPTURE)
 
 
 def test_rounded_rotations_are_read_as_the_nearest_one(tmp_path: Path) -> None:
@@ -357,7 +394,7 @@ REFUSED: dict[str, tuple[str, Callable[[Path], Path], Sequence[str]]] = {
     "one device": (
         "rig.npz", lambda p: without("proj_A", "proj_d")(p, {}), ["matrices of two devices", "cam_A (3 x 3)"]
     ),
-    "no pose": ("rig.npz", lambda p: without("R")(p, {}), ["expected a pose", "T (3 x 1)", "--keys 'camera="]),
+    "no pose": ("rig.npz", lambda p: without("R")(p, {}), ["expected the pose between", "T (3 x 1)", "--keys '"]),
     "words": ("rig.txt", lambda p: written(p, "focal length 12 mm\n"), ["two devices", "found no arrays"]),
     "cut JSON": ("rig.json", lambda p: written(p, '{"K1": [[1,'), ["expected JSON, found", "save it again"]),
     "another lens": (
