@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import re
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -225,34 +226,88 @@ def _read_npz(data: bytes, path: Path) -> dict[str, Any]:
     return found
 
 
-def _read_mat(data: bytes, path: Path) -> dict[str, Any]:
-    from scipy import io as scipy_io
+_MAT_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_MAT_TEXTS = {1: "latin-1", 2: "utf-8", 4: "utf-16-", 16: "utf-8", 17: "utf-16-", 18: "utf-32-"}
+_MAT_MATRIX, _MAT_COMPRESSED = 14, 15
+_MAT_CELL, _MAT_STRUCT, _MAT_CHAR, _MAT_OPAQUE, _MAT_NUMBERS = 1, 2, 4, 17, range(6, 16)
 
-    _require_small_mat(data, path)
-    file: Any = io.BytesIO(data)
-    names = [(name, kind) for name, _, kind in scipy_io.whosmat(file)]
-    wanted = [name for name, kind in names if kind not in ("opaque", "function", "unknown")]
-    found = scipy_io.loadmat(file, variable_names=wanted, simplify_cells=True) if wanted else {}
-    found = {name: value for name, value in found.items() if name in wanted}
-    if not found and any(kind == "opaque" for _, kind in names):
+
+def _read_mat(data: bytes, path: Path) -> dict[str, Any]:
+    """Return the numbers, texts, structs and cells of a MATLAB file of version 5 ("MAT-File Level 5 File Format").
+
+    SciPy's reader is unsafe for files from others: a damaged one ends the process.
+    """
+    reader = _MatReader("<" if data[126:128] == b"IM" else ">")
+    found: dict[str, Any] = {}
+    total = 0
+    for kind, content in reader.elements(data[128:]):
+        if kind == _MAT_COMPRESSED:
+            unpacker = zlib.decompressobj()
+            content = unpacker.decompress(content, MAX_BINARY_BYTES - total)
+            total += len(content)
+            if unpacker.unconsumed_tail:
+                message = f"{path}: expected at most {MAX_BINARY_BYTES} bytes of arrays, found more; {_ALONE}"
+                raise CalibrationError(message)
+            kind, content = next(reader.elements(content))
+        if kind == _MAT_MATRIX:
+            name, value = reader.variable(content)
+            found[name] = value
+    if reader.has_objects and all(value is None for name, value in found.items() if name):
         raise CalibrationError(f"{path}: expected numbers, found {_OBJECT}")
     return found
 
 
-def _require_small_mat(data: bytes, path: Path) -> None:
-    """Check how large the packed elements of a MATLAB file of version 5 become. Raises CalibrationError."""
-    order: Literal["little", "big"] = "little" if data[126:128] == b"IM" else "big"
-    at, total = 128, 0
-    while at + 8 <= len(data):
-        kind, count = (int.from_bytes(data[at + i : at + i + 4], order) for i in (0, 4))
-        if kind == 15:  # miCOMPRESSED
-            unpacker = zlib.decompressobj()
-            total += len(unpacker.decompress(data[at + 8 : at + 8 + count], MAX_BINARY_BYTES))
-            if total >= MAX_BINARY_BYTES:
-                raise CalibrationError(
-                    f"{path}: expected at most {MAX_BINARY_BYTES} bytes of arrays, found more; {_ALONE}"
-                )
-        at += 8 + count
+class _MatReader:
+    """Elements of a MATLAB file. order : of bytes, "<" or ">"; has_objects : True once one of an object was read."""
+
+    def __init__(self, order: Literal["<", ">"]) -> None:
+        self._order, self._ending = order, "le" if order == "<" else "be"
+        self.has_objects = False
+
+    def elements(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """Yield the type and the content of each element. Raises ValueError: the data are cut."""
+        at = 0
+        while at + 8 <= len(data):
+            kind, count = struct.unpack_from(f"{self._order}II", data, at)
+            start = at + 8
+            if kind >> 16:
+                # A small element has its size and its content in the tag.
+                kind, count, start = kind & 0xFFFF, kind >> 16, at + 4
+            if start + count > len(data):
+                raise ValueError("the file is cut")
+            yield kind, data[start : start + count]
+            at = max(at + 8, start + count)
+            at += 0 if kind == _MAT_COMPRESSED else -at % 8
+
+    def variable(self, data: bytes, depth: int = 0) -> tuple[str, Any]:
+        """Return the name and the value of an array; None for kinds that hold no numbers."""
+        if depth > _MAX_DEPTH:
+            raise ValueError("structs are nested too deep")
+        parts = self.elements(data)
+        flags, sides, name = (next(parts)[1] for _ in range(3))
+        kind = int.from_bytes(flags[:4], "little" if self._order == "<" else "big") & 0xFF
+        self.has_objects |= kind == _MAT_OPAQUE
+        shape = self._numbers(5, sides).astype(int) if kind != _MAT_OPAQUE else np.zeros(1, dtype=int)
+        title = name.decode("latin-1")
+        if kind in _MAT_NUMBERS:
+            values = self._numbers(*next(parts, (9, b"")))
+            return title, values.reshape(shape, order="F") if values.size else None
+        if kind == _MAT_CHAR:
+            code, text = next(parts, (16, b""))
+            return title, text.decode(_MAT_TEXTS[code] + ("" if code not in (4, 17, 18) else self._ending))
+        if kind == _MAT_CELL:
+            return title, [self.variable(content, depth + 1)[1] for _, content in parts]
+        if kind != _MAT_STRUCT:
+            return title, None
+        width = int(self._numbers(*next(parts))[0])
+        names = next(parts)[1]
+        fields = [names[n : n + width].split(b"\0")[0].decode("latin-1") for n in range(0, len(names), max(width, 1))]
+        held = [self.variable(content, depth + 1)[1] if content else None for _, content in parts]
+        items = [dict(zip(fields, held[n:], strict=False)) for n in range(0, len(held), max(len(fields), 1))]
+        return title, items[0] if len(items) == 1 else items
+
+    def _numbers(self, kind: int, data: bytes) -> FloatArray:
+        return np.frombuffer(data, dtype=f"{self._order}{_MAT_KINDS[kind]}").astype(np.float64)
 
 
 def _leaves(value: Any, path: Path_, file: Path) -> Iterator[tuple[Path_, Leaf]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import random
+import struct
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -371,6 +372,18 @@ def pickled(path: Path) -> Path:
     return path
 
 
+def with_object(path: Path) -> Path:
+    """A file of MATLAB that holds an object: an array of the class 17, with its name, system and class as texts."""
+
+    def element(kind: int, content: bytes) -> bytes:
+        return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+    texts = b"".join(element(1, text) for text in (b"stereoParams", b"MCOS", b"stereoParameters"))
+    data = element(14, element(6, struct.pack("<II", 17, 0)) + texts)
+    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + data)
+    return path
+
+
 def bomb(path: Path) -> Path:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("K1.npy", bytes(2**26 + 1))
@@ -390,6 +403,7 @@ REFUSED: dict[str, tuple[str, Callable[[Path], Path], Sequence[str]]] = {
     "HDF5": ("rig.h5", lambda p: (p.write_bytes(b"\x89HDF\r\n\x1a\n"), p)[1], ["found HDF5", "NumPy's savez"]),
     "pickle": ("rig.pkl", lambda p: (p.write_bytes(pickle.dumps({"K1": 1}, 4)), p)[1], ["can run code", "np.savez("]),
     "a dict in np.save": ("rig.npy", pickled, ["can run code; save plain arrays: np.savez("]),
+    "a MATLAB object": ("rig.mat", with_object, ["s = toStruct(stereoParams); save('rig.mat', 's', '-v7')"]),
     "a bomb": ("rig.npz", bomb, ["expected at most 67108864 bytes of arrays"]),
     "one device": (
         "rig.npz", lambda p: without("proj_A", "proj_d")(p, {}), ["matrices of two devices", "cam_A (3 x 3)"]
