@@ -33,9 +33,9 @@ from slrig.bundle import (
 )
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import CalibrationError
-from slrig.importers.documents import DOCUMENT_SUFFIXES, Leaf, Path_, read_document, read_yaml
+from slrig.importers.documents import DOCUMENT_SUFFIXES, Leaf, Name, read_document, read_yaml
 from slrig.importers.lenses import as_lens
-from slrig.importers.recognition import PROJECTOR, CodedCapture, Keys, is_centred, parse_keys, recognise
+from slrig.importers.recognition import PROJECTOR, CodedCapture, Keys, Recognition, is_centred, parse_keys
 from slrig.model import (
     MM_PER_UNIT,
     Axis,
@@ -422,7 +422,7 @@ def write_kalibr(path: Path, calibration: Calibration) -> None:
     write_file(path, yaml_bytes(chain))
 
 
-def _known_program(leaves: Mapping[Path_, Leaf], cameras: Mapping[str, Size]) -> tuple[str, Keys | None]:
+def _known_program(leaves: Mapping[Name, Leaf], cameras: Mapping[str, Size]) -> tuple[str, Keys | None]:
     """Return the program of `_PROGRAMS` that wrote a file, and what its names mean; no name for another one."""
     for program, names in _PROGRAMS.items():
         if {(name,) for name in names} <= set(leaves):
@@ -583,9 +583,7 @@ def _read(
             return (parse_calibration if form == "slrig" else read_opencv_calibration)(path), "mm", ()
     leaves = read_document(path)
     program, known = _known_program(leaves, cameras) if keys is None else ("", None)
-    found = recognise(
-        leaves, path, keys=keys or known, cameras=cameras, projector=projector, capture=capture, program=program
-    )
+    found = Recognition(leaves, path, keys or known, cameras, projector, capture, program).found()
     calibration, scaled = found.calibration, found.calibration.projector
     if program == "scan3d-capture" and scaled is not None:
         matrix = _scale_cells_to_pixels(scaled.matrix, scaled.size, bits)

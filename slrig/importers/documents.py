@@ -59,10 +59,10 @@ _Loader.add_implicit_resolver(
 )
 
 Leaf = FloatArray | float | str
-Path_ = tuple[str, ...]
+Name = tuple[str, ...]
 
 
-def read_document(path: Path) -> dict[Path_, Leaf]:
+def read_document(path: Path) -> dict[Name, Leaf]:
     """Return the numbers, arrays (float64) and texts of a file by the path of their names; lists have names 0, 1, ...
     A folder has the names of its files in front. Raises CalibrationError: the format is unknown, or the file is
     damaged, too large, or could run code.
@@ -77,7 +77,7 @@ def read_document(path: Path) -> dict[Path_, Leaf]:
             f"{path}: expected 1 to {_MAX_FILES} files of a calibration ({', '.join(DOCUMENT_SUFFIXES)}), found "
             f"{len(files)}; give the file"
         )
-    leaves: dict[Path_, Leaf] = {}
+    leaves: dict[Name, Leaf] = {}
     for file in files:
         document = _read_file(file)
         # An array alone is called as its file.
@@ -310,7 +310,7 @@ class _MatReader:
         return np.frombuffer(data, dtype=f"{self._order}{_MAT_KINDS[kind]}").astype(np.float64)
 
 
-def _leaves(value: Any, path: Path_, file: Path) -> Iterator[tuple[Path_, Leaf]]:
+def _leaves(value: Any, path: Name, file: Path) -> Iterator[tuple[Name, Leaf]]:
     """Yield numbers, arrays and texts. Lists of numbers of one length, and maps of rows, cols and data, are arrays."""
     count = 0
     pending = [(path, value)]

@@ -142,7 +142,7 @@ def entries_of(leaves: Mapping[tuple[str, ...], object]) -> list[Entry]:
             values = np.array([numbers.get(each, 0.0) for each in terms])
             used = tuple(names[each] for each in terms if each in names)
             entries.append(Entry((*around, "distortion"), values, labels_of(around), used))
-    return entries + _focal_matrices(entries) + _vectors(leaves)
+    return entries + _vectors(leaves)
 
 
 def _vectors(leaves: Mapping[tuple[str, ...], object]) -> list[Entry]:
@@ -159,20 +159,4 @@ def _vectors(leaves: Mapping[tuple[str, ...], object]) -> list[Entry]:
             quaternion = np.array([parts[each] for each in "xyzw"])
             if abs(float(np.linalg.norm(quaternion)) - 1) < 1e-3:
                 found.append(Entry(path, Rotation.from_quat(quaternion).as_matrix(), labels_of(path)))
-    return found
-
-
-def _focal_matrices(entries: list[Entry]) -> list[Entry]:
-    """Return matrices of pairs of numbers: fc and cc, focal length and principal point."""
-    found = []
-    for entry in entries:
-        words = split_words(entry.path[-1])
-        if entry.values.size == 2 and words[0] in ("fc", "focal"):
-            for other in entries:
-                same = other.path[:-1] == entry.path[:-1] and other.labels == entry.labels
-                if same and other.values.size == 2 and split_words(other.path[-1])[0] in ("cc", "principal"):
-                    (fx, fy), (cx, cy) = entry.values.ravel(), other.values.ravel()
-                    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-                    path = (*entry.path[:-1], "matrix")
-                    found.append(Entry(path, matrix, entry.labels, (entry.name, other.name)))
     return found

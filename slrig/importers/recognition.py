@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.bundle import CAMERA_NAME, MAX_SIDE_PX
 from slrig.errors import CalibrationError
-from slrig.importers.documents import Leaf, Path_
+from slrig.importers.documents import Leaf, Name
 from slrig.importers.lenses import Lens, as_lens
 from slrig.importers.names import (
     LENS_WORDS,
@@ -42,7 +42,7 @@ _MAX_SKEW = 0.1  # of the focal length
 _TERM_COUNTS = (2, 3, 4, 5, 8, 12, 14)
 _ROTATION_ERROR = 5e-3  # of numbers rounded to three digits
 _EXACT_ROTATION = 1e-4  # of `Pinhole`
-_MIN_SIDE_PX = 16
+_MIN_SIDE_PX = 64
 _STATED_WORDS = {"r", "t", "rot", "rotation", "roration", "trans", "translation", "om", "rvec", "tvec"} | VECTOR_WORDS
 """Words of poses that are x_second = R x_first + T, as OpenCV, MATLAB and all programs above them have it."""
 _MODEL_WORDS = {"model", "type", "distortion", "lens", "projection"}
@@ -56,6 +56,8 @@ _UNITS: Mapping[str, LengthUnit] = {
     "centimeters": "cm", "centimetres": "cm", "meter": "m", "meters": "m", "metres": "m", "inches": "inch", "m": "m",
 }  # fmt: skip
 
+_MAX_OFF_CENTRE = 0.12
+"""Distance of a camera's principal point from the middle of its image, in sides of the image."""
 _AGREES = 0.35
 """Residual of the best reading of a file over that of the next best, for the capture to decide between them."""
 _MAX_AGREEING_PX = 20.0
@@ -180,35 +182,20 @@ class Found:
     calibration: Calibration
     unit: LengthUnit | None
     notes: tuple[str, ...]
-    sized: frozenset[str] = frozenset()
+    sized: frozenset[str]
 
 
-def recognise(
-    leaves: Mapping[Path_, Leaf],
-    path: Path,
-    *,
-    keys: Keys | None,
-    cameras: Mapping[str, Size],
-    projector: Size | None,
-    capture: CodedCapture | None,
-    program: str = "",
-) -> Found:
-    """Return the calibration among the numbers of a file.
+class Recognition:
+    """Finds the calibration among the numbers of a file.
 
-    cameras, projector : extents of a capture, which replace sizes that the file lacks; empty without one. capture :
-    decides between ways to read the file. program : that wrote the file, if it is known.
-
-    Raises CalibrationError: something is missing, or open and to be asked.
+    leaves : as `slrig.importers.documents.read_document` returns them. cameras, projector : extents of a capture, which
+    replace sizes that the file lacks; empty without one. capture : decides between ways to read the file. program :
+    that wrote the file, empty if it is not known.
     """
-    return _Recognition(leaves, path, keys, cameras, projector, capture, program).found()
-
-
-class _Recognition:
-    """The numbers of one file, the capture that it comes with, and what was found."""
 
     def __init__(
         self,
-        leaves: Mapping[Path_, Leaf],
+        leaves: Mapping[Name, Leaf],
         path: Path,
         keys: Keys | None,
         cameras: Mapping[str, Size],
@@ -216,9 +203,9 @@ class _Recognition:
         capture: CodedCapture | None,
         program: str,
     ) -> None:
-        self._program = f", in a file of {program}" if program else ""
         self._path, self._keys, self._capture = path, keys or Keys({}), capture
         self._cameras, self._projector = cameras, projector
+        self._program = f", in a file of {program}" if program else ""
         self._entries = entries_of(leaves)
         self._texts = {name: text for name, text in leaves.items() if isinstance(text, str)}
         # MATLAB's objects count pixels from 1, and multiply rows from the left.
@@ -226,6 +213,7 @@ class _Recognition:
         self._lenses: dict[tuple[str, Size], Lens] = {}
 
     def found(self) -> Found:
+        """Return the calibration. Raises CalibrationError: something is missing, or open and to be asked."""
         devices = self._keyed_devices() or self._devices()
         poses = self._keyed_poses() or self._poses(devices)
         roles = self._roles(devices)
@@ -642,14 +630,10 @@ class _Recognition:
         return next((_UNITS[word] for word in words if word in _UNITS), None)
 
 
-MAX_OFF_CENTRE = 0.12
-"""Distance of a camera's principal point from the middle of its image, in sides of the image."""
-
-
 def is_centred(device: Pinhole) -> bool:
     """Return True if the principal point is near the middle of the image."""
     sides = np.array([device.size.width_px, device.size.height_px])
-    return bool(np.abs((device.matrix[:2, 2] + 0.5) / sides - 0.5).max() <= MAX_OFF_CENTRE)
+    return bool(np.abs((device.matrix[:2, 2] + 0.5) / sides - 0.5).max() <= _MAX_OFF_CENTRE)
 
 
 def _is_intrinsic(matrix: FloatArray) -> bool:

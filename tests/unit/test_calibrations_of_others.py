@@ -17,7 +17,7 @@ import pytest
 import scipy.io
 import yaml
 
-from slrig.bundle import check_calibration
+from slrig.bundle import check_calibration, read_calibration
 from slrig.errors import CalibrationError
 from slrig.importers import import_calibration
 from slrig.importers.coded_images import CodedImages
@@ -25,6 +25,7 @@ from slrig.importers.lenses import MAX_FIT_PX, as_lens
 from slrig.model import Axis, Calibration, CameraFormat, FloatArray, Gray, Pattern, Pinhole, Size, to_gray
 from slrig.model.lens import distort
 from tests.strangers import harmed
+from tests.unit.calibrate_command import refused, run
 
 CAMERA, PROJECTOR = Size(160, 128), Size(128, 96)
 K1: FloatArray = np.array([[172.0, 0, 80.5], [0, 172.5, 62.5], [0, 0, 1]])
@@ -180,7 +181,8 @@ FORMS: dict[str, tuple[str, Mapping[str, Any]]] = {
     "the calibration toolbox for MATLAB": ("mat", {
         "om": TURN[:, None], "R": R, "T": T, "kc_left": D1.T, "kc_right": D2.T, "nx": 160.0, "ny": 128.0,
         "fc_left": K1[[0, 1], [0, 1]], "cc_left": K1[:2, 2], "KK_left": K1, "KK_left_error": np.eye(3),
-        "fc_right": K2[[0, 1], [0, 1]], "cc_right": K2[:2, 2], "om_error": TURN, "T_error": T, "alpha_c_left": 0.0,
+        "fc_right": K2[[0, 1], [0, 1]], "cc_right": K2[:2, 2], "KK_right": K2, "om_error": TURN,
+        "T_error": T, "alpha_c_left": 0.0,
     }),
     "MATLAB's stereoParameters": ("mat", {"stereoParams": {
         "CameraParameters1": matlab_camera(K1, D1, CAMERA), "CameraParameters2": matlab_camera(K2, D2, PROJECTOR),
@@ -262,6 +264,7 @@ def test_rounded_rotations_are_read_as_the_nearest_one(tmp_path: Path) -> None:
 def pattern_images(lit: FloatArray, axes: Sequence[Axis]) -> list[tuple[Any, Pattern]]:
     """Images of the codes of these axes, with noise, by the projector pixel (column, row) that lights each pixel."""
     chance = np.random.default_rng(1)
+    inside = ((lit >= -0.5) & (lit < np.array([PROJECTOR.width_px, PROJECTOR.height_px]) - 0.5)).all(axis=-1)
     images: list[tuple[Any, Pattern]] = []
     for axis in axes:
         place = np.rint(lit[..., 0 if axis is Axis.COLUMN else 1]).astype(int)
@@ -269,7 +272,7 @@ def pattern_images(lit: FloatArray, axes: Sequence[Axis]) -> list[tuple[Any, Pat
         for bit in range(7):
             on = (word >> (6 - bit)) & 1
             for inverted in (False, True):
-                light = 60 + 120 * (on ^ inverted) + chance.normal(0, 2, on.shape)
+                light = 20 + 160 * (on ^ inverted) * inside + chance.normal(0, 2, on.shape)
                 images.append((light.clip(0, 255).astype(np.uint8), Gray(axis, bit, 7, inverted=inverted)))
     return images
 
@@ -281,11 +284,11 @@ def camera_rays() -> tuple[FloatArray, FloatArray, FloatArray]:
     return u, v, np.column_stack([rays, np.ones(len(rays))])
 
 
-def codes(*axes: Axis) -> CodedImages[Any]:
+def codes(*axes: Axis, turn: FloatArray = TURN, shift: FloatArray = T) -> CodedImages[Any]:
     """The capture of a bent surface; nothing of it is slrig's geometry."""
     u, v, rays = camera_rays()
     points = rays * (600 + 60 * np.sin(u / 25) + 40 * np.cos(v / 17)).reshape(-1, 1)
-    lit = cv2.projectPoints(points, TURN, T, K2, D2)[0].reshape(*u.shape, 2)
+    lit = cv2.projectPoints(points, turn, shift, K2, D2)[0].reshape(*u.shape, 2)
     form = CameraFormat(CAMERA, 8)
     return CodedImages({"cam0": pattern_images(lit, axes)}, {"cam0": form}, PROJECTOR, lambda image, _: image)
 
@@ -311,6 +314,20 @@ def test_columns_and_rows_decide_what_names_leave_open(tmp_path: Path, case: str
     found = import_calibration(path, **CAPTURE, capture=codes(*Axis))
     require_numbers(found.calibration)
     assert "decided by the capture: columns and rows" in found.notes[-1]
+
+
+def test_columns_alone_decide_where_points_are_otherwise_behind_the_devices(tmp_path: Path) -> None:
+    """Devices side by side, with parallel axes."""
+    shift = np.array([-60.0, 0, 0])
+    pose = np.eye(4)
+    pose[:3, 3] = shift
+    for written_pose in (pose, np.linalg.inv(pose)):
+        data = {"camera": CAMERA_MAP, "projector": PROJECTOR_MAP, "extrinsic": written_pose}
+        path = written(tmp_path / "rig.json", json.dumps(plain(data)))
+        found = import_calibration(path, **CAPTURE, capture=codes(Axis.COLUMN, turn=np.zeros(3), shift=shift))
+        assert found.calibration.projector is not None
+        np.testing.assert_allclose(found.calibration.projector.translation_mm, shift, atol=1e-9)
+        assert found.notes[-1].endswith("decided by the capture: otherwise points are behind the devices")
 
 
 def test_the_codes_of_two_cameras_decide_the_pose_between_them(tmp_path: Path) -> None:
@@ -545,6 +562,15 @@ def test_an_equidistant_lens_of_kalibr_is_fitted(tmp_path: Path) -> None:
     wanted = equidistant([-0.02, 0.01, 0, 0])(x, y + 1e-9)[0] * K1[0, 0] + K1[0, 2]
     found_px = distort(left.distortion, x, y)[0] * left.matrix[0, 0] + left.matrix[0, 2]
     np.testing.assert_allclose(found_px, wanted, atol=0.1)
+
+
+def test_the_commands_take_the_words(tmp_path: Path) -> None:
+    path = without()(tmp_path / "rig.npz", {})
+    assert "expected a calibration with the sizes of its images" in refused(run("export", path, tmp_path / "rig.json"))
+    shown = run("export", path, tmp_path / "rig.json", "--keys", "camera=160x128 projector=128x96")
+    assert shown.exit_code == 0
+    assert "read      R, T: x_projector = R x_cam0 + T" in shown.output
+    require_numbers(read_calibration(tmp_path / "rig.json"))
 
 
 @pytest.mark.parametrize("writer", ["NumPy's savez", "MATLAB's save", "json", "OpenCV's YAML"])
