@@ -224,11 +224,14 @@ class Recognition:
             try:
                 readings += self._readings(devices, each, poses)
             except CalibrationError:
-                if each == fitting[-1] and not readings:
+                # Another order may give a lens that cannot be, at another size.
+                if each == fitting[0]:
                     raise
         chosen, reason = self._choose(readings)
+        unit = self._unit()
         notes = (*chosen.words, chosen.direction + (f", {reason}" if reason else ""))
-        return Found(chosen.calibration, self._unit(), notes, chosen.sized)
+        notes += (f"lengths in {unit}, as the file says",) if unit else ()
+        return Found(chosen.calibration, unit, notes, chosen.sized)
 
     def _fits_capture(self, role: str, device: Device) -> bool:
         wanted = self._projector if role == PROJECTOR else self._cameras.get(role)
@@ -245,7 +248,8 @@ class Recognition:
                 square = entry.values.reshape(3, 3)
                 for matrix, transposed in ((square, False), (square.T, True)):
                     if _is_intrinsic(matrix):
-                        yield entry, np.array(matrix), transposed
+                        corner = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]]) if self._is_matlab else 0
+                        yield entry, matrix - corner, transposed
                         break
 
     def _devices(self) -> list[Device]:
@@ -259,9 +263,7 @@ class Recognition:
             # Names that share all words with a meaning: the order of the file tells them apart.
             groups = {frozenset({str(n)}): [each] for n, each in enumerate(matrices)}
         for labels, group in groups.items():
-            # The same matrix again, transposed or from its parts.
-            group[1:] = [each for each in group[1:] if not np.allclose(each[1], group[0][1])]
-            if len(group) > 1:
+            if len(group := _distinct(group)) > 1:
                 names = ", ".join(each[0].name for each in group)
                 self._refuse(f"one matrix of each device, here {' '.join(sorted(labels)) or 'the first'}", names,
                              f"say which, as {KEYS_HELP}")  # fmt: skip
@@ -301,8 +303,6 @@ class Recognition:
             self._refuse(
                 "a pinhole lens", f"'{match[0]}'", "slrig has no such lens: calibrate with OpenCV's five terms"
             )
-        if self._is_matlab:
-            values = values - [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
         equidistant = _FISHEYE.search(f"{texts} {name} {entry.name}") is not None and terms.size == 4
         return Device(labels, values, _names(entry), terms, name, equidistant, is_transposed=transposed)
 
@@ -332,7 +332,8 @@ class Recognition:
 
     def _sizes(self, devices: Sequence[Device], common: Labels) -> dict[int, Size]:
         """Return the extents that the file states, by the number of the device."""
-        pairs: list[tuple[Labels, float, float, bool]] = []
+        # Width and height have their names; of a pair, the order is open (None) or stated.
+        pairs: list[tuple[Labels, float, float, bool | None]] = []
         sides: dict[tuple[str, ...], dict[bool, float]] = {}
         for entry in self._entries:
             words = set(split_words(entry.path[-1]))
@@ -341,13 +342,13 @@ class Recognition:
                 continue
             if entry.values.size == 2 and SIZE_WORDS & (words | entry.words):
                 a, b = entry.values.ravel().tolist()
-                pairs.append((entry.labels, a, b, "shape" in words or self._is_matlab))
+                pairs.append((entry.labels, a, b, True if "shape" in words or self._is_matlab else None))
             elif part is not None and entry.values.size == 1:
                 around = (*entry.path[:-1], part[1])
                 sides.setdefault(around, {})[part[2] in _WIDTHS] = float(entry.values.item())
         pairs += [(labels_of(a), both[True], both[False], False) for a, both in sides.items() if len(both) == 2]
         labels = [device.labels for device in devices]
-        found: dict[int, tuple[float, float, bool]] = {}
+        found: dict[int, tuple[Size, bool | None]] = {}
         for of, a, b, is_rows_first in pairs:
             if not all(float(side).is_integer() and _MIN_SIDE_PX <= side <= MAX_SIDE_PX for side in (a, b)):
                 continue
@@ -358,28 +359,26 @@ class Recognition:
                 numbers = [n for n, each in enumerate(labels) if PROJECTOR not in each]
                 numbers = numbers if len(numbers) == 1 or self._projector is None else []
             for n in numbers:
-                found.setdefault(n, (a, b, is_rows_first))
-        wants = [*self._cameras.values(), *([self._projector] if self._projector else [])]
-        is_rows_first = self._are_rows_first(found, devices, wants)
-        return {n: Size(int(b), int(a)) if is_rows_first else Size(int(a), int(b)) for n, (a, b, _) in found.items()}
+                found.setdefault(n, (Size(int(a), int(b)), is_rows_first))
+        flip = self._are_rows_first({n: size for n, (size, stated) in found.items() if stated is None}, devices)
+        return {
+            n: Size(*size.shape) if stated or (stated is None and flip) else size for n, (size, stated) in found.items()
+        }
 
-    def _are_rows_first(
-        self, found: Mapping[int, tuple[float, float, bool]], devices: Sequence[Device], wanted: Sequence[Size]
-    ) -> bool:
-        """Return True if the sizes are (rows, columns): by the capture, by their names, or by the principal points."""
-        fits = [
-            sum((Size(int(a), int(b)) if not flip else Size(int(b), int(a))) in wanted for a, b, _ in found.values())
-            for flip in (False, True)
-        ]
-        if fits[0] != fits[1]:
-            return fits[1] > fits[0]
-        if any(stated for _, _, stated in found.values()):
-            return True
+    def _are_rows_first(self, pairs: Mapping[int, Size], devices: Sequence[Device]) -> bool:
+        """Return True if pairs are (rows, columns): by the capture, or by the principal points of cameras."""
+        wanted = [*self._cameras.values(), *([self._projector] if self._projector else [])]
+        fits, turned = (sum(each in wanted for each in sizes) for sizes in (
+            pairs.values(), [Size(*each.shape) for each in pairs.values()]
+        ))  # fmt: skip
+        if fits != turned:
+            return turned > fits
         off = np.zeros(2)
-        for n, (a, b, _) in found.items():
+        for n, size in pairs.items():
             centre = devices[n].matrix[:2, 2] + 0.5
             if PROJECTOR not in devices[n].labels:
-                off += [np.abs(centre / [a, b] - 0.5).max(), np.abs(centre / [b, a] - 0.5).max()]
+                sides = np.array([size.width_px, size.height_px])
+                off += [np.abs(centre / each - 0.5).max() for each in (sides, sides[::-1])]
         return bool(off[1] < 0.5 * off[0])
 
     def _keyed_devices(self) -> list[Device]:
@@ -390,7 +389,7 @@ class Recognition:
         for name, items in self._keys.devices.items():
             own = [entry for item in items for entry in self._named(item)]
             inner = {id(entry) for entry in own}
-            matrices = [each for each in self._matrices() if id(each[0]) in inner]
+            matrices = _distinct([each for each in self._matrices() if id(each[0]) in inner])
             if len(matrices) != 1:
                 self._refuse(f"one matrix of '{name}' in --keys", f"{len(matrices)} in {', '.join(items)}",
                              f"name it, as {KEYS_HELP}")  # fmt: skip
@@ -401,7 +400,7 @@ class Recognition:
                 terms, lens = rest[0].values.ravel(), rest[0].name
             equidistant = terms.size == 4 and any(_FISHEYE.search(e.name) for e in own)
             is_only = sum(each != PROJECTOR for each in self._keys.devices) == 1
-            labels = frozenset({name if name == PROJECTOR or not is_only else "camera"})
+            labels = entry.labels - {"camera", PROJECTOR} | {"camera" if is_only and name != PROJECTOR else name}
             devices.append(Device(labels, values, _names(entry), terms, lens, equidistant, is_transposed=transposed))
         if len(devices) < 2:
             self._refuse("two devices in --keys", "one", f"name both, as {KEYS_HELP}")
@@ -625,8 +624,9 @@ class Recognition:
 
     def _unit(self) -> LengthUnit | None:
         words = [text.lower() for path, text in self._texts.items() if "unit" in path[-1].lower()]
-        words += [word for e in self._entries if e.words & TRANSLATION_WORDS for word in split_words(e.path[-1])
-                  if word != "m"]  # fmt: skip
+        names = [word for e in self._entries if e.words & TRANSLATION_WORDS for word in split_words(e.path[-1])]
+        # A single letter, and cm, may be frames.
+        words += [word for word in names if word not in ("m", "cm")]
         return next((_UNITS[word] for word in words if word in _UNITS), None)
 
 
@@ -634,6 +634,11 @@ def is_centred(device: Pinhole) -> bool:
     """Return True if the principal point is near the middle of the image."""
     sides = np.array([device.size.width_px, device.size.height_px])
     return bool(np.abs((device.matrix[:2, 2] + 0.5) / sides - 0.5).max() <= _MAX_OFF_CENTRE)
+
+
+def _distinct(matrices: Sequence[tuple[Entry, FloatArray, bool]]) -> list[tuple[Entry, FloatArray, bool]]:
+    """Leave out the same matrix again: transposed, or from its parts."""
+    return [each for n, each in enumerate(matrices) if not any(np.allclose(each[1], b[1]) for b in matrices[:n])]
 
 
 def _is_intrinsic(matrix: FloatArray) -> bool:

@@ -150,6 +150,7 @@ def matlab_camera(matrix: FloatArray, terms: FloatArray, size: Size) -> dict[str
         "WorldPoints": np.zeros((54, 2)),
         "WorldUnits": "millimeters",
         "IntrinsicMatrix": shifted.T,
+        "K": shifted,
         "RotationVectors": np.zeros((12, 3)),
     }
 
@@ -216,9 +217,11 @@ def test_two_files_of_opencv_and_a_file_for_each_device_are_read_as_a_folder(tmp
 
 
 def test_sizes_and_the_unit_are_those_of_the_file(tmp_path: Path) -> None:
-    path = written(tmp_path / "rig.json", json.dumps(plain({**SCALARS, "R": R, "translation_cm": T / 10})))
+    path = written(tmp_path / "rig.json", json.dumps(plain({**SCALARS, "R": R, "T": T / 10, "units": "cm"})))
     require_numbers(read(path))
-    assert "fx, camera.fy" in import_calibration(path).notes[0]
+    notes = import_calibration(path).notes
+    assert "fx, camera.fy" in notes[0]
+    assert notes[-1] == "lengths in cm, as the file says"
 
 
 def test_slstudio_states_the_sizes_of_both(tmp_path: Path) -> None:
@@ -382,6 +385,18 @@ def test_keys_say_what_is_what(tmp_path: Path) -> None:
         with pytest.raises(CalibrationError) as caught:
             read(path, **CAPTURE, keys=keys)
         assert words in str(caught.value)
+
+
+def test_keys_may_name_groups(tmp_path: Path) -> None:
+    parts = FORMS["MATLAB's stereoParameters"][1]["stereoParams"]
+    path = mat(tmp_path / "rig.mat", {"stereoParams": parts})
+    with pytest.raises(CalibrationError, match="names that say which device is the projector"):
+        read(path)
+    words = ["camera=CameraParameters1,160x128 projector=CameraParameters2,128x96"]
+    require_numbers(read(path, keys=words))
+    two = read(path, keys=["left=CameraParameters1,160x128 right=CameraParameters2,128x96"])
+    assert two.projector is None
+    np.testing.assert_allclose(two.cameras["right"].rotation, R)
 
 
 def pickled(path: Path) -> Path:
