@@ -69,13 +69,13 @@ class CodedImages(Generic[Image]):
         from slrig.reconstruction import PixelPairs
 
         codes = {name: self._decoded(name) for name in calibration.cameras if name in self._cameras}
-        seen = [(calibration.cameras[name], calibration.projector, codes[name]) for name in codes]
+        views = [(calibration.cameras[name], calibration.projector, codes[name]) for name in codes]
         if calibration.projector is None:
-            seen = [
+            views = [
                 (calibration.cameras[a], calibration.cameras[b], _same_codes(codes[a], codes[b]))
                 for a, b in combinations(codes, 2)
             ]
-        for first, second, (pixels, coded) in seen:
+        for first, second, (pixels, coded) in views:
             if second is not None and len(pixels) >= _MIN_PAIRS:
                 axis = Axis.ROW if np.isnan(coded[:, 0]).all() else Axis.COLUMN
                 yield first, second, PixelPairs(pixels, coded, np.zeros(len(pixels)), axis)

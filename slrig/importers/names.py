@@ -35,9 +35,9 @@ ROTATION_WORDS = _words(
 TRANSLATION_WORDS = _words("t tr trans translation translate tvec position offset shift origin")
 VECTOR_WORDS = _words("vec vector mat matrix stereo of the in rel relative extrinsic extrinsics xyz mm cm m")
 SIZE_WORDS = _words("size sizes resolution res shape dims dim dimensions dimension imsize wh extent")
-_NOT_RAW = _words(
-    "new opt optimal rect rectified rectify rectification undist undistorted undistort init initial guess error errors "
-    "err std stds sigma uncertainty homography essential fundamental vectors vecs rvecs tvecs rotations translations"
+_NOT_RAW = re.compile(
+    r"\b(new|opt|rect|init|err|std|stds|vecs|rvecs|tvecs)\b|new(cam|mtx|k)|optimal|rectif|undist|initial|guess|error"
+    "|uncertain|sigma|homograph|essential|fundamental|vectors|rotations|translations"
 )
 _SHORT = MATRIX_WORDS | LENS_WORDS | ROTATION_WORDS | TRANSLATION_WORDS | {"rt"}
 _PART = re.compile(r"(?:(.*)[_.\- ])?(fx|fy|cx|cy|ppx|ppy|k[1-6]|p[12])(?:[_.\- ](.*))?")
@@ -50,7 +50,7 @@ def split_words(name: str) -> list[str]:
     (['camera', 'matrix', '1'], ['kk', 'left'], ['r', 'cam', '2', 'proj'], ['cam', '0'])
     """
     words = re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+", name)
-    return [str(int(word)) if word.isdigit() else word.lower() for word in words]
+    return [word.lstrip("0") or "0" if word.isdigit() else word.lower() for word in words]
 
 
 def labels_of(path: Iterable[str]) -> Labels:
@@ -105,7 +105,7 @@ class Entry:
     @property
     def is_raw(self) -> bool:
         """False for what was computed from a calibration: rectified and optimal matrices, errors, first guesses."""
-        return not _NOT_RAW & {word for part in self.path for word in split_words(part)}
+        return not _NOT_RAW.search(" ".join(word for part in self.path for word in split_words(part)))
 
     @property
     def vector(self) -> FloatArray | None:

@@ -35,6 +35,10 @@ from slrig.model import Calibration, FloatArray, LengthUnit, Pinhole, Size
 
 PROJECTOR = "projector"
 POSE = "pose"
+KNOWN_HELP = (
+    "Files of OpenCV, MATLAB, NumPy, ROS, Kalibr, scan3d-capture, SLStudio, sltk and procam-calibration are read as "
+    "they are"
+)
 KEYS_HELP = "--keys 'camera=K1,D1,1280x1024 projector=K2,D2,1024x768 pose=R,T'"
 
 _MIN_FOCAL_PX = 10.0
@@ -286,7 +290,7 @@ class Recognition:
             f"{e.name} ({' x '.join(map(str, e.values.shape))})" for e in self._entries if e.values.size > 1
         )
         self._refuse(expected, f"{shapes[:300] or 'no arrays'}",
-                     f"name them, as {KEYS_HELP}, or export a file that has them")  # fmt: skip
+                     f"name them, as {KEYS_HELP}, or export a file that has them. {KNOWN_HELP}")  # fmt: skip
 
     def _device(
         self, labels: Labels, common: Labels, matrix: tuple[Entry, FloatArray, bool], others: Sequence[Labels]
@@ -589,10 +593,11 @@ class Recognition:
         if len(readings) == 1:
             return usual, ""
         if self._capture is not None:
-            scores = [self._capture.disagreement_px(each.calibration) for each in readings]
-            known = sorted((score, n) for n, score in enumerate(scores) if score is not None)
-            if len(known) > 1 and not (usual.is_stated and known and (scores[0] or 0.0) <= _CONTRADICTS_PX):
-                (best, place), (second, _) = known[:2]
+            first = self._capture.disagreement_px(usual.calibration)
+            if first is not None and not (usual.is_stated and first <= _CONTRADICTS_PX):
+                scores = [self._capture.disagreement_px(each.calibration) for each in readings[1:]]
+                known = [(score, n) for n, score in enumerate(scores, 1) if score is not None]
+                (best, place), (second, _) = sorted([(first, 0), *known])[:2]
                 if best <= min(_MAX_AGREEING_PX, _AGREES * second):
                     otherwise = f"otherwise to {second:.2g} px" if np.isfinite(second) else "otherwise rays do not meet"
                     agreement = f"columns and rows of the images agree with it to {best:.2g} px (median), {otherwise}"
@@ -707,10 +712,10 @@ def _pose_owner(labels: Labels, devices: Sequence[Labels]) -> Labels | None:
     return found[0] if len(found) == 1 else None
 
 
-def _order(labels: Labels) -> tuple[int, ...]:
+def _order(labels: Labels) -> tuple[int, str]:
     """Sort numbers by their value, left before right, others as the file has them."""
-    numbers = [int(each) for each in labels if each.isdigit()]
-    return (0, min(numbers)) if numbers else (0, int("right" in labels))
+    number = min((each for each in labels if each.isdigit()), key=lambda each: (len(each), each), default="")
+    return (len(number), number) if number else (0, "right" if "right" in labels else "")
 
 
 def _names(entry: Entry) -> str:

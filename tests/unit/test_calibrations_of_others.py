@@ -175,7 +175,7 @@ FORMS: dict[str, tuple[str, Mapping[str, Any]]] = {
     "single numbers": ("json", {**SCALARS, "rotation": R, "translation_mm": T}),
     "a rotation vector": ("yaml", {"camera": CAMERA_MAP, "projector": {**PROJECTOR_MAP, "rvec": TURN, "tvec": T}}),
     "results of rectification beside it": ("npz", {
-        **dict(zip(("M1", "D1", "M2", "D2", "R", "T"), SIX, strict=True)), "R1": R.T, "R2": R, "E": R @ R,
+        **dict(zip(("K1", "D1", "K2", "D2", "R", "T"), SIX, strict=True)), "R1": R.T, "R2": R, "E": R @ R,
         "Q": np.diag([1, 2, 3, 4]), "P1": np.hstack([K1, T]), "newcameramtx1": K1 - np.diag([9, 9, 0]),
         "roi1": np.arange(4), "rms": np.float64(0.3), "rvecs": np.zeros((7, 3)),
     }),
