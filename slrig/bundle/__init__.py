@@ -1,7 +1,6 @@
 """Scan bundles: folders with a description, frames, and a calibration, from slrig or from other programs."""
 
 from slrig.bundle.calibration import (
-    DEVICE_KEYS,
     MAX_CALIBRATION_BYTES,
     check_calibration,
     parse_calibration,
@@ -110,7 +109,6 @@ __all__ = [
     "CALIBRATION",
     "CAMERA_NAME",
     "DESCRIPTION",
-    "DEVICE_KEYS",
     "EXPOSURE_KEYS",
     "MAX_CALIBRATION_BYTES",
     "MAX_CAMERA_PX",

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from slrig.bundle import (
     CAMERA_NAME,
-    DEVICE_KEYS,
     MAX_SIDE_PX,
     MAX_STORAGE_BYTES,
     Strict,
@@ -558,8 +557,8 @@ def _format(path: Path) -> CalibrationFormat | None:
         return None
     if text.startswith(("%YAML", "<")):
         root = read_file_storage(text, path)
-        devices = [each for each in root.values() if isinstance(each, dict) and len(set(each) & set(DEVICE_KEYS)) >= 4]
-        return "opencv" if devices or not root else None
+        is_own = any(isinstance(each, dict) and "translation_mm" in each for each in root.values())
+        return "opencv" if is_own or not root else None
     if path.suffix.lower() in (".yml", ".yaml"):
         return "kalibr" if re.search(r"(?m)^cam\d+:", text) and "intrinsics" in text else None
     return "slrig" if not text.strip() or re.search(r'"(format|size_px)"\s*:', text) else None

@@ -46,6 +46,8 @@ def plain(value: Any) -> Any:
     """The same with lists instead of arrays."""
     if isinstance(value, Mapping):
         return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [plain(each) for each in value]
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
@@ -54,8 +56,17 @@ def file_storage(path: Path, data: Mapping[str, Any]) -> Path:
     # What programs write beside it.
     storage.write("empty", np.zeros((0, 0)))
     storage.write("image_files", ["a b.png", "c.png"])
-    for name, value in data.items():
-        storage.write(name, value)
+
+    def put(entries: Mapping[str, Any]) -> None:
+        for name, value in entries.items():
+            if isinstance(value, Mapping):
+                storage.startWriteStruct(name, cv2.FileNode_MAP)
+                put(value)
+                storage.endWriteStruct()
+            else:
+                storage.write(name, value)
+
+    put(data)
     storage.release()
     return path
 
@@ -173,6 +184,12 @@ FORMS: dict[str, tuple[str, Mapping[str, Any]]] = {
                  "resolution": [96, 128]},
     }),
     "single numbers": ("json", {**SCALARS, "rotation": R, "translation_mm": T}),
+    "OpenCV's sample of one camera, twice": ("xml", {
+        **{name: {"image_width": s.width_px, "image_height": s.height_px, "camera_matrix": k,
+                  "distortion_coefficients": d, "board_width": 9, "avg_reprojection_error": 0.2}
+           for name, k, d, s in (("camera", K1, D1, CAMERA), ("projector", K2, D2, PROJECTOR))},
+        "R": R, "T": T,
+    }),
     "a rotation vector": ("yaml", {"camera": CAMERA_MAP, "projector": {**PROJECTOR_MAP, "rvec": TURN, "tvec": T}}),
     "results of rectification beside it": ("npz", {
         **dict(zip(("K1", "D1", "K2", "D2", "R", "T"), SIX, strict=True)), "R1": R.T, "R2": R, "E": R @ R,
@@ -195,12 +212,8 @@ FORMS: dict[str, tuple[str, Mapping[str, Any]]] = {
 @pytest.mark.parametrize("form", FORMS)
 def test_forms_of_programs_are_read(tmp_path: Path, form: str) -> None:
     kind, data = FORMS[form]
-    writer = {"json": "json", "yaml": "PyYAML", "npz": "NumPy's savez", "mat": "MATLAB's save"}[kind]
-    if form == "MATLAB's stereoParameters":
-        data["stereoParams"]["CameraParameters2"]["ImageSize"] = np.array([96, 128])
-    if form == "a list of cameras":
-        data = {**data, "cameras": [plain(CAMERA_MAP)]}
-    require_numbers(read(WRITERS[writer][1](tmp_path / f"rig.{kind}", data), **CAPTURE))
+    writers = {"xml": "OpenCV's XML", "yaml": "PyYAML", "npz": "NumPy's savez", "mat": "MATLAB's save", "json": "json"}
+    require_numbers(read(WRITERS[writers[kind]][1](tmp_path / f"rig.{kind}", data), **CAPTURE))
 
 
 def test_two_files_of_opencv_and_a_file_for_each_device_are_read_as_a_folder(tmp_path: Path) -> None:
