@@ -32,9 +32,10 @@ from slrig.bundle import (
 )
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import CalibrationError
+from slrig.importers.coded_images import CodedImages
 from slrig.importers.documents import DOCUMENT_SUFFIXES, Leaf, Name, read_document, read_yaml
 from slrig.importers.lenses import as_lens
-from slrig.importers.recognition import PROJECTOR, CodedCapture, Keys, Recognition, is_centred, parse_keys
+from slrig.importers.recognition import PROJECTOR, Keys, Recognition, is_centred, parse_keys
 from slrig.model import (
     MM_PER_UNIT,
     Axis,
@@ -519,7 +520,7 @@ def import_calibration(
     cameras: Mapping[str, Size] | None = None,
     projector: Size | None = None,
     bits: Mapping[Axis, Gray] | None = None,
-    capture: CodedCapture | None = None,
+    capture: CodedImages[Any] | None = None,
     unit: LengthUnit | None = None,
     keys: Sequence[str] = (),
 ) -> ImportedCalibration:
@@ -569,7 +570,7 @@ def _read(
     cameras: Mapping[str, Size],
     projector: Size | None,
     bits: Mapping[Axis, Gray],
-    capture: CodedCapture | None,
+    capture: CodedImages[Any] | None,
     keys: Keys | None,
 ) -> tuple[Calibration, LengthUnit | None, Sequence[str]]:
     """Return the calibration in mm, the unit that its format states (None for none: mm were assumed), and notes."""

@@ -35,7 +35,7 @@ Image = TypeVar("Image")
 
 
 class CodedImages(Generic[Image]):
-    """Gray codes of a capture, as `slrig.importers.recognition.CodedCapture`. Images are read when they are needed.
+    """Gray codes of a capture. Images are read when they are needed.
 
     read : returns the (H, W) pixels of an image in the format of its camera.
     """

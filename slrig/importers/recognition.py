@@ -10,13 +10,14 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NoReturn, Protocol
+from typing import Any, NoReturn
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slrig.bundle import CAMERA_NAME, MAX_SIDE_PX
 from slrig.errors import CalibrationError
+from slrig.importers.coded_images import CodedImages
 from slrig.importers.documents import Leaf, Name
 from slrig.importers.lenses import Lens, as_lens
 from slrig.importers.names import (
@@ -67,16 +68,6 @@ _AGREES = 0.35
 _MAX_AGREEING_PX = 20.0
 _CONTRADICTS_PX = 1.0  # residual of the usual reading from which another one may take its place
 _IN_FRONT, _BEHIND = 0.9, 0.5  # shares of points
-
-
-class CodedCapture(Protocol):
-    """What a capture says of a calibration."""
-
-    def disagreement_px(self, calibration: Calibration) -> float | None:
-        """Median residual of the equation that a point with both coordinates has to spare; None if there is none."""
-
-    def share_in_front(self, calibration: Calibration) -> float | None:
-        """Share of the points that lie in front of both devices; None if the capture has too few."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +195,7 @@ class Recognition:
         keys: Keys | None,
         cameras: Mapping[str, Size],
         projector: Size | None,
-        capture: CodedCapture | None,
+        capture: CodedImages[Any] | None,
         program: str,
     ) -> None:
         self._path, self._keys, self._capture = path, keys or Keys({}), capture
@@ -442,14 +433,18 @@ class Recognition:
         ]
         of_name = [entry for entry in translations if entry.words & TRANSLATION_WORDS]
         transpose = self._is_matlab or (bool(devices) and all(device.is_transposed for device in devices))
-        for entry, rotation in named or rotations:
-            for other in of_name or translations:
-                if other is entry or other.path[:-1] != entry.path[:-1] or other.labels != entry.labels:
-                    continue
-                turn = rotation.T if transpose and entry.values.size == 9 else rotation
-                stated = entry.words | other.words <= _STATED_WORDS and not (transpose and not self._is_matlab)
-                names, vector = f"{entry.name}, {other.name}", other.values.ravel()
-                yield _from_to(Pose(entry.labels, turn, vector, names, stated), entry)
+        turns, shifts = named or rotations, of_name or translations
+        pairs = [(turn, shift) for turn in turns for shift in shifts if shift is not turn[0]]
+        alike = [
+            (turn, shift)
+            for turn, shift in pairs
+            if shift.path[:-1] == turn[0].path[:-1] and shift.labels == turn[0].labels
+        ]
+        for (entry, rotation), other in alike or (pairs if len(named) == len(of_name) == 1 else []):
+            turn = rotation.T if transpose and entry.values.size == 9 else rotation
+            stated = entry.words | other.words <= _STATED_WORDS and not (transpose and not self._is_matlab)
+            names, vector = f"{entry.name}, {other.name}", other.values.ravel()
+            yield _from_to(Pose(entry.labels, turn, vector, names, stated), entry)
         for entry in entries:
             if entry.values.size in (12, 16) and entry.values.shape in ((3, 4), (4, 4), (12,), (16,)):
                 rows = entry.values.reshape(-1, 4)

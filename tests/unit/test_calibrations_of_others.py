@@ -123,6 +123,7 @@ NAMES = [
     ("camera_matrix", "camera_distortion", "projector_matrix", "projector_distortion", "R_cam2proj", "t_cam2proj"),
     ("A1", "k1", "A2", "k2", "rot", "trans"),
     ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),
+    ("cameraMatrix", "distCoeffs", "projectorMatrix", "projectorDistCoeffs", "R_proj", "tvec"),
 ]
 
 
@@ -260,8 +261,7 @@ def test_sections_of_a_text_are_devices(tmp_path: Path) -> None:
 def test_an_array_of_both_and_one_distortion_without_a_device(tmp_path: Path) -> None:
     stacked = {"K": np.stack([K1, K2]), "D": np.stack([D1, D2]), "R": R, "T": T}
     require_numbers(read(npz(tmp_path / "stacked.npz", stacked), **CAPTURE))
-    loose = {"cameraMatrix": K1, "distCoeffs": D1, "projectorMatrix": K2, "projectorDistCoeffs": D2, "R": R, "T": T}
-    require_numbers(read(npz(tmp_path / "loose.npz", loose), **CAPTURE))
+    loose = dict(zip(NAMES[-1], SIX, strict=True))
     with pytest.raises(CalibrationError, match="expected the distortion of each device, found distCoeffs alone"):
         read(npz(tmp_path / "one.npz", {k: v for k, v in loose.items() if k != "projectorDistCoeffs"}), **CAPTURE)
 
