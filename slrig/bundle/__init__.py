@@ -2,13 +2,9 @@
 
 from slrig.bundle.calibration import (
     MAX_CALIBRATION_BYTES,
-    MAX_STORAGE_BYTES,
-    Value,
     check_calibration,
-    five_distortion_terms,
     parse_calibration,
     read_calibration,
-    read_file_storage,
     read_opencv_calibration,
     require_two_rays,
     write_calibration,
@@ -23,6 +19,7 @@ from slrig.bundle.description import (
     CameraName,
     read_description,
 )
+from slrig.bundle.file_storage import MAX_STORAGE_BYTES, Value, read_file_storage
 from slrig.bundle.images import (
     read_frame_format,
     read_pages,
@@ -154,7 +151,6 @@ __all__ = [
     "embed_masks",
     "encode_poses",
     "encode_turntable",
-    "five_distortion_terms",
     "json_bytes",
     "model_keys",
     "natural_sort_key",

@@ -1,11 +1,4 @@
-"""Calibration files: slrig's calibration.json, and OpenCV's FileStorage (YAML, XML) with its own small reader.
-
-OpenCV's reader is unsafe for files from others: a short file can make it write outside its memory. PyYAML's pure Python
-parser takes seconds for a large covariance, and does not end in useful time for deeply nested sequences. This reader
-knows maps, text, numbers and dense matrices of `d`, `f` or `i` with one channel. It checks its limits before it builds
-anything, and does not recurse, so that no file is too deep for it. It refuses everything else with the line number.
-OpenCV 5 writes an array of one dimension as an `opencv-nd-matrix` with one size, which is read; more sizes are refused.
-"""
+"""Calibration files: slrig's calibration.json, and the same as OpenCV's FileStorage (YAML, XML)."""
 
 from __future__ import annotations
 
@@ -14,14 +7,14 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, TypeAlias, TypeGuard
-from xml.parsers import expat
+from typing import Annotated, Any, Literal, NoReturn, TypeGuard
 
 import cv2
 import numpy as np
 from pydantic import Field
 
 from slrig.bundle.description import CAMERA_NAME, MAX_SIDE_PX, PROJECTOR, CameraName, Extent
+from slrig.bundle.file_storage import MAX_STORAGE_BYTES, Value, read_file_storage
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.bundle.validation import MAX_FAULTS, AwareMoment, Strict, read_json_model, read_text, shorten
 from slrig.errors import CalibrationError
@@ -36,31 +29,6 @@ from slrig.model import (
     require_plausible,
 )
 
-MAX_DEPTH = 8
-MAX_NODES = 4096
-MAX_NUMBERS = 2**16
-"""Numbers of one matrix: the covariance of 16 devices has 57 600."""
-
-Value: TypeAlias = "dict[str, Value] | FloatArray | list[str | int | float] | str | int | float"
-
-_KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,63}")
-_INT = re.compile(r"[+-]?(?:0|[1-9][0-9]{0,18})")
-_REAL = re.compile(r"[+-]?(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))(?:[eE][+-]?[0-9]{1,5})?")
-_SPECIAL = {".nan": np.nan, ".inf": np.inf, "+.inf": np.inf, "-.inf": -np.inf}
-_MATRIX_KEYS = {
-    "opencv-matrix": {"rows", "cols", "dt", "data"},
-    "opencv-nd-matrix": {"sizes", "dt", "data"},
-}
-_KINDS = {"d": np.float64, "f": np.float32, "i": np.int32}
-_CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f]")
-_YAML_HEAD = re.compile(r"%YAML[: ]1\.[0-9]")
-_YAML_ENTRY = re.compile(r"( *)([^\s:]+):(?:[ \t]+(.*))?")
-_QUOTED = re.compile(r'"((?:[^"\\]|\\.)*)"|\'((?:[^\']|\'\')*)\'')
-_COMMENT = re.compile(r"[ \t]*(?:#.*)?")
-_ESCAPE = re.compile(r"\\(x[0-9A-Fa-f]{2}|.)")
-_ESCAPED = {"n": "\n", "r": "\r", "t": "\t", "0": "\0"}
-
-MAX_STORAGE_BYTES = 4 * 2**20
 SOLVED = "solved"
 MAX_ID_LENGTH = 64
 NODE_NAME = re.compile(r"^[A-Za-z_][A-Za-z0-9_-]*$")
@@ -76,233 +44,6 @@ SOLVED_KEYS = ("id", "solved_at", "covariance", "volume_mm", "expected_error_mm"
 
 MAX_CALIBRATION_BYTES = 4 * 2**20
 MAX_DEVICES = 16
-
-
-def read_file_storage(text: str, path: Path) -> dict[str, Value]:
-    """Return the maps, numbers, texts and matrices (float64) of a FileStorage text; `path` is for messages.
-    Raises CalibrationError, with the line: the text is cut, of another layout, or beyond a limit.
-    """
-    builder = _TreeBuilder(path)
-    text = text.removeprefix("\ufeff")
-    control = _CONTROL.search(text)
-    if control:
-        builder.line = text.count("\n", 0, control.start()) + 1
-        builder.refuse("text", f"the control character {control[0]!r}")
-    if text.startswith("<"):
-        _read_xml(text, builder)
-    elif text.startswith("%YAML"):
-        _read_yaml(text.split("\n"), builder)
-    else:
-        builder.refuse("OpenCV FileStorage, which begins with %YAML or <", shorten(text[:40]))
-    return builder.root
-
-
-class _TreeBuilder:
-    """Builds the tree of a file within the limits. `line` is the reader's present line."""
-
-    def __init__(self, path: Path) -> None:
-        self.root: dict[str, Value] = {}
-        self.line = 1
-        self._path = path
-        self._open: list[tuple[str, str, dict[str, Value], int]] = [("", "", self.root, 1)]
-        self._nodes = 0
-
-    @property
-    def depth(self) -> int:
-        """Number of open maps, without the root."""
-        return len(self._open) - 1
-
-    def refuse(self, expected: str, found: str, remedy: str = "export it again") -> NoReturn:
-        raise CalibrationError(f"{self._path}: expected {expected}, found {found} at line {self.line}; {remedy}")
-
-    def open(self, key: str, kind: str) -> None:
-        """Begin a map; `kind` is empty, or the type of a matrix."""
-        if self.depth >= MAX_DEPTH:
-            self.refuse(f"at most {MAX_DEPTH} maps in each other", "another one")
-        if kind and kind not in _MATRIX_KEYS:
-            self.refuse("an opencv-matrix", shorten(kind), "export matrices of numbers only")
-        self._check(key)
-        self._open.append((key, kind, {}, self.line))
-
-    def add(self, key: str, value: Value) -> None:
-        """Put a value into the innermost open map."""
-        self._check(key)
-        self._open[-1][2][key] = value
-
-    def close(self) -> None:
-        """End the innermost open map."""
-        key, kind, entries, opening_line = self._open.pop()
-        # Faults of a matrix show at its end, which may be the line of another key: report its beginning.
-        line, self.line = self.line, opening_line
-        self._open[-1][2][key] = self._matrix(key, kind, entries) if kind else entries
-        self.line = line
-
-    def _check(self, key: str) -> None:
-        self._nodes += 1
-        if self._nodes > MAX_NODES:
-            self.refuse(f"at most {MAX_NODES} entries", "more", "leave out all but the calibration")
-        if not _KEY.fullmatch(key):
-            self.refuse("a key of at most 64 letters, digits, - and _", shorten(key), "rename it")
-        if key in self._open[-1][2]:
-            self.refuse("each key once in a map", f"'{key}' twice", "keep one of them")
-
-    def _matrix(self, key: str, kind: str, entries: dict[str, Value]) -> FloatArray:
-        if set(entries) != _MATRIX_KEYS[kind]:
-            self.refuse(f"{', '.join(sorted(_MATRIX_KEYS[kind]))} in '{key}'", f"{', '.join(sorted(entries)[:8])}")
-        shape = [entries[name] for name in ("rows", "cols", "sizes") if name in entries]
-        shape = [part[0] if isinstance(part, list) and len(part) == 1 else part for part in shape]
-        sides = [part for part in shape if isinstance(part, int) and 1 <= part <= MAX_NUMBERS]
-        if len(sides) != len(shape):
-            self.refuse(f"whole numbers from 1 as extent of '{key}', two of them at most", shorten(shape))
-        dt = str(entries["dt"]).removeprefix("1") if isinstance(entries["dt"], str) else ""
-        if dt not in _KINDS:
-            self.refuse(f"d, f or i as dt of '{key}'", shorten(entries["dt"]), "export it with one channel of numbers")
-        data = entries["data"] if isinstance(entries["data"], list) else [entries["data"]]
-        count = int(np.prod(sides, dtype=np.int64))
-        if len(data) != count:
-            self.refuse(f"{count} numbers as data of '{key}'", f"{len(data)}")
-        limit = 2**31
-        wrong = [
-            each
-            for each in data
-            if not isinstance(each, int if dt == "i" else int | float) or (dt == "i" and not -limit <= each < limit)
-        ]
-        if wrong:
-            self.refuse(f"numbers of the kind '{dt}' as data of '{key}'", shorten(wrong[0]))
-        with np.errstate(over="ignore"):
-            return np.array(data, dtype=_KINDS[dt]).astype(np.float64).reshape(sides)
-
-    def scalar(self, word: str) -> str | int | float:
-        """Return the value of an unquoted word."""
-        if _INT.fullmatch(word):
-            return int(word)
-        if _REAL.fullmatch(word):
-            return float(word)
-        return _SPECIAL.get(word.lower(), word)
-
-    def scalars(self, words: list[str]) -> list[str | int | float]:
-        """Return the values of the words of a sequence."""
-        if len(words) > MAX_NUMBERS:
-            self.refuse(f"at most {MAX_NUMBERS} numbers in a matrix", f"{len(words)}")
-        return [self.scalar(word.strip()) for word in words]
-
-
-def _read_yaml(lines: list[str], builder: _TreeBuilder) -> None:
-    if not _YAML_HEAD.fullmatch(lines[0].rstrip()):
-        builder.refuse("%YAML:1.0 or %YAML 1.2", shorten(lines[0]))
-    columns = [-1]
-    """Column of the keys of each open map; a map without keys yet has the column of its opener."""
-    opener: int | None = None
-    next_line = 1
-    while next_line < len(lines):
-        line, builder.line, next_line = lines[next_line].rstrip("\r"), next_line + 1, next_line + 1
-        if _COMMENT.fullmatch(line) or (line.rstrip() == "---" and not builder.root and not builder.depth):
-            continue
-        if line.rstrip() == "..." and not any(map(str.strip, lines[next_line:])):
-            break
-        entry = _YAML_ENTRY.fullmatch(line)
-        if entry is None:
-            builder.refuse("`key: value`, indented with spaces", shorten(line), "write maps and opencv-matrices only")
-        column, key, rest = len(entry[1]), entry[2], entry[3] or ""
-        if opener is not None and column > opener:
-            columns.append(column)
-        elif opener is not None:
-            builder.close()
-        elif columns == [-1]:
-            columns = [column]
-        opener = None
-        while column < columns[-1] and len(columns) > 1:
-            columns.pop()
-            builder.close()
-        if column != columns[-1]:
-            builder.refuse(
-                "a key below that of its map", f"'{key[:64]}' in column {column + 1}", "indent it as the others"
-            )
-        if _COMMENT.fullmatch(rest) or rest.startswith("!!"):
-            builder.open(key, rest[2:].partition("#")[0].strip() or "!!" if rest.startswith("!!") else "")
-            opener = column
-        elif rest.startswith("["):
-            first = next_line
-            while "]" not in lines[next_line - 1] and next_line < len(lines):
-                next_line += 1
-            parts = [rest, *lines[first:next_line]]
-            body, end, after = " ".join(part.rstrip("\r").split(" #")[0] for part in parts).partition("]")
-            builder.line = next_line
-            if not end or not _COMMENT.fullmatch(after):
-                builder.refuse("a sequence that ends in ]", "none that does", "the file may be cut: copy it again")
-            builder.add(key, builder.scalars(body[1:].split(",") if body[1:].strip() else []))
-        else:
-            builder.add(key, _yaml_scalar(rest, builder))
-    for _ in range(builder.depth):
-        builder.close()
-
-
-def _yaml_scalar(text: str, builder: _TreeBuilder) -> str | int | float:
-    quoted = _QUOTED.match(text)
-    if quoted and _COMMENT.fullmatch(text, quoted.end()):
-        if quoted[1] is None:
-            return quoted[2].replace("''", "'")
-        return _ESCAPE.sub(lambda e: chr(int(e[1][1:], 16)) if len(e[1]) > 1 else _ESCAPED.get(e[1], e[1]), quoted[1])
-    if text[0] in "\"'{}[]&*!|>%@`?,":
-        builder.refuse("a number, text or an opencv-matrix", shorten(text), "write nothing else")
-    return builder.scalar(re.split(r"[ \t]#", text, maxsplit=1)[0].strip())
-
-
-def _read_xml(text: str, builder: _TreeBuilder) -> None:
-    parser = expat.ParserCreate("utf-8")
-    parser.buffer_text = True
-    # One for each open element: its key, its type, its text, and whether it contains elements.
-    elements: list[list[Any]] = []
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        builder.line = parser.CurrentLineNumber
-        if set(attributes) - {"type_id"}:
-            builder.refuse("no attribute but type_id", shorten(sorted(attributes)[0]), "leave it out")
-        if not elements:
-            if name != "opencv_storage":
-                builder.refuse("<opencv_storage>", shorten(name))
-        elif len(elements) > MAX_DEPTH + 1:
-            builder.refuse(f"at most {MAX_DEPTH} maps in each other", "another one")
-        else:
-            parent = elements[-1]
-            if "".join(parent[2]).strip():
-                builder.refuse("a map or text", "both in one element")
-            if len(elements) > 1 and not parent[3]:
-                builder.open(parent[0], parent[1])
-            parent[3] = True
-        elements.append([name, attributes.get("type_id", ""), [], False])
-
-    def end(_: str) -> None:
-        builder.line = parser.CurrentLineNumber
-        key, kind, parts, holds_elements = elements.pop()
-        text = "".join(parts).strip(" \t\r\n")
-        if holds_elements or not elements:
-            if text:
-                builder.refuse("a map or text", "both in one element")
-            if elements:
-                builder.close()
-        elif kind:
-            builder.refuse("an opencv-matrix with rows, cols, dt and data", shorten(kind))
-        elif text.startswith('"'):
-            if len(text) < 2 or not text.endswith('"'):
-                builder.refuse("one quoted text", shorten(text))
-            builder.add(key, text[1:-1])
-        else:
-            words = text.split()
-            builder.add(key, builder.scalar(words[0]) if len(words) == 1 else builder.scalars(words))
-
-    def refuse_kind(*_: object) -> None:
-        builder.line = parser.CurrentLineNumber
-        builder.refuse("elements, text and comments", "a document type, an entity or an instruction", "leave it out")
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler = lambda data: elements[-1][2].append(data)
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = parser.ProcessingInstructionHandler = refuse_kind
-    try:
-        parser.Parse(text.encode(), True)
-    except expat.ExpatError as cause:
-        builder.line = cause.lineno
-        builder.refuse("sound XML", expat.ErrorString(cause.code) or "a fault", "the file may be cut: copy it again")
 
 
 def read_opencv_calibration(path: Path) -> Calibration:

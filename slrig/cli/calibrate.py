@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 
 import typer
 
-from slrig.cli.options import AsJson, BoardArguments, ServiceOptions, Unit, by_beginning, grouped
+from slrig.cli.options import AsJson, BoardArguments, Keys, ServiceOptions, Unit, by_beginning, grouped
 from slrig.errors import CalibrationNotFoundError, ConfigError, ServiceError
 
 if TYPE_CHECKING:
@@ -303,17 +303,18 @@ def export(
         typer.Option(help="Whose form. ros: a new folder of camera_info and transforms. Default: by the ending."),
     ] = None,
     unit: Unit = None,
+    keys: Keys = None,
     *,
     service: ServiceOptions,
 ) -> None:
     """Write a calibration of a service, or a file, into a file.
 
-    Reads and writes the forms of slrig, OpenCV, ROS and Kalibr.
+    Reads files of any program; writes the forms of slrig, OpenCV, ROS and Kalibr.
     """
-    if Path(calibration).exists() or to is not None or unit is not None:
+    if Path(calibration).exists() or to is not None or unit is not None or keys:
         import tempfile
 
-        from slrig.importers import read_any_calibration, write_any_calibration
+        from slrig.importers import import_calibration, write_any_calibration
 
         with tempfile.TemporaryDirectory() as folder:
             source = Path(calibration)
@@ -321,7 +322,10 @@ def export(
                 source = Path(folder) / "calibration.json"
                 with service.client() as client:
                     _fetch(client, calibration, source.name, source)
-            write_any_calibration(file, read_any_calibration(source, unit=unit), to)
+            read = import_calibration(source, unit=unit, keys=keys or ())
+            write_any_calibration(file, read.calibration, to)
+        for note in read.notes:
+            typer.echo(f"{'read':<10}{note}")
     else:
         name = FILES.get(file.suffix.lower())
         if name is None:
@@ -353,25 +357,28 @@ def submit(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", help="Calibration: slrig's .json, OpenCV's .yml or .xml, Kalibr's .yaml, a folder of ROS's."
+            metavar="FILE", help="Calibration of any program: .json, .yml, .xml, .npz, .mat, or a folder, as ROS's."
         ),
     ],
     label: Annotated[str | None, typer.Option(help="Free text, to find the calibration again.")] = None,
     unit: Unit = None,
+    keys: Keys = None,
     service: ServiceOptions,
 ) -> None:
     """Give a service a calibration that was found elsewhere."""
     import tempfile
 
     from slrig.bundle import write_calibration
-    from slrig.importers import read_any_calibration
+    from slrig.importers import import_calibration
 
     with service.client() as client:
         # Looked at here first, so that faults are told by the file's name; one form travels, whichever the file has.
-        calibration = read_any_calibration(file, unit=unit)
+        read = import_calibration(file, unit=unit, keys=keys or ())
+        for note in read.notes:
+            typer.echo(f"{'read':<10}{note}")
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "calibration.json"
-            write_calibration(path, calibration)
+            write_calibration(path, read.calibration)
             document: Mapping[str, Any] = json.loads(path.read_bytes())
         query = "" if label is None else f"?{urlencode({'label': label})}"
         found = client.post(f"/calibration/import{query}", document)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from slrig.cli.options import Unit
+from slrig.cli.options import Keys, Unit
 from slrig.errors import ConfigError
 
 
@@ -61,9 +61,13 @@ def import_images(
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(help="Calibration to put into the bundle. Default: FOLDER/calibration.yml, .xml, .json."),
+        typer.Option(
+            help="Calibration to put into the bundle, a file of any program or a folder of them. Default: "
+            "FOLDER/calibration.yml, .xml, .json, .npz, .mat."
+        ),
     ] = None,
     unit: Unit = None,
+    keys: Keys = None,
 ) -> None:
     """Make a bundle of another program's images.
 
@@ -84,7 +88,15 @@ def import_images(
     naming = ImageNaming(program or (None if asked else "opencv"), pattern, names, white, black, listed)
     code = ProjectorCode(parse_size(projector), cell_px=cell_px, offset_px=offset_px)
     found, used = import_capture(
-        folder, output, code, naming, names=camera or (), bit_depth=bit_depth, calibration_file=calibration, unit=unit
+        folder,
+        output,
+        code,
+        naming,
+        names=camera or (),
+        bit_depth=bit_depth,
+        calibration_file=calibration,
+        unit=unit,
+        keys=keys or (),
     )
     for name, files in found.cameras.items():
         typer.echo(f"{'camera':<11}{name}: {len(files)} images, {files[0][0].name} to {files[-1][0].name}")
@@ -96,4 +108,6 @@ def import_images(
     typer.echo(f"{'bundle':<11}{output}")
     how = "" if used is not None else " --decode-only"
     typer.echo(f"{'calibrated':<11}{used or 'no: it can only be decoded'}")
+    for note in found.calibration_notes:
+        typer.echo(f"{'':<11}{note}")
     typer.echo(f"To go on: slrig reconstruct {output} --output {output.name}-mesh{how}")

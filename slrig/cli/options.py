@@ -23,6 +23,14 @@ Unit = Annotated[
     Literal["mm", "cm", "m", "inch"] | None,
     typer.Option(help="Unit of the calibration's translations. Default: what its format states, otherwise mm."),
 ]
+Keys = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="WORDS",
+        help="What the names of a calibration's file mean, and sizes that it lacks: 'camera=K1,D1,1280x1024 "
+        "projector=K2,D2,1024x768 pose=R,T' (or pose=R,T,inverse). Default: found by shape and names.",
+    ),
+]
 
 
 @dataclass(frozen=True, slots=True)

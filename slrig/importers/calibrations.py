@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,8 +19,6 @@ from slrig.bundle import (
     MAX_SIDE_PX,
     MAX_STORAGE_BYTES,
     Strict,
-    Value,
-    five_distortion_terms,
     parse_calibration,
     read_file_storage,
     read_opencv_calibration,
@@ -34,6 +32,10 @@ from slrig.bundle import (
 )
 from slrig.disk import staging_name, storage_errors
 from slrig.errors import CalibrationError
+from slrig.importers.coded_images import CodedImages
+from slrig.importers.documents import DOCUMENT_SUFFIXES, Leaf, Name, read_document, read_yaml
+from slrig.importers.lenses import as_lens
+from slrig.importers.recognition import PROJECTOR, Keys, Recognition, is_centred, parse_keys
 from slrig.model import (
     MM_PER_UNIT,
     Axis,
@@ -48,66 +50,22 @@ from slrig.model import (
     units_sentence,
 )
 from slrig.patterns import gray_bits
-from slrig.ros_messages import FRAME, MM_PER_M, PROJECTOR, WORLD, lens, pose
+from slrig.ros_messages import FRAME, MM_PER_M, WORLD, lens, pose
 
 CalibrationFormat = Literal["slrig", "opencv", "ros", "kalibr"]
 FORMAT_BY_SUFFIX: Mapping[str, CalibrationFormat] = {".json": "slrig", ".yml": "opencv", ".xml": "opencv"}
 
-MAX_YAML_BYTES = 2**18
-MAX_YAML_DEPTH = 12
-
 TRANSFORMS = "transforms.yaml"
 
-PROGRAM_KEYS = {
+_PROGRAMS = {
     "scan3d-capture": ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
     "SLStudio": ("Kc", "kc", "Kp", "kp", "Rp", "Tp"),
     "procam-calibration": ("cam_int", "cam_dist", "proj_int", "proj_dist", "rotation", "translation"),
+    "procam-calibration's sample": ("cam_int", "cam_dist", "proj_int", "proj_dist", "roration", "translation"),
+    "sltk": ("cam_K", "cam_kc", "pro_K", "pro_kc", "R", "T"),
     "OpenCV's sample of stereo calibration": ("M1", "D1", "M2", "D2", "R", "T"),
 }
-"""Keys by which a program's file is recognised: matrix and distortion of both devices, rotation and translation."""
-
-_Loader: Any = type("_Loader", (yaml.SafeLoader,), {})
-# YAML 1.1 requires a point in a number with an exponent; other programs write 1e-05.
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+$"), list("-+0123456789")
-)
-
-
-def read_yaml(path: Path) -> Any:
-    """Return the data of a YAML file. Raises CalibrationError, with the line: the file is truncated, too large, nested
-    too deep, or has anchors, which can expand a short file without limit.
-    """
-    text = read_text(path, MAX_YAML_BYTES, CalibrationError)
-    depth = 0
-    try:
-        # Check all events before anything is built from them.
-        for event in yaml.parse(text, _Loader):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_YAML_DEPTH or isinstance(event, yaml.AliasEvent):
-                mark: Any = event.start_mark
-                message = (
-                    f"{path}: expected YAML without anchors, nested at most {MAX_YAML_DEPTH} deep, found otherwise"
-                )
-                raise CalibrationError(f"{message} at line {mark.line + 1}; export it again")
-        _require_single_keys(yaml.compose(text, _Loader), path)
-        return yaml.load(text, _Loader)  # noqa: S506 - a safe loader
-    except (yaml.YAMLError, ValueError) as cause:
-        mark = getattr(cause, "problem_mark", None)
-        where = "" if mark is None else f" at line {mark.line + 1}"
-        problem = getattr(cause, "problem", None) or str(cause)
-        raise CalibrationError(f"{path}: expected YAML, found {problem}{where}; correct it") from cause
-
-
-def _require_single_keys(node: Any, path: Path) -> None:
-    """Reject duplicate keys in a map, of which PyYAML would keep the last."""
-    if isinstance(node, yaml.MappingNode):
-        keys = [str(key.value) for key, _ in node.value]
-        if len(set(keys)) < len(keys):
-            line = node.start_mark.line + 1
-            raise CalibrationError(f"{path}: expected each key once, found one twice in the map at line {line}")
-    for part in node.value if isinstance(node, yaml.CollectionNode) else ():
-        for each in part if isinstance(part, tuple) else (part,):
-            _require_single_keys(each, path)
+"""Names by which a program's file is known: matrix and distortion of both devices, rotation and translation."""
 
 
 def yaml_bytes(data: object) -> bytes:
@@ -190,29 +148,42 @@ class TfMessage(Strict):
     transforms: Annotated[list[TransformStamped], Field(min_length=1, max_length=64)]
 
 
-def read_ros(folder: Path) -> Calibration:
-    """Return the calibration in a folder of camera_info files.
+def read_ros(folder: Path) -> tuple[Calibration, list[str]]:
+    """Return the calibration in a folder of camera_info files, and notes on lenses that were fitted.
+
+    The poses are those of transforms.yaml, or without it those that the rectification of a stereo pair implies.
     Raises CalibrationError: a file is missing or invalid, a lens model is not supported, or a device has no transform.
     """
     files = {each.stem: each for each in sorted(folder.glob("*.yaml")) if each.name != TRANSFORMS}
-    if not files or not (folder / TRANSFORMS).is_file():
+    infos = {
+        name: validate(RosCameraInfo, read_yaml(path), str(path), error=CalibrationError)
+        for name, path in files.items()
+    }
+    has_transforms = (folder / TRANSFORMS).is_file()
+    rectified = {} if has_transforms else _rectified_poses(infos)
+    if not files or not (has_transforms or rectified):
         found = ", ".join(sorted(each.name for each in folder.iterdir())[:8]) or "nothing"
         raise CalibrationError(
             f"{folder}: expected NAME.yaml of each device, camera_info as camera_calibration writes it, and "
-            f"{TRANSFORMS} with their poses, found {found}; add the missing files"
+            f"{TRANSFORMS} with their poses (or two with the projection_matrix of a stereo pair), found {found}; add "
+            "the missing files"
         )
-    poses = _read_ros_poses(folder / TRANSFORMS)
-    devices = {name: _read_ros_device(path, poses, name) for name, path in files.items()}
+    poses = rectified or _read_ros_poses(folder / TRANSFORMS)
+    notes: list[str] = []
+    devices = {name: _build_ros_device(files[name], info, poses, name, notes) for name, info in infos.items()}
     projector = devices.pop(PROJECTOR, None)
     if not devices:
         raise CalibrationError(f"{folder}: expected a camera, found the projector alone; add its NAME.yaml")
-    return Calibration(devices, projector)
+    return Calibration(devices, projector), notes
 
 
-def _read_ros_device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: str) -> Pinhole:
-    info = validate(RosCameraInfo, read_yaml(path), str(path), error=CalibrationError)
-    terms = info.distortion_coefficients.array(f"{path}: distortion_coefficients").ravel()
-    if info.distortion_model not in ("plumb_bob", "rational_polynomial") or terms[5:].any() or len(terms) < 4:
+def _build_ros_device(
+    path: Path, info: RosCameraInfo, poses: dict[str, tuple[FloatArray, FloatArray]], name: str, notes: list[str]
+) -> Pinhole:
+    # Its writer states 5 columns for any number of terms.
+    terms = np.array(info.distortion_coefficients.data, dtype=np.float64)
+    is_equidistant = info.distortion_model in ("equidistant", "fisheye")
+    if not is_equidistant and info.distortion_model not in ("plumb_bob", "rational_polynomial", "thin_prism_fisheye"):
         raise CalibrationError(
             f"{path}: expected the distortion plumb_bob (k1, k2, p1, p2, k3), found {info.distortion_model} with "
             f"{len(terms)} numbers; slrig supports no other lens: calibrate with plumb_bob"
@@ -224,13 +195,38 @@ def _read_ros_device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]]
             f"{path}: expected a transform to the frame {name} or {name}{FRAME}, found {known}; add it"
         )
     rotation, translation_mm = poses[frame]
-    five = np.zeros(5)
-    five[: min(len(terms), 5)] = terms[:5]
-    matrix = info.camera_matrix.array(f"{path}: camera_matrix")
+    matrix, size = info.camera_matrix.array(f"{path}: camera_matrix"), Size(info.image_width, info.image_height)
+    lens = as_lens(matrix, terms, size, f"{path}: distortion_coefficients", equidistant=is_equidistant)
+    notes += [f"{name}: {lens.note}"] if lens.note else []
     try:
-        return Pinhole(Size(info.image_width, info.image_height), matrix, five, rotation, translation_mm)
+        return Pinhole(size, lens.matrix, lens.distortion, rotation, translation_mm)
     except CalibrationError as cause:
         raise CalibrationError(f"{path}: {cause}") from cause
+
+
+def _rectified_poses(infos: Mapping[str, RosCameraInfo]) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return rotation and translation, mm, from the first of two cameras to each; empty if they are no stereo pair.
+
+    The rectified cameras have one matrix K', and R_2 x_2 = R_1 x_1 + t, with K' t the last column of the second's
+    projection (sensor_msgs/CameraInfo, less that of the first).
+    """
+    if len(infos) != 2:
+        return {}
+    straight, shifts = [], []
+    for info in infos.values():
+        try:
+            turn = validate(RosMatrix, info.rectification_matrix, "", error=CalibrationError).array("")
+            projection = validate(RosMatrix, info.projection_matrix, "", error=CalibrationError).array("")
+            shifts.append(np.linalg.solve(projection[:, :3], projection[:, 3]))
+        except (CalibrationError, ValueError, np.linalg.LinAlgError):
+            return {}
+        straight.append(turn)
+    shift = shifts[1] - shifts[0]
+    if not np.isfinite(shift).all() or not shift.any() or any(turn.shape != (3, 3) for turn in straight):
+        return {}
+    first, second = infos
+    moved = straight[1].T @ straight[0], straight[1].T @ shift * MM_PER_M
+    return {first: (np.eye(3), np.zeros(3)), second: moved}
 
 
 def _read_ros_poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
@@ -334,8 +330,8 @@ class KalibrCamera(Strict):
     cam_overlaps: object = None
 
 
-def read_kalibr(path: Path) -> Calibration:
-    """Return the calibration in a camchain file.
+def read_kalibr(path: Path) -> tuple[Calibration, list[str]]:
+    """Return the calibration in a camchain file, and notes on lenses that were fitted.
     Raises CalibrationError: the file is truncated, a lens model is not supported, or the chain has a gap.
     """
     data = read_yaml(path)
@@ -346,7 +342,7 @@ def read_kalibr(path: Path) -> Calibration:
         )
     chain = [_check_kalibr_camera(path, key, entry) for key, entry in data.items()]
     rotation, translation_mm = np.eye(3), np.zeros(3)
-    devices = {}
+    devices, notes = {}, []
     for name, key, entry in zip(_kalibr_camera_names(chain), data, chain, strict=True):
         if (entry.T_cn_cnm1 is None) != (key == "cam0"):
             message = (
@@ -359,24 +355,28 @@ def read_kalibr(path: Path) -> Calibration:
             translation_mm = step[:3, :3] @ translation_mm + step[:3, 3] * MM_PER_M
         (fx, fy, cx, cy), size = entry.intrinsics, Size(*entry.resolution)
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        terms, is_equidistant = np.array(entry.distortion_coeffs), entry.distortion_model == "equidistant"
+        lens = as_lens(matrix, terms, size, f"{path}: {key}.distortion_coeffs", equidistant=is_equidistant)
+        notes += [f"{name}: {lens.note}"] if lens.note else []
         try:
-            devices[name] = Pinhole(size, matrix, np.array([*entry.distortion_coeffs, 0.0]), rotation, translation_mm)
+            devices[name] = Pinhole(size, lens.matrix, lens.distortion, rotation, translation_mm)
         except CalibrationError as cause:
             raise CalibrationError(f"{path}: {key}.{cause}") from cause
     projector = devices.pop(PROJECTOR, None)
     if not devices:
         raise CalibrationError(f"{path}: expected a camera, found the projector alone; add it")
-    return Calibration(devices, projector)
+    return Calibration(devices, projector), notes
 
 
 def _check_kalibr_camera(path: Path, key: str, data: object) -> KalibrCamera:
     entry = validate(KalibrCamera, data, f"{path}: {key}", error=CalibrationError)
     models = (entry.camera_model, entry.distortion_model)
-    if models != ("pinhole", "radtan") or (len(entry.intrinsics), len(entry.distortion_coeffs)) != (4, 4):
+    known = {("pinhole", "radtan"), ("pinhole", "equidistant")}
+    if models not in known or (len(entry.intrinsics), len(entry.distortion_coeffs)) != (4, 4):
         raise CalibrationError(
-            f"{path}: {key}: expected pinhole-radtan with 4 intrinsics and 4 coefficients, found {'-'.join(models)} "
-            f"with {len(entry.intrinsics)} and {len(entry.distortion_coeffs)}; slrig supports no other lens: calibrate "
-            "with --models pinhole-radtan"
+            f"{path}: {key}: expected pinhole-radtan or pinhole-equi with 4 intrinsics and 4 coefficients, found "
+            f"{'-'.join(models)} with {len(entry.intrinsics)} and {len(entry.distortion_coeffs)}; slrig supports no "
+            "other lens: calibrate with --models pinhole-radtan"
         )
     return entry
 
@@ -422,57 +422,15 @@ def write_kalibr(path: Path, calibration: Calibration) -> None:
     write_file(path, yaml_bytes(chain))
 
 
-def detect_program(root: Mapping[str, Value]) -> str | None:
-    """Return the program of `PROGRAM_KEYS` that wrote a file; None if there is none."""
-    return next((program for program, keys in PROGRAM_KEYS.items() if set(keys) <= set(root)), None)
-
-
-def read_program_calibration(
-    root: Mapping[str, Value],
-    path: Path,
-    *,
-    cameras: Mapping[str, Size],
-    projector: Size | None,
-    bits: Mapping[Axis, Gray],
-) -> Calibration:
-    """Return the calibration of the first of `cameras`, and of the projector or, with two cameras, of the second.
-
-    bits : a bit of the code of each axis; scan3d-capture counts projector pixels in cells of its finest bit.
-    Raises CalibrationError: a matrix is missing or has another shape, the extents are not known, or a camera's matrix
-    is of images of another size.
-    """
-    program = str(detect_program(root))
-    found: list[FloatArray] = []
-    for key in PROGRAM_KEYS[program]:
-        value = root[key]
-        if not isinstance(value, np.ndarray):
-            raise CalibrationError(
-                f"{path}: expected an !!opencv-matrix at {key}, found something else; export it again"
-            )
-        found.append(value)
-    first, first_lens, second, second_lens, rotation, translation = found
-    if not cameras or projector is None:
-        raise CalibrationError(
-            f"{path}: expected a calibration with the sizes of its images, found one of {program} without them; import "
-            "a capture with it: slrig import --calibration"
-        )
-    names, sizes = list(cameras), list(cameras.values())
-    both_cameras = program.startswith("OpenCV") and len(cameras) == 2
-    if program == "scan3d-capture":
-        second = _scale_cells_to_pixels(second, projector, bits)
-    try:
-        terms = five_distortion_terms(first_lens, path, PROGRAM_KEYS[program][1])
-        first_device = Pinhole(sizes[0], first, terms, np.eye(3), np.zeros(3))
-        terms = five_distortion_terms(second_lens, path, PROGRAM_KEYS[program][3])
-        size = sizes[1] if both_cameras else projector
-        second_device = Pinhole(size, second, terms, rotation, translation.ravel())
-    except CalibrationError as cause:
-        raise CalibrationError(f"{path}: {cause}") from cause
-    _require_matrix_of_image(first_device, path, PROGRAM_KEYS[program][0])
-    if both_cameras:
-        _require_matrix_of_image(second_device, path, PROGRAM_KEYS[program][2])
-        return Calibration({names[0]: first_device, names[1]: second_device}, None)
-    return Calibration({names[0]: first_device}, second_device)
+def _known_program(leaves: Mapping[Name, Leaf], cameras: Mapping[str, Size]) -> tuple[str, Keys | None]:
+    """Return the program of `_PROGRAMS` that wrote a file, and what its names mean; no name for another one."""
+    for program, names in _PROGRAMS.items():
+        if {(name,) for name in names} <= set(leaves):
+            # OpenCV's sample is of two cameras, and used for a camera and a projector.
+            both = list(cameras)[:2] if program.startswith("OpenCV") and len(cameras) == 2 else []
+            first, second = both or [next(iter(cameras), "cam0"), PROJECTOR]
+            return program, Keys({first: names[:2], second: names[2:4]}, names[4:])
+    return "", None
 
 
 def _scale_cells_to_pixels(matrix: FloatArray, projector: Size, bits: Mapping[Axis, Gray]) -> FloatArray:
@@ -503,21 +461,20 @@ def centring_offset_px(extent_px: int) -> int:
     return int((2 ** gray_bits(extent_px, 1, 0) - extent_px) // 2)
 
 
-_MAX_OFF_CENTRE = 0.12
-"""Distance of a camera's principal point from the middle of its image, in sides of the image."""
 _SAME_SHARE = 0.1
+_MIN_SHARE = 1 / 32  # of images; less is a matrix in millimetres
 
 
-def _require_matrix_of_image(device: Pinhole, path: Path, key: str) -> None:
+def _require_matrix_of_image(device: Pinhole, path: Path, name: str) -> None:
     """Check a camera whose file does not state the size of its images, by the place of the principal point.
     Raises CalibrationError: it is that of larger or smaller images of the same shape.
     """
     sides = np.array([device.size.width_px, device.size.height_px])
     shares = (device.matrix[:2, 2] + 0.5) / sides
-    if np.abs(shares - 0.5).max() > _MAX_OFF_CENTRE and np.ptp(shares) < _SAME_SHARE * shares.mean():
+    if not is_centred(device) and np.ptp(shares) < _SAME_SHARE * shares.mean() and shares.mean() > _MIN_SHARE:
         cx, cy = device.matrix[:2, 2]
         raise CalibrationError(
-            f"{path}: {key}: expected a principal point near the middle of images of {device.size}, found "
+            f"{path}: camera '{name}': expected a principal point near the middle of images of {device.size}, found "
             f"({cx:g}, {cy:g}), the middle of images about {2 * shares.mean():.2g} times as large; scale fx, fy, cx "
             "and cy to the size of these images, or import images of the size that was calibrated"
         )
@@ -549,46 +506,95 @@ def _in_unit(calibration: Calibration, scale: float) -> Calibration:
     )
 
 
-def read_any_calibration(
+@dataclass(frozen=True, slots=True)
+class ImportedCalibration:
+    """A calibration of another program. notes : what was taken for what, and what was done to it."""
+
+    calibration: Calibration
+    notes: tuple[str, ...] = ()
+
+
+def import_calibration(
     path: Path,
     *,
     cameras: Mapping[str, Size] | None = None,
     projector: Size | None = None,
     bits: Mapping[Axis, Gray] | None = None,
+    capture: CodedImages[Any] | None = None,
     unit: LengthUnit | None = None,
-) -> Calibration:
-    """Return the calibration in a file, or in a folder of ROS files.
+    keys: Sequence[str] = (),
+) -> ImportedCalibration:
+    """Return the calibration in a file or a folder, of any program.
 
-    cameras, projector, bits : data that some programs' files lack; see `read_program_calibration`. unit : that of the
-    file's translations; None for the one that its format states, metres for ROS and Kalibr, and otherwise mm.
-    Raises CalibrationError: the format is unknown, the file is invalid, its numbers cannot be those of a rig
-    (`slrig.model.calibration_faults`), or it states no unit and in mm it would not be of a bench.
+    cameras, projector : extents of the capture that it comes with, for files that lack them. bits : a bit of the code
+    of each axis; scan3d-capture counts projector pixels in cells of its finest bit. capture : decides what names leave
+    open. unit : that of the file's translations; None for the one that it states, metres for ROS and Kalibr, otherwise
+    mm. keys : words as `slrig.importers.recognition.parse_keys` reads them.
+
+    Raises CalibrationError: the format is unknown, the file is invalid, something is missing or to be asked, its
+    numbers cannot be those of a rig (`slrig.model.calibration_faults`), or it states no unit and in mm it would not be
+    of a bench.
     """
-    calibration, stated = _read_with_unit(path, cameras or {}, projector, bits or {})
+    calibration, stated, notes = _read(path, cameras or {}, projector, bits or {}, capture, parse_keys(keys))
     if unit is None and stated is None:
         _require_unit(calibration, path)
     scale = MM_PER_UNIT[unit or stated or "mm"] / MM_PER_UNIT[stated or "mm"]
     if scale != 1:
         calibration = _in_unit(calibration, scale)
     require_plausible(calibration, str(path))
-    return calibration
+    return ImportedCalibration(calibration, tuple(notes))
 
 
-def _read_with_unit(
-    path: Path, cameras: Mapping[str, Size], projector: Size | None, bits: Mapping[Axis, Gray]
-) -> tuple[Calibration, LengthUnit | None]:
-    """Return the calibration in mm, and the unit that its format states; None if it states none and mm were assumed."""
+def _format(path: Path) -> CalibrationFormat | None:
+    """Return the format that a file or a folder has, or that it has with faults; None for one of another program."""
     if path.is_dir():
-        return read_ros(path), "m"
-    if path.suffix.lower() not in {".yml", ".yaml", ".xml"}:
-        return parse_calibration(path), "mm"
-    text = read_text(path, MAX_STORAGE_BYTES, CalibrationError)
-    if not text.removeprefix("\ufeff").startswith(("%YAML", "<")):
-        return read_kalibr(path), "m"
-    root = read_file_storage(text, path)
-    if detect_program(root) is None:
-        return read_opencv_calibration(path), "mm"
-    return read_program_calibration(root, path, cameras=cameras, projector=projector, bits=bits), None
+        with storage_errors(path):
+            names = [each for each in path.iterdir() if each.suffix.lower() in DOCUMENT_SUFFIXES]
+            infos = [each for each in names if each.suffix == ".yaml" and b"distortion_model:" in each.read_bytes()]
+        return "ros" if infos or not names or (path / TRANSFORMS).is_file() else None
+    try:
+        text = read_text(path, MAX_STORAGE_BYTES, CalibrationError).removeprefix("\ufeff")
+    except CalibrationError:
+        return None
+    if text.startswith(("%YAML", "<")):
+        root = read_file_storage(text, path)
+        is_own = any(isinstance(each, dict) and "translation_mm" in each for each in root.values())
+        return "opencv" if is_own or not root else None
+    if path.suffix.lower() in (".yml", ".yaml"):
+        return "kalibr" if re.search(r"(?m)^cam\d+:", text) and "intrinsics" in text else None
+    return "slrig" if not text.strip() or re.search(r'"(format|size_px)"\s*:', text) else None
+
+
+def _read(
+    path: Path,
+    cameras: Mapping[str, Size],
+    projector: Size | None,
+    bits: Mapping[Axis, Gray],
+    capture: CodedImages[Any] | None,
+    keys: Keys | None,
+) -> tuple[Calibration, LengthUnit | None, Sequence[str]]:
+    """Return the calibration in mm, the unit that its format states (None for none: mm were assumed), and notes."""
+    if keys is None:
+        form = _format(path)
+        if form in ("ros", "kalibr"):
+            calibration, fits = read_ros(path) if form == "ros" else read_kalibr(path)
+            return calibration, "m", fits
+        if form in ("slrig", "opencv"):
+            return (parse_calibration if form == "slrig" else read_opencv_calibration)(path), "mm", ()
+    leaves = read_document(path)
+    program, known = _known_program(leaves, cameras) if keys is None else ("", None)
+    found = Recognition(leaves, path, keys or known, cameras, projector, capture, program).found()
+    calibration, scaled = found.calibration, found.calibration.projector
+    if program == "scan3d-capture" and scaled is not None:
+        matrix = _scale_cells_to_pixels(scaled.matrix, scaled.size, bits)
+        calibration = replace(calibration, projector=replace(scaled, matrix=matrix))
+    for name, device in calibration.cameras.items():
+        if name not in found.sized:
+            _require_matrix_of_image(device, path, name)
+    # Without a unit of its own, translations count as millimetres until `_require_unit` has looked at them.
+    scale = MM_PER_UNIT[found.unit or "mm"]
+    notes = [*found.notes, *([f"a file as {program} writes it"] if program else [])]
+    return _in_unit(calibration, scale) if scale != 1 else calibration, found.unit, notes
 
 
 def write_any_calibration(path: Path, calibration: Calibration, form: CalibrationFormat | None = None) -> None:

@@ -24,7 +24,8 @@ from slrig.bundle import (
 from slrig.capture import Evidence
 from slrig.disk import storage_errors
 from slrig.errors import BundleError, PatternError
-from slrig.importers.calibrations import centring_offset_px, read_any_calibration
+from slrig.importers.calibrations import centring_offset_px, import_calibration
+from slrig.importers.coded_images import CodedImages
 from slrig.model import Axis, Black, CameraFormat, Gray, LengthUnit, LineShift, Pattern, Pixels, Shot, Size, White
 from slrig.patterns import encode, gray_bits
 
@@ -32,7 +33,7 @@ SLSTUDIO_BITS = {Axis.COLUMN: 10, Axis.ROW: 6}
 """Number of first bits that SLStudio shows on any projector."""
 
 IMAGES = {".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg"}
-CALIBRATIONS = ("calibration.yml", "calibration.yaml", "calibration.xml", "calibration.json")
+CALIBRATIONS = tuple(f"calibration.{each}" for each in ("yml", "yaml", "xml", "json", "npz", "mat"))
 MAX_LIST_BYTES = 2**20
 
 _MIN_DIFFERENCE = 0.02  # of full scale, between white and black where the projector's light falls
@@ -236,12 +237,13 @@ class ImageNaming:
 @dataclass(slots=True)
 class ImageAssignment:
     """Images of each camera with their patterns. unassigned : names of images without a known pattern. faults : images
-    that contradict one another, each cause once.
+    that contradict one another, each cause once. calibration_notes : what was read from the calibration's file.
     """
 
     cameras: dict[str, list[tuple[Path, Pattern]]] = field(default_factory=dict)
     unassigned: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
+    calibration_notes: tuple[str, ...] = ()
 
 
 def import_capture(
@@ -254,6 +256,7 @@ def import_capture(
     bit_depth: int | None = None,
     calibration_file: Path | None = None,
     unit: LengthUnit | None = None,
+    keys: Sequence[str] = (),
 ) -> tuple[ImageAssignment, Path | None]:
     """Write the images of `folder` as the bundle `output`; return the images and the calibration file that was used.
 
@@ -261,8 +264,10 @@ def import_capture(
     proven wrong; if they do not come in the order of their patterns, nothing is written.
 
     names : new names of the cameras, in the natural order of their names in the folder. bit_depth : of samples in
-    files with 16 bits. unit : as for `read_any_calibration`. Raises BundleError, PatternError, CalibrationError: the
-    images, the naming or the calibration do not fit; StorageError.
+    files with 16 bits. unit, keys : as for `import_calibration`.
+
+    Raises BundleError, PatternError, CalibrationError: the images, the naming or the calibration do not fit;
+    StorageError.
     """
     with storage_errors(folder):
         images = _assign_images(folder, code, naming)
@@ -278,7 +283,13 @@ def import_capture(
     path, calibration = calibration_file or default_file, None
     if path is not None:
         bits = {p.axis: p for files in images.cameras.values() for _, p in files if isinstance(p, Gray)}
-        calibration = read_any_calibration(path, cameras=sizes, projector=code.size, bits=bits, unit=unit)
+        capture = CodedImages(
+            images.cameras, formats, code.size, lambda image, form: read_with_colour(image, (0,), form)[0][0]
+        )
+        read = import_calibration(
+            path, cameras=sizes, projector=code.size, bits=bits, capture=capture, unit=unit, keys=keys
+        )
+        calibration, images.calibration_notes = read.calibration, read.notes
         check_calibration(calibration, code.size, sizes, str(path))
     patterns = list(dict.fromkeys(pattern for files in images.cameras.values() for _, pattern in files))
     with BundleWriter(output, code.size, patterns, formats, calibration) as writer:

@@ -18,8 +18,10 @@ from slrig.reconstruction.calibration_check import (
     CalibrationFit,
     PixelPairs,
     check_calibration,
+    disagreement_px,
     find_correspondences,
     find_cross_line_pairs,
+    share_in_front,
 )
 from slrig.reconstruction.camera_response import estimate_noise
 from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
@@ -130,6 +132,7 @@ __all__ = [
     "check_calibration",
     "decode_edges",
     "decode_second_axis",
+    "disagreement_px",
     "distorted_from_pixel",
     "estimate_albedo",
     "estimate_noise",
@@ -157,6 +160,7 @@ __all__ = [
     "refine_pose",
     "sampling_mm",
     "select_points",
+    "share_in_front",
     "sheet_coordinates",
     "sigma_along_normal",
     "stripe_crossing",

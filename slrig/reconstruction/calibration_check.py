@@ -190,13 +190,24 @@ def epipolar_residual_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs)
     return _RayPairs.from_devices(camera, projector, pairs).residual_px()
 
 
-def _disagreement_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> float:
+def disagreement_px(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> float:
     """Median distance from the epipolar line; infinite if points are behind a device or lenses image no such pixels."""
     rays = _RayPairs.from_devices(camera, projector, pairs)
     distance = np.abs(rays.residual_px())
     if np.isfinite(distance).mean() < _MIN_IN_FRONT or rays.in_front() < _MIN_IN_FRONT:
         return float("inf")
     return float(np.nanmedian(distance))
+
+
+def share_in_front(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> float:
+    """Share of the points of the coded position alone that lie in front of both devices."""
+    # The other coordinate does not matter: where it is unknown, the middle of the image gives the same sheet of light.
+    middle = (np.array([projector.size.width_px, projector.size.height_px]) - 1) / 2
+    known = np.where(np.isfinite(pairs.projector_px), pairs.projector_px, middle)
+    depth = coded_depth_mm(camera, projector, replace(pairs, projector_px=known))
+    points = camera.centre_mm + depth[:, None] * pixel_rays(camera, pairs.camera_px)
+    ahead = points @ projector.rotation[2] + projector.translation_mm[2]
+    return float(np.mean((depth > 0) & (ahead > 0)))
 
 
 def coded_depth_mm(camera: Pinhole, projector: Pinhole, pairs: PixelPairs) -> FloatArray:
@@ -331,7 +342,7 @@ def check_calibration(
     if len(pairs) < _MIN_POINTS:
         return None
     devices = camera, projector
-    median, sigma = _disagreement_px(*devices, pairs), float(np.median(pairs.sigma_px))
+    median, sigma = disagreement_px(*devices, pairs), float(np.median(pairs.sigma_px))
     fit = fit_calibration(*devices, pairs) if median <= 4 * _REFUTED_PX else None
     systematic = _systematic_px(*devices, pairs) if fit is not None else median
     check = CalibrationCheck(devices, len(pairs), median, systematic, sigma, fit)
@@ -406,7 +417,7 @@ def fit_calibration(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, /) -
 
         solved = least_squares(error, np.zeros(count), loss="soft_l1", x_scale="jac", max_nfev=60)
         fitted = _changed(camera, projector, solved.x)
-        median = _disagreement_px(*fitted, pairs)
+        median = disagreement_px(*fitted, pairs)
         if not np.isfinite(median):
             break
         turned = float(np.degrees(linalg.norm(solved.x[:3])))
@@ -490,12 +501,12 @@ def explain_residuals(camera: Pinhole, projector: Pinhole, pairs: PixelPairs, co
     fit = fit_calibration(camera, projector, pairs)
     if fit is not None:
         limit = min(limit, _SIMPLER * fit.residual_px + 0.05)
-    stated = _disagreement_px(camera, projector, pairs)
+    stated = disagreement_px(camera, projector, pairs)
     agreeing: list[tuple[float, _Mistake]] = []
     for trial in _trials(camera, projector, pairs, code, fit):
         if trial.free > 0 and agreeing and agreeing[0][1].free == 0:
             break  # fitting takes seconds, and could explain the same by a coincidence
-        left = _disagreement_px(trial.camera, trial.projector, trial.pairs)
+        left = disagreement_px(trial.camera, trial.projector, trial.pairs)
         if left <= limit and left < _IMPROVED * stated:
             agreeing.append((left, trial))
     if not agreeing:

@@ -23,7 +23,7 @@ from slrig.bundle import (
     write_calibration,
     write_opencv_calibration,
 )
-from slrig.bundle.calibration import read_file_storage
+from slrig.bundle.file_storage import read_file_storage
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, LightMap, Size
 from tests.samples import CAMERA, PROJECTOR, pinhole, sample_calibration, sample_capture
@@ -50,6 +50,10 @@ def _matrix(dt: str = "d", data: str = "1., 2.", rows: str = "1", kind: str = "o
          {"a": {"b": {"c": "x y"}, "d": "it's"}}),
         (HEAD + '# of the bench\na: "q\\"\\\\ \\x41 # no comment"\nempty:\nlist: [ 1, x ]\n',
          {"a": 'q"\\ A # no comment', "empty": {}, "list": [1, "x"]}),
+        (HEAD + 'a:\n- 1\n- b: 2\n  c: [ [ 1., "], {" ], { "x": 1, \'y\' : [ 2,\n  3 ], z:w } ]\n-\n   - x\n'
+         "d: !!binary |\n  AA=\ns: !!opencv-sparse-matrix\n   rows: 1\n",
+         {"a": [1, {"b": 2, "c": [[1.0, "], {"], {"x": 1, "y": [2, 3], "z": "w"}]}, ["x"]], "d": "AA=",
+          "s": {"rows": 1}}),
         # No `---`, deeper indentation, and closed on a line of its own: what scripts for Matlab write.
         ("%YAML:1.0\n    m: !!opencv-matrix\n        rows: 1\n        cols: 2\n        dt: f\n"
          "        data: [ 0.5, \n            0.25]\n", {"m": [[0.5, 0.25]]}),
@@ -82,28 +86,29 @@ REFUSED = {
         f"{HEAD}m: !!opencv-nd-matrix\n   sizes: [ {', '.join(['1'] * 64)} ]\n   dt: d\n   data: [ 1. ]\n",
         "extent of 'm'",
     ),
-    "dt of 65 pairs": (_matrix(dt='"' + "1d" * 65 + '"'), "d, f or i as dt of 'm'"),
-    "dt of three channels": (_matrix(dt='"3d"'), "d, f or i as dt of 'm'"),
-    "sparse": (_matrix(kind="opencv-sparse-matrix"), "found 'opencv-sparse-matrix' at line 3"),
+    "dt of 65 pairs": (_matrix(dt='"' + "1d" * 65 + '"'), "i, f or d as dt of 'm'"),
+    "dt of three channels": (_matrix(dt='"3d"'), "expected 6 numbers as data of 'm', found 2"),
     "too few numbers": (_matrix(data="1."), "expected 2 numbers as data of 'm', found 1 at line 3"),
     "a vast extent": (_matrix(rows="65536"), "expected 131072 numbers as data of 'm', found 2"),
-    "a vaster extent": (_matrix(rows="9" * 18), "whole numbers from 1 as extent"),
-    "no extent": (_matrix(rows="0", data=""), "whole numbers from 1 as extent"),
+    "a vaster extent": (_matrix(rows="9" * 18), "whole numbers from 0 as extent"),
+    "no extent": (_matrix(rows="-1", data=""), "whole numbers from 0 as extent"),
     "too many numbers": (_matrix(data="1," * 70_000), "at most 65536 numbers"),
     "a fraction in whole numbers": (_matrix(dt="i"), "numbers of the kind 'i'"),
     "a vast whole number": (_matrix(dt="i", data="1, 2147483648"), "numbers of the kind 'i'"),
     "words in a matrix": (_matrix(data="1., 0x10"), "numbers of the kind 'd'"),
     "a matrix without data": (HEAD + "m: !!opencv-matrix\n   rows: 1\n", "cols, data, dt, rows in 'm', found rows"),
-    "deep YAML": (HEAD + "".join(" " * each + "a:\n" for each in range(1500)), "at most 8 maps in each other"),
-    "deep sequences": (HEAD + "a: " + "[" * NESTED + "\n", "expected a sequence that ends in ]"),
-    "deep flow maps": (HEAD + "a: " + "{a: " * NESTED + "\n", "expected a number, text or an opencv-matrix"),
-    "deep XML": (_in_xml("<a>" * NESTED + "</a>" * NESTED), "at most 8 maps in each other"),
+    "deep YAML": (HEAD + "".join(" " * each + "a:\n" for each in range(1500)), "at most 16 maps and"),
+    "deep sequences": (HEAD + "a: " + "[" * NESTED + "\n", "at most 16 maps and"),
+    "deep flow maps": (HEAD + "a: " + "{a: " * NESTED + "\n", "at most 16 maps and"),
+    "deep dashes": (HEAD + "a:\n  " + "- " * NESTED + "1\n", "at most 16 maps and"),
+    "an open sequence": (HEAD + "a: [ 1,\n   { x:1 }\nb: 2\n", "expected a sequence that ends"),
+    "brackets that cross": (HEAD + "a: [ { x:1 ] }\n", "brackets that close as they open"),
+    "deep XML": (_in_xml("<a>" * NESTED + "</a>" * NESTED), "at most 16 maps and"),
     "an anchor": (HEAD + "a: &x 1\nb: *x\n", "found '&x 1' at line 3"),
-    "a block sequence": (HEAD + "a:\n   - 1\n", "found '   - 1' at line 4"),
     "a second document": (HEAD + "a: 1\n...\n---\nb: 2\n", "found '...' at line 4"),
     "a key twice": (HEAD + "a: 1\na: 2\n", "'a' twice at line 4"),
     "a long key": (HEAD + "a" * 65 + ": 1\n", "a key of at most 64"),
-    "many keys": (HEAD + "".join(f"a{each}: 1\n" for each in range(4097)), "at most 4096 entries"),
+    "many keys": (HEAD + "".join(f"a{each}: 1\n" for each in range(65_537)), "at most 65536 entries"),
     "uneven indentation": (HEAD + "a:\n   b: 1\n  c: 2\n", "column 3 at line 5"),
     "a tab": (HEAD + "a:\n\tb: 1\n", "indented with spaces"),
     "an open quote": (HEAD + 'a: "x\n', "found '\"x' at line 3"),
@@ -124,6 +129,36 @@ REFUSED = {
     "an empty matrix of XML": (_in_xml('<a type_id="opencv-matrix"></a>'), "an opencv-matrix with rows"),
     "other encodings": ('<?xml version="1.0" encoding="no-such"?><opencv_storage>\n<</opencv_storage>', "sound XML"),
 }
+
+
+@pytest.mark.parametrize("ending", [".yml", ".xml"])
+def test_all_that_opencv_writes_is_read(ending: str) -> None:
+    storage = cv2.FileStorage(ending, cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
+    points = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
+    storage.write("empty", np.zeros((0, 0)))
+    storage.write("points", points)
+    storage.write("bytes", np.array([[1, 255]], dtype=np.uint8))
+    storage.write("texts", ["a", "b c"])
+    for kind in (cv2.FileNode_SEQ, cv2.FileNode_SEQ | cv2.FileNode_FLOW):
+        storage.startWriteStruct(f"sequence{kind}", kind)
+        storage.write("", 1)
+        storage.startWriteStruct("", cv2.FileNode_MAP | (kind & cv2.FileNode_FLOW))
+        storage.write("x", 1.5)
+        storage.write("name", "b c")
+        storage.endWriteStruct()
+        storage.startWriteStruct("", kind)
+        storage.write("", 7)
+        storage.endWriteStruct()
+        storage.endWriteStruct()
+    storage.startWriteStruct("none", cv2.FileNode_SEQ)
+    storage.endWriteStruct()
+    storage.writeComment("why", append=False)
+    storage.write("last", np.eye(2))
+    found = read_file_storage(storage.releaseAndGetString(), PATH)
+    items = [1, {"x": 1.5, "name": "b c"}, 7 if ending == ".xml" else [7]]
+    wanted = {"empty": np.zeros((0, 0)), "points": points, "bytes": np.array([[1, 255]]), "texts": ["a", "b c"]}
+    wanted |= {f"sequence{kind}": items for kind in (cv2.FileNode_SEQ, cv2.FileNode_SEQ | cv2.FileNode_FLOW)}
+    np.testing.assert_equal(found, wanted | {"none": [] if ending == ".yml" else {}, "last": np.eye(2)})
 
 
 @pytest.mark.parametrize("case", REFUSED)
