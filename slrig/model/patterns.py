@@ -63,6 +63,7 @@ class SequenceName(StrEnum):
     FAST = "fast"
     STANDARD = "standard"
     ROBUST = "robust"
+    PHASE = "phase"
 
 
 @dataclass(frozen=True, slots=True)

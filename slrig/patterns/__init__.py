@@ -10,12 +10,21 @@ from slrig.patterns.codes import (
     index_of_word,
     line_positions,
 )
-from slrig.patterns.sequence import SEQUENCES, SequenceOptions, encode, merge_sequences, scan_patterns
+from slrig.patterns.sequence import (
+    SEQUENCES,
+    SequenceOptions,
+    encode,
+    merge_sequences,
+    phase_patterns,
+    scan_patterns,
+)
+from slrig.patterns.sinusoids import SinePosition, sine_periods_px, sine_position_px, sine_turns
 
 __all__ = [
     "MIN_BORDER_DISTANCE_PX",
     "SEQUENCES",
     "SequenceOptions",
+    "SinePosition",
     "cell_centre_px",
     "cell_positions",
     "edge_indices",
@@ -25,5 +34,9 @@ __all__ = [
     "index_of_word",
     "line_positions",
     "merge_sequences",
+    "phase_patterns",
     "scan_patterns",
+    "sine_periods_px",
+    "sine_position_px",
+    "sine_turns",
 ]
