@@ -18,7 +18,7 @@ from slrig.patterns.sequence import (
     phase_patterns,
     scan_patterns,
 )
-from slrig.patterns.sinusoids import SinePosition, sine_periods_px, sine_position_px, sine_turns
+from slrig.patterns.sine_positions import SinePosition, sine_periods_px, sine_position_px, sine_turns
 
 __all__ = [
     "MIN_BORDER_DISTANCE_PX",

@@ -28,7 +28,7 @@ from slrig.model import (
     diagnostic_line_pairs,
 )
 from slrig.patterns.codes import gray_bits, gray_profile, line_profile, sine_profile
-from slrig.patterns.sinusoids import sine_periods_px
+from slrig.patterns.sine_positions import sine_periods_px
 
 GRAY_ONLY_CELL_PX = 2
 """Chosen: without lines edges are all that is measured, and those of cells of 1 px blur into each other."""

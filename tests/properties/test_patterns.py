@@ -21,7 +21,7 @@ from slrig.patterns.codes import (
     line_profile,
 )
 from slrig.patterns.sequence import encode, phase_patterns
-from slrig.patterns.sinusoids import sine_periods_px, sine_position_px, sine_turns
+from slrig.patterns.sine_positions import sine_periods_px, sine_position_px, sine_turns
 
 few = settings(max_examples=30)
 
