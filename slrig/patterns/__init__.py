@@ -11,6 +11,7 @@ from slrig.patterns.codes import (
     line_positions,
 )
 from slrig.patterns.sequence import SEQUENCES, SequenceOptions, encode, merge_sequences, scan_patterns
+from slrig.patterns.sinusoids import level_lines, require_numbered
 
 __all__ = [
     "MIN_BORDER_DISTANCE_PX",
@@ -23,7 +24,9 @@ __all__ = [
     "encode",
     "gray_bits",
     "index_of_word",
+    "level_lines",
     "line_positions",
     "merge_sequences",
+    "require_numbered",
     "scan_patterns",
 ]
