@@ -188,6 +188,16 @@ class Sine:
         return replace(self, shift=(self.shift + self.steps // 2) % self.steps)
 
 
+def sine_groups(patterns: Sequence[Sine]) -> list[list[int]]:
+    """Return the indices of the frames of each period with three or more shifts, the finest period first.
+
+    Such frames give level, modulation and phase of a pixel by themselves.
+    """
+    periods = sorted({each.period_px for each in patterns})
+    members = [[i for i, each in enumerate(patterns) if each.period_px == period] for period in periods]
+    return [each for each in members if len({patterns[i].shift / patterns[i].steps for i in each}) >= MIN_LINE_STEPS]
+
+
 def has_even_shifts(lines: Sequence[LineShift]) -> bool:
     """True if the shifts divide the period evenly into three or more steps. lines : sorted by shift."""
     count = len(lines)

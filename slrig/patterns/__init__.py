@@ -19,6 +19,7 @@ from slrig.patterns.sequence import (
     scan_patterns,
 )
 from slrig.patterns.sine_positions import SinePosition, sine_periods_px, sine_position_px, sine_turns
+from slrig.patterns.sinusoids import level_lines, require_numbered
 
 __all__ = [
     "MIN_BORDER_DISTANCE_PX",
@@ -32,9 +33,11 @@ __all__ = [
     "encode",
     "gray_bits",
     "index_of_word",
+    "level_lines",
     "line_positions",
     "merge_sequences",
     "phase_patterns",
+    "require_numbered",
     "scan_patterns",
     "sine_periods_px",
     "sine_position_px",
