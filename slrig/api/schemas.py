@@ -49,8 +49,8 @@ class PatternRequest(Strict):
     sequence: Annotated[SequenceName, Field(strict=False)] | None = Field(
         default=None,
         description="what stands where the options below say nothing: `fast`, fewest frames; `standard`; `robust`, "
-        "each bit with its inverse, for reflecting and concave objects; `phase`, sinusoids in few frames, for light "
-        "objects and projectors that show shades of grey. Default standard",
+        "each bit with its inverse, for reflecting and concave objects; `phase`, sinusoids in few frames, "
+        "where the projector shows shades of grey. Default standard",
     )
     line_shift: bool | None = Field(default=None, description="false: Gray code only. Default true")
     line_shift_period_px: Annotated[int, Field(ge=4, le=1024)] | None = Field(
@@ -65,7 +65,7 @@ class PatternRequest(Strict):
         default=None, description="of a line, projector pixels. Default: half the line period"
     )
     sine_period_px: Annotated[int, Field(ge=4, le=1024)] | None = Field(
-        default=None, description="of `phase`: period of the shortest sinusoid, projector pixels. Default 12"
+        default=None, description="of `phase`: period of the shortest sinusoid, projector pixels. Default 8"
     )
     sine_steps: Annotated[int, Field(ge=3, le=64)] | None = Field(
         default=None, description="of `phase`: frames of each sinusoid. Default 4, which gamma hardly bends"

@@ -119,7 +119,7 @@ def scan(
         Literal["fast", "standard", "robust", "phase"] | None,
         typer.Option(
             help="Patterns: fewest frames; the usual ones; each bit with its inverse, for what reflects or is hollow; "
-            "sinusoids, for light objects. Default: the rig file's, or standard."
+            "sinusoids in few frames. Default: the rig file's, or standard."
         ),
     ] = None,
     period_px: Annotated[

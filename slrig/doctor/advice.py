@@ -14,8 +14,6 @@ _NEGLIGIBLE_FLICKER = 0.004
 _MAX_PERIODS = 64
 _PERIODS_PX = (8, 12, 16, 24, 32)
 """From the default on: shorter periods gain nothing, however sharp the picture (`tests/bench/line_sweep.py`)."""
-_SINE_PERIODS_PX = _PERIODS_PX[1:]
-"""From the default on: shorter ones take more light to number."""
 _MIN_GAIN = 1.1
 
 
@@ -71,11 +69,7 @@ def advise_lines(blur_px: float, own_period_px: int, own_steps: int, *, sines: b
     def deviation(period_px: int, steps: int) -> float:
         return period_px * math.exp(2 * (math.pi * blur_px / period_px) ** 2) / math.sqrt(steps)
 
-    offered = (
-        [(period_px, own_steps) for period_px in _SINE_PERIODS_PX]
-        if sines
-        else [(period_px, _line_steps(period_px)) for period_px in _PERIODS_PX]
-    )
+    offered = ((period_px, own_steps if sines else _line_steps(period_px)) for period_px in _PERIODS_PX)
     best = min(offered, key=lambda each: deviation(*each))
     gain = deviation(own_period_px, own_steps) / deviation(*best)
     if gain < _MIN_GAIN:

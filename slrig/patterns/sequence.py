@@ -55,13 +55,13 @@ SEQUENCES: Mapping[SequenceName, SequenceOptions] = {
     SequenceName.FAST: SequenceOptions(period_px=6, steps=3, line_width_px=None, inverses=False, closing=0),
     SequenceName.STANDARD: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=False, closing=1),
     SequenceName.ROBUST: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=True, closing=2),
-    # Four steps, because the harmonics that a projector's gamma adds hardly reach the phase of four (of three, the
-    # second does); and 12 px, because the shorter the period, the more light it takes to number it.
+    # Four steps, because the harmonics that a projector's gamma adds hardly reach the phase of four; of three, the
+    # second does.
     SequenceName.PHASE: SequenceOptions(
-        period_px=12, steps=4, line_width_px=None, inverses=False, closing=0, sines=True
+        period_px=8, steps=4, line_width_px=None, inverses=False, closing=0, sines=True
     ),
 }
-"""Lines are chosen by `tests/bench/line_sweep.py` and tested by `tests/bench/fault_campaign.py`;
+"""Chosen by `tests/bench/line_sweep.py` and tested by `tests/bench/fault_campaign.py`;
 `slrig/scan/README.md` lists costs and results.
 """
 
