@@ -55,8 +55,8 @@ SEQUENCES: Mapping[SequenceName, SequenceOptions] = {
     SequenceName.FAST: SequenceOptions(period_px=6, steps=3, line_width_px=None, inverses=False, closing=0),
     SequenceName.STANDARD: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=False, closing=1),
     SequenceName.ROBUST: SequenceOptions(period_px=8, steps=None, line_width_px=None, inverses=True, closing=2),
-    # Four steps, because the harmonics that a projector's gamma adds hardly reach the phase of four; of three, the
-    # second does.
+    # Four steps: each frame has its inverse, and the harmonics that gamma adds hardly reach the phase. Three take less
+    # time where gamma is known or fitted.
     SequenceName.PHASE: SequenceOptions(
         period_px=8, steps=4, line_width_px=None, inverses=False, closing=0, sines=True
     ),
