@@ -69,7 +69,7 @@ class PatternRequest(Strict):
     )
     sine_steps: Annotated[int, Field(ge=3, le=64)] | None = Field(
         default=None,
-        description="of `phase`: frames of each sinusoid. Default 4; 3 take less time, and gamma bends them more",
+        description="of `phase`: frames of each sinusoid. Default 4; 3 take less time, bent more by gamma",
     )
     gray_cell_px: Annotated[int, Field(ge=1, le=1024)] | None = Field(
         default=None, description="width of the finest Gray cell. Default: half the line period, or 2 without lines"
