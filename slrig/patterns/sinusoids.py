@@ -7,15 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from slrig.errors import PatternError
-from slrig.model import Axis, LineShift, Sine, Size, sine_groups
+from slrig.model import LineShift, Sine, Size, sine_groups
 
-_LEVELS = 8
+_LEVELS, _MAX_LEVELS = 8, 64
 _MIN_APART_TURNS = 1e-3  # of the phase of some period, between two positions with the same finest phase
 
 
-def level_lines(axis: Axis) -> tuple[LineShift, ...]:
-    """Lines one position wide, together at every position: the levels of a continuous map of positions."""
-    return tuple(LineShift(axis, shift, _LEVELS, 1) for shift in range(_LEVELS))
+def level_lines(sines: Sequence[Sine]) -> tuple[LineShift, ...]:
+    """Lines one position wide, together at every position: the levels of the map of positions that sinusoids give.
+
+    Their period is half of the finest sinusoid's, so that noise of the positions does not number them wrong.
+    """
+    half_px = sines[sine_groups(sines)[0][0]].period_px / 2
+    period = min(_LEVELS * int(np.ceil((half_px + 2) / _LEVELS)), _MAX_LEVELS)
+    return tuple(LineShift(sines[0].axis, shift, period, 1) for shift in range(period))
 
 
 def require_numbered(sines: Sequence[Sine], size: Size) -> None:

@@ -60,6 +60,7 @@ from slrig.reconstruction.redundancy import (
     sheet_coordinates,
 )
 from slrig.reconstruction.second_axis import AxisPositions, axis_residuals, decode_second_axis
+from slrig.reconstruction.sinusoids import SinusoidResponse
 from slrig.reconstruction.triangulation import (
     CONVERGED,
     SheetCurves,
@@ -116,6 +117,7 @@ __all__ = [
     "RefinedPose",
     "RegionMask",
     "SheetCurves",
+    "SinusoidResponse",
     "StripeEnsemble",
     "StripeResiduals",
     "axis_frames",

@@ -296,8 +296,8 @@ def _locate_by_sinusoids(image: DecodedImage, code: CodeMap, tables: CodeTables)
     image = replace(image, code=found.code).with_position_noise(
         frames.sinusoids, sinusoid_pixel_sum(found.measured.position, period_px)
     )
-    middle = (frames.white + frames.black) / 2
-    wider = np.sqrt(image.position_noise.variance(middle) / noise.variance(middle))
+    middle = np.asarray(frames.white + frames.black, dtype=np.float32) / np.float32(2)
+    wider = np.sqrt(np.divide(image.position_noise.variance(middle), noise.variance(middle)))
     return replace(
         image, sinusoids=found._replace(measured=found.measured._replace(sigma=found.measured.sigma * wider))
     )
@@ -345,6 +345,7 @@ def align_points(
     frames, code, disagreement_px, points = image.frames, image.code, np.zeros(0), found
     frame_sigma_px = np.zeros(len(found))
     resolution_px = cell_width_px(image)
+    step_px: int | None
     if image.sinusoids is not None:
         position, sigma = image.sinusoids.measured
         measured, step_px = PositionMap(np.where(code.refusal == 0, position, np.float32(np.nan)), sigma), 1
@@ -372,6 +373,7 @@ def align_points(
         refinement = refine_points(
             found, measured, usable, code, tables.position_table, step_px, extra_sigma_px=extra_sigma_px,
             max_disagreement_px=limits.max_disagreement_px, sampled=sampled, release_lines=release_lines,
+            **({} if image.sinusoids is None else {"start_sigma_px": np.inf}),
         )  # fmt: skip
         points, disagreement_px, frame_sigma_px = (
             refinement.points, refinement.disagreement_px, refinement.frame_sigma_px

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammainc, gammaincinv
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray, NoiseModel, Refusal, Sine, sine_groups
@@ -52,8 +53,9 @@ _GAMMAS = 13
 _REFINEMENTS = 6
 _MIN_SAMPLES, _MAX_SAMPLES = 200, 6000
 _MIN_GAIN = 12.0  # of the sum of χ²
+_MIN_NOISE_SHARE = 0.3
 _CAP = 25.0  # of χ²: pixels of two surfaces count no more
-_MEDIAN_SQUARE = 0.4549  # the median of a squared normal, of its variance
+_COUNTED = 0.9
 _MIN_APART_SIGMA = 8.0  # of two positions
 _MIN_APART = 1.5  # ratio of periods whose modulations show the blur
 _MAX_BLUR = 0.3  # of the finest period
@@ -83,12 +85,14 @@ class SinusoidResponse:
     """How light follows the values of the pattern.
 
     gamma : light is the value to this power; NaN if the frames cannot tell. blur_px : standard deviation of the blur of
-    both lenses, projector px. misfit : standard deviation of what the fit leaves beyond noise, of B.
+    both lenses, projector px. misfit : standard deviation of what the fit leaves beyond noise, of B. noise_share :
+    variance that it leaves over that of the noise model, where it leaves less than noise; 1 otherwise.
     """
 
     gamma: float = 1.0
     blur_px: float = 0.0
     misfit: float = 0.0
+    noise_share: float = 1.0
 
 
 def sine_model(patterns: Sequence[Sine], response: SinusoidResponse, /) -> SineModel:
@@ -186,6 +190,19 @@ class _Found(NamedTuple):
     advantage: NDArray[np.float32]
     refusal: NDArray[np.uint8]
 
+    @classmethod
+    def unknown(cls, refusal: NDArray[np.uint8]) -> _Found:
+        """No positions yet."""
+        part = np.full((8, *refusal.shape), np.nan, dtype=np.float32)
+        return cls(part[0], part[1], part[2], part[3], part[4], part[5], part[6], part[7], refusal.copy())
+
+    def rows(self, rows: slice) -> _Found:
+        """Select rows, as views."""
+        return _Found(
+            self.position[rows], self.other[rows], self.sigma[rows], self.swing[rows], self.level[rows],
+            self.coarsest[rows], self.misfit[rows], self.advantage[rows], self.refusal[rows],
+        )  # fmt: skip
+
 
 def locate_sinusoids(frames: AxisFrames, noise: NoiseModel, code: CodeMap, extent_px: int, /) -> SinusoidMap:
     """Measure the projector position at each pixel.
@@ -232,8 +249,9 @@ def _locate(
 ) -> _Found:  # fmt: skip
     """Fill in all pixels that are not refused."""
     shape, model = refusal.shape, sine_model(patterns, response)
-    found = _Found(*(np.full(shape, np.nan, dtype=np.float32) for _ in range(8)), refusal.copy())
+    found = _Found.unknown(refusal)
     edge_px = _EDGE_SHARE * finest_period_px(patterns)
+    noise = noise.scale_variance(response.noise_share)
 
     def band(first: int, last: int) -> None:
         rows = slice(first, last)
@@ -241,7 +259,7 @@ def _locate(
         _locate_kernel(
             0, last - first, stack, model, _Intervals(*(each[rows] for each in intervals)), float(extent_px), edge_px,
             *_variances(noise.rows(rows), stack), response.misfit**2, np.float32(clipped_at),
-            _Found(*(each[rows] for each in found)),
+            found.rows(rows),
         )  # fmt: skip
 
     in_bands(band, shape[0], rows_at_most=rows_per_band(images, shape[1]))
@@ -278,7 +296,7 @@ def _estimate_response(
         return np.ascontiguousarray(image[rows, columns][np.newaxis])
 
     images = [pick(image) for image in frames.sinusoids]
-    white, black = (pick(each).astype(np.float64) for each in (frames.white, frames.black))
+    white, black = pick(frames.white), pick(frames.black)
     where, refusal = _Intervals(*(pick(each) for each in intervals)), np.zeros(white.shape, dtype=np.uint8)
     if noise.read_share is not None and noise.shot_share is not None:
         noise = replace(noise, read_share=pick(noise.read_share), shot_share=pick(noise.shot_share))
@@ -301,15 +319,15 @@ def _estimate_response(
         fitted = found.refusal == 0
         # Positions that the other frames hardly tell apart agree with any γ.
         apart = np.sqrt(found.misfit + found.advantage) + np.sqrt(found.misfit)
-        variance = noise.variance(found.level)
-        if freedom:
-            squared = found.misfit.astype(np.float64)
-        else:
+        variance = noise.variance(found.level).astype(np.float64)
+        squared = found.misfit.astype(np.float64)
+        if not freedom:
             mean, _ = mean_light(gamma)
-            variance = variance / 3 + (mean**2 * noise.variance(white) + (1 - mean) ** 2 * noise.variance(black))
+            variance /= 3
+            variance += mean**2 * noise.variance(white) + (1 - mean) ** 2 * noise.variance(black)
             squared = (found.level - black - mean * (white - black)) ** 2 / variance
         squared = np.where(apart > _MIN_APART_SIGMA, squared, np.nan)
-        return np.where(fitted, squared, np.inf).ravel(), (found.swing**2 / variance).ravel(), response
+        return np.where(fitted, squared, np.inf)[0], (found.swing**2 / variance)[0], response
 
     def cost(gamma: float) -> float:
         squared, _, _ = disagreement(gamma)
@@ -333,23 +351,32 @@ def _estimate_response(
     squared, per_share, response = disagreement(gamma)
     if np.count_nonzero(np.isfinite(squared)) < _MIN_SAMPLES:
         return SinusoidResponse(gamma=np.nan)
-    return replace(response, misfit=_misfit(squared, per_share, max(freedom, 1)))
+    misfit, noise_share = _misfit(squared, per_share, max(freedom, 1))
+    # White and black have noise of their own, and do not measure that of the sinusoids.
+    return replace(response, misfit=misfit, noise_share=noise_share if freedom else 1.0)
 
 
-def _misfit(squared: FloatArray, per_share: FloatArray, freedom: int) -> float:
-    """Share of B which, added to the noise, explains the median of χ²."""
+def _misfit(squared: FloatArray, per_share: FloatArray, freedom: int) -> tuple[float, float]:
+    """Share of B which, added to the noise, explains χ²; and the share of the noise that does, if that is less than 1.
+
+    Compared is the mean of the lesser nine tenths of χ², since the median of sums of whole numbers is coarse.
+    """
     usable = np.isfinite(squared) & np.isfinite(per_share)
-    if not usable.any():
-        return 0.0
     squared, per_share = squared[usable], per_share[usable]
-    expected = freedom * (1 - 2 / (9 * freedom)) ** 3
-    low, high = 0.0, 1.0
-    if np.median(squared) <= expected:
-        return 0.0
+    limit = float(gammaincinv(freedom / 2, _COUNTED))
+    expected = freedom * float(gammainc(freedom / 2 + 1, limit)) / _COUNTED
+
+    def mean_of_lesser(values: FloatArray) -> float:
+        count = int(_COUNTED * len(values))
+        return float(np.partition(values, count)[:count].mean())
+
+    low, high, least = 0.0, 1.0, mean_of_lesser(squared)
+    if least <= expected:
+        return 0.0, max(least / expected, _MIN_NOISE_SHARE)
     for _ in range(30):
         share = (low + high) / 2
-        low, high = (share, high) if np.median(squared / (1 + share**2 * per_share)) > expected else (low, share)
-    return high
+        low, high = (share, high) if mean_of_lesser(squared / (1 + share**2 * per_share)) > expected else (low, share)
+    return high, 1.0
 
 
 def _finest_swing(images: Sequence[NDArray[Any]], patterns: Sequence[Sine]) -> FloatArray:

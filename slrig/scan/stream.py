@@ -465,7 +465,7 @@ def _tables(patterns: AxisPatterns, size: Size) -> CodeTables:
         return CodeTables(
             index_of_word=index_of_word(gray),
             cell_position=cell_positions(positions, size),
-            position_table=line_positions(level_lines(gray.axis), positions, size),
+            position_table=line_positions(level_lines(patterns.sines), positions, size),
             edge_table=edge_positions(gray, size) if patterns.has_code else np.zeros((0, 0)),
         )
     return CodeTables(

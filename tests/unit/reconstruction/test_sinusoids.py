@@ -34,7 +34,7 @@ TWO_PERIODS = played((64.0, 3), (1024.0, 3))
 MICRO = played((18.62, 3), singles=(19.21, 20.08, 20.9, 21.6))
 
 
-def slope(height: int = 80, width: int = 300) -> FloatArray:
+def slope(height: int = 40, width: int = 300) -> FloatArray:
     x, y = grid((height, width))
     return np.asarray(200 + 1.1 * x + 0.13 * y + 3 * np.sin(x / 30))
 
@@ -147,7 +147,7 @@ def test_clipped_pixels_have_no_position() -> None:
 
 def test_pixels_too_dark_for_the_number_of_their_period_are_refused() -> None:
     position_px, noise = slope(), NoiseModel(30.0, 0.02)
-    frames, code = frames_of(TWO_PERIODS, position_px, noise=noise, brighter=0.28, has_reference=False)
+    frames, code = frames_of(TWO_PERIODS, position_px, noise=noise, brighter=0.3, has_reference=False)
     found = located(frames, code, noise)
     error_px = np.abs(found.measured.position - position_px)
     assert 0.1 < np.isfinite(error_px).mean() < 0.9
